@@ -326,9 +326,9 @@ class Run:
         directory : path
             Takes a folder for each format.
         formats : str or list of str
-            ``pvd``, ``vtp``, ``ply``, ``stl``, ``obj``, ``glb``, ``usd``, ``animated-glb`` or ``html``.
+            ``pvd``, ``vtp``, ``ply``, ``stl``, ``obj``, ``glb``, ``usd`` or ``animated-glb``.
         units : {"m", "cm", "mm"}, optional
-            The scene's where not given; glTF and html are in metres.
+            The scene's where not given; glTF is in metres.
         """
         names = [formats] if isinstance(formats, str) else list(formats)
         return export_run(self.saved.directory, names, output=directory, units=units)
@@ -347,23 +347,6 @@ class Run:
 
     def __repr__(self) -> str:
         return f"<Run of {self.info['scene']['name']!r}: {len(self)} frames, {', '.join(self.muscles)}>"
-
-    def _repr_html_(self) -> str:
-        from rbfmuscle.report.render import figure_html
-
-        if not self.frames:
-            return figure_html({}, {}, repr(self), np.eye(3))
-        last, scene = self.frames[-1], self.scene
-        if scene is None:
-            bones, body = {name: self.saved.bone(name) for name in self.saved.bones}, self.saved.body
-        else:
-            bones, body = {b.name: (b.mesh.vertices, b.mesh.faces) for b in scene.bones}, scene.body
-        moved = {
-            name: (vertices @ last.poses[name][:3, :3].T + last.poses[name][:3, 3], faces)
-            for name, (vertices, faces) in bones.items()
-        }
-        muscles = {name: (surface.vertices, surface.faces) for name, surface in last.surfaces.items()}
-        return figure_html(moved, muscles, f"{self!r} {self.verdict}", body)
 
 
 class MuscleRun:

@@ -25,12 +25,12 @@ def export(
     directory
         Folder of the run.
     formats
-        pvd, vtp, ply, stl, obj or glb: files for each frame; usd or animated-glb: all frames as an animation;
-        html: a page that turns and scrubs it. Several may be given.
+        pvd, vtp, ply, stl, obj or glb: files for each frame; usd or animated-glb: all frames as an animation.
+        Several may be given.
     output
         Folder to write to, DIR/export by default.
     units
-        m, cm or mm; the scene's by default (glb, animated-glb, html: m).
+        m, cm or mm; the scene's by default (glb, animated-glb: m).
     frames
         Of the written frames, as A:B:S.
     """

@@ -8,18 +8,15 @@ from pathlib import Path
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.animation.gltf import animated_glb
 from rbfmuscle.output.animation.moving import MovingRun, read_moving
-from rbfmuscle.output.animation.page import write_animated_page
 from rbfmuscle.output.animation.usd import check_usd, write_usd
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import SolveError, UsageError
 
-# One file a muscle (or bone) and frame; one file a frame; one file of all frames.
+# One file a muscle (or bone) and frame.
 MESHES = ("pvd", "vtp", "ply", "stl", "obj")
-SUFFIX_OF = {"usd": ".usdc", "animated-glb": ".glb", "html": ".html"}
-FORMATS = (*MESHES, "glb", *SUFFIX_OF)
-IN_METRES = ("glb", "animated-glb", "html")
+FORMATS = (*MESHES, "glb", "usd", "animated-glb")
 
 
 def export_run(
@@ -37,12 +34,12 @@ def export_run(
     directory : path
         Folder of the run.
     formats : str or list of str
-        Of `FORMATS`. ``pvd`` is ``vtp`` and a collection over the frames; ``glb`` gives one file a frame, ``usd``,
-        ``animated-glb`` and ``html`` (a page that turns and scrubs) one of all frames.
+        Of `FORMATS`. ``pvd`` is ``vtp`` and a collection over the frames; ``glb`` gives one file a frame, ``usd`` and
+        ``animated-glb`` one of all frames.
     output : path, optional
         ``DIR/export`` where not given; each format has its own folder there.
     units : {"m", "cm", "mm"}, optional
-        The scene's unit where not given; metres for ``glb``, ``animated-glb`` and ``html``, which know no other.
+        The scene's unit where not given; metres for ``glb`` and ``animated-glb``, which know no other.
     frames : slice, optional
         Of the written frames; all where not given.
 
@@ -72,23 +69,10 @@ def export_run(
         for name in formats:
             folder = base / name
             folder.mkdir(parents=True, exist_ok=True)
-            unit = units or ("m" if name in IN_METRES else saved.units)
-            if name == "glb":
-                for frame in chosen:
-                    written.append(folder / f"frame_{frame:04d}.glb")
-                    written[-1].write_bytes(animated_glb(read_moving(saved, [frame], unit=unit)))
-                continue
-            run = read_moving(saved, chosen, unit=unit)
-            if name in MESHES:
-                written += _export_meshes(run, folder, name, chosen)
-                continue
-            written.append(folder / f"{run.name}{SUFFIX_OF[name]}")
-            if name == "html":
-                write_animated_page(written[-1], run)
-            elif name == "usd":
-                write_usd(written[-1], run)
-            else:
-                written[-1].write_bytes(animated_glb(run))
+            unit = units or ("m" if "glb" in name else saved.units)
+            for frames_of_file in [[frame] for frame in chosen] if name == "glb" else [chosen]:
+                run = read_moving(saved, frames_of_file, unit=unit)
+                written += _export(run, folder, name, frames_of_file)
     except OSError as error:
         raise SolveError(f"cannot write to {base}: {error.strerror}") from None
     return written
@@ -98,12 +82,25 @@ def _check_words(formats: Sequence[str], units: str | None) -> None:
     for name in formats:
         if name not in FORMATS:
             raise UsageError(f"unknown format {name!r}; known: {', '.join(FORMATS)}")
-        if name in IN_METRES and units not in (None, "m"):
+        if "glb" in name and units not in (None, "m"):
             raise UsageError(f"{name} is in metres by its standard; leave out --units {units}")
     if units is not None and units not in MM_PER_UNIT:
         raise UsageError(f"units must be m, cm or mm, got {units!r}")
     if "usd" in formats:
         check_usd()
+
+
+def _export(run: MovingRun, folder: Path, name: str, frames: list[int]) -> list[Path]:
+    """Write a run in one format, and return the files."""
+    if name in MESHES:
+        return _export_meshes(run, folder, name, frames)
+    if name == "usd":
+        path = folder / f"{run.name}.usdc"
+        write_usd(path, run)
+    else:
+        path = folder / (f"frame_{frames[0]:04d}.glb" if name == "glb" else f"{run.name}.glb")
+        path.write_bytes(animated_glb(run))
+    return [path]
 
 
 def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -> list[Path]:
@@ -130,10 +127,5 @@ def write_mesh(path: Path, vertices: Floats, faces: Integers) -> None:
         return
     import trimesh
 
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    if path.suffix == ".obj":
-        path.write_text(
-            trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=12), encoding="ascii"
-        )
-    else:
-        path.write_bytes(mesh.export(file_type=path.suffix[1:]))
+    options = {"include_normals": False, "digits": 12} if path.suffix == ".obj" else {}
+    trimesh.Trimesh(vertices, faces, process=False).export(path, **options)

@@ -7,7 +7,6 @@ import os
 import re
 import zlib
 from collections.abc import Mapping
-from functools import lru_cache
 from html import escape
 from pathlib import Path
 
@@ -100,25 +99,13 @@ class _Appended:
     def add(self, values: np.ndarray, name: str, components: int = 1) -> str:
         """The element that names the array; its data goes to ``blocks``."""
         raw, start = values.tobytes(), self._size
-        block = _packed(raw) if values.dtype.kind == "f" else _packed_again(raw)
+        block = zlib.compress(raw, 1)
         self.blocks += [np.array([1, len(raw), 0, len(block)], dtype="<u4").tobytes(), block]
         self._size += 16 + len(block)
         return (
             f'<DataArray type="{_TYPES[values.dtype.str[1:]]}" Name="{name}" NumberOfComponents="{components}" '
             f'format="appended" offset="{start}"/>\n'
         )
-
-
-def _packed(raw: bytes) -> bytes:
-    # Digits of positions are as good as random: only how often each byte comes can be used.
-    packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, 9, zlib.Z_HUFFMAN_ONLY)
-    return packer.compress(raw) + packer.flush()
-
-
-@lru_cache(maxsize=128)
-def _packed_again(raw: bytes) -> bytes:
-    """Numbers of points and ends, which are those of the frame before where a surface keeps its faces."""
-    return zlib.compress(raw, 1)
 
 
 class Collection:

@@ -6,7 +6,7 @@ import csv
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rbfmuscle.experiments.kernel_study import ALIKE, cost, describe, row_name, row_toml
 from rbfmuscle.metrics.mesh_distance import MeshDistance
@@ -93,31 +93,19 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
     kernels = len({row["kernel"] for row in rows})
     counts = ", ".join(map(str, sorted({row["centres"] for row in rows})))
     found = {name: study.recommended for name, study in studies.items() if study.recommended}
+    code = "\n\n".join(f"# {name}\n{row_toml(row)}" for name, row in found.items())
+    hint = f"distances in {units or 'mesh units'}"
     return Page(
         f"Kernels for {surfaces}",
-        [
-            f"{kernels} kernels",
-            f"{counts} centres",
-            "every muscle; --muscle for one" if several else "one surface",
-        ],
+        [f"{kernels} kernels", f"{counts} centres", *["every muscle; --muscle for one"][:several]],
         answer(studies),
         GOOD if found else BAD,
         plot=_plot(studies, units),
         lights=_lights(studies, units),
         heads=["RMS error", "fit and values"],
         sections=[
-            *(
-                Section(
-                    f"Every row{f' of {name}' if several else ''}",
-                    f"distances in {units or 'mesh units'}",
-                    table=_rows(study),
-                )
-                for name, study in studies.items()
-            ),
-            Section(
-                "To paste at the end of a [[muscle]]",
-                code="\n\n".join(f"# {name}\n{row_toml(row)}" for name, row in found.items()),
-            ),
+            *(Section(f"Every row of {name}", hint, table=_rows(s)) for name, s in studies.items()),
+            Section("To paste at the end of a [[muscle]]", code=code),
             Section("How to read this", text=_READING),
         ],
     )
@@ -125,37 +113,29 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
 
 def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
     """Of one surface its best rows, each with whether it ties; of several what is recommended for each."""
-    if len(studies) > 1:
-        return [_light(s.recommended, name, units, GOOD) for name, s in studies.items() if s.recommended]
-    (study,) = studies.values()
-    good, best = [row for row in study.rows if not row["unfit"]], study.recommended
-    lights = []
-    for row in [best, *(row for row in good if row is not best)][:_MOST_LIGHTS] if best else []:
-        state = GOOD if row["rms"] <= ALIKE * good[0]["rms"] else PLAIN
-        lights.append(_light(row, "recommended" if row is best else "", units, state))
-    return lights
-
-
-def _light(row: dict[str, Any], note: str, units: str, state: str) -> Light:
-    cells = [number_cell(row["rms"], units, state), number_cell(cost(row), "s")]
-    return Light(row_name(row), cells, note=note)
+    chosen = [(name, study.recommended, GOOD) for name, study in studies.items() if study.recommended]
+    if len(studies) == 1:
+        (study,) = studies.values()
+        good = [row for row in study.rows if not row["unfit"]]
+        others = [row for row in good if row is not study.recommended]
+        chosen = [("recommended", row, GOOD) for _, row, _ in chosen]
+        chosen += [("", row, GOOD if row["rms"] <= ALIKE * good[0]["rms"] else PLAIN) for row in others]
+        chosen = chosen[:_MOST_LIGHTS]
+    return [
+        Light(row_name(row), [number_cell(row["rms"], units, state), number_cell(cost(row), "s")], note=note)
+        for note, row, state in chosen
+    ]
 
 
 def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
     """Error against the time of a fit and 20,000 values: a colour a surface, or of one a number of centres."""
-    points = [
-        Point(
-            1e3 * cost(row),
-            row["rms"],
-            row["kernel"],
-            name if len(studies) > 1 else f"{row['centres']} centres",
-            row is study.recommended,
-            row["front"],
-        )
-        for name, study in studies.items()
-        for row in study.rows
-        if not row["unfit"]
-    ]
+    points = []
+    for name, study in studies.items():
+        for row in study.rows:
+            if not row["unfit"]:
+                group = name if len(studies) > 1 else f"{row['centres']} centres"
+                place = 1e3 * cost(row), row["rms"], row["kernel"], group
+                points.append(Point(*place, row is study.recommended, row["front"]))
     labels = ("a fit and 20,000 values [ms of one thread]", f"RMS error [{units or 'mesh units'}]")
     return front_plot(points, labels)
 
@@ -165,13 +145,12 @@ def _rows(study: KernelStudy) -> Table:
     for row in study.rows:
         state = GOOD if row is study.recommended else BAD if row["unfit"] else PLAIN
         verdict = row["unfit"] or ("on the front" if row["front"] else "")
-        rows.append(
-            [Cell(row["kernel"]), *(_cell(name, row[name]) for name in COLUMNS), Cell(verdict, None, state)]
-        )
+        cells = [Cell(_shown(row[name], factor)) for name, (_, factor) in COLUMNS.items()]
+        rows.append([Cell(row["kernel"]), *cells, Cell(verdict, state)])
     return Table(["kernel", *(head for head, _ in COLUMNS.values()), "verdict"], rows)
 
 
-def _cell(name: str, value: float | str | None) -> Cell:
+def _shown(value: float | str | None, factor: float) -> str:
     if isinstance(value, float):
-        return Cell(shown_number(COLUMNS[name][1] * value), value)
-    return Cell("" if value is None else str(value), value if isinstance(value, int) else None)
+        return shown_number(factor * value)
+    return "" if value is None else str(value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,20 +16,19 @@ _NEAR_LIMIT = 0.8
 
 
 class Cell(NamedTuple):
-    """A cell of a table: its text, what a column is sorted by, and good, bad or plain."""
+    """A cell of a table: its text, and good, near, bad or plain."""
 
     text: str
-    value: float | None = None
     state: str = PLAIN
 
 
 def number_cell(value: float | None, unit: str = "", state: str = PLAIN) -> Cell:
     """A cell that shows a number."""
-    return Cell(shown_number(value, unit), value, state)
+    return Cell(shown_number(value, unit), state)
 
 
 class Table(NamedTuple):
-    """Headings and rows of cells, which a click on a heading sorts; the first cell of a row names it."""
+    """Headings and rows of cells; the first cell of a row names it."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[Cell]]
@@ -93,11 +91,6 @@ class Page:
             path.write_text(text, encoding="utf-8")
         except OSError as error:
             raise SolveError(f"cannot write {path}: {error.strerror}") from None
-
-
-def embedded_image(data: bytes, kind: str) -> str:
-    """Address of an image that holds the image itself."""
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def limit_state(value: float, limit: float | None, *, least: bool = False, count: bool = False) -> str:

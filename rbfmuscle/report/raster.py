@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
@@ -65,29 +64,16 @@ def fitted_size(axes: Floats, points: Floats, area: float) -> tuple[int, int]:
 
 
 def draw_solids(solids: Sequence[Solid], camera: Camera) -> Integers:
-    """Picture (h, w, 3) of uint8; of solids that are not opaque the nearest one is seen, over all that are."""
+    """Picture (h, w, 3) of uint8; what is not opaque is laid over all that is."""
     width, height = camera.size
     fine = camera._replace(scale=camera.scale * _FINER, size=(_FINER * width, _FINER * height))
-    depth, image = _nearest([solid for solid in solids if solid.opacity >= 1.0], fine)
-    veils = [solid for solid in solids if solid.opacity < 1.0]
-    if veils:
-        over, veil = _nearest(veils, fine)
-        share = np.where(over > depth, veil[..., 3], 0.0)[..., None]
-        image = (1.0 - share) * image + share * veil
-    mean = image[..., :3].reshape(height, _FINER, width, _FINER, 3).mean(axis=(1, 3))
+    depth = np.full(fine.size[::-1], -np.inf, dtype=np.float32)
+    image = np.tile(rgb(BACKGROUND).astype(np.float32), (*depth.shape, 1))
+    for solid in sorted(solids, key=lambda solid: -solid.opacity):
+        points, shades = fine.project(np.asarray(solid.vertices, dtype=float)), _shaded(solid, camera.axes)
+        _raster_loop(points, np.asarray(solid.faces, dtype=np.int64), shades, solid.opacity, depth, image)
+    mean = image.reshape(height, _FINER, width, _FINER, 3).mean(axis=(1, 3))
     return np.round(255.0 * np.clip(mean, 0.0, 1.0)).astype(np.uint8)
-
-
-def _nearest(solids: Sequence[Solid], camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth (h, w) of what is nearest in each pixel, and its colour with opacity (h, w, 4)."""
-    depth = np.full(camera.size[::-1], -np.inf, dtype=np.float32)
-    image = np.tile(np.array([*rgb(BACKGROUND), 1.0], dtype=np.float32), (*depth.shape, 1))
-    for solid in solids:
-        shades = np.empty((len(solid.vertices), 4))
-        shades[:, :3], shades[:, 3] = _shaded(solid, camera.axes), solid.opacity
-        points = camera.project(np.asarray(solid.vertices, dtype=float))
-        _raster_loop(points, shades, np.asarray(solid.faces, dtype=np.int64), depth, image)
-    return depth, image
 
 
 def _shaded(solid: Solid, axes: Floats) -> Floats:
@@ -136,10 +122,11 @@ def labelled(image: Integers, text: str, titles: Sequence[str], chips: Mapping[s
 
 
 @compiled
-def _raster_loop(points, shades, faces, depth, image):
+def _raster_loop(points, faces, shades, opacity, depth, image):
     height, width = depth.shape
     for f in range(len(faces)):
-        a, b, c = points[faces[f, 0]], points[faces[f, 1]], points[faces[f, 2]]
+        i, j, k = faces[f]
+        a, b, c = points[i], points[j], points[k]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
         if area == 0.0:
             continue
@@ -150,11 +137,11 @@ def _raster_loop(points, shades, faces, depth, image):
                 u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
                 v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
                 w = 1.0 - u - v
-                if u < 0.0 or v < 0.0 or w < 0.0:
-                    continue
                 z = u * a[2] + v * b[2] + w * c[2]
-                if z > depth[y, x]:
+                if u < 0.0 or v < 0.0 or w < 0.0 or z <= depth[y, x]:
+                    continue
+                if opacity >= 1.0:
                     depth[y, x] = z
-                    for k in range(4):
-                        a_k, b_k, c_k = shades[faces[f, 0], k], shades[faces[f, 1], k], shades[faces[f, 2], k]
-                        image[y, x, k] = u * a_k + v * b_k + w * c_k
+                for m in range(3):
+                    shade = u * shades[i, m] + v * shades[j, m] + w * shades[k, m]
+                    image[y, x, m] += opacity * (shade - image[y, x, m])

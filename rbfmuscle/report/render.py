@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
+import base64
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,31 +24,27 @@ from rbfmuscle.output.appearance import (
     view_axes,
 )
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.page import embedded_image
 from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids, fitted_size, labelled
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-ANIMATIONS = (".webp", ".gif")
-Meshes = Mapping[str, tuple[Floats, Integers]]
-# Pixels of a figure in a notebook, and from where it is seen.
-_FIGURE, _DIRECTION = (300, 340), (1.4, -1.6, 0.5)
-# Pixels of a panel, and of one of a preview; frames of a preview, and how many a second.
+# Pixels of a panel, and of one of a preview; frames of a preview, and its length [s].
 _AREA, _PREVIEW_AREA, _PREVIEW_FRAMES, _PREVIEW_SECONDS = 220_000, 110_000, 12, 4.0
 
 
-def draw_preview(runs: Mapping[str, SavedRun], path: Path, *, area: float = _PREVIEW_AREA) -> None:
-    """Write the whole motion of runs beside each other, seen in its plane; one run is seen from the front as well."""
+def draw_preview(runs: Mapping[str, SavedRun], path: Path, *, area: float = _PREVIEW_AREA) -> str:
+    """Draw a WebP animation of runs of one scene, by title, in the motion's plane; return it as an image's address.
+
+    ``area`` is pixels of each run.
+    """
     first = next(iter(runs.values()))
     frames = chosen_frames(first.frames, _PREVIEW_FRAMES)
     side = view_axes(motion_direction([first.poses[frame] for frame in frames], first.body), first.body)
-    panels, chips = [(title, run, side) for title, run in runs.items()], {}
-    if len(runs) == 1:
-        front = view_axes(VIEWS["front"], first.body)
-        panels, chips = [("plane of the motion", first, side), ("front", first, front)], _chips(first)
-    save_images(_draw_panels(panels, frames, chips, frames, area), path, _PREVIEW_SECONDS)
+    panels = [(title, run, side) for title, run in runs.items()]
+    save_images(_draw_panels(panels, frames, area), path, _PREVIEW_SECONDS)
+    return f"data:image/webp;base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
 def render_run(
@@ -87,7 +82,7 @@ def render_run(
     for view in views or ():
         if view not in VIEWS:
             raise UsageError(f"unknown view {view!r}; known: {', '.join(VIEWS)}")
-    if output.suffix not in (".png", *ANIMATIONS):
+    if output.suffix not in (".png", ".gif", ".webp"):
         raise UsageError(f"{output}: the suffix must be .png, .gif or .webp")
     if not saved.has_surfaces():
         raise UsageError(f"{directory} has no surfaces to draw")
@@ -98,15 +93,11 @@ def render_run(
         )
     panels = [(view, saved, view_axes(VIEWS[view], saved.body)) for view in views or USUAL_VIEWS]
     frames = [frame] if output.suffix == ".png" else saved.frames
-    save_images(_draw_panels(panels, frames, _chips(saved), saved.frames, area), output, seconds)
+    save_images(_draw_panels(panels, frames, area), output, seconds)
 
 
 def _draw_panels(
-    panels: Sequence[tuple[str, SavedRun, Floats]],
-    frames: Sequence[int],
-    chips: Mapping[str, str],
-    seen_in: Sequence[int],
-    area: float,
+    panels: Sequence[tuple[str, SavedRun, Floats]], frames: Sequence[int], area: float
 ) -> list[Image]:
     """A picture of each frame: runs beside each other, with titles above, and caption and colours below.
 
@@ -114,22 +105,20 @@ def _draw_panels(
     ----------
     panels : sequence of (title, run, axes)
     frames : sequence of int
-    chips : dict of str to colour
-    seen_in : sequence of int
-        Frames in the first, middle and last of which every muscle is in the picture.
     area : float
         Pixels of a panel.
     """
-    first, some = panels[0], sorted({seen_in[0], seen_in[len(seen_in) // 2], seen_in[-1]})
-    runs = {run.directory: run for _, run, _ in panels}.values()
-    names = [(run, name) for run in runs for name in (*run.muscles, *run.tendons)]
+    _, first, axes = panels[0]
+    some = {first.frames[0], first.frames[len(first.frames) // 2], first.frames[-1]}
+    names = [(run, name) for _, run, _ in panels for name in (*run.muscles, *run.tendons)]
     seen = np.concatenate([run.surface(name, k)[0][::3] for run, name in names for k in some])
-    size = fitted_size(first[2], seen, area)
+    size = fitted_size(axes, seen, area)
     cameras = [(run, aim(axes, seen, size)) for _, run, axes in panels]
+    titles, chips = [title for title, *_ in panels], _chips(first)
 
     def draw(frame: int) -> Image:
         image = np.concatenate([_draw_frame(run, camera, frame) for run, camera in cameras], axis=1)
-        return labelled(image, first[1].caption(frame), [title for title, *_ in panels], chips)
+        return labelled(image, first.caption(frame), titles, chips)
 
     return each(draw, frames)
 
@@ -161,42 +150,15 @@ def chosen_frames(frames: Sequence[int], most: int) -> list[int]:
 
 def save_images(images: Sequence[Image], path: Path, seconds: float) -> None:
     """Save one picture, or several of one width as an animation of so many seconds; raises SolveError if it fails."""
-    from PIL import Image
+    from PIL import ImageOps
 
-    height, sheets = max(image.height for image in images), []
-    for image in images:
-        sheets.append(Image.new("RGB", (image.width, height), BACKGROUND))
-        sheets[-1].paste(image, (0, 0))
-    kind: dict[str, Any] = {}
+    size = images[0].width, max(image.height for image in images)
+    sheets = [ImageOps.pad(image, size, color=BACKGROUND, centering=(0, 0)) for image in images]
+    kind: dict[str, Any] = {"quality": 82, "method": 2} if path.suffix == ".webp" else {}
     if len(sheets) > 1:
         pauses = [max(20, int(1000 * seconds / len(sheets)))] * (len(sheets) - 1) + [900]
-        kind = {"save_all": True, "append_images": sheets[1:], "duration": pauses, "loop": 0}
-        kind |= {"quality": 82, "method": 2} if path.suffix == ".webp" else {}
+        kind |= {"save_all": True, "append_images": sheets[1:], "duration": pauses, "loop": 0}
     try:
         sheets[0].save(path, **kind)
     except OSError as error:
         raise SolveError(f"cannot write {path}: {error.strerror}") from None
-
-
-def figure_html(bones: Meshes, muscles: Meshes, caption: str, body: Floats) -> str:
-    """HTML of a picture.
-
-    Parameters
-    ----------
-    bones, muscles : mapping of str to (vertices, faces)
-        Where they are drawn.
-    caption : str
-    body : (3, 3) ndarray
-        Left, posterior and superior.
-    """
-    from PIL import Image
-
-    solids = [Solid(*mesh, BONE_COLOUR) for mesh in bones.values()]
-    solids += [Solid(*muscles[name], colour) for name, colour in muscle_colours(list(muscles)).items()]
-    picture = ""
-    if solids:
-        camera = aim(view_axes(_DIRECTION, body), np.concatenate([s.vertices for s in solids]), _FIGURE)
-        file = io.BytesIO()
-        Image.fromarray(draw_solids(solids, camera)).save(file, format="PNG")
-        picture = f'<img alt="{escape(caption)}" src="{embedded_image(file.getvalue(), "png")}">'
-    return f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -25,7 +25,6 @@ from rbfmuscle.report.page import (
     Page,
     Section,
     Table,
-    embedded_image,
     limit_state,
     number_cell,
     sentence,
@@ -42,19 +41,16 @@ LIGHTS = {
     "Moves without jumps or bowing": ("flicker", "slack"),
 }
 COUNTS = ("components", "euler", "self_crossings", "tunnelled")
-# Title, quantity, factor, unit (None: the scene's), whether it can be of either sign.
+# Title, quantity, factor, unit (None: the scene's).
 PANELS = (
-    ("Length", "length", 1.0, None, False),
-    ("Activation", "activation", 1.0, "", False),
-    ("Volume error", "volume_error", 100.0, "%", True),
-    ("Surface inside a bone", "penetration_max", 1.0, None, False),
-    ("Bone inside the muscle", "bone_penetration_max", 1.0, None, False),
-    ("Edge strain of the carried mesh (RMS)", "edge_strain_rms", 100.0, "%", False),
-    ("Time per frame after the first", "time_frame", 1000.0, "ms", False),
+    ("Length", "length", 1.0, None),
+    ("Activation", "activation", 1.0, ""),
+    ("Volume error", "volume_error", 100.0, "%"),
+    ("Surface inside a bone", "penetration_max", 1.0, None),
+    ("Bone inside the muscle", "bone_penetration_max", 1.0, None),
+    ("Edge strain of the carried mesh (RMS)", "edge_strain_rms", 100.0, "%"),
+    ("Time per frame after the first", "time_frame", 1000.0, "ms"),
 )
-_MECHANICS = ("length", "activation", "moment_arm")
-# Below this share of its limit a quantity is named in place of a plot.
-_NEGLIGIBLE = 0.01
 # Points of all muscles in all frames that a page holds.
 _MOST_POINTS = 2_600_000
 # Tables or plots of their own.
@@ -81,9 +77,7 @@ def write_report(directory: str | Path, *, pictures: bool = True) -> None:
     else:
         page.scene = packed_scene({"": saved})
         if len(saved.frames) > 1:
-            moving = saved.directory / "preview.webp"
-            draw_preview({"": saved}, moving)
-            page.picture = embedded_image(moving.read_bytes(), "webp")
+            page.picture = draw_preview({"": saved}, saved.directory / "preview.webp")
     page.write(saved.directory / "report.html")
 
 
@@ -124,14 +118,10 @@ def _page(saved: SavedRun) -> Page:
 def _facts(saved: SavedRun) -> list[str]:
     info = saved.info
     models = sorted({muscle["model"]["name"] for muscle in info["scene"]["muscles"]})
+    counts = [f"{len(saved.muscles)} muscles", f"{len(saved.frames)} frame{'s'[: len(saved.frames) != 1]}"]
     median = (info.get("frame_time") or {}).get("median")
-    return [
-        f"model {', '.join(models)}",
-        f"{len(saved.muscles)} muscles",
-        f"{len(saved.frames)} frame{'s'[: len(saved.frames) != 1]}",
-        *([f"{shown_number(median, 's')} per frame"] if median else []),
-        f"{info['times']['wall']:.1f} s in all",
-    ]
+    times = [f"{shown_number(median, 's')} per frame"] if median else []
+    return [f"model {', '.join(models)}", *counts, *times, f"{info['times']['wall']:.1f} s in all"]
 
 
 def _lights(saved: SavedRun) -> list[Light]:
@@ -171,32 +161,24 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
 def _plots(saved: SavedRun) -> list[Section]:
     """Moment arms and lengths, then what else changes along the motion."""
     axis, label = motion_axis(saved)
-    panels = [
-        (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), True, name)
+    arms = [
+        (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), name)
         for name in saved.moment_arm_coordinates()
-    ] + [(*panel, None) for panel in PANELS]
-    mechanics, errors, negligible = [], [], []
-    for title, quantity, factor, unit, both, coordinate in panels:
+    ]
+    mechanics: list[str] = []
+    errors: list[str] = []
+    for title, quantity, factor, unit, coordinate in [*arms, *((*panel, None) for panel in PANELS)]:
         tracks = _tracks(saved, quantity, factor, axis, coordinate)
-        if not tracks:
-            continue
-        unit, limit = (
-            saved.units if unit is None else unit,
-            factor * (saved.info["limits"].get(quantity) or 0.0),
-        )
-        greatest = max(np.nanmax(np.abs(track.y), initial=0.0) for track in tracks)
-        if quantity not in _MECHANICS and greatest <= _NEGLIGIBLE * limit:
-            value = shown_number(greatest, unit)
-            negligible.append(f"{title.lower()} {value if value[0] == '<' else f'≤ {value}'}")
-            continue
-        limits = [limit, -limit][: 1 + both] if limit else []
-        zero = quantity != "length" and not both
-        picture = line_plot(title, tracks, (label, unit), limits=limits, zero=zero)
-        (mechanics if quantity in _MECHANICS else errors).append(picture)
-    text = f"Not plotted, as below 1 % of the limit: {'; '.join(negligible)}." if negligible else ""
+        if tracks:
+            unit, limit = saved.units if unit is None else unit, saved.info["limits"].get(quantity)
+            signed = any(np.nanmin(track.y) < 0.0 for track in tracks)
+            limits = [factor * limit, -factor * limit][: 1 + signed] if limit else []
+            zero = quantity != "length" and not signed
+            picture = line_plot(title, tracks, (label, unit), limits=limits, zero=zero)
+            (mechanics if quantity in ("length", "activation", "moment_arm") else errors).append(picture)
     return [
         Section("Moment arms and lengths", plots=mechanics),
-        Section("Errors and times over the motion", plots=errors, text=text),
+        Section("Errors and times over the motion", plots=errors),
     ]
 
 
@@ -237,7 +219,7 @@ def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Mapping[str
     if not facts or facts.get("worst") is None:
         return Cell("–")
     if name in ("length", "edge_strain_rms"):
-        return Cell(f"{facts['min']:.4g} … {facts['max']:.4g}", facts["max"])
+        return Cell(f"{facts['min']:.4g} … {facts['max']:.4g}")
     if name == "time_frame":
         return number_cell(facts["median"], "s")
     limit = muscle_limit(name, limits[name], found) if name in limits else None
@@ -250,10 +232,8 @@ def _neighbours(saved: SavedRun) -> Table:
     rows = [
         [
             Cell(" and ".join(pair["muscles"])),
-            *(
-                Cell(f"{shown_number(pair[name])}, frame {pair[frame]}", pair[name])
-                for name, frame in (("overlap_max", "overlap_frame"), ("gap_rms", "gap_frame"))
-            ),
+            Cell(f"{shown_number(pair['overlap_max'])}, frame {pair['overlap_frame']}"),
+            Cell(f"{shown_number(pair['gap_rms'])}, frame {pair['gap_frame']}"),
         ]
         for pair in saved.info.get("neighbours") or []
     ]
@@ -265,12 +245,8 @@ def _events(events: Sequence[Sequence[Any]]) -> Table:
     kinds: dict[str, Counter[str]] = {}
     for event in events:
         kinds.setdefault(event[4], Counter()).update([event[1] or event[2]])
-    rows = [
-        [
-            Cell(kind),
-            Cell(str(n := found.total()), n),
-            Cell(", ".join(f"{m} {k}" for m, k in found.most_common(6))),
-        ]
-        for kind, found in sorted(kinds.items(), key=lambda row: -row[1].total())
-    ]
+    rows = []
+    for kind, found in sorted(kinds.items(), key=lambda row: -row[1].total()):
+        most = ", ".join(f"{name} {count}" for name, count in found.most_common(6))
+        rows.append([Cell(kind), Cell(str(found.total())), Cell(most)])
     return Table(["event", "how often", "most often"], rows)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
 SIZE, SIDES = (480, 860), ("front", "right", "back", "left")
-_MUSCLE, _OPACITY, _AXIS, _PALE = "#9a8f8f", 0.4, "#0057d9", 0.72
+_MUSCLE, _OPACITY, _AXIS, _PALE = "#9a8f8f", 0.12, "#0057d9", 0.72
 
 
 def draw_scene(scene: Scene, path: str | Path) -> None:
@@ -63,11 +63,11 @@ def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:
 
 
 def _draw_joints(pen: ImageDraw, camera: Camera, scene: Scene) -> None:
-    """Centres, axes and names of the joints; names of those at one place below each other."""
+    """Centres, axes and names of the joints, each name below the one before."""
     from PIL import ImageFont
 
-    font, rows = ImageFont.load_default(13), []
-    for joint in scene.joints:
+    font, row = ImageFont.load_default(13), -np.inf
+    for joint in sorted(scene.joints, key=lambda joint: -float(camera.axes[1] @ joint.centre)):
         if not joint.coordinates:
             continue
         centre = np.asarray(joint.centre, dtype=float)
@@ -79,11 +79,8 @@ def _draw_joints(pen: ImageDraw, camera: Camera, scene: Scene) -> None:
                 ends = camera.project(np.array([centre - reach * along, centre + reach * along]))
                 pen.line([tuple(end[:2]) for end in ends], fill=_AXIS, width=2)
         pen.ellipse((x - 4, y - 4, x + 4, y + 4), fill=_AXIS)
-        row, wide = y - 7, pen.textlength(joint.name, font=font)
-        left = min(x + 8, camera.size[0] - wide - 4)
-        while any(abs(row - other) < 14 and left < end and start < left + wide for other, start, end in rows):
-            row += 14
-        rows.append((row, left, left + wide))
+        left = min(x + 8, camera.size[0] - pen.textlength(joint.name, font=font) - 4)
+        row = max(y - 7, row + 13)
         pen.text((left, row), joint.name, fill=_AXIS, font=font)
 
 

@@ -44,14 +44,9 @@ def write_page(found: dict[str, Any], directory: str | Path) -> None:
 
 def inside_grid(rows: Iterable[dict[str, Any]]) -> bool:
     """Whether a reference has no setting beyond those of the other points."""
-    rows = list(rows)
-    others = [row["settings"] for row in rows if row["role"] != "reference"]
-    values = {(key, str(value)) for settings in others for key, value in settings.items()}
-    return any(
-        {(key, str(value)) for key, value in row["settings"].items()} <= values
-        for row in rows
-        if row["role"] == "reference"
-    )
+    found = [(row["role"], {(key, str(value)) for key, value in row["settings"].items()}) for row in rows]
+    others = set().union(*(settings for role, settings in found if role != "reference"))
+    return any(settings <= others for role, settings in found if role == "reference")
 
 
 def front_picture(rows: Iterable[dict[str, Any]], quantity: str) -> str:
@@ -59,18 +54,12 @@ def front_picture(rows: Iterable[dict[str, Any]], quantity: str) -> str:
 
     Points that are their own reference, but for rounding, are left out.
     """
-    points = [
-        Point(
-            1e3 * row["time_frame"],
-            row[quantity],
-            _short(row),
-            f"{row['scene']} {row['settings'].get('model', '')}".strip(),
-            row["role"] == "default",
-            row["front"],
-        )
-        for row in rows
-        if row["role"] != "reference" and row["status"] == "done" and row[quantity] > ROUNDING
-    ]
+    points = []
+    for row in rows:
+        if row["role"] != "reference" and row["status"] == "done" and row[quantity] > ROUNDING:
+            group = f"{row['scene']} {row['settings'].get('model', '')}".strip()
+            place = 1e3 * row["time_frame"], row[quantity], _short(row), group
+            points.append(Point(*place, row["role"] == "default", row["front"]))
     return front_plot(points, ("time per frame [ms]", quantity.replace("_", " ")))
 
 
@@ -110,17 +99,10 @@ def _light(row: dict[str, Any], title: str, quantity: str, state: str) -> Light:
 def _points(rows: list[dict[str, Any]]) -> Table:
     settings = list(dict.fromkeys(key for row in rows for key in row["settings"]))
     head = ["scene", *settings, "role", "front", *(name.replace("_", " ") for name in SHOWN), "status"]
-    lines = [
-        [
-            *(
-                Cell(str(text))
-                for text in (row["scene"], *(row["settings"].get(key, "") for key in settings))
-            ),
-            Cell(row["role"]),
-            Cell("yes" if row["front"] else ""),
-            *(number_cell(row[name], "s" if name.startswith("time_") else "") for name in SHOWN),
-            Cell(row["error"] or row["status"]),
-        ]
-        for row in rows
-    ]
+    lines = []
+    for row in rows:
+        values = (str(row["settings"].get(key, "")) for key in settings)
+        numbers = (number_cell(row[name], "s" if name.startswith("time_") else "") for name in SHOWN)
+        texts = row["scene"], *values, row["role"], "yes" if row["front"] else ""
+        lines.append([*map(Cell, texts), *numbers, Cell(row["error"] or row["status"])])
     return Table(head, lines)

@@ -50,12 +50,3 @@ class Scene(SceneData):
         import rbfmuscle  # Scenes know nothing of viewers; the facade does.
 
         return rbfmuscle.show(self, model=model)
-
-    def _repr_html_(self) -> str:
-        import rbfmuscle
-
-        bones, muscles = (
-            {item.name: (item.mesh.vertices, item.mesh.faces) for item in items}
-            for items in (self.bones, self.muscles)
-        )
-        return rbfmuscle.figure_html(bones, muscles, repr(self), rbfmuscle.orient_scene(self.copy()).body)

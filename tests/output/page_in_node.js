@@ -17,7 +17,7 @@ globalThis.document = {
   // No canvas draws here: the script ends with its message after all is unpacked.
   createElement: () => ({appendChild: (child) => child, getContext: () => null}),
 };
-vm.runInThisContext(scripts.find(([, attributes]) => !attributes.includes("json"))[2]);
+vm.runInThisContext(scripts.at(-1)[2]);
 setTimeout(() => {
   for (const part of parsed.parts)
     for (const piece of part.pieces) {

@@ -203,14 +203,6 @@ def test_files_with_y_up_or_z_up_stand_upright_whatever_the_data(folder, truth, 
     np.testing.assert_allclose(found, np.column_stack([y, z, x]), rtol=0, atol=TOLERANCE)
 
 
-def test_a_page_of_a_run_says_frame_and_coordinates(folder, tmp_path):
-    (path,) = export_run(folder, "html", output=tmp_path)
-    text = path.read_text(encoding="utf-8")
-    assert path.suffix == ".html" and path.parent.name == "html" and '"frame 1, ' in text
-    with pytest.raises(UsageError, match="html is in metres by its standard"):
-        export_run(folder, "html", output=tmp_path, units="mm")
-
-
 def test_times_of_a_motion_are_those_of_the_files(folder, tmp_path):
     import pyvista
 

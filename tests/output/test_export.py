@@ -152,6 +152,8 @@ class TestExport:
             export_run(run[1], "fbx", output=tmp_path)
         with pytest.raises(UsageError, match="units"):
             export_run(run[1], "ply", output=tmp_path, units="inch")
+        with pytest.raises(UsageError, match="glb is in metres by its standard"):
+            export_run(run[1], "glb", output=tmp_path, units="mm")
 
 
 def test_json_has_no_nan_and_is_replaced_whole(tmp_path):

@@ -10,7 +10,6 @@ import pytest
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.runinfo import Neighbours
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.comparison_page import worst_series
 from rbfmuscle.report.plots import Point, Track, front_plot, line_plot, motion_axis
 from rbfmuscle.report.report import _tracks
 
@@ -100,12 +99,3 @@ def test_line_is_broken_where_there_is_no_number():
     svg = line_plot("a", [Track("m", "#000000", np.arange(5.0), y)], ("x", "y"))
     path = re.search(r'<g data-muscle="m">.*?<path d="([^"]*)"', svg, re.S)[1]
     assert path.count("M") == 2 and path.count("L") == 2
-
-
-def test_worst_of_several_muscles_is_the_greatest_in_size_with_its_sign():
-    rows = {"a": [0.1, -0.5, 0.2], "b": [-0.3, 0.4, 0.1]}
-    run = SimpleNamespace(
-        muscles=list(rows), series=lambda muscle, quantity: (np.array([0, 2, 4]), np.array(rows[muscle]))
-    )
-    frames, values = worst_series(run, "volume_error")
-    assert list(values) == [-0.3, -0.5, 0.2] and list(frames) == [0, 2, 4]

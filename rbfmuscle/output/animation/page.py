@@ -7,13 +7,11 @@ the vertices; all arrays follow each other in one deflated stream, their bytes s
 from __future__ import annotations
 
 import base64
-import html
 import json
 import zlib
 from collections.abc import Mapping
 from importlib import resources
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,26 +22,6 @@ from rbfmuscle.output.appearance import VIEWS
 
 # Whole numbers of which the longest side of all that moves has so many: 0.03 mm of 900.
 _STEPS = 30_000
-
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">
-<title>{title}</title><style>
-html,body{{margin:0;height:100%;font:15px/1.4 system-ui,"Segoe UI",Helvetica,Arial,sans-serif;color:#26282b}}
-.scene{{height:100%}}{style}</style></head>
-<body><div class="scene" data-scene="scene"></div>
-<script id="scene" type="application/json">{data}</script><script>{script}</script></body></html>
-"""
-
-
-def write_animated_page(path: Path, run: MovingRun) -> None:
-    """Write a run as one ``.html`` file that needs nothing else."""
-    page = _PAGE.format(
-        title=html.escape(run.name),
-        data=pack_runs({"": run}),
-        script=scene_file("scene.js"),
-        style=scene_file("scene.css"),
-    )
-    path.write_text(page, encoding="utf-8")
 
 
 def scene_file(name: str) -> str:
