@@ -20,7 +20,7 @@ def view(
     *,
     model: Model = None,
     at: Texts = None,
-    colour: Literal["group", "activation", "stretch", "penetration", "distance"] = "group",
+    colour: Literal["group", "activation", "stretch", "penetration"] = "group",
     browser: bool = True,
     port: int = 0,
     screenshot: Path | None = None,

@@ -8,7 +8,6 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import edge_lengths, unique_edges
-from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.penetration import BoneProbe, surface_depth
 
 if TYPE_CHECKING:
@@ -30,26 +29,25 @@ COLOURINGS = {
     "activation": Colouring("Activation", 0.0, 1.0, "viridis"),
     "stretch": Colouring("Stretch of the edges", -0.5, 0.5, "coolwarm"),
     "penetration": Colouring("Depth in a bone", 0.0, 2.0, "inferno", length=True),
-    "distance": Colouring("Distance to the other model", 0.0, 5.0, "viridis", length=True),
 }
 
 
 class Look(NamedTuple):
     """What of a picture is shown, and how: colouring, hidden muscles and bones, axis and place [scene unit] of a cut.
 
-    Nothing is shown beyond the cut; ``others`` are choices that ask for a new picture too.
+    Nothing is shown beyond the cut; another ``quantity`` of the plot asks for a new picture too.
     """
 
     colour: str
     hidden: frozenset[str]
     cut: tuple[int, float] | None
-    others: tuple[str, ...]
+    quantity: str
 
 
 def vertex_values(
-    colouring: str, name: str, picture: Picture, rest: Picture, probes: list[BoneProbe], other: Picture | None
+    colouring: str, name: str, picture: Picture, rest: Picture, probes: list[BoneProbe]
 ) -> Floats:
-    """One number for each vertex of a muscle, NaN where it is not known; ``other`` is the model beside it."""
+    """One number for each vertex of a muscle, NaN where it is not known."""
     vertices, faces = picture.surfaces[name]
     if colouring == "activation":
         return np.full(len(vertices), picture.activation.get(name, np.nan))
@@ -57,8 +55,6 @@ def vertex_values(
         return _stretch(vertices, *rest.surfaces[name])
     if colouring == "penetration":
         return surface_depth(vertices, probes, picture.poses)
-    if colouring == "distance" and other is not None:
-        return MeshDistance(*other.surfaces[name]).unsigned(vertices)
     return np.full(len(vertices), np.nan)
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from rbfmuscle.output.appearance import VIEWS
 from rbfmuscle.viewer.colours import COLOURINGS, Look, legend
-from rbfmuscle.viewer.side import Side
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 WIDTH = 350  # [pixel]
@@ -46,13 +45,8 @@ class Panel:
         with tabs.add_tab("Show"):
             self._add_choices(colour)
         with tabs.add_tab("Plot") as self._tab:
-            quantities = (
-                "none",
-                "volume error [%]",
-                f"depth in bones [{source.units}]",
-                "mean of the colour",
-            )
-            self.quantity = self._watch(self.gui.add_dropdown("Quantity", quantities))
+            names = "none", "volume error [%]", f"depth in bones [{source.units}]", "mean of the colour"
+            self.quantity = self._watch(self.gui.add_dropdown("Quantity", names))
             self._plot: Any = None
             self._lines, self._history = [], []
 
@@ -78,10 +72,7 @@ class Panel:
 
     def _add_choices(self, colour: str) -> None:
         gui, choices = self.gui, self.source.choices
-        self.models = [
-            self._watch(gui.add_dropdown("Model", choices)),
-            self._watch(gui.add_dropdown("Beside it", ("none", *choices))),
-        ]
+        self.model = self._watch(gui.add_dropdown("Model", choices))
         self.colour = self._watch(gui.add_dropdown("Colour", tuple(COLOURINGS), initial_value=colour))
         self.view = gui.add_button_group("View", [view.capitalize() for view in VIEWS])
         self.cut = self._watch(gui.add_dropdown("Cut along", ("none", "x", "y", "z")))
@@ -99,43 +90,42 @@ class Panel:
             points = np.concatenate([vertices[:, axis] for vertices, _ in self.source.muscles.values()])
             cut = axis, float(points.min() + self.place.value * np.ptp(points))
         hidden = frozenset(name for name, eye in self.eyes.items() if not eye.value)
-        others = *(model.value for model in self.models), self.quantity.value
-        return Look(self.colour.value, hidden, cut, others)
+        return Look(self.colour.value, hidden, cut, self.quantity.value)
 
     def move_to(self, values: dict[str, float]) -> None:
         """Set controls."""
         for name, value in values.items():
             self.controls[name].value = value
 
-    def write(self, sides: list[Side], texts: list[str]) -> None:
+    def write(self, numbers: Mapping[str, Mapping[str, float]], texts: Sequence[str]) -> None:
         """Write the scale of the colours, the numbers of all muscles and texts."""
         colouring, units = COLOURINGS[self.colour.value], self.source.units
         bar = "" if colouring is None else legend(colouring, units, self.source.millimetre)
-        head = (" / ".join(side.choice for side in sides), "volume [%]", f"in bones [{units}]")
+        head = self.model.value, "volume [%]", f"in bones [{units}]"
         rows = [f"<tr><th style='text-align:left'>{'</th><th>'.join(head)}</th></tr>"]
-        for name, colour in self.source.colours.items() if sides else ():
-            cells = [f"<span style='color:{colour}'>■</span> {name.replace('_', ' ')}"]
-            for key, digits in (("volume", 3), ("depth", 2)):
-                # 0.0 is added so that no -0 is shown.
-                numbers = (f"{round(side.numbers[name][key], digits) + 0.0:.{digits}f}" for side in sides)
-                cells.append(" / ".join(numbers).replace("nan", "–"))
-            rows.append(f"<tr><td style='text-align:left'>{'</td><td>'.join(cells)}</td></tr>")
+        for name, found in numbers.items():
+            colour, title = self.source.colours[name], name.replace("_", " ")
+            # 0.0 is added so that no -0 is shown.
+            values = (f"{round(found[k], n) + 0.0:.{n}f}" for k, n in (("volume", 3), ("depth", 2)))
+            cells = f"<span style='color:{colour}'>■</span> {title}", *values
+            row = "</td><td>".join(cells).replace(">nan", ">–")
+            rows.append(f"<tr><td style='text-align:left'>{row}</td></tr>")
         self._numbers.content = (
             f"<div style='padding:4px 12px;font-size:12px'>{bar}<div style='max-height:170px;overflow:auto'>"
             "<table style='width:100%;text-align:right;line-height:1.25'>"
             f"{''.join(rows)}</table></div>{'<br>'.join(text for text in texts if text)}</div>"
         )
 
-    def plot_on(self, sides: list[Side]) -> None:
+    def plot(self, numbers: Mapping[str, Mapping[str, float]]) -> None:
         """Go on with the plot of the quantity; begin anew where other lines are asked for."""
         from viser import uplot
 
         key = self.quantity.value.partition(" ")[0]
-        shown = [(s, name) for s in sides for name in self.source.colours if self.eyes[name].value][:LINES]
-        row = [side.numbers[name][key] for side, name in shown if key != "none"]
+        shown = [name for name in self.source.colours if self.eyes[name].value][:LINES]
+        row = [numbers[name][key] for name in shown if key != "none"]
         if not row or not np.isfinite(row).all():
             return
-        lines = [key, self.colour.value, *((side.choice, name) for side, name in shown)]
+        lines = [key, self.colour.value, self.model.value, *shown]
         if lines != self._lines:
             self._lines, self._history = lines, []
         self._history = [*self._history[1 - HISTORY :], row]
@@ -145,10 +135,8 @@ class Panel:
             return
         if self._plot is not None:
             self._plot.remove()
-        series = [uplot.Series(label="picture")]
-        for side, name in shown:
-            dash = [] if side is sides[0] else [6, 4]
-            label = f"{name} {side.choice}" if len(sides) > 1 else name
-            series.append(uplot.Series(label=label, stroke=self.source.colours[name], width=2, dash=dash))
+        colours = self.source.colours
+        series = [uplot.Series(label=name, stroke=colours[name], width=2) for name in shown]
+        axis = uplot.Series(label="picture")
         with self._tab:
-            self._plot = self.gui.add_uplot(data, tuple(series), height=260, scales={"x": {"time": False}})
+            self._plot = self.gui.add_uplot(data, (axis, *series), height=260, scales={"x": {"time": False}})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from rbfmuscle.output.tubes import tendon_mesh, tendon_name
 from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.live import LiveSession, live_fields
+from rbfmuscle.simulation.live import LiveSession
 from rbfmuscle.validation import UsageError
 
 Mesh = tuple[Floats, Integers]
@@ -74,8 +74,8 @@ class LiveSource:
             for items in (scene.bones, scene.muscles)
         )
         self.colours = muscle_colours(list(self.muscles), muscle_groups({"scene": scene.resolved()}))
-        self.fields = live_fields(scene)
-        session = LiveSession(scene, fields=self.fields)
+        self.stride, self._unfinished = math.radians(scene.contact.substep_angle), True
+        self.session = session = LiveSession(scene)
         self.controls = {
             name: _coordinate(scene, name, (*limits, session.rest[name]))
             for name, limits in session.limits.items()
@@ -85,26 +85,12 @@ class LiveSource:
             for frame in scene.motion.frames
         ]
 
-    def figure(self, choice: str) -> LiveFigure:
-        """A model of every muscle, at rest."""
+    def choose(self, choice: str) -> None:
+        """Begin anew with a model of every muscle, at rest."""
         scene = self.scene if choice == self.choices[0] else self.scene.with_options(model=choice)
-        return LiveFigure(LiveSession(scene, fields=self.fields), build_models(scene))
-
-
-def _coordinate(scene: Scene, name: str, numbers: tuple[float, ...]) -> Control:
-    group, _, label = name.rpartition(".")
-    unit = unit_sign(scene, name).strip()
-    numbers = tuple(round(shown_value(scene, name, number), 9) for number in numbers)
-    return Control(group, f"{label} [{unit}]" if unit else label, *numbers)
-
-
-class LiveFigure:
-    """New models of a session's muscles that follow coordinates set by hand."""
-
-    def __init__(self, session: LiveSession, models: list[Any]) -> None:
-        self.session, self._unfinished = session, True
-        self.stride = math.radians(session.scene.contact.substep_angle)
-        session.use(models)
+        self.session = LiveSession(scene, fields=self.session.fields)
+        self.session.use(build_models(scene))
+        self._unfinished = True
 
     def set(self, name: str, value: float) -> None:
         """Give a control a new target."""
@@ -135,6 +121,13 @@ class LiveFigure:
         return Picture(frame.poses, surfaces, tendons, frame.activations, known, "")
 
 
+def _coordinate(scene: Scene, name: str, numbers: tuple[float, ...]) -> Control:
+    group, _, label = name.rpartition(".")
+    unit = unit_sign(scene, name).strip()
+    numbers = tuple(round(shown_value(scene, name, number), 9) for number in numbers)
+    return Control(group, f"{label} [{unit}]" if unit else label, *numbers)
+
+
 class SavedSource:
     """Saved runs of one scene by name, scrubbed by frame; attributes as of `LiveSource`.
 
@@ -157,16 +150,10 @@ class SavedSource:
         self.motion = [{"frame": float(frame)} for frame in first.frames]
         self.controls = {"frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])}
 
-    def figure(self, choice: str) -> SavedFigure:
-        """A run at its first frame."""
-        return SavedFigure(self.runs[choice])
-
-
-class SavedFigure:
-    """A saved run at one of its frames."""
-
-    def __init__(self, saved: SavedRun) -> None:
-        self.saved, self.frame, self.pending = saved, saved.frames[0], True
+    def choose(self, choice: str) -> None:
+        """Show a run, at its first frame."""
+        self.saved = self.runs[choice]
+        self.frame, self.pending = self.saved.frames[0], True
 
     def set(self, name: str, value: float) -> None:
         """Go to the frame nearest to a number."""
