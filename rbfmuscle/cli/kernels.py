@@ -89,7 +89,7 @@ def _study(meshes, output, options):
     for name, mesh in meshes.items():
         with Progress(f"kernels of {name}", what="fit") as bar:
             studies[name] = study_kernels(mesh, **options, progress=bar)
-    write_studies(studies, output, meshes)
+    write_studies(studies, output)
     for name, study in studies.items():
         if study.recommended is not None:
             print(f"{name}: {describe(study.rows)}")

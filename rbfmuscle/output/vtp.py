@@ -6,7 +6,6 @@ import errno
 import os
 import re
 import zlib
-from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 
@@ -19,16 +18,22 @@ from rbfmuscle.validation import MeshError
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32"}
 # Last bits of double precision that are rounded away: 1e-11 of a coordinate is kept, and a quarter of the space saved.
 _ROUNDED_BITS = 16
-_HEAD = (
-    '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32" '
-    'compressor="vtkZLibDataCompressor">\n<PolyData>\n'
-)
+_HEAD = """<?xml version="1.0"?>
+<VTKFile type="PolyData" version="1.0"
+ byte_order="LittleEndian" header_type="UInt32" compressor="vtkZLibDataCompressor">
+<PolyData>
+<Piece NumberOfPoints="{}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" NumberOfPolys="{}">
+<Points>
+{}</Points>
+<Polys>
+{}{}</Polys>
+</Piece>
+</PolyData>
+"""
 _BEFORE_DATA, _AFTER_DATA = b'<AppendedData encoding="raw">\n_', b"\n</AppendedData>\n</VTKFile>\n"
 
 
-def write_vtp(
-    path: str | Path, vertices: ArrayLike, faces: ArrayLike, *, values: Mapping[str, ArrayLike] | None = None
-) -> None:
+def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
     """Write a triangle mesh as VTK XML PolyData.
 
     Parameters
@@ -37,23 +42,24 @@ def write_vtp(
     vertices : (n, 3) array_like
         Written in single precision where they are float32, else in double precision rounded to 1e-11 of each number.
     faces : (m, 3) array_like of int
-    values : mapping of str to (n,) array_like, optional
-        Of the vertices, by name.
     """
     points = np.ascontiguousarray(vertices)
     points = _rounded(points) if points.dtype != np.float32 else points
     corners = np.ascontiguousarray(faces, dtype="<i4")
     ends = np.arange(3, 3 * len(corners) + 1, 3, dtype="<i4")
-    data = _Appended()
-    text = (
-        f'{_HEAD}<Piece NumberOfPoints="{len(points)}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" '
-        f'NumberOfPolys="{len(corners)}">\n'
-        f"<Points>\n{data.add(points, 'Points', 3)}</Points>\n"
-        f"<Polys>\n{data.add(corners.ravel(), 'connectivity')}{data.add(ends, 'offsets')}</Polys>\n<PointData>\n"
-        + "".join(data.add(np.asarray(v, dtype="<f8"), name) for name, v in (values or {}).items())
-        + "</PointData>\n</Piece>\n</PolyData>\n"
-    )
-    Path(path).write_bytes(b"".join([text.encode("ascii"), _BEFORE_DATA, *data.blocks, _AFTER_DATA]))
+    elements: list[str] = []
+    blocks: list[bytes] = []
+    for name, values, components in ("Points", points, 3), ("connectivity", corners, 1), ("offsets", ends, 1):
+        elements.append(
+            f'<DataArray type="{_TYPES[values.dtype.str[1:]]}" Name="{name}" NumberOfComponents="{components}" '
+            f'format="appended" offset="{sum(len(block) for block in blocks)}"/>\n'
+        )
+        raw = values.tobytes()
+        packed = zlib.compress(raw, 1)
+        # VTK's header with the sizes of one zlib block, then the block.
+        blocks += [np.array([1, len(raw), 0, len(packed)], dtype="<u4").tobytes(), packed]
+    head = _HEAD.format(len(points), len(corners), *elements).encode("ascii")
+    Path(path).write_bytes(b"".join([head, _BEFORE_DATA, *blocks, _AFTER_DATA]))
 
 
 def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
@@ -87,25 +93,6 @@ def _rounded(points):
     whole = np.ascontiguousarray(points, dtype="<f8").view(np.uint64)
     half, kept = np.uint64(1 << (_ROUNDED_BITS - 1)), np.uint64(2**64 - (1 << _ROUNDED_BITS))
     return ((whole + half) & kept).view(np.float64)
-
-
-class _Appended:
-    """Arrays that follow the text of a file: VTK's header with the sizes of one zlib block, then the block."""
-
-    def __init__(self) -> None:
-        self.blocks: list[bytes] = []
-        self._size = 0
-
-    def add(self, values: np.ndarray, name: str, components: int = 1) -> str:
-        """The element that names the array; its data goes to ``blocks``."""
-        raw, start = values.tobytes(), self._size
-        block = zlib.compress(raw, 1)
-        self.blocks += [np.array([1, len(raw), 0, len(block)], dtype="<u4").tobytes(), block]
-        self._size += 16 + len(block)
-        return (
-            f'<DataArray type="{_TYPES[values.dtype.str[1:]]}" Name="{name}" NumberOfComponents="{components}" '
-            f'format="appended" offset="{start}"/>\n'
-        )
 
 
 class Collection:

@@ -89,7 +89,6 @@ def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
             Section("How to read this", text=_READING, terms=terms),
         ],
         footer=", ".join(f"{name} {value}" for name, value in found["versions"].items()),
-        layout="below",
     )
 
 

@@ -1,4 +1,4 @@
-"""The kernel study of one or several surfaces as files: tables, a page, and the recommended surfaces."""
+"""The kernel study of one or several surfaces as files: tables and a page."""
 
 from __future__ import annotations
 
@@ -9,16 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rbfmuscle.experiments.kernel_study import ALIKE, cost, describe, row_name, row_toml
-from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.summary import shown_number
-from rbfmuscle.output.vtp import write_vtp
 from rbfmuscle.output.writer import json_text
 from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, number_cell
 from rbfmuscle.report.plots import Point, front_plot
 
 if TYPE_CHECKING:
-    import trimesh
-
     from rbfmuscle.experiments.kernel_study import KernelStudy
 
 # Quantity: heading, factor.
@@ -36,19 +32,8 @@ quickest row (a fit and 20,000 values, processor time of one thread) that errs a
 alike in time one without a parameter, then the best-conditioned one."""
 
 
-def write_studies(
-    studies: Mapping[str, KernelStudy], directory: str | Path, meshes: Mapping[str, trimesh.Trimesh]
-) -> None:
-    """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html``, and each recommended surface as a VTP file.
-
-    Parameters
-    ----------
-    studies : dict of str to KernelStudy
-        By the name of the surface.
-    directory : path
-    meshes : dict of str to trimesh.Trimesh
-        ``recommended_NAME.vtp`` holds each vertex's distance from them, positive outside.
-    """
+def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> None:
+    """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html`` of studies by the names of their surfaces."""
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
     rows = [{"surface": name, **row} for name, study in studies.items() for row in study.rows]
@@ -58,13 +43,6 @@ def write_studies(
         writer.writerows(rows)
     units = next(iter(studies.values())).units
     (directory / "kernels.json").write_text(json_text({"units": units, "rows": rows}), encoding="utf-8")
-    for name, study in studies.items():
-        surfaces = dict(zip(map(row_name, study.rows), study.surfaces, strict=True))
-        surface = surfaces.get(row_name(study.recommended)) if study.recommended else None
-        if surface is not None:
-            mesh = MeshDistance(meshes[name].vertices, meshes[name].faces)
-            values = {"distance": mesh.signed(surface[0])}
-            write_vtp(directory / f"recommended_{name}.vtp", *surface, values=values)
     _page(studies).write(directory / "kernels.html")
 
 

@@ -61,7 +61,8 @@ class Page:
 
     The ``answer`` is one sentence, ``detail`` stands below it. ``scene``, from `pack_runs`, moves; ``picture`` is the
     address of an image in place of the scene where a browser cannot show it; ``plot`` is SVG; ``missing`` says why
-    there is none of them. ``heads`` are those of the lights' columns; the lights stand beside or below the picture.
+    there is none of them. ``heads`` are those of the lights' columns; the lights stand beside the picture, below a
+    scene where they have several.
     """
 
     title: str
@@ -77,7 +78,6 @@ class Page:
     heads: Sequence[str] = ("worst",)
     sections: Sequence[Section] = ()
     footer: str = ""
-    layout: str = "beside"
 
     def write(self, path: Path) -> None:
         """Write the page, which needs no other file; raises SolveError where that fails."""
@@ -103,8 +103,3 @@ def limit_state(value: float, limit: float | None, *, least: bool = False, count
     if not (value >= limit if least else abs(value) <= limit):
         return BAD
     return NEAR if not least and not count and abs(value) > _NEAR_LIMIT * limit else GOOD
-
-
-def sentence(text: str) -> str:
-    """A text with a capital letter and a full stop."""
-    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")

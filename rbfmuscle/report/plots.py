@@ -14,7 +14,6 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
 
 if TYPE_CHECKING:
-    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
     from rbfmuscle.output.saved import SavedRun
@@ -78,11 +77,10 @@ def line_plot(
     from matplotlib import style
     from matplotlib.figure import Figure
 
-    below = _ROW * len(tracks) if legend else 0.0
+    tall = 2.3 + _ROW * len(tracks) * legend
     with style.context(["default", _STYLE]):
-        figure = Figure((4.2, 2.3 + below))
-        tall = 2.3 + below
-        axes = figure.add_axes((0.12, (0.4 + below) / tall, 0.86, 1.65 / tall), xlabel=labels[0])
+        figure = Figure((4.2, tall))
+        axes = figure.add_axes((0.12, 1.0 - 1.9 / tall, 0.86, 1.65 / tall), xlabel=labels[0])
         axes.set_title(title, loc="left")
         axes.set_title(labels[1], loc="right", color=_SOFT, weight="normal")
         for limit in limits:
@@ -108,6 +106,7 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
     """
     from matplotlib import style
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
     shown = [point for point in points if point.x > 0 and point.y > 0]
     if not shown:
@@ -128,41 +127,28 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
             marker, size = ("*", 13.0) if point.star else ("o", 6.0)
             shade = colours[point.group] + ("" if point.star or point.front else "66")
             axes.plot(point.x, point.y, marker, color=shade, markersize=size, markeredgewidth=0.0)
-        _set_ticks(axes.xaxis, axes.get_xlim())
-        _set_ticks(axes.yaxis, axes.get_ylim())
+        for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+            axis.set_major_locator(MaxNLocator(5) if high < 10.0 * low else LogLocator(subs=(1, 2, 5)))
+            axis.set_minor_locator(NullLocator())
+            axis.set_major_formatter("{x:.4g}")
         _label_beside(axes, named, groups, _ROW / (tall - 0.55))
         return _svg(figure, f"{labels[1]} against {labels[0]}")
 
 
 def _label_beside(axes, points, groups, row):
     """Write groups, then the points' labels, below each other beside the plot, each joined to its point."""
-    for k, (name, colour) in enumerate(groups.items()):
-        axes.text(
-            1.04, 1.0 - row * k, name, color=colour, weight="bold", transform=axes.transAxes, va="center"
-        )
-    low, high = np.log(axes.get_ylim())
-    top = 1.0 - row * len(groups)
-    for k, point in enumerate(sorted(points, key=lambda point: -point.y)):
-        height = (np.log(point.y) - low) / (high - low)
-        top = max(min(height, top), row * (len(points) - 1 - k))
-        axes.annotate(
-            point.label, (point.x, point.y), (1.04, top), textcoords="axes fraction", va="center",
-            weight="bold" if point.star else "normal",
-            arrowprops={"arrowstyle": "-", "linewidth": 0.5, "color": _SOFT, "shrinkA": 0.0, "shrinkB": 0.0},
-        )  # fmt: skip
+    top, whole = 1.0, axes.transAxes
+    for name, colour in groups.items():
+        axes.text(1.04, top, name, color=colour, weight="bold", transform=whole, va="center")
         top -= row
-
-
-def _set_ticks(axis: Axis, span: tuple[float, float]) -> None:
-    """Round numbers on a logarithmic axis, as many as are legible."""
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
-
-    ratio = span[1] / span[0]
-    axis.set_major_locator(
-        MaxNLocator(5) if ratio < 10 else LogLocator(subs=(1, 2, 5) if ratio < 300 else (1,))
-    )
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter("{x:.4g}")
+    line = {"arrowstyle": "-", "linewidth": 0.5, "color": _SOFT, "shrinkA": 0.0, "shrinkB": 0.0}
+    for k, point in enumerate(sorted(points, key=lambda point: -point.y)):
+        height = whole.inverted().transform(axes.transData.transform((point.x, point.y)))[1]
+        top = max(min(height, top), row * (len(points) - 1 - k))
+        weight = "bold" if point.star else "normal"
+        place = (point.x, point.y), (1.04, top), "data", whole
+        axes.annotate(point.label, *place, arrowprops=line, va="center", weight=weight)
+        top -= row
 
 
 def _svg(figure: Figure, title: str) -> str:

@@ -27,7 +27,6 @@ from rbfmuscle.report.page import (
     Table,
     limit_state,
     number_cell,
-    sentence,
 )
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, draw_preview
@@ -98,15 +97,15 @@ def _page(saved: SavedRun) -> Page:
     return Page(
         info["scene"]["name"],
         _facts(saved),
-        sentence(answer),
+        f"{answer[:1].upper()}{answer[1:].rstrip('.')}.",
         BAD if info["beyond"] or not complete else GOOD,
-        detail=sentence(detail) if detail else "",
+        detail=detail and f"{detail.rstrip('.')}.",
         lights=_lights(saved),
         sections=[
             *_plots(saved),
             Section("Every quantity of every muscle", "worst over the frames", table=_summary(saved)),
             Section("Neighbours", table=_neighbours(saved)),
-            Section("Events", "each with its frame in events.csv", table=_events(saved.events)),
+            Section("Events", "each with its frame in events.csv", text=_events(saved.events)),
             Section(
                 "How to read this", text=_READING, terms=[(n, text) for n, (_, text) in QUANTITIES.items()]
             ),
@@ -229,24 +228,21 @@ def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Mapping[str
 
 def _neighbours(saved: SavedRun) -> Table:
     """Pairs of muscles that slide on each other, the deepest overlap first."""
-    rows = [
-        [
-            Cell(" and ".join(pair["muscles"])),
-            Cell(f"{shown_number(pair['overlap_max'])}, frame {pair['overlap_frame']}"),
-            Cell(f"{shown_number(pair['gap_rms'])}, frame {pair['gap_frame']}"),
-        ]
-        for pair in saved.info.get("neighbours") or []
-    ]
-    return Table(["pair", f"overlap [{saved.units}]", f"gap opened, RMS [{saved.units}]"], rows)
+    rows = []
+    for pair in saved.info.get("neighbours") or []:
+        overlap, gap = shown_number(pair["overlap_max"]), shown_number(pair["gap_rms"])
+        texts = " and ".join(pair["muscles"]), overlap, pair["overlap_frame"], gap, pair["gap_frame"]
+        rows.append([Cell(str(text)) for text in texts])
+    return Table(["pair", f"overlap [{saved.units}]", "frame", f"gap, RMS [{saved.units}]", "frame"], rows)
 
 
-def _events(events: Sequence[Sequence[Any]]) -> Table:
+def _events(events: Sequence[Sequence[Any]]) -> str:
     """How many events of each kind, the commonest first, and the muscles that have most of them."""
     kinds: dict[str, Counter[str]] = {}
     for event in events:
         kinds.setdefault(event[4], Counter()).update([event[1] or event[2]])
-    rows = []
+    texts = []
     for kind, found in sorted(kinds.items(), key=lambda row: -row[1].total()):
         most = ", ".join(f"{name} {count}" for name, count in found.most_common(6))
-        rows.append([Cell(kind), Cell(str(found.total())), Cell(most)])
-    return Table(["event", "how often", "most often"], rows)
+        texts.append(f"{kind}: {found.total()} ({most}).")
+    return " ".join(texts)
