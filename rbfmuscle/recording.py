@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from datetime import UTC, datetime
 from typing import Any
@@ -27,7 +27,6 @@ from rbfmuscle.metrics.summary import (
 )
 from rbfmuscle.models import configure_scene
 from rbfmuscle.output.runinfo import Neighbours, build_info, frame_facts
-from rbfmuscle.output.sinks import Sink
 from rbfmuscle.output.writer import RunWriter
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
@@ -38,6 +37,26 @@ from rbfmuscle.sharing.share import MuscleGroup, timed
 from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.simulation.substeps import check_substeps
 from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError, UsageError
+
+
+class MemorySink:
+    """Keeps the frames of a run and the rows of its metrics, as `RunWriter` writes them."""
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+        self.rows: list[Row] = []
+
+    def write(self, frame: Frame, rows: Sequence[Row] = ()) -> None:
+        """Keep a frame, and the rows of metrics that are complete by now."""
+        self.frames.append(frame)
+        self.rows.extend(rows)
+
+    def close(self, rows: Sequence[Row] = ()) -> None:
+        """Keep the last rows."""
+        self.rows.extend(rows)
+
+    def write_info(self, info: dict[str, Any]) -> None:
+        """Nothing: the facts are the run's own."""
 
 
 class Recording:
@@ -97,7 +116,9 @@ class Recording:
         """Context whose time is added to one entry of ``times`` [s]."""
         return timed(self.times, part)
 
-    def feed(self, sink: Sink, *, progress: Callable[[int, int], None] | None = None) -> None:
+    def feed(
+        self, sink: RunWriter | MemorySink, *, progress: Callable[[int, int], None] | None = None
+    ) -> None:
         """Run the whole motion into a sink, which is closed whatever ends it."""
         self.status, self.message = "interrupted", "interrupted"
         try:

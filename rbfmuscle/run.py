@@ -19,10 +19,9 @@ from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.metrics.summary import parse_limits
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun, saved_frames
-from rbfmuscle.output.sinks import MemorySink
 from rbfmuscle.output.writer import RunWriter, check_writable
 from rbfmuscle.progress import Progress
-from rbfmuscle.recording import Recording
+from rbfmuscle.recording import MemorySink, Recording
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Event, Frame
@@ -89,7 +88,7 @@ def simulate(
             return simulate(scene, model, settings=settings, frames=frames, progress=shown, fields=fields)
     recording = Recording(scene, model=model, settings=settings, frames=frames, fields=fields)
     memory = MemorySink()
-    run = Run(memory.frames, memory.rows, recording=recording, memory=memory)
+    run = Run(memory.frames, memory.rows, recording=recording)
     try:
         recording.feed(memory, progress=progress or None)
     except SolveError as error:
@@ -176,11 +175,10 @@ class Run:
         metrics: list[Row],
         *,
         recording: Recording | None = None,
-        memory: MemorySink | None = None,
         saved: SavedRun | None = None,
     ) -> None:
         self.frames, self.metrics = frames, metrics
-        self._recording, self._memory = recording, memory
+        self._recording = recording
         self.scene = None if recording is None else recording.scene
         if saved is not None:
             self.saved = saved
@@ -341,7 +339,9 @@ class Run:
 
     def _write(self, directory):
         writer = RunWriter(directory, self.scene)
-        self._memory.replay(writer)
+        for frame in self.frames:
+            writer.write(frame)
+        writer.close(self.metrics)
         writer.write_info(self._recording.info())
         return writer
 

@@ -121,15 +121,15 @@ def motion_direction(poses: Sequence[Mapping[str, Floats]], body: Floats) -> Flo
     body : (3, 3) ndarray
         Left, posterior and superior, along which the direction is given.
     """
+    from scipy.spatial.transform import Rotation
+
     usual = np.array(VIEWS["right"])
-    widest, axis = np.radians(2.0), usual
-    for bone, start in poses[0].items():
-        for pose in poses[1:]:
-            turn = body @ pose[bone][:3, :3] @ start[:3, :3].T @ body.T
-            skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-            angle = float(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
-            if angle > widest and np.linalg.norm(skew) > 1e-9:
-                widest, axis = angle, skew / np.linalg.norm(skew)
-    if abs(axis[2]) > 0.8:
+    pairs = [(start, pose[bone]) for bone, start in poses[0].items() for pose in poses[1:]]
+    turns = [body @ pose[:3, :3] @ start[:3, :3].T @ body.T for start, pose in pairs]
+    vectors = Rotation.from_matrix(turns).as_rotvec() if turns else np.zeros((1, 3))
+    widest = max(vectors, key=np.linalg.norm)
+    angle = float(np.linalg.norm(widest))
+    if angle < np.radians(2.0) or abs(widest[2]) > 0.8 * angle:
         return usual
+    axis = widest / angle
     return axis if axis @ usual > 0 or (axis @ usual == 0 and axis[1] < 0) else -axis

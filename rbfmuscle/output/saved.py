@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -61,24 +62,19 @@ class SavedRun:
             self.info = json.loads(path.read_text(encoding="utf-8"))
             self.units = self.info["scene"]["units"]
             self.body = body_axes(*(self.info["scene"].get(word) for word in ("superior", "anterior")))
-            self.muscles = [muscle["name"] for muscle in self.info["scene"]["muscles"]]
+            muscles, output = self.info["scene"]["muscles"], self.info["scene"]["output"]
+            self.muscles = [muscle["name"] for muscle in muscles]
             self.bones = [bone["name"] for bone in self.info["scene"]["bones"]]
-            output = self.info["scene"]["output"]
             self._meshes = bool(output["surfaces"])
-            self.tendons = [
-                tendon_name(muscle["name"])
-                for muscle in self.info["scene"]["muscles"]
-                if output.get("tendons") and any("tendon" in held for held in muscle.get("attach", ()))
-            ]
+            held = [m["name"] for m in muscles if any("tendon" in end for end in m.get("attach", ()))]
+            self.tendons = [tendon_name(name) for name in held if output.get("tendons")]
             self.frames = [frame["frame"] for frame in self.info["frames"]]
         except OSError:
-            raise UsageError(
-                f"{self.directory} holds no run (no run.json); give the folder of 'run -o'"
-            ) from None
+            message = f"{self.directory} holds no run (no run.json); give the folder of 'run -o'"
+            raise UsageError(message) from None
         except (ValueError, KeyError, TypeError) as error:
-            raise UsageError(
-                f"{path} is not the run.json of a run ({error!r}); run the scene again"
-            ) from None
+            message = f"{path} is not the run.json of a run ({error!r}); run the scene again"
+            raise UsageError(message) from None
         if self.info.get("status") == "running":
             self.info["frames"] = self._whole_frames()
             self.frames = [frame["frame"] for frame in self.info["frames"]]
@@ -104,12 +100,6 @@ class SavedRun:
             found.setdefault(int(row[0]), {})[row[1]] = np.array(row[2:], dtype=float).reshape(4, 4)
         return found
 
-    @cached_property
-    def times(self) -> dict[int, float] | None:
-        """Time of each frame [s], None where the motion has none."""
-        found = self.info["scene"].get("motion", {}).get("times")
-        return None if found is None else dict(enumerate(map(float, found)))
-
     def surface(self, muscle: str, frame: int) -> tuple[Floats, Integers]:
         """Vertices and faces of a muscle in a frame."""
         self._check_surfaces()
@@ -124,15 +114,15 @@ class SavedRun:
 
     def series(self, muscle: str, quantity: str, coordinate: str | None = None) -> tuple[Integers, Floats]:
         """Frames and values of a quantity of a muscle, of moment arms those of a coordinate, as two arrays."""
-        found = [r for r in self._rows.get((muscle, quantity), []) if coordinate in (None, r.coordinate)]
+        found = [r for r in self._rows[muscle, quantity] if coordinate in (None, r.coordinate)]
         return np.array([r.frame for r in found]), np.array([r.value for r in found], dtype=float)
 
     @cached_property
     def _rows(self) -> dict[tuple[str, str], list[Row]]:
         """Rows of ``metrics.csv`` by muscle and quantity: of dozens of muscles there are tens of thousands."""
-        found: dict[tuple[str, str], list[Row]] = {}
+        found = defaultdict(list)
         for row in self.metrics:
-            found.setdefault((row.muscle, row.quantity), []).append(row)
+            found[row.muscle, row.quantity].append(row)
         return found
 
     def moment_arm_coordinates(self, muscle: str | None = None) -> list[str]:
@@ -145,10 +135,9 @@ class SavedRun:
         rows, units = self.info["frames"], self.info["scene"].get("coordinate_units", {})
         entry = next(row for row in rows if row["frame"] == frame)
         values = entry["coordinates"]
-        if len(values) > MOST_SHOWN:
-            spans = {name: np.ptp([row["coordinates"].get(name, 0.0) for row in rows]) for name in values}
-            values = {name: values[name] for name in sorted(values, key=lambda n: -spans[n])[:MOST_SHOWN]}
-        texts = [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values.items()]
+        spans = {name: np.ptp([row["coordinates"].get(name, 0.0) for row in rows]) for name in values}
+        most = sorted(values, key=lambda name: -spans[name])[:MOST_SHOWN]
+        texts = [f"{n} {value:.4g}{units.get(n, '°')}" for n, value in values.items() if n in most]
         clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
         return ", ".join([f"frame {frame}", *clock, *texts])
 

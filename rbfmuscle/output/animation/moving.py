@@ -106,9 +106,11 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
         poses = np.array([saved.poses[frame][name] for frame in frames])
         poses[:, :3, 3] *= factor
         bones.append(MovingPart(name, BONE_COLOUR, [vertices * factor], [faces], poses))
-    times = saved.times or {frame: frame / FRAMES_A_SECOND for frame in frames}
+    times = saved.info["scene"].get("motion", {}).get("times")
     name = str(saved.info["scene"].get("name") or saved.directory.name)
-    at = np.array([times[frame] for frame in frames], dtype=float)
+    at = np.array(
+        [frame / FRAMES_A_SECOND if times is None else times[frame] for frame in frames], dtype=float
+    )
     captions = [saved.caption(frame) for frame in frames]
     direction = motion_direction([saved.poses[frame] for frame in frames], saved.body)
-    return MovingRun(name, unit, at, bool(saved.times), captions, muscles, bones, saved.body, direction)
+    return MovingRun(name, unit, at, times is not None, captions, muscles, bones, saved.body, direction)

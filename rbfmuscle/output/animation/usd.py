@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,8 @@ def check_usd() -> None:
     try:
         import pxr.Usd  # noqa: F401
     except ImportError:
-        raise MissingPartError(
-            "export to usd needs usd-core: pip install -e '.[usd]' in rbfmuscle's folder"
-        ) from None
+        message = "export to usd needs usd-core: pip install -e '.[usd]' in rbfmuscle's folder"
+        raise MissingPartError(message) from None
 
 
 def write_usd(path: Path, run: MovingRun) -> None:
@@ -103,9 +103,6 @@ def identifier(name: str, used: set[str]) -> str:
     from pxr import Tf
 
     base = Tf.MakeValidIdentifier(name)
-    found, count = base, 1
-    while found in used:
-        count += 1
-        found = f"{base}_{count}"
+    found = next(text for k in count(1) if (text := base if k == 1 else f"{base}_{k}") not in used)
     used.add(found)
     return found
