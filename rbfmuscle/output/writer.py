@@ -84,17 +84,11 @@ class RunWriter:
             names = ("surfaces", "bones") if self.meshes else ()
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
         except OSError as error:
-            raise UsageError(
-                f"cannot write to {self.directory}: {error.strerror}; choose another folder"
-            ) from None
+            message = f"cannot write to {self.directory}: {error.strerror}; choose another folder"
+            raise UsageError(message) from None
 
     def write(self, frame: Frame, rows: Sequence[Any] = ()) -> None:
         """Write one frame and the rows of metrics that are complete by now.
-
-        Parameters
-        ----------
-        frame : Frame
-        rows : list of Row
 
         Raises
         ------
@@ -142,17 +136,11 @@ class RunWriter:
         if self.meshes:
             times = self.scene.motion.times
             step = frame.index if times is None else times[frame.index]
-            surfaces = self._write_surfaces(frame)
+            self._collections["surfaces"].add(step, self._write_surfaces(frame))
             self._collections["bones"].add(step, self._write_bones(frame))
-            self._collections["surfaces"].add(step, surfaces)
         # A frame's surfaces are on the disk before its poses: readers of a run that was killed rely on it.
-        self._add_rows(
-            "poses.csv",
-            [
-                (frame.index, bone.name, *map(float, frame.poses[bone.name].ravel()))
-                for bone in self.scene.bones
-            ],
-        )
+        poses = [(bone.name, frame.poses[bone.name].ravel().tolist()) for bone in self.scene.bones]
+        self._add_rows("poses.csv", [(frame.index, name, *pose) for name, pose in poses])
         self._add_rows("events.csv", [(e.frame, e.muscle, e.bone, e.count, e.action) for e in frame.events])
         self._add_rows("metrics.csv", rows)
 

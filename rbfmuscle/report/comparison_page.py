@@ -39,20 +39,9 @@ differ."""
 
 
 def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:
-    """Write ``report.html`` and ``models.webp``.
+    """Write ``report.html`` and ``models.webp`` to a folder with a run of each model; raises SolveError if that fails.
 
-    Parameters
-    ----------
-    folder : pathlib.Path
-        With a run of each model.
-    found : dict
-        From `rbfmuscle.experiments.comparison.write_tables`.
-    pictures : bool
-
-    Raises
-    ------
-    SolveError
-        If a file cannot be written.
+    ``found`` is from `rbfmuscle.experiments.comparison.write_tables`.
     """
     runs = {found["labels"][name]: SavedRun(folder / name) for name in found["models"]}
     page = _page(found, runs)

@@ -58,21 +58,9 @@ def line_plot(
     zero: bool = False,
     legend: bool = False,
 ) -> str:
-    """Markup of a plot of lines.
+    """Markup of a plot of lines; one that bears a muscle's name is switched on and off with it.
 
-    Parameters
-    ----------
-    title : str
-    tracks : sequence of Track
-        A line that bears a muscle's name is switched on and off with it.
-    labels : (str, str)
-        Of the axes.
-    limits : sequence of float
-        Drawn as dashed lines.
-    zero : bool
-        Whether the axis begins at zero.
-    legend : bool
-        Whether the lines' names stand below.
+    ``labels`` are those of the axes, ``limits`` dashed lines; the axis begins at ``zero``; a ``legend`` stands below.
     """
     from matplotlib import style
     from matplotlib.figure import Figure
@@ -97,12 +85,7 @@ def line_plot(
 def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
     """Markup of error against time on logarithmic axes: the front joined, its points and the default labelled.
 
-    Parameters
-    ----------
-    points : sequence of Point
-        Each group has a colour, named where there are several, and its own front.
-    labels : (str, str)
-        Of the axes.
+    Each group has a colour, named where there are several, and its own front; ``labels`` are those of the axes.
     """
     from matplotlib import style
     from matplotlib.figure import Figure
@@ -165,14 +148,9 @@ def _svg(figure: Figure, title: str) -> str:
 
 
 def motion_axis(saved: SavedRun) -> tuple[dict[int, float], str]:
-    """What plots run along.
+    """Place of each frame on the axis that plots run along, and its label.
 
-    Returns
-    -------
-    values : dict of int to float
-        Place of each frame on the axis.
-    label : str
-        The only coordinate that moves, in degrees, if it goes one way; else the frame number.
+    It is the only coordinate that moves, in degrees, if it goes one way; else the frame number.
     """
     rows = saved.info["frames"]
     names = sorted({name for row in rows for name in row["coordinates"]})

@@ -88,22 +88,13 @@ def _shaded(solid: Solid, axes: Floats) -> Floats:
 
 
 def labelled(image: Integers, text: str, titles: Sequence[str], chips: Mapping[str, str]) -> Image:
-    """Image with a strip above that has a title for each column, and one below with text and what colours mean.
-
-    Parameters
-    ----------
-    image : (h, w, 3) ndarray of uint8
-    text : str
-    titles : sequence of str
-    chips : dict of str to colour
-    """
+    """Image (h, w, 3) with a strip above that has a title for each column, and one below: text and colours."""
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.load_default(13)
     height, width = image.shape[:2]
-    parts = text.split(", ") if font.getlength(text) > width - 16 else [text]
     x, y, places = 8, height + _LINE + 5, []
-    for name, colour in [*((part, "") for part in parts), *chips.items()]:
+    for name, colour in [*((part, "") for part in text.split(", ")), *chips.items()]:
         wide = int(font.getlength(name)) + (_CHIP if colour else 0)
         if places and x + wide > width:
             x, y = 8, y + _LINE

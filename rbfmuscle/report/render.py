@@ -99,15 +99,7 @@ def render_run(
 def _draw_panels(
     panels: Sequence[tuple[str, SavedRun, Floats]], frames: Sequence[int], area: float
 ) -> list[Image]:
-    """A picture of each frame: runs beside each other, with titles above, and caption and colours below.
-
-    Parameters
-    ----------
-    panels : sequence of (title, run, axes)
-    frames : sequence of int
-    area : float
-        Pixels of a panel.
-    """
+    """A picture of each frame: panels (title, run, axes) of so many pixels, with captions and colours below."""
     _, first, axes = panels[0]
     some = {first.frames[0], first.frames[len(first.frames) // 2], first.frames[-1]}
     names = [(run, name) for _, run, _ in panels for name in (*run.muscles, *run.tendons)]

@@ -23,13 +23,7 @@ _MUSCLE, _OPACITY, _AXIS, _PALE = "#9a8f8f", 0.12, "#0057d9", 0.72
 
 
 def draw_scene(scene: Scene, path: str | Path) -> None:
-    """Draw a scene in its rest pose to a PNG file, from four sides of the body.
-
-    Parameters
-    ----------
-    scene : Scene
-    path : path
-    """
+    """Draw a scene in its rest pose to a PNG file, from four sides of the body."""
     from PIL import Image, ImageDraw
 
     colours = {bone.name: _bone_colour(k) for k, bone in enumerate(scene.bones)}

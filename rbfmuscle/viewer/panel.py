@@ -17,18 +17,10 @@ HISTORY, LINES = 200, 8  # Pictures and lines in a plot.
 
 
 class Panel:
-    """Sliders by joint, play bar, choices, numbers and plot.
+    """Sliders by joint, play bar, choices, numbers and plot of a viser server.
 
-    Parameters
-    ----------
-    server : viser.ViserServer
-    source : LiveSource or SavedSource
-    at : dict of str to float
-        Controls that begin elsewhere than at rest.
-    colour : str
-        Of `COLOURINGS`, to begin with.
-    touch : callable
-        Called whenever something was changed.
+    ``at`` are controls that begin elsewhere than at rest, ``colour`` is the first of `COLOURINGS`; ``touch`` is called
+    whenever something was changed.
     """
 
     def __init__(

@@ -22,10 +22,7 @@ BONE_TRIANGLES = 6000  # Software drawing pays for each of them in every picture
 class Shapes:
     """Meshes of a viser server; in metres, as the browser shows nothing far away.
 
-    Attributes
-    ----------
-    numbers : dict of str to dict of str to float
-        Volume error [%], depth in bones and mean of the coloured quantity of each muscle, NaN where not known.
+    ``numbers`` are volume error [%], depth in bones and mean of the coloured quantity of each muscle, NaN if unknown.
     """
 
     def __init__(self, server: Any, source: LiveSource | SavedSource) -> None:

@@ -50,17 +50,8 @@ class Picture(NamedTuple):
 class LiveSource:
     """A scene whose coordinates and activations are set by hand, by its own model or the one named.
 
-    Attributes
-    ----------
-    choices : list of str
-        Models.
-    body : (3, 3) ndarray
-        Left, posterior and superior.
-    bones, muscles : dict of str to (vertices, faces)
-        At rest.
-    controls : dict of str to Control
-    motion : list of dict of str to float
-        What the controls are set to in each frame of the scene's motion.
+    ``choices`` are models, ``body`` (3, 3) is left, posterior and superior, ``bones`` and ``muscles`` are meshes at
+    rest by name, ``motion`` is what the ``controls`` are set to in each frame of the scene's motion.
     """
 
     def __init__(self, scene: Scene, model: str | None = None) -> None:
