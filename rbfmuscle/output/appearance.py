@@ -24,8 +24,6 @@ VIEWS: dict[str, tuple[float, float, float]] = {
     "top": (0.0, 0.0, 1.0),
     "bottom": (0.0, 0.0, -1.0),
 }
-# What is drawn where nothing else is asked for.
-USUAL_VIEWS = ("front", "right", "back")
 
 
 def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:

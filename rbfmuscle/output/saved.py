@@ -16,6 +16,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
+from rbfmuscle.output.appearance import muscle_colours, muscle_groups
 from rbfmuscle.output.tubes import tendon_name
 from rbfmuscle.output.vtp import read_vtp
 from rbfmuscle.scene.objects import body_axes
@@ -47,6 +48,8 @@ class SavedRun:
     frames : list of int
         Frames that were written.
     muscles, bones : list of str
+    groups, colours : dict of str to str
+        Of the muscles, from `muscle_groups` and `muscle_colours`.
     tendons : list of str
         Names of the meshes of tendons, which `surface` takes as it takes muscles.
     units : str
@@ -65,6 +68,8 @@ class SavedRun:
             muscles, output = self.info["scene"]["muscles"], self.info["scene"]["output"]
             self.muscles = [muscle["name"] for muscle in muscles]
             self.bones = [bone["name"] for bone in self.info["scene"]["bones"]]
+            self.groups = muscle_groups(self.info)
+            self.colours = muscle_colours(self.muscles, self.groups)
             self._meshes = bool(output["surfaces"])
             held = [m["name"] for m in muscles if any("tendon" in end for end in m.get("attach", ()))]
             self.tendons = [tendon_name(name) for name in held if output.get("tendons")]

@@ -14,17 +14,7 @@ from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.page import (
-    BAD,
-    GOOD,
-    PLAIN,
-    Cell,
-    Light,
-    Page,
-    Section,
-    Table,
-    limit_state,
-)
+from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, limit_state
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import draw_preview
 from rbfmuscle.report.report import COUNTS, packed_scene

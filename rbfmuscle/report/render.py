@@ -11,18 +11,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.output.appearance import (
-    BACKGROUND,
-    BONE_COLOUR,
-    MUSCLE_COLOURS,
-    TENDON_COLOUR,
-    USUAL_VIEWS,
-    VIEWS,
-    motion_direction,
-    muscle_colours,
-    muscle_groups,
-    view_axes,
-)
+from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, VIEWS, motion_direction, view_axes
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids, fitted_size, labelled
 from rbfmuscle.validation import SolveError, UsageError
@@ -30,6 +19,8 @@ from rbfmuscle.validation import SolveError, UsageError
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+# Views where none are asked for; muscles that are named, more are named by their groups.
+USUAL_VIEWS, _MOST_CHIPS = ("front", "right", "back"), 8
 # Pixels of a panel, and of one of a preview; frames of a preview, and its length [s].
 _AREA, _PREVIEW_AREA, _PREVIEW_FRAMES, _PREVIEW_SECONDS = 220_000, 110_000, 12, 4.0
 
@@ -106,7 +97,9 @@ def _draw_panels(
     seen = np.concatenate([run.surface(name, k)[0][::3] for run, name in names for k in some])
     size = fitted_size(axes, seen, area)
     cameras = [(run, aim(axes, seen, size)) for _, run, axes in panels]
-    titles, chips = [title for title, *_ in panels], _chips(first)
+    titles, chips = [title for title, *_ in panels], first.colours
+    if len(chips) > _MOST_CHIPS:
+        chips = {first.groups[name]: chips[name] for name in reversed(first.muscles)}
 
     def draw(frame: int) -> Image:
         image = np.concatenate([_draw_frame(run, camera, frame) for run, camera in cameras], axis=1)
@@ -117,21 +110,12 @@ def _draw_panels(
 
 def _draw_frame(run: SavedRun, camera: Camera, frame: int) -> Integers:
     """Picture (h, w, 3) of a frame of a run."""
-    colours = muscle_colours(run.muscles, muscle_groups(run.info)) | dict.fromkeys(run.tendons, TENDON_COLOUR)
+    colours = run.colours | dict.fromkeys(run.tendons, TENDON_COLOUR)
     solids = [Solid(*run.surface(name, frame), colour) for name, colour in colours.items()]
     for name, pose in run.poses[frame].items():
         vertices, faces = run.bone(name)
         solids.append(Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, BONE_COLOUR))
     return draw_solids(solids, camera)
-
-
-def _chips(saved: SavedRun) -> dict[str, str]:
-    """Names of the muscles with their colours; of many, those of the groups."""
-    groups = muscle_groups(saved.info)
-    colours = muscle_colours(saved.muscles, groups)
-    if len(colours) <= len(MUSCLE_COLOURS):
-        return colours
-    return {groups[name]: colours[name] for name in reversed(saved.muscles)}
 
 
 def chosen_frames(frames: Sequence[int], most: int) -> list[int]:
@@ -145,7 +129,7 @@ def save_images(images: Sequence[Image], path: Path, seconds: float) -> None:
     from PIL import ImageOps
 
     size = images[0].width, max(image.height for image in images)
-    sheets = [ImageOps.pad(image, size, color=BACKGROUND, centering=(0, 0)) for image in images]
+    sheets = [ImageOps.pad(image, size, color="white", centering=(0, 0)) for image in images]
     kind: dict[str, Any] = {"quality": 82, "method": 2} if path.suffix == ".webp" else {}
     if len(sheets) > 1:
         pauses = [max(20, int(1000 * seconds / len(sheets)))] * (len(sheets) - 1) + [900]

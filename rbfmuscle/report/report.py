@@ -14,20 +14,8 @@ from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import LEAST, exceeded, excess, muscle_limit, shown_number, within
 from rbfmuscle.output.animation.moving import read_moving
 from rbfmuscle.output.animation.page import pack_runs
-from rbfmuscle.output.appearance import muscle_colours, muscle_groups
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.page import (
-    BAD,
-    GOOD,
-    PLAIN,
-    Cell,
-    Light,
-    Page,
-    Section,
-    Table,
-    limit_state,
-    number_cell,
-)
+from rbfmuscle.report.page import BAD, GOOD, Cell, Light, Page, Section, Table, limit_state, number_cell
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, draw_preview
 
@@ -185,11 +173,8 @@ def _tracks(
     saved: SavedRun, quantity: str, factor: float, axis: Mapping[int, float], coordinate: str | None
 ) -> list[Track]:
     """Lines of the muscles in the colours of the picture; of times without the first frame, and all together."""
-    colours = muscle_colours(saved.muscles, muscle_groups(saved.info))
-    if quantity == "time_frame" and len(saved.muscles) > 1:
-        colours[ALL] = "#26282b"
-    tracks = []
-    for name, colour in colours.items():
+    tracks, together = [], {ALL: "#26282b"} if quantity == "time_frame" and len(saved.muscles) > 1 else {}
+    for name, colour in (saved.colours | together).items():
         frames, values = saved.series(name, quantity, coordinate)
         if quantity == "time_frame":
             frames, values = frames[1:], values[1:]
@@ -223,7 +208,7 @@ def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Mapping[str
         return number_cell(facts["median"], "s")
     limit = muscle_limit(name, limits[name], found) if name in limits else None
     state = limit_state(facts["worst"], limit, least=name in LEAST)
-    return number_cell(facts["worst"], state=BAD if state == BAD else PLAIN)
+    return number_cell(facts["worst"], state=state) if state == BAD else number_cell(facts["worst"])
 
 
 def _neighbours(saved: SavedRun) -> Table:

@@ -137,7 +137,7 @@ class SavedSource:
         self.millimetre = 1.0 / MM_PER_UNIT[first.units]
         self.bones = {name: first.bone(name) for name in first.bones}
         self.muscles = {name: first.surface(name, first.frames[0]) for name in first.muscles}
-        self.colours = muscle_colours(first.muscles, muscle_groups(first.info))
+        self.colours = first.colours
         self.motion = [{"frame": float(frame)} for frame in first.frames]
         self.controls = {"frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])}
 

@@ -7,13 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.appearance import (
-    BONE_COLOUR,
-    TENDON_COLOUR,
-    motion_direction,
-    muscle_colours,
-    muscle_groups,
-)
+from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, motion_direction
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.objects import MM_PER_UNIT
 
@@ -91,8 +85,8 @@ class MovingRun:
 def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
     """Some frames of a saved run at once, lengths in ``unit``."""
     factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[unit]
-    groups = muscle_groups(saved.info) | dict.fromkeys(saved.tendons, "tendons")
-    colours = muscle_colours(saved.muscles, groups) | dict.fromkeys(saved.tendons, TENDON_COLOUR)
+    groups = saved.groups | dict.fromkeys(saved.tendons, "tendons")
+    colours = saved.colours | dict.fromkeys(saved.tendons, TENDON_COLOUR)
     muscles = [MovingPart(name, colour, [], [], group=groups[name]) for name, colour in colours.items()]
     bones = []
     for muscle in muscles:
