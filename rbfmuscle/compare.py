@@ -44,7 +44,7 @@ def compare_models(
     ----------
     scene : Scene, path or "phantom"
     directory : path
-        Takes ``comparison.json``, ``comparison.csv``, ``report.html``, ``models.webp`` and the run of each model.
+        Takes ``comparison.json``, ``comparison.csv``, ``report.html`` and the run of each model.
     models : list of str
         Distances are to the first. One that cannot be solved is left out, and named in the tables.
     frames : slice or str, optional

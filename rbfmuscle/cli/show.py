@@ -63,7 +63,8 @@ def render(
     frame
         Of a picture; the last one by default.
     view
-        front, back, left, right, top or bottom; may be repeated; front, right and back by default.
+        front, back, left, right, top, bottom or motion (in its plane); may be repeated; front, right and back
+        by default.
     seconds
         Length of an animation.
     """

@@ -16,12 +16,9 @@ from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, limit_state
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
-from rbfmuscle.report.render import draw_preview
-from rbfmuscle.report.report import COUNTS, packed_scene
+from rbfmuscle.report.report import packed_scene
 
 LIGHTS = ("volume_error", "penetration_max", "bone_penetration_max", "return_rms", "time_frame")
-# Pixels of a picture of one model, and of all together.
-_AREA, _WHOLE = 90_000, 400_000
 _READING = """All models ran through the same frames and sub-steps, one after another with the same bone fields and
 number of threads. The time per frame is the wall time of prediction, solution, contacts and surface of all muscles,
 without the first frame, which loads and compiles. The distance to the first model is no error: it says how far models
@@ -29,14 +26,13 @@ differ."""
 
 
 def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:
-    """Write ``report.html`` and ``models.webp`` to a folder with a run of each model; raises SolveError if that fails.
+    """Write ``report.html`` to a folder with a run of each model; raises SolveError where that fails.
 
     ``found`` is from `rbfmuscle.experiments.comparison.write_tables`.
     """
     runs = {found["labels"][name]: SavedRun(folder / name) for name in found["models"]}
     page = _page(found, runs)
     if pictures:
-        page.picture = draw_preview(runs, folder / "models.webp", area=min(_AREA, _WHOLE / len(runs)))
         page.scene = packed_scene(runs)
     else:
         page.missing = "No pictures: they were switched off."
@@ -83,8 +79,7 @@ def _known(found: dict[str, Any], quantity: str) -> bool:
 def _light(found: dict[str, Any], quantity: str, limit: float | None) -> Light:
     cells = []
     for value in _values(found, quantity):
-        state = PLAIN if value is None else limit_state(value, limit, count=quantity in COUNTS)
-        cells.append(Cell(shown(found, quantity, value), state))
+        cells.append(Cell(shown(found, quantity, value), limit_state(quantity, value, limit)))
     # A column of limits would be off a phone's screen.
     note = MEASURES[quantity].meaning if limit is None else f"limit {shown(found, quantity, limit)}"
     return Light(MEASURES[quantity].title, cells, note=note)

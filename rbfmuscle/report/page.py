@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from rbfmuscle.metrics.summary import shown_number
+from rbfmuscle.metrics.summary import shown_number, within
 from rbfmuscle.validation import SolveError
 
 GOOD, NEAR, BAD, PLAIN = "good", "near", "bad", "plain"
+COUNTS = ("components", "euler", "self_crossings", "tunnelled")
 # From this share of a limit a value is near it.
 _NEAR_LIMIT = 0.8
 
@@ -59,10 +60,9 @@ class Section(NamedTuple):
 class Page:
     """What a page says, in its order.
 
-    The ``answer`` is one sentence, ``detail`` stands below it. ``scene``, from `pack_runs`, moves; ``picture`` is the
-    address of an image in place of the scene where a browser cannot show it; ``plot`` is SVG; ``missing`` says why
-    there is none of them. ``heads`` are those of the lights' columns; the lights stand beside the picture, below a
-    scene where they have several.
+    The ``answer`` is one sentence, ``detail`` stands below it. ``scene``, from `pack_runs`, moves; ``plot`` is SVG;
+    ``missing`` says why there is none of them. ``heads`` are those of the lights' columns; the lights stand beside the
+    picture, below a scene where they have several.
     """
 
     title: str
@@ -71,7 +71,6 @@ class Page:
     state: str = PLAIN
     detail: str = ""
     scene: str = ""
-    picture: str = ""
     plot: str = ""
     missing: str = ""
     lights: Sequence[Light] = ()
@@ -93,13 +92,10 @@ class Page:
             raise SolveError(f"cannot write {path}: {error.strerror}") from None
 
 
-def limit_state(value: float, limit: float | None, *, least: bool = False, count: bool = False) -> str:
-    """Light of a value: good, near its limit (from four fifths of it; no count is near) or bad; without limit plain.
-
-    With ``least`` the limit is the least allowed value.
-    """
-    if limit is None:
+def limit_state(quantity: str, value: float | None, limit: float | None) -> str:
+    """Light of a value: bad beyond its limit, near from four fifths of it (no count is), good, or plain without one."""
+    if value is None or limit is None:
         return PLAIN
-    if not (value >= limit if least else abs(value) <= limit):
+    if not within(quantity, value, limit):
         return BAD
-    return NEAR if not least and not count and abs(value) > _NEAR_LIMIT * limit else GOOD
+    return NEAR if quantity not in COUNTS and abs(value) > _NEAR_LIMIT * limit else GOOD

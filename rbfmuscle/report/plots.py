@@ -152,13 +152,13 @@ def motion_axis(saved: SavedRun) -> tuple[dict[int, float], str]:
 
     It is the only coordinate that moves, in degrees, if it goes one way; else the frame number.
     """
-    rows = saved.info["frames"]
+    rows, units = saved.info["frames"], saved.info["scene"].get("coordinate_units", {})
     names = sorted({name for row in rows for name in row["coordinates"]})
     tracks = {name: np.array([row["coordinates"].get(name, 0.0) for row in rows]) for name in names}
     moving = {name: track for name, track in tracks.items() if np.ptp(track) > 1e-9}
     if len(moving) == 1:
         name, track = next(iter(moving.items()))
-        unit = saved.info.get("scene", {}).get("coordinate_units", {}).get(name, "degree").strip() or "1"
+        unit = units.get(name, "degree").strip() or "1"
         if np.all(np.diff(track) > 0) or np.all(np.diff(track) < 0):
             return dict(zip(saved.frames, track.tolist())), f"{name} [{unit}]"
     return {frame: float(frame) for frame in saved.frames}, "frame"
@@ -166,5 +166,4 @@ def motion_axis(saved: SavedRun) -> tuple[dict[int, float], str]:
 
 def arm_unit(saved: SavedRun, coordinate: str) -> str:
     """Unit of the moment arms about a coordinate of a saved run."""
-    shift = saved.info.get("scene", {}).get("coordinate_units", {}).get(coordinate, "").strip()
-    return "1" if shift else saved.units
+    return "1" if saved.info["scene"].get("coordinate_units", {}).get(coordinate, "").strip() else saved.units

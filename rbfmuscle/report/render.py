@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,23 +18,8 @@ from rbfmuscle.validation import SolveError, UsageError
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-# Views where none are asked for; muscles that are named, more are named by their groups.
-USUAL_VIEWS, _MOST_CHIPS = ("front", "right", "back"), 8
-# Pixels of a panel, and of one of a preview; frames of a preview, and its length [s].
-_AREA, _PREVIEW_AREA, _PREVIEW_FRAMES, _PREVIEW_SECONDS = 220_000, 110_000, 12, 4.0
-
-
-def draw_preview(runs: Mapping[str, SavedRun], path: Path, *, area: float = _PREVIEW_AREA) -> str:
-    """Draw a WebP animation of runs of one scene, by title, in the motion's plane; return it as an image's address.
-
-    ``area`` is pixels of each run.
-    """
-    first = next(iter(runs.values()))
-    frames = chosen_frames(first.frames, _PREVIEW_FRAMES)
-    side = view_axes(motion_direction([first.poses[frame] for frame in frames], first.body), first.body)
-    panels = [(title, run, side) for title, run in runs.items()]
-    save_images(_draw_panels(panels, frames, area), path, _PREVIEW_SECONDS)
-    return f"data:image/webp;base64,{base64.b64encode(path.read_bytes()).decode()}"
+# Views where none are asked for; muscles that are named, more are named by their groups; pixels of a view.
+USUAL_VIEWS, _MOST_CHIPS, _AREA = ("front", "right", "back"), 8, 220_000
 
 
 def render_run(
@@ -45,6 +29,7 @@ def render_run(
     frame: int | None = None,
     views: Sequence[str] | None = None,
     area: int = _AREA,
+    most: int | None = None,
     seconds: float = 5.0,
 ) -> None:
     """Draw a saved run to a picture or an animation.
@@ -58,9 +43,11 @@ def render_run(
     frame : int, optional
         Of a picture; the last one where not given.
     views : list of str, optional
-        Of `VIEWS`, side by side; `USUAL_VIEWS` where not given.
+        Of `VIEWS`, or "motion" for its plane, side by side; `USUAL_VIEWS` where not given.
     area : int
         Pixels of one view.
+    most : int, optional
+        Frames of an animation, chosen evenly; all where not given.
     seconds : float
         Length of an animation.
 
@@ -70,9 +57,6 @@ def render_run(
         If the folder holds nothing to draw, or the suffix, frame or view is unknown.
     """
     saved, output = SavedRun(directory), Path(output)
-    for view in views or ():
-        if view not in VIEWS:
-            raise UsageError(f"unknown view {view!r}; known: {', '.join(VIEWS)}")
     if output.suffix not in (".png", ".gif", ".webp"):
         raise UsageError(f"{output}: the suffix must be .png, .gif or .webp")
     if not saved.has_surfaces():
@@ -82,28 +66,29 @@ def render_run(
         raise UsageError(
             f"frame {frame} was not written; the run has {saved.frames[0]} to {saved.frames[-1]}"
         )
-    panels = [(view, saved, view_axes(VIEWS[view], saved.body)) for view in views or USUAL_VIEWS]
-    frames = [frame] if output.suffix == ".png" else saved.frames
-    save_images(_draw_panels(panels, frames, area), output, seconds)
+    poses = [saved.poses[k] for k in saved.frames]
+    directions: dict[str, Sequence[float] | Floats] = {**VIEWS, "motion": motion_direction(poses, saved.body)}
+    for view in views or ():
+        if view not in directions:
+            raise UsageError(f"unknown view {view!r}; known: {', '.join(directions)}")
+    axes = {view: view_axes(directions[view], saved.body) for view in views or USUAL_VIEWS}
+    frames = [frame] if output.suffix == ".png" else chosen_frames(saved.frames, most or len(saved.frames))
+    save_images(_draw_views(saved, axes, frames, area), output, seconds)
 
 
-def _draw_panels(
-    panels: Sequence[tuple[str, SavedRun, Floats]], frames: Sequence[int], area: float
-) -> list[Image]:
-    """A picture of each frame: panels (title, run, axes) of so many pixels, with captions and colours below."""
-    _, first, axes = panels[0]
-    some = {first.frames[0], first.frames[len(first.frames) // 2], first.frames[-1]}
-    names = [(run, name) for _, run, _ in panels for name in (*run.muscles, *run.tendons)]
-    seen = np.concatenate([run.surface(name, k)[0][::3] for run, name in names for k in some])
-    size = fitted_size(axes, seen, area)
-    cameras = [(run, aim(axes, seen, size)) for _, run, axes in panels]
-    titles, chips = [title for title, *_ in panels], first.colours
+def _draw_views(run: SavedRun, axes: Mapping[str, Floats], frames: Sequence[int], area: float) -> list[Image]:
+    """A picture of each frame: views of so many pixels side by side, with titles, caption and colours."""
+    some = {run.frames[0], run.frames[len(run.frames) // 2], run.frames[-1]}
+    names = [*run.muscles, *run.tendons]
+    seen = np.concatenate([run.surface(name, k)[0][::3] for name in names for k in some])
+    size = fitted_size(next(iter(axes.values())), seen, area)
+    cameras, chips = [aim(view, seen, size) for view in axes.values()], run.colours
     if len(chips) > _MOST_CHIPS:
-        chips = {first.groups[name]: chips[name] for name in reversed(first.muscles)}
+        chips = {run.groups[name]: chips[name] for name in reversed(run.muscles)}
 
     def draw(frame: int) -> Image:
-        image = np.concatenate([_draw_frame(run, camera, frame) for run, camera in cameras], axis=1)
-        return labelled(image, first.caption(frame), titles, chips)
+        image = np.concatenate([_draw_frame(run, camera, frame) for camera in cameras], axis=1)
+        return labelled(image, run.caption(frame), list(axes), chips)
 
     return each(draw, frames)
 

@@ -15,9 +15,20 @@ from rbfmuscle.metrics.summary import LEAST, exceeded, excess, muscle_limit, sho
 from rbfmuscle.output.animation.moving import read_moving
 from rbfmuscle.output.animation.page import pack_runs
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.page import BAD, GOOD, Cell, Light, Page, Section, Table, limit_state, number_cell
+from rbfmuscle.report.page import (
+    BAD,
+    COUNTS,
+    GOOD,
+    Cell,
+    Light,
+    Page,
+    Section,
+    Table,
+    limit_state,
+    number_cell,
+)
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
-from rbfmuscle.report.render import chosen_frames, draw_preview
+from rbfmuscle.report.render import chosen_frames, render_run
 
 # What the rows beside the picture say, and the quantities that each holds to a limit.
 LIGHTS = {
@@ -27,7 +38,6 @@ LIGHTS = {
     "Is one closed piece": ("components", "euler", "self_crossings", "unfitted_fraction"),
     "Moves without jumps or bowing": ("flicker", "slack"),
 }
-COUNTS = ("components", "euler", "self_crossings", "tunnelled")
 # Title, quantity, factor, unit (None: the scene's).
 PANELS = (
     ("Length", "length", 1.0, None),
@@ -42,10 +52,9 @@ PANELS = (
 _MOST_POINTS = 2_600_000
 # Tables or plots of their own.
 _ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
-_READING = """Each muscle is one closed surface in each frame. Depths in bones are exact distances to the bone
-meshes; where the model cuts the bone out of the surface, the depth before the cut is given too. A row is amber from
-four fifths of its limit. Times are medians, as the first frame may load and compile. Drag to turn the picture, scroll
-or pinch to zoom, drag with shift to move it; names below it switch muscles and their lines on and off."""
+_READING = """Depths in bones are exact distances to the bone meshes. A row is amber from four fifths of its limit.
+Times are medians, as the first frame may load and compile. Drag to turn the picture, scroll or pinch to zoom, drag with
+shift to move it; names below it switch muscles and their lines on and off."""
 
 
 def write_report(directory: str | Path, *, pictures: bool = True) -> None:
@@ -64,7 +73,8 @@ def write_report(directory: str | Path, *, pictures: bool = True) -> None:
     else:
         page.scene = packed_scene({"": saved})
         if len(saved.frames) > 1:
-            page.picture = draw_preview({"": saved}, saved.directory / "preview.webp")
+            preview = saved.directory / "preview.webp"
+            render_run(saved.directory, preview, views=["motion"], area=110_000, most=12, seconds=4.0)
     page.write(saved.directory / "report.html")
 
 
@@ -105,10 +115,10 @@ def _page(saved: SavedRun) -> Page:
 def _facts(saved: SavedRun) -> list[str]:
     info = saved.info
     models = sorted({muscle["model"]["name"] for muscle in info["scene"]["muscles"]})
-    counts = [f"{len(saved.muscles)} muscles", f"{len(saved.frames)} frame{'s'[: len(saved.frames) != 1]}"]
     median = (info.get("frame_time") or {}).get("median")
-    times = [f"{shown_number(median, 's')} per frame"] if median else []
-    return [f"model {', '.join(models)}", *counts, *times, f"{info['times']['wall']:.1f} s in all"]
+    counts = [f"{len(saved.muscles)} muscles", f"{len(saved.frames)} frames"]
+    times = [f"{shown_number(median, 's')} per frame", f"{info['times']['wall']:.1f} s in all"]
+    return [f"model {', '.join(models)}", *counts, *times]
 
 
 def _lights(saved: SavedRun) -> list[Light]:
@@ -135,7 +145,7 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
         return None
     _, muscle, name, worst, facts, limit = max(found, key=lambda entry: entry[0])
     unit, title_of = facts["unit"], name.replace("_", " ")
-    state = limit_state(worst, limit, least=name in LEAST, count=name in COUNTS)
+    state = limit_state(name, worst, limit)
     place = f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}"
     return Light(
         title,
@@ -207,7 +217,7 @@ def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Mapping[str
     if name == "time_frame":
         return number_cell(facts["median"], "s")
     limit = muscle_limit(name, limits[name], found) if name in limits else None
-    state = limit_state(facts["worst"], limit, least=name in LEAST)
+    state = limit_state(name, facts["worst"], limit)
     return number_cell(facts["worst"], state=state) if state == BAD else number_cell(facts["worst"])
 
 

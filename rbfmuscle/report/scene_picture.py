@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.output.appearance import MUSCLE_COLOURS, TENDON_COLOUR, VIEWS, mixed_colour, view_axes
+from rbfmuscle.output.appearance import TENDON_COLOUR, VIEWS, mixed_colour, muscle_colours, view_axes
 from rbfmuscle.output.tubes import tendon_mesh
 from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids, labelled
 from rbfmuscle.scene.tendons import AT_REST
@@ -26,7 +26,8 @@ def draw_scene(scene: Scene, path: str | Path) -> None:
     """Draw a scene in its rest pose to a PNG file, from four sides of the body."""
     from PIL import Image, ImageDraw
 
-    colours = {bone.name: _bone_colour(k) for k, bone in enumerate(scene.bones)}
+    names = [bone.name for bone in scene.bones]
+    colours = muscle_colours(names, {name: str(k % 8) for k, name in enumerate(names)})
     solids = [
         Solid(np.asarray(bone.mesh.vertices), bone.mesh.faces, mixed_colour(colours[bone.name], _PALE))
         for bone in scene.bones
@@ -76,8 +77,3 @@ def _draw_joints(pen: ImageDraw, camera: Camera, scene: Scene) -> None:
         left = min(x + 8, camera.size[0] - pen.textlength(joint.name, font=font) - 4)
         row = max(y - 7, row + 13)
         pen.text((left, row), joint.name, fill=_AXIS, font=font)
-
-
-def _bone_colour(k: int) -> str:
-    """A colour for the k-th bone; darker ones where there are more bones than colours."""
-    return mixed_colour(MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)], -min(0.45 * (k // len(MUSCLE_COLOURS)), 0.8))

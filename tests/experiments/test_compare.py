@@ -108,15 +108,9 @@ class TestComparison:
 
 
 def test_pictures_show_every_model(tmp_path):
-    from PIL import Image
-
     compare_models(arm_scene(), tmp_path, ["pbd", "arap-volume"])
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert '"panels":["PBD, 3 sweeps as in the paper","arap-volume"]' in text
-    with Image.open(tmp_path / "models.webp") as moving:
-        assert moving.n_frames == 3
-        left, right = np.split(np.asarray(moving.convert("RGB"), dtype=int)[30:-40], 2, axis=1)
-        assert all((half[..., 0] > half[..., 1] + 50).mean() > 0.01 for half in (left, right))
 
 
 class TestFailure:

@@ -260,7 +260,6 @@ async function mount(home) {
     const data = JSON.parse(document.getElementById(home.dataset.scene).textContent);
     unpack(data, await inflate(data.bytes));
     home.scene = new Scene(home, data);
-    home.classList.add("live");
   } catch (error) {
     element("p", home, {textContent: `The moving picture needs a browser with WebGL 2 (${error.message}).`});
   }
