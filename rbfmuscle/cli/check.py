@@ -26,7 +26,7 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
         errors = _measure_fields(loaded) if fields else {}
         drawn = {}
         if picture:
-            from rbfmuscle.report.scene_picture import draw_scene
+            from rbfmuscle.report.render import draw_scene
 
             drawn = {"picture": str(scene.with_suffix(".png"))}
             with stage("drawing the picture"):

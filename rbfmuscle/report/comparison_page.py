@@ -19,10 +19,8 @@ from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.report import packed_scene
 
 LIGHTS = ("volume_error", "penetration_max", "bone_penetration_max", "return_rms", "time_frame")
-_READING = """All models ran through the same frames and sub-steps, one after another with the same bone fields and
-number of threads. The time per frame is the wall time of prediction, solution, contacts and surface of all muscles,
-without the first frame, which loads and compiles. The distance to the first model is no error: it says how far models
-differ."""
+_READING = """All models ran through the same frames and sub-steps, with the same bone fields and number of threads. The
+time per frame leaves out the first, which loads and compiles. The distance to the first model is no error."""
 
 
 def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:

@@ -25,11 +25,10 @@ COLUMNS = {
     "fit_time": ("fit [ms]", 1e3), "evaluation_time": ("20,000 values [ms]", 1e3), "note": ("note", 1.0),
 }  # fmt: skip
 _MOST_LIGHTS = 5
-_READING = """Each kernel has the same number of centres; its shape parameter is chosen by the error at other points
-of the mesh. Distances are measured both ways between the mesh and the extracted surface, root mean square and greatest.
-The volume error is that of the level zero; a muscle's level is moved until its volume is right. Recommended is the
-quickest row (a fit and 20,000 values, processor time of one thread) that errs at most 5 % more than the best; of those
-alike in time one without a parameter, then the best-conditioned one."""
+_READING = """A kernel's shape parameter is chosen by the error at other points of the mesh. Distances are measured both
+ways between mesh and extracted surface, root mean square and greatest. Recommended is the quickest row (a fit and
+20,000 values) that errs at most 5 % more than the best; of those alike in time one without a parameter, then the
+best-conditioned one."""
 
 
 def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> None:
@@ -123,12 +122,7 @@ def _rows(study: KernelStudy) -> Table:
     for row in study.rows:
         state = GOOD if row is study.recommended else BAD if row["unfit"] else PLAIN
         verdict = row["unfit"] or ("on the front" if row["front"] else "")
-        cells = [Cell(_shown(row[name], factor)) for name, (_, factor) in COLUMNS.items()]
-        rows.append([Cell(row["kernel"]), *cells, Cell(verdict, state)])
+        values = [(row[name], factor) for name, (_, factor) in COLUMNS.items()]
+        texts = [shown_number(x * factor) if isinstance(x, float) else str(x or "") for x, factor in values]
+        rows.append([Cell(row["kernel"]), *map(Cell, texts), Cell(verdict, state)])
     return Table(["kernel", *(head for head, _ in COLUMNS.values()), "verdict"], rows)
-
-
-def _shown(value: float | str | None, factor: float) -> str:
-    if isinstance(value, float):
-        return shown_number(factor * value)
-    return "" if value is None else str(value)

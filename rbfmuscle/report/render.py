@@ -1,4 +1,4 @@
-"""Pictures and animations of saved runs."""
+"""Pictures and animations of saved runs; a scene before it runs as one picture."""
 
 from __future__ import annotations
 
@@ -10,16 +10,25 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, VIEWS, motion_direction, view_axes
+from rbfmuscle.output import appearance as look
 from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.tubes import tendon_mesh
 from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids, fitted_size, labelled
+from rbfmuscle.scene.tendons import AT_REST
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
     from PIL.Image import Image
+    from PIL.ImageDraw import ImageDraw
+
+    from rbfmuscle.scene.objects import Muscle
+    from rbfmuscle.scene.scene import Scene
 
 # Views where none are asked for; muscles that are named, more are named by their groups; pixels of a view.
 USUAL_VIEWS, _MOST_CHIPS, _AREA = ("front", "right", "back"), 8, 220_000
+# Of pictures of scenes: pixels of a view, the views, how pale bones are.
+_SCENE_SIZE, _SCENE_SIDES, _PALE = (480, 860), ("front", "right", "back", "left"), 0.72
+_MUSCLE, _OPACITY, _AXIS = "#9a8f8f", 0.12, "#0057d9"
 
 
 def render_run(
@@ -63,15 +72,17 @@ def render_run(
         raise UsageError(f"{directory} has no surfaces to draw")
     frame = saved.frames[-1] if frame is None else frame
     if frame not in saved.frames:
-        raise UsageError(
-            f"frame {frame} was not written; the run has {saved.frames[0]} to {saved.frames[-1]}"
-        )
+        ends = f"{saved.frames[0]} to {saved.frames[-1]}"
+        raise UsageError(f"frame {frame} was not written; the run has {ends}")
     poses = [saved.poses[k] for k in saved.frames]
-    directions: dict[str, Sequence[float] | Floats] = {**VIEWS, "motion": motion_direction(poses, saved.body)}
+    directions: dict[str, Sequence[float] | Floats] = {
+        **look.VIEWS,
+        "motion": look.motion_direction(poses, saved.body),
+    }
     for view in views or ():
         if view not in directions:
             raise UsageError(f"unknown view {view!r}; known: {', '.join(directions)}")
-    axes = {view: view_axes(directions[view], saved.body) for view in views or USUAL_VIEWS}
+    axes = {view: look.view_axes(directions[view], saved.body) for view in views or USUAL_VIEWS}
     frames = [frame] if output.suffix == ".png" else chosen_frames(saved.frames, most or len(saved.frames))
     save_images(_draw_views(saved, axes, frames, area), output, seconds)
 
@@ -95,11 +106,11 @@ def _draw_views(run: SavedRun, axes: Mapping[str, Floats], frames: Sequence[int]
 
 def _draw_frame(run: SavedRun, camera: Camera, frame: int) -> Integers:
     """Picture (h, w, 3) of a frame of a run."""
-    colours = run.colours | dict.fromkeys(run.tendons, TENDON_COLOUR)
+    colours = run.colours | dict.fromkeys(run.tendons, look.TENDON_COLOUR)
     solids = [Solid(*run.surface(name, frame), colour) for name, colour in colours.items()]
     for name, pose in run.poses[frame].items():
         vertices, faces = run.bone(name)
-        solids.append(Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, BONE_COLOUR))
+        solids.append(Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, look.BONE_COLOUR))
     return draw_solids(solids, camera)
 
 
@@ -123,3 +134,62 @@ def save_images(images: Sequence[Image], path: Path, seconds: float) -> None:
         sheets[0].save(path, **kind)
     except OSError as error:
         raise SolveError(f"cannot write {path}: {error.strerror}") from None
+
+
+def draw_scene(scene: Scene, path: str | Path) -> None:
+    """Draw a scene in its rest pose to a PNG file, from four sides of the body."""
+    from PIL import Image, ImageDraw
+
+    names = [bone.name for bone in scene.bones]
+    colours = look.muscle_colours(names, {name: str(k % 8) for k, name in enumerate(names)})
+    solids = [
+        Solid(np.asarray(bone.mesh.vertices), bone.mesh.faces, look.mixed_colour(colours[bone.name], _PALE))
+        for bone in scene.bones
+    ]
+    solids += [solid for muscle in scene.muscles for solid in _muscle_solids(muscle, colours)]
+    points, images = np.concatenate([solid.vertices for solid in solids]), []
+    for side in _SCENE_SIDES:
+        camera = aim(look.view_axes(look.VIEWS[side], scene.body), points, _SCENE_SIZE)
+        images.append(Image.fromarray(draw_solids(solids, camera)))
+        _draw_joints(ImageDraw.Draw(images[-1]), camera, scene)
+    text = f"{scene.name}: held patches in the colour of their bone"
+    chips = {**colours, "joint centres and axes": _AXIS}
+    labelled(np.concatenate([np.asarray(image) for image in images], axis=1), text, _SCENE_SIDES, chips).save(
+        path
+    )
+
+
+def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:
+    """A muscle as a veil, its held patches in the colours of their bones, and its tendons."""
+    vertices, faces = np.asarray(muscle.mesh.vertices), np.asarray(muscle.mesh.faces)
+    free, solids = np.ones(len(faces), dtype=bool), []
+    for attachment in muscle.attachments:
+        held = np.isin(faces, attachment.vertices).all(axis=1)
+        solids.append(Solid(vertices, faces[held], colours[attachment.bone]))
+        free &= ~held
+    tendons = tendon_mesh(muscle, {end.name: end.place(AT_REST)[0] for end in muscle.tendons})
+    if tendons is not None:
+        solids.append(Solid(*tendons, look.TENDON_COLOUR))
+    return [Solid(vertices, faces[free], _MUSCLE, _OPACITY), *solids]
+
+
+def _draw_joints(pen: ImageDraw, camera: Camera, scene: Scene) -> None:
+    """Centres, axes and names of the joints, each name below the one before."""
+    from PIL import ImageFont
+
+    font, row = ImageFont.load_default(13), -np.inf
+    for joint in sorted(scene.joints, key=lambda joint: -float(camera.axes[1] @ joint.centre)):
+        if not joint.coordinates:
+            continue
+        centre = np.asarray(joint.centre, dtype=float)
+        x, y, _ = camera.project(centre[None])[0]
+        for axis in (*joint.rotations, *joint.translations):
+            if axis.coordinates:
+                along = joint.frame[:3, :3] @ np.asarray(axis.direction, dtype=float)
+                reach = 26.0 / camera.scale / np.linalg.norm(along)
+                ends = camera.project(np.array([centre - reach * along, centre + reach * along]))
+                pen.line([tuple(end[:2]) for end in ends], fill=_AXIS, width=2)
+        pen.ellipse((x - 4, y - 4, x + 4, y + 4), fill=_AXIS)
+        left = min(x + 8, camera.size[0] - pen.textlength(joint.name, font=font) - 4)
+        row = max(y - 7, row + 13)
+        pen.text((left, row), joint.name, fill=_AXIS, font=font)

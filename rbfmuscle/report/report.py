@@ -102,7 +102,6 @@ def _page(saved: SavedRun) -> Page:
         sections=[
             *_plots(saved),
             Section("Every quantity of every muscle", "worst over the frames", table=_summary(saved)),
-            Section("Neighbours", table=_neighbours(saved)),
             Section("Events", "each with its frame in events.csv", text=_events(saved.events)),
             Section(
                 "How to read this", text=_READING, terms=[(n, text) for n, (_, text) in QUANTITIES.items()]
@@ -219,16 +218,6 @@ def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Mapping[str
     limit = muscle_limit(name, limits[name], found) if name in limits else None
     state = limit_state(name, facts["worst"], limit)
     return number_cell(facts["worst"], state=state) if state == BAD else number_cell(facts["worst"])
-
-
-def _neighbours(saved: SavedRun) -> Table:
-    """Pairs of muscles that slide on each other, the deepest overlap first."""
-    rows = []
-    for pair in saved.info.get("neighbours") or []:
-        overlap, gap = shown_number(pair["overlap_max"]), shown_number(pair["gap_rms"])
-        texts = " and ".join(pair["muscles"]), overlap, pair["overlap_frame"], gap, pair["gap_frame"]
-        rows.append([Cell(str(text)) for text in texts])
-    return Table(["pair", f"overlap [{saved.units}]", "frame", f"gap, RMS [{saved.units}]", "frame"], rows)
 
 
 def _events(events: Sequence[Sequence[Any]]) -> str:

@@ -15,7 +15,6 @@ from rbfmuscle.output.appearance import VIEWS, view_axes
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SolveError
-from rbfmuscle.viewer.colours import Look
 from rbfmuscle.viewer.panel import Panel
 from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.shapes import Shapes
@@ -82,7 +81,7 @@ class Page:
         self._model = ""
         self._picture: Any = None  # a Picture, and the one at rest, as soon as a model is chosen
         self._rest_picture: Any = None
-        self._shown: Look | None = None
+        self._shown: Any = None
         # Software drawing takes long for shadows.
         self.server.scene.configure_default_lights(cast_shadow=False)
         self.shapes = Shapes(self.server, source)
@@ -167,10 +166,10 @@ class Page:
             if not coarse:
                 self._cost = time.perf_counter() - start
         look = panel.look()
-        if new or look != self._shown:
-            self._shown = look
+        if new or (*look, panel.quantity.value) != self._shown:
+            self._shown = (*look, panel.quantity.value)
             with self.server.atomic():
-                self.shapes.draw(self._picture, self._rest_picture, look)
+                self.shapes.draw(self._picture, self._rest_picture, *look)
                 self._write()
                 panel.plot(self.shapes.numbers)
         return panel.play.value or source.pending

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.output.appearance import VIEWS
-from rbfmuscle.viewer.colours import COLOURINGS, Look, legend
+from rbfmuscle.viewer.shapes import COLOURINGS, Cut, legend
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 WIDTH = 350  # [pixel]
@@ -74,15 +74,15 @@ class Panel:
             with gui.add_folder(title, expand_by_default=False):
                 self.eyes |= {name: self._watch(gui.add_checkbox(name, True)) for name in names}
 
-    def look(self) -> Look:
-        """All that decides how a picture is shown."""
-        cut = None
+    def look(self) -> tuple[str, frozenset[str], Cut]:
+        """How a picture is shown: coloured by what, which muscles and bones hidden, and its cut."""
+        cut: Cut = None
         if self.cut.value != "none":
             axis = "xyz".index(self.cut.value)
             points = np.concatenate([vertices[:, axis] for vertices, _ in self.source.muscles.values()])
             cut = axis, float(points.min() + self.place.value * np.ptp(points))
         hidden = frozenset(name for name, eye in self.eyes.items() if not eye.value)
-        return Look(self.colour.value, hidden, cut, self.quantity.value)
+        return self.colour.value, hidden, cut
 
     def move_to(self, values: dict[str, float]) -> None:
         """Set controls."""

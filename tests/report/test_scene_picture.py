@@ -4,7 +4,7 @@ import numpy as np
 from PIL import Image
 
 from rbfmuscle.cli.app import run_command as command
-from rbfmuscle.report.scene_picture import draw_scene
+from rbfmuscle.report.render import draw_scene
 from rbfmuscle.scene.phantom import phantom_scene
 
 

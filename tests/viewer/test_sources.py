@@ -10,7 +10,7 @@ from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import stream_run
 from rbfmuscle.simulation.live import LiveSession
 from rbfmuscle.validation import UsageError
-from rbfmuscle.viewer.colours import vertex_values
+from rbfmuscle.viewer.shapes import vertex_values
 from rbfmuscle.viewer.sources import LiveSource, Picture, SavedSource
 
 

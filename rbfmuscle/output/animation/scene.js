@@ -53,11 +53,6 @@ function normals(places, corners) {
   return found;
 }
 
-function posed(part, k) {
-  const p = part.poses ? part.poses[Math.min(k, part.poses.length - 1)] : [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0];
-  return [[p[0], p[1], p[2]], [p[4], p[5], p[6]], [p[8], p[9], p[10]], [p[3], p[7], p[11]]];
-}
-
 class Scene {
   constructor(home, data) {
     this.data = data; this.frame = 0; this.zoom = 1; this.shift = [0, 0]; this.home = home;
@@ -102,8 +97,7 @@ class Scene {
   }
 
   switches(field, group, members) {
-    const boxes = [];
-    const all = element("legend", field, {});
+    const boxes = [], all = element("legend", field, {});
     if (group && members.size > 1) {
       const label = element("label", all, {}), box = element("input", label, {type: "checkbox", checked: true});
       label.append(group);
@@ -234,7 +228,8 @@ class Scene {
     const place = (name) => gl.getUniformLocation(program, name);
     for (const part of this.data.parts) {
       if (!part.shown || (part.panel >= 0 && part.panel !== number)) continue;
-      const [r0, r1, r2, shift] = posed(part, this.frame), columns = [0, 1, 2].map((k) => [r0[k], r1[k], r2[k]]);
+      const poses = part.poses || [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]], pose = poses[Math.min(this.frame, poses.length - 1)];
+      const [shift, ...columns] = [3, 0, 1, 2].map((k) => [pose[k], pose[k + 4], pose[k + 8]]);
       const rows = axes.map((axis) => columns.map((column) => dot(axis, column)));
       const at = axes.map((axis) => dot(axis, add(shift, box.centre, -1)));
       const factors = [2 * scale / w, 2 * scale / h, -1 / (4 * box.deep)];
