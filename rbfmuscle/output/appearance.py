@@ -9,7 +9,6 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 
-BACKGROUND = "#ffffff"
 BONE_COLOUR, TENDON_COLOUR = "#e9e0cd", "#cfd8dc"
 # People who are colour-blind can distinguish them (P. Tol, "muted"); its sand is left out, as bones have that colour.
 MUSCLE_COLOURS = ("#cc6677", "#332288", "#44aa99", "#882255", "#88ccee", "#117733", "#aa4499", "#999933")

@@ -50,9 +50,7 @@ def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
         ],
         " ".join([found["answer"], *failed]),
         BAD if failed else PLAIN,
-        lights=[
-            _light(found, quantity, limits.get(quantity)) for quantity in LIGHTS if _known(found, quantity)
-        ],
+        lights=[_light(found, name, limits.get(name)) for name in LIGHTS if _values(found, name)],
         heads=list(runs),
         sections=[
             Section(
@@ -66,18 +64,14 @@ def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
 
 
 def _values(found: dict[str, Any], quantity: str) -> list[float | None]:
-    """A measure of each model over all muscles; None where it was not measured."""
-    return [found["results"][name][ALL].get(quantity) for name in found["models"]]
-
-
-def _known(found: dict[str, Any], quantity: str) -> bool:
-    return any(value is not None for value in _values(found, quantity))
+    """A measure of each model over all muscles; empty where none has it."""
+    values = [found["results"][name][ALL].get(quantity) for name in found["models"]]
+    return values if any(value is not None for value in values) else []
 
 
 def _light(found: dict[str, Any], quantity: str, limit: float | None) -> Light:
-    cells = []
-    for value in _values(found, quantity):
-        cells.append(Cell(shown(found, quantity, value), limit_state(quantity, value, limit)))
+    values = _values(found, quantity)
+    cells = [Cell(shown(found, quantity, x), limit_state(quantity, x, limit)) for x in values]
     # A column of limits would be off a phone's screen.
     note = MEASURES[quantity].meaning if limit is None else f"limit {shown(found, quantity, limit)}"
     return Light(MEASURES[quantity].title, cells, note=note)
@@ -94,10 +88,10 @@ def shown(found: dict[str, Any], quantity: str, value: float | None) -> str:
 def _measures(found: dict[str, Any]) -> Table:
     rows = []
     for quantity, measure in MEASURES.items():
-        if _known(found, quantity):
+        if values := _values(found, quantity):
             best, models = best_models(found["results"], quantity, found["units"]), found["models"]
             states = [GOOD if name in best and len(best) < len(models) else PLAIN for name in models]
-            texts = [shown(found, quantity, value) for value in _values(found, quantity)]
+            texts = [shown(found, quantity, value) for value in values]
             rows.append([Cell(measure.title), Cell(measure.against), *map(Cell, texts, states)])
     return Table(["", "against", *(found["labels"][name] for name in found["models"])], rows)
 

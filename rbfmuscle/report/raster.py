@@ -10,7 +10,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.jit import compiled
-from rbfmuscle.output.appearance import BACKGROUND, rgb
+from rbfmuscle.output.appearance import rgb
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -68,7 +68,7 @@ def draw_solids(solids: Sequence[Solid], camera: Camera) -> Integers:
     width, height = camera.size
     fine = camera._replace(scale=camera.scale * _FINER, size=(_FINER * width, _FINER * height))
     depth = np.full(fine.size[::-1], -np.inf, dtype=np.float32)
-    image = np.tile(rgb(BACKGROUND).astype(np.float32), (*depth.shape, 1))
+    image = np.ones((*depth.shape, 3), dtype=np.float32)
     for solid in sorted(solids, key=lambda solid: -solid.opacity):
         points, shades = fine.project(np.asarray(solid.vertices, dtype=float)), _shaded(solid, camera.axes)
         _raster_loop(points, np.asarray(solid.faces, dtype=np.int64), shades, solid.opacity, depth, image)
@@ -100,7 +100,7 @@ def labelled(image: Integers, text: str, titles: Sequence[str], chips: Mapping[s
             x, y = 8, y + _LINE
         places.append((x, y, name, colour))
         x += wide + 20
-    sheet = Image.new("RGB", (width, y + _LINE + 3), BACKGROUND)
+    sheet = Image.new("RGB", (width, y + _LINE + 3), "white")
     sheet.paste(Image.fromarray(image), (0, _LINE))
     pen = ImageDraw.Draw(sheet)
     for k, title in enumerate(titles):

@@ -92,6 +92,7 @@ def _page(saved: SavedRun) -> Page:
     answer, _, detail = info["verdict"].partition(". ")
     if not complete:
         answer, detail = f"the run ended early ({info['status']}): {info['message'] or ''}", ""
+    terms = [(name, text) for name, (_, text) in QUANTITIES.items()]
     return Page(
         info["scene"]["name"],
         _facts(saved),
@@ -103,9 +104,7 @@ def _page(saved: SavedRun) -> Page:
             *_plots(saved),
             Section("Every quantity of every muscle", "worst over the frames", table=_summary(saved)),
             Section("Events", "each with its frame in events.csv", text=_events(saved.events)),
-            Section(
-                "How to read this", text=_READING, terms=[(n, text) for n, (_, text) in QUANTITIES.items()]
-            ),
+            Section("How to read this", text=_READING, terms=terms),
         ],
         footer=", ".join(f"{name} {value}" for name, value in info["versions"].items()),
     )
@@ -115,7 +114,7 @@ def _facts(saved: SavedRun) -> list[str]:
     info = saved.info
     models = sorted({muscle["model"]["name"] for muscle in info["scene"]["muscles"]})
     median = (info.get("frame_time") or {}).get("median")
-    counts = [f"{len(saved.muscles)} muscles", f"{len(saved.frames)} frames"]
+    counts = [f"{len(saved.muscles)} muscles", f"{len(saved.frames)} frame{'s'[: len(saved.frames) != 1]}"]
     times = [f"{shown_number(median, 's')} per frame", f"{info['times']['wall']:.1f} s in all"]
     return [f"model {', '.join(models)}", *counts, *times]
 
@@ -143,26 +142,19 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
     if not found:
         return None
     _, muscle, name, worst, facts, limit = max(found, key=lambda entry: entry[0])
-    unit, title_of = facts["unit"], name.replace("_", " ")
-    state = limit_state(name, worst, limit)
-    place = f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}"
-    return Light(
-        title,
-        [number_cell(worst, unit, state)],
-        f"{'≥' if name in LEAST else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}",
-        title_of + (place if worst else ""),
-    )
+    unit, place = facts["unit"], f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}"
+    allowed = f"{'≥' if name in LEAST else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}"
+    cells, note = [number_cell(worst, unit, limit_state(name, worst, limit))], name.replace("_", " ")
+    return Light(title, cells, allowed, note + place if worst else note)
 
 
 def _plots(saved: SavedRun) -> list[Section]:
     """Moment arms and lengths, then what else changes along the motion."""
     axis, label = motion_axis(saved)
-    arms = [
-        (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), name)
-        for name in saved.moment_arm_coordinates()
-    ]
-    mechanics: list[str] = []
-    errors: list[str] = []
+    mechanics, errors = "Moment arms and lengths", "Errors and times over the motion"
+    plots: dict[str, list[str]] = {mechanics: [], errors: []}
+    about = saved.moment_arm_coordinates()
+    arms = [(f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), name) for name in about]
     for title, quantity, factor, unit, coordinate in [*arms, *((*panel, None) for panel in PANELS)]:
         tracks = _tracks(saved, quantity, factor, axis, coordinate)
         if tracks:
@@ -170,12 +162,9 @@ def _plots(saved: SavedRun) -> list[Section]:
             signed = any(np.nanmin(track.y) < 0.0 for track in tracks)
             limits = [factor * limit, -factor * limit][: 1 + signed] if limit else []
             zero = quantity != "length" and not signed
-            picture = line_plot(title, tracks, (label, unit), limits=limits, zero=zero)
-            (mechanics if quantity in ("length", "activation", "moment_arm") else errors).append(picture)
-    return [
-        Section("Moment arms and lengths", plots=mechanics),
-        Section("Errors and times over the motion", plots=errors),
-    ]
+            group = mechanics if quantity in ("length", "activation", "moment_arm") else errors
+            plots[group].append(line_plot(title, tracks, (label, unit), limits=limits, zero=zero))
+    return [Section(title, plots=found) for title, found in plots.items()]
 
 
 def _tracks(
@@ -201,9 +190,7 @@ def _summary(saved: SavedRun) -> Table:
         unit = next(found[name]["unit"] for found in muscles.values() if name in found)
         limit = "" if name not in limits else f" ({'≥' if name in LEAST else '≤'} {limits[name]:g})"
         head.append(f"{name.replace('_', ' ')}{'' if unit == '1' else f' [{unit}]'}{limit}")
-    rows = [
-        [Cell(muscle), *(_cell(name, found, limits) for name in used)] for muscle, found in muscles.items()
-    ]
+    rows = [[Cell(name), *(_cell(q, found, limits) for q in used)] for name, found in muscles.items()]
     return Table(head, sorted(rows, key=lambda row: -sum(cell.state == BAD for cell in row)))
 
 

@@ -105,11 +105,10 @@ class LiveSource:
         frame = self.session.advance(self.stride, surfaces=not coarse)
         self._unfinished = coarse
         surfaces = {n: (s.vertices, s.faces) for n, s in frame.surfaces.items()} or frame.carried
-        depths = {n: s.quantities.get("solver_penetration_max") for n, s in frame.surfaces.items()}
+        depth = {n: s.quantities.get("solver_penetration_max", math.nan) for n, s in frame.surfaces.items()}
         meshes = {m.name: tendon_mesh(m, frame.tendons) for m in self.session.scene.muscles}
         tendons = {name: mesh for name, mesh in meshes.items() if mesh is not None}
-        known = {name: depth for name, depth in depths.items() if depth is not None}
-        return Picture(frame.poses, surfaces, tendons, frame.activations, known, "")
+        return Picture(frame.poses, surfaces, tendons, frame.activations, depth, "")
 
 
 def _coordinate(scene: Scene, name: str, numbers: tuple[float, ...]) -> Control:
