@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 import os
 import tempfile
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.tubes import tendon_mesh, tendon_name
 from rbfmuscle.output.vtp import Collection, write_vtp
+from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
@@ -127,8 +127,10 @@ class RunWriter:
         While the run goes on it holds the coordinates of all frames to come, for readers of a run that was killed.
         """
         if info.get("status") == "running":
-            frames = self.scene.motion.frames
-            planned = [{name: math.degrees(value) for name, value in frame.items()} for frame in frames]
+            planned = [
+                {name: shown_value(self.scene, name, value) for name, value in frame.items()}
+                for frame in self.scene.motion.frames
+            ]
             info = {**info, "planned": planned}
         write_json(self.directory / "run.json", info)
 
@@ -136,8 +138,9 @@ class RunWriter:
         if self.meshes:
             times = self.scene.motion.times
             step = frame.index if times is None else times[frame.index]
-            self._collections["surfaces"].add(step, self._write_surfaces(frame))
+            surfaces = self._write_surfaces(frame)
             self._collections["bones"].add(step, self._write_bones(frame))
+            self._collections["surfaces"].add(step, surfaces)
         # A frame's surfaces are on the disk before its poses: readers of a run that was killed rely on it.
         poses = [(bone.name, frame.poses[bone.name].ravel().tolist()) for bone in self.scene.bones]
         self._add_rows("poses.csv", [(frame.index, name, *pose) for name, pose in poses])

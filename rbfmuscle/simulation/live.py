@@ -81,9 +81,13 @@ class LiveSession:
     @property
     def arrived(self) -> bool:
         """Whether coordinates and activations have reached their targets."""
+        return self.within(1e-9, 1e-9)
+
+    def within(self, stride: float, step: float) -> bool:
+        """Whether no coordinate is farther than ``stride`` from its target, and no activation than ``step``."""
         active = self._loop.activations.here if self._loop else dict.fromkeys(self.activation, 0.0)
-        wanted = {**self.target, **self.activation}
-        return all(abs(value - {**self.here, **active}[name]) < 1e-9 for name, value in wanted.items())
+        near = all(abs(value - self.here[name]) <= stride for name, value in self.target.items())
+        return near and all(abs(value - active[name]) <= step for name, value in self.activation.items())
 
     def advance(self, stride: float = math.inf, *, surfaces: bool = True) -> Frame:
         """Move towards the target and return the frame reached.

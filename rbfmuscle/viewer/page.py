@@ -20,8 +20,7 @@ from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.shapes import Shapes
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
-COSTLY = 0.1  # While controls are moved, a picture that takes longer [s] is drawn coarse.
-MOVED = 0.25  # A control counts as moved for so long [s].
+COSTLY = 0.1  # Where a picture takes longer [s], those on the way to the controls' places are drawn coarse.
 PACE = 0.04  # Least time of a picture while a motion is played [s].
 FIELD_OF_VIEW = 0.5
 FIRST = (-1.4, 1.6, 0.5)  # Where the camera stands at first, along the body's axes.
@@ -77,8 +76,7 @@ class Page:
     ) -> None:  # fmt: skip
         self.source, (self.server, self.address) = source, open_server(port)
         self._wake, self._closed, self._resting = threading.Event(), False, False
-        self._moved, self._cost, self._message, self._place = 0.0, 0.0, "", 0
-        self._model = ""
+        self._cost, self._message, self._place, self._model = 0.0, "", 0, ""
         self._picture: Any = None  # a Picture, and the one at rest, as soon as a model is chosen
         self._rest_picture: Any = None
         self._shown: Any = None
@@ -111,7 +109,7 @@ class Page:
         return f'<iframe src="{self.address}" width="100%" height="640" style="border:0"></iframe>'
 
     def _touch(self, *, rest: bool = False) -> None:
-        self._moved, self._resting = time.perf_counter(), self._resting or rest
+        self._resting |= rest
         self._wake.set()
 
     def _aim(self, direction: tuple[float, ...], camera: Any) -> None:
@@ -161,7 +159,7 @@ class Page:
             source.set(name, control.value)
         if source.pending:
             start, new = time.perf_counter(), True
-            coarse = self._cost > COSTLY and start - self._moved < MOVED
+            coarse = self._cost > COSTLY and not source.near
             self._picture = source.advance(coarse=coarse)
             if not coarse:
                 self._cost = time.perf_counter() - start
@@ -190,6 +188,5 @@ class Page:
         self.source.rest()
 
     def _write(self) -> None:
-        text = "" if self._picture is None else self._picture.text
-        texts = self._message, text, f"{1e3 * self._cost:.0f} ms per picture"
-        self.panel.write(self.shapes.numbers, texts)
+        text = self._picture.text if self._picture else ""
+        self.panel.write(self.shapes.numbers, (self._message, text, f"{1e3 * self._cost:.0f} ms per picture"))

@@ -13,6 +13,7 @@ from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
 from rbfmuscle.output.appearance import muscle_colours, muscle_groups
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.tubes import tendon_mesh, tendon_name
+from rbfmuscle.scene.activation.curve import STEP
 from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
@@ -100,6 +101,11 @@ class LiveSource:
         """Whether there is something new to show."""
         return self._unfinished or not self.session.arrived
 
+    @property
+    def near(self) -> bool:
+        """Whether the next picture shows the target."""
+        return self.session.within(self.stride, STEP)
+
     def advance(self, *, coarse: bool = False) -> Picture:
         """Go one sub-step further; coarse shows the material where it is and leaves fit and cut for later."""
         frame = self.session.advance(self.stride, surfaces=not coarse)
@@ -119,13 +125,9 @@ def _coordinate(scene: Scene, name: str, numbers: tuple[float, ...]) -> Control:
 
 
 class SavedSource:
-    """Saved runs of one scene by name, scrubbed by frame; attributes as of `LiveSource`.
+    """Saved runs by name, scrubbed by frame; attributes as of `LiveSource`. UsageError if one has no surfaces."""
 
-    Raises
-    ------
-    UsageError
-        If one holds no surfaces.
-    """
+    near = True
 
     def __init__(self, runs: dict[str, SavedRun]) -> None:
         for saved in runs.values():

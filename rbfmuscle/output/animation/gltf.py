@@ -23,8 +23,8 @@ _FLOAT, _INT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963  # what a view is bound as
 
 
-def animated_glb(run: MovingRun, name: str = "animated-glb") -> bytes:
-    """The content of an animated ``.glb``; ``name`` is what messages call the format.
+def animated_glb(run: MovingRun) -> bytes:
+    """The content of an animated ``.glb``.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def animated_glb(run: MovingRun, name: str = "animated-glb") -> bytes:
     changing = [muscle.name for muscle in run.muscles if not muscle.keeps_vertices]
     if changing:
         raise UsageError(
-            f"{name} needs surfaces that keep their vertices, those of {changing[0]!r} do not; "
+            f"animated-glb needs surfaces that keep their vertices, those of {changing[0]!r} do not; "
             "run with surface = 'material', or export to usd, pvd or glb"
         )
     file = _File()
@@ -86,9 +86,8 @@ class _File:
     def __init__(self) -> None:
         self.parts: list[bytes] = []
         self.size, self.times = 0, 0
-        self.lists: dict[str, list[Any]] = {
-            key: [] for key in ("bufferViews", "accessors", "meshes", "materials", "nodes")
-        }
+        keys = "bufferViews", "accessors", "meshes", "materials", "nodes"
+        self.lists: dict[str, list[Any]] = {key: [] for key in keys}
         self.samplers: list[Any] = []
         self.channels: list[Any] = []
 
@@ -107,28 +106,19 @@ class _File:
         view |= {} if target is None else {"target": target}
         self.parts.append(rows.tobytes())
         self.size += rows.nbytes
-        entry = {
-            "bufferView": self.append("bufferViews", view),
-            "componentType": _INT if whole else _FLOAT,
-            "count": len(rows),
-            "type": shape,
-        }
+        entry = {"bufferView": self.append("bufferViews", view), "count": len(rows), "type": shape}
+        entry["componentType"] = _INT if whole else _FLOAT
         if bounds:
             entry |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self.append("accessors", entry)
 
     def mesh(self, part: MovingPart, normals: Floats, targets: Sequence[Any]) -> int:
         """Number of a new mesh, that of the first frame, with a material of its own."""
-        look = {
-            "baseColorFactor": [*linear_rgb(rgb(part.colour)).tolist(), 1.0],
-            "metallicFactor": 0.0,
-            "roughnessFactor": 0.6,
-        }
+        colour = [*linear_rgb(rgb(part.colour)).tolist(), 1.0]
+        look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}
+        position = self.add(part.vertices[0], "VEC3", target=_VERTICES, bounds=True)
         primitive = {
-            "attributes": {
-                "POSITION": self.add(part.vertices[0], "VEC3", target=_VERTICES, bounds=True),
-                "NORMAL": self.add(normals, "VEC3", target=_VERTICES),
-            },
+            "attributes": {"POSITION": position, "NORMAL": self.add(normals, "VEC3", target=_VERTICES)},
             "indices": self.add(part.faces[0].reshape(-1, 1), "SCALAR", target=_INDICES),
             "material": self.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
         }
@@ -146,13 +136,9 @@ class _File:
 
     def content(self, scene: dict[str, Any]) -> bytes:
         """The whole file."""
-        tree: dict[str, Any] = {
-            "asset": {"version": "2.0", "generator": "rbfmuscle"},
-            "scene": 0,
-            "scenes": [scene],
-            "buffers": [{"byteLength": self.size}],
-            **self.lists,
-        }
+        asset = {"version": "2.0", "generator": "rbfmuscle"}
+        tree: dict[str, Any] = {"asset": asset, "scene": 0, "scenes": [scene], **self.lists}
+        tree["buffers"] = [{"byteLength": self.size}]
         if self.channels:
             tree["animations"] = [{"name": "motion", "samplers": self.samplers, "channels": self.channels}]
         text = json.dumps(tree, separators=(",", ":")).encode()
