@@ -115,7 +115,6 @@ def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -
             if collection is not None:
                 collection.add(run.times[k] if run.timed else frame, list(files.items()))
         if collection is not None:
-            collection.close()
             written.append(folder / f"{group}.pvd")
     return written
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import zlib
@@ -104,34 +103,24 @@ class Collection:
         The files that it names are relative to its folder.
     """
 
-    _HEAD = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
-    _TAIL = "</Collection>\n</VTKFile>\n"
-
     def __init__(self, path: str | Path) -> None:
-        # Unbuffered: entries and closing tags go to the disk in one piece.
-        self._file = open(path, "wb", buffering=0)  # noqa: SIM115
-        self._end = 0
-        self._write(self._HEAD)
+        self._path, self._lines = Path(path), ""
+        self.add(0.0, [])
 
     def add(self, time: float, entries: list[tuple[str, str]]) -> None:
         """Add one time step; ``entries`` are pairs of name and file."""
-        lines = [
-            f'<DataSet timestep="{time}" group="" part="{part}" name="{escape(name)}" file="{escape(file)}"/>\n'
-            for part, (name, file) in enumerate(entries)
-        ]
-        self._write("".join(lines))
+        for part, (name, file) in enumerate(entries):
+            place = f'part="{part}" name="{escape(name)}" file="{escape(file)}"'
+            self._lines += f'<DataSet timestep="{time}" group="" {place}/>\n'
+        head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
+        write_whole(self._path, f"{head}{self._lines}</Collection>\n</VTKFile>\n")
 
-    def close(self) -> None:
-        """End the file."""
-        self._file.close()
 
-    def _write(self, text: str) -> None:
-        """Add text before the closing tags, or nothing where the disk is full."""
-        data, tail = text.encode(), self._TAIL.encode()
-        self._file.seek(self._end)
-        if self._file.write(data + tail) < len(data) + len(tail):
-            self._file.seek(self._end)
-            self._file.write(tail)
-            self._file.truncate()
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        self._end += len(data)
+def write_whole(path: Path, text: str) -> None:
+    """Write a text in one move, so that whoever reads it finds the old file or the new, never half of it."""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        part.write_text(text, encoding="utf-8", newline="\n")
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import os
 import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +15,7 @@ from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.tubes import tendon_mesh, tendon_name
-from rbfmuscle.output.vtp import Collection, write_vtp
+from rbfmuscle.output.vtp import Collection, write_vtp, write_whole
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.validation import SolveError, UsageError
 
@@ -80,7 +78,8 @@ class RunWriter:
         self._light: dict[str, tuple[Floats, Integers]] = {}
         try:
             self._clear()
-            self._tables = {name: self._table(name) for name in TABLES}
+            for name, head in TABLES.items():
+                self._add_rows(name, [head], mode="w")
             names = ("surfaces", "bones") if self.meshes else ()
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
         except OSError as error:
@@ -99,27 +98,17 @@ class RunWriter:
             self._write(frame, rows)
         except OSError as error:
             self._failed = True
-            for file in self._open_files():
-                with suppress(OSError):
-                    file.close()
             self._remove(frame.index - 1)
             kept = f"{self.count} frames are kept in {self.directory}"
             raise SolveError(f"cannot write frame {frame.index}: {error.strerror}; {kept}") from None
         self.count += 1
 
     def close(self, rows: Sequence[Any] = ()) -> None:
-        """Write the last rows of metrics and close all files; after a frame that could not be written, nothing."""
-        if self._failed:
-            return
+        """Write the last rows of metrics; after a frame that could not be written, nothing."""
         try:
-            self._add_rows("metrics.csv", rows)
-            for file in self._open_files():
-                file.close()
+            self._add_rows("metrics.csv", () if self._failed else rows)
         except OSError as error:
             raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
-
-    def _open_files(self):
-        return [*(file for _, file in self._tables.values()), *self._collections.values()]
 
     def write_info(self, info: dict[str, Any]) -> None:
         """Write ``run.json`` in one piece: a reader finds the old one or the new one, never half of it.
@@ -147,10 +136,9 @@ class RunWriter:
         self._add_rows("events.csv", [(e.frame, e.muscle, e.bone, e.count, e.action) for e in frame.events])
         self._add_rows("metrics.csv", rows)
 
-    def _add_rows(self, name, rows):
-        writer, file = self._tables[name]
-        writer.writerows(rows)
-        file.flush()
+    def _add_rows(self, name, rows, mode="a"):
+        with (self.directory / name).open(mode, encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(rows)
 
     def _write_surfaces(self, frame):
         """Surfaces of a frame, side by side: most of the time goes into packing them."""
@@ -199,23 +187,12 @@ class RunWriter:
         for folder in ("surfaces", "bones") if self.meshes else ():
             (self.directory / folder).mkdir(exist_ok=True)
 
-    def _table(self, name):
-        file = open(self.directory / name, "w", encoding="utf-8", newline="")  # noqa: SIM115
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(TABLES[name])
-        file.flush()
-        return writer, file
-
 
 def write_json(path: Path, data: dict[str, Any]) -> None:
     """Write JSON in one move, so that whoever reads it finds the old or the new; NaN and infinity become null."""
-    path = Path(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        part.write_text(json_text(data) + "\n", encoding="utf-8")
-        os.replace(part, path)
+        write_whole(Path(path), json_text(data) + "\n")
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise SolveError(f"cannot write {path}: {error.strerror}") from None
 
 
