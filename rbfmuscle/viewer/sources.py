@@ -65,7 +65,9 @@ class LiveSource:
             {item.name: (np.asarray(item.mesh.vertices), np.asarray(item.mesh.faces)) for item in items}
             for items in (scene.bones, scene.muscles)
         )
-        self.colours = muscle_colours(list(self.muscles), muscle_groups({"scene": scene.resolved()}))
+        held = [{"name": m.name, "attach": [{"bone": a.bone} for a in m.attachments]} for m in scene.muscles]
+        groups = muscle_groups({"scene": {"joints": list(map(vars, scene.joints)), "muscles": held}})
+        self.colours = muscle_colours(list(self.muscles), groups)
         self.stride, self._unfinished = math.radians(scene.contact.substep_angle), True
         self.session = session = LiveSession(scene)
         self.controls = {
