@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import threading
 import webbrowser
 from pathlib import Path
@@ -92,27 +91,25 @@ def _open_runs(folder):
 def _draw(opened, model, stops, path):
     """Draw a run's frame, or a scene's pose after a run to it, in the way `rbfmuscle render` does."""
     from rbfmuscle.report.render import render_run
+    from rbfmuscle.run import simulate
 
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(opened, dict):
         _check_stops(stops, ["frame"])
         saved = next(iter(opened.values()))
-        render_run(saved.directory, path, frame=int(stops.get("frame", saved.frames[0])))
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        _run_to(opened, model, stops, folder)
-        render_run(folder, path)
+        frame = int(stops.get("frame", saved.frames[0]))
+    else:
+        saved, frame = simulate(_posed(opened, stops), model).saved, 1
+    render_run(saved.directory, path, frame=frame)
 
 
-def _run_to(scene, model, stops, folder):
-    """Run a scene from rest to one pose, and write that frame."""
-    from rbfmuscle.run import stream_run
+def _posed(scene, stops):
+    """The scene with a motion from rest to one pose."""
     from rbfmuscle.scene.motion import inner_value, rest_coordinates
     from rbfmuscle.scene.objects import Motion
     from rbfmuscle.simulation.live import coordinate_limits
 
     _check_stops(stops, coordinate_limits(scene))
-    rest = rest_coordinates(scene)
-    scene = scene.copy()
+    rest, scene = rest_coordinates(scene), scene.copy()
     scene.motion = Motion([rest, rest | {name: inner_value(scene, name, x) for name, x in stops.items()}])
-    stream_run(scene, folder, model=model, settings={"output.report": False})
+    return scene

@@ -140,18 +140,10 @@ class Scene {
     canvas.ondblclick = () => this.look(this.data.direction);
     this.slider.oninput = () => this.show(Number(this.slider.value));
     this.play.onclick = () => {
-      this.started = this.started === undefined ? [performance.now(), this.frame] : undefined;
-      this.play.textContent = this.started ? "❚❚ Stop" : "▶ Play";
-      if (this.started) requestAnimationFrame((now) => this.step(now));
+      const {captions, rate} = this.data, next = () => this.show((this.frame + 1) % captions.length);
+      this.timer = this.timer ? clearInterval(this.timer) : setInterval(next, 1000 / rate);
+      this.play.textContent = this.timer ? "❚❚ Stop" : "▶ Play";
     };
-  }
-
-  step(now) {
-    if (!this.started) return;
-    const passed = Math.floor(((now - this.started[0]) / 1000) * this.data.rate);
-    const next = (this.started[1] + Math.max(0, passed)) % this.data.captions.length;
-    if (next !== this.frame) this.show(next);
-    requestAnimationFrame((later) => this.step(later));
   }
 
   // Seen from a direction along the body's axes: left, posterior, superior.
