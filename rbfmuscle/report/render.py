@@ -185,7 +185,7 @@ def _draw_joints(pen: ImageDraw, camera: Camera, scene: Scene) -> None:
         x, y, _ = camera.project(centre[None])[0]
         for axis in (*joint.rotations, *joint.translations):
             if axis.coordinates:
-                along = joint.frame[:3, :3] @ np.asarray(axis.direction, dtype=float)
+                along = np.asarray(axis.direction, dtype=float)
                 reach = 26.0 / camera.scale / np.linalg.norm(along)
                 ends = camera.project(np.array([centre - reach * along, centre + reach * along]))
                 pen.line([tuple(end[:2]) for end in ends], fill=_AXIS, width=2)
