@@ -11,13 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from rbfmuscle.metrics.penetration import BoneProbe
 from rbfmuscle.output.appearance import VIEWS, view_axes
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SolveError
+from rbfmuscle.viewer.colours import Look
 from rbfmuscle.viewer.panel import Panel
 from rbfmuscle.viewer.server import open_server
-from rbfmuscle.viewer.shapes import Shapes
+from rbfmuscle.viewer.side import Side
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 COSTLY = 0.1  # Where a picture takes longer [s], those on the way to the controls' places are drawn coarse.
@@ -74,15 +76,16 @@ class Page:
         self, source: LiveSource | SavedSource, *, at: dict[str, float] | None = None,
         colour: str = "group", port: int = 0,
     ) -> None:  # fmt: skip
+        import trimesh
+
         self.source, (self.server, self.address) = source, open_server(port)
+        self._probes = [BoneProbe(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()]
         self._wake, self._closed, self._resting = threading.Event(), False, False
-        self._cost, self._message, self._place, self._model = 0.0, "", 0, ""
-        self._picture: Any = None  # a Picture, and the one at rest, as soon as a model is chosen
-        self._rest_picture: Any = None
-        self._shown: Any = None
+        self._cost, self._message, self._place = 0.0, "", 0
+        self._shown: Look | None = None
         # Software drawing takes long for shadows.
         self.server.scene.configure_default_lights(cast_shadow=False)
-        self.shapes = Shapes(self.server, source)
+        self.sides = [Side(self.server, f"/{name}", source) for name in ("first", "second")]
         self.panel = Panel(self.server, source, at or {}, colour, self._touch)
         self.panel.rest.on_click(lambda _: self._touch(rest=True))
         self.panel.view.on_click(
@@ -113,12 +116,16 @@ class Page:
         self._wake.set()
 
     def _aim(self, direction: tuple[float, ...], camera: Any) -> None:
-        """Let a camera look at everything."""
-        points = self.shapes.points(self._picture)
+        """Let a camera look at everything; models then stand side by side across its direction."""
+        points = (0.001 / self.source.millimetre) * np.concatenate(self.sides[0].points())
         middle, size = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0)
         right, up, ahead = view_axes(direction, self.source.body)
         wide, tall, deep = (float(np.abs(axis) @ size) for axis in (right, up, ahead))
-        away = 0.55 * max(tall, wide) / math.tan(FIELD_OF_VIEW / 2) + deep / 2
+        both = self.panel.models[1].value != "none"
+        apart = 1.1 * max(wide, 0.7 * tall) * right
+        self.sides[1].frame.position = apart
+        middle = middle + both * apart / 2
+        away = 0.55 * max(tall, wide + both * np.linalg.norm(apart)) / math.tan(FIELD_OF_VIEW / 2) + deep / 2
         pole = self.source.body[2] if abs(ahead @ self.source.body[2]) < 0.99 else up
         with self.server.atomic():
             setattr(camera, "up_direction" if hasattr(camera, "up_direction") else "up", pole)
@@ -135,8 +142,7 @@ class Page:
             try:
                 more = self._turn()
             except SolveError as error:
-                more = False
-                self._rest(f"Back to rest: {error}")
+                more = self._rest(f"Back to rest: {error}")
             except RBFMuscleError as error:
                 more, self._message = False, str(error)
                 self._write()
@@ -147,30 +153,30 @@ class Page:
 
     def _turn(self) -> bool:
         """Show the next picture if there is a new one; returns whether more follow."""
-        panel, source, new = self.panel, self.source, False
-        if panel.model.value != self._model:
-            self._model, new = panel.model.value, True
-            source.choose(self._model)
-            self._picture = self._rest_picture = source.advance()
+        panel = self.panel
+        changed = [side.choose(model.value) for side, model in zip(self.sides, panel.models)]
+        if changed[1]:
+            for client in self.server.get_clients().values():
+                self._aim(FIRST, client.camera)
+        sides = [side for side in self.sides if side.figure is not None]
         if self._resting:
             self._rest("")
-        self._follow_motion(not source.pending)
-        for name, control in panel.controls.items():
-            source.set(name, control.value)
-        if source.pending:
-            start, new = time.perf_counter(), True
-            coarse = self._cost > COSTLY and not source.near
-            self._picture = source.advance(coarse=coarse)
-            if not coarse:
-                self._cost = time.perf_counter() - start
+        self._follow_motion(not any(side.figure.pending for side in sides))
+        for side in sides:
+            for name, control in panel.controls.items():
+                side.figure.set(name, control.value)
+        start = time.perf_counter()
+        coarse = self._cost > COSTLY and not all(side.figure.near for side in sides)
+        waiting = [side for side in sides if side.figure.pending]
+        for side in waiting:
+            side.picture = side.figure.advance(coarse=coarse)
+        if waiting and not coarse:
+            self._cost = time.perf_counter() - start
         look = panel.look()
-        if new or (*look, panel.quantity.value) != self._shown:
-            self._shown = (*look, panel.quantity.value)
-            with self.server.atomic():
-                self.shapes.draw(self._picture, self._rest_picture, *look)
-                self._write()
-                panel.plot(self.shapes.numbers)
-        return panel.play.value or source.pending
+        if waiting or look != self._shown:
+            self._shown = look
+            self._draw(sides, look)
+        return panel.play.value or any(side.figure.pending for side in sides)
 
     def _follow_motion(self, arrived: bool) -> None:
         """Set the controls to the frame of the motion where the play bar is."""
@@ -181,12 +187,27 @@ class Page:
             self._place = frame.value
             self.panel.move_to(self.source.motion[frame.value])
 
-    def _rest(self, message: str) -> None:
-        """Set controls and muscles to rest."""
+    def _rest(self, message: str) -> bool:
+        """Set controls and models to rest; returns that no picture has to follow by itself."""
         self._resting, self._message, self.panel.play.value = False, message, False
         self.panel.move_to({name: control.value for name, control in self.source.controls.items()})
-        self.source.rest()
+        for side in self.sides:
+            if side.figure is not None:
+                side.figure.rest()
+        return False
+
+    def _draw(self, sides: list[Side], look: Look) -> None:
+        with self.server.atomic():
+            for side, other in zip(sides, sides[::-1] if len(sides) > 1 else [None]):
+                side.draw(look, self._probes, None if other is None else other.picture)
+            self._write()
+            self.panel.plot_on(sides)
 
     def _write(self) -> None:
-        text = self._picture.text if self._picture else ""
-        self.panel.write(self.shapes.numbers, (self._message, text, f"{1e3 * self._cost:.0f} ms per picture"))
+        sides = [side for side in self.sides if side.picture is not None]
+        texts = [
+            self._message,
+            *(side.picture.text for side in sides),
+            f"{1e3 * self._cost:.0f} ms per picture",
+        ]
+        self.panel.write(sides, texts)

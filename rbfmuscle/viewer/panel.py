@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from rbfmuscle.output.appearance import VIEWS
-from rbfmuscle.viewer.shapes import COLOURINGS, Cut, legend
+from rbfmuscle.viewer.colours import COLOURINGS, Look, legend
+from rbfmuscle.viewer.side import Side
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 WIDTH = 350  # [pixel]
@@ -17,10 +18,18 @@ HISTORY, LINES = 200, 8  # Pictures and lines in a plot.
 
 
 class Panel:
-    """Sliders by joint, play bar, choices, numbers and plot of a viser server.
+    """Sliders by joint, play bar, choices, numbers and plot.
 
-    ``at`` are controls that begin elsewhere than at rest, ``colour`` is the first of `COLOURINGS`; ``touch`` is called
-    whenever something was changed.
+    Parameters
+    ----------
+    server : viser.ViserServer
+    source : LiveSource or SavedSource
+    at : dict of str to float
+        Controls that begin elsewhere than at rest.
+    colour : str
+        Of `COLOURINGS`, to begin with.
+    touch : callable
+        Called whenever something was changed.
     """
 
     def __init__(
@@ -37,8 +46,13 @@ class Panel:
         with tabs.add_tab("Show"):
             self._add_choices(colour)
         with tabs.add_tab("Plot") as self._tab:
-            names = "none", "volume error [%]", f"depth in bones [{source.units}]", "mean of the colour"
-            self.quantity = self._watch(self.gui.add_dropdown("Quantity", names))
+            quantities = (
+                "none",
+                "volume error [%]",
+                f"depth in bones [{source.units}]",
+                "mean of the colour",
+            )
+            self.quantity = self._watch(self.gui.add_dropdown("Quantity", quantities))
             self._plot: Any = None
             self._lines, self._history = [], []
 
@@ -64,7 +78,10 @@ class Panel:
 
     def _add_choices(self, colour: str) -> None:
         gui, choices = self.gui, self.source.choices
-        self.model = self._watch(gui.add_dropdown("Model", choices))
+        self.models = [
+            self._watch(gui.add_dropdown("Model", choices)),
+            self._watch(gui.add_dropdown("Beside it", ("none", *choices))),
+        ]
         self.colour = self._watch(gui.add_dropdown("Colour", tuple(COLOURINGS), initial_value=colour))
         self.view = gui.add_button_group("View", [view.capitalize() for view in VIEWS])
         self.cut = self._watch(gui.add_dropdown("Cut along", ("none", "x", "y", "z")))
@@ -74,50 +91,51 @@ class Panel:
             with gui.add_folder(title, expand_by_default=False):
                 self.eyes |= {name: self._watch(gui.add_checkbox(name, True)) for name in names}
 
-    def look(self) -> tuple[str, frozenset[str], Cut]:
-        """How a picture is shown: coloured by what, which muscles and bones hidden, and its cut."""
-        cut: Cut = None
+    def look(self) -> Look:
+        """All that decides how a picture is shown."""
+        cut = None
         if self.cut.value != "none":
             axis = "xyz".index(self.cut.value)
             points = np.concatenate([vertices[:, axis] for vertices, _ in self.source.muscles.values()])
             cut = axis, float(points.min() + self.place.value * np.ptp(points))
         hidden = frozenset(name for name, eye in self.eyes.items() if not eye.value)
-        return self.colour.value, hidden, cut
+        others = *(model.value for model in self.models), self.quantity.value
+        return Look(self.colour.value, hidden, cut, others)
 
     def move_to(self, values: dict[str, float]) -> None:
         """Set controls."""
         for name, value in values.items():
             self.controls[name].value = value
 
-    def write(self, numbers: Mapping[str, Mapping[str, float]], texts: Sequence[str]) -> None:
+    def write(self, sides: list[Side], texts: list[str]) -> None:
         """Write the scale of the colours, the numbers of all muscles and texts."""
         colouring, units = COLOURINGS[self.colour.value], self.source.units
         bar = "" if colouring is None else legend(colouring, units, self.source.millimetre)
-        head = self.model.value, "volume [%]", f"in bones [{units}]"
+        head = (" / ".join(side.choice for side in sides), "volume [%]", f"in bones [{units}]")
         rows = [f"<tr><th style='text-align:left'>{'</th><th>'.join(head)}</th></tr>"]
-        for name, found in numbers.items():
-            colour, title = self.source.colours[name], name.replace("_", " ")
-            # 0.0 is added so that no -0 is shown.
-            values = (f"{round(found[k], n) + 0.0:.{n}f}" for k, n in (("volume", 3), ("depth", 2)))
-            cells = f"<span style='color:{colour}'>■</span> {title}", *values
-            row = "</td><td>".join(cells).replace(">nan", ">–")
-            rows.append(f"<tr><td style='text-align:left'>{row}</td></tr>")
+        for name, colour in self.source.colours.items() if sides else ():
+            cells = [f"<span style='color:{colour}'>■</span> {name.replace('_', ' ')}"]
+            for key, digits in (("volume", 3), ("depth", 2)):
+                # 0.0 is added so that no -0 is shown.
+                numbers = (f"{round(side.numbers[name][key], digits) + 0.0:.{digits}f}" for side in sides)
+                cells.append(" / ".join(numbers).replace("nan", "–"))
+            rows.append(f"<tr><td style='text-align:left'>{'</td><td>'.join(cells)}</td></tr>")
         self._numbers.content = (
             f"<div style='padding:4px 12px;font-size:12px'>{bar}<div style='max-height:170px;overflow:auto'>"
             "<table style='width:100%;text-align:right;line-height:1.25'>"
             f"{''.join(rows)}</table></div>{'<br>'.join(text for text in texts if text)}</div>"
         )
 
-    def plot(self, numbers: Mapping[str, Mapping[str, float]]) -> None:
+    def plot_on(self, sides: list[Side]) -> None:
         """Go on with the plot of the quantity; begin anew where other lines are asked for."""
         from viser import uplot
 
         key = self.quantity.value.partition(" ")[0]
-        shown = [name for name in self.source.colours if self.eyes[name].value][:LINES]
-        row = [numbers[name][key] for name in shown if key != "none"]
+        shown = [(s, name) for s in sides for name in self.source.colours if self.eyes[name].value][:LINES]
+        row = [side.numbers[name][key] for side, name in shown if key != "none"]
         if not row or not np.isfinite(row).all():
             return
-        lines = [key, self.colour.value, self.model.value, *shown]
+        lines = [key, self.colour.value, *((side.choice, name) for side, name in shown)]
         if lines != self._lines:
             self._lines, self._history = lines, []
         self._history = [*self._history[1 - HISTORY :], row]
@@ -127,8 +145,10 @@ class Panel:
             return
         if self._plot is not None:
             self._plot.remove()
-        colours = self.source.colours
-        series = [uplot.Series(label=name, stroke=colours[name], width=2) for name in shown]
-        axis = uplot.Series(label="picture")
+        series = [uplot.Series(label="picture")]
+        for side, name in shown:
+            dash = [] if side is sides[0] else [6, 4]
+            label = f"{name} {side.choice}" if len(sides) > 1 else name
+            series.append(uplot.Series(label=label, stroke=self.source.colours[name], width=2, dash=dash))
         with self._tab:
-            self._plot = self.gui.add_uplot(data, (axis, *series), height=260, scales={"x": {"time": False}})
+            self._plot = self.gui.add_uplot(data, tuple(series), height=260, scales={"x": {"time": False}})

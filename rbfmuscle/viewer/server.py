@@ -6,7 +6,7 @@ import contextlib
 import http
 import io
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.validation import MissingPartError
@@ -43,6 +43,24 @@ class Gate:
         return self.inner(connection, request)
 
 
+@contextlib.contextmanager
+def _every_request_through(gate: Gate) -> Iterator[None]:
+    """Put the gate before any websocket server that starts meanwhile; viser has no setting for it."""
+    from websockets.asyncio import server as module
+
+    plain = module.serve
+
+    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        gate.inner = process_request
+        return plain(*arguments, process_request=gate, **options)
+
+    module.serve = serve
+    try:
+        yield
+    finally:
+        module.serve = plain
+
+
 def open_server(port: int = 0) -> tuple[ViserServer, str]:
     """Start a server on the loopback address, at any free port for 0; return it and its address with the token.
 
@@ -55,20 +73,9 @@ def open_server(port: int = 0) -> tuple[ViserServer, str]:
         import viser
     except ImportError:
         raise MissingPartError("the viewer needs viser; install it with pip install -e '.[web]'") from None
-    from websockets.asyncio import server as module
-
-    gate, plain = Gate(secrets.token_urlsafe(16)), module.serve
-
-    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
-        gate.inner = process_request
-        return plain(*arguments, process_request=gate, **options)
-
-    module.serve = serve  # viser has no setting for what checks its requests
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            server = viser.ViserServer(host=LOOPBACK, port=port, label="rbfmuscle", verbose=False)
-    finally:
-        module.serve = plain
+    gate = Gate(secrets.token_urlsafe(16))
+    with _every_request_through(gate), contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host=LOOPBACK, port=port, label="rbfmuscle", verbose=False)
     if gate.inner is None:
         server.stop()
         raise MissingPartError(f"requests to viser {viser.__version__} cannot be checked; install viser 1.1")

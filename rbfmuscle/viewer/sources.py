@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from rbfmuscle.scene.activation.curve import STEP
 from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.live import LiveSession
+from rbfmuscle.simulation.live import LiveSession, live_fields
 from rbfmuscle.validation import UsageError
 
 Mesh = tuple[Floats, Integers]
@@ -51,8 +51,17 @@ class Picture(NamedTuple):
 class LiveSource:
     """A scene whose coordinates and activations are set by hand, by its own model or the one named.
 
-    ``choices`` are models, ``body`` (3, 3) is left, posterior and superior, ``bones`` and ``muscles`` are meshes at
-    rest by name, ``motion`` is what the ``controls`` are set to in each frame of the scene's motion.
+    Attributes
+    ----------
+    choices : list of str
+        Models.
+    body : (3, 3) ndarray
+        Left, posterior and superior.
+    bones, muscles : dict of str to (vertices, faces)
+        At rest.
+    controls : dict of str to Control
+    motion : list of dict of str to float
+        What the controls are set to in each frame of the scene's motion.
     """
 
     def __init__(self, scene: Scene, model: str | None = None) -> None:
@@ -68,8 +77,8 @@ class LiveSource:
         held = [{"name": m.name, "attach": [{"bone": a.bone} for a in m.attachments]} for m in scene.muscles]
         groups = muscle_groups({"scene": {"joints": list(map(vars, scene.joints)), "muscles": held}})
         self.colours = muscle_colours(list(self.muscles), groups)
-        self.stride, self._unfinished = math.radians(scene.contact.substep_angle), True
-        self.session = session = LiveSession(scene)
+        self.fields = live_fields(scene)
+        session = LiveSession(scene, fields=self.fields)
         self.controls = {
             name: _coordinate(scene, name, (*limits, session.rest[name]))
             for name, limits in session.limits.items()
@@ -79,12 +88,26 @@ class LiveSource:
             for frame in scene.motion.frames
         ]
 
-    def choose(self, choice: str) -> None:
-        """Begin anew with a model of every muscle, at rest."""
+    def figure(self, choice: str) -> LiveFigure:
+        """A model of every muscle, at rest."""
         scene = self.scene if choice == self.choices[0] else self.scene.with_options(model=choice)
-        self.session = LiveSession(scene, fields=self.session.fields)
-        self.session.use(build_models(scene))
-        self._unfinished = True
+        return LiveFigure(LiveSession(scene, fields=self.fields), build_models(scene))
+
+
+def _coordinate(scene: Scene, name: str, numbers: tuple[float, ...]) -> Control:
+    group, _, label = name.rpartition(".")
+    unit = unit_sign(scene, name).strip()
+    numbers = tuple(round(shown_value(scene, name, number), 9) for number in numbers)
+    return Control(group, f"{label} [{unit}]" if unit else label, *numbers)
+
+
+class LiveFigure:
+    """New models of a session's muscles that follow coordinates set by hand."""
+
+    def __init__(self, session: LiveSession, models: list[Any]) -> None:
+        self.session, self._unfinished = session, True
+        self.stride = math.radians(session.scene.contact.substep_angle)
+        session.use(models)
 
     def set(self, name: str, value: float) -> None:
         """Give a control a new target."""
@@ -113,23 +136,21 @@ class LiveSource:
         frame = self.session.advance(self.stride, surfaces=not coarse)
         self._unfinished = coarse
         surfaces = {n: (s.vertices, s.faces) for n, s in frame.surfaces.items()} or frame.carried
-        depth = {n: s.quantities.get("solver_penetration_max", math.nan) for n, s in frame.surfaces.items()}
+        depths = {n: s.quantities.get("solver_penetration_max") for n, s in frame.surfaces.items()}
         meshes = {m.name: tendon_mesh(m, frame.tendons) for m in self.session.scene.muscles}
         tendons = {name: mesh for name, mesh in meshes.items() if mesh is not None}
-        return Picture(frame.poses, surfaces, tendons, frame.activations, depth, "")
-
-
-def _coordinate(scene: Scene, name: str, numbers: tuple[float, ...]) -> Control:
-    group, _, label = name.rpartition(".")
-    unit = unit_sign(scene, name).strip()
-    numbers = tuple(round(shown_value(scene, name, number), 9) for number in numbers)
-    return Control(group, f"{label} [{unit}]" if unit else label, *numbers)
+        known = {name: depth for name, depth in depths.items() if depth is not None}
+        return Picture(frame.poses, surfaces, tendons, frame.activations, known, "")
 
 
 class SavedSource:
-    """Saved runs by name, scrubbed by frame; attributes as of `LiveSource`. UsageError if one has no surfaces."""
+    """Saved runs of one scene by name, scrubbed by frame; attributes as of `LiveSource`.
 
-    near = True
+    Raises
+    ------
+    UsageError
+        If one holds no surfaces.
+    """
 
     def __init__(self, runs: dict[str, SavedRun]) -> None:
         for saved in runs.values():
@@ -144,10 +165,18 @@ class SavedSource:
         self.motion = [{"frame": float(frame)} for frame in first.frames]
         self.controls = {"frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])}
 
-    def choose(self, choice: str) -> None:
-        """Show a run, at its first frame."""
-        self.saved = self.runs[choice]
-        self.frame, self.pending = self.saved.frames[0], True
+    def figure(self, choice: str) -> SavedFigure:
+        """A run at its first frame."""
+        return SavedFigure(self.runs[choice])
+
+
+class SavedFigure:
+    """A saved run at one of its frames."""
+
+    near = True
+
+    def __init__(self, saved: SavedRun) -> None:
+        self.saved, self.frame, self.pending = saved, saved.frames[0], True
 
     def set(self, name: str, value: float) -> None:
         """Go to the frame nearest to a number."""

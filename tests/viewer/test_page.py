@@ -60,7 +60,8 @@ def tab(page, opened):
 
 
 def arrived(page):
-    return not page.source.pending and not page._resting
+    figure = page.sides[0].figure
+    return figure is not None and not figure.pending and not page._resting
 
 
 def drag(tab, share):
@@ -90,7 +91,7 @@ def changed(one, two):
 
 
 def degrees(page):
-    return float(np.degrees(page.source.session.here["hip.flexion"]))
+    return float(np.degrees(page.sides[0].figure.session.here["hip.flexion"]))
 
 
 def test_page_shows_bones_muscles_and_numbers(tab):
@@ -157,22 +158,35 @@ def test_hidden_muscles_and_cut_leave_less(page, tab):
     wait_for(lambda: changed(before, canvas(tab)) < 0.002, SLOW)
 
 
-def test_another_model_is_shown_and_plotted(page, tab):
-    page.panel.model.value = "xpbd"
-    page.panel.quantity.value = "volume error [%]"
+def test_second_model_follows_the_same_slider(page, tab):
+    before = canvas(tab)
+    page.panel.models[1].value = "xpbd"
+    wait_for(lambda: "pbd / xpbd" in tab.text(), SLOW)
+    assert changed(before, canvas(tab)) > 0.02
+    page.panel.colour.value = "distance"
+    page.panel.quantity.value = "mean of the colour"
     page.panel.controls["hip.flexion"].value = 6.0
-    wait_for(lambda: "xpbd" in tab.text() and abs(degrees(page) - 6.0) < 1e-6, SLOW)
-    assert {model.options.method for model in page.source.session.models} == {"xpbd"}
+
+    def both_there():
+        here = [side.figure.session.here["hip.flexion"] for side in page.sides]
+        return np.abs(np.degrees(here) - 6.0).max() < 1e-6
+
+    wait_for(both_there, SLOW)
     wait_for(lambda: len(page.panel._history) > 2, SLOW)
-    assert 0.0 < np.abs(page.panel._history[-1]).max() < 5.0
-    page.panel.model.value, page.panel.quantity.value = "pbd", "none"
-    wait_for(lambda: page._model == "pbd", SLOW)
+    assert 0.0 < max(page.panel._history[-1]) < 5.0
+    for element, value in (
+        (page.panel.models[1], "none"),
+        (page.panel.colour, "group"),
+        (page.panel.quantity, "none"),
+    ):
+        element.value = value
+    wait_for(lambda: page.sides[1].figure is None, SLOW)
 
 
 def test_buttons_turn_the_camera_of_their_own_browser(page, tab):
     client = max(page.server.get_clients().values(), key=lambda client: client.client_id)
     # A click while the page is drawn anew may be lost.
-    wait_for(lambda: tab.click("Show") or "Cut along" in tab.text(), SLOW)
+    wait_for(lambda: tab.click("Show") or "Beside it" in tab.text(), SLOW)
     tab.click("Top")
     wait_for(lambda: client.camera.position[2] - client.camera.look_at[2] > 0.5, SLOW)
     ahead = client.camera.position - client.camera.look_at
@@ -180,7 +194,7 @@ def test_buttons_turn_the_camera_of_their_own_browser(page, tab):
 
 
 def test_solve_error_sets_controls_to_rest_and_says_so(page, tab):
-    model = page.source.session.models[0]
+    model = page.sides[0].figure.session.models[0]
     healthy = model.solve
 
     def broken(contacts):
@@ -255,6 +269,6 @@ def test_notebook_shows_a_scene_and_a_run():
     try:
         assert f'<iframe src="{shown.address}"' in shown._repr_html_()
         names = {muscle.name for muscle in rm.phantom_scene().muscles}
-        wait_for(lambda: set(shown.shapes.numbers) == names, SLOW)
+        wait_for(lambda: set(shown.sides[0].numbers) == names, SLOW)
     finally:
         shown.close()

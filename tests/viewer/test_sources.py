@@ -10,24 +10,22 @@ from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import stream_run
 from rbfmuscle.simulation.live import LiveSession
 from rbfmuscle.validation import UsageError
-from rbfmuscle.viewer.shapes import vertex_values
-from rbfmuscle.viewer.sources import LiveSource, Picture, SavedSource
+from rbfmuscle.viewer.colours import vertex_values
+from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource
 
 
 @pytest.fixture
-def live():
+def figure():
     scene, fields = toy_scene.hinged_scene([0, 20, 40])
-    made = object.__new__(LiveSource)  # toy muscles are no model that a scene may name
-    made.stride, made._unfinished = np.radians(2.0), True
-    made.session = LiveSession(scene, fields=fields)
-    made.session.use([toy_scene.ToyMuscle(m, scene) for m in scene.muscles])
-    return made
+    return LiveFigure(
+        LiveSession(scene, fields=fields), [toy_scene.ToyMuscle(m, scene) for m in scene.muscles]
+    )
 
 
-def go(live, *, coarse=False):
+def go(figure, *, coarse=False):
     count, picture = 0, None
-    while live.pending:
-        picture, count = live.advance(coarse=coarse and not live.session.arrived), count + 1
+    while figure.pending:
+        picture, count = figure.advance(coarse=coarse and not figure.session.arrived), count + 1
     return picture, count
 
 
@@ -35,46 +33,46 @@ def strap(picture):
     return picture.surfaces["strap"][0]
 
 
-def test_control_moves_the_muscle_by_sub_steps(live):
-    start, _ = go(live)
-    live.set("hinge.bend", 21.0)
-    assert live.pending
-    picture, count = go(live)
+def test_control_moves_the_muscle_by_sub_steps(figure):
+    start, _ = go(figure)
+    figure.set("hinge.bend", 21.0)
+    assert figure.pending
+    picture, count = go(figure)
     assert count == 11  # two degrees a picture
     assert not np.allclose(strap(picture), strap(start))
-    assert np.degrees(live.session.here["hinge.bend"]) == pytest.approx(21.0)
+    assert np.degrees(figure.session.here["hinge.bend"]) == pytest.approx(21.0)
 
 
-def test_live_equals_a_run(live):
+def test_live_equals_a_run(figure):
     from rbfmuscle.simulation.frame_loop import simulate_frames
 
     scene, fields = toy_scene.hinged_scene([0, 2, 4, 6])
     models = [toy_scene.ToyMuscle(m, scene) for m in scene.muscles]
     run = list(simulate_frames(scene, models, fields=fields))
-    go(live)
-    live.set("hinge.bend", 6.0)
-    picture, _ = go(live)
+    go(figure)
+    figure.set("hinge.bend", 6.0)
+    picture, _ = go(figure)
     np.testing.assert_allclose(strap(picture), run[-1].surfaces["strap"].vertices, atol=1e-9)
 
 
-def test_coarse_pictures_show_the_material_and_end_with_a_full_one(live):
-    go(live)
-    live.set("hinge.bend", 10.0)
-    coarse = live.advance(coarse=True)
-    np.testing.assert_array_equal(strap(coarse), live.session.models[0].material_mesh()[0])
+def test_coarse_pictures_show_the_material_and_end_with_a_full_one(figure):
+    go(figure)
+    figure.set("hinge.bend", 10.0)
+    coarse = figure.advance(coarse=True)
+    np.testing.assert_array_equal(strap(coarse), figure.session.models[0].material_mesh()[0])
     assert coarse.depth == {}  # of the surface, which was not made
-    full, _ = go(live, coarse=True)
+    full, _ = go(figure, coarse=True)
     assert set(full.depth) == {"strap"}
-    assert np.degrees(live.session.here["hinge.bend"]) == pytest.approx(10.0)
+    assert np.degrees(figure.session.here["hinge.bend"]) == pytest.approx(10.0)
 
 
-def test_rest_leads_back_to_the_same_shape(live):
-    start, _ = go(live)
-    live.set("hinge.bend", 10.0)
-    go(live)
-    live.set("hinge.bend", 0.0)
-    live.rest()
-    again, count = go(live)
+def test_rest_leads_back_to_the_same_shape(figure):
+    start, _ = go(figure)
+    figure.set("hinge.bend", 10.0)
+    go(figure)
+    figure.set("hinge.bend", 0.0)
+    figure.rest()
+    again, count = go(figure)
     assert count == 1
     np.testing.assert_array_equal(strap(again), strap(start))
 
@@ -94,7 +92,7 @@ def ball():
 def test_stretch_of_a_ball_that_grew(ball):
     vertices, faces = ball
     now, rest = picture_of(1.2 * vertices, faces), picture_of(vertices, faces)
-    values = vertex_values("stretch", "ball", now, rest, [])
+    values = vertex_values("stretch", "ball", now, rest, [], None)
     np.testing.assert_allclose(values, 0.2, atol=1e-12)
 
 
@@ -105,7 +103,7 @@ def test_depth_in_a_box(ball):
     bone = trimesh.creation.box(extents=(100.0, 100.0, 100.0))
     bone.apply_translation((0.0, 0.0, 58.0))  # its lower face cuts the ball 2 below the top
     picture = picture_of(vertices, faces)
-    values = vertex_values("penetration", "ball", picture, picture, [BoneProbe("bone", bone)])
+    values = vertex_values("penetration", "ball", picture, picture, [BoneProbe("bone", bone)], None)
     np.testing.assert_allclose(values, np.maximum(vertices[:, 2] - 8.0, 0.0), atol=1e-9)
 
 
@@ -120,15 +118,15 @@ def run_folder(tmp_path_factory):
 def test_saved_run_is_scrubbed(run_folder):
     source = SavedSource({"run": SavedRun(run_folder)})
     assert source.motion == [{"frame": 0.0}, {"frame": 1.0}]
-    source.choose("run")
-    first = source.advance()
-    assert not source.pending
-    source.set("frame", 0.9)
-    assert source.pending
-    last = source.advance()
+    figure = source.figure("run")
+    first = figure.advance()
+    assert not figure.pending
+    figure.set("frame", 0.9)
+    assert figure.pending
+    last = figure.advance()
     assert not np.allclose(first.surfaces["extensor"][0], last.surfaces["extensor"][0])
     assert "frame 1" in last.text and set(last.depth) == set(last.surfaces)
-    assert np.abs(vertex_values("stretch", "extensor", last, first, [])).max() > 0.01
+    assert np.abs(vertex_values("stretch", "extensor", last, first, [], None)).max() > 0.01
 
 
 def test_run_without_surfaces_is_refused(tmp_path):
@@ -151,8 +149,8 @@ def test_activation_of_a_muscle_is_set_and_coloured():
     scene.muscles = [scene.muscle("extensor")]
     source = LiveSource(scene.with_options({"activation": 0.0}), "arap-volume")
     assert source.controls["activation extensor"] == ("Activation", "extensor", 0.0, 1.0, 0.0)
-    source.choose("arap-volume")
-    source.set("activation extensor", 0.35)
-    picture, _ = go(source)
-    values = vertex_values("activation", "extensor", picture, picture, [])
+    figure = source.figure("arap-volume")
+    figure.set("activation extensor", 0.35)
+    picture, _ = go(figure)
+    values = vertex_values("activation", "extensor", picture, picture, [], None)
     np.testing.assert_allclose(values, 0.35)

@@ -1,0 +1,128 @@
+"""One of the models that stand beside each other: its bones and muscles in the browser's scene."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rbfmuscle.geometry.coarse import clustered
+from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.metrics.penetration import BoneProbe
+from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, linear_rgb
+from rbfmuscle.output.tubes import tendon_name
+from rbfmuscle.viewer.colours import COLOURINGS, Look, shades, vertex_values
+from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
+
+BONE_TRIANGLES = 6000  # Software drawing pays for each of them in every picture.
+
+
+class Side:
+    """A model, or a run, under a node of a viser server; in metres, as the browser shows nothing far away.
+
+    Attributes
+    ----------
+    choice : str
+        Which of the source's models or runs; "none" for none.
+    figure : LiveFigure, SavedFigure or None
+        The one chosen.
+    picture, rest : Picture or None
+        What is shown of it, and what it began with.
+    numbers : dict of str to dict of str to float
+        Volume error [%], depth in bones and mean of the coloured quantity of each muscle, NaN where not known.
+    """
+
+    def __init__(self, server: Any, root: str, source: LiveSource | SavedSource) -> None:
+        self.server, self.root, self.source, self.choice = server, root, source, "none"
+        self.figure: Any = None
+        self.picture: Any = None
+        self.rest: Any = None
+        self.numbers: dict[str, dict[str, float]] = {}
+        self.frame = server.scene.add_frame(root, show_axes=False, visible=False)
+        self._bones = {
+            name: clustered(mesh[0], mesh[1], BONE_TRIANGLES) for name, mesh in source.bones.items()
+        }
+        self._volumes = {name: mesh_volume(*mesh) for name, mesh in source.muscles.items()}
+        self._nodes: dict[str, Any] = {}
+        self._painted: list[Any] = []
+
+    def choose(self, choice: str) -> bool:
+        """Show another model or run, or none; returns whether it is another."""
+        if choice == self.choice:
+            return False
+        figure = None if choice == "none" else self.source.figure(choice)
+        picture = None if figure is None else figure.advance()
+        self.choice, self.figure = choice, figure
+        self.rest = self.picture = picture
+        self.frame.visible = figure is not None
+        return True
+
+    def draw(self, look: Look, probes: list[BoneProbe], other: Picture | None) -> None:
+        """Show the picture; ``other`` is that of the model beside this one."""
+        from viser.transforms import SO3
+
+        for name, (vertices, faces) in self._bones.items():
+            pose = self.picture.poses[name]
+            _, kept = self._part((vertices @ pose[:3, :3].T + pose[:3, 3], faces), look.cut)
+            self._show(name, self._part((vertices, kept), None), BONE_COLOUR, visible=name not in look.hidden)
+            node = self._nodes[name]
+            node.position = pose[:3, 3] * (0.001 / self.source.millimetre)
+            node.wxyz = SO3.from_matrix(pose[:3, :3]).wxyz
+        painted, colouring = [], COLOURINGS[look.colour]
+        for name, mesh in self.picture.surfaces.items():
+            values = vertex_values(look.colour, name, self.picture, self.rest, probes, other)
+            error = 100.0 * (mesh_volume(*mesh) / self._volumes[name] - 1.0)
+            depth = self.picture.depth.get(name, math.nan)
+            self.numbers[name] = {"volume": error, "depth": depth, "mean": float(values.mean())}
+            part, shown = self._part(mesh, look.cut), name not in look.hidden
+            self._show(name, part, self.source.colours[name], visible=shown and colouring is None)
+            if shown and colouring is not None:
+                painted.append((*part, linear_rgb(shades(colouring, values, self.source.millimetre))))
+        for name, mesh in self.picture.tendons.items():
+            part = self._part(mesh, look.cut)
+            self._show(tendon_name(name), part, TENDON_COLOUR, visible=name not in look.hidden)
+        self._paint(painted)
+
+    def _part(self, mesh: Mesh, cut: tuple[int, float] | None) -> Mesh:
+        """The part of a mesh that is shown, in metres."""
+        vertices, faces = mesh
+        if cut is not None:
+            faces = faces[(vertices[:, cut[0]] <= cut[1])[faces].all(axis=1)]
+        return vertices * (0.001 / self.source.millimetre), faces
+
+    def _show(self, name: str, mesh: Mesh, colour: str, *, visible: bool) -> None:
+        """Show a mesh in one colour."""
+        if name not in self._nodes:
+            look: dict[str, Any] = {"color": tuple(bytes.fromhex(colour[1:])), "side": "double"}
+            self._nodes[name] = self.server.scene.add_mesh_simple(f"{self.root}/{name}", *mesh, **look)
+        node = self._nodes[name]
+        node.visible = visible
+        if visible:
+            node.vertices, node.faces = mesh
+
+    def _paint(self, painted: list[Any]) -> None:
+        """Show meshes (vertices, faces, colours) as glTF, the only form in which viser takes vertices' colours.
+
+        The browser needs a moment to read it, so what was shown before stays until the next picture.
+        """
+        import trimesh
+
+        while len(self._painted) > bool(painted):
+            self._painted.pop(0).remove()
+        if painted:
+            counts = [len(vertices) for vertices, _, _ in painted]
+            vertices, faces, colours = (np.concatenate(parts) for parts in zip(*painted))
+            starts = np.repeat(np.cumsum([0, *counts[:-1]]), [len(part) for _, part, _ in painted])
+            mesh = trimesh.Trimesh(vertices, faces + starts[:, None], vertex_colors=colours, process=False)
+            free = "a" if self._painted and self._painted[0].name.endswith("b") else "b"
+            glb = mesh.export(file_type="glb")
+            self._painted.append(self.server.scene.add_glb(f"{self.root}/painted_{free}", glb))
+
+    def points(self) -> list[Any]:
+        """Vertices (n, 3) of bones and muscles, where they are shown; at rest before the first picture."""
+        if self.picture is None:
+            return [vertices for vertices, _ in (self.source.bones | self.source.muscles).values()]
+        poses = [(vertices, self.picture.poses[name]) for name, (vertices, _) in self._bones.items()]
+        bones = [vertices @ pose[:3, :3].T + pose[:3, 3] for vertices, pose in poses]
+        return bones + [vertices for vertices, _ in self.picture.surfaces.values()]
