@@ -235,10 +235,8 @@ class TestMomentArm:
     def test_turning_point_takes_the_way_there(self):
         assert self.arms([0.2, 0.3, 0.2], [10, 11, 10.4])[1] == pytest.approx(-10)
 
-    def test_two_coordinates_at_once_give_none(self):
+    def test_legs_of_a_path_have_their_coordinate_and_two_at_once_none(self):
         assert moment_arms([{"a": 0.0, "b": 0.0}, {"a": 0.1, "b": 0.1}], [1.0, 1.2]) == [{}, {}]
-
-    def test_each_leg_of_a_path_has_its_coordinate(self):
         found = moment_arms([{"a": 0.0}, {"a": 0.1}, {"a": 0.1, "b": 0.2}], [1.0, 1.1, 1.5])
         assert found[1] == {"a": pytest.approx(-1.0), "b": pytest.approx(-2.0)}
 
