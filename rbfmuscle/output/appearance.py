@@ -26,13 +26,10 @@ VIEWS: dict[str, tuple[float, float, float]] = {
 
 
 def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
-    """Group of each muscle by the joints that it crosses.
+    """Group of each muscle in what ``run.json`` holds, by the joints that it crosses.
 
-    Parameters
-    ----------
-    info : dict
-        What ``run.json`` holds. Joints that carry a single bone without another joint (a patella, a tendon's end) are
-        left out; a muscle that crosses no other belongs to the bone that it lies along.
+    Joints that carry a single bone without another joint (a patella, a tendon's end) are left out; a muscle that
+    crosses no other belongs to the bone that it lies along.
     """
     joints = info["scene"].get("joints", [])
     above = {joint["child"]: joint for joint in joints}
@@ -59,14 +56,7 @@ def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
 
 
 def muscle_colours(names: Sequence[str], groups: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Dict of muscle name to its colour in pictures and plots; of many muscles a hue for each group.
-
-    Parameters
-    ----------
-    names : sequence of str
-    groups : dict of str to str, optional
-        Of each muscle.
-    """
+    """Dict of muscle name to its colour in pictures and plots; of many muscles a hue for each of their groups."""
     if groups is None or len(names) <= len(MUSCLE_COLOURS):
         return {name: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, name in enumerate(names)}
     kinds = list(dict.fromkeys(groups[name] for name in names))
@@ -111,12 +101,8 @@ def view_axes(direction: Sequence[float] | Floats, body: Floats) -> Floats:
 def motion_direction(poses: Sequence[Mapping[str, Floats]], body: Floats) -> Floats:
     """Direction (3,) from which the motion is seen in its plane: along the axis about which a bone turns most.
 
-    Parameters
-    ----------
-    poses : sequence of dict of str to (4, 4) ndarray
-        Of each frame, by bone. From the right where no bone turns, or about an axis that is nearly upright.
-    body : (3, 3) ndarray
-        Left, posterior and superior, along which the direction is given.
+    ``poses`` (4, 4) are those of each frame by bone. The direction is along ``body`` (3, 3): left, posterior and
+    superior; it is from the right where no bone turns, or about an axis that is nearly upright.
     """
     from scipy.spatial.transform import Rotation
 

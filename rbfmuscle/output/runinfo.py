@@ -24,19 +24,11 @@ _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "v
 def build_info(
     scene: Scene, started: datetime, neighbours: Neighbours, summary: dict[str, Any], **facts: Any
 ) -> dict[str, Any]:
-    """Assemble ``run.json``.
+    """Assemble ``run.json``; ``summary`` is from `Summary.table`.
 
-    Parameters
-    ----------
-    scene : Scene
-    started : datetime
-    neighbours : Neighbours
-    summary : dict
-        From `Summary.table`.
-    **facts
-        As they are: ``status`` ("running", "complete", "interrupted" or "failed"), ``message`` (why it did not
-        complete), ``options`` of the caller, ``times`` of the parts of the run [s], ``limits``, ``verdict``, ``beyond``
-        (muscle, quantity, worst value, limit, frame) and ``frames`` (`frame_facts`).
+    Other facts are kept as they are: ``status`` ("running", "complete", "interrupted" or "failed"), ``message`` (why it
+    did not complete), ``options`` of the caller, ``times`` of the parts of the run [s], ``limits``, ``verdict``,
+    ``beyond`` (muscle, quantity, worst value, limit, frame) and ``frames`` (`frame_facts`).
     """
     return {
         "format": FORMAT,

@@ -28,33 +28,12 @@ MOST_SHOWN = 4
 
 
 class SavedRun:
-    """A run in a folder; surfaces are read one by one.
+    """A run in a folder, UsageError if it holds none; surfaces are read one by one.
 
-    Of a run that was killed, or still goes on, the frames up to the last whole one are found on the disk.
-
-    Parameters
-    ----------
-    directory : path
-
-    Raises
-    ------
-    UsageError
-        If the folder holds no run.
-
-    Attributes
-    ----------
-    info : dict
-        ``run.json``.
-    frames : list of int
-        Frames that were written.
-    muscles, bones : list of str
-    groups, colours : dict of str to str
-        Of the muscles, from `muscle_groups` and `muscle_colours`.
-    tendons : list of str
-        Names of the meshes of tendons, which `surface` takes as it takes muscles.
-    units : str
-    body : (3, 3) ndarray
-        Left, posterior and superior; x, y and z where they are not known.
+    Of a run that was killed, or still goes on, the frames up to the last whole one are found on the disk. ``info`` is
+    ``run.json``, ``frames`` are the numbers of those that were written. ``tendons`` are names of meshes, which
+    `surface` takes as it takes muscles; ``groups`` and ``colours`` are the muscles'. ``body`` (3, 3) is left,
+    posterior and superior; x, y and z where they are not known.
     """
 
     def __init__(self, directory: str | Path) -> None:

@@ -25,11 +25,7 @@ def tendon_name(muscle: str) -> str:
 def tendon_mesh(muscle: Muscle, tendons: Mapping[str, TendonLine]) -> tuple[Floats, Integers] | None:
     """Vertices (n, 3) and outward faces (m, 3) of all tendons of a muscle; None where it has none.
 
-    Parameters
-    ----------
-    muscle : Muscle
-    tendons : mapping of str to TendonLine
-        By end, as a frame holds them. The faces are the same in all frames.
+    ``tendons`` are by end, as a frame holds them. The faces are the same in all frames.
     """
     tubes = [_tube(tendons[end.name]) for end in muscle.tendons if end.name in tendons]
     if not tubes:

@@ -55,17 +55,8 @@ def check_writable(directory: str | Path) -> None:
 class RunWriter:
     """Streams frames to a folder; nothing of a frame is kept in memory.
 
-    Parameters
-    ----------
-    directory : path
-        Made where it is missing. A run that lies there already is replaced.
-    scene : Scene
-        Its ``output`` table says which parts are written.
-
-    Raises
-    ------
-    UsageError
-        If the folder cannot be written to.
+    The folder is made where it is missing, UsageError where that fails; a run that lies there already is replaced. The
+    scene's ``output`` table says which parts are written.
     """
 
     def __init__(self, directory: str | Path, scene: Scene) -> None:

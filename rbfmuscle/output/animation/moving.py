@@ -50,25 +50,10 @@ class MovingPart:
 
 @dataclass(frozen=True)
 class MovingRun:
-    """All muscles and bones of a run over time.
+    """All muscles and bones of a run over time; ``name`` is the scene's, all lengths are in ``unit``: m, cm or mm.
 
-    Attributes
-    ----------
-    name : str
-        Of the scene.
-    unit : {"m", "cm", "mm"}
-        Of all lengths here.
-    times : (T,) ndarray
-        Of the frames [s].
-    timed : bool
-        Whether these are the motion's own.
-    captions : list of str
-        Of each frame.
-    muscles, bones : list of MovingPart
-    body : (3, 3) ndarray
-        Left, posterior and superior.
-    direction : (3,) ndarray
-        From which the motion is seen in its plane, along the body's axes.
+    ``times`` (T,) of the frames [s] are the motion's own where ``timed``, ``captions`` those of the frames. ``body``
+    (3, 3) is left, posterior and superior; the motion is seen in its plane from ``direction`` (3,) along these.
     """
 
     name: str

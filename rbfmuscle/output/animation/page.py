@@ -30,12 +30,9 @@ def scene_file(name: str) -> str:
 
 
 def pack_runs(runs: Mapping[str, MovingRun]) -> str:
-    """JSON of one or several runs of the same frames and bones, which ``scene.js`` shows beside each other.
+    """JSON of one or several runs of the same frames and bones, by what stands above each, for ``scene.js``.
 
-    Parameters
-    ----------
-    runs : dict of str to MovingRun
-        By what stands above each. They are first seen in the plane of the motion.
+    They are shown beside each other, first in the plane of the motion.
     """
     first = next(iter(runs.values()))
     packer = _Packer(runs)
