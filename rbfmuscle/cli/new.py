@@ -28,7 +28,8 @@ def new(
     units
         Unit of the meshes, by the size of the bones where it is left out; label volumes become millimetres.
     labels
-        Names of a segmentation's labels: JSON, CSV, TSV or ITK-SNAP's descriptions.
+        Names of a segmentation's labels: JSON, CSV, TSV or ITK-SNAP's descriptions, or a known table, as
+        totalsegmentator, musclemap-thigh.
     output
         Scene file to write, scene.toml beside the meshes by default.
     force

@@ -97,6 +97,7 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
     """
     try:
         _check_runs(guess, path)
+        _write_coarse(guess, path.parent)
         for muscle in guess.muscles:
             for hold in muscle.holds:
                 file = path.parent / hold_file(muscle, hold)
@@ -113,6 +114,16 @@ def write_scene(guess: SceneGuess, path: Path) -> Scene:
                 _check_runs(guess, path)
     except OSError as error:
         raise UsageError(f"cannot write {path}: {error.strerror}; choose another --output") from None
+
+
+def _write_coarse(guess, folder):
+    """Meshes that were made coarser, beside the scene."""
+    for part in (*guess.parts.bones, *guess.parts.muscles):
+        if part.coarse:
+            (folder / "coarse").mkdir(parents=True, exist_ok=True)
+            part.file = f"coarse/{part.name}.ply"
+            part.mesh.export(folder / part.file)
+            part.read.vertex_map = np.arange(len(part.points))
 
 
 def _check_runs(guess, path):

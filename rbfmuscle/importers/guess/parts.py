@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.importers.guess.names import MuscleFacts, name_facts
 from rbfmuscle.scene.check import LARGEST_MM, SMALLEST_MM
-from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_mesh
+from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_arrays
 from rbfmuscle.validation import MeshError, UsageError
 
 # Folders below the one that is given, as people sort their meshes.
@@ -24,8 +25,8 @@ MILLIMETRE = {"mm": 1.0, "cm": 0.1, "m": 0.001}
 # Length of a bone [mm] by its class, and of the largest one where none is known, from child to large adult.
 LENGTHS = {"femur": (200, 600), "tibia": (150, 500), "humerus": (120, 420), "pelvis": (100, 450)}
 LARGEST_BONE = (90, 900)
-# Fits take their points from no fewer triangles.
-FEWEST = 3000
+# Meshes of more triangles are made coarser, to about as many; fits take their points from no fewer.
+MOST_TRIANGLES, FEWEST = 400_000, 3000
 
 
 @dataclass(eq=False)
@@ -44,6 +45,8 @@ class Part:
     doubt : str
         What speaks for a bone or a muscle where its name does not; empty where it does.
     facts : MuscleFacts or None
+    coarse : bool
+        The mesh was made coarser than its file.
     frame : Frame or None
         Directions of a femur.
     """
@@ -55,6 +58,7 @@ class Part:
     side: str = ""
     doubt: str = ""
     facts: MuscleFacts | None = None
+    coarse: bool = False
     frame: Any = None
 
     @property
@@ -74,7 +78,7 @@ class Part:
 
     @cached_property
     def faces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Middles, normals and areas of the triangles; where they are few they are divided."""
+        """Middles, normals and areas of the triangles; those of a coarse mesh are divided."""
         mesh = self.mesh
         while len(mesh.faces) < FEWEST:
             mesh = mesh.subdivide()
@@ -91,7 +95,7 @@ class Parts:
     """What is in a folder, and the unit of its lengths.
 
     ``unusable`` gives reasons by file, ``left_out`` names those that are no muscles;
-    ``notes`` name what was left out or misspelt, and the unit where it was guessed.
+    ``notes`` name what was left out, misspelt or made coarser, and the unit where it was guessed.
     """
 
     units: str = ""
@@ -120,7 +124,7 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
             continue
         tissue = facts.tissue if path.parent == folder else FOLDERS[path.parent.name.lower()]
         try:
-            part = _read_part(path, base, names, facts, closed=tissue == "muscle")
+            part = _read_part(path, base, names, facts, found.notes, closed=tissue == "muscle")
         except MeshError as error:
             found.unusable[path.name] = str(error).removeprefix(f"{path}: ")
             found.left_out += [path.stem] if tissue != "muscle" else []
@@ -169,14 +173,19 @@ def _find_meshes(folder):
     return [path for path in files if path.suffix.lower() in MESH_SUFFIXES]
 
 
-def _read_part(path, base, names, facts, *, closed):
+def _read_part(path, base, names, facts, notes, *, closed):
     name = re.sub(r"[^a-z0-9_-]+", "_", path.stem.lower()).strip("_") or "part"
     while name in names:
         name += "_2"
     names.add(name)
-    read = read_mesh(path, may_be_open=not closed)
+    vertices, faces = read_arrays(path)
+    coarse = len(faces) > MOST_TRIANGLES and not closed  # cells of thin walls may open a surface
+    if coarse:
+        notes.append(f"{path.name}: {len(faces)} triangles, made coarser to about {MOST_TRIANGLES}")
+        vertices, faces = clustered(vertices, faces, MOST_TRIANGLES)
+    read = prepare_mesh(vertices, faces, place=str(path), name=path.stem, may_be_open=not closed)
     file = os.path.relpath(path, base).replace(os.sep, "/")
-    return Part(name, file, read, facts.bone, facts.side, facts=facts.muscle)
+    return Part(name, file, read, facts.bone, facts.side, facts=facts.muscle, coarse=coarse)
 
 
 def _guess_units(found):

@@ -6,6 +6,7 @@ order and the signs of the voxels' axes; NRRD files in LPS are turned.
 
 import json
 import re
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -186,12 +187,16 @@ def _check_affine(affine, path):
 
 
 def read_names(path: Path) -> dict[int, str]:
-    """Names of labels from JSON, or from lines as CSV, TSV or ITK-SNAP write them."""
+    """Names of labels from JSON, from lines as CSV, TSV or ITK-SNAP write them, or from a known table by its name."""
+    tables = tomllib.loads((Path(__file__).parent / "tables.toml").read_text(encoding="utf-8"))
+    if not path.exists() and path.name in tables:
+        return dict(enumerate(tables[path.name].split(), start=1))
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
         names = _json_names(json.loads(text)) if path.suffix.lower() == ".json" else _row_names(text)
     except OSError as error:
-        raise UsageError(f"cannot read {path}: {error.strerror}; give a table of names") from None
+        known = ", ".join(tables)
+        raise UsageError(f"cannot read {path}: {error.strerror}; known tables: {known}") from None
     except (ValueError, RecursionError):
         raise UsageError(f"{path} is no JSON") from None
     if not names:
