@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from rbfmuscle.experiments.kernel_study import study_kernels as study_kernels
     from rbfmuscle.experiments.wanted_error import reach_error as reach_error
     from rbfmuscle.implicit.field import RBFField as RBFField
+    from rbfmuscle.importers.guess.orientation import orient_scene as orient_scene
     from rbfmuscle.muscle.muscle import RBFMuscle as RBFMuscle
+    from rbfmuscle.report.render import draw_scene as draw_scene
+    from rbfmuscle.report.render import figure_html as figure_html
     from rbfmuscle.run import Run as Run
     from rbfmuscle.run import simulate as simulate
     from rbfmuscle.scene.phantom import phantom_scene as phantom_scene
@@ -52,7 +55,12 @@ _HOME = {
     **dict.fromkeys(_ERRORS, "rbfmuscle.validation"),
 }
 # For modules that may not import it themselves.
-_INNER = {"Page": "rbfmuscle.viewer.page"}
+_INNER = {
+    "Page": "rbfmuscle.viewer.page",
+    "draw_scene": "rbfmuscle.report.render",
+    "figure_html": "rbfmuscle.report.render",
+    "orient_scene": "rbfmuscle.importers.guess.orientation",
+}
 
 __all__ = [*_HOME, "__version__"]
 

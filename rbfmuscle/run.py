@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import html
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -347,6 +348,13 @@ class Run:
 
     def __repr__(self) -> str:
         return f"<Run of {self.info['scene']['name']!r}: {len(self)} frames, {', '.join(self.muscles)}>"
+
+    def _repr_html_(self) -> str:
+        from rbfmuscle.report.render import figure_html, render_run
+
+        if not self.saved.has_surfaces():
+            return html.escape(repr(self))
+        return figure_html(lambda file: render_run(self.saved.directory, file), f"{self!r} {self.verdict}")
 
 
 class MuscleRun:

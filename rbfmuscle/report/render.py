@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import base64
+import html
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
 USUAL_VIEWS, _MOST_CHIPS, _AREA = ("front", "right", "back"), 8, 220_000
 # Of pictures of scenes: pixels of a view, the views, how pale bones are.
 _SCENE_SIZE, _SCENE_SIDES, _PALE = (480, 860), ("front", "right", "back", "left"), 0.72
+_SMALL = 900, 600  # pixels of a picture in a notebook, at most
 _MUSCLE, _OPACITY, _AXIS = "#9a8f8f", 0.12, "#0057d9"
 
 
@@ -157,6 +161,21 @@ def draw_scene(scene: Scene, path: str | Path) -> None:
     labelled(np.concatenate([np.asarray(image) for image in images], axis=1), text, _SCENE_SIDES, chips).save(
         path
     )
+
+
+def figure_html(draw: Callable[[Path], None], caption: str) -> str:
+    """HTML of a picture that a function writes to a PNG file, made small, and its caption."""
+    from PIL import Image
+
+    with tempfile.TemporaryDirectory() as folder:
+        file, small = Path(folder) / "picture.png", Path(folder) / "picture.webp"
+        draw(file)
+        with Image.open(file) as image:
+            image.thumbnail(_SMALL)
+            image.save(small, quality=80)
+        data = base64.b64encode(small.read_bytes()).decode()
+    text = html.escape(caption)
+    return f'<figure><img alt="{text}" src="data:image/webp;base64,{data}"><figcaption>{text}</figcaption></figure>'
 
 
 def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:

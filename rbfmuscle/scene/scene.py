@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from typing import TYPE_CHECKING
 
 from rbfmuscle.scene import build
@@ -44,6 +45,14 @@ class Scene(SceneData):
     check = check_scene
     with_options = change_scene
     resolved = describe_scene
+
+    def _repr_html_(self) -> str:
+        import rbfmuscle
+
+        if not self.bones:
+            return html.escape(repr(self))
+        oriented = rbfmuscle.orient_scene(self.copy())
+        return rbfmuscle.figure_html(lambda file: rbfmuscle.draw_scene(oriented, file), repr(self))
 
     def show(self, *, model: str | None = None) -> rbfmuscle.Page:
         """Show the scene in a browser or a notebook, to be moved by hand; see `rbfmuscle.show`."""

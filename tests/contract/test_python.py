@@ -105,6 +105,13 @@ def test_plot_shows_every_value(run):
         run.plot("lenght")
 
 
+def test_notebooks_show_a_small_picture(run, loaded):
+    for shown in (run.scene, run, loaded):
+        html = shown._repr_html_()
+        assert html.startswith("<figure><img ") and len(html) < 100_000 and "abductor" in html
+    assert "no muscles" in rm.Scene("bare")._repr_html_()
+
+
 def test_setting_without_its_table_is_named_with_it():
     with pytest.raises(rm.UsageError, match=r"centres: unknown setting, did you mean 'model\.centres'\?"):
         rm.simulate("phantom", settings={"centres": 300})

@@ -178,7 +178,7 @@ def test_a_notebook_shows_a_run_with_tendons_that_are_left_out_of_its_files_on_r
     run.save(tmp_path, pictures=False)
     assert not SavedRun(tmp_path).tendons and not list(tmp_path.glob("surfaces/*tendon*"))
     for shown in (run, rm.Run.load(tmp_path)):
-        assert "data:image/png;base64," in shown._repr_html_()
+        assert "data:image/webp;base64," in shown._repr_html_()
 
 
 def test_a_belly_between_two_tendons_keeps_both():
