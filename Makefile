@@ -7,9 +7,10 @@ STAMP := $(VENV)/.installed
 .PHONY: demo test portability fuzz test-fast test-nojit coverage mutants references check bench figures docs release-check clean
 
 $(STAMP): pyproject.toml
+	@echo "Installing into $(VENV), about a minute."
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --quiet -e ".[dev]"
+	$(BIN)/python -m pip install --quiet --quiet -e ".[dev]" --config-settings editable_mode=compat
 	touch $(STAMP)
 
 demo: $(STAMP)
@@ -17,7 +18,7 @@ demo: $(STAMP)
 	$(BIN)/rbfmuscle demo --model rbf -o demo_output/rbf
 	$(BIN)/rbfmuscle demo --model pbd -o demo_output/pbd
 	@echo "Reports: demo_output/rbf/report.html and demo_output/pbd/report.html"
-	@echo "Next: $(BIN)/rbfmuscle new examples/meshes --units mm"
+	@echo "Next: $(BIN)/rbfmuscle new examples/meshes"
 
 # A worker for each core (WORKERS=0 for none, as plain pytest has it); whoever is done takes tests from the others.
 WORKERS ?= auto

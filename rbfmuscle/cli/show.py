@@ -41,7 +41,7 @@ def export(
         chosen = parse_slice(frames) if frames is not None else None
         written = export_run(directory, formats, output=output, units=units, frames=chosen)
     folders = sorted({str(path.parent) for path in written})
-    print(f"{len(written)} file{'s'[: len(written) != 1]} in {', '.join(folders)}")
+    print(f"{len(written)} files in {', '.join(folders)}" if len(written) > 1 else written[0])
 
 
 def render(

@@ -45,6 +45,10 @@ MEASURES = {
     "penetration_max": Measure("surface in a bone", "length", LAW, 0.02, "deepest surface vertex in a bone"),
     "bone_penetration_max": Measure("bone in the muscle", "length", LAW, 0.02, "deepest bone vertex in it"),
     "solver_penetration_max": Measure("before the cut", "length", LAW, 0.02, "model in a bone by then"),
+    "initial_overlap": Measure(
+        "overlap left at rest", "length", LAW, 0.02, "of muscle and bones before the motion"
+    ),
+    "slack": Measure("bowing", "1", LAW, 0.005, "centreline over shortest path", 1.0),
     "components": Measure("pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"),
     "euler": Measure("Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle", 2.0),
     "self_crossings": Measure("self-crossings", "1", LAW, 0.0, "triangles that cross others of the surface"),
@@ -163,6 +167,12 @@ def best_models(results: dict[str, Any], quantity: str, units: str) -> list[str]
     return [name for name, value in values.items() if value <= limit]
 
 
+def _deepened(values: dict[str, float]) -> float:
+    """How deep a muscle is in a bone, or a bone in it, beyond what the surface has at rest."""
+    surface = values.get("penetration_max", 0.0) - values.get("initial_overlap", 0.0)
+    return max(surface, values.get("bone_penetration_max", 0.0))
+
+
 def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str:
     """One sentence: how the first model keeps out of bones at which price, and how near another comes at which price.
 
@@ -170,10 +180,7 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
     """
     first, *others = results
     whole = {name: found[ALL] for name, found in results.items()}
-    depth = {
-        name: max(v.get("penetration_max", 0.0), v.get("bone_penetration_max", 0.0))
-        for name, v in whole.items()
-    }
+    depth = {name: max(map(_deepened, found.values())) for name, found in results.items()}
     verb = "keeps out of" if depth[first] <= KEPT_OUT / MM_PER_UNIT[units] else "stands in"
     text = f"{labels[first]} {verb} bones ({depth[first]:.2g} {units})"
     timed = [name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]]

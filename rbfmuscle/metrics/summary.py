@@ -30,18 +30,21 @@ class Limit(NamedTuple):
 
 _SMALLER_STEPS = "lower contact.substep_angle"
 _MORE_CENTRES = "raise model.centres"
+_LOOK = "draw that frame: rbfmuscle render RUN --frame FRAME -o frame.png"
 _JOINT = "correct the joint's centre, axes or range"
 LIMITS = {
     "volume_error": Limit(1e-9, "volume error", "let the model settle: raise its iterations or sweeps"),
     "penetration_max": Limit(0.1, "surface in a bone", _SMALLER_STEPS),
     "bone_penetration_max": Limit(0.3, "bone in the muscle", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"),
     "initial_overlap": Limit(0.3, "overlap left at rest", "move muscle or bone apart: rbfmuscle check SCENE"),
-    "components": Limit(1.0, "pieces", f"look at it with rbfmuscle view; {_MORE_CENTRES}"),
-    "euler": Limit(2.0, "Euler characteristic", f"look at it with rbfmuscle view; {_MORE_CENTRES}"),
-    "self_crossings": Limit(0.0, "self-crossing triangles", _SMALLER_STEPS),
+    "components": Limit(1.0, "pieces", f"{_LOOK}; {_MORE_CENTRES}"),
+    "euler": Limit(2.0, "Euler characteristic", f"{_LOOK}; {_MORE_CENTRES}"),
+    "self_crossings": Limit(
+        0.0, "self-crossing triangles", "raise model.iterations, or take pbd-converged or rbf"
+    ),
     "unfitted_fraction": Limit(0.999, "surface shown without a fit", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"),
     "flicker": Limit(0.5, "flicker", _SMALLER_STEPS),
-    "slack": Limit(1.03, "centreline over shortest path", "look at that frame with rbfmuscle view"),
+    "slack": Limit(1.03, "centreline over shortest path", _LOOK),
     "tunnelled": Limit(0.0, "points beyond a bone", _SMALLER_STEPS),
     "rest_error_rms": Limit(0.6, "rest error", _MORE_CENTRES),
     "end_gap": Limit(25.0, "end away from its bone", "correct the attachment, or give it a tendon"),
@@ -229,11 +232,19 @@ def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequen
     named = [*(row for row in found if row in first), *(row for row in found if row not in first)][
         :MOST_NAMED
     ]
-    remedies = dict.fromkeys(LIMITS[quantity].remedy for _, quantity, *_ in named if quantity in LIMITS)
+    remedies = dict.fromkeys(_remedy(row, table) for row in named if row[1] in LIMITS)
     values = "; ".join(_describe_excess(row, table, left_out) for row in named)
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
     to_do = f". What to do: {'; '.join(remedies)}" if remedies else ""
     return f"{text}. Worst: {values}{more}{to_do}"
+
+
+def _remedy(row, table):
+    """What to do about one excess; smaller steps do not mend an overlap of the meshes at rest."""
+    muscle, quantity, _, limit, _ = row
+    first = table[muscle][quantity]["first"]
+    at_rest = quantity in ("penetration_max", "bone_penetration_max") and first is not None and first > limit
+    return LIMITS["initial_overlap" if at_rest else quantity].remedy
 
 
 def _listed(names):

@@ -34,7 +34,7 @@ from rbfmuscle.report.render import chosen_frames, render_run
 LIGHTS = {
     "Keeps its volume": ("volume_error",),
     "Stays out of bones": ("penetration_max", "bone_penetration_max", "initial_overlap", "tunnelled"),
-    "Is the scanned shape at rest": ("rest_error_rms", "end_gap"),
+    "Is the scanned shape at rest": ("rest_error_rms",),
     "Is one closed piece": ("components", "euler", "self_crossings", "unfitted_fraction"),
     "Moves without jumps or bowing": ("flicker", "slack"),
 }

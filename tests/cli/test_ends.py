@@ -175,12 +175,11 @@ class TestKilledRuns:
         assert (killed / "last.png").read_bytes().startswith(b"\x89PNG")
 
     def test_it_is_scrubbed_in_the_viewer(self, killed):
-        from rbfmuscle.viewer.sources import SavedSource
+        from rbfmuscle.viewer.sources import SavedFigure
 
-        source = SavedSource({"run": SavedRun(killed)})
-        source.choose("run")
-        source.set("frame", 5)
-        assert source.advance().text.startswith("frame 5")
+        figure = SavedFigure(SavedRun(killed))
+        figure.set("frame", 5)
+        assert figure.advance().text.startswith("frame 5")
 
     def test_what_was_cut_short_is_left_out(self, killed):
         poses = (killed / "poses.csv").read_text(encoding="utf-8")

@@ -46,10 +46,9 @@ def facts(values, *, units="mm", muscle="psoas", **others):
 def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantity, units):
     scale = 0.001 if units == "m" and QUANTITIES[quantity][0] == "length" else 1.0
     limits = {name: default_limit(name, arm_scene(units=units)) for name in LIMITS}
-    # Slack at rest and twice in the motion: a muscle that is straight at rest.
-    allowed, beyond = (
-        {quantity: [1.0 if quantity == "slack" else scale * v, scale * v]} for v in TABLE[quantity]
-    )
+    # A muscle that is straight and in no bone at rest; other quantities are the same in both frames.
+    rest = {"slack": 1.0, "penetration_max": 0.0, "bone_penetration_max": 0.0}
+    allowed, beyond = ({quantity: [rest.get(quantity, scale * v), scale * v]} for v in TABLE[quantity])
     assert exceeded(facts(allowed, units=units), limits) == []
     assert "every muscle is within all limits" in describe_verdict(facts(allowed, units=units), limits)
     ((muscle, name, worst, limit, _),) = exceeded(facts(beyond, units=units), limits)
@@ -58,6 +57,11 @@ def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantit
     said = describe_verdict(facts(beyond, units=units), limits)
     assert said.startswith("1 of 2 muscles are within all limits, not psoas. Worst: psoas, ")
     assert LIMITS[quantity].remedy in said and shown_number(worst) in said
+
+
+def test_an_overlap_at_rest_is_not_mended_by_smaller_steps():
+    said = describe_verdict(facts({"penetration_max": [0.2, 0.3]}), {"penetration_max": 0.1})
+    assert said.endswith(f"What to do: {LIMITS['initial_overlap'].remedy}")
 
 
 def test_the_table_is_complete():

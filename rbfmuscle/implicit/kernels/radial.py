@@ -143,7 +143,7 @@ def _binomial_loop(beta, u, b):
 def _inner_loop(base, row, u, s, b, out):
     """out = base * A(s)."""
     a0, a1, a2, a3, a4 = row[2], row[3], row[4], row[5], row[6]
-    if base == ONE or (a0 == 0.0 and a1 == 0.0 and a2 == 0.0 and a4 == 0.0):
+    if base == ONE or (a0 == 0.0 and a1 == 0.0 and a2 == 0.0 and a3 == 0.0 and a4 == 0.0):
         for i in range(u.size):
             out[i] = 0.0
         return

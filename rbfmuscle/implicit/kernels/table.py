@@ -166,6 +166,8 @@ def _radial_rows(base: int, parameter: float, phi: _Phi) -> Floats:
     """
     rows, exponent, size = np.zeros((3, 2 + 2 * _TERMS)), Fraction(parameter), _TERMS + 2
     power, inner, outer, extra = phi
+    if base == radial.ONE and any(inner):
+        raise ValueError(f"a kernel with the base 1 has no A, got {inner}: write it as B")
     a, b = (np.array([Fraction(c) for c in (*part, *[0] * size)][:size]) for part in (inner, outer))
     for row in rows:
         lowest = int(np.flatnonzero((a != 0) | (b != 0))[0])
