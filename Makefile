@@ -3,20 +3,29 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DEV := $(VENV)/.installed-dev
+# Beside a clone's folder Python takes that folder for the package, but where the package itself is on the path.
+INSTALL := $(BIN)/python -m pip install --quiet --quiet --config-settings editable_mode=compat
 
 .PHONY: demo test portability fuzz test-fast test-nojit coverage mutants references check bench figures docs release-check clean
 
 $(STAMP): pyproject.toml
-	@echo "Installing into $(VENV), about a minute."
+	@echo "Installing into $(VENV), about half a minute."
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --quiet -e ".[dev]" --config-settings editable_mode=compat
+	$(INSTALL) -e .
 	touch $(STAMP)
 
+$(DEV): $(STAMP)
+	$(INSTALL) -e ".[dev]"
+	touch $(DEV)
+
+# Both models at once; what the second says is printed when the first is done.
 demo: $(STAMP)
-	@echo "The first run compiles what it needs; later ones start at once."
-	$(BIN)/rbfmuscle demo --model rbf -o demo_output/rbf
-	$(BIN)/rbfmuscle demo --model pbd -o demo_output/pbd
+	@echo "The first run compiles what it needs, for a minute; later ones start at once."
+	@mkdir -p demo_output
+	@$(BIN)/rbfmuscle demo --model pbd -o demo_output/pbd >demo_output/pbd.log 2>&1 & second=$$!; \
+	$(BIN)/rbfmuscle demo --model rbf -o demo_output/rbf; code=$$?; \
+	wait $$second || code=$$?; grep -v "^phantom: " demo_output/pbd.log; exit $$code
 	@echo "Reports: demo_output/rbf/report.html and demo_output/pbd/report.html"
 	@echo "Next: $(BIN)/rbfmuscle new examples/meshes"
 
@@ -24,19 +33,19 @@ demo: $(STAMP)
 WORKERS ?= auto
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-test: $(STAMP)
+test: $(DEV)
 	$(PYTEST)
 
 # What each list holds, and why, stands at its top.
-test-fast: $(STAMP)
+test-fast: $(DEV)
 	$(PYTEST) -q $$(grep -v '^#' tests/fast.txt)
 
-test-nojit: $(STAMP)
+test-nojit: $(DEV)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q $$(grep -v '^#' tests/nojit.txt)
 
 PACKAGES := $(patsubst %/,%,$(sort $(dir $(wildcard rbfmuscle/*/__init__.py)))) pbd_baseline
 # Loops count as covered where they run as Python: without compiler; the rest by all tests, child processes included.
-coverage: $(STAMP)
+coverage: $(DEV)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q --cov --cov-report= $$(grep -v '^#' tests/nojit.txt)
 	$(PYTEST) -q --cov --cov-append --cov-report=term:skip-covered
 	@for package in $(PACKAGES); do echo "$$package $$($(BIN)/python -m coverage report --include="$$package/*" --format=total) %"; done
@@ -44,45 +53,45 @@ coverage: $(STAMP)
 # The tests under other BLAS kernels, processor features, threads, versions, and with vertices moved by last digits.
 # Hours for all; a part by TESTS="tests/implicit tests/muscle" ONLY="haswell oldest".
 TESTS ?= tests
-portability: $(STAMP)
+portability: $(DEV)
 	$(BIN)/python benchmarks/portability.py $(TESTS) $(if $(ONLY),--only $(ONLY))
 
 # Damaged scenes and meshes by the thousand; ends with a table of what became of them.
-fuzz: $(STAMP)
+fuzz: $(DEV)
 	PYTHONPATH=tests $(BIN)/python -m fuzz --scene 10000 --mesh 2000 --frames 250
 
 # Faults planted one at a time, a seeded sample of every room, each against the tests that reach its line: ten minutes a
 # share, from where the last one ended (MINUTES=600 for the whole). The first time, which tests reach what is recorded.
 MINUTES ?= 10
 SEED ?= 24
-mutants: $(STAMP)
+mutants: $(DEV)
 	test -f .mutants/compiled.json || $(BIN)/python benchmarks/mutants.py record
 	$(BIN)/python benchmarks/mutants.py run --minutes $(MINUTES) --seed $(SEED)
 
 # Results of small whole runs that tests compare with, written anew; what differs is reviewed as part of the change.
-references: $(STAMP)
+references: $(DEV)
 	PYTHONPATH=tests:benchmarks $(BIN)/python -m whole_runs
 	git --no-pager diff --stat -- tests/data/references
 
-check: $(STAMP)
+check: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/contract/test_layers.py
 
-bench: $(STAMP)
+bench: $(DEV)
 	$(BIN)/python benchmarks/interpolation.py
 
 # Measures what the tables of the pages show, writes the JSON files of docs/evidence and the tables from them.
-figures: $(STAMP)
+figures: $(DEV)
 	$(BIN)/python docs/figures.py --measure
 
 # A wheel and an sdist, installed in a clean environment each, and the embedded hip run there.
-release-check: $(STAMP)
+release-check: $(DEV)
 	$(BIN)/python -m pytest -q -m slow tests/contract/test_release.py
 
-docs: $(STAMP)
-	$(BIN)/python -c "import furo, myst_parser, sphinx" 2>/dev/null || $(BIN)/python -m pip install --quiet -e ".[docs]"
+docs: $(DEV)
+	$(BIN)/python -c "import furo, myst_parser, sphinx" 2>/dev/null || $(INSTALL) -e ".[docs]"
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "Open docs/_build/html/index.html"
 
