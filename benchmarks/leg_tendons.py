@@ -97,7 +97,10 @@ TENDONS = {
             )
         ],
     },
-    "popliteus femur": {"to": [-651.0, -415.0, 495.0]},
+    "popliteus femur": {
+        "to": [-651.0, -415.0, 495.0],
+        "via": [{"bone": "tibia", "point": [-626.5, -398.6, 486.7]}],
+    },
 }
 
 
