@@ -12,7 +12,10 @@ import json
 import tomllib
 from pathlib import Path
 
+import numpy as np
+import trimesh
 from evidence import data_folder
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.importers.toml_text import table_text
@@ -82,7 +85,7 @@ TENDONS = {
     },
     "obturator_internus femur": {
         "to": [-653.0, -417.0, 880.0],
-        "via": [{"bone": "pelvis", "point": [-619.0, -394.0, 869.0]}],
+        "via": [{"bone": "pelvis", "point": [-619.0, -388.0, 873.0]}],
     },
     # The iliotibial tract, over the vastus lateralis to Gerdy's tubercle.
     "tensor_fasciae_latae femur": {
@@ -103,6 +106,11 @@ TENDONS = {
         "via": [{"bone": "tibia", "point": [-626.5, -398.6, 486.7]}],
     },
 }
+
+
+# Attached vertices nearer than this to the muscle's other end are left free [mm]. Over the lesser sciatic notch lies a
+# bursa, and fibres of 16 mm would be stretched by 13 mm in the squat.
+FREE_NECK = {"obturator_internus pelvis": 40.0}
 
 
 def convert(source: Path, facts: dict, out: Path) -> Path:
@@ -127,6 +135,10 @@ def convert(source: Path, facts: dict, out: Path) -> Path:
         data["joint"] = [joint for joint in data["joint"] if joint["child"] != "patella"] + [_patella(facts)]
         row = {"coordinate": "patella.flexion", "of": ["knee.knee_angle"], "linear": [1, 0]}
         data.setdefault("coupling", []).append(row)
+    for muscle in data["muscle"]:
+        for entry in muscle["attach"]:
+            if f"{muscle['name']} {entry['bone']}" in FREE_NECK:
+                entry["vertices"] = _without_neck(muscle, entry)
     path = out / source.name
     path.write_text(_toml(data), encoding="utf-8")
     return path
@@ -141,6 +153,17 @@ def _attachment(muscle: str, entry: dict, bones: set[str], folder: Path) -> dict
         found["bone"] = tendon.pop("bone", bone)
         found["tendon"] = tendon
     return found
+
+
+def _without_neck(muscle: dict, entry: dict) -> list[int]:
+    """Attached vertices that are not too near to the muscle's other end."""
+    vertices = trimesh.load(muscle["mesh"], process=False).vertices
+    own, other = (
+        np.loadtxt(e["vertices"], dtype=int)
+        for e in sorted(muscle["attach"], key=lambda each: each is not entry)
+    )
+    away = cKDTree(vertices[other]).query(vertices[own])[0]
+    return own[away > FREE_NECK[f"{muscle['name']} {entry['bone']}"]].tolist()
 
 
 def _patella(facts: dict) -> dict:

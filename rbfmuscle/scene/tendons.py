@@ -134,11 +134,9 @@ class TendonEnd:
 
     @cached_property
     def _share(self) -> float:
-        """Place of the belly's end between the muscle's ends at rest, 0 to 1."""
-        belly, tendon = (
-            float(np.linalg.norm(self.middle - end[1])) for end in (self.other[0], self.line[-1])
-        )
-        return belly / max(belly + tendon, 1e-300)
+        """Place of the belly's end between the string's fixed points before and after it at rest, 0 to 1."""
+        before, after = (float(np.linalg.norm(self.middle - p)) for _, p in (self.other[-1], self.line[0]))
+        return before / max(before + after, 1e-300)
 
     @cached_property
     def _sides(self) -> list[Floats]:
@@ -243,10 +241,10 @@ class TendonEnd:
     def _turn(self, before: Floats, now: Floats, poses: Mapping[str, Floats]) -> Floats:
         """Rotation (3, 3) that takes one direction to the other.
 
-        Seen from the bone of either end it would be the least rotation that does; the twist about the direction between
-        these two is spread evenly along the string.
+        Seen from the bones of the string's fixed points before and after the end it would be the least rotation that
+        does; the twist about the direction between these two is spread evenly from one point to the other.
         """
-        near, far = (poses[end[0]][:3, :3] for end in (self.other[0], self.line[-1]))
+        near, far = (poses[bone][:3, :3] for bone, _ in (self.other[-1], self.line[0]))
         first, last = (turn @ _least_turn(turn.T @ now, before) for turn in (near, far))
         twist = last @ first.T
         skew = np.array([twist[2, 1] - twist[1, 2], twist[0, 2] - twist[2, 0], twist[1, 0] - twist[0, 1]])

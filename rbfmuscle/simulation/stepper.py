@@ -119,6 +119,8 @@ class MuscleStepper:
         self._path: Any = None
         self._saved: Any = None
         self._shown: TimedDrawing | None = None
+        # Whether points crossed a bone in this frame or the last that no step resolved: halving is not tried again.
+        self._unresolved = False
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[Any]:
@@ -216,6 +218,7 @@ class MuscleStepper:
         """Times, events and status since the last call."""
         times, solves = self.times, self.solves
         times["time_frame"] = sum(times.values())
+        self._unresolved = any(action == "unresolved" for _, _, action in self.events)
         events = [Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()]
         moved = self.carrier is not None and self.carrier.collect()
         self.times, self.events, self.solves = {}, {}, 0
@@ -248,13 +251,14 @@ class MuscleStepper:
         if not remaining:
             self._report_all(crossings, "rotated")
             return
-        angle = step_angle(self.scene, before, after)
-        if self.detect.action == "rotate" or angle <= 2.0 * SMALLEST_STEP:
+        smallest = step_angle(self.scene, before, after) <= 2.0 * SMALLEST_STEP
+        if self.detect.action == "rotate" or smallest or self._unresolved:
             for crossing in self._held_back(state, start, poses, after, remaining):
                 name = self.contacts.names[crossing.bone]
                 paths, ends = (start, self.model.contact_points()), (poses[0][name], poses[1][name])
                 touched = only_grazed(crossing, self.scene.bone(name).mesh, paths, *ends, self.tolerance)
                 self.report(name, len(crossing.index), "grazed" if touched else "unresolved")
+                self._unresolved |= not touched
             return
         self._report_all(remaining, "halved")
         self.model.restore(state)
