@@ -37,7 +37,6 @@ from rbfmuscle.scene.options import (
     Table,
     Vector,
     check_plain,
-    check_removed,
     describe_error,
 )
 from rbfmuscle.validation import MeshError, SceneError, is_file, shown, shown_path
@@ -115,7 +114,6 @@ def read_scene_file(path: Path) -> SceneFile:
     """
     data = _read_toml(path)
     check_plain(data, place=f"{path}: ")
-    check_removed(data, place=f"{path}: ")
     try:
         return SceneFile.model_validate(data, context={"folder": path.parent})
     except ValidationError as error:

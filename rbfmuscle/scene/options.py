@@ -32,37 +32,6 @@ DEEPEST = 20
 LARGEST_INTEGER = 2**53
 MAX_FRAMES = 100_000
 
-# What to do in place of keys that were removed: of a muscle, or of its model (`model.KEY`), without the muscle.
-# The table is deleted at 1.0.
-_REPLACED = {
-    "delete the key": (
-        "contact.margin contact.tolerance contact.still_angle detect.tunnelling.smallest_step sliding.strip "
-        "sliding.release sliding.join sliding.cut motion.max_substeps shortening joint.coordinates.*.default "
-        "model.seed model.acceleration model.contacts model.edge model.arap_compliance model.arap_reach "
-        "model.swelling_reach model.contact model.sound model.self_collision model.derivatives "
-        "output.metrics output.fibres output.moment_arms"
-    ),
-    "delete the table": "opensim",
-    "delete the key: solve_pose(scene, models, coordinates) in Python solves a pose from rest": "contact.from_rest",
-    "delete the key: call simulate(scene, fields={bone: field}) in Python for other fields": "contact.detector",
-    "write inDegrees=yes or inDegrees=no into the header of the motion file": "motion.degrees",
-    "use a list of numbers, spread over the motion": "activation.from activation.to activation.file",
-    "use fibre_stretch_at_rest: the mean length of the fibres in the scan over it": "optimal_fibre_length",
-    "give the axes in the scene's directions": "joint.orientation",
-    "use tendon.length, measured from the attachments": "tendon.share tendon.vertices",
-    "multiply the numbers of the function by it": "joint.rotations.scale joint.translations.scale coupling.scale",
-    "use spline": "joint.rotations.natural_spline joint.translations.natural_spline coupling.natural_spline",
-    'use a model whose sweeps go on until none moves a vertex, for instance "pbd-converged"': "model.tolerance",
-    "use model.nodes: every RBF muscle is carried by an elastic solid": "model.inside model.across model.across_weight",
-    "use model.fibre_ratio, the stiffness along the fibres": "model.stretch_high model.stretch_hold",
-    "use model.slack: fibres shorten freely to 1 / slack of their length in the scan": "model.stretch_low",
-    'use model = "pbd-paper", or delete the key': (
-        "model.prediction model.damping model.limits model.soft_length model.response"
-    ),
-    "use output.report = false, which leaves out report.html and preview.webp": "output.preview",
-}
-REMOVED_KEYS = {key: remedy for remedy, keys in _REPLACED.items() for key in keys.split()}
-
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -111,21 +80,6 @@ def check_plain(value: object, *, place: str, depth: int = 0) -> None:
         raise SceneError(f"{place}: a whole number must be at most 2^53 in size, got {shown(value)}")
     elif isinstance(value, float) and not math.isfinite(value):
         raise SceneError(f"{place}: must be a finite number, got {value}")
-
-
-def check_removed(values: object, *, place: str, prefix: str = "") -> None:
-    """Raise SceneError where a table, or list of tables, holds a removed key; the message says what to do instead.
-
-    ``place`` begins the message; ``prefix`` is the dotted name of the table, with a full stop at its end.
-    """
-    for row in values if isinstance(values, list) else [values]:
-        for key, value in row.items() if isinstance(row, dict) else ():
-            name = f"{prefix}{key}".removeprefix("muscle.").removeprefix("defaults.")
-            if name in REMOVED_KEYS:
-                raise SceneError(f"{place}{name} was removed: {REMOVED_KEYS[name]}")
-            # Coordinates have names of their own.
-            inner = "joint.coordinates.*" if prefix == "joint.coordinates." else name
-            check_removed(value, place=place, prefix=f"{inner}.")
 
 
 class Table(BaseModel):

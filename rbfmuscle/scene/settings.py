@@ -17,7 +17,6 @@ from rbfmuscle.scene.options import (
     MotionOptions,
     SlidingOptions,
     check_plain,
-    check_removed,
     set_dotted,
 )
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
@@ -75,12 +74,10 @@ def chooses_model(key: str) -> bool:
 
 
 def _apply(scene, key, value):
-    check_removed({key: value}, place="")
     head, _, rest = key.partition(".")
     muscles, folder = scene.muscles, scene.path.parent if scene.path else None
     if head == "muscle":
         name, _, inner = rest.partition(".")
-        check_removed({inner: value}, place=f"{key}: ")
         head, _, rest = inner.partition(".")
         muscles = [scene.muscle(name)]
         if head != "model" and head not in KEYS:
