@@ -1,7 +1,5 @@
 """``rbfmuscle run`` and ``rbfmuscle demo``: a scene through its motion, into a folder."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Parents of bones; hip, knee and ankle with methods, names, signs and ranges of anatomy; a joint as guessed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

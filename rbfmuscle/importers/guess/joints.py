@@ -6,8 +6,6 @@ the axis of the cylinder that fits the dome of the face. Both follow from the fa
 and Guibas 2004, Shape segmentation using local slippage analysis). Knee, ankle and patella have methods of their own.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ Iwaki et al. 2000; the cylindrical axis of Eckhoff et al. 2005). Ankle: the cyli
 tibial plafond above it, each with its own radius (Singh et al. 1992; Siegler et al. 2014).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

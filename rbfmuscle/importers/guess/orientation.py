@@ -1,7 +1,5 @@
 """Which way is up and forwards: from the bones themselves, or from a volume's header."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import TypeVar
 

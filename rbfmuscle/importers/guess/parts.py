@@ -1,7 +1,5 @@
 """The meshes of a folder, sorted into bones and muscles; the unit of their lengths."""
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import dataclass, field

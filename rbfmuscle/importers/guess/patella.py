@@ -6,8 +6,6 @@ ligament from its apex to the tibial tuberosity has its length at rest (as in th
 Points of the plane are complex numbers about the knee's axis: forwards, and i times downwards.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded

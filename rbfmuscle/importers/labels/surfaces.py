@@ -6,8 +6,6 @@ labels share a face, the fields are each other's negative there and their zero s
 then shifted to the label's volume, by a few hundredths of a voxel.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -4,8 +4,6 @@ A tube has the volume of its fibres: maximum isometric force times optimal fibre
 middle line is the model's path in its default pose, over its wrapping objects, kept out of the bones.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
