@@ -1,7 +1,5 @@
 """Building a scene, part by part, and checking that it is whole. Each function is a method of `Scene` too."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -15,8 +13,7 @@ from rbfmuscle.scene.attachments import AttachTable, resolve_attachments, tendon
 from rbfmuscle.scene.joints.joint import Coupling, Joint
 from rbfmuscle.scene.joints.skeleton import all_coordinates, ordered
 from rbfmuscle.scene.joints.tables import CouplingTable, JointTable, make_coupling
-from rbfmuscle.scene.meshes.fibres import read_fibres
-from rbfmuscle.scene.meshes.read import ReadMesh, as_mesh
+from rbfmuscle.scene.meshes.read import ReadMesh, as_mesh, read_fibres
 from rbfmuscle.scene.motion import make_motion
 from rbfmuscle.scene.objects import Attachment, Bone, Muscle, SceneData, find_named
 from rbfmuscle.scene.options import MotionOptions

@@ -1,7 +1,5 @@
 """Looking a scene over before it is solved: sizes, overlaps at rest, bones that meet in the motion."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The scene file: its tables, and the scene that they describe."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import tomllib

@@ -3,8 +3,6 @@
 They check themselves, so the same rules hold for a file, for code and for ``--set``.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping

@@ -3,8 +3,6 @@
 A right hip in millimetres with the joint's centre at the origin: +x medial, +y posterior, +z up.
 """
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 from typing import Any

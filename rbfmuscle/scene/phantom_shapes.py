@@ -1,7 +1,5 @@
 """Shapes from formulas: tubes of known volume for muscles, blended solids for bones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

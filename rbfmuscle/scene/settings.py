@@ -1,7 +1,5 @@
 """Changing a scene by dotted keys: ``--set KEY=VALUE``, grids of a sweep, ``Scene.with_options``."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """The shortest line between two points in a plane that passes bones on one side."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Activation of the muscles along a motion, and the sub-steps that it needs."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

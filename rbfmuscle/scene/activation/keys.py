@@ -1,7 +1,5 @@
 """The keys of a muscle that contracts, checked as they stand in a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 

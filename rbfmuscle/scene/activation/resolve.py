@@ -1,7 +1,5 @@
 """From the keys of a muscle that contracts to numbers on its mesh: slack length, tendon."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import dijkstra

@@ -1,7 +1,5 @@
 """VTK and VTP files, read by pyvista in one process beside this one: some broken files end it."""
 
-from __future__ import annotations
-
 import atexit
 import os
 import pickle
