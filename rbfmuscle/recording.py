@@ -1,7 +1,5 @@
 """One run of a scene: its models through the frame loop, measured and clocked, a generator of frames for a sink."""
 
-from __future__ import annotations
-
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -31,8 +29,7 @@ from rbfmuscle.output.writer import RunWriter
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.sharing.crew import WorkerPool
-from rbfmuscle.sharing.processes import helpers_for
+from rbfmuscle.sharing.crew import WorkerPool, helpers_for
 from rbfmuscle.sharing.share import MuscleGroup, timed
 from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.simulation.substeps import check_substeps

@@ -4,8 +4,6 @@ Two threads of one interpreter share its lock and do 1.2 to 1.35 times the work 
 (docs/speed.md).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import pickle
@@ -21,6 +19,27 @@ from rbfmuscle.child import end_child, start_child, unexpected_end
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.sharing.share import Solved
+
+# A process more takes about two seconds to begin: fewer muscles, or fewer muscles times frames, are quicker in one.
+LEAST_MUSCLES, LEAST_WORK = 5, 400
+MOST_HELPERS = 4
+
+
+def helpers_for(scene: Scene, threads: int) -> int:
+    """How many processes should share the muscles of a run; fewer than two: none but one's own.
+
+    Muscles that slide on each other see each other at every sub-step, and stay together.
+
+    Parameters
+    ----------
+    scene : Scene
+    threads : int
+        That the run may use.
+    """
+    count = len(scene.muscles)
+    if scene.sliding is not None or count * len(scene.motion.frames) < LEAST_WORK:
+        return 0
+    return min(threads, count // LEAST_MUSCLES, MOST_HELPERS)
 
 
 class WorkerPool:

@@ -4,8 +4,6 @@ It reads a scene and the names of its muscles from standard input, and writes pa
 standard output: first that the muscles are built, then frame by frame. It ends with the process that started it.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import traceback

@@ -1,7 +1,5 @@
 """Muscles of a scene that one process builds, solves and measures."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
