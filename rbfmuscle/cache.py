@@ -4,8 +4,6 @@ An entry is a NumPy archive (`numpy.load` reads it). It is written to a temporar
 several processes may build the same field and none reads half of it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import logging
