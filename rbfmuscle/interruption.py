@@ -26,14 +26,9 @@ class _State:
 
 
 def install(*, as_json: bool = False, watch: bool = False) -> None:
-    """Let SIGINT and SIGTERM end the process with 130.
+    """Let SIGINT and SIGTERM end the process with 130, with the error as JSON on standard output where ``as_json``.
 
-    Parameters
-    ----------
-    as_json : bool
-        Standard output gets the error as JSON.
-    watch : bool
-        Also listen in a thread: Python's own handlers wait until compiled code of the main thread returns.
+    With ``watch`` a thread listens too: Python's own handlers wait until compiled code of the main thread returns.
     """
     _State.asked, _State.kept, _State.as_json = False, None, as_json
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -58,22 +58,10 @@ def model_title(muscle: Muscle) -> str:
 
 
 def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> MuscleModel:
-    """Return the model of one muscle of a scene.
+    """Return the model of one muscle of a scene, of a name in ``MODEL_NAMES``, the scene's own choice where not given.
 
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-    name : str, optional
-        One of ``MODEL_NAMES``; the scene's own choice where not given. The options of the scene's model
-        table are for the class of models that it names, and are left out for another.
-
-    Raises
-    ------
-    UsageError
-        On an unknown name, with the nearest right one.
-    SceneError
-        If a setting is unknown or impossible.
+    The options of the scene's model table are for the class of models that it names, and are left out for another.
+    UsageError on an unknown name, with the nearest right one; SceneError if a setting is unknown or impossible.
     """
     name = muscle.model if name is None else name
     home = _HOME[check_model_name(name)]
@@ -83,13 +71,7 @@ def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> Muscle
 
 
 def solved_points(muscle: Muscle, scene: Scene) -> str:
-    """The points that the model of a muscle solves for, in words; nothing is built.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-    """
+    """The points that the model of a muscle solves for, in words; nothing is built."""
     home = _HOME[check_model_name(muscle.model)]
     options = _read_options(muscle, home, muscle.options)
     return _part(home, "rest", "solved_points")(muscle, scene, options)
@@ -113,17 +95,8 @@ def configure_scene(
 ) -> Scene:
     """Return a scene with other settings, checked to the last key of every muscle's model; nothing is built.
 
-    Parameters
-    ----------
-    scene, settings, model, frames
-        As for `Scene.with_options`.
-
-    Raises
-    ------
-    SceneError
-        If the scene itself names an unknown model, or an unknown or impossible setting of one.
-    UsageError
-        If the settings do.
+    Arguments are those of `Scene.with_options`. SceneError if the scene itself names an unknown model, or an unknown or
+    impossible setting of one; UsageError if the settings do.
     """
     check_models(scene)
     for key in settings or ():
@@ -141,10 +114,7 @@ def configure_scene(
 def check_models(scene: Scene) -> None:
     """Check the model and the settings of every muscle of a scene, building nothing.
 
-    Raises
-    ------
-    SceneError
-        Naming the file, the muscle and the nearest right name.
+    SceneError names the file, the muscle and the nearest right name.
     """
     root = f"{scene.path}: " if scene.path else ""
     for muscle in scene.muscles:

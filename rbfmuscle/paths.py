@@ -35,22 +35,13 @@ Ranges = dict[str, tuple[float, float]]
 
 @dataclass
 class Samples:
-    """A muscle's lengths and moment arms at some poses; a pose that could not be solved has NaN.
-
-    Attributes
-    ----------
-    coordinates : tuple of str
-        Those that the muscle depends on, full names.
-    values, arms : (n, d) ndarray
-        [radian or scene unit], [scene unit].
-    lengths : (n,) ndarray
-    """
+    """A muscle's lengths and moment arms at some poses; a pose that could not be solved has NaN."""
 
     muscle: str
-    coordinates: tuple[str, ...]
-    values: np.ndarray
-    lengths: np.ndarray
-    arms: np.ndarray
+    coordinates: tuple[str, ...]  # that the muscle depends on, full names
+    values: np.ndarray  # (n, d) [radian or scene unit]
+    lengths: np.ndarray  # (n,) [scene unit]
+    arms: np.ndarray  # (n, d) [scene unit]
 
 
 def parse_ranges(scene: Scene, texts: list[str]) -> Ranges:
@@ -76,18 +67,9 @@ def sample_muscles(
 ) -> list[Samples]:
     """Return lengths and moment arms of every muscle at quasi-random poses of the coordinates that it depends on.
 
-    Each pose is reached from rest in a straight line and the muscle settles there. A moment arm is minus the central
-    difference of the length over `STEP` to both sides, the muscle settling there too.
-
-    Parameters
-    ----------
-    scene : Scene
-    given : dict of str to (float, float)
-        Ranges instead of the coordinates' own.
-    samples : int
-        Poses for each muscle.
-    progress : callable, optional
-        Told how many poses are done, and of how many.
+    Each of the ``samples`` poses is reached from rest in a straight line and the muscle settles there. A moment arm is
+    minus the central difference of the length over `STEP` to both sides, the muscle settling there too. Ranges that are
+    ``given`` stand for the coordinates' own; ``progress`` is called with the poses that are done, and of how many.
     """
     scene = scene.validate().copy()
     scene.sliding = None

@@ -59,13 +59,8 @@ class MemorySink:
 class Recording:
     """One run of a scene: its models through the frame loop, measured and clocked, into a sink.
 
-    Parameters
-    ----------
-    scene : Scene
-    model, settings, frames
-        As for `configure_scene`.
-    fields : mapping of str to BoneField, optional
-        Of the bones, by name, in place of `BoneSDF`; all muscles are then in this process.
+    ``model``, ``settings`` and ``frames`` are those of `configure_scene`; ``fields`` of the bones, by name, stand in
+    place of `BoneSDF`, and all muscles are then in this process.
     """
 
     def __init__(

@@ -109,24 +109,11 @@ def stream_run(
     pictures: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Run a scene and write it to a folder frame by frame; memory does not grow with the frames.
+    """Run a scene and write it to a folder frame by frame, and return what ``run.json`` holds.
 
-    Parameters
-    ----------
-    scene : Scene
-        Its ``output`` table says what is written.
-    directory : path
-    model, settings, frames, progress
-        As for `simulate`.
-    fail_on : str or list of str, optional
-        Limits, see `rbfmuscle.metrics.summary.parse_limits`.
-    pictures : bool
-        Draw pictures for the report and the preview.
-
-    Returns
-    -------
-    dict
-        What ``run.json`` holds.
+    Memory does not grow with the frames. The scene's ``output`` table says what is written; ``model``, ``settings``,
+    ``frames`` and ``progress`` are as for `simulate`; ``fail_on`` are limits, see
+    `rbfmuscle.metrics.summary.parse_limits`; ``pictures`` are those of the report and the preview.
 
     Raises
     ------

@@ -100,19 +100,7 @@ def is_file(path: str | os.PathLike[str]) -> bool:
 
 
 def check_points(points: ArrayLike, *, name: str = "points") -> NDArray[np.float64]:
-    """Return points as a finite, C-contiguous (n, 3) float64 array.
-
-    Parameters
-    ----------
-    points : (n, 3) array_like
-    name : str
-        What the message calls them.
-
-    Raises
-    ------
-    ValueError
-        On any other shape, or on NaN or infinity.
-    """
+    """Return points as a finite, C-contiguous (n, 3) float64 array, or raise ValueError that calls them ``name``."""
     points = _as_floats(points, name)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name} must have shape (n, 3), got {points.shape}")
@@ -163,12 +151,9 @@ def check_positive(value: float, *, name: str) -> float:
 def check_mesh(
     vertices: ArrayLike, faces: ArrayLike, *, name: str = "mesh"
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return ``(vertices, faces)`` as (n, 3) float64 and (m, 3) int64, indices in range.
+    """Return ``(vertices, faces)`` as (n, 3) float64 and (m, 3) int64.
 
-    Raises
-    ------
-    MeshError
-        If the mesh is empty, has non-finite vertices or indices out of range.
+    MeshError if the mesh is empty, has non-finite vertices or indices out of range.
     """
     try:
         vertices = check_points(vertices, name=f"vertices of {name}")

@@ -74,10 +74,7 @@ def resolve_attachments(
 ) -> list[Attachment]:
     """Return the attachments of the muscle of that name and mesh.
 
-    Raises
-    ------
-    SceneError
-        On an unknown bone, an empty selection, an index out of range, or a vertex held by two bones.
+    SceneError on an unknown bone, an empty selection, an index out of range, or a vertex held by two bones.
     """
     found = []
     for number, entry in enumerate(attach):

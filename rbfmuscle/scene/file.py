@@ -105,10 +105,7 @@ class SceneFile(Table):
 def read_scene_file(path: Path) -> SceneFile:
     """Return the checked SceneFile of a TOML file; relative names of files become relative to its folder.
 
-    Raises
-    ------
-    SceneError
-        Naming the file, the table, the key, the value and what is right.
+    SceneError names the file, the table, the key, the value and what is right.
     """
     data = _read_toml(path)
     check_plain(data, place=f"{path}: ")

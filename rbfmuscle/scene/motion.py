@@ -25,12 +25,9 @@ IN_DEGREES = dict.fromkeys(("yes", "true", "1"), math.pi / 180) | dict.fromkeys(
 
 
 def make_motion(scene: SceneData, options: MotionOptions) -> Motion:
-    """Return the motion that ``[motion]`` asks of a scene's joints.
+    """The motion that ``[motion]`` asks of a scene's joints.
 
-    Raises
-    ------
-    SceneError
-        If a coordinate is unknown, the motion has too many frames, or its file cannot be read.
+    SceneError on an unknown coordinate, too many frames, or a file that cannot be read.
     """
     facts = all_coordinates(scene.joints)
     followers = {coupling.coordinate for coupling in scene.couplings}
@@ -79,14 +76,9 @@ def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> 
 def bone_poses(scene: SceneData, coordinates: dict[str, float]) -> Poses:
     """Return the pose (4, 4) of every bone, and of every end of a muscle that a tendon holds: rest -> world.
 
-    A joint moves its child, and all that hangs on it, against its parent. At the coordinates at which the
-    scene's meshes are (``rest``), every pose is the identity. A bone without a joint is fixed.
-
-    Parameters
-    ----------
-    scene : SceneData
-    coordinates : dict of str -> float
-        "joint.coordinate" -> value [radian or scene unit]; absent ones are at rest.
+    A joint moves its child, and all that hangs on it, against its parent. Where the scene's meshes are (``rest``),
+    every pose is the identity. A bone without a joint is fixed. ``coordinates`` are values of "joint.coordinate"
+    [radian or scene unit]; absent ones are at rest.
     """
     known = all_coordinates(scene.joints)
     for name in coordinates:
@@ -228,25 +220,12 @@ def _check_count(count):
 def read_motion_file(
     path: Path, facts: dict[str, Coordinate], followers: set[str], *, metre: float
 ) -> tuple[list[dict[str, float]], list[float] | None, list[str]]:
-    """Read the rows of a motion file as frames.
+    """Frames, times [s] (None without a column ``time``) and notes of an OpenSim motion file.
 
-    Angles are turned from degrees where the header says ``inDegrees=yes``, lengths from metres; numbers of
-    coordinates that are neither are taken as they are, as OpenSim does.
-
-    Parameters
-    ----------
-    path : path
-    facts : dict of str to Coordinate
-        The scene's coordinates by full name.
-    followers : set of str
-        Coordinates that follow others; their columns are not used.
-    metre : float
-        Scene units in a metre.
-
-    Returns
-    -------
-    frames, times, notes
-        Times [s] where the file has a column ``time``, else None.
+    It holds a header up to ``endheader``, column names and rows of numbers. Angles are turned from degrees where the
+    header says ``inDegrees=yes``, lengths from metres, ``metre`` scene units each; numbers of coordinates that are
+    neither are taken as they are, as OpenSim does. ``facts`` are the scene's coordinates by full name; columns of
+    ``followers``, which follow others, are not used.
     """
     header, labels, values = _read_storage(path)
     if len(values) > MAX_FRAMES:

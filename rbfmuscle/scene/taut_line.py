@@ -16,20 +16,13 @@ DIRECTIONS = 64
 def taut_line(
     start: Floats, end: Floats, side: Floats, bones: Sequence[tuple[Floats, Floats]], width: float
 ) -> Floats:
-    """Points (n, 3) of the taut line between two points that passes bones on one side.
+    """Points (n, 3) of the taut line between two points (3,) that passes bones on one side, a direction (3,).
 
     The line lies in the plane of its ends and ``side``. A point of a bone at a distance z from the plane is an obstacle
     in it, lower by z² / (2 ``width``), as for a round band. One that the line could only pass by leaving an end more
     steeply than `STEEPEST` is lowered below that slope by as much as it is above. So the line changes continuously
-    where the plane comes to meet a bone, and parts of bones that lie far to the side do not count.
-
-    Parameters
-    ----------
-    start, end, side : (3,) ndarray
-    bones : sequence of (pose, points)
-        (4, 4) and, at rest, (n, 3).
-    width : float
-        [scene unit]
+    where the plane comes to meet a bone, and parts of bones that lie far to the side do not count. ``bones`` are poses
+    (4, 4) and points (n, 3) at rest.
     """
     size = float(np.linalg.norm(end - start))
     along = (end - start) / max(size, 1e-300)

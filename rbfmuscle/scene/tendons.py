@@ -58,15 +58,7 @@ AT_REST = AtRest()
 class Poses(dict[str, Floats]):
     """Poses (4, 4) of bones by name; those of ends that tendons hold are computed when they are first asked for.
 
-    Parameters
-    ----------
-    bones : mapping of str to (4, 4) ndarray
-    ends : mapping of str to TendonEnd
-
-    Attributes
-    ----------
-    tendons : dict of str to TendonLine
-        Of the ends asked for so far.
+    ``tendons`` are the `TendonLine` of the ends asked for so far.
     """
 
     def __init__(self, bones: Mapping[str, Floats], ends: Mapping[str, TendonEnd]) -> None:
@@ -90,36 +82,17 @@ class _Mark(NamedTuple):
 
 @dataclass(eq=False)
 class TendonEnd:
-    """The end of a belly that a tendon joins to a bone.
+    """The end of a belly that a tendon joins to a bone."""
 
-    Attributes
-    ----------
-    name : str
-        Of the end among the poses.
-    patch : (n, 3) ndarray
-        Vertices of the end at rest [scene unit].
-    middle : (3,) ndarray
-        Of the patch.
-    radii : (float, float)
-        Of the belly there, and of the tendon as it is drawn [scene unit].
-    line : list of BonePoint
-        Via points, then the insertion.
-    other : list of BonePoint
-        The muscle's other end: a point of its bone, or of its tendon the insertion and the via points.
-    slack : float
-        Length of that tendon at rest, zero where there is none.
-    obstacles : sequence of Bone
-        Bones that string and tendon go around.
-    """
-
-    name: str
-    patch: Floats
-    middle: Floats
-    radii: tuple[float, float]
-    line: list[BonePoint]
+    name: str  # of the end among the poses
+    patch: Floats  # vertices of the end (n, 3) at rest [scene unit]
+    middle: Floats  # of the patch (3,)
+    radii: tuple[float, float]  # of the belly there, and of the tendon as it is drawn [scene unit]
+    line: list[BonePoint]  # via points, then the insertion
+    # The muscle's other end: a point of its bone, or of its tendon the insertion and the via points.
     other: list[BonePoint] = field(default_factory=list)
-    slack: float = 0.0
-    obstacles: Sequence[Bone] = ()
+    slack: float = 0.0  # length of that tendon at rest, zero where there is none
+    obstacles: Sequence[Bone] = ()  # bones that string and tendon go around
 
     @cached_property
     def length(self) -> float:
@@ -160,13 +133,7 @@ class TendonEnd:
         return way / max(float(np.linalg.norm(way)), 1e-300)
 
     def place(self, poses: Mapping[str, Floats]) -> tuple[TendonLine, Floats]:
-        """The tendon, and the pose (4, 4) of the belly's end from rest to world.
-
-        Parameters
-        ----------
-        poses : mapping of str to (4, 4) ndarray
-            Of the bones.
-        """
+        """The tendon, and the pose (4, 4) of the belly's end from rest to world, at poses (4, 4) of the bones."""
         at_rest, before = self._rest
         legs = self._string(poses)
         length = self.length * (1.0 + self._strain(sum(map(line_length, legs)) - at_rest))

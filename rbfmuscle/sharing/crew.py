@@ -26,15 +26,9 @@ MOST_HELPERS = 4
 
 
 def helpers_for(scene: Scene, threads: int) -> int:
-    """How many processes should share the muscles of a run; fewer than two: none but one's own.
+    """How many processes should share the muscles of a run that may use ``threads``; fewer than two: one's own alone.
 
     Muscles that slide on each other see each other at every sub-step, and stay together.
-
-    Parameters
-    ----------
-    scene : Scene
-    threads : int
-        That the run may use.
     """
     count = len(scene.muscles)
     if scene.sliding is not None or count * len(scene.motion.frames) < LEAST_WORK:
@@ -43,21 +37,10 @@ def helpers_for(scene: Scene, threads: int) -> int:
 
 
 class WorkerPool:
-    """Several `MuscleGroup` in processes, with the frames of one of all muscles, to the last digit.
+    """Several `MuscleGroup` in at least two processes, with the frames of one of all muscles, to the last digit.
 
     A process continues while its last frame is taken, and waits with the next one until it is asked for: memory is
-    bounded by the pipes.
-
-    Parameters
-    ----------
-    scene : Scene
-    helpers : int
-        At least two.
-
-    Attributes
-    ----------
-    times : dict of str to float
-        Wall time spent so far [s], of the helper that spent most: ``simulate``, ``metrics``.
+    bounded by the pipes. ``times`` are wall times so far [s], of the helper that spent most.
     """
 
     def __init__(self, scene: Scene, helpers: int) -> None:

@@ -55,39 +55,23 @@ MISFIT = 0.05
 
 @dataclass
 class JointGuess:
-    """A joint as guessed.
-
-    Attributes
-    ----------
-    kind : str
-        ``"ball"``, ``"hinge"``, ``"custom"`` (the patella) or ``"fixed"``.
-    centre, axes : (3,) ndarray [scene unit], dict of str to (3,) ndarray
-        The axes by coordinate.
-    confidence : float
-        0 to 1: one minus half the misfit over the greatest allowed, where something was fitted.
-    ranges, rest : dict of str to (float, float), float
-        Of coordinates; the value of the first one in the pose of the meshes [degree].
-    tables : dict
-        ``rotations`` and ``translations`` of a custom joint, as the scene file has them.
-    follows : str
-        Full name of the coordinate that the first one follows.
-    ligament : (2, 3) ndarray or None
-        Ends of a patella's ligament at rest, on it and on the tibia [scene unit].
-    """
+    """A joint as guessed."""
 
     parent: Part
     child: Part
-    kind: str
-    centre: np.ndarray
-    axes: dict[str, np.ndarray]
-    confidence: float
+    kind: str  # "ball", "hinge", "custom" (the patella) or "fixed"
+    centre: np.ndarray  # (3,) [scene unit]
+    axes: dict[str, np.ndarray]  # (3,) by coordinate
+    confidence: (
+        float  # 0 to 1: one minus half the misfit over the greatest allowed, where something was fitted
+    )
     reason: str
     name: str = ""
-    ranges: dict[str, tuple] = field(default_factory=dict)
-    rest: float = 0.0
-    tables: dict[str, list] = field(default_factory=dict)
-    follows: str = ""
-    ligament: np.ndarray | None = None
+    ranges: dict[str, tuple] = field(default_factory=dict)  # of coordinates [degree]
+    rest: float = 0.0  # value of the first coordinate in the pose of the meshes [degree]
+    tables: dict[str, list] = field(default_factory=dict)  # rotations and translations of a custom joint
+    follows: str = ""  # full name of the coordinate that the first one follows
+    ligament: np.ndarray | None = None  # ends (2, 3) of a patella's, on it and on the tibia, at rest
 
     @property
     def axis(self) -> np.ndarray:

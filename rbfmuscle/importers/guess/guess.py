@@ -52,23 +52,11 @@ class SceneGuess:
 def guess_scene(
     folder: Path, units: str | None, base: Path, *, header: Orientation | None = None
 ) -> SceneGuess:
-    """Guess a scene from the meshes of a folder.
+    """Guess a scene from the meshes of a folder, or of folders ``bones`` and ``muscles`` in it.
 
-    Parameters
-    ----------
-    folder : Path
-        Meshes, or folders ``bones`` and ``muscles`` with them.
-    units : str or None
-        ``"mm"``, ``"cm"`` or ``"m"``; by the size of the bones where it is not given.
-    base : Path
-        Folder that the scene's paths are relative to.
-    header : Orientation, optional
-        Anatomical directions where they are known.
-
-    Raises
-    ------
-    UsageError
-        If the folder is missing, holds no bone or no muscle, or is of no known unit.
+    ``units`` are ``"mm"``, ``"cm"`` or ``"m"``, by the size of the bones where None; the scene's paths are relative to
+    ``base``; a ``header`` holds anatomical directions where they are known. UsageError if the folder is missing, holds
+    no bone or no muscle, or is of no known unit.
     """
     parts = read_parts(folder, units, base)
     bones, millimetre = parts.bones, parts.millimetre
@@ -91,14 +79,10 @@ def guess_scene(
 
 
 def write_scene(guess: SceneGuess, path: Path) -> Scene:
-    """Write the scene file and, beside it, ``attachments/``; what cannot be loaded is commented out, with the reason.
+    """Write the scene file and, beside it, ``attachments/``, and return the scene as loaded from there.
 
-    Returns the scene as loaded from the file.
-
-    Raises
-    ------
-    UsageError
-        If nothing can be written there, or no muscle can be held.
+    What cannot be loaded is commented out, with the reason. UsageError if nothing can be written there, or no muscle
+    can be held.
     """
     try:
         _check_runs(guess, path)

@@ -25,13 +25,8 @@ NARROWEST = 0.002
 class Imported:
     """A scene made from a model.
 
-    Attributes
-    ----------
-    scene, model : Scene, OsimModel
-    places : dict of str to (4, 4) ndarray
-        From every body of the model to the scene, rest pose [metre].
-    notes : list of str
-        What was not taken, or taken otherwise than one may expect.
+    ``places`` are (4, 4) from every body of the model to the scene, rest pose [metre]; ``notes`` say what was not
+    taken, or taken otherwise than one may expect.
     """
 
     scene: Scene
@@ -41,24 +36,11 @@ class Imported:
 
 
 def import_osim(path: Path | str, *, geometry: list[Path] | None = None, muscles: bool = True) -> Imported:
-    """Make a scene of an OpenSim model, in metres as the model is.
+    """Make a scene of an OpenSim model (``.osim``), in metres as it is, with a tube for each of its ``muscles``.
 
     Meshes stand where the model's default pose puts them, which is then the rest pose of the scene. A body without a
-    mesh becomes a bone without one.
-
-    Parameters
-    ----------
-    path : path
-        An ``.osim`` file.
-    geometry : list of path, optional
-        Folders with meshes, after the model's own and its ``Geometry``.
-    muscles : bool
-        Make a tube of each of the model's muscles.
-
-    Raises
-    ------
-    SceneError
-        If the model cannot be read, or has a joint that the table of joints lacks.
+    mesh becomes a bone without one. Meshes are looked for in the model's folder, its ``Geometry``, then in
+    ``geometry``. SceneError if the model cannot be read, or has a joint that the table of joints lacks.
     """
     model = read_osim(path)
     scene, places = Scene(model.name, units="m"), model.transforms()

@@ -25,16 +25,8 @@ def activation_curve(muscle: Muscle, motion: Motion) -> Floats:
 class Activations:
     """Activations of the muscles that contract in the frame loop, and the sub-steps that they need.
 
-    Parameters
-    ----------
-    scene : SceneData
-
-    Attributes
-    ----------
-    here : dict of str to float
-        Of each muscle that contracts, now: 0 before the first frame.
-    target : dict of str to float
-        Set by hand, as a window does; overrides the scene's own curves.
+    ``here`` is that of each muscle now, 0 before the first frame; ``target``, set by hand as a window does, overrides
+    the scene's own curves.
     """
 
     def __init__(self, scene: SceneData) -> None:
@@ -55,18 +47,8 @@ class Activations:
     ) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
         """Sub-steps short enough in activation too.
 
-        Parameters
-        ----------
-        frame : int
-        stops : list of dict
-            Coordinates: where the bones are, then the ends of the sub-steps that they need.
-
-        Returns
-        -------
-        stops : list of dict
-            The same with further ones between them.
-        activations : list of dict
-            For each stop but the first: activation by muscle.
+        ``stops`` are coordinates: where the bones are, then the ends of the sub-steps that they need. Returned are
+        these with further ones between them, and for each but the first the activation by muscle.
         """
         if not self.curves:
             return stops, []

@@ -18,10 +18,7 @@ OUTSIDE = 0.1
 def resolve_contraction(muscle: Muscle) -> Contraction:
     """What the keys of a muscle come to on its mesh.
 
-    Raises
-    ------
-    SceneError
-        On fibres outside the muscle, or a tendon that covers all or nothing.
+    SceneError on fibres outside it, or a tendon that covers all or nothing.
     """
     keys = muscle.contraction or ContractionTable()
     _check_fibres(muscle)

@@ -48,26 +48,14 @@ IDENTITY = Linear((1.0,))
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One number that moves a joint: an angle [radian], a length [scene unit], or one with no unit.
+    """One number that moves a joint: an angle [radian], a length [scene unit], or one with no unit."""
 
-    Attributes
-    ----------
-    motion : {"rotation", "translation", "coupled"}
-        What the number is; a coupled one drives several axes by functions and has no unit of its own.
-    rest : float
-        Its value in the pose in which the meshes are, and in a motion that does not mention it.
-    range : (float, float), optional
-    clamped : bool
-        Cut to the range; others may leave it, which is reported.
-    locked : bool
-        Stays at ``rest`` whatever is asked of it.
-    """
-
+    # What the number is; a coupled one drives several axes by functions and has no unit of its own.
     motion: MotionKind = "rotation"
-    rest: float = 0.0
+    rest: float = 0.0  # in the pose in which the meshes are, and in a motion that does not mention it
     range: tuple[float, float] | None = None
-    clamped: bool = False
-    locked: bool = False
+    clamped: bool = False  # cut to the range; others may leave it, which is reported
+    locked: bool = False  # stays at rest whatever is asked of it
 
     def honoured(self, value: float) -> float:
         """Return what the coordinate becomes when ``value`` is asked of it."""
@@ -93,30 +81,17 @@ class TransformAxis:
 
 @dataclass
 class Joint:
-    """Moves ``child`` (and all that hangs on it) against ``parent``; all is in the scene's coordinates at rest.
-
-    Attributes
-    ----------
-    centre : (3,) ndarray
-        What a ball turns about.
-    coordinates : dict of str to Coordinate
-    rotations, translations : tuple of TransformAxis
-        In order; the first rotation is the outermost.
-    kind : str
-        A key of `KINDS`.
-    backward : bool
-        The joint was written from ``child`` to ``parent``: its motion is inverted.
-    """
+    """Moves ``child`` (and all that hangs on it) against ``parent``; all is in the scene's coordinates at rest."""
 
     name: str
     parent: str
     child: str
-    centre: np.ndarray = field(repr=False)
+    centre: np.ndarray = field(repr=False)  # (3,), what a ball turns about
     coordinates: dict[str, Coordinate]
-    rotations: tuple[TransformAxis, ...] = ()
+    rotations: tuple[TransformAxis, ...] = ()  # the first is the outermost
     translations: tuple[TransformAxis, ...] = ()
-    kind: str = "ball"
-    backward: bool = False
+    kind: str = "ball"  # a key of KINDS
+    backward: bool = False  # written from child to parent: its motion is inverted
 
     def motion(self, values: dict[str, float], rest: dict[str, float]) -> np.ndarray:
         """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity at rest.
@@ -161,13 +136,8 @@ def motion_of(name: str, axes: Iterable[tuple[MotionKind, Sequence[str], float]]
     """What a coordinate of a custom joint is, by OpenSim's rule.
 
     It is an angle or a length where it alone drives an axis of that sort with a slope of 1 or -1, the last such axis
-    deciding; else it is coupled.
-
-    Parameters
-    ----------
-    name : str
-    axes : iterable of (str, sequence of str, float)
-        Sort of each axis, its coordinates, and the first slope of its function where that is linear, else 0.
+    deciding; else it is coupled. ``axes`` are the sort of each, its coordinates, and the first slope of its function
+    where that is linear, else 0.
     """
     found: MotionKind = "coupled"
     for sort, coordinates, slope in axes:

@@ -36,23 +36,11 @@ MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
 def read_mesh(
     path: str | Path, *, name: str | None = None, scale: float = 1.0, may_be_open: bool = False
 ) -> ReadMesh:
-    """Read a surface mesh and mend what is safe to mend.
+    """Read a surface mesh (``.stl``, ``.obj``, ``.ply``, ``.vtk``, ``.vtp``) and mend what is safe to mend.
 
-    Parameters
-    ----------
-    path : path
-        ``.stl``, ``.obj``, ``.ply``, ``.vtk`` or ``.vtp``; polygons are split into triangles.
-    name : str, optional
-        What messages call the mesh, the file's stem by default.
-    scale : float
-        Factor from the file's unit to the scene's.
-    may_be_open : bool
-        Accept holes that cannot be closed safely (bones), with a note.
-
-    Raises
-    ------
-    MeshError
-        If the file is missing, unreadable or empty, or the surface cannot be made closed and manifold.
+    ``name`` is what messages call it, the file's stem by default; ``scale`` takes the file's unit to the scene's.
+    Holes that cannot be closed safely are kept, with a note, where it ``may_be_open`` (bones). MeshError if the file is
+    missing, unreadable or empty, or the surface cannot be made closed and manifold.
     """
     path = Path(path)
     vertices, faces = read_arrays(path)
@@ -178,14 +166,9 @@ def _read_obj(content):
 
 
 def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Floats]:
-    """Return fibres as a list of (k, 3) arrays in scene units.
+    """Return fibres as a list of (k, 3) arrays in scene units, ``scale`` from the unit of a file or of given arrays.
 
-    Parameters
-    ----------
-    fibres : path or list of (k, 3) array_like
-        A JSON file holds ``{"polylines": [[[x, y, z], ...], ...]}`` or that list alone.
-    scale : float
-        Factor from the file's unit to the scene's.
+    A JSON file holds ``{"polylines": [[[x, y, z], ...], ...]}`` or that list alone.
     """
     place = f"muscle {muscle!r} fibres"
     if isinstance(fibres, (str, Path)):

@@ -27,29 +27,15 @@ CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are droppe
 
 @dataclass
 class ReadMesh:
-    """A mesh as read and mended.
+    """A mesh as read and mended."""
 
-    Attributes
-    ----------
-    vertices : (n, 3) ndarray
-        In scene units.
-    faces : (m, 3) ndarray of int
-        Outward.
-    vertex_map : (n_file,) ndarray of int
-        The vertex that each vertex of the file became, -1 where it was dropped.
-    notes : list of str
-        What was mended.
-    closed : bool
-    source : str
-        The file.
-    """
-
-    vertices: Floats = field(repr=False)
-    faces: Integers = field(repr=False)
+    vertices: Floats = field(repr=False)  # (n, 3) in scene units
+    faces: Integers = field(repr=False)  # (m, 3), outward
+    # The vertex (n_file,) that each vertex of the file became, -1 where it was dropped.
     vertex_map: Integers = field(repr=False)
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # what was mended
     closed: bool = True
-    source: str = ""
+    source: str = ""  # the file
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
@@ -60,16 +46,9 @@ class ReadMesh:
 
 
 def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool = False) -> ReadMesh:
-    """Return the mesh closed, manifold and outward, with notes of what was done.
+    """Return the mesh closed, manifold and outward, with notes of what was done; ``place`` begins each message.
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-    place : str
-        Begins each message: the file or the object.
-    may_be_open : bool
-        Keep holes and several parts (bones) instead of refusing them by a MeshError.
+    Holes and several parts are kept where it ``may_be_open`` (bones), and refused by a MeshError elsewhere.
     """
     bad = _repeated(faces)
     state = ReadMesh(vertices, faces[~bad], np.arange(len(vertices)))
