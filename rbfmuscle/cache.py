@@ -20,8 +20,7 @@ from rbfmuscle.geometry.arrays import Array, Floats, Integers
 
 log = logging.getLogger(__name__)
 
-# Part of every name: raise it when the arrays or the way they are built change.
-VERSION = 12
+VERSION = 12  # part of every name: raise it when the arrays or the way they are built change
 SUFFIX = ".sdf.npz"
 _READING = Lock()
 # What reading a damaged, foreign or half-removed archive may raise.

@@ -22,21 +22,14 @@ class _Home(NamedTuple):
     implied: dict
 
 
-_RBF = "rbfmuscle.muscle", "RBFMuscle", "RBFOptions"
 _PBD = "pbd_baseline", "PBDMuscle", "PBDOptions"
 # Sweeps of the converged mesh models go on until none moves a vertex by more than this share of the muscle's size.
 CONVERGED, _SUFFIX = 5e-6, "-converged"
-_HOME = {
-    "rbf": _Home(*_RBF, {}),
-    **{
-        name: _Home(*_PBD, {"method": name, "tolerance": 0.0})
-        for name in ("pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
-    },
-    **{
-        f"{name}{_SUFFIX}": _Home(*_PBD, {"method": name, "tolerance": CONVERGED})
-        for name in ("pbd", "xpbd", "arap-pbd", "arap-volume")
-    },
-}
+_METHODS = ("pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+_HOME = {"rbf": _Home("rbfmuscle.muscle", "RBFMuscle", "RBFOptions", {})}
+_HOME |= {name: _Home(*_PBD, {"method": name, "tolerance": 0.0}) for name in _METHODS}
+for _name in ("pbd", "xpbd", "arap-pbd", "arap-volume"):
+    _HOME[f"{_name}{_SUFFIX}"] = _Home(*_PBD, {"method": _name, "tolerance": CONVERGED})
 
 MODEL_NAMES = tuple(_HOME)
 # The default of `compare`: all but the historical model, and PBD converged.
@@ -100,7 +93,8 @@ def configure_scene(
     """
     check_models(scene)
     for key in settings or ():
-        if key.partition(".")[0] not in HEADS and f"model.{key}" in _model_keys():
+        schemas = (_part(home, "options", home.options) for home in _HOME.values())
+        if key.partition(".")[0] not in HEADS and any(key in schema.model_fields for schema in schemas):
             raise UsageError(f"{key}: unknown setting, did you mean 'model.{key}'?")
     changed = scene.with_options(settings, model=model, frames=frames)
     for muscle in changed.muscles:
@@ -134,12 +128,6 @@ def check_model_name(name: str) -> str:
     raise UsageError(f"unknown model {shown(repr(name))}, {hint}")
 
 
-def _model_keys():
-    return {
-        f"model.{key}" for home in _HOME.values() for key in _part(home, "options", home.options).model_fields
-    }
-
-
 def _check_muscle(muscle):
     _read_options(muscle, _HOME[check_model_name(muscle.model)], muscle.options)
 
@@ -148,9 +136,8 @@ def _read_options(muscle: Muscle, home: _Home, table: Mapping[str, Any]) -> Tabl
     """The checked settings of a muscle's model."""
     for key in home.implied:
         if key in table:
-            raise SceneError(
-                f"muscle {muscle.name!r}: model: {key} follows from the model's name; known: {', '.join(MODEL_NAMES)}"
-            )
+            words = f"{key} follows from the model's name; known: {', '.join(MODEL_NAMES)}"
+            raise SceneError(f"muscle {muscle.name!r}: model: {words}")
     schema = _part(home, "options", home.options)
     return schema.build({**table, **home.implied}, place=f"muscle {muscle.name!r}: model: ")
 

@@ -1,11 +1,9 @@
-"""Checks at the public edges, and the errors that the command line turns into exit codes.
-
-Every package may import this module; it imports nothing of ours.
-"""
+"""Checks at the public edges, and the errors that the command line turns into exit codes."""
 
 import difflib
 import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -97,6 +95,16 @@ def is_file(path: str | os.PathLike[str]) -> bool:
         return os.path.isfile(path)
     except (OSError, ValueError):
         return False
+
+
+def read_text(path: Path, *, place: str) -> str:
+    """Return the text of a file that a scene names, or raise SceneError that begins with ``place``."""
+    if not is_file(path):
+        raise SceneError(f"{place}{shown_path(path)}: cannot read it: no such file")
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise SceneError(f"{place}{path}: cannot read it: {error.strerror}") from None
 
 
 def check_points(points: ArrayLike, *, name: str = "points") -> NDArray[np.float64]:

@@ -116,14 +116,11 @@ def kernels(
     meshes, units = _meshes(source, muscle, units)
     check_writable(output)
     options: dict[str, Any] = {"kernels": _split(names), "placement": placement}
-    try:
-        if error is None:
-            options |= {"centres": [int(c) for c in counts], "units": units, "resolution": resolution}
-            _study(meshes, output, options)
-        else:
-            _find_wanted(meshes, output, error, options, units)
-    except OSError as failed:
-        raise UsageError(f"cannot write to {output}: {failed.strerror}; choose another --output") from None
+    if error is None:
+        options |= {"centres": [int(c) for c in counts], "units": units, "resolution": resolution}
+        _study(meshes, output, options)
+    else:
+        _find_wanted(meshes, output, error, options, units)
 
 
 def _split(texts):
@@ -228,9 +225,8 @@ def sweep(
     axes, changes = parse_grid(grid or []), parse_settings(settings)
     if not scenes or (len(scenes) == 1 and not axes):
         raise UsageError("a sweep needs several scenes, or a grid, for instance --grid model.centres=100,200")
-    loaded = {
-        name: configure_scene(open_scene(path), changes, model=model) for name, path in _names(scenes).items()
-    }
+    opened = {name: open_scene(path) for name, path in _names(scenes).items()}
+    loaded = {name: configure_scene(each, changes, model=model) for name, each in opened.items()}
     points = plan_sweep(loaded, axes, frames=frames, reference=parse_settings(reference))
     for point in points:  # a mistyped key is reported now, not after the first point
         configure_scene(loaded[point.scene], point.settings, frames=frames)
@@ -243,10 +239,8 @@ def sweep(
 
 def _names(scenes):
     """Scene files by their names, or by those of their folders where names are the same."""
-    for names in (
-        [Path(path).stem for path in scenes],
-        [Path(path).resolve().parent.name for path in scenes],
-    ):
+    folders = [Path(path).resolve().parent.name for path in scenes]
+    for names in ([Path(path).stem for path in scenes], folders):
         if len(set(names)) == len(names):
             return dict(zip(names, scenes))
     raise UsageError("scenes of a sweep need different names, or folders of different names")
@@ -272,9 +266,8 @@ def _finish(points, output, units, error):
     for row in bad[:5]:
         print(f"rbfmuscle: {row['scene']} {row['label']}: {row['error'] or row['status']}", file=sys.stderr)
     if bad:
-        raise SolveError(
-            f"{len(bad)} of {len(table['rows'])} points failed; the others are kept, the same command runs these again"
-        )
+        remedy = "the others are kept, the same command runs these again"
+        raise SolveError(f"{len(bad)} of {len(table['rows'])} points failed; {remedy}")
 
 
 def paths(

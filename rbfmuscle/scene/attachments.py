@@ -14,7 +14,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.geometry.winding import inside_test
-from rbfmuscle.scene.joints.skeleton import bones_between
+from rbfmuscle.scene.joints.joint import bones_between
 from rbfmuscle.scene.meshes.read import ReadMesh
 from rbfmuscle.scene.objects import (
     Attachment,

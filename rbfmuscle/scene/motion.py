@@ -8,16 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.joints.joint import Coordinate
-from rbfmuscle.scene.joints.skeleton import all_coordinates, joint_poses, joint_values, resolve
+from rbfmuscle.scene.joints.joint import Coordinate, all_coordinates, joint_poses, joint_values, resolve
 from rbfmuscle.scene.joints.tables import FACTORS, full_name
 from rbfmuscle.scene.objects import Motion, SceneData
 from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions
 from rbfmuscle.scene.tendons import Poses
-from rbfmuscle.validation import SceneError, did_you_mean, is_file, shown_path
+from rbfmuscle.validation import SceneError, did_you_mean, read_text
 
-# Lever [mm] at which a shift of a joint is counted as a turn.
-SHIFT_LEVER = 50.0
+SHIFT_LEVER = 50.0  # lever [mm] at which a shift of a joint is counted as a turn
 NOT_MOVED = 1e-9  # A locked coordinate may be given, at its rest value.
 # Share of a turn [radian] or of a length that rounding may take a coordinate beyond its range.
 RANGE_TOLERANCE = 1e-6
@@ -141,16 +139,12 @@ def _asked_frames(options, facts):
     if options.ramp is not None:
         ramps = named(options.ramp)
         starts = {name: ramp.start for name, ramp in ramps.items() if ramp.start is not None}
-        stops, steps = (
-            [starts, {name: ramp.end for name, ramp in ramps.items()}],
-            [r.step for r in ramps.values()],
-        )
-        return _frames_between(stops, list(ramps), steps, facts)
+        stops = [starts, {name: ramp.end for name, ramp in ramps.items()}]
+        return _frames_between(stops, list(ramps), [ramp.step for ramp in ramps.values()], facts)
     if options.waypoints is not None:
         stops = [named(stop) for stop in options.waypoints]
-        return _frames_between(
-            stops, list(dict.fromkeys(itertools.chain(*stops))), options.step or 1.0, facts
-        )
+        names = list(dict.fromkeys(itertools.chain(*stops)))
+        return _frames_between(stops, names, options.step or 1.0, facts)
     return [{}]
 
 
@@ -165,9 +159,16 @@ def _frames_between(stops, names, steps, facts):
     rows = [table[0]]
     with np.errstate(over="ignore"):
         paces = (np.abs(np.diff(table, axis=0)) / steps).max(axis=1, initial=0.0)
-        _check_count(np.ceil(paces).sum())
+        count = np.ceil(paces).sum()
+    if not count <= MAX_FRAMES:
+        raise SceneError(
+            f"[motion]: about {count:.3g} frames, more than {MAX_FRAMES}: a step is too small for its range; "
+            "make the step larger or the range smaller"
+        )
     for pace, (before, after) in zip(paces.tolist(), itertools.pairwise(table)):
-        rows.extend(before + t * (after - before) for t in _marks(pace)[1:])
+        # At whole steps, then the end: 2.5 steps give 0.4, 0.8, 1 of the path.
+        marks = [*(k / pace for k in range(1, math.ceil(pace - 1e-9))), 1.0] if pace else []
+        rows.extend(before + t * (after - before) for t in marks)
     return [dict(zip(names, (row * factors).tolist())) for row in rows]
 
 
@@ -202,19 +203,6 @@ def _range_notes(frames: list[dict[str, float]], facts: dict[str, Coordinate]) -
                 f"frames, by up to {most:.3g}"
             )
     return notes
-
-
-def _marks(pace):
-    """Fractions of the path at whole steps, then the end: 2.5 steps give 0, 0.4, 0.8, 1."""
-    return [*(k / pace for k in range(math.ceil(pace - 1e-9))), 1.0] if pace else [0.0]
-
-
-def _check_count(count):
-    if not count <= MAX_FRAMES:
-        raise SceneError(
-            f"[motion]: about {count:.3g} frames, more than {MAX_FRAMES}: a step is too small for its range; "
-            "make the step larger or the range smaller"
-        )
 
 
 def read_motion_file(
@@ -260,12 +248,7 @@ def read_motion_file(
 
 def _read_storage(path: Path) -> tuple[dict[str, str], list[str], Floats]:
     """Header (lower case), labels of the columns, and values (rows, columns) of an OpenSim storage file."""
-    if not is_file(path):
-        raise SceneError(f"[motion]: cannot read {shown_path(path)}: no such file")
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise SceneError(f"[motion]: cannot read {path}: {error.strerror}") from None
+    lines = read_text(path, place="[motion]: ").splitlines()
     end = next((row for row, line in enumerate(lines) if line.strip().lower() == "endheader"), len(lines))
     if len(lines) < end + 3:
         words = "no 'endheader' line with columns and rows after it"

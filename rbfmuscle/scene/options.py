@@ -1,7 +1,4 @@
-"""The tables of a scene that hold settings: contact, sliding, detection, output, motion.
-
-They check themselves, so the same rules hold for a file, for code and for ``--set``.
-"""
+"""The tables of a scene that hold settings; the same rules hold for a file, for code and for ``--set``."""
 
 import math
 import re
@@ -101,15 +98,22 @@ class Table(BaseModel):
         return data
 
     @classmethod
-    def build(cls, values: Mapping[str, Any], *, place: str, folder: Path | None = None) -> Self:
+    def build(
+        cls,
+        values: Mapping[str, Any],
+        *,
+        place: str,
+        folder: Path | None = None,
+        name_row: Callable[[tuple[str | int, ...]], str] | None = None,
+    ) -> Self:
         """Return the table made from a mapping, or raise SceneError that begins with ``place``.
 
-        Relative names of files are relative to ``folder``.
+        Relative names of files are relative to ``folder``; ``name_row`` turns pydantic's location into words.
         """
         try:
             return cls.model_validate(values, context={"folder": folder})
         except ValidationError as error:
-            raise SceneError(f"{place}{describe_error(error)}") from None
+            raise SceneError(f"{place}{_describe_error(error, name_row)}") from None
 
 
 def set_dotted(table: dict[str, Any], key: str, value: object, *, place: str) -> None:
@@ -124,11 +128,8 @@ def set_dotted(table: dict[str, Any], key: str, value: object, *, place: str) ->
     table[last] = value
 
 
-def describe_error(error: Any, *, root: str = "", name_row: Callable[..., Any] | None = None) -> str:
-    """Return the first problem of a pydantic error as "root: where: what, given value".
-
-    ``name_row`` turns the location (a tuple) into words.
-    """
+def _describe_error(error, name_row):
+    """The first problem of a pydantic error as "where: what, given value"."""
     first = error.errors(include_url=False)[0]
     # Of a value of several types, pydantic's place names the class that it tried.
     parts = [str(part) for part in first["loc"] if not str(part).endswith("Options")]
@@ -139,7 +140,7 @@ def describe_error(error: Any, *, root: str = "", name_row: Callable[..., Any] |
     value = ""
     if first["type"] not in ("unknown_key", "missing") and not isinstance(given, dict):
         value = f", got {shown(repr(given) if isinstance(given, str) else given)}"
-    return ": ".join(part for part in (root, where, message + value) if part)
+    return f"{where}: {message}{value}" if where else message + value
 
 
 class ContactOptions(Table):

@@ -105,9 +105,8 @@ def _stations(tube, spacing):
     centre, wide, thin = tube.sections(fine)
     path = np.zeros(len(fine))
     for line in (centre + wide, centre + thin, centre - wide, centre - thin):
-        path = np.maximum(
-            path, np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-        )
+        steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+        path = np.maximum(path, np.concatenate([[0], np.cumsum(steps)]))
     count = max(8, round(path[-1] / spacing))
     return np.interp(np.linspace(0, path[-1], count + 1), path, fine)
 

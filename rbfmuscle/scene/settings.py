@@ -10,13 +10,7 @@ from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
 from rbfmuscle.scene.build import split_model
 from rbfmuscle.scene.motion import make_motion, slice_motion
 from rbfmuscle.scene.objects import Muscle, SceneData
-from rbfmuscle.scene.options import (
-    DetectOptions,
-    MotionOptions,
-    SlidingOptions,
-    check_plain,
-    set_dotted,
-)
+from rbfmuscle.scene.options import DetectOptions, MotionOptions, SlidingOptions, check_plain, set_dotted
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
 S = TypeVar("S", bound=SceneData)
@@ -79,9 +73,8 @@ def _apply(scene, key, value):
         head, _, rest = inner.partition(".")
         muscles = [scene.muscle(name)]
         if head != "model" and head not in KEYS:
-            raise SceneError(
-                f"{key}: of a muscle its model (muscle.{name}.model.KEY) and {', '.join(KEYS)} can be set"
-            )
+            allowed = f"its model (muscle.{name}.model.KEY) and {', '.join(KEYS)}"
+            raise SceneError(f"{key}: of a muscle {allowed} can be set")
     if head == "model" and not rest:
         _set_models(muscles, value)
     elif head == "model":
@@ -95,9 +88,8 @@ def _apply(scene, key, value):
     elif not rest:
         raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
     elif head == "motion":
-        options = MotionOptions.build(
-            _changed_motion(scene.motion.options, rest, value, key), place=f"{key}: motion ", folder=folder
-        )
+        values = _changed_motion(scene.motion.options, rest, value, key)
+        options = MotionOptions.build(values, place=f"{key}: motion ", folder=folder)
         scene.motion = make_motion(scene, options)
     else:
         table = getattr(scene, head) or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
@@ -176,7 +168,6 @@ def parse_slice(text: str) -> slice:
         if len(numbers) > 3 or numbers[2:] == [0]:
             raise ValueError
     except ValueError:
-        raise UsageError(
-            f"frames {text!r} must look like A:B:S (whole numbers, S not 0), for instance 0:46:5"
-        ) from None
+        example = "A:B:S (whole numbers, S not 0), for instance 0:46:5"
+        raise UsageError(f"frames {text!r} must look like {example}") from None
     return slice(*numbers)

@@ -18,21 +18,21 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.jit import compiled
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import rotation_about
-from rbfmuscle.scene.taut_line import line_length, points_along, taut_line
 
 # Strain of a passive belly at which it bears the force that strains its tendon by `TENDON_STRAIN` (Zajac 1989), and
 # the tendon's strain over the belly's.
 BELLY_STRAIN = 0.6
 STIFFNESS_RATIO = TENDON_STRAIN / BELLY_STRAIN
-# The string's direction is that of a chord so long, in lengths of the string.
-CHORD = 0.06
+CHORD = 0.06  # the string's direction is that of a chord so long, in lengths of the string
 # Steps to the place of the end where its tendon has the wanted length, and the relative error that ends them.
 STEPS, TOLERANCE = 8, 1e-9
-# Points of a tendon as it is drawn.
-NODES = 33
+NODES = 33  # points of a tendon as it is drawn
+STEEPEST = 2.0  # greatest slope of a line against the chord of its ends
+DIRECTIONS = 64  # directions in which a convex hull is begun
 
 # A bone and a point (3,) of it at rest [scene unit].
 BonePoint: TypeAlias = tuple[str, Floats]
@@ -108,9 +108,8 @@ class TendonEnd:
     @cached_property
     def _share(self) -> float:
         """Place of the belly's end between the muscle's ends at rest, 0 to 1."""
-        belly, tendon = (
-            float(np.linalg.norm(self.middle - end[1])) for end in (self.other[0], self.line[-1])
-        )
+        ends = self.other[0], self.line[-1]
+        belly, tendon = (float(np.linalg.norm(self.middle - point)) for _, point in ends)
         return belly / max(belly + tendon, 1e-300)
 
     @cached_property
@@ -260,3 +259,75 @@ def _least_turn(now: Floats, before: Floats) -> Floats:
     axis, cosine = np.cross(before, now), float(before @ now)
     skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     return np.eye(3) + skew + skew @ skew / max(1.0 + cosine, 1e-9)
+
+
+def taut_line(
+    start: Floats, end: Floats, side: Floats, bones: Sequence[tuple[Floats, Floats]], width: float
+) -> Floats:
+    """Points (n, 3) of the taut line between two points (3,) that passes bones on one side, a direction (3,).
+
+    The line lies in the plane of its ends and ``side``. A point of a bone at a distance z from the plane is an obstacle
+    in it, lower by z² / (2 ``width``), as for a round band. One that the line could only pass by leaving an end more
+    steeply than `STEEPEST` is lowered below that slope by as much as it is above. So the line changes continuously
+    where the plane comes to meet a bone, and parts of bones that lie far to the side do not count. ``bones`` are poses
+    (4, 4) and points (n, 3) at rest.
+    """
+    size = float(np.linalg.norm(end - start))
+    along = (end - start) / max(size, 1e-300)
+    up = side - (side @ along) * along
+    up = up / max(float(np.linalg.norm(up)), 1e-300)
+    axes = np.stack([along, up, np.cross(along, up)])
+    profile = []
+    for pose, points in bones:
+        turn, shift, found = axes @ pose[:3, :3], axes @ (pose[:3, 3] - start), np.empty((len(points), 2))
+        profile.append(found[: _profile_loop(points, turn, shift, size, max(width, 1e-300), found)])
+    if not any(len(found) for found in profile):
+        return np.stack([start, end])
+    return start + _upper_hull(np.concatenate([[[0.0, 0.0], [size, 0.0]], *profile])) @ axes[:2]
+
+
+@compiled(error_model="numpy")
+def _profile_loop(points, turn, shift, size, width, found):
+    """Fill ``found`` with points along and above a chord, counted as in `taut_line`; return how many there are."""
+    count = 0
+    for i in range(len(points)):
+        a, b, c = points[i, 0], points[i, 1], points[i, 2]
+        x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0]
+        if x <= 0.0 or x >= size:
+            continue
+        y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + shift[1]
+        z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + shift[2]
+        y = min(y, 2.0 * STEEPEST * min(x, size - x) - y) - z * z / (2.0 * width)
+        if y > 0.0:
+            found[count, 0], found[count, 1] = x, y
+            count += 1
+    return count
+
+
+def _upper_hull(points: Floats) -> Floats:
+    """Upper convex hull (k, 2) of points (n, 2), from left to right (Andrew 1979)."""
+    # Nearly all points lie below the hull of those that are outermost in some directions.
+    angles = np.linspace(0.0, np.pi, DIRECTIONS)
+    outermost = np.unique(np.argmax(np.stack([-np.cos(angles), np.sin(angles)], axis=1) @ points.T, axis=1))
+    outermost = outermost[np.argsort(points[outermost, 0], kind="stable")]
+    above = points[:, 1] >= np.interp(points[:, 0], *points[outermost].T)
+    hull: list[Floats] = []
+    for point in points[above][np.lexsort(points[above].T[::-1])]:
+        while len(hull) > 1:
+            (ax, ay), (bx, by) = hull[-2], hull[-1]
+            if (bx - ax) * (point[1] - ay) < (by - ay) * (point[0] - ax):
+                break
+            hull.pop()
+        hull.append(point)
+    return np.array(hull)
+
+
+def line_length(points: Floats) -> float:
+    """Length of the line through points (n, 3)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def points_along(line: Floats, places: Floats) -> Floats:
+    """Points (k, 3) at distances (k,) along a line (n, 3) from its beginning."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    return np.stack([np.interp(places, along, line[:, axis]) for axis in range(3)], axis=1)

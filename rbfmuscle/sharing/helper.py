@@ -22,7 +22,6 @@ class _Forward(logging.Handler):
         self.outbox = outbox
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Send one record."""
         self.outbox.put(("logged", (record.name, record.levelno, record.getMessage())))
 
 

@@ -34,14 +34,7 @@ PARENTS = {
 }
 ROOTS = ("pelvis", "ilium", "sacrum", "scapula", "rib", "vertebra", "femur", "humerus", "tibia")
 # Class of the child: name of its joint with one of its parents above.
-JOINTS = {
-    "femur": "hip",
-    "tibia": "knee",
-    "talus": "ankle",
-    "patella": "patella",
-    "humerus": "shoulder",
-    "ulna": "elbow",
-}
+JOINTS = dict(femur="hip", tibia="knee", talus="ankle", patella="patella", humerus="shoulder", ulna="elbow")
 # Joint: coordinates and ranges [degree] (American Academy of Orthopaedic Surgeons 1965, Joint Motion). Positive as the
 # International Society of Biomechanics has it (Wu et al. 2002): flexion, adduction, internal rotation, dorsiflexion.
 COORDINATES = {
@@ -49,8 +42,7 @@ COORDINATES = {
     "knee": {"flexion": (-10.0, 135.0)},
     "ankle": {"dorsiflexion": (-50.0, 20.0)},
 }
-# Greatest misfit of a condyle or a dome against its radius.
-MISFIT = 0.05
+MISFIT = 0.05  # greatest misfit of a condyle or a dome against its radius
 
 
 @dataclass
@@ -62,9 +54,7 @@ class JointGuess:
     kind: str  # "ball", "hinge", "custom" (the patella) or "fixed"
     centre: np.ndarray  # (3,) [scene unit]
     axes: dict[str, np.ndarray]  # (3,) by coordinate
-    confidence: (
-        float  # 0 to 1: one minus half the misfit over the greatest allowed, where something was fitted
-    )
+    confidence: float  # 0 to 1: where something was fitted, one minus half the misfit over its limit
     reason: str
     name: str = ""
     ranges: dict[str, tuple] = field(default_factory=dict)  # of coordinates [degree]

@@ -18,12 +18,9 @@ from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normal
 from rbfmuscle.importers.labels.read import LabelVolume
 from rbfmuscle.validation import MeshError
 
-# Deviation of the Gaussian [voxels], and how often what it lost is smoothed again.
-SMOOTHING, PASSES = 1.3, 4
-# Voxels kept around a label, beyond which the filter sees nothing.
-MARGIN = 6
-# Share of the largest piece from which on a piece belongs to a bone of several parts.
-PIECE = 0.01
+SMOOTHING, PASSES = 1.3, 4  # deviation of the Gaussian [voxels], and how often what it lost is smoothed again
+MARGIN = 6  # voxels kept around a label, beyond which the filter sees nothing
+PIECE = 0.01  # share of the largest piece from which on a piece belongs to a bone of several parts
 # Edge of the surface's triangles [voxels], and rounds in which triangles that cross are drawn apart.
 EDGE, UNTANGLE = 2.2, 20
 

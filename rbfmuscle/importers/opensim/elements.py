@@ -11,21 +11,12 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.importers.opensim.xml import Node, plain_name
-from rbfmuscle.scene.joints.functions import (
-    Function,
-    Linear,
-    PiecewiseLinear,
-    Polynomial,
-    Spline,
-    scaled,
-)
+from rbfmuscle.scene.joints.functions import Function, Linear, PiecewiseLinear, Polynomial, Spline, scaled
 from rbfmuscle.validation import SceneError
 
 _DEEPEST = 50
-# Older names of the same spline.
-SPLINES = ("SimmSpline", "NaturalCubicSpline", "natCubicSpline")
-# What stands beside a function in an element.
-BESIDE = ("coordinates", "axis", "scale")
+SPLINES = ("SimmSpline", "NaturalCubicSpline", "natCubicSpline")  # older names of the same spline
+BESIDE = ("coordinates", "axis", "scale")  # what stands beside a function in an element
 
 
 class Frames:

@@ -19,8 +19,7 @@ from rbfmuscle.scene.joints.functions import Linear, scaled
 from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, TransformAxis, motion_of
 from rbfmuscle.validation import SceneError
 
-# From this version on joints stand in a set of their own and name their frames.
-SOCKETS = 40000
+SOCKETS = 40000  # from this version on joints stand in a set of their own and name their frames
 # What OpenSim calls otherwise than our table of joints; where both have one, its coordinates are in the same order.
 RENAMED = {"weld": "fixed", "pin": "hinge", "gimbal": "ball"}
 # Force per area of muscle [N/m2] (Arnold et al. 2010, Ann Biomed Eng 38: 269; Rajagopal et al. 2016 have 60 N/cm2).
@@ -52,9 +51,8 @@ def _read_model(root, path):
     model.bodies = [GROUND, *(body.name for body in bodies if body.name != GROUND)]
     units = node.word("length_units", "meters")
     if units not in ("meters", "m", "metres"):
-        model.notes.append(
-            f"<length_units> says {units!r}; lengths are read as metres, as OpenSim reads them"
-        )
+        words = "lengths are read as metres, as OpenSim reads them"
+        model.notes.append(f"<length_units> says {units!r}; {words}")
     frames = Frames(node)
     if version >= SOCKETS or node.child("JointSet") is not None:
         _read_sockets(model, node, frames)

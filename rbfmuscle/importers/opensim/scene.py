@@ -14,10 +14,9 @@ from rbfmuscle.importers.toml_text import table_text
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, ReadMesh, prepare_mesh, read_arrays
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import MeshError, SceneError, UsageError, check_mesh
+from rbfmuscle.validation import MeshError, SceneError, check_mesh
 
-# A mesh wider than this [m] is a floor or a wall, not a bone.
-WIDEST = 3.0
+WIDEST = 3.0  # a mesh wider than this [m] is a floor or a wall, not a bone
 NARROWEST = 0.002
 
 
@@ -151,20 +150,17 @@ def write_scene(found: Imported, directory: Path) -> Path:
     directory, scene = Path(directory), found.scene
     target = directory / "scene.toml"
     facts = {"format": 1, "name": scene.name, "units": scene.units}
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        facts |= {"left_out": scene.left_out} if scene.left_out else {}
-        facts |= {"superior": scene.superior, "anterior": scene.anterior}
-        bones = [{"name": bone.name, "mesh": _write_mesh(directory, "bones", bone)} for bone in scene.bones]
-        parts = [_head(found), table_text("[scene]", facts)]
-        parts += [table_text("[[bone]]", row) for row in bones]
-        parts += [table_text("[[bone]]   # no mesh: joints only", {"name": name}) for name in scene.links]
-        parts += [table_text("[[joint]]", joint_row(joint)) for joint in scene.joints]
-        parts += [table_text("[[coupling]]", coupling_row(c, scene.joints)) for c in scene.couplings]
-        parts += [_muscle_text(directory, muscle) for muscle in scene.muscles]
-        target.write_text("\n".join(parts), encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another --output") from None
+    directory.mkdir(parents=True, exist_ok=True)
+    facts |= {"left_out": scene.left_out} if scene.left_out else {}
+    facts |= {"superior": scene.superior, "anterior": scene.anterior}
+    bones = [{"name": bone.name, "mesh": _write_mesh(directory, "bones", bone)} for bone in scene.bones]
+    parts = [_head(found), table_text("[scene]", facts)]
+    parts += [table_text("[[bone]]", row) for row in bones]
+    parts += [table_text("[[bone]]   # no mesh: joints only", {"name": name}) for name in scene.links]
+    parts += [table_text("[[joint]]", joint_row(joint)) for joint in scene.joints]
+    parts += [table_text("[[coupling]]", coupling_row(c, scene.joints)) for c in scene.couplings]
+    parts += [_muscle_text(directory, muscle) for muscle in scene.muscles]
+    target.write_text("\n".join(parts), encoding="utf-8")
     return target
 
 

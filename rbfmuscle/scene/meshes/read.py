@@ -24,6 +24,7 @@ from rbfmuscle.validation import (
     check_positive,
     did_you_mean,
     is_file,
+    read_text,
     shown,
     shown_path,
 )
@@ -65,9 +66,8 @@ def as_mesh(
         return read_mesh(mesh, name=name, scale=scale, may_be_open=may_be_open)
     vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
     vertices = np.asarray(vertices, dtype=np.float64) * scale
-    return prepare_mesh(
-        vertices, np.asarray(faces), place=f"mesh {name!r}", name=name, may_be_open=may_be_open
-    )
+    place = f"mesh {name!r}"
+    return prepare_mesh(vertices, np.asarray(faces), place=place, name=name, may_be_open=may_be_open)
 
 
 def prepare_mesh(
@@ -101,9 +101,8 @@ def read_arrays(path: Path) -> tuple[Floats, Integers]:
     """Return vertices (n, 3) and triangles (m, 3) of a mesh file as they stand, or raise MeshError."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise MeshError(
-            f"{shown_path(path)}: {shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
-        )
+        words = f"{shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
+        raise MeshError(f"{shown_path(path)}: {words}")
     if not is_file(path):
         raise MeshError(f"{shown_path(path)}: no such mesh file{_neighbours(path)}")
     try:
@@ -172,8 +171,7 @@ def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Fl
     """
     place = f"muscle {muscle!r} fibres"
     if isinstance(fibres, (str, Path)):
-        place = f"{place}: {fibres}"
-        fibres = _read_lines(Path(fibres), place)
+        place, fibres = f"{place}: {fibres}", _read_lines(Path(fibres), f"{place}: ")
     lines = []
     for number, line in enumerate(fibres):
         try:
@@ -181,9 +179,8 @@ def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Fl
         except (ValueError, TypeError) as error:
             raise SceneError(f"{place}: {error}") from None
         if len(points) < 2:
-            raise SceneError(
-                f"{place}: polyline {number} has {len(points)} points, a fibre needs two or more"
-            )
+            words = f"polyline {number} has {len(points)} points, a fibre needs two or more"
+            raise SceneError(f"{place}: {words}")
         lines.append(points * scale)
     if not lines:
         raise SceneError(f"{place}: no polylines")
@@ -191,15 +188,12 @@ def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Fl
 
 
 def _read_lines(path, place):
-    if not is_file(path):
-        raise SceneError(f"{place}: no such file")
+    text = read_text(path, place=place)
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SceneError(f"{place}: cannot be read: {error.strerror}") from None
+        found = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise SceneError(f"{place}: not JSON ({shown(str(error))})") from None
+        raise SceneError(f"{place}{path}: not JSON ({shown(str(error))})") from None
     lines = found.get("polylines") if isinstance(found, dict) else found
     if not isinstance(lines, list):
-        raise SceneError(f"{place}: needs a list 'polylines'")
+        raise SceneError(f"{place}{path}: needs a list 'polylines'")
     return lines
