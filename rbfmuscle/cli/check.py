@@ -22,7 +22,13 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
     """
     with Progress(f"check {scene.name}"):
         loaded, findings = _findings(scene)
-        errors = _measure_fields(loaded) if fields else {}
+        errors = {}
+        if fields:
+            from rbfmuscle.bones.errors import measure_field
+            from rbfmuscle.bones.sdf import BoneSDF
+
+            with stage("errors of the bones' fields"):
+                errors = {b.name: measure_field(BoneSDF.from_mesh(b.mesh, name=b.name)) for b in loaded.bones}
         drawn = {}
         if picture:
             from rbfmuscle.report.render import draw_scene
@@ -44,7 +50,6 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
 def _findings(path):
     from rbfmuscle.importers.guess.orientation import orient_scene
     from rbfmuscle.models import check_models
-    from rbfmuscle.scene.attachments import ExactMeshes
     from rbfmuscle.scene.check import Finding, check_scene, sort_findings
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.simulation.motion_check import motion_findings
@@ -53,16 +58,15 @@ def _findings(path):
     loaded = open_scene(path, skeleton=True)
     orient_scene(loaded)
     check_models(loaded)
-    exact = ExactMeshes()
     with stage("fields of the bones"):
-        findings = [*check_scene(loaded, exact), *_field_notes(loaded)]
+        findings = [*check_scene(loaded), *_field_notes(loaded)]
     try:
         check_substeps(loaded)
     except SceneError as error:
         findings.append(Finding("error", loaded.name, str(error)))
     if not any(finding.level == "error" for finding in findings):
         with stage("checking the motion"):
-            findings += motion_findings(loaded, exact)
+            findings += motion_findings(loaded)
     return loaded, sort_findings(findings)
 
 
@@ -82,15 +86,6 @@ def _field_notes(scene):
         ]
     finally:
         logger.setLevel(level)
-
-
-def _measure_fields(scene):
-    """Errors of the distance field of each bone, by name."""
-    from rbfmuscle.bones.errors import measure_field
-    from rbfmuscle.bones.sdf import BoneSDF
-
-    with stage("errors of the bones' fields"):
-        return {b.name: measure_field(BoneSDF.from_mesh(b.mesh, name=b.name)) for b in scene.bones}
 
 
 def _describe_field(name, found, units):

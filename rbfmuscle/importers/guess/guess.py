@@ -12,12 +12,11 @@ from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
 from rbfmuscle.importers.guess.parts import Part, Parts, read_parts
 from rbfmuscle.importers.toml_text import table_text
-from rbfmuscle.scene.attachments import ExactMeshes
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
-# Below this confidence a guess is listed on the terminal.
-DOUBTFUL = 0.6
+DOUBTFUL = 0.6  # below this confidence a guess is listed on the terminal
 _TAIL = """[contact]
 initial = "resolve"   # muscles that start inside a bone are pushed out; or "keep", "error"
 
@@ -67,7 +66,7 @@ def guess_scene(
     for joint in joints:  # parents come before their children
         if joint.kind == "fixed":
             bodies[joint.child] = bodies[joint.parent]
-    skeleton = Skeleton(bones, bodies, joints, ExactMeshes(), millimetre)
+    skeleton = Skeleton({bone: Bone(bone.name, bone.mesh) for bone in bones}, bodies, joints, millimetre)
     guess.muscles = [guess_attachments(muscle, skeleton) for muscle in parts.muscles]
     # Where the bones that names ask for are not here, what is there is taken.
     if all(muscle.wrong for muscle in guess.muscles):
@@ -81,28 +80,24 @@ def guess_scene(
 def write_scene(guess: SceneGuess, path: Path) -> Scene:
     """Write the scene file and, beside it, ``attachments/``, and return the scene as loaded from there.
 
-    What cannot be loaded is commented out, with the reason. UsageError if nothing can be written there, or no muscle
-    can be held.
+    What cannot be loaded is commented out, with the reason. UsageError if no muscle can be held.
     """
-    try:
-        _check_runs(guess, path)
-        _write_coarse(guess, path.parent)
-        for muscle in guess.muscles:
-            for hold in muscle.holds:
-                file = path.parent / _hold_file(muscle, hold)
-                file.parent.mkdir(parents=True, exist_ok=True)
-                in_file = np.isin(muscle.muscle.read.vertex_map, hold.vertices)
-                np.savetxt(file, np.flatnonzero(in_file), fmt="%d")
-        while True:
-            path.write_text(_scene_text(guess), encoding="utf-8")
-            try:
-                return Scene.load(path)
-            except (SceneError, MeshError) as error:
-                path.unlink()
-                _leave_out(guess, error)
-                _check_runs(guess, path)
-    except OSError as error:
-        raise UsageError(f"cannot write {path}: {error.strerror}; choose another --output") from None
+    _check_runs(guess, path)
+    _write_coarse(guess, path.parent)
+    for muscle in guess.muscles:
+        for hold in muscle.holds:
+            file = path.parent / _hold_file(muscle, hold)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            in_file = np.isin(muscle.muscle.read.vertex_map, hold.vertices)
+            np.savetxt(file, np.flatnonzero(in_file), fmt="%d")
+    while True:
+        path.write_text(_scene_text(guess), encoding="utf-8")
+        try:
+            return Scene.load(path)
+        except (SceneError, MeshError) as error:
+            path.unlink()
+            _leave_out(guess, error)
+            _check_runs(guess, path)
 
 
 def _write_coarse(guess, folder):
@@ -133,10 +128,8 @@ def _leave_out(guess, error):
 
 def _scene_text(guess: SceneGuess) -> str:
     """The scene file of a guess: what is not sure marked GUESS, what cannot run commented out."""
-    bones = [
-        table_text("[[bone]]", {"name": bone.name, "mesh": bone.file}, _doubt(bone))
-        for bone in guess.parts.bones
-    ]
+    rows = [({"name": bone.name, "mesh": bone.file}, _doubt(bone)) for bone in guess.parts.bones]
+    bones = [table_text("[[bone]]", row, doubt) for row, doubt in rows]
     movable = [joint for joint in guess.joints if joint.axes and not joint.follows]
     motion = [_motion(movable[0])] if movable else []
     muscles = map(_muscle, guess.muscles)
