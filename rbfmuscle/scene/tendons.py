@@ -114,10 +114,7 @@ class TendonEnd:
 
     @cached_property
     def _sides(self) -> list[Floats]:
-        """Direction (3,) at rest to the side on which each leg of the string passes the bones.
-
-        It leads out of the nearest bone: from the belly's end in the leg that passes it, from the middle of others.
-        """
+        """Directions (3,) at rest out of the nearest bone, on whose side each leg of the string passes the bones."""
         stops = [point for _, point in (*self.other, *self.line)]
         places = [0.5 * (a + b) for a, b in itertools.pairwise(stops)]
         places[len(self.other) - 1] = self.middle
@@ -207,11 +204,8 @@ class TendonEnd:
         return legs
 
     def _turn(self, before: Floats, now: Floats, poses: Mapping[str, Floats]) -> Floats:
-        """Rotation (3, 3) that takes one direction to the other.
-
-        Seen from the bone of either end it would be the least rotation that does; the twist about the direction between
-        these two is spread evenly along the string.
-        """
+        """Rotation (3, 3) from one direction to the other; the twist between both ends' bones is spread evenly."""
+        # Seen from the bone of either end it would be the least rotation.
         near, far = (poses[end[0]][:3, :3] for end in (self.other[0], self.line[-1]))
         first, last = (turn @ _least_turn(turn.T @ now, before) for turn in (near, far))
         twist = last @ first.T

@@ -59,6 +59,7 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     if target < len(faces):
         vertices, faces = (np.asarray(part) for part in igl.qslim(vertices, faces, target)[:2])
     faces = faces.astype(np.int64)
+    # Edges that collapse on either side of a thin wall fold it, or bring its sides through each other.
     vertices = _to_volume(_untangled(vertices, faces, smooth), faces, count)
     corner = np.array([part.start for part in box]) - MARGIN
     world = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
@@ -99,10 +100,7 @@ def _without_islands(mask, notes, least):
 
 
 def _untangled(vertices, faces, smooth):
-    """Vertices where no triangle goes through another: beside such places evened out, and put back on the zero set.
-
-    Edges that collapse on either side of a wall thinner than a triangle fold it, or bring its sides through each other.
-    """
+    """Vertices where no triangle goes through another: beside such places evened out, and put back on the zero set."""
     heads, tails = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     degree = np.bincount(heads, minlength=len(vertices))
     least, best = np.inf, vertices

@@ -100,11 +100,7 @@ def _find_mesh(name: str, folders: list[Path]) -> Path | None:
 def _body_meshes(
     model: OsimModel, places: dict[str, np.ndarray], geometry: list[Path]
 ) -> tuple[dict[str, ReadMesh], list[str]]:
-    """One mesh for each body that shows any, in the scene's coordinates, and what could not be taken.
-
-    ``places`` are (4, 4) from every body to the ground in the rest pose [metre]; ``geometry`` are folders with meshes,
-    after the model's own and its ``Geometry``.
-    """
+    """One mesh for each body that shows any, in the scene's coordinates [metre], and what could not be taken."""
     folders = [model.path.parent, model.path.parent / "Geometry", *geometry]
     parts, meshes, notes = {}, {}, []
     for mesh in model.meshes:

@@ -69,10 +69,8 @@ def _tendon(muscle: Muscle, given: TendonTable | None) -> Booleans:
 
 
 def _along_surface(mesh, start):
-    """Length of the shortest path over the surface from the vertices ``start``, (n,), some per cent too long.
-
-    Along edges, and across them to the corner on the other side: along edges alone paths are up to 15 % too long.
-    """
+    """Length (n,) of the shortest path over the surface from the vertices ``start``, some per cent too long."""
+    # Along edges, and across them to the corner on the other side: along edges alone up to 15 % too long.
     ends = np.concatenate([mesh.edges_unique, mesh.face_adjacency_unshared])
     ends = np.unique(np.sort(ends, axis=1), axis=0)
     lengths = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)

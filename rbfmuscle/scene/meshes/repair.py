@@ -93,10 +93,7 @@ def _check_closed(state, place, may_be_open):
 
 
 def _check_inside(state, place):
-    """Refuse or note a closed surface that does not enclose a volume, once, over all of its area.
-
-    A flat or twisted surface may be closed and consistently oriented, and still have no inside.
-    """
+    """Refuse or note a surface that is closed and has no inside: flat or twisted, judged over all of its area."""
     wrong, volume = _twisted_share(state.mesh), float(_cones(state.vertices, state.faces).sum())
     if wrong > MOST_TWISTED:
         raise MeshError(
@@ -253,10 +250,7 @@ def _rims(faces: Integers) -> list[Integers]:
 
 
 def _orient(state, place):
-    """Make neighbouring faces agree, then turn what was mended, or the whole, outward.
-
-    A consistent inner shell (a cavity of a bone) rightly faces the other way and stays.
-    """
+    """Make neighbouring faces agree, then turn what was mended, or the whole, outward; consistent cavities stay."""
     faces = np.ascontiguousarray(state.faces)
     oriented, part = igl.bfs_orient(faces)
     sides = oriented * (int(faces.max()) + 1) + np.roll(oriented, -1, axis=1)
