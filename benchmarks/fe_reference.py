@@ -23,7 +23,6 @@ from rbfmuscle.models import COMPARED
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.run import simulate
-from rbfmuscle.scene.attachments import ExactMeshes
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.phantom import ATTACHED_ENDS, ATTACHED_WITHIN, MUSCLES, phantom_scene
 
@@ -128,7 +127,7 @@ class Course:
         skin = np.unique(self.solid.surface_faces())
         first, last = ATTACHED_ENDS[MUSCLE]
         for index, (bone, place) in enumerate(zip(self.scene.bones, (u <= first, u >= last))):
-            near = ExactMeshes().distances(rest[skin], bone.mesh) <= ATTACHED_WITHIN
+            near = bone.distances(rest[skin]) <= ATTACHED_WITHIN
             owner[skin[near & place[skin]]] = index
         return owner
 

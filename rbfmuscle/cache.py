@@ -4,8 +4,6 @@ An entry is a NumPy archive (`numpy.load` reads it). It is written to a temporar
 several processes may build the same field and none reads half of it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import logging
@@ -22,8 +20,7 @@ from rbfmuscle.geometry.arrays import Array, Floats, Integers
 
 log = logging.getLogger(__name__)
 
-# Part of every name: raise it when the arrays or the way they are built change.
-VERSION = 12
+VERSION = 12  # part of every name: raise it when the arrays or the way they are built change
 SUFFIX = ".sdf.npz"
 _READING = Lock()
 # What reading a damaged, foreign or half-removed archive may raise.

@@ -3,8 +3,6 @@
 They are started by command and not by `multiprocessing`, so that a script needs no guard of its main part.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

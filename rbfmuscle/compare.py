@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
 
-# The motion is repeated with steps this many times as long.
-COARSER = 5
+COARSER = 5  # the motion is repeated with steps this many times as long
 
 
 def compare_models(
@@ -130,18 +129,12 @@ def _measure(name, scene, folder, progress):
     report = None if progress is None else (lambda done, total: progress(name, done, total))
     stream_run(scene, folder, pictures=False, progress=report)
     with stage(f"{name}: there and back by coarser steps"):
-        again = _there_and_back(scene)
+        frames = scene.motion.frames
+        coarse = frames[:-1:COARSER]
+        build, shown = _surfaces(scene, [*coarse, frames[-1], *coarse[::-1]])
+    again = {"build": build} | ({"turn": shown[len(coarse)], "end": shown[-1]} if coarse else {})
     with stage(f"{name}: measuring"):
         return measure_run(SavedRun(folder), again)
-
-
-def _there_and_back(scene):
-    """Time to build, and surfaces at the last pose and back at the first, by coarser steps."""
-    frames = scene.motion.frames
-    coarse = frames[:-1:COARSER]
-    turn = len(coarse)
-    build, shown = _surfaces(scene, [*coarse, frames[-1], *coarse[::-1]])
-    return {"build": build} | ({"turn": shown[turn], "end": shown[2 * turn]} if turn else {})
 
 
 def _surfaces(scene, frames):

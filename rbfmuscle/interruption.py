@@ -26,25 +26,19 @@ class _State:
 
 
 def install(*, as_json: bool = False, watch: bool = False) -> None:
-    """Let SIGINT and SIGTERM end the process with 130.
+    """Let SIGINT and SIGTERM end the process with 130, with the error as JSON on standard output where ``as_json``.
 
-    Parameters
-    ----------
-    as_json : bool
-        Standard output gets the error as JSON.
-    watch : bool
-        Also listen in a thread: Python's own handlers wait until compiled code of the main thread returns.
+    With ``watch`` a thread listens too: Python's own handlers wait until compiled code of the main thread returns.
     """
     _State.asked, _State.kept, _State.as_json = False, None, as_json
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _handle)
+    _answer_by(_handle)
     if watch:
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         threading.Thread(target=_listen, args=(reader,), daemon=True).start()
-        # The first of all that is registered is the last that is called.
-        atexit.register(_ignore)
+        # The first of all that is registered is the last that is called: signals are ignored while Python exits.
+        atexit.register(_answer_by, signal.SIG_IGN)
 
 
 @contextlib.contextmanager
@@ -71,10 +65,9 @@ def check() -> None:
         raise KeyboardInterrupt
 
 
-def _ignore():
-    """Ignore signals while Python exits, so that the exit code stays."""
+def _answer_by(handler):
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+        signal.signal(number, handler)
 
 
 def _must_finish():

@@ -22,21 +22,14 @@ class _Home(NamedTuple):
     implied: dict
 
 
-_RBF = "rbfmuscle.muscle", "RBFMuscle", "RBFOptions"
 _PBD = "pbd_baseline", "PBDMuscle", "PBDOptions"
 # Sweeps of the converged mesh models go on until none moves a vertex by more than this share of the muscle's size.
 CONVERGED, _SUFFIX = 5e-6, "-converged"
-_HOME = {
-    "rbf": _Home(*_RBF, {}),
-    **{
-        name: _Home(*_PBD, {"method": name, "tolerance": 0.0})
-        for name in ("pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
-    },
-    **{
-        f"{name}{_SUFFIX}": _Home(*_PBD, {"method": name, "tolerance": CONVERGED})
-        for name in ("pbd", "xpbd", "arap-pbd", "arap-volume")
-    },
-}
+_METHODS = ("pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+_HOME = {"rbf": _Home("rbfmuscle.muscle", "RBFMuscle", "RBFOptions", {})}
+_HOME |= {name: _Home(*_PBD, {"method": name, "tolerance": 0.0}) for name in _METHODS}
+for _name in ("pbd", "xpbd", "arap-pbd", "arap-volume"):
+    _HOME[f"{_name}{_SUFFIX}"] = _Home(*_PBD, {"method": _name, "tolerance": CONVERGED})
 
 MODEL_NAMES = tuple(_HOME)
 # The default of `compare`: all but the historical model, and PBD converged.
@@ -58,22 +51,10 @@ def model_title(muscle: Muscle) -> str:
 
 
 def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> MuscleModel:
-    """Return the model of one muscle of a scene.
+    """Return the model of one muscle of a scene, of a name in ``MODEL_NAMES``, the scene's own choice where not given.
 
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-    name : str, optional
-        One of ``MODEL_NAMES``; the scene's own choice where not given. The options of the scene's model
-        table are for the class of models that it names, and are left out for another.
-
-    Raises
-    ------
-    UsageError
-        On an unknown name, with the nearest right one.
-    SceneError
-        If a setting is unknown or impossible.
+    The options of the scene's model table are for the class of models that it names, and are left out for another.
+    UsageError on an unknown name, with the nearest right one; SceneError if a setting is unknown or impossible.
     """
     name = muscle.model if name is None else name
     home = _HOME[check_model_name(name)]
@@ -83,13 +64,7 @@ def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> Muscle
 
 
 def solved_points(muscle: Muscle, scene: Scene) -> str:
-    """The points that the model of a muscle solves for, in words; nothing is built.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-    """
+    """The points that the model of a muscle solves for, in words; nothing is built."""
     home = _HOME[check_model_name(muscle.model)]
     options = _read_options(muscle, home, muscle.options)
     return _part(home, "rest", "solved_points")(muscle, scene, options)
@@ -113,21 +88,13 @@ def configure_scene(
 ) -> Scene:
     """Return a scene with other settings, checked to the last key of every muscle's model; nothing is built.
 
-    Parameters
-    ----------
-    scene, settings, model, frames
-        As for `Scene.with_options`.
-
-    Raises
-    ------
-    SceneError
-        If the scene itself names an unknown model, or an unknown or impossible setting of one.
-    UsageError
-        If the settings do.
+    Arguments are those of `Scene.with_options`. SceneError if the scene itself names an unknown model, or an unknown or
+    impossible setting of one; UsageError if the settings do.
     """
     check_models(scene)
     for key in settings or ():
-        if key.partition(".")[0] not in HEADS and f"model.{key}" in _model_keys():
+        schemas = (_part(home, "options", home.options) for home in _HOME.values())
+        if key.partition(".")[0] not in HEADS and any(key in schema.model_fields for schema in schemas):
             raise UsageError(f"{key}: unknown setting, did you mean 'model.{key}'?")
     changed = scene.with_options(settings, model=model, frames=frames)
     for muscle in changed.muscles:
@@ -141,10 +108,7 @@ def configure_scene(
 def check_models(scene: Scene) -> None:
     """Check the model and the settings of every muscle of a scene, building nothing.
 
-    Raises
-    ------
-    SceneError
-        Naming the file, the muscle and the nearest right name.
+    SceneError names the file, the muscle and the nearest right name.
     """
     root = f"{scene.path}: " if scene.path else ""
     for muscle in scene.muscles:
@@ -164,12 +128,6 @@ def check_model_name(name: str) -> str:
     raise UsageError(f"unknown model {shown(repr(name))}, {hint}")
 
 
-def _model_keys():
-    return {
-        f"model.{key}" for home in _HOME.values() for key in _part(home, "options", home.options).model_fields
-    }
-
-
 def _check_muscle(muscle):
     _read_options(muscle, _HOME[check_model_name(muscle.model)], muscle.options)
 
@@ -178,9 +136,8 @@ def _read_options(muscle: Muscle, home: _Home, table: Mapping[str, Any]) -> Tabl
     """The checked settings of a muscle's model."""
     for key in home.implied:
         if key in table:
-            raise SceneError(
-                f"muscle {muscle.name!r}: model: {key} follows from the model's name; known: {', '.join(MODEL_NAMES)}"
-            )
+            words = f"{key} follows from the model's name; known: {', '.join(MODEL_NAMES)}"
+            raise SceneError(f"muscle {muscle.name!r}: model: {words}")
     schema = _part(home, "options", home.options)
     return schema.build({**table, **home.implied}, place=f"muscle {muscle.name!r}: model: ")
 

@@ -1,18 +1,19 @@
-"""Paths of muscles for OpenSim: sample muscles over their coordinates, fit, and say how well the fits hold."""
+"""Paths of muscles for OpenSim: sample muscles over their coordinates, fit polynomials, and say how well they hold."""
 
 import csv
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.importers.opensim.fitted import MOST_COORDINATES, fit_path, write_paths
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
-from rbfmuscle.scene.joints.skeleton import all_coordinates
+from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.joints.tables import full_name
 from rbfmuscle.scene.motion import bone_poses, inner_value
 from rbfmuscle.scene.objects import Motion
@@ -21,36 +22,27 @@ from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.validation import SceneError, SolveError, UsageError
 
-# Every fifth sample is held out of the fit.
-HELD_OUT = 5
-# Of the polynomials that are tried.
-HIGHEST_ORDER = 7
-# Of the central differences, to either side [degree, or mm of a shift].
-STEP = 1.0
+HELD_OUT = 5  # every fifth sample is held out of the fit
+HIGHEST_ORDER = 7  # of the polynomials that are tried
+STEP = 1.0  # of the central differences, to either side [degree, or mm of a shift]
 # A muscle has settled where no contact point moves by more than this share of its size in a solve.
 MOST_SOLVES, SETTLED = 60, 3e-7
+ARM_WEIGHT = 1.0 / 3.0  # one mm of a length weighs as much as this many mm/rad of a moment arm
+MOST_COORDINATES = 6  # OpenSim's function takes up to six coordinates
+FOLDS = 5  # parts of the poses that are left out in turn to choose the order
 
 Ranges = dict[str, tuple[float, float]]
 
 
 @dataclass
 class Samples:
-    """A muscle's lengths and moment arms at some poses; a pose that could not be solved has NaN.
-
-    Attributes
-    ----------
-    coordinates : tuple of str
-        Those that the muscle depends on, full names.
-    values, arms : (n, d) ndarray
-        [radian or scene unit], [scene unit].
-    lengths : (n,) ndarray
-    """
+    """A muscle's lengths and moment arms at some poses; a pose that could not be solved has NaN."""
 
     muscle: str
-    coordinates: tuple[str, ...]
-    values: np.ndarray
-    lengths: np.ndarray
-    arms: np.ndarray
+    coordinates: tuple[str, ...]  # that the muscle depends on, full names
+    values: np.ndarray  # (n, d) [radian or scene unit]
+    lengths: np.ndarray  # (n,) [scene unit]
+    arms: np.ndarray  # (n, d) [scene unit]
 
 
 def parse_ranges(scene: Scene, texts: list[str]) -> Ranges:
@@ -61,9 +53,8 @@ def parse_ranges(scene: Scene, texts: list[str]) -> Ranges:
         try:
             low, high = (float(end) for end in ends.split(":"))
         except ValueError:
-            raise UsageError(
-                f"--range {text!r} is not COORDINATE=LOW:HIGH, for instance hip.flexion=0:60"
-            ) from None
+            form = "COORDINATE=LOW:HIGH, for instance hip.flexion=0:60"
+            raise UsageError(f"--range {text!r} is not {form}") from None
         full = full_name(name, known, place="--range")
         if not -np.inf < low < high < np.inf:
             raise UsageError(f"--range {text!r}: the range must go upwards between two numbers")
@@ -76,18 +67,9 @@ def sample_muscles(
 ) -> list[Samples]:
     """Return lengths and moment arms of every muscle at quasi-random poses of the coordinates that it depends on.
 
-    Each pose is reached from rest in a straight line and the muscle settles there. A moment arm is minus the central
-    difference of the length over `STEP` to both sides, the muscle settling there too.
-
-    Parameters
-    ----------
-    scene : Scene
-    given : dict of str to (float, float)
-        Ranges instead of the coordinates' own.
-    samples : int
-        Poses for each muscle.
-    progress : callable, optional
-        Told how many poses are done, and of how many.
+    Each of the ``samples`` poses is reached from rest in a straight line and the muscle settles there. A moment arm is
+    minus the central difference of the length over `STEP` to both sides, the muscle settling there too. Ranges that are
+    ``given`` stand for the coordinates' own; ``progress`` is called with the poses that are done, and of how many.
     """
     scene = scene.validate().copy()
     scene.sliding = None
@@ -221,19 +203,14 @@ def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[s
             + (f"; {row['failed']} poses could not be solved" if row["failed"] else "")
         )
     turning = {name: f.motion != "translation" for name, f in all_coordinates(scene.joints).items()}
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        write_paths(directory / "paths.xml", fitted, scene.length(1000.0), turning)
-        with (directory / "errors.csv").open("w", encoding="utf-8", newline="") as out:
-            writer = csv.DictWriter(out, fieldnames=list(errors[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(errors)
-    except OSError as error:
-        raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another folder") from None
-    return [
-        *lines,
-        f"{directory / 'paths.xml'}: {len(fitted)} paths; OpenSim puts them in by their names, /forceset/MUSCLE",
-    ]
+    directory.mkdir(parents=True, exist_ok=True)
+    write_paths(directory / "paths.xml", fitted, scene.length(1000.0), turning)
+    with (directory / "errors.csv").open("w", encoding="utf-8", newline="") as out:
+        writer = csv.DictWriter(out, fieldnames=list(errors[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(errors)
+    file = directory / "paths.xml"
+    return [*lines, f"{file}: {len(fitted)} paths; OpenSim puts them in by their names, /forceset/MUSCLE"]
 
 
 def _fit(found):
@@ -242,16 +219,118 @@ def _fit(found):
     held = np.arange(len(solved)) % HELD_OUT == HELD_OUT - 1
     use, out, failed = solved & ~held, solved & held, int((~solved).sum())
     if use.sum() < 2 * (len(found.coordinates) + 1) or not out.any():
-        raise SolveError(
-            f"muscle {found.muscle!r}: {failed} of {len(solved)} poses failed, too few are left to fit"
-        )
+        why = f"{failed} of {len(solved)} poses failed, too few are left to fit"
+        raise SolveError(f"muscle {found.muscle!r}: {why}")
     parts = (found.values[use], found.lengths[use], found.arms[use])
     path = fit_path(found.muscle, found.coordinates, *parts, most=HIGHEST_ORDER)
     row = {"muscle": path.muscle, "order": path.order, "fitted": int(use.sum()), "failed": failed}
     row["held_out"] = int(out.sum())
-    for name, error in (
-        ("length", path.length(found.values[out]) - found.lengths[out]),
-        ("arm", path.arms(found.values[out]) - found.arms[out]),
-    ):
+    length = path.length(found.values[out]) - found.lengths[out]
+    arm = path.arms(found.values[out]) - found.arms[out]
+    for name, error in {"length": length, "arm": arm}.items():
         row |= {f"{name}_rms": float(np.sqrt(np.mean(error**2))), f"{name}_max": float(np.abs(error).max())}
     return path, row
+
+
+@dataclass(frozen=True)
+class FittedPath:
+    """A polynomial for a muscle's length over coordinates (full names); minus its derivatives are the moment arms.
+
+    ``order`` is the largest sum of exponents; ``coefficients`` are those of the terms in `exponents`, for coordinates
+    in radians or scene units [scene unit].
+    """
+
+    muscle: str
+    coordinates: tuple[str, ...]
+    order: int
+    coefficients: np.ndarray
+
+    def length(self, values: np.ndarray) -> np.ndarray:
+        """Length (n,) at coordinates (n, d)."""
+        return _rows(values, self.order)[0] @ self.coefficients
+
+    def arms(self, values: np.ndarray) -> np.ndarray:
+        """Moment arms (n, d) at coordinates (n, d)."""
+        return (_rows(values, self.order)[1:] @ self.coefficients).T
+
+
+def exponents(dimension: int, order: int) -> np.ndarray:
+    """Return the exponents (m, d) of every term up to an order, the last coordinate's going fastest, as OpenSim's."""
+    powers = itertools.product(range(order + 1), repeat=dimension)
+    return np.array([power for power in powers if sum(power) <= order])
+
+
+def _rows(values, order):
+    """Terms (1 + d, n, m) of the length, then of the moment arm of each coordinate."""
+    values = np.asarray(values, dtype=float)
+    powers = exponents(values.shape[1], order)
+    rows = [np.prod(values[:, None, :] ** powers, axis=2)]
+    for axis in range(values.shape[1]):
+        lower = powers.copy()
+        lower[:, axis] = np.maximum(lower[:, axis] - 1, 0)
+        rows.append(-powers[:, axis] * np.prod(values[:, None, :] ** lower, axis=2))
+    return np.array(rows)
+
+
+def fit_path(
+    muscle: str,
+    coordinates: tuple[str, ...],
+    values: np.ndarray,
+    lengths: np.ndarray,
+    arms: np.ndarray,
+    *,
+    most: int = 7,
+) -> FittedPath:
+    """Fit a polynomial to lengths (n,) and, by its derivatives, to moment arms (n, d).
+
+    ``values`` (n, d) are the coordinates [radian or scene unit]. The order, at most ``most``, is the one whose fit
+    without a fifth of the poses, each in turn, errs least there; there are always more equations than terms.
+    """
+    count, dimension = values.shape
+    weights = np.r_[1.0, np.full(dimension, ARM_WEIGHT)][:, None]
+    wanted = weights * np.vstack([lengths, arms.T])
+    group, best = np.arange(count) % FOLDS, (np.inf, 1, np.empty(0))
+    for order in range(1, most + 1):
+        if order > 1 and 1.5 * len(exponents(dimension, order)) > 0.8 * count * (1 + dimension):
+            break
+        rows = weights[:, :, None] * _rows(values, order)
+        error = 0.0
+        for fold in range(FOLDS):
+            out = group == fold
+            left_out = rows[:, out] @ _solve(rows[:, ~out], wanted[:, ~out])
+            error += np.sum((left_out - wanted[:, out]) ** 2)
+        if error < best[0]:
+            best = (error, order, _solve(rows, wanted))
+    return FittedPath(muscle, coordinates, *best[1:])
+
+
+def _solve(rows, wanted):
+    """Coefficients by least squares; columns are scaled, as powers of coordinates differ by orders of magnitude."""
+    matrix = rows.reshape(-1, rows.shape[2])
+    size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    return np.linalg.lstsq(matrix / size, wanted.ravel(), rcond=None)[0] / size
+
+
+def write_paths(file: Path, fitted: list[FittedPath], metre: float, turning: dict[str, bool]) -> None:
+    """Write paths as the set of ``FunctionBasedPath`` that OpenSim loads.
+
+    ``metre`` is its length in scene units; ``turning`` says which coordinates are no shifts, which are in metres there.
+    """
+    add = ElementTree.SubElement
+    root = ElementTree.Element("OpenSimDocument", Version="40600")
+    paths = add(root, "Set_FunctionBasedPath_")
+    objects = add(paths, "objects")
+    add(paths, "groups")
+    for path in fitted:
+        units = np.array([1.0 if turning[name] else metre for name in path.coordinates])
+        powers = exponents(len(path.coordinates), path.order)
+        numbers = path.coefficients * np.prod(units**powers, axis=1) / metre
+        item = add(objects, "FunctionBasedPath", name=f"/forceset/{path.muscle}")
+        function = add(add(item, "length_function"), "MultivariatePolynomialFunction")
+        names = ["/jointset/" + name.replace(".", "/", 1) for name in path.coordinates]
+        add(item, "coordinate_paths").text = " ".join(names)
+        add(function, "coefficients").text = " ".join(repr(float(value)) for value in numbers)
+        add(function, "dimension").text = str(len(path.coordinates))
+        add(function, "order").text = str(path.order)
+    ElementTree.indent(root)
+    ElementTree.ElementTree(root).write(file, encoding="UTF-8", xml_declaration=True)

@@ -17,12 +17,7 @@ FIRST, EVERY = 2.0, 10.0  # Time before the first line for a count, and then bet
 class Progress:
     """Context manager; call it with (done, total). A nested one is shown under the title of the outer one.
 
-    Parameters
-    ----------
-    title : str
-        Of the command or scene.
-    what : str
-        What is counted.
+    ``title`` is that of the command or scene, ``what`` is what is counted.
     """
 
     shown: ClassVar[Progress | None] = None

@@ -1,11 +1,9 @@
 """One run of a scene: its models through the frame loop, measured and clocked, a generator of frames for a sink."""
 
-from __future__ import annotations
-
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -31,8 +29,7 @@ from rbfmuscle.output.writer import RunWriter
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.sharing.crew import WorkerPool
-from rbfmuscle.sharing.processes import helpers_for
+from rbfmuscle.sharing.crew import WorkerPool, helpers_for
 from rbfmuscle.sharing.share import MuscleGroup, timed
 from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.simulation.substeps import check_substeps
@@ -62,13 +59,8 @@ class MemorySink:
 class Recording:
     """One run of a scene: its models through the frame loop, measured and clocked, into a sink.
 
-    Parameters
-    ----------
-    scene : Scene
-    model, settings, frames
-        As for `configure_scene`.
-    fields : mapping of str to BoneField, optional
-        Of the bones, by name, in place of `BoneSDF`; all muscles are then in this process.
+    ``model``, ``settings`` and ``frames`` are those of `configure_scene`; ``fields`` of the bones, by name, stand in
+    place of `BoneSDF`, and all muscles are then in this process.
     """
 
     def __init__(
@@ -93,7 +85,7 @@ class Recording:
         self.written: list[dict] = []
         self._path: dict[int, dict[str, float]] = {}
         self._place = {muscle.name: k for k, muscle in enumerate(scene.muscles)}
-        with self.timed("build"), stage("building"):
+        with timed(self.times, "build"), stage("building"):
             helpers = 0 if fields is not None else helpers_for(scene, numba.get_num_threads())
             self.share, self._skeleton = self._build(helpers, fields)
 
@@ -112,10 +104,6 @@ class Recording:
             undo.pop_all()
             return pool, skeleton
 
-    def timed(self, part: str) -> AbstractContextManager[None]:
-        """Context whose time is added to one entry of ``times`` [s]."""
-        return timed(self.times, part)
-
     def feed(
         self, sink: RunWriter | MemorySink, *, progress: Callable[[int, int], None] | None = None
     ) -> None:
@@ -125,7 +113,7 @@ class Recording:
             sink.write_info(self.info("running"))
             for frame, measured in self.share.frames():
                 rows = self._take(frame, measured)
-                with self.timed("write"):
+                with timed(self.times, "write"):
                     sink.write(frame, rows)
                 self._path[frame.index] = dict(frame.coordinates)
                 self.written.append(frame_facts(self.scene, frame))
@@ -148,7 +136,7 @@ class Recording:
         self, writer: RunWriter, limits: Mapping[str, float], *, pictures: bool = True
     ) -> dict[str, Any]:
         """Write report and pictures of a run that is in a folder, then hold it to limits; what ``run.json`` holds."""
-        with self.timed("report"), stage("drawing pictures"):
+        with timed(self.times, "report"), stage("drawing pictures"):
             if self.scene.output.report:
                 from rbfmuscle.report.report import write_report
 
@@ -174,16 +162,10 @@ class Recording:
         self.summary.add(rows)
         return rows
 
-    def _spent(self):
-        """Wall time of all parts so far [s]."""
-        times = dict(self.times)
-        for part, seconds in self.share.times.items():
-            times[part] = times.get(part, 0.0) + seconds
-        return times
-
     def info(self, status: str | None = None) -> dict:
         """What ``run.json`` holds by now."""
         self.times["wall"] = time.perf_counter() - self._start
+        here, shared = self.times, self.share.times
         table = self.summary.table()
         limits = {name: default_limit(name, self.scene) for name in LIMITS}
         return build_info(
@@ -194,7 +176,7 @@ class Recording:
             status=status or self.status,
             message=self.message,
             options=self.options,
-            times=self._spent(),
+            times={part: here.get(part, 0.0) + shared.get(part, 0.0) for part in {**here, **shared}},
             limits=limits,
             verdict=describe_verdict(table, limits, self.scene.left_out),
             beyond=exceeded(table, limits),

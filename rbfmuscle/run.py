@@ -109,24 +109,11 @@ def stream_run(
     pictures: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Run a scene and write it to a folder frame by frame; memory does not grow with the frames.
+    """Run a scene and write it to a folder frame by frame, and return what ``run.json`` holds.
 
-    Parameters
-    ----------
-    scene : Scene
-        Its ``output`` table says what is written.
-    directory : path
-    model, settings, frames, progress
-        As for `simulate`.
-    fail_on : str or list of str, optional
-        Limits, see `rbfmuscle.metrics.summary.parse_limits`.
-    pictures : bool
-        Draw pictures for the report and the preview.
-
-    Returns
-    -------
-    dict
-        What ``run.json`` holds.
+    Memory does not grow with the frames. The scene's ``output`` table says what is written; ``model``, ``settings``,
+    ``frames`` and ``progress`` are as for `simulate`; ``fail_on`` are limits, see
+    `rbfmuscle.metrics.summary.parse_limits`; ``pictures`` are those of the report and the preview.
 
     Raises
     ------
@@ -186,17 +173,7 @@ class Run:
 
     @classmethod
     def load(cls, directory: str | Path) -> Run:
-        """Return the run in a folder.
-
-        Parameters
-        ----------
-        directory : path
-
-        Raises
-        ------
-        UsageError
-            If the folder holds no run.
-        """
+        """Return the run in a folder, or raise UsageError if it holds none."""
         saved = SavedRun(directory)
         return cls(saved_frames(saved), saved.metrics, saved=saved)
 
@@ -259,13 +236,7 @@ class Run:
         return np.array([r.value for r in self.metrics if r.muscle == muscle and r.quantity == quantity])
 
     def table(self) -> pandas.DataFrame:
-        """Return the metrics as a pandas DataFrame.
-
-        Raises
-        ------
-        MissingPartError
-            If pandas is not installed.
-        """
+        """Return the metrics as a pandas DataFrame, or raise MissingPartError if pandas is not installed."""
         try:
             import pandas
         except ImportError:
@@ -273,16 +244,7 @@ class Run:
         return pandas.DataFrame(self.metrics, columns=list(Row._fields))
 
     def plot(self, quantity: str = "penetration_max") -> Axes:
-        """Plot a quantity of every muscle over the motion.
-
-        Parameters
-        ----------
-        quantity : str
-
-        Returns
-        -------
-        matplotlib.axes.Axes
-        """
+        """Plot a quantity of every muscle over the motion, and return the matplotlib Axes."""
         if quantity not in self.quantities:
             raise UsageError(f"unknown quantity {quantity!r}, {did_you_mean(quantity, self.quantities)}")
         from matplotlib import pyplot
@@ -299,16 +261,7 @@ class Run:
     def save(self, directory: str | Path, *, pictures: bool = True) -> None:
         """Write what `stream_run` would have written; a run that was loaded is copied.
 
-        Parameters
-        ----------
-        directory : path
-        pictures : bool
-            Draw pictures for the report and the preview.
-
-        Raises
-        ------
-        UsageError
-            If the folder cannot be written to.
+        ``pictures`` are those of the report and the preview. UsageError if the folder cannot be written to.
         """
         if self._recording is None:
             shutil.copytree(self.saved.directory, directory, dirs_exist_ok=True)
@@ -318,16 +271,10 @@ class Run:
     def export(
         self, directory: str | Path, formats: str | Sequence[str], *, units: str | None = None
     ) -> list[Path]:
-        """Write the surfaces in other formats and return the files.
+        """Write the surfaces in other formats, into a folder for each, and return the files.
 
-        Parameters
-        ----------
-        directory : path
-            Takes a folder for each format.
-        formats : str or list of str
-            ``pvd``, ``vtp``, ``ply``, ``stl``, ``obj``, ``glb``, ``usd`` or ``animated-glb``.
-        units : {"m", "cm", "mm"}, optional
-            The scene's where not given; glTF is in metres.
+        Formats are ``pvd``, ``vtp``, ``ply``, ``stl``, ``obj``, ``glb``, ``usd`` and ``animated-glb``; ``units`` are
+        ``"m"``, ``"cm"`` or ``"mm"``, the scene's where not given; glTF is in metres.
         """
         names = [formats] if isinstance(formats, str) else list(formats)
         return export_run(self.saved.directory, names, output=directory, units=units)
@@ -364,17 +311,9 @@ class MuscleRun:
         self.run, self.name = run, name
 
     def surface(self, frame: int = -1) -> trimesh.Trimesh:
-        """Surface in a frame of the run.
+        """Surface in a frame of the run: closed, faces outward, world coordinates [scene unit].
 
-        Parameters
-        ----------
-        frame : int
-            Place in the run's frames; negative counts from the end.
-
-        Returns
-        -------
-        trimesh.Trimesh
-            Closed, faces outward, world coordinates [scene unit].
+        ``frame`` is the place in the run's frames; negative counts from the end.
         """
         import trimesh
 

@@ -1,11 +1,9 @@
-"""Checks at the public edges, and the errors that the command line turns into exit codes.
-
-Every package may import this module; it imports nothing of ours.
-"""
+"""Checks at the public edges, and the errors that the command line turns into exit codes."""
 
 import difflib
 import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -99,20 +97,18 @@ def is_file(path: str | os.PathLike[str]) -> bool:
         return False
 
 
+def read_text(path: Path, *, place: str) -> str:
+    """Return the text of a file that a scene names, or raise SceneError that begins with ``place``."""
+    if not is_file(path):
+        raise SceneError(f"{place}{shown_path(path)}: cannot read it: no such file")
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise SceneError(f"{place}{path}: cannot read it: {error.strerror}") from None
+
+
 def check_points(points: ArrayLike, *, name: str = "points") -> NDArray[np.float64]:
-    """Return points as a finite, C-contiguous (n, 3) float64 array.
-
-    Parameters
-    ----------
-    points : (n, 3) array_like
-    name : str
-        What the message calls them.
-
-    Raises
-    ------
-    ValueError
-        On any other shape, or on NaN or infinity.
-    """
+    """Return points as a finite, C-contiguous (n, 3) float64 array, or raise ValueError that calls them ``name``."""
     points = _as_floats(points, name)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name} must have shape (n, 3), got {points.shape}")
@@ -163,12 +159,9 @@ def check_positive(value: float, *, name: str) -> float:
 def check_mesh(
     vertices: ArrayLike, faces: ArrayLike, *, name: str = "mesh"
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return ``(vertices, faces)`` as (n, 3) float64 and (m, 3) int64, indices in range.
+    """Return ``(vertices, faces)`` as (n, 3) float64 and (m, 3) int64.
 
-    Raises
-    ------
-    MeshError
-        If the mesh is empty, has non-finite vertices or indices out of range.
+    MeshError if the mesh is empty, has non-finite vertices or indices out of range.
     """
     try:
         vertices = check_points(vertices, name=f"vertices of {name}")

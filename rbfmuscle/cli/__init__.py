@@ -6,13 +6,7 @@ from rbfmuscle import interruption
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and leave the process with the promised exit code.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        The process's own by default.
-    """
+    """Run the command line, on the process's own arguments by default, and leave with the promised exit code."""
     whole_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     interruption.install(as_json="--json" in arguments, watch=whole_process)

@@ -14,17 +14,11 @@ import warnings
 from cyclopts import App, CycloptsError, Group
 
 from rbfmuscle import __version__
-from rbfmuscle.cli.check import check
-from rbfmuscle.cli.compare import compare
-from rbfmuscle.cli.import_model import import_
-from rbfmuscle.cli.kernels import kernels
-from rbfmuscle.cli.new import new
-from rbfmuscle.cli.paths import paths
-from rbfmuscle.cli.plan import plan
+from rbfmuscle.cli.check import check, plan
+from rbfmuscle.cli.look import export, render, view
+from rbfmuscle.cli.new import import_, new
 from rbfmuscle.cli.run import demo, run
-from rbfmuscle.cli.show import export, render
-from rbfmuscle.cli.sweep import sweep
-from rbfmuscle.cli.view import view
+from rbfmuscle.cli.study import compare, kernels, paths, sweep
 from rbfmuscle.interruption import INTERRUPTED
 from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError
 

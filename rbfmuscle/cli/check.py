@@ -1,10 +1,9 @@
-"""``rbfmuscle check``: a scene file and its meshes, nothing solved."""
-
-from __future__ import annotations
+"""``rbfmuscle check`` and ``rbfmuscle plan``: a scene file and what a run of it would build, nothing solved."""
 
 import json
 import logging
 import sys
+from time import perf_counter
 
 from rbfmuscle.cli.options import Flag, Json, SceneName
 from rbfmuscle.progress import Progress, stage
@@ -23,7 +22,13 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
     """
     with Progress(f"check {scene.name}"):
         loaded, findings = _findings(scene)
-        errors = _measure_fields(loaded) if fields else {}
+        errors = {}
+        if fields:
+            from rbfmuscle.bones.errors import measure_field
+            from rbfmuscle.bones.sdf import BoneSDF
+
+            with stage("errors of the bones' fields"):
+                errors = {b.name: measure_field(BoneSDF.from_mesh(b.mesh, name=b.name)) for b in loaded.bones}
         drawn = {}
         if picture:
             from rbfmuscle.report.render import draw_scene
@@ -45,7 +50,6 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
 def _findings(path):
     from rbfmuscle.importers.guess.orientation import orient_scene
     from rbfmuscle.models import check_models
-    from rbfmuscle.scene.attachments import ExactMeshes
     from rbfmuscle.scene.check import Finding, check_scene, sort_findings
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.simulation.motion_check import motion_findings
@@ -54,16 +58,15 @@ def _findings(path):
     loaded = open_scene(path, skeleton=True)
     orient_scene(loaded)
     check_models(loaded)
-    exact = ExactMeshes()
     with stage("fields of the bones"):
-        findings = [*check_scene(loaded, exact), *_field_notes(loaded)]
+        findings = [*check_scene(loaded), *_field_notes(loaded)]
     try:
         check_substeps(loaded)
     except SceneError as error:
         findings.append(Finding("error", loaded.name, str(error)))
     if not any(finding.level == "error" for finding in findings):
         with stage("checking the motion"):
-            findings += motion_findings(loaded, exact)
+            findings += motion_findings(loaded)
     return loaded, sort_findings(findings)
 
 
@@ -83,15 +86,6 @@ def _field_notes(scene):
         ]
     finally:
         logger.setLevel(level)
-
-
-def _measure_fields(scene):
-    """Errors of the distance field of each bone, by name."""
-    from rbfmuscle.bones.errors import measure_field
-    from rbfmuscle.bones.sdf import BoneSDF
-
-    with stage("errors of the bones' fields"):
-        return {b.name: measure_field(BoneSDF.from_mesh(b.mesh, name=b.name)) for b in scene.bones}
 
 
 def _describe_field(name, found, units):
@@ -120,4 +114,57 @@ def _scene_lines(scene):
         yield (
             f"  muscle {muscle.name}: model {muscle.model}, {len(muscle.mesh.vertices)} vertices, "
             f"{volume:.4g} cm3, attached: {held}"
+        )
+
+
+def plan(scene: SceneName, *, time: Flag = False, as_json: Json = False) -> None:
+    """List what a run of the scene would build, without building it.
+
+    Parameters
+    ----------
+    time
+        Also build the muscles, solve two frames after the first, and extrapolate to the whole motion.
+    """
+    from rbfmuscle.models import check_models, solved_points
+    from rbfmuscle.scene.phantom import open_scene
+    from rbfmuscle.simulation.plan import plan_scene
+
+    with Progress(f"plan {scene.name}"):
+        loaded = open_scene(scene)
+        check_models(loaded)
+        made = plan_scene(loaded)
+        for muscle, facts in zip(loaded.muscles, made["muscles"]):
+            facts["points"] = solved_points(muscle, loaded)
+        if time:
+            with stage("solving two frames"):
+                made["time"] = _measure_time(loaded)
+    print(json.dumps(made, indent=1) if as_json else "\n".join(_lines(made)))
+
+
+def _measure_time(scene):
+    """Wall time of a run without report, pictures and files [s], extrapolated from its first three frames."""
+    from rbfmuscle.run import simulate
+
+    start = perf_counter()
+    frames = simulate(scene, frames=slice(0, 3)).frames
+    spent, count = perf_counter() - start, len(scene.motion)
+    frame = spent / count if len(frames) < 2 else sum(f.wall for f in frames[1:]) / (len(frames) - 1)
+    build = max(0.0, spent - frame * (len(frames) - 1))
+    return {"build": build, "frame": frame, "total": build + frame * (count - 1)}
+
+
+def _lines(made):
+    yield f"{made['frames']} frames in {made['substeps']} sub-steps"
+    for muscle in made["muscles"]:
+        yield (
+            f"muscle {muscle['name']}: {muscle['model']}, {muscle['points']}, can meet "
+            f"{', '.join(muscle['bones']) or 'no bone'}; solved in {muscle['substeps']} sub-steps"
+        )
+    for field in made["fields"]:
+        yield f"field of {field['bone']}: {field['share']:.0%} of its box, {field['triangles']} triangles"
+    if "time" in made:
+        spent = made["time"]
+        yield (
+            f"expected time: {spent['total']:.3g} s without report, pictures and files; build and first frame "
+            f"{spent['build']:.2g} s, {1e3 * spent['frame']:.3g} ms per frame"
         )

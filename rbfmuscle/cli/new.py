@@ -1,4 +1,4 @@
-"""``rbfmuscle new``: a commented scene file to start from, guessed from meshes or from a volume of labels."""
+"""``rbfmuscle new`` and ``rbfmuscle import``: scene files from meshes, volumes of labels and OpenSim models."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from rbfmuscle.cli.options import Flag
+from rbfmuscle.cli.options import Force, Output
 from rbfmuscle.validation import UsageError
 
 
@@ -16,7 +16,7 @@ def new(
     units: Literal["mm", "cm", "m"] | None = None,
     labels: Path | None = None,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
-    force: Flag = False,
+    force: Force = False,
 ) -> None:
     """Write a commented scene file for a folder of meshes or a volume of labels.
 
@@ -32,8 +32,6 @@ def new(
         totalsegmentator, musclemap-thigh.
     output
         Scene file to write, scene.toml beside the meshes by default.
-    force
-        Replace a file that exists.
     """
     from rbfmuscle.importers.guess.guess import guess_scene, write_scene
     from rbfmuscle.importers.guess.orientation import HEADER
@@ -45,8 +43,7 @@ def new(
         raise UsageError(f"--labels names the labels of a segmentation, {source} is a folder of meshes")
     folder = _beside(source, output) if volume else source
     output = output or folder / "scene.toml"
-    if output.exists() and not force:
-        raise UsageError(f"{output} exists; give another --output, or --force to replace it")
+    _check_target(output, force)
     if volume:
         folder = _write_surfaces(source, labels, folder)
     guess = guess_scene(folder, "mm" if volume else units, output.parent, header=HEADER if volume else None)
@@ -59,6 +56,46 @@ def new(
     for finding in scene.check():
         print(finding)
     print(f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out")
+
+
+def import_(
+    model: Path,
+    *,
+    output: Output,
+    geometry: Annotated[list[Path] | None, Parameter(negative="")] = None,
+    muscles: Annotated[bool, Parameter(negative="--no-muscles")] = True,
+    force: Force = False,
+) -> None:
+    """Write a scene file and its meshes from an OpenSim model (.osim), in metres.
+
+    Parameters
+    ----------
+    model
+        The model, of version 2 to 4; OpenSim itself is not needed.
+    geometry
+        Folder with meshes, besides the model's own and its Geometry; repeatable.
+    muscles
+        Make a tube of each muscle of the model, along its path.
+    """
+    from rbfmuscle.importers.opensim.scene import import_osim, write_scene
+
+    _check_target(output / "scene.toml", force)
+    for folder in geometry or []:
+        if not folder.is_dir():
+            raise UsageError(f"--geometry {folder}: no such folder")
+    found = import_osim(model, geometry=geometry, muscles=muscles)
+    written = write_scene(found, output)
+    for note in found.notes:
+        print(f"note: {note}")
+    scene = found.scene
+    counts = f"{len(scene.bones)} bones, {len(scene.links)} without a mesh, {len(scene.joints)} joints"
+    print(f"{written}: {counts}, {len(scene.couplings)} couplings, {len(scene.muscles)} muscles as tubes")
+    print(f"next: rbfmuscle check {written}, then rbfmuscle run {written} -o out")
+
+
+def _check_target(file, force):
+    if file.exists() and not force:
+        raise UsageError(f"{file} exists; give another --output, or --force to replace it")
 
 
 def _is_segmentation(source):
@@ -89,10 +126,7 @@ def _write_surfaces(source, labels, folder):
 
     volume = read_labels(source, names=labels)
     meshes = folder / "meshes"
-    try:
-        meshes.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot write to {folder}: {error.strerror}; choose another --output") from None
+    meshes.mkdir(parents=True, exist_ok=True)
     values, files = volume.values(), set()
     with Progress("surfaces", "label") as progress:
         for done, label in enumerate(values, start=1):

@@ -19,4 +19,5 @@ Settings = Annotated[
 Frames = Annotated[str | None, Parameter(help="Frames of the motion, as A:B:S (B not included).")]
 Json = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON and nothing else.")]
 Flag = Annotated[bool, Parameter(negative="")]
+Force = Annotated[bool, Parameter(negative="", help="Replace a scene file that exists.")]
 Texts = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]

@@ -1,7 +1,5 @@
 """``rbfmuscle run`` and ``rbfmuscle demo``: a scene through its motion, into a folder."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any
@@ -12,11 +10,7 @@ from rbfmuscle.validation import SolveError
 
 
 def demo(
-    *,
-    output: Output = Path("demo_output"),
-    model: Model = None,
-    frames: Frames = None,
-    as_json: Json = False,
+    *, output: Output = Path("demo_output"), model: Model = None, frames: Frames = None, as_json: Json = False
 ) -> None:
     """Run the embedded hip: no data, no network."""
     run(Path("phantom"), output=output, model=model, frames=frames, as_json=as_json)

@@ -1,7 +1,5 @@
 """Tables of a scene file as TOML that a person can read."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

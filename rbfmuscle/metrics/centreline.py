@@ -12,9 +12,8 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.surfaces import vertex_areas
-from rbfmuscle.scene.joints.skeleton import all_coordinates
-from rbfmuscle.scene.taut_line import line_length
-from rbfmuscle.scene.tendons import TendonLine
+from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.scene.tendons import TendonLine, line_length
 
 if TYPE_CHECKING:
     from rbfmuscle.scene.joints.joint import Joint

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rbfmuscle.metrics.moment_arms import REACH, moment_arms
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
-from rbfmuscle.scene.joints.skeleton import all_coordinates
+from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.objects import MM_PER_UNIT
 

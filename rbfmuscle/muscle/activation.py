@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.muscle.fibres import flux
 from rbfmuscle.muscle.solid import EmbeddedSolid
-from rbfmuscle.scene.activation.resolve import resolve_contraction
+from rbfmuscle.scene.activation.contraction import resolve_contraction
 from rbfmuscle.scene.objects import Muscle
 
 PEAK = 30.0  # greatest isometric tension of active fibres, in shear moduli

@@ -5,38 +5,22 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BeforeValidator, ValidationInfo
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import vertex_areas
-from rbfmuscle.geometry.winding import inside_test
-from rbfmuscle.scene.joints.skeleton import bones_between
+from rbfmuscle.scene.joints.joint import bones_between
 from rbfmuscle.scene.meshes.read import ReadMesh
-from rbfmuscle.scene.objects import (
-    Attachment,
-    Bone,
-    LineTable,
-    Muscle,
-    SceneData,
-    ViaTable,
-    find_named,
-)
+from rbfmuscle.scene.objects import Attachment, Bone, LineTable, Muscle, SceneData, ViaTable, find_named
 from rbfmuscle.scene.options import NotNegative, Positive, Table, Vector, in_folder
 from rbfmuscle.scene.tendons import BonePoint, TendonEnd
-from rbfmuscle.validation import SceneError, is_file, shown, shown_path
+from rbfmuscle.validation import SceneError, read_text, shown, shown_path
 
-if TYPE_CHECKING:
-    import trimesh
-
-
-# Section of a tendon as it is drawn, over the mean section of its muscle.
-THIN = 0.05
-# Points of a belly's end that are kept out of bones, at most.
-PATCH = 16
+THIN = 0.05  # section of a tendon as it is drawn, over the mean section of its muscle
+PATCH = 16  # points of a belly's end that are kept out of bones, at most
 
 
 class SphereTable(Table):
@@ -74,10 +58,7 @@ def resolve_attachments(
 ) -> list[Attachment]:
     """Return the attachments of the muscle of that name and mesh.
 
-    Raises
-    ------
-    SceneError
-        On an unknown bone, an empty selection, an index out of range, or a vertex held by two bones.
+    SceneError on an unknown bone, an empty selection, an index out of range, or a vertex held by two bones.
     """
     found = []
     for number, entry in enumerate(attach):
@@ -161,7 +142,7 @@ def _select(table, read, bone, place):
         distance = np.linalg.norm(points - table.sphere.centre, axis=1)
         limit, what = table.sphere.radius, "sphere.radius"
     else:
-        distance = ExactMeshes().distances(points, bone.mesh)
+        distance = bone.distances(points)
         limit, what = table.near, "near"
     chosen = np.flatnonzero(distance <= limit)
     if len(chosen) == 0:
@@ -172,35 +153,11 @@ def _select(table, read, bone, place):
     return chosen
 
 
-class ExactMeshes:
-    """Exact distances to meshes, each of which is sorted once for all questions."""
-
-    def __init__(self) -> None:
-        # A mesh is kept too, so that no other one takes its number.
-        self._known: dict[int, tuple[Any, ExactDistance, Any]] = {}
-
-    def distances(self, points: Floats, mesh: trimesh.Trimesh) -> Floats:
-        """Distance (n,) of points (n, 3) to a mesh, negative inside (by pseudonormals, or winding numbers if open)."""
-        points = np.ascontiguousarray(points, dtype=np.float64)
-        if id(mesh) not in self._known:
-            inside = None if mesh.is_watertight else inside_test(mesh.vertices, mesh.faces)
-            self._known[id(mesh)] = mesh, ExactDistance(mesh.vertices, mesh.faces), inside
-        _, exact, inside = self._known[id(mesh)]
-        distance = exact.signed_distance(points)
-        return distance if inside is None else np.where(inside(points), -1.0, 1.0) * np.abs(distance)
-
-
 def _listed(listed: Path | list[int], count: int, place: str) -> Integers:
     """Vertex numbers of a list or of a text file, below ``count``; ``place`` begins each message."""
     numbers = listed if isinstance(listed, list) else []
     if isinstance(listed, Path):
-        place = f"{place}{shown_path(listed)}: "
-        if not is_file(listed):
-            raise SceneError(f"{place}cannot read it: no such file")
-        try:
-            words = listed.read_text(encoding="utf-8", errors="replace").split()
-        except OSError as error:
-            raise SceneError(f"{place}cannot read it: {error.strerror}") from None
+        words, place = read_text(listed, place=place).split(), f"{place}{shown_path(listed)}: "
         for word in words:
             try:
                 numbers.append(int(word))

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.winding import inside_test
 
 if TYPE_CHECKING:
     import trimesh
 
-# About how many points cover a bone: 4.5 mm apart on a femur.
-SURFACE_POINTS = 2000
+SURFACE_POINTS = 2000  # about how many points cover a bone: 4.5 mm apart on a femur
 
 
 @dataclass
@@ -28,6 +29,10 @@ class Bone:
     closed: bool = True
     notes: list[str] = field(default_factory=list)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What is computed on demand is not copied, nor sent to other processes."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
     @cached_property
     def bounds(self) -> Floats:
         """Box (2, 3) about the mesh."""
@@ -36,6 +41,18 @@ class Bone:
     @cached_property
     def _distance(self) -> ExactDistance:
         return ExactDistance(self.mesh.vertices, self.mesh.faces)
+
+    @cached_property
+    def _inside(self) -> Callable[[Floats], Booleans] | None:
+        """Of an open mesh, by winding numbers."""
+        return None if self.mesh.is_watertight else inside_test(self.mesh.vertices, self.mesh.faces)
+
+    def distances(self, points: Floats) -> Floats:
+        """Distances (n,) of points (n, 3) to the mesh, negative inside, of an open mesh by winding numbers."""
+        distance = self._distance.signed_distance(points)
+        if self._inside is None:
+            return distance
+        return np.where(self._inside(points), -1.0, 1.0) * np.abs(distance)
 
     def nearest(self, points: Floats) -> tuple[Floats, Floats]:
         """Distances (n,) to the mesh, negative inside, and the nearest places (n, 3) on it, of points (n, 3)."""

@@ -1,7 +1,5 @@
 """Building a scene, part by part, and checking that it is whole. Each function is a method of `Scene` too."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -9,14 +7,12 @@ from typing import Any, TypeAlias, TypeVar
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import MeshLike
+from rbfmuscle.scene.activation.contraction import resolve_contraction
 from rbfmuscle.scene.activation.keys import contraction_keys
-from rbfmuscle.scene.activation.resolve import resolve_contraction
 from rbfmuscle.scene.attachments import AttachTable, resolve_attachments, tendon_ends
-from rbfmuscle.scene.joints.joint import Coupling, Joint
-from rbfmuscle.scene.joints.skeleton import all_coordinates, ordered
+from rbfmuscle.scene.joints.joint import Coupling, Joint, all_coordinates, ordered
 from rbfmuscle.scene.joints.tables import CouplingTable, JointTable, make_coupling
-from rbfmuscle.scene.meshes.fibres import read_fibres
-from rbfmuscle.scene.meshes.read import ReadMesh, as_mesh
+from rbfmuscle.scene.meshes.read import ReadMesh, as_mesh, read_fibres
 from rbfmuscle.scene.motion import make_motion
 from rbfmuscle.scene.objects import Attachment, Bone, Muscle, SceneData, find_named
 from rbfmuscle.scene.options import MotionOptions
@@ -204,8 +200,7 @@ def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[str, dict[s
 def check_new_name(items: Sequence[Bone | Joint | Muscle], name: str, what: str) -> None:
     """Raise SceneError if a name is no name for a file, or taken."""
     if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
-        raise SceneError(
-            f"{what} name {shown(repr(name))} may hold letters, digits, '_' and '-' only (it becomes a file name)"
-        )
+        allowed = "letters, digits, '_' and '-' only (it becomes a file name)"
+        raise SceneError(f"{what} name {shown(repr(name))} may hold {allowed}")
     if any(item.name == name for item in items):
         raise SceneError(f"{what} {name!r} is given twice")

@@ -1,7 +1,5 @@
 """Looking a scene over before it is solved: sizes, overlaps at rest, bones that meet in the motion."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable
@@ -12,7 +10,6 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
-from rbfmuscle.scene.attachments import ExactMeshes
 from rbfmuscle.scene.build import validate
 from rbfmuscle.scene.meshes.read import ReadMesh
 from rbfmuscle.scene.motion import bone_poses
@@ -41,12 +38,8 @@ class Finding:
         return f"{self.level}: {self.place}: {self.message}"
 
 
-def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Finding]:
-    """Return all findings about a scene, the first error among them, the worst first; nothing is solved or changed.
-
-    ``exact`` keeps what was prepared for distances to the bones' meshes, for later calls.
-    """
-    exact = exact or ExactMeshes()
+def check_scene(scene: SceneData) -> list[Finding]:
+    """Return all findings about a scene, the first error among them, the worst first; nothing is solved or changed."""
     items: list[Bone | Muscle] = [*scene.bones, *scene.muscles]
     findings = [Finding("note", item.name, note) for item in items for note in item.notes]
     opened = "the bone is open, its inside follows from winding numbers"
@@ -54,9 +47,9 @@ def check_scene(scene: SceneData, exact: ExactMeshes | None = None) -> list[Find
     findings += [Finding("warning", bone.name, opened) for bone in scene.bones if not bone.closed]
     findings += [Finding("warning", name, unusable) for name in scene.left_out]
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
-    findings += _rest_overlaps(scene, exact)
+    findings += _rest_overlaps(scene)
     try:
-        findings += bone_findings(bone_collisions(scene, exact=exact), scene.units)
+        findings += bone_findings(bone_collisions(scene), scene.units)
         check_extents(scene)
         validate(scene)
     except RBFMuscleError as error:
@@ -80,12 +73,14 @@ def check_extents(scene: SceneData) -> None:
 
 def check_size(scene: SceneData, kind: str, name: str, item: Item) -> None:
     """Raise MeshError for a mesh smaller than a mouse's or larger than a person's."""
-    size = np.linalg.norm(np.ptp(item.mesh.vertices, axis=0))
+    size = float(np.linalg.norm(np.ptp(item.mesh.vertices, axis=0)))
     millimetres = size / scene.length(1.0)
     if not SMALLEST_MM <= millimetres <= LARGEST_MM:
+        best = 10.0 ** round(math.log10(300.0 / max(millimetres, 1e-12)))
         raise MeshError(
             f"{kind} {name!r} ({item.source or 'built in code'}) is {size:.4g} {scene.units} across, which "
-            f"cannot be right; correct the scene's units, or set its scale ({_likely_scale(millimetres)})"
+            f"cannot be right; correct the scene's units, or set its scale ({best:g} times the present one would "
+            f"make it {millimetres * best:.4g} mm)"
         )
 
 
@@ -119,17 +114,11 @@ def _away_from_bones(scene, low, high):
     return float(np.linalg.norm(away)), float(np.linalg.norm(most - least))
 
 
-def _likely_scale(millimetres):
-    """The power of ten that brings the size nearest to 300 mm."""
-    best = 10.0 ** round(math.log10(300.0 / max(millimetres, 1e-12)))
-    return f"{best:g} times the present one would make it {millimetres * best:.4g} mm"
-
-
-def _rest_overlaps(scene, exact):
+def _rest_overlaps(scene):
     """Muscle vertices inside bones at rest."""
     findings = []
     for muscle, bone in itertools.product(scene.muscles, scene.bones):
-        depth = _depths(np.asarray(muscle.mesh.vertices), bone.mesh, exact)
+        depth = _depths(np.asarray(muscle.mesh.vertices), bone)
         for attachment in muscle.attachments:
             depth[attachment.vertices] = 0.0
         inside = np.count_nonzero(depth)
@@ -152,34 +141,33 @@ def check_initial(scene: SceneData) -> None:
 
     With ``initial = "error"`` a muscle may not lie in a bone at all.
     """
-    for finding in _rest_overlaps(scene, ExactMeshes()):
+    for finding in _rest_overlaps(scene):
         if finding.level == "error":
-            raise SceneError(
-                f"muscle {finding.place!r}: {finding.message}; move it, or set [contact] initial"
-            )
+            remedy = "move it, or set [contact] initial"
+            raise SceneError(f"muscle {finding.place!r}: {finding.message}; {remedy}")
 
 
-def _depths(points, mesh, exact):
-    """Depth of points inside a mesh, zero outside; only points in its box are measured."""
+def _depths(points, bone):
+    """Depth of points inside a bone, zero outside; only points in its box are measured."""
     depth = np.zeros(len(points))
-    low, high = mesh.bounds
+    low, high = bone.bounds
     near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     if len(near):
-        depth[near] = -np.minimum(exact.distances(points[near], mesh), 0.0)
+        depth[near] = -np.minimum(bone.distances(points[near]), 0.0)
     return depth
 
 
 def bone_collisions(
-    scene: SceneData, frames: Iterable[int] | None = None, *, exact: ExactMeshes | None = None
+    scene: SceneData, frames: Iterable[int] | None = None
 ) -> list[tuple[int, str, str, float]]:
     """Return where a motion drives bones into each other, as (frame, bone, other, depth [scene unit]).
 
     The depth is that of the deepest vertex of either bone in the other; pairs that do not move are left out. ``frames``
-    are about ten of the motion by default; ``exact`` is as in `check_scene`.
+    are about ten of the motion by default.
     """
-    exact, found = exact or ExactMeshes(), []
+    found = []
     for frame in sampled_frames(scene) if frames is None else frames:
-        depths = _pair_depths(scene, bone_poses(scene, scene.motion.frames[frame]), exact)
+        depths = _pair_depths(scene, bone_poses(scene, scene.motion.frames[frame]))
         least = scene.length(COUNTED_DEPTH_MM)
         found += [(frame, *pair, depth) for pair, depth in depths.items() if depth > least]
     return found
@@ -191,7 +179,7 @@ def sampled_frames(scene: SceneData) -> list[int]:
     return [int(frame) for frame in np.unique(chosen)]
 
 
-def _pair_depths(scene, poses, exact):
+def _pair_depths(scene, poses):
     """Deepest vertex of either bone in the other, for the pairs that move against each other and overlap."""
     depths = {}
     for first, second in itertools.combinations(scene.bones, 2):
@@ -204,7 +192,7 @@ def _pair_depths(scene, poses, exact):
             continue
         one = np.asarray(first.mesh.vertices) @ relative[:3, :3].T + relative[:3, 3]
         two = np.asarray(second.mesh.vertices) @ back[:3, :3].T + back[:3, 3]
-        deepest = max(_depths(one, second.mesh, exact).max(), _depths(two, first.mesh, exact).max())
+        deepest = max(_depths(one, second).max(), _depths(two, first).max())
         if deepest > 0:
             depths[first.name, second.name] = float(deepest)
     return depths
@@ -216,11 +204,8 @@ def bone_findings(collisions: list[tuple[int, str, str, float]], units: str) -> 
     for frame, first, second, depth in collisions:
         start, deepest = worst.get((first, second), (frame, 0.0))
         worst[first, second] = (start, max(deepest, depth))
+    said = "the motion drives the bones into each other"
     return [
-        Finding(
-            "warning",
-            f"{first} and {second}",
-            f"the motion drives the bones into each other, from about frame {start}, up to {deepest:.3g} {units}",
-        )
-        for (first, second), (start, deepest) in worst.items()
+        Finding("warning", f"{a} and {b}", f"{said}, from about frame {start}, up to {deepest:.3g} {units}")
+        for (a, b), (start, deepest) in worst.items()
     ]

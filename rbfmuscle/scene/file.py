@@ -1,7 +1,5 @@
 """The scene file: its tables, and the scene that they describe."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import tomllib
@@ -9,20 +7,14 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field
 
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.attachments import AttachTable
 from rbfmuscle.scene.build import add_bone, add_muscle, place_coupling, place_joint, validate
 from rbfmuscle.scene.check import check_centre, check_place, check_size
-from rbfmuscle.scene.joints.skeleton import all_coordinates
-from rbfmuscle.scene.joints.tables import (
-    CouplingTable,
-    JointTable,
-    coupling_row,
-    joint_row,
-    make_coupling,
-)
+from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.scene.joints.tables import CouplingTable, JointTable, coupling_row, joint_row, make_coupling
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.motion import make_motion, unit_sign
 from rbfmuscle.scene.objects import Bone, Muscle, SceneData
@@ -37,8 +29,6 @@ from rbfmuscle.scene.options import (
     Table,
     Vector,
     check_plain,
-    check_removed,
-    describe_error,
 )
 from rbfmuscle.validation import MeshError, SceneError, is_file, shown, shown_path
 
@@ -74,13 +64,6 @@ class DefaultsTable(ContractionTable):
     attach: list[AttachTable] = Field(default_factory=list)
     fibres: FileName | None = None
 
-    @field_validator("model")
-    @classmethod
-    def _check_model(cls, model):
-        if not isinstance(model, (str, dict)):
-            raise ValueError("model must be a name or a table with a name")
-        return model
-
 
 class MuscleTable(DefaultsTable):
     """``[[muscle]]``."""
@@ -108,20 +91,12 @@ class SceneFile(Table):
 def read_scene_file(path: Path) -> SceneFile:
     """Return the checked SceneFile of a TOML file; relative names of files become relative to its folder.
 
-    Raises
-    ------
-    SceneError
-        Naming the file, the table, the key, the value and what is right.
+    SceneError names the file, the table, the key, the value and what is right.
     """
     data = _read_toml(path)
     check_plain(data, place=f"{path}: ")
-    check_removed(data, place=f"{path}: ")
-    try:
-        return SceneFile.model_validate(data, context={"folder": path.parent})
-    except ValidationError as error:
-        raise SceneError(
-            describe_error(error, root=str(path), name_row=lambda at: _place(at, data))
-        ) from None
+    place, folder = f"{path}: ", path.parent
+    return SceneFile.build(data, place=place, folder=folder, name_row=lambda at: _place(at, data))
 
 
 def _read_toml(path):
@@ -199,15 +174,10 @@ def _add_muscle(scene, muscle, defaults):
     read = read_mesh(muscle.mesh, name=muscle.name, scale=scale)
     check_size(scene, "muscle", muscle.name, read)
     check_place(scene, muscle.name, read)
-    given |= {"mesh": read, "model": _merge_model(given.get("model", "rbf"), defaults.model)}
-    add_muscle(scene, **given)
-
-
-def _merge_model(model, default):
-    """A model table without a name changes some options of the default model."""
-    if isinstance(model, dict) and "name" not in model:
-        return {**({"name": default} if isinstance(default, str) else default), **model}
-    return model
+    model, default = given.get("model", "rbf"), defaults.model
+    if isinstance(model, dict) and "name" not in model:  # some options of the default model are changed
+        model = {**(default if isinstance(default, dict) else {"name": default}), **model}
+    add_muscle(scene, **given | {"mesh": read, "model": model})
 
 
 def _place(location, data):

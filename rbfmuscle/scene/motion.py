@@ -1,37 +1,31 @@
 """From joint coordinates to the poses of bones: ramps, waypoints and OpenSim motion files."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.joints.joint import Coordinate
-from rbfmuscle.scene.joints.skeleton import all_coordinates, joint_poses, joint_values, resolve
+from rbfmuscle.scene.joints.joint import Coordinate, all_coordinates, joint_poses, joint_values, resolve
 from rbfmuscle.scene.joints.tables import FACTORS, full_name
-from rbfmuscle.scene.motion_file import read_motion_file
 from rbfmuscle.scene.objects import Motion, SceneData
 from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions
 from rbfmuscle.scene.tendons import Poses
-from rbfmuscle.validation import SceneError, did_you_mean
+from rbfmuscle.validation import SceneError, did_you_mean, read_text
 
-# Lever [mm] at which a shift of a joint is counted as a turn.
-SHIFT_LEVER = 50.0
+SHIFT_LEVER = 50.0  # lever [mm] at which a shift of a joint is counted as a turn
 NOT_MOVED = 1e-9  # A locked coordinate may be given, at its rest value.
 # Share of a turn [radian] or of a length that rounding may take a coordinate beyond its range.
 RANGE_TOLERANCE = 1e-6
+IN_DEGREES = dict.fromkeys(("yes", "true", "1"), math.pi / 180) | dict.fromkeys(("no", "false", "0"), 1.0)
 
 
 def make_motion(scene: SceneData, options: MotionOptions) -> Motion:
-    """Return the motion that ``[motion]`` asks of a scene's joints.
+    """The motion that ``[motion]`` asks of a scene's joints.
 
-    Raises
-    ------
-    SceneError
-        If a coordinate is unknown, the motion has too many frames, or its file cannot be read.
+    SceneError on an unknown coordinate, too many frames, or a file that cannot be read.
     """
     facts = all_coordinates(scene.joints)
     followers = {coupling.coordinate for coupling in scene.couplings}
@@ -80,14 +74,9 @@ def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> 
 def bone_poses(scene: SceneData, coordinates: dict[str, float]) -> Poses:
     """Return the pose (4, 4) of every bone, and of every end of a muscle that a tendon holds: rest -> world.
 
-    A joint moves its child, and all that hangs on it, against its parent. At the coordinates at which the
-    scene's meshes are (``rest``), every pose is the identity. A bone without a joint is fixed.
-
-    Parameters
-    ----------
-    scene : SceneData
-    coordinates : dict of str -> float
-        "joint.coordinate" -> value [radian or scene unit]; absent ones are at rest.
+    A joint moves its child, and all that hangs on it, against its parent. Where the scene's meshes are (``rest``),
+    every pose is the identity. A bone without a joint is fixed. ``coordinates`` are values of "joint.coordinate"
+    [radian or scene unit]; absent ones are at rest.
     """
     known = all_coordinates(scene.joints)
     for name in coordinates:
@@ -150,16 +139,12 @@ def _asked_frames(options, facts):
     if options.ramp is not None:
         ramps = named(options.ramp)
         starts = {name: ramp.start for name, ramp in ramps.items() if ramp.start is not None}
-        stops, steps = (
-            [starts, {name: ramp.end for name, ramp in ramps.items()}],
-            [r.step for r in ramps.values()],
-        )
-        return _frames_between(stops, list(ramps), steps, facts)
+        stops = [starts, {name: ramp.end for name, ramp in ramps.items()}]
+        return _frames_between(stops, list(ramps), [ramp.step for ramp in ramps.values()], facts)
     if options.waypoints is not None:
         stops = [named(stop) for stop in options.waypoints]
-        return _frames_between(
-            stops, list(dict.fromkeys(itertools.chain(*stops))), options.step or 1.0, facts
-        )
+        names = list(dict.fromkeys(itertools.chain(*stops)))
+        return _frames_between(stops, names, options.step or 1.0, facts)
     return [{}]
 
 
@@ -174,9 +159,16 @@ def _frames_between(stops, names, steps, facts):
     rows = [table[0]]
     with np.errstate(over="ignore"):
         paces = (np.abs(np.diff(table, axis=0)) / steps).max(axis=1, initial=0.0)
-        _check_count(np.ceil(paces).sum())
+        count = np.ceil(paces).sum()
+    if not count <= MAX_FRAMES:
+        raise SceneError(
+            f"[motion]: about {count:.3g} frames, more than {MAX_FRAMES}: a step is too small for its range; "
+            "make the step larger or the range smaller"
+        )
     for pace, (before, after) in zip(paces.tolist(), itertools.pairwise(table)):
-        rows.extend(before + t * (after - before) for t in _marks(pace)[1:])
+        # At whole steps, then the end: 2.5 steps give 0.4, 0.8, 1 of the path.
+        marks = [*(k / pace for k in range(1, math.ceil(pace - 1e-9))), 1.0] if pace else []
+        rows.extend(before + t * (after - before) for t in marks)
     return [dict(zip(names, (row * factors).tolist())) for row in rows]
 
 
@@ -213,14 +205,83 @@ def _range_notes(frames: list[dict[str, float]], facts: dict[str, Coordinate]) -
     return notes
 
 
-def _marks(pace):
-    """Fractions of the path at whole steps, then the end: 2.5 steps give 0, 0.4, 0.8, 1."""
-    return [*(k / pace for k in range(math.ceil(pace - 1e-9))), 1.0] if pace else [0.0]
+def read_motion_file(
+    path: Path, facts: dict[str, Coordinate], followers: set[str], *, metre: float
+) -> tuple[list[dict[str, float]], list[float] | None, list[str]]:
+    """Frames, times [s] (None without a column ``time``) and notes of an OpenSim motion file.
+
+    It holds a header up to ``endheader``, column names and rows of numbers. Angles are turned from degrees where the
+    header says ``inDegrees=yes``, lengths from metres, ``metre`` scene units each; numbers of coordinates that are
+    neither are taken as they are, as OpenSim does. ``facts`` are the scene's coordinates by full name; columns of
+    ``followers``, which follow others, are not used.
+    """
+    header, labels, values = _read_storage(path)
+    if len(values) > MAX_FRAMES:
+        raise SceneError(f"[motion]: {path} has {len(values)} rows, more than {MAX_FRAMES}")
+    columns: dict[str, int] = {}
+    for column, label in enumerate(labels):
+        name = match_label(label, list(facts))
+        if name in columns:
+            raise SceneError(f"[motion]: {path} has two columns of coordinate {name!r}, leave one out")
+        if name is not None:
+            columns[name] = column
+    if not columns:
+        names = ", ".join(list(facts)[:20]) or "no joints"
+        raise SceneError(f"[motion]: {path} has none of the scene's coordinates ({names})")
+    used = [*columns.values(), *([labels.index("time")] if "time" in labels else [])]
+    bad = np.argwhere(~np.isfinite(values[:, used]))
+    if len(bad):
+        row, column = bad[0]
+        raise SceneError(f"[motion]: {path} row {row + 1}: {labels[used[column]]} is not a finite number")
+    factor, notes = _angle_factor(path, header)
+    units = {"rotation": factor, "translation": metre, "coupled": 1.0}
+    tracks = {}
+    for name, column in columns.items():
+        if name in followers or facts[name].locked:
+            why = "follows other coordinates" if name in followers else "is locked"
+            notes.append(f"{path}: the column of {name!r} is not used, the coordinate {why}")
+        else:
+            tracks[name] = (values[:, column] * units[facts[name].motion]).tolist()
+    frames = [{name: track[row] for name, track in tracks.items()} for row in range(len(values))]
+    return frames, values[:, labels.index("time")].tolist() if "time" in labels else None, notes
 
 
-def _check_count(count):
-    if not count <= MAX_FRAMES:
-        raise SceneError(
-            f"[motion]: about {count:.3g} frames, more than {MAX_FRAMES}: a step is too small for its range; "
-            "make the step larger or the range smaller"
-        )
+def _read_storage(path: Path) -> tuple[dict[str, str], list[str], Floats]:
+    """Header (lower case), labels of the columns, and values (rows, columns) of an OpenSim storage file."""
+    lines = read_text(path, place="[motion]: ").splitlines()
+    end = next((row for row, line in enumerate(lines) if line.strip().lower() == "endheader"), len(lines))
+    if len(lines) < end + 3:
+        words = "no 'endheader' line with columns and rows after it"
+        raise SceneError(f"[motion]: {path} is no OpenSim motion: {words}")
+    pairs = [line.lower().split("=", 1) for line in lines[:end] if "=" in line]
+    labels, rows = lines[end + 1].split(), [line.split() for line in lines[end + 2 :] if line.strip()]
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(labels):
+            words = f"row {number} has {len(row)} values, the header names {len(labels)}"
+            raise SceneError(f"[motion]: {path} {words}")
+    try:
+        values = np.array(rows, dtype=float)
+    except ValueError as error:
+        raise SceneError(f"[motion]: {path}: {error}") from None
+    return {key.strip(): value.strip() for key, value in pairs}, labels, values
+
+
+def match_label(label: str, known: list[str]) -> str | None:
+    """Return the coordinate that a column is of: ``joint.coordinate``, ``coordinate`` or ``.../joint/name/value``."""
+    parts = label.removesuffix("/value").split("/")
+    for name in (label, ".".join(parts[-2:]), parts[-1]):
+        owners = [full for full in known if name in (full, full.split(".", 1)[1])]
+        if name in owners or len(owners) == 1:
+            return name if name in owners else owners[0]
+    return None
+
+
+def _angle_factor(path, header):
+    """Radians in the file's unit of angles, and a note where the header does not say it."""
+    said = header.get("indegrees")
+    if said is None:
+        words = "angles are taken as radians; add inDegrees=yes to its header"
+        return 1.0, [f"{path} does not say inDegrees: {words}"]
+    if said not in IN_DEGREES:
+        raise SceneError(f"[motion]: {path}: inDegrees={said} is neither yes nor no")
+    return IN_DEGREES[said], []

@@ -92,28 +92,15 @@ class Muscle:
 
 @dataclass(eq=False)
 class Motion:
-    """The frames of a motion, each a dict of "joint.coordinate" -> value [radian or scene unit].
-
-    Attributes
-    ----------
-    frames : list of dict
-        A coordinate that is absent stays at rest.
-    options : MotionOptions
-        What the frames were made from.
-    times : list of float, optional
-        Time of each frame [s], where a motion file gives it.
-    progress : (n,) ndarray
-        Where each frame lies in the whole motion, 0 to 1; even where not given.
-    notes : list of str
-        Warnings: coordinates that leave their range, columns that were not used.
-    """
+    """The frames of a motion, each a dict of "joint.coordinate" -> value [radian or scene unit]; absent ones rest."""
 
     frames: Sequence[dict[str, float]] = ({},)
     _: KW_ONLY
-    options: MotionOptions = field(default_factory=MotionOptions)
-    times: Sequence[float] | None = None
+    options: MotionOptions = field(default_factory=MotionOptions)  # what the frames were made from
+    times: Sequence[float] | None = None  # of each frame [s], where a motion file gives it
+    # Where each frame lies in the whole motion (n,), 0 to 1; even where not given.
     progress: Floats = field(default_factory=lambda: np.empty(0))
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # coordinates that leave their range, columns not used
 
     def __post_init__(self) -> None:
         if not len(self.progress):

@@ -1,9 +1,4 @@
-"""The tables of a scene that hold settings: contact, sliding, detection, output, motion.
-
-They check themselves, so the same rules hold for a file, for code and for ``--set``.
-"""
-
-from __future__ import annotations
+"""The tables of a scene that hold settings; the same rules hold for a file, for code and for ``--set``."""
 
 import math
 import re
@@ -31,37 +26,6 @@ from rbfmuscle.validation import SceneError, did_you_mean, shown
 DEEPEST = 20
 LARGEST_INTEGER = 2**53
 MAX_FRAMES = 100_000
-
-# What to do in place of keys that were removed: of a muscle, or of its model (`model.KEY`), without the muscle.
-# The table is deleted at 1.0.
-_REPLACED = {
-    "delete the key": (
-        "contact.margin contact.tolerance contact.still_angle detect.tunnelling.smallest_step sliding.strip "
-        "sliding.release sliding.join sliding.cut motion.max_substeps shortening joint.coordinates.*.default "
-        "model.seed model.acceleration model.contacts model.edge model.arap_compliance model.arap_reach "
-        "model.swelling_reach model.contact model.sound model.self_collision model.derivatives "
-        "output.metrics output.fibres output.moment_arms"
-    ),
-    "delete the table": "opensim",
-    "delete the key: solve_pose(scene, models, coordinates) in Python solves a pose from rest": "contact.from_rest",
-    "delete the key: call simulate(scene, fields={bone: field}) in Python for other fields": "contact.detector",
-    "write inDegrees=yes or inDegrees=no into the header of the motion file": "motion.degrees",
-    "use a list of numbers, spread over the motion": "activation.from activation.to activation.file",
-    "use fibre_stretch_at_rest: the mean length of the fibres in the scan over it": "optimal_fibre_length",
-    "give the axes in the scene's directions": "joint.orientation",
-    "use tendon.length, measured from the attachments": "tendon.share tendon.vertices",
-    "multiply the numbers of the function by it": "joint.rotations.scale joint.translations.scale coupling.scale",
-    "use spline": "joint.rotations.natural_spline joint.translations.natural_spline coupling.natural_spline",
-    'use a model whose sweeps go on until none moves a vertex, for instance "pbd-converged"': "model.tolerance",
-    "use model.nodes: every RBF muscle is carried by an elastic solid": "model.inside model.across model.across_weight",
-    "use model.fibre_ratio, the stiffness along the fibres": "model.stretch_high model.stretch_hold",
-    "use model.slack: fibres shorten freely to 1 / slack of their length in the scan": "model.stretch_low",
-    'use model = "pbd-paper", or delete the key': (
-        "model.prediction model.damping model.limits model.soft_length model.response"
-    ),
-    "use output.report = false, which leaves out report.html and preview.webp": "output.preview",
-}
-REMOVED_KEYS = {key: remedy for remedy, keys in _REPLACED.items() for key in keys.split()}
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -113,21 +77,6 @@ def check_plain(value: object, *, place: str, depth: int = 0) -> None:
         raise SceneError(f"{place}: must be a finite number, got {value}")
 
 
-def check_removed(values: object, *, place: str, prefix: str = "") -> None:
-    """Raise SceneError where a table, or list of tables, holds a removed key; the message says what to do instead.
-
-    ``place`` begins the message; ``prefix`` is the dotted name of the table, with a full stop at its end.
-    """
-    for row in values if isinstance(values, list) else [values]:
-        for key, value in row.items() if isinstance(row, dict) else ():
-            name = f"{prefix}{key}".removeprefix("muscle.").removeprefix("defaults.")
-            if name in REMOVED_KEYS:
-                raise SceneError(f"{place}{name} was removed: {REMOVED_KEYS[name]}")
-            # Coordinates have names of their own.
-            inner = "joint.coordinates.*" if prefix == "joint.coordinates." else name
-            check_removed(value, place=place, prefix=f"{inner}.")
-
-
 class Table(BaseModel):
     """A table whose unknown keys are errors that name the nearest right one."""
 
@@ -149,15 +98,22 @@ class Table(BaseModel):
         return data
 
     @classmethod
-    def build(cls, values: Mapping[str, Any], *, place: str, folder: Path | None = None) -> Self:
+    def build(
+        cls,
+        values: Mapping[str, Any],
+        *,
+        place: str,
+        folder: Path | None = None,
+        name_row: Callable[[tuple[str | int, ...]], str] | None = None,
+    ) -> Self:
         """Return the table made from a mapping, or raise SceneError that begins with ``place``.
 
-        Relative names of files are relative to ``folder``.
+        Relative names of files are relative to ``folder``; ``name_row`` turns pydantic's location into words.
         """
         try:
             return cls.model_validate(values, context={"folder": folder})
         except ValidationError as error:
-            raise SceneError(f"{place}{describe_error(error)}") from None
+            raise SceneError(f"{place}{_describe_error(error, name_row)}") from None
 
 
 def set_dotted(table: dict[str, Any], key: str, value: object, *, place: str) -> None:
@@ -172,11 +128,8 @@ def set_dotted(table: dict[str, Any], key: str, value: object, *, place: str) ->
     table[last] = value
 
 
-def describe_error(error: Any, *, root: str = "", name_row: Callable[..., Any] | None = None) -> str:
-    """Return the first problem of a pydantic error as "root: where: what, given value".
-
-    ``name_row`` turns the location (a tuple) into words.
-    """
+def _describe_error(error, name_row):
+    """The first problem of a pydantic error as "where: what, given value"."""
     first = error.errors(include_url=False)[0]
     # Of a value of several types, pydantic's place names the class that it tried.
     parts = [str(part) for part in first["loc"] if not str(part).endswith("Options")]
@@ -187,7 +140,7 @@ def describe_error(error: Any, *, root: str = "", name_row: Callable[..., Any] |
     value = ""
     if first["type"] not in ("unknown_key", "missing") and not isinstance(given, dict):
         value = f", got {shown(repr(given) if isinstance(given, str) else given)}"
-    return ": ".join(part for part in (root, where, message + value) if part)
+    return f"{where}: {message}{value}" if where else message + value
 
 
 class ContactOptions(Table):

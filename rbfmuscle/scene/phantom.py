@@ -3,8 +3,6 @@
 A right hip in millimetres with the joint's centre at the origin: +x medial, +y posterior, +z up.
 """
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.attachments import ExactMeshes
 from rbfmuscle.scene.objects import Attachment
 from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
 from rbfmuscle.scene.phantom_shapes import Tube, ball, blend, carve, ellipsoid, plate, rod, solid_mesh
@@ -93,8 +90,7 @@ def _parts(spacing):
     for name, tube in MUSCLES.items():
         vertices, faces, u = tube.mesh(spacing)
         first, last = ATTACHED_ENDS.get(name, USUAL_ENDS)
-        exact = ExactMeshes()
-        near = {bone.name: exact.distances(vertices, bone.mesh) <= ATTACHED_WITHIN for bone in scene.bones}
+        near = {bone.name: bone.distances(vertices) <= ATTACHED_WITHIN for bone in scene.bones}
         attach = [
             Attachment("pelvis", np.flatnonzero((u <= first) & near["pelvis"])),
             Attachment("femur", np.flatnonzero((u >= last) & near["femur"])),

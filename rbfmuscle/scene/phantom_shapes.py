@@ -1,7 +1,5 @@
 """Shapes from formulas: tubes of known volume for muscles, blended solids for bones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,30 +19,15 @@ class Tube:
     section's centroid lies on the axis, so by Pappus the volume is the integral of the section's area,
 
         V = pi * width * thickness * length * fullness / (fullness + 1).
-
-    Parameters
-    ----------
-    points : (3, 3) array_like
-        Start, corner and end of the axis.
-    radius : float
-        Of the rounded corner; at most what the shorter leg allows.
-    width, thickness : float
-        Half-axes of the largest section (for spread 1).
-    fullness : float
-        2 gives an ellipsoid's ends, more gives blunter ones.
-    spread : float
-        Above 1 the start is wider and thinner than the end.
-    twist : (float, float)
-        Angle of the wide half-axis from the binormal of the bend, at the start and the end [radian].
     """
 
-    points: tuple
-    radius: float
-    width: float
+    points: tuple  # start, corner and end of the axis (3, 3)
+    radius: float  # of the rounded corner, at most what the shorter leg allows
+    width: float  # half-axes of the largest section, for spread 1
     thickness: float
-    fullness: float = 4.0
-    spread: float = 1.0
-    twist: tuple = (0.0, 0.0)
+    fullness: float = 4.0  # 2 gives an ellipsoid's ends, more gives blunter ones
+    spread: float = 1.0  # above 1 the start is wider and thinner than the end
+    twist: tuple = (0.0, 0.0)  # of the wide half-axis from the bend's binormal at both ends [radian]
 
     def _bend(self):
         start, corner, end = np.asarray(self.points, dtype=float)
@@ -101,12 +84,7 @@ class Tube:
     def mesh(self, spacing: float) -> tuple[Floats, Integers, Floats]:
         """Closed outward triangles with edges of about ``spacing``, vertices on the tube.
 
-        Returns
-        -------
-        vertices : (n, 3) ndarray
-        faces : (m, 3) ndarray of int
-        u : (n,) ndarray
-            Fraction of the axis of each vertex.
+        Vertices (n, 3), faces (m, 3), and the fraction of the axis (n,) of each vertex.
         """
         u = _stations(self, spacing)
         centre, wide, thin = self.sections(u)
@@ -127,9 +105,8 @@ def _stations(tube, spacing):
     centre, wide, thin = tube.sections(fine)
     path = np.zeros(len(fine))
     for line in (centre + wide, centre + thin, centre - wide, centre - thin):
-        path = np.maximum(
-            path, np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-        )
+        steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+        path = np.maximum(path, np.concatenate([[0], np.cumsum(steps)]))
     count = max(8, round(path[-1] / spacing))
     return np.interp(np.linspace(0, path[-1], count + 1), path, fine)
 

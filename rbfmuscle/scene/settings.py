@@ -1,7 +1,5 @@
 """Changing a scene by dotted keys: ``--set KEY=VALUE``, grids of a sweep, ``Scene.with_options``."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
@@ -12,14 +10,7 @@ from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
 from rbfmuscle.scene.build import split_model
 from rbfmuscle.scene.motion import make_motion, slice_motion
 from rbfmuscle.scene.objects import Muscle, SceneData
-from rbfmuscle.scene.options import (
-    DetectOptions,
-    MotionOptions,
-    SlidingOptions,
-    check_plain,
-    check_removed,
-    set_dotted,
-)
+from rbfmuscle.scene.options import DetectOptions, MotionOptions, SlidingOptions, check_plain, set_dotted
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
 S = TypeVar("S", bound=SceneData)
@@ -75,18 +66,15 @@ def chooses_model(key: str) -> bool:
 
 
 def _apply(scene, key, value):
-    check_removed({key: value}, place="")
     head, _, rest = key.partition(".")
     muscles, folder = scene.muscles, scene.path.parent if scene.path else None
     if head == "muscle":
         name, _, inner = rest.partition(".")
-        check_removed({inner: value}, place=f"{key}: ")
         head, _, rest = inner.partition(".")
         muscles = [scene.muscle(name)]
         if head != "model" and head not in KEYS:
-            raise SceneError(
-                f"{key}: of a muscle its model (muscle.{name}.model.KEY) and {', '.join(KEYS)} can be set"
-            )
+            allowed = f"its model (muscle.{name}.model.KEY) and {', '.join(KEYS)}"
+            raise SceneError(f"{key}: of a muscle {allowed} can be set")
     if head == "model" and not rest:
         _set_models(muscles, value)
     elif head == "model":
@@ -100,9 +88,8 @@ def _apply(scene, key, value):
     elif not rest:
         raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
     elif head == "motion":
-        options = MotionOptions.build(
-            _changed_motion(scene.motion.options, rest, value, key), place=f"{key}: motion ", folder=folder
-        )
+        values = _changed_motion(scene.motion.options, rest, value, key)
+        options = MotionOptions.build(values, place=f"{key}: motion ", folder=folder)
         scene.motion = make_motion(scene, options)
     else:
         table = getattr(scene, head) or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
@@ -181,7 +168,6 @@ def parse_slice(text: str) -> slice:
         if len(numbers) > 3 or numbers[2:] == [0]:
             raise ValueError
     except ValueError:
-        raise UsageError(
-            f"frames {text!r} must look like A:B:S (whole numbers, S not 0), for instance 0:46:5"
-        ) from None
+        example = "A:B:S (whole numbers, S not 0), for instance 0:46:5"
+        raise UsageError(f"frames {text!r} must look like {example}") from None
     return slice(*numbers)

@@ -18,21 +18,21 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.jit import compiled
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import rotation_about
-from rbfmuscle.scene.taut_line import line_length, points_along, taut_line
 
 # Strain of a passive belly at which it bears the force that strains its tendon by `TENDON_STRAIN` (Zajac 1989), and
 # the tendon's strain over the belly's.
 BELLY_STRAIN = 0.6
 STIFFNESS_RATIO = TENDON_STRAIN / BELLY_STRAIN
-# The string's direction is that of a chord so long, in lengths of the string.
-CHORD = 0.06
+CHORD = 0.06  # the string's direction is that of a chord so long, in lengths of the string
 # Steps to the place of the end where its tendon has the wanted length, and the relative error that ends them.
 STEPS, TOLERANCE = 8, 1e-9
-# Points of a tendon as it is drawn.
-NODES = 33
+NODES = 33  # points of a tendon as it is drawn
+STEEPEST = 2.0  # greatest slope of a line against the chord of its ends
+DIRECTIONS = 64  # directions in which a convex hull is begun
 
 # A bone and a point (3,) of it at rest [scene unit].
 BonePoint: TypeAlias = tuple[str, Floats]
@@ -58,15 +58,7 @@ AT_REST = AtRest()
 class Poses(dict[str, Floats]):
     """Poses (4, 4) of bones by name; those of ends that tendons hold are computed when they are first asked for.
 
-    Parameters
-    ----------
-    bones : mapping of str to (4, 4) ndarray
-    ends : mapping of str to TendonEnd
-
-    Attributes
-    ----------
-    tendons : dict of str to TendonLine
-        Of the ends asked for so far.
+    ``tendons`` are the `TendonLine` of the ends asked for so far.
     """
 
     def __init__(self, bones: Mapping[str, Floats], ends: Mapping[str, TendonEnd]) -> None:
@@ -90,36 +82,17 @@ class _Mark(NamedTuple):
 
 @dataclass(eq=False)
 class TendonEnd:
-    """The end of a belly that a tendon joins to a bone.
+    """The end of a belly that a tendon joins to a bone."""
 
-    Attributes
-    ----------
-    name : str
-        Of the end among the poses.
-    patch : (n, 3) ndarray
-        Vertices of the end at rest [scene unit].
-    middle : (3,) ndarray
-        Of the patch.
-    radii : (float, float)
-        Of the belly there, and of the tendon as it is drawn [scene unit].
-    line : list of BonePoint
-        Via points, then the insertion.
-    other : list of BonePoint
-        The muscle's other end: a point of its bone, or of its tendon the insertion and the via points.
-    slack : float
-        Length of that tendon at rest, zero where there is none.
-    obstacles : sequence of Bone
-        Bones that string and tendon go around.
-    """
-
-    name: str
-    patch: Floats
-    middle: Floats
-    radii: tuple[float, float]
-    line: list[BonePoint]
+    name: str  # of the end among the poses
+    patch: Floats  # vertices of the end (n, 3) at rest [scene unit]
+    middle: Floats  # of the patch (3,)
+    radii: tuple[float, float]  # of the belly there, and of the tendon as it is drawn [scene unit]
+    line: list[BonePoint]  # via points, then the insertion
+    # The muscle's other end: a point of its bone, or of its tendon the insertion and the via points.
     other: list[BonePoint] = field(default_factory=list)
-    slack: float = 0.0
-    obstacles: Sequence[Bone] = ()
+    slack: float = 0.0  # length of that tendon at rest, zero where there is none
+    obstacles: Sequence[Bone] = ()  # bones that string and tendon go around
 
     @cached_property
     def length(self) -> float:
@@ -140,10 +113,7 @@ class TendonEnd:
 
     @cached_property
     def _sides(self) -> list[Floats]:
-        """Direction (3,) at rest to the side on which each leg of the string passes the bones.
-
-        It leads out of the nearest bone: from the belly's end in the leg that passes it, from the middle of others.
-        """
+        """Directions (3,) at rest out of the nearest bone, on whose side each leg of the string passes the bones."""
         stops = [point for _, point in (*self.other, *self.line)]
         places = [0.5 * (a + b) for a, b in itertools.pairwise(stops)]
         places[len(self.other) - 1] = self.middle
@@ -158,13 +128,7 @@ class TendonEnd:
         return way / max(float(np.linalg.norm(way)), 1e-300)
 
     def place(self, poses: Mapping[str, Floats]) -> tuple[TendonLine, Floats]:
-        """The tendon, and the pose (4, 4) of the belly's end from rest to world.
-
-        Parameters
-        ----------
-        poses : mapping of str to (4, 4) ndarray
-            Of the bones.
-        """
+        """The tendon, and the pose (4, 4) of the belly's end from rest to world, at poses (4, 4) of the bones."""
         at_rest, before = self._rest
         legs = self._string(poses)
         length = self.length * (1.0 + self._strain(sum(map(line_length, legs)) - at_rest))
@@ -239,11 +203,8 @@ class TendonEnd:
         return legs
 
     def _turn(self, before: Floats, now: Floats, poses: Mapping[str, Floats]) -> Floats:
-        """Rotation (3, 3) that takes one direction to the other.
-
-        Seen from the bones of the string's fixed points before and after the end it would be the least rotation that
-        does; the twist about the direction between these two is spread evenly from one point to the other.
-        """
+        """Rotation (3, 3) from one direction to the other; the twist between two fixed points is spread evenly."""
+        # Seen from the bones of the string's fixed points before and after the end it would be the least rotation.
         near, far = (poses[bone][:3, :3] for bone, _ in (self.other[-1], self.line[0]))
         first, last = (turn @ _least_turn(turn.T @ now, before) for turn in (near, far))
         twist = last @ first.T
@@ -291,3 +252,75 @@ def _least_turn(now: Floats, before: Floats) -> Floats:
     axis, cosine = np.cross(before, now), float(before @ now)
     skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     return np.eye(3) + skew + skew @ skew / max(1.0 + cosine, 1e-9)
+
+
+def taut_line(
+    start: Floats, end: Floats, side: Floats, bones: Sequence[tuple[Floats, Floats]], width: float
+) -> Floats:
+    """Points (n, 3) of the taut line between two points (3,) that passes bones on one side, a direction (3,).
+
+    The line lies in the plane of its ends and ``side``. A point of a bone at a distance z from the plane is an obstacle
+    in it, lower by z² / (2 ``width``), as for a round band. One that the line could only pass by leaving an end more
+    steeply than `STEEPEST` is lowered below that slope by as much as it is above. So the line changes continuously
+    where the plane comes to meet a bone, and parts of bones that lie far to the side do not count. ``bones`` are poses
+    (4, 4) and points (n, 3) at rest.
+    """
+    size = float(np.linalg.norm(end - start))
+    along = (end - start) / max(size, 1e-300)
+    up = side - (side @ along) * along
+    up = up / max(float(np.linalg.norm(up)), 1e-300)
+    axes = np.stack([along, up, np.cross(along, up)])
+    profile = []
+    for pose, points in bones:
+        turn, shift, found = axes @ pose[:3, :3], axes @ (pose[:3, 3] - start), np.empty((len(points), 2))
+        profile.append(found[: _profile_loop(points, turn, shift, size, max(width, 1e-300), found)])
+    if not any(len(found) for found in profile):
+        return np.stack([start, end])
+    return start + _upper_hull(np.concatenate([[[0.0, 0.0], [size, 0.0]], *profile])) @ axes[:2]
+
+
+@compiled(error_model="numpy")
+def _profile_loop(points, turn, shift, size, width, found):
+    """Fill ``found`` with points along and above a chord, counted as in `taut_line`; return how many there are."""
+    count = 0
+    for i in range(len(points)):
+        a, b, c = points[i, 0], points[i, 1], points[i, 2]
+        x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0]
+        if x <= 0.0 or x >= size:
+            continue
+        y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + shift[1]
+        z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + shift[2]
+        y = min(y, 2.0 * STEEPEST * min(x, size - x) - y) - z * z / (2.0 * width)
+        if y > 0.0:
+            found[count, 0], found[count, 1] = x, y
+            count += 1
+    return count
+
+
+def _upper_hull(points: Floats) -> Floats:
+    """Upper convex hull (k, 2) of points (n, 2), from left to right (Andrew 1979)."""
+    # Nearly all points lie below the hull of those that are outermost in some directions.
+    angles = np.linspace(0.0, np.pi, DIRECTIONS)
+    outermost = np.unique(np.argmax(np.stack([-np.cos(angles), np.sin(angles)], axis=1) @ points.T, axis=1))
+    outermost = outermost[np.argsort(points[outermost, 0], kind="stable")]
+    above = points[:, 1] >= np.interp(points[:, 0], *points[outermost].T)
+    hull: list[Floats] = []
+    for point in points[above][np.lexsort(points[above].T[::-1])]:
+        while len(hull) > 1:
+            (ax, ay), (bx, by) = hull[-2], hull[-1]
+            if (bx - ax) * (point[1] - ay) < (by - ay) * (point[0] - ax):
+                break
+            hull.pop()
+        hull.append(point)
+    return np.array(hull)
+
+
+def line_length(points: Floats) -> float:
+    """Length of the line through points (n, 3)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def points_along(line: Floats, places: Floats) -> Floats:
+    """Points (k, 3) at distances (k,) along a line (n, 3) from its beginning."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    return np.stack([np.interp(places, along, line[:, axis]) for axis in range(3)], axis=1)

@@ -4,8 +4,6 @@ Two threads of one interpreter share its lock and do 1.2 to 1.35 times the work 
 (docs/speed.md).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import pickle
@@ -22,23 +20,27 @@ from rbfmuscle.progress import stage
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.sharing.share import Solved
 
+# A process more takes about two seconds to begin: fewer muscles, or fewer muscles times frames, are quicker in one.
+LEAST_MUSCLES, LEAST_WORK = 5, 400
+MOST_HELPERS = 4
+
+
+def helpers_for(scene: Scene, threads: int) -> int:
+    """How many processes should share the muscles of a run that may use ``threads``; fewer than two: one's own alone.
+
+    Muscles that slide on each other see each other at every sub-step, and stay together.
+    """
+    count = len(scene.muscles)
+    if scene.sliding is not None or count * len(scene.motion.frames) < LEAST_WORK:
+        return 0
+    return min(threads, count // LEAST_MUSCLES, MOST_HELPERS)
+
 
 class WorkerPool:
-    """Several `MuscleGroup` in processes, with the frames of one of all muscles, to the last digit.
+    """Several `MuscleGroup` in at least two processes, with the frames of one of all muscles, to the last digit.
 
     A process continues while its last frame is taken, and waits with the next one until it is asked for: memory is
-    bounded by the pipes.
-
-    Parameters
-    ----------
-    scene : Scene
-    helpers : int
-        At least two.
-
-    Attributes
-    ----------
-    times : dict of str to float
-        Wall time spent so far [s], of the helper that spent most: ``simulate``, ``metrics``.
+    bounded by the pipes. ``times`` are wall times so far [s], of the helper that spent most.
     """
 
     def __init__(self, scene: Scene, helpers: int) -> None:

@@ -4,8 +4,6 @@ It reads a scene and the names of its muscles from standard input, and writes pa
 standard output: first that the muscles are built, then frame by frame. It ends with the process that started it.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import traceback
@@ -24,7 +22,6 @@ class _Forward(logging.Handler):
         self.outbox = outbox
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Send one record."""
         self.outbox.put(("logged", (record.name, record.levelno, record.getMessage())))
 
 

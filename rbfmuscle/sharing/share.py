@@ -1,7 +1,5 @@
 """Muscles of a scene that one process builds, solves and measures."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,41 +15,17 @@ from rbfmuscle.simulation.frame_loop import simulate_frames
 
 
 class Solved(NamedTuple):
-    """A frame of some muscles, or of all.
-
-    Attributes
-    ----------
-    frame : Frame
-    measured : dict of str to dict
-        Values by muscle and quantity; empty where metrics are not asked for.
-    """
+    """A frame of some muscles, or of all, and its values by muscle and quantity, none where metrics are off."""
 
     frame: Frame
     measured: dict[str, Values]
 
 
 class MuscleGroup:
-    """Some muscles of a scene, or all.
+    """The models of some muscles of a scene, by ``names``, or of all; SceneError or MeshError if one cannot be built.
 
-    Parameters
-    ----------
-    scene : Scene
-        Whole: what does not belong to a muscle is the same in every share.
-    names : collection of str, optional
-        Of the muscles; all where not given.
-    fields : mapping of str to BoneField, optional
-        Of the bones, by name; `BoneSDF` where not given.
-
-    Attributes
-    ----------
-    models : list of MuscleModel
-    times : dict of str to float
-        Wall time spent so far [s]: ``simulate``, ``metrics``.
-
-    Raises
-    ------
-    SceneError, MeshError
-        If a muscle cannot be built.
+    The scene is whole: what does not belong to a muscle is the same in every share. ``fields`` of the bones by name
+    replace `BoneSDF`; ``times`` are wall times spent so far [s], by ``simulate`` and ``metrics``.
     """
 
     def __init__(
@@ -68,13 +42,7 @@ class MuscleGroup:
         self._measures = MuscleMeasures(scene, carried)
 
     def frames(self) -> Iterator[Solved]:
-        """The frames as they are solved and measured.
-
-        Raises
-        ------
-        SolveError
-            If a muscle cannot be solved, naming muscle, frame and coordinates.
-        """
+        """The frames as they are solved and measured; SolveError names muscle, frame and coordinates."""
         frames = simulate_frames(self.scene, self.models, fields=self._fields)
         with stage("solving the first frame"), timed(self.times, "simulate"):
             frame = next(frames, None)

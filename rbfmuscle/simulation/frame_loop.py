@@ -10,7 +10,7 @@ from threadpoolctl import ThreadpoolController
 
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.scene.activation.curve import Activations
+from rbfmuscle.scene.activation.contraction import Activations
 from rbfmuscle.scene.motion import completed, rest_coordinates
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rbfmuscle.geometry.fields import BoneField
-from rbfmuscle.scene.activation.curve import STEP
-from rbfmuscle.scene.joints.skeleton import all_coordinates
+from rbfmuscle.scene.activation.contraction import STEP
+from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame_loop import FrameLoop

@@ -11,13 +11,11 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
-from rbfmuscle.scene.attachments import ExactMeshes
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import Finding
 from rbfmuscle.scene.motion import bone_poses
 
 if TYPE_CHECKING:
-    import trimesh
-
     from rbfmuscle.scene.objects import Muscle
     from rbfmuscle.scene.scene import Scene
 
@@ -55,22 +53,15 @@ class Fault(NamedTuple):
     first: int
 
 
-def check_motion(scene: Scene, exact: ExactMeshes | None = None) -> list[Fault]:
-    """Follow the attachments of every muscle along the motion.
-
-    Parameters
-    ----------
-    scene : Scene
-    exact : ExactMeshes, optional
-        Distances to the bones' meshes that are known already.
-    """
-    exact, count = exact or ExactMeshes(), len(scene.motion)
+def check_motion(scene: Scene) -> list[Fault]:
+    """Follow the attachments of every muscle along the motion."""
+    count = len(scene.motion)
     frames = sorted({round(k) for k in np.linspace(0, count - 1, min(count, MOST_FRAMES))})
     poses = [bone_poses(scene, {}), *(bone_poses(scene, scene.motion.frames[k]) for k in frames)]
     faults = []
     for muscle in scene.muscles:
         extent = float(np.linalg.norm(np.ptp(np.asarray(muscle.mesh.vertices), axis=0)))
-        for bones, values, bad in _followed(scene, muscle, extent, poses, exact):
+        for bones, values, bad in _followed(scene, muscle, extent, poses):
             if bad.any():
                 worst, first = int(np.abs(values[1:] - values[0]).argmax()), int(np.flatnonzero(bad)[0])
                 faults.append(
@@ -80,7 +71,7 @@ def check_motion(scene: Scene, exact: ExactMeshes | None = None) -> list[Fault]:
 
 
 def _followed(
-    scene: Scene, muscle: Muscle, extent: float, poses: list[Any], exact: ExactMeshes
+    scene: Scene, muscle: Muscle, extent: float, poses: list[Any]
 ) -> Iterator[tuple[tuple[str, str], Floats, np.ndarray]]:
     """For an attachment and a bone, or two attachments: a value (1 + p,) along the motion, and where it is bad."""
     patches = _patches(muscle)
@@ -89,7 +80,7 @@ def _followed(
         for other in scene.bones:
             places = [np.linalg.inv(pose[other.name]) @ pose[bone] for pose in poses]
             if not all(np.allclose(place, places[0], atol=1e-9) for place in places[1:]):
-                depths = np.array([_depth(points, bounds, place, other.mesh, exact) for place in places])
+                depths = np.array([_depth(points, bounds, place, other) for place in places])
                 deeper = np.maximum(depths - depths[0], 0.0)
                 yield (bone, other.name), deeper, deeper[1:] > scene.length(DEEPER)
     for pair in itertools.combinations(patches, 2):
@@ -116,17 +107,17 @@ def _patches(muscle: Muscle) -> dict[str, Floats]:
     return thinned
 
 
-def _depth(points: Floats, bounds: Floats, place: Floats, mesh: trimesh.Trimesh, exact: ExactMeshes) -> float:
-    """Depth of the deepest point inside a mesh, of points moved into its coordinates."""
+def _depth(points: Floats, bounds: Floats, place: Floats, bone: Bone) -> float:
+    """Depth of the deepest point inside a bone, of points moved into its coordinates."""
     low, high = moved_box(bounds, place)
-    if np.any(low > mesh.bounds[1]) or np.any(high < mesh.bounds[0]):
+    if np.any(low > bone.bounds[1]) or np.any(high < bone.bounds[0]):
         return 0.0
-    return max(0.0, -float(exact.distances(points @ place[:3, :3].T + place[:3, 3], mesh).min()))
+    return max(0.0, -float(bone.distances(points @ place[:3, :3].T + place[:3, 3]).min()))
 
 
-def motion_findings(scene: Scene, exact: ExactMeshes | None = None) -> list[Finding]:
+def motion_findings(scene: Scene) -> list[Finding]:
     """The faults of `check_motion` as warnings with remedies, the worst of each kind first."""
-    faults, units = check_motion(scene, exact), scene.units
+    faults, units = check_motion(scene), scene.units
     inside = sorted((one for one in faults if not one.rest), key=lambda one: -one.value)
     apart = [one for one in faults if one.rest]
     said = []

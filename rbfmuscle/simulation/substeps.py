@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
-from rbfmuscle.scene.joints.skeleton import all_coordinates
+from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import (
     bone_poses,
     completed,

@@ -13,7 +13,7 @@ from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
 from rbfmuscle.output.appearance import muscle_colours, muscle_groups
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.tubes import tendon_mesh, tendon_name
-from rbfmuscle.scene.activation.curve import STEP
+from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene

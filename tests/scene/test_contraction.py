@@ -5,8 +5,13 @@ import pytest
 from contraction_scenes import MUSCLE, spindle_scene
 
 from rbfmuscle.models import build_model
-from rbfmuscle.scene.activation.curve import SETTLING, STEP, Activations, activation_curve
-from rbfmuscle.scene.activation.resolve import resolve_contraction
+from rbfmuscle.scene.activation.contraction import (
+    SETTLING,
+    STEP,
+    Activations,
+    activation_curve,
+    resolve_contraction,
+)
 from rbfmuscle.validation import SceneError
 
 

@@ -9,8 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.scene.joints.functions import Linear, PiecewiseLinear, Polynomial, Spline
-from rbfmuscle.scene.joints.joint import KINDS
-from rbfmuscle.scene.joints.skeleton import all_coordinates, resolve
+from rbfmuscle.scene.joints.joint import KINDS, all_coordinates, resolve
 from rbfmuscle.scene.joints.tables import JointTable, joint_row
 from rbfmuscle.scene.motion import bone_poses, step_angle, turned_angle
 from rbfmuscle.scene.objects import Motion

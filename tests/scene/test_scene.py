@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.scene import options
 from rbfmuscle.scene.check import bone_collisions, check_initial
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError, UsageError
@@ -42,18 +41,6 @@ initial = "keep"
 [detect]
 tunnelling = { action = "report" }
 """
-
-
-@pytest.mark.parametrize(
-    ("key", "place"), [("model.centres", "muscle.biceps."), ("detect.tunnelling.action", "")]
-)
-def test_removed_key_is_an_error_that_names_what_replaces_it(tmp_path, monkeypatch, key, place):
-    monkeypatch.setitem(options.REMOVED_KEYS, key, "use another")
-    (tmp_path / "scene.toml").write_text(TEXT)
-    with pytest.raises(SceneError, match=rf"scene.toml: {key} was removed: use another"):
-        Scene.load(tmp_path / "scene.toml")
-    with pytest.raises(UsageError, match=rf"{key} was removed: use another"):
-        built().with_options({place + key: 1})
 
 
 def meshes():

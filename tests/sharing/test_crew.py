@@ -21,8 +21,7 @@ from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
-from rbfmuscle.sharing.crew import WorkerPool
-from rbfmuscle.sharing.processes import helpers_for
+from rbfmuscle.sharing.crew import WorkerPool, helpers_for
 from rbfmuscle.sharing.share import MuscleGroup
 from rbfmuscle.validation import MeshError, SceneWarning, SolveError
 

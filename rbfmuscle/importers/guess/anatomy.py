@@ -1,7 +1,5 @@
 """Parents of bones; hip, knee and ankle with methods, names, signs and ranges of anatomy; a joint as guessed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,14 +34,7 @@ PARENTS = {
 }
 ROOTS = ("pelvis", "ilium", "sacrum", "scapula", "rib", "vertebra", "femur", "humerus", "tibia")
 # Class of the child: name of its joint with one of its parents above.
-JOINTS = {
-    "femur": "hip",
-    "tibia": "knee",
-    "talus": "ankle",
-    "patella": "patella",
-    "humerus": "shoulder",
-    "ulna": "elbow",
-}
+JOINTS = dict(femur="hip", tibia="knee", talus="ankle", patella="patella", humerus="shoulder", ulna="elbow")
 # Joint: coordinates and ranges [degree] (American Academy of Orthopaedic Surgeons 1965, Joint Motion). Positive as the
 # International Society of Biomechanics has it (Wu et al. 2002): flexion, adduction, internal rotation, dorsiflexion.
 COORDINATES = {
@@ -51,45 +42,26 @@ COORDINATES = {
     "knee": {"flexion": (-10.0, 135.0)},
     "ankle": {"dorsiflexion": (-50.0, 20.0)},
 }
-# Greatest misfit of a condyle or a dome against its radius.
-MISFIT = 0.05
+MISFIT = 0.05  # greatest misfit of a condyle or a dome against its radius
 
 
 @dataclass
 class JointGuess:
-    """A joint as guessed.
-
-    Attributes
-    ----------
-    kind : str
-        ``"ball"``, ``"hinge"``, ``"custom"`` (the patella) or ``"fixed"``.
-    centre, axes : (3,) ndarray [scene unit], dict of str to (3,) ndarray
-        The axes by coordinate.
-    confidence : float
-        0 to 1: one minus half the misfit over the greatest allowed, where something was fitted.
-    ranges, rest : dict of str to (float, float), float
-        Of coordinates; the value of the first one in the pose of the meshes [degree].
-    tables : dict
-        ``rotations`` and ``translations`` of a custom joint, as the scene file has them.
-    follows : str
-        Full name of the coordinate that the first one follows.
-    ligament : (2, 3) ndarray or None
-        Ends of a patella's ligament at rest, on it and on the tibia [scene unit].
-    """
+    """A joint as guessed."""
 
     parent: Part
     child: Part
-    kind: str
-    centre: np.ndarray
-    axes: dict[str, np.ndarray]
-    confidence: float
+    kind: str  # "ball", "hinge", "custom" (the patella) or "fixed"
+    centre: np.ndarray  # (3,) [scene unit]
+    axes: dict[str, np.ndarray]  # (3,) by coordinate
+    confidence: float  # 0 to 1: where something was fitted, one minus half the misfit over its limit
     reason: str
     name: str = ""
-    ranges: dict[str, tuple] = field(default_factory=dict)
-    rest: float = 0.0
-    tables: dict[str, list] = field(default_factory=dict)
-    follows: str = ""
-    ligament: np.ndarray | None = None
+    ranges: dict[str, tuple] = field(default_factory=dict)  # of coordinates [degree]
+    rest: float = 0.0  # value of the first coordinate in the pose of the meshes [degree]
+    tables: dict[str, list] = field(default_factory=dict)  # rotations and translations of a custom joint
+    follows: str = ""  # full name of the coordinate that the first one follows
+    ligament: np.ndarray | None = None  # ends (2, 3) of a patella's, on it and on the tibia, at rest
 
     @property
     def axis(self) -> np.ndarray:

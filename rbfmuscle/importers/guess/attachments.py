@@ -19,25 +19,21 @@ from scipy.sparse.csgraph import dijkstra
 from rbfmuscle.importers.guess.anatomy import JointGuess
 from rbfmuscle.importers.guess.landmarks import unit
 from rbfmuscle.importers.guess.parts import Part
-from rbfmuscle.scene.attachments import ExactMeshes
+from rbfmuscle.scene.bone import Bone
 
 if TYPE_CHECKING:
     import trimesh
 
 # A bone nearer than this [mm] is touched; the patch is what lies within TOUCH of the nearest.
 NEAR, TOUCH = 6.0, 3.0
-# A bone that only may hold a muscle does so where it is nearer than this [mm].
-MAYBE = 4.0
+MAYBE = 4.0  # a bone that only may hold a muscle does so where it is nearer than this [mm]
 # Length [mm] of the cap that is held where an end stops short of its bone, and as a share of the muscle.
 CAP, CAP_SHARE = 8.0, 0.12
 # Fewest vertices of a patch, and the greatest share of the muscle that all patches may hold.
 FEWEST, LARGEST = 8, 0.6
-# How far along the muscle a patch at one end may reach (0 at that end, 1 at the other).
-REACH = 0.75
-# How much farther a bone counts that an end does not point to.
-ASIDE = 60.0
-# An end farther than this [mm] from its bone gets a tendon.
-FAR = 25.0
+REACH = 0.75  # how far along the muscle a patch at one end may reach (0 at that end, 1 at the other)
+ASIDE = 60.0  # how much farther a bone counts that an end does not point to
+FAR = 25.0  # an end farther than this [mm] from its bone gets a tendon
 
 
 class TendonGuess(NamedTuple):
@@ -81,10 +77,9 @@ class MuscleGuess:
 class Skeleton(NamedTuple):
     """What muscles are held by; ``bodies`` gives of bones that move as one the one that stands for all."""
 
-    bones: list[Part]
+    bones: dict[Part, Bone]
     bodies: dict[Part, Part]
     joints: list[JointGuess]
-    exact: ExactMeshes
     millimetre: float
 
 
@@ -111,8 +106,8 @@ class Ends:
 
 def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -> MuscleGuess:
     """Find the bones that hold a muscle, by its name where ``named``, else the nearest, and the vertices they hold."""
-    bones, ends = skeleton.bones, Ends(muscle.mesh)
-    distances = {b: skeleton.exact.distances(muscle.points, b.mesh) / skeleton.millimetre for b in bones}
+    ends, millimetre = Ends(muscle.mesh), skeleton.millimetre
+    distances = {b: bone.distances(muscle.points) / millimetre for b, bone in skeleton.bones.items()}
     guess = MuscleGuess(muscle, [], 1.0)
     places = _named_places(guess, distances, ends) if named and muscle.facts is not None else []
     by_name = bool(places)
@@ -122,7 +117,7 @@ def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -
         why = "the bones of its name are not here" if known else "its name is not known"
         guess.reasons = []
         guess.doubt(0.2 if known else 0.4, f"{why}; the bones are the nearest to its two ends")
-    holds = [_hold(bone, distances[bone], ends, end, skeleton.millimetre) for bone, end in places]
+    holds = [_hold(bone, distances[bone], ends, end, millimetre) for bone, end in places]
     guess.holds = _disjoint(holds, distances)
     if by_name:  # the nearer its ends are to the bones, the surer
         worst = max((hold.gap for hold in guess.holds), default=FAR)

@@ -1,24 +1,28 @@
 """A scene guessed from a folder of meshes: bones, joints, attachments, each with a confidence and its reason."""
 
-from __future__ import annotations
-
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.importers.guess.anatomy import JointGuess
+from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
 from rbfmuscle.importers.guess.attachments import MuscleGuess, Skeleton, guess_attachments
 from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
 from rbfmuscle.importers.guess.parts import Part, Parts, read_parts
-from rbfmuscle.importers.guess.text import hold_file, scene_text
-from rbfmuscle.scene.attachments import ExactMeshes
+from rbfmuscle.importers.toml_text import table_text
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
-# Below this confidence a guess is listed on the terminal.
-DOUBTFUL = 0.6
+DOUBTFUL = 0.6  # below this confidence a guess is listed on the terminal
+_TAIL = """[contact]
+initial = "resolve"   # muscles that start inside a bone are pushed out; or "keep", "error"
+
+[detect]
+tunnelling = { angle = 135, action = "substep" }   # points that pass through a bone in one step
+"""
 
 
 @dataclass
@@ -47,23 +51,11 @@ class SceneGuess:
 def guess_scene(
     folder: Path, units: str | None, base: Path, *, header: Orientation | None = None
 ) -> SceneGuess:
-    """Guess a scene from the meshes of a folder.
+    """Guess a scene from the meshes of a folder, or of folders ``bones`` and ``muscles`` in it.
 
-    Parameters
-    ----------
-    folder : Path
-        Meshes, or folders ``bones`` and ``muscles`` with them.
-    units : str or None
-        ``"mm"``, ``"cm"`` or ``"m"``; by the size of the bones where it is not given.
-    base : Path
-        Folder that the scene's paths are relative to.
-    header : Orientation, optional
-        Anatomical directions where they are known.
-
-    Raises
-    ------
-    UsageError
-        If the folder is missing, holds no bone or no muscle, or is of no known unit.
+    ``units`` are ``"mm"``, ``"cm"`` or ``"m"``, by the size of the bones where None; the scene's paths are relative to
+    ``base``; a ``header`` holds anatomical directions where they are known. UsageError if the folder is missing, holds
+    no bone or no muscle, or is of no known unit.
     """
     parts = read_parts(folder, units, base)
     bones, millimetre = parts.bones, parts.millimetre
@@ -74,7 +66,7 @@ def guess_scene(
     for joint in joints:  # parents come before their children
         if joint.kind == "fixed":
             bodies[joint.child] = bodies[joint.parent]
-    skeleton = Skeleton(bones, bodies, joints, ExactMeshes(), millimetre)
+    skeleton = Skeleton({bone: Bone(bone.name, bone.mesh) for bone in bones}, bodies, joints, millimetre)
     guess.muscles = [guess_attachments(muscle, skeleton) for muscle in parts.muscles]
     # Where the bones that names ask for are not here, what is there is taken.
     if all(muscle.wrong for muscle in guess.muscles):
@@ -86,34 +78,26 @@ def guess_scene(
 
 
 def write_scene(guess: SceneGuess, path: Path) -> Scene:
-    """Write the scene file and, beside it, ``attachments/``; what cannot be loaded is commented out, with the reason.
+    """Write the scene file and, beside it, ``attachments/``, and return the scene as loaded from there.
 
-    Returns the scene as loaded from the file.
-
-    Raises
-    ------
-    UsageError
-        If nothing can be written there, or no muscle can be held.
+    What cannot be loaded is commented out, with the reason. UsageError if no muscle can be held.
     """
-    try:
-        _check_runs(guess, path)
-        _write_coarse(guess, path.parent)
-        for muscle in guess.muscles:
-            for hold in muscle.holds:
-                file = path.parent / hold_file(muscle, hold)
-                file.parent.mkdir(parents=True, exist_ok=True)
-                in_file = np.isin(muscle.muscle.read.vertex_map, hold.vertices)
-                np.savetxt(file, np.flatnonzero(in_file), fmt="%d")
-        while True:
-            path.write_text(scene_text(guess), encoding="utf-8")
-            try:
-                return Scene.load(path)
-            except (SceneError, MeshError) as error:
-                path.unlink()
-                _leave_out(guess, error)
-                _check_runs(guess, path)
-    except OSError as error:
-        raise UsageError(f"cannot write {path}: {error.strerror}; choose another --output") from None
+    _check_runs(guess, path)
+    _write_coarse(guess, path.parent)
+    for muscle in guess.muscles:
+        for hold in muscle.holds:
+            file = path.parent / _hold_file(muscle, hold)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            in_file = np.isin(muscle.muscle.read.vertex_map, hold.vertices)
+            np.savetxt(file, np.flatnonzero(in_file), fmt="%d")
+    while True:
+        path.write_text(_scene_text(guess), encoding="utf-8")
+        try:
+            return Scene.load(path)
+        except (SceneError, MeshError) as error:
+            path.unlink()
+            _leave_out(guess, error)
+            _check_runs(guess, path)
 
 
 def _write_coarse(guess, folder):
@@ -140,3 +124,85 @@ def _leave_out(guess, error):
     if not found:
         raise error
     found[0].wrong, found[0].confidence = text, 0.0
+
+
+def _scene_text(guess: SceneGuess) -> str:
+    """The scene file of a guess: what is not sure marked GUESS, what cannot run commented out."""
+    rows = [({"name": bone.name, "mesh": bone.file}, _doubt(bone)) for bone in guess.parts.bones]
+    bones = [table_text("[[bone]]", row, doubt) for row, doubt in rows]
+    movable = [joint for joint in guess.joints if joint.axes and not joint.follows]
+    motion = [_motion(movable[0])] if movable else []
+    muscles = map(_muscle, guess.muscles)
+    return "\n".join([_head(guess), *bones, *map(_joint, guess.joints), *motion, *muscles, _TAIL])
+
+
+def _doubt(part):
+    return {"name": f"GUESS: {part.doubt}"} if part.doubt else {}
+
+
+def _head(guess):
+    folder, parts = guess.folder, guess.parts
+    lines = [
+        f"# Scene guessed from the meshes in {folder.name or folder}. "
+        "Lines marked GUESS want a look; the number is how sure it is, of 1.",
+        "# All keys: docs/scene_file.md. Then: rbfmuscle check --picture, rbfmuscle run.",
+        *(f"# NOT USED: {file}: {reason}" for file, reason in parts.unusable.items()),
+    ]
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
+    row = {"format": 1, "name": name, "units": parts.units}
+    comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
+    if parts.left_out:
+        row["left_out"] = parts.left_out
+        comments["left_out"] = "bones whose meshes cannot be used; every run counts them as beyond its limits"
+    for word in ("superior", "anterior") if guess.orientation is not None else ():
+        row[word] = rounded(getattr(guess.orientation, word), 5)
+        comments[word] = f"by {guess.orientation.source}"
+    scene = table_text("[scene]", row, comments)
+    models = {"model": 'or a table: { name = "rbf", centres = 300 }'}
+    return "\n".join([*lines, scene, table_text("[defaults]", {"model": "rbf"}, models)])
+
+
+def _joint(joint: JointGuess) -> str:
+    comments = {"axes": "angles follow the right-hand rule"}
+    if not joint.ranges:
+        comments["axes"] += "; GUESS: rename and turn them where angles should have the other sign"
+    text = table_text(f"[[joint]]   # GUESS {joint.confidence:.1f}: {joint.reason}", joint.row(), comments)
+    if joint.follows:
+        row = {"coordinate": joint.coordinate, "of": [joint.follows], "linear": [1, 0]}
+        text += "\n" + table_text("[[coupling]]", row)
+    return text
+
+
+def _motion(joint):
+    """A ramp of the joint's first coordinate, within its range."""
+    _, high = joint.ranges.get(next(iter(joint.axes)), (0.0, joint.rest + 30.0))
+    end = min(joint.rest + 30.0, high) if high > joint.rest else joint.rest
+    ramp = {joint.coordinate: {"from": joint.rest, "to": end, "step": 2}}
+    return table_text("[motion]   # degrees", {"ramp": ramp}, {"ramp": "GUESS"})
+
+
+def _hold_file(muscle, hold):
+    """File of a hold's vertices, relative to the scene's folder."""
+    return f"attachments/{muscle.muscle.name}_{hold.bone.name}.txt"
+
+
+def _attachment(hold, file):
+    """A row of ``attach``, with its tendon."""
+    if hold.tendon is None:
+        return {"bone": hold.bone.name, "vertices": file}
+    line = {"to": rounded(hold.tendon.to, 6)}
+    if hold.tendon.via:
+        line["via"] = [{"bone": bone.name, "point": rounded(at, 6)} for bone, at in hold.tendon.via]
+    return {"bone": hold.tendon.bone.name, "vertices": file, "tendon": line}
+
+
+def _muscle(guess: MuscleGuess) -> str:
+    part, sure = guess.muscle, f"GUESS {guess.confidence:.1f}"
+    attach = [_attachment(hold, _hold_file(guess, hold)) for hold in guess.holds]
+    said = [f"{sure}: {len(hold.vertices)} vertices, {hold.reason}" for hold in guess.holds]
+    row = {"name": part.name, "mesh": part.file, "attach": attach}
+    head = "\n".join(["[[muscle]]", *(f"# {reason}" for reason in guess.reasons)])
+    text = table_text(head, row, {"attach": said, **_doubt(part)})
+    if guess.wrong:
+        text = "".join(f"# {line}\n" for line in [f"NOT RUN: {guess.wrong}", *text.splitlines()])
+    return text

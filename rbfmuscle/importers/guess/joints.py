@@ -6,8 +6,6 @@ the axis of the cylinder that fits the dome of the face. Both follow from the fa
 and Guibas 2004, Shape segmentation using local slippage analysis). Knee, ankle and patella have methods of their own.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from typing import NamedTuple
 
@@ -19,18 +17,14 @@ from rbfmuscle.importers.guess.orientation import Orientation
 from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.importers.guess.patella import place_patellae
 
-# Width [mm] beyond the least gap within which faces face each other.
-BAND = 8.0
+BAND = 8.0  # width [mm] beyond the least gap within which faces face each other
 # Least cosine between a face's normal and the direction to the other bone, and between the two opposed normals.
 LOOK, OPPOSED = 0.3, 0.0
-# Faces farther apart than this [mm] are no joint.
-FARTHEST = 25.0
-# Closer than this [mm] all along: grown together or bound, no cartilage in between.
-BOUND = 1.5
+FARTHEST = 25.0  # faces farther apart than this [mm] are no joint
+BOUND = 1.5  # closer than this [mm] all along: grown together or bound, no cartilage in between
 # A ball: misfit against radius, and the least share of the hemisphere that its face covers.
 BALL_MISFIT, BALL_COVER = 0.05, 0.3
-# A hinge: misfit of the cylinder against its radius.
-HINGE_MISFIT = 0.15
+HINGE_MISFIT = 0.15  # a hinge: misfit of the cylinder against its radius
 # Cosine of the cone of normals about their mean that is the dome of a hinge, without the cheeks beside it.
 DOME = 0.8
 
@@ -135,9 +129,8 @@ def _fit(parent, child, millimetre, area):
     band = max(BAND, 0.5 * np.sqrt(area))
     hinges = [fit for pair in pairs if (fit := fit_hinge(find_face(*pair, millimetre, band))) is not None]
     # What rolls has the smaller radius, not its socket.
-    hinge = min(
-        hinges, key=lambda fit: (fit.misfit > HINGE_MISFIT * fit.radii[0], fit.radii[0]), default=None
-    )
+    hinges.sort(key=lambda fit: (fit.misfit > HINGE_MISFIT * fit.radii[0], fit.radii[0]))
+    hinge = next(iter(hinges), None)
     fits_hinge = hinge is not None and hinge.misfit < HINGE_MISFIT * hinge.radii[0]
     gap = faces[0].gap
     kind = named or ("ball" if fits_ball else "hinge" if fits_hinge and gap >= BOUND else "fixed")
@@ -153,9 +146,8 @@ def _fit(parent, child, millimetre, area):
         why = f"cylinder of radius {hinge.radii[0]:.4g}, misfit {hinge.misfit:.2g}, about the dome where they face"
         return JointGuess(parent, child, "hinge", hinge.centre, {"angle": hinge.axis}, sure, why)
     middle = faces[1].points.mean(axis=0) if len(faces[1].points) else child.points.mean(axis=0)
-    why = f"they are {gap:.2g} mm apart, " + (
-        "bound all over" if gap < BOUND else "neither ball nor hinge fits"
-    )
+    why = f"they are {gap:.2g} mm apart, "
+    why += "bound all over" if gap < BOUND else "neither ball nor hinge fits"
     return JointGuess(parent, child, "fixed", middle, {}, 0.8 if gap < BOUND else 0.6 if named else 0.4, why)
 
 

@@ -5,8 +5,6 @@ Iwaki et al. 2000; the cylindrical axis of Eckhoff et al. 2005). Ankle: the cyli
 tibial plafond above it, each with its own radius (Singh et al. 1992; Siegler et al. 2014).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,8 +15,7 @@ from rbfmuscle.importers.guess.parts import Part
 
 # Radii that anatomy allows [mm]: head of the femur, posterior condyle, talar dome, all from child to large adult.
 HEAD, CONDYLE, DOME = (12.0, 35.0), (11.0, 30.0), (11.0, 27.0)
-# Share of the femur's length that holds an end, and its condyles.
-END, CONDYLES = 0.12, 0.16
+END, CONDYLES = 0.12, 0.16  # share of the femur's length that holds an end, and its condyles
 # Normals of a condyle that count: from above (-) to below the backward direction [degree], greatest cosine sideways.
 POSTERIOR, SIDEWAYS = (-30.0, 60.0), 0.5
 # Of the dome: half its arc [degree], band beyond the least gap [mm], least cosine of a normal and its radius.

@@ -4,8 +4,6 @@ A name is split at capitals, digits and signs; words are brought to one form, th
 and unknown ones may be misspelt. The table is ``names.toml``, with its sources.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from dataclasses import dataclass

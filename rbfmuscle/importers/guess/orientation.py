@@ -1,7 +1,5 @@
 """Which way is up and forwards: from the bones themselves, or from a volume's header."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -14,12 +12,10 @@ from rbfmuscle.scene.objects import SceneData
 
 S = TypeVar("S", bound=SceneData)
 
-# Directions of bones and header that differ by more than this [degree] are named.
-AGREE = 45.0
+AGREE = 45.0  # directions of bones and header that differ by more than this [degree] are named
 # Scans are saved along the body: an axis of the coordinates within this [degree] of what a thigh shows is taken.
 ALONG = 25.0
-# Of fewer triangles the shape of a bone says nothing.
-LEAST_TRIANGLES = 100
+LEAST_TRIANGLES = 100  # of fewer triangles the shape of a bone says nothing
 _ABOVE = {"femur": ("pelvis", "ilium", "sacrum"), "tibia": ("femur", "patella")}
 _BELOW = {
     "femur": ("tibia", "patella", "fibula", "talus", "calcaneus", "foot"),
@@ -51,23 +47,22 @@ def find_orientation(bones: list[Part], header: Orientation | None = None) -> Or
         bone.side = bone.side or bone.frame.side
         if bone.side != bone.frame.side:
             words = {"l": "left", "r": "right"}
-            said, seen = words[bone.side], words[bone.frame.side]
-            doubts.append(f"{bone.name}: named {said}, its shape is that of the {seen} one; is it mirrored?")
-    frames = [bone.frame for bone in femora] or [
-        frame for bone in bones if (frame := _shank_frame(bone, bones)) is not None
-    ]
+            said, shape = words[bone.side], words[bone.frame.side]
+            doubts.append(f"{bone.name}: named {said}, its shape is that of the {shape} one; is it mirrored?")
+    shanks = (_shank_frame(bone, bones) for bone in bones) if not femora else ()
+    frames = [bone.frame for bone in femora] + [frame for frame in shanks if frame is not None]
     if not frames:
         return header
     superior = unit(np.sum([frame.superior for frame in frames], axis=0))
     anterior = unit(across(np.sum([frame.anterior for frame in frames], axis=0), superior))
     if header is None:
-        up, front = _along_axes(superior, anterior)
+        found = np.stack([superior, anterior])
+        axes = np.sign(found) * (np.abs(found) == np.abs(found).max(axis=1, keepdims=True))
+        near = ((found * axes).sum(axis=1) > np.cos(np.radians(ALONG))).all()
+        up, front = axes if near else found
         return Orientation(up, front, doubts=doubts)
-    for word, found, known in (
-        ("superior", superior, header.superior),
-        ("anterior", anterior, header.anterior),
-    ):
-        angle = np.degrees(np.arccos(np.clip(found @ known, -1.0, 1.0)))
+    for word, seen in {"superior": superior, "anterior": anterior}.items():
+        angle = np.degrees(np.arccos(np.clip(seen @ getattr(header, word), -1.0, 1.0)))
         if angle > AGREE:
             doubts.append(f"{word} by the bones is {angle:.0f} degrees off {header.source}, which counts")
     return Orientation(header.superior, header.anterior, source=header.source, doubts=doubts)
@@ -81,13 +76,6 @@ def orient_scene(scene: S) -> S:
         if found is not None:
             scene.superior, scene.anterior = found.superior.tolist(), found.anterior.tolist()
     return scene
-
-
-def _along_axes(superior, anterior):
-    """Directions, or in place of both the nearest axes of the coordinates."""
-    found = np.stack([superior, anterior])
-    axes = np.sign(found) * (np.abs(found) == np.abs(found).max(axis=1, keepdims=True))
-    return axes if ((found * axes).sum(axis=1) > np.cos(np.radians(ALONG))).all() else found
 
 
 def neighbours(bone: Part, bones: list[Part], table: dict[str, tuple[str, ...]]) -> list[Part]:

@@ -1,7 +1,5 @@
 """The meshes of a folder, sorted into bones and muscles; the unit of their lengths."""
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import dataclass, field
@@ -31,35 +29,17 @@ MOST_TRIANGLES, FEWEST = 400_000, 3000
 
 @dataclass(eq=False)
 class Part:
-    """One mesh and what it is taken for.
+    """One mesh and what it is taken for."""
 
-    Attributes
-    ----------
-    name, file : str
-        In the scene; path as the scene file gives it.
-    read : ReadMesh
-    kind : str
-        Class of bone, empty where the name says none.
-    side : str
-        ``"l"``, ``"r"`` or empty.
-    doubt : str
-        What speaks for a bone or a muscle where its name does not; empty where it does.
-    facts : MuscleFacts or None
-    coarse : bool
-        The mesh was made coarser than its file.
-    frame : Frame or None
-        Directions of a femur.
-    """
-
-    name: str
-    file: str
-    read: Any
-    kind: str = ""
-    side: str = ""
-    doubt: str = ""
+    name: str  # in the scene
+    file: str  # path as the scene file gives it
+    read: Any  # ReadMesh or Bone
+    kind: str = ""  # class of bone, empty where the name says none
+    side: str = ""  # "l", "r" or empty
+    doubt: str = ""  # what speaks for a bone or a muscle where the name does not
     facts: MuscleFacts | None = None
-    coarse: bool = False
-    frame: Any = None
+    coarse: bool = False  # whether the mesh was made coarser than its file
+    frame: Any = None  # directions of a femur, a Frame
 
     @property
     def mesh(self) -> Any:

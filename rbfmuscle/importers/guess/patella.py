@@ -6,20 +6,16 @@ ligament from its apex to the tibial tuberosity has its length at rest (as in th
 Points of the plane are complex numbers about the knee's axis: forwards, and i times downwards.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
 from rbfmuscle.importers.guess.landmarks import across, fit_sphere, unit
 
-# Knee flexion from the rest pose [degree] at which the path is taken.
-FLEXIONS = tuple(range(0, 131, 10))
+FLEXIONS = tuple(range(0, 131, 10))  # knee flexion from the rest pose [degree] at which the path is taken
 TURN = 0.7
 # Half the breadth beside the patella's middle that counts as its groove, and its part of the tibia [mm].
 GROOVE, TUBEROSITY = 10.0, 15.0
-# Length of the ligament that anatomy allows [mm].
-LIGAMENT = (25.0, 80.0)
+LIGAMENT = (25.0, 80.0)  # length of the ligament that anatomy allows [mm]
 # Angles about the knee's axis that the outline covers, its steps [degree], and the fewest points of it.
 OUTLINE, STEP, FEWEST = (-30.0, 90.0), 5.0, 6
 

@@ -6,8 +6,6 @@ labels share a face, the fields are each other's negative there and their zero s
 then shifted to the label's volume, by a few hundredths of a voxel.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,12 +18,9 @@ from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normal
 from rbfmuscle.importers.labels.read import LabelVolume
 from rbfmuscle.validation import MeshError
 
-# Deviation of the Gaussian [voxels], and how often what it lost is smoothed again.
-SMOOTHING, PASSES = 1.3, 4
-# Voxels kept around a label, beyond which the filter sees nothing.
-MARGIN = 6
-# Share of the largest piece from which on a piece belongs to a bone of several parts.
-PIECE = 0.01
+SMOOTHING, PASSES = 1.3, 4  # deviation of the Gaussian [voxels], and how often what it lost is smoothed again
+MARGIN = 6  # voxels kept around a label, beyond which the filter sees nothing
+PIECE = 0.01  # share of the largest piece from which on a piece belongs to a bone of several parts
 # Edge of the surface's triangles [voxels], and rounds in which triangles that cross are drawn apart.
 EDGE, UNTANGLE = 2.2, 20
 
@@ -64,6 +59,7 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     if target < len(faces):
         vertices, faces = (np.asarray(part) for part in igl.qslim(vertices, faces, target)[:2])
     faces = faces.astype(np.int64)
+    # Edges that collapse on either side of a thin wall fold it, or bring its sides through each other.
     vertices = _to_volume(_untangled(vertices, faces, smooth), faces, count)
     corner = np.array([part.start for part in box]) - MARGIN
     world = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
@@ -104,10 +100,7 @@ def _without_islands(mask, notes, least):
 
 
 def _untangled(vertices, faces, smooth):
-    """Vertices where no triangle goes through another: beside such places evened out, and put back on the zero set.
-
-    Edges that collapse on either side of a wall thinner than a triangle fold it, or bring its sides through each other.
-    """
+    """Vertices where no triangle goes through another: beside such places evened out, and put back on the zero set."""
     heads, tails = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     degree = np.bincount(heads, minlength=len(vertices))
     least, best = np.inf, vertices

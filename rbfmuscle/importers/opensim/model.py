@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint
-from rbfmuscle.scene.joints.skeleton import ordered, resolve
+from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint, ordered, resolve
 from rbfmuscle.validation import SceneError
 
 GROUND = "ground"

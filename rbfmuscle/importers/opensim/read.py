@@ -4,19 +4,26 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.importers.opensim.frames import Frames, frame_at, socket
-from rbfmuscle.importers.opensim.functions import read_function
-from rbfmuscle.importers.opensim.model import GROUND, ModelJoint, ModelMesh, OsimModel, finish
-from rbfmuscle.importers.opensim.muscles import read_muscles
+from rbfmuscle.importers.opensim.elements import Frames, frame_at, read_function, socket
+from rbfmuscle.importers.opensim.model import (
+    GROUND,
+    ModelJoint,
+    ModelMesh,
+    ModelMuscle,
+    OsimModel,
+    WrapShape,
+    finish,
+)
 from rbfmuscle.importers.opensim.xml import plain_name, read_xml
 from rbfmuscle.scene.joints.functions import Linear, scaled
 from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, TransformAxis, motion_of
 from rbfmuscle.validation import SceneError
 
-# From this version on joints stand in a set of their own and name their frames.
-SOCKETS = 40000
+SOCKETS = 40000  # from this version on joints stand in a set of their own and name their frames
 # What OpenSim calls otherwise than our table of joints; where both have one, its coordinates are in the same order.
 RENAMED = {"weld": "fixed", "pin": "hinge", "gimbal": "ball"}
+# Force per area of muscle [N/m2] (Arnold et al. 2010, Ann Biomed Eng 38: 269; Rajagopal et al. 2016 have 60 N/cm2).
+SPECIFIC_TENSION = 61e4
 
 
 def read_osim(path: Path | str) -> OsimModel:
@@ -44,16 +51,15 @@ def _read_model(root, path):
     model.bodies = [GROUND, *(body.name for body in bodies if body.name != GROUND)]
     units = node.word("length_units", "meters")
     if units not in ("meters", "m", "metres"):
-        model.notes.append(
-            f"<length_units> says {units!r}; lengths are read as metres, as OpenSim reads them"
-        )
+        words = "lengths are read as metres, as OpenSim reads them"
+        model.notes.append(f"<length_units> says {units!r}; {words}")
     frames = Frames(node)
     if version >= SOCKETS or node.child("JointSet") is not None:
         _read_sockets(model, node, frames)
     else:
         _read_nested(model, bodies)
     _read_couplings(model, node)
-    model.muscles = read_muscles(model, node, frames)
+    model.muscles = _read_muscles(model, node, frames)
     return finish(model)
 
 
@@ -218,3 +224,58 @@ def _read_couplings(model, node):
         model.couplings.append(Coupling(target, of, scaled(function, factor) if factor != 1.0 else function))
         if target in coordinates and coordinates[target].locked:
             model.notes.append(f"coordinate {target!r} is locked and follows others: it follows")
+
+
+def _read_muscles(model, node, frames):
+    """The muscles of a model that have a path, a maximum isometric force and an optimal fibre length."""
+    ground = node.child("Ground")
+    shapes = {}
+    for body in [*([ground] if ground is not None else []), *node.objects("BodySet")]:
+        for shape in body.objects("WrapObjectSet"):
+            radii = _radii(shape)
+            if radii is None:
+                model.notes.append(f"wrapping object {shape.name!r} ({shape.tag}) is not taken")
+            elif shape.truth("active", True) and min(radii) > 0:
+                frame = frame_at(shape.vector("translation"), shape.vector("xyz_body_rotation").tolist())
+                quadrant = shape.word("quadrant", "all").lower().removeprefix("+").replace("all", "")
+                body_name = body.name or GROUND
+                shapes[shape.name] = WrapShape(body_name, frame, np.array(radii), shape.tag, quadrant)
+    muscles, resting = [], {name: facts.rest for name, facts in model.coordinates().items()}
+    for force in node.objects("ForceSet"):
+        path = force.child("GeometryPath")
+        if path is None or not force.word("optimal_fiber_length"):
+            continue
+        points = [_path_point(point, frames, resting) for point in path.objects("PathPointSet")]
+        names = [plain_name(wrap.word("wrap_object")) for wrap in path.objects("PathWrapSet")]
+        volume = force.number("max_isometric_force") * force.number("optimal_fiber_length") / SPECIFIC_TENSION
+        wraps = [shapes[name] for name in names if name in shapes]
+        muscles.append(ModelMuscle(force.name, [p for p in points if p is not None], wraps, volume))
+    return muscles
+
+
+def _radii(shape):
+    if shape.tag == "WrapCylinder":
+        return [shape.number("radius")] * 2 + [0.5 * shape.number("length")]
+    if shape.tag == "WrapSphere":
+        return [shape.number("radius")] * 3
+    return shape.numbers("dimensions", "0 0 0", count=3) if shape.tag == "WrapEllipsoid" else None
+
+
+def _path_point(point, frames, resting):
+    """Body and place in it of a path point where coordinates are at their defaults; None where it is not active."""
+    body, frame = frames.place(point.word("socket_parent_frame") or point.word("body"))
+
+    def value_of(tag):
+        return resting.get(plain_name(point.word(f"socket_{tag}") or point.word(tag)).split("/")[-1], 0.0)
+
+    if point.tag == "ConditionalPathPoint":
+        low, high = point.numbers("range", "-1e9 1e9", count=2)
+        if not low <= value_of("coordinate") <= high:
+            return None
+    at = point.vector("location")
+    if point.tag == "MovingPathPoint":
+        for k, axis in enumerate("xyz"):
+            function = read_function(point.child(f"{axis}_location"))
+            if function is not None:
+                at[k] = function(value_of(f"{axis}_coordinate"))
+    return body, frame[:3, :3] @ at + frame[:3, 3]

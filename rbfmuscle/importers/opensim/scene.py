@@ -1,4 +1,4 @@
-"""A scene from an OpenSim model: bodies as bones where the default pose puts them, joints as they are."""
+"""A scene from an OpenSim model: bodies as bones where the default pose puts them, joints as they are; its files."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -7,25 +7,25 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.importers.opensim.geometry import body_meshes
-from rbfmuscle.importers.opensim.model import OsimModel
+from rbfmuscle.importers.opensim.model import ModelMesh, OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.tubes import make_tube
+from rbfmuscle.importers.toml_text import table_text
+from rbfmuscle.scene.joints.tables import coupling_row, joint_row
+from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, ReadMesh, prepare_mesh, read_arrays
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import MeshError, SceneError
+from rbfmuscle.validation import MeshError, SceneError, check_mesh
+
+WIDEST = 3.0  # a mesh wider than this [m] is a floor or a wall, not a bone
+NARROWEST = 0.002
 
 
 @dataclass
 class Imported:
     """A scene made from a model.
 
-    Attributes
-    ----------
-    scene, model : Scene, OsimModel
-    places : dict of str to (4, 4) ndarray
-        From every body of the model to the scene, rest pose [metre].
-    notes : list of str
-        What was not taken, or taken otherwise than one may expect.
+    ``places`` are (4, 4) from every body of the model to the scene, rest pose [metre]; ``notes`` say what was not
+    taken, or taken otherwise than one may expect.
     """
 
     scene: Scene
@@ -35,28 +35,15 @@ class Imported:
 
 
 def import_osim(path: Path | str, *, geometry: list[Path] | None = None, muscles: bool = True) -> Imported:
-    """Make a scene of an OpenSim model, in metres as the model is.
+    """Make a scene of an OpenSim model (``.osim``), in metres as it is, with a tube for each of its ``muscles``.
 
     Meshes stand where the model's default pose puts them, which is then the rest pose of the scene. A body without a
-    mesh becomes a bone without one.
-
-    Parameters
-    ----------
-    path : path
-        An ``.osim`` file.
-    geometry : list of path, optional
-        Folders with meshes, after the model's own and its ``Geometry``.
-    muscles : bool
-        Make a tube of each of the model's muscles.
-
-    Raises
-    ------
-    SceneError
-        If the model cannot be read, or has a joint that the table of joints lacks.
+    mesh becomes a bone without one. Meshes are looked for in the model's folder, its ``Geometry``, then in
+    ``geometry``. SceneError if the model cannot be read, or has a joint that the table of joints lacks.
     """
     model = read_osim(path)
     scene, places = Scene(model.name, units="m"), model.transforms()
-    meshes, notes = body_meshes(model, places, list(geometry or []))
+    meshes, notes = _body_meshes(model, places, list(geometry or []))
     notes = [*model.notes, *notes]
     for body in model.bodies:
         if body in meshes:
@@ -93,3 +80,113 @@ def _add_muscles(found):
             scene.add_muscle(muscle.name, (tube.vertices, tube.faces), attach=attach)
         except (SceneError, MeshError) as error:
             found.notes.append(f"muscle {muscle.name!r} is not taken: {error}")
+
+
+def _find_mesh(name: str, folders: list[Path]) -> Path | None:
+    """Return the first file of that name in some folders, or None; exact names before others in case or suffix."""
+    plain = name.replace("\\", "/")
+    for folder in folders:
+        if (folder / plain).is_file():
+            return folder / plain
+    wanted = Path(plain).name.lower()
+    endings = ("",) if Path(plain).suffix.lower() in MESH_SUFFIXES else MESH_SUFFIXES
+    for parent in ((folder / plain).parent for folder in folders):
+        for file in sorted(parent.iterdir()) if parent.is_dir() else ():
+            if file.name.lower() in {wanted + ending for ending in endings}:
+                return file
+    return None
+
+
+def _body_meshes(
+    model: OsimModel, places: dict[str, np.ndarray], geometry: list[Path]
+) -> tuple[dict[str, ReadMesh], list[str]]:
+    """One mesh for each body that shows any, in the scene's coordinates [metre], and what could not be taken."""
+    folders = [model.path.parent, model.path.parent / "Geometry", *geometry]
+    parts, meshes, notes = {}, {}, []
+    for mesh in model.meshes:
+        try:
+            file, vertices, faces = _placed(mesh, places[mesh.body], folders)
+        except MeshError as error:
+            notes.append(f"body {mesh.body!r}: mesh {mesh.file!r} is not taken: {error}")
+            continue
+        if file.name != Path(mesh.file).name:
+            notes.append(f"body {mesh.body!r}: mesh {mesh.file!r} was read from {file.name!r}")
+        parts.setdefault(mesh.body, []).append((vertices, faces, file.name))
+    for body, found in parts.items():
+        starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in found)])
+        vertices = np.concatenate([part[0] for part in found])
+        faces = np.concatenate([part[1] + start for part, start in zip(found, starts)])
+        source = ", ".join(part[2] for part in found)
+        try:
+            meshes[body] = prepare_mesh(vertices, faces, place=source, name=body, may_be_open=True)
+        except MeshError as error:
+            notes.append(f"body {body!r}: its meshes are not taken: {error}")
+            continue
+        meshes[body].source = source
+    return meshes, notes
+
+
+def _placed(mesh: ModelMesh, place: np.ndarray, folders: list[Path]) -> tuple[Path, np.ndarray, np.ndarray]:
+    """File, vertices [metre, ground] and triangles of a mesh."""
+    file = _find_mesh(mesh.file, folders)
+    if file is None:
+        where = ", ".join(str(folder) for folder in folders)
+        raise MeshError(f"it is not there (looked in {where}); give its folder with --geometry")
+    vertices, faces = check_mesh(*read_arrays(file))
+    transform = place @ mesh.transform
+    vertices = (vertices * mesh.scale) @ transform[:3, :3].T + transform[:3, 3]
+    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if not NARROWEST <= size <= WIDEST:
+        raise MeshError(f"it is {size:.3g} m across, which no bone is")
+    return file, vertices, faces[:, ::-1] if np.prod(mesh.scale) < 0 else faces
+
+
+def write_scene(found: Imported, directory: Path) -> Path:
+    """Write ``scene.toml``, meshes and attachments to a folder, and return the scene file."""
+    directory, scene = Path(directory), found.scene
+    target = directory / "scene.toml"
+    facts = {"format": 1, "name": scene.name, "units": scene.units}
+    directory.mkdir(parents=True, exist_ok=True)
+    facts |= {"left_out": scene.left_out} if scene.left_out else {}
+    facts |= {"superior": scene.superior, "anterior": scene.anterior}
+    bones = [{"name": bone.name, "mesh": _write_mesh(directory, "bones", bone)} for bone in scene.bones]
+    parts = [_head(found), table_text("[scene]", facts)]
+    parts += [table_text("[[bone]]", row) for row in bones]
+    parts += [table_text("[[bone]]   # no mesh: joints only", {"name": name}) for name in scene.links]
+    parts += [table_text("[[joint]]", joint_row(joint)) for joint in scene.joints]
+    parts += [table_text("[[coupling]]", coupling_row(c, scene.joints)) for c in scene.couplings]
+    parts += [_muscle_text(directory, muscle) for muscle in scene.muscles]
+    target.write_text("\n".join(parts), encoding="utf-8")
+    return target
+
+
+def _head(found):
+    """The comment that begins the file: where it is from, and what was not taken."""
+    model = found.model
+    lines = [
+        f"Scene from the OpenSim model {model.path.name} (version {model.version}).",
+        "Its meshes, authors and licence are the model's: see its <credits>.",
+        "Meshes stand in the model's default pose; angles are degrees. All keys: docs/scene_file.md.",
+        *(f"note: {note}" for note in found.notes),
+    ]
+    return "\n".join("# " + " ".join(line.split()) for line in lines) + "\n"
+
+
+def _muscle_text(directory, muscle):
+    """The table of a muscle, its mesh and attachments written."""
+    row = {"name": muscle.name, "mesh": _write_mesh(directory, "muscles", muscle), "attach": []}
+    (directory / "attachments").mkdir(exist_ok=True)
+    for held in muscle.attachments:
+        file = f"attachments/{muscle.name}_{held.bone}.txt"
+        np.savetxt(directory / file, held.vertices, fmt="%d")
+        row["attach"].append({"bone": held.bone, "vertices": file})
+    head = "[[muscle]]   # a tube along the model's path, of its fibres' volume; put a mesh of your own here"
+    return table_text(head, row)
+
+
+def _write_mesh(directory, folder, item):
+    """Write a mesh and return its file."""
+    file = f"{folder}/{item.name}.ply"
+    (directory / folder).mkdir(exist_ok=True)
+    item.mesh.export(directory / file)
+    return file

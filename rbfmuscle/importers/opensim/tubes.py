@@ -4,8 +4,6 @@ A tube has the volume of its fibres: maximum isometric force times optimal fibre
 middle line is the model's path in its default pose, over its wrapping objects, kept out of the bones.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,13 +13,12 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.geometry.tubes import SIDES, tube_mesh
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
-from rbfmuscle.scene.taut_line import points_along
+from rbfmuscle.scene.tendons import line_length, points_along
 from rbfmuscle.validation import SceneError
 
 # Sections along a tube; radius at the ends against the middle; share of the length held at an end.
 SECTIONS, END_RADIUS, HELD = 28, 0.3, 0.06
-# Rounds in which the middle line is drawn straight and put out of what is in its way.
-ROUNDS = 60
+ROUNDS = 60  # rounds in which the middle line is drawn straight and put out of what is in its way
 
 
 @dataclass
@@ -45,8 +42,12 @@ def make_tube(muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[st
         if body not in bones:
             raise SceneError(f"muscle {muscle.name!r}: body {body!r} has no mesh to hold it")
     points = np.array([places[body][:3, :3] @ at + places[body][:3, 3] for body, at in muscle.points])
-    line, fixed = _middle_line(points)
-    length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    line = points_along(points, np.linspace(0.0, along[-1], SECTIONS))
+    fixed = np.rint(along / max(along[-1], 1e-300) * (SECTIONS - 1)).astype(
+        int
+    )  # the path's points in the line
+    length = line_length(line)
     share = END_RADIUS + (1.0 - END_RADIUS) * np.sin(np.pi * np.linspace(0.0, 1.0, len(line)))
     radius = share * np.sqrt(muscle.volume / (np.pi * length * np.mean(share**2)))
     wraps = [(wrap, places[wrap.body] @ wrap.frame) for wrap in muscle.wraps]
@@ -54,13 +55,6 @@ def make_tube(muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[st
     found = mesh_volume(*tube_mesh(line, radius))  # as its square, but for where sections run into each other
     vertices, faces = tube_mesh(line, radius * np.sqrt(muscle.volume / found))
     return Tube(vertices, faces, _held(bodies, fixed, bones))
-
-
-def _middle_line(points):
-    """Points (n, 3) evenly along a path, and the place in them of each of its points."""
-    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    line = points_along(points, np.linspace(0.0, along[-1], SECTIONS))
-    return line, np.rint(along / max(along[-1], 1e-300) * (SECTIONS - 1)).astype(int)
 
 
 def _clear_line(line, fixed, radius, wraps, bones):

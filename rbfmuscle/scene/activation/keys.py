@@ -1,7 +1,5 @@
 """The keys of a muscle that contracts, checked as they stand in a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 
@@ -35,18 +33,11 @@ def _check_activation(value: Any) -> Any:
 
 
 class ContractionTable(Table):
-    """The keys of one muscle that contracts.
+    """The keys of one muscle that contracts."""
 
-    Attributes
-    ----------
-    activation : number or list of numbers
-        0 to 1; waypoints are spread evenly over the motion.
-    fibre_stretch_at_rest : float, optional
-        Stretch of the fibres in the scan pose against their slack length.
-    tendon : TendonTable, optional
-    """
-
+    # 0 to 1; of a list, waypoints are spread evenly over the motion.
     activation: Annotated[float | list[float], BeforeValidator(_check_activation)] = 0.0
+    # Stretch of the fibres in the scan pose against their slack length.
     fibre_stretch_at_rest: Annotated[float, Field(gt=0.2, lt=5)] | None = None
     tendon: TendonTable | None = None
 
@@ -58,23 +49,14 @@ def contraction_keys(given: Mapping[str, Any], *, muscle: str) -> ContractionTab
 
 
 class Contraction(NamedTuple):
-    """What the keys of a muscle come to.
-
-    Attributes
-    ----------
-    stretch_at_rest : float
-    tendon : (n,) ndarray of bool
-        Vertices of the muscle's mesh that are tendon.
-    tendon_strain : float
-        At full activation.
-    slack : bool
-        Whether the scene says where passive fibres are slack; the model's own slack band holds where not.
-    """
+    """What the keys of a muscle come to."""
 
     stretch_at_rest: float
-    tendon: Booleans
-    tendon_strain: float = TENDON_STRAIN
-    slack: bool = False
+    tendon: Booleans  # vertices (n,) of the muscle's mesh that are tendon
+    tendon_strain: float = TENDON_STRAIN  # at full activation
+    slack: bool = (
+        False  # the scene says where passive fibres are slack; the model's own slack band holds where not
+    )
 
     @property
     def shortest(self) -> float:

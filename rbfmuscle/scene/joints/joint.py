@@ -1,19 +1,21 @@
-"""A joint: coordinates that move one bone against another, and the table of the kinds of joint.
+"""Joints: coordinates that move one bone against another, the table of their kinds, and poses of bones.
 
 Every kind is rotations about axes that are carried along by those before them, and a shift along axes that are not
-turned by them (Seth et al. 2010, the custom joint of Simbody); what a kind fixes is how many
-there are, and that each follows one coordinate.
+turned by them (Seth et al. 2010, the custom joint of Simbody); what a kind fixes is how many there are, and that each
+follows one coordinate. Couplings, locks and ranges come first, then joint after joint from the root.
 """
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from graphlib import CycleError, TopologicalSorter
 from typing import Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.scene.joints.functions import Function, Linear
+from rbfmuscle.validation import SceneError
 
 MotionKind: TypeAlias = Literal["rotation", "translation", "coupled"]
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -48,26 +50,14 @@ IDENTITY = Linear((1.0,))
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One number that moves a joint: an angle [radian], a length [scene unit], or one with no unit.
+    """One number that moves a joint: an angle [radian], a length [scene unit], or one with no unit."""
 
-    Attributes
-    ----------
-    motion : {"rotation", "translation", "coupled"}
-        What the number is; a coupled one drives several axes by functions and has no unit of its own.
-    rest : float
-        Its value in the pose in which the meshes are, and in a motion that does not mention it.
-    range : (float, float), optional
-    clamped : bool
-        Cut to the range; others may leave it, which is reported.
-    locked : bool
-        Stays at ``rest`` whatever is asked of it.
-    """
-
+    # What the number is; a coupled one drives several axes by functions and has no unit of its own.
     motion: MotionKind = "rotation"
-    rest: float = 0.0
+    rest: float = 0.0  # in the pose in which the meshes are, and in a motion that does not mention it
     range: tuple[float, float] | None = None
-    clamped: bool = False
-    locked: bool = False
+    clamped: bool = False  # cut to the range; others may leave it, which is reported
+    locked: bool = False  # stays at rest whatever is asked of it
 
     def honoured(self, value: float) -> float:
         """Return what the coordinate becomes when ``value`` is asked of it."""
@@ -93,30 +83,17 @@ class TransformAxis:
 
 @dataclass
 class Joint:
-    """Moves ``child`` (and all that hangs on it) against ``parent``; all is in the scene's coordinates at rest.
-
-    Attributes
-    ----------
-    centre : (3,) ndarray
-        What a ball turns about.
-    coordinates : dict of str to Coordinate
-    rotations, translations : tuple of TransformAxis
-        In order; the first rotation is the outermost.
-    kind : str
-        A key of `KINDS`.
-    backward : bool
-        The joint was written from ``child`` to ``parent``: its motion is inverted.
-    """
+    """Moves ``child`` (and all that hangs on it) against ``parent``; all is in the scene's coordinates at rest."""
 
     name: str
     parent: str
     child: str
-    centre: np.ndarray = field(repr=False)
+    centre: np.ndarray = field(repr=False)  # (3,), what a ball turns about
     coordinates: dict[str, Coordinate]
-    rotations: tuple[TransformAxis, ...] = ()
+    rotations: tuple[TransformAxis, ...] = ()  # the first is the outermost
     translations: tuple[TransformAxis, ...] = ()
-    kind: str = "ball"
-    backward: bool = False
+    kind: str = "ball"  # a key of KINDS
+    backward: bool = False  # written from child to parent: its motion is inverted
 
     def motion(self, values: dict[str, float], rest: dict[str, float]) -> np.ndarray:
         """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity at rest.
@@ -161,13 +138,8 @@ def motion_of(name: str, axes: Iterable[tuple[MotionKind, Sequence[str], float]]
     """What a coordinate of a custom joint is, by OpenSim's rule.
 
     It is an angle or a length where it alone drives an axis of that sort with a slope of 1 or -1, the last such axis
-    deciding; else it is coupled.
-
-    Parameters
-    ----------
-    name : str
-    axes : iterable of (str, sequence of str, float)
-        Sort of each axis, its coordinates, and the first slope of its function where that is linear, else 0.
+    deciding; else it is coupled. ``axes`` are the sort of each, its coordinates, and the first slope of its function
+    where that is linear, else 0.
     """
     found: MotionKind = "coupled"
     for sort, coordinates, slope in axes:
@@ -184,3 +156,78 @@ def rotation_about(axis: ArrayLike, angle: float, centre: np.ndarray) -> np.ndar
     pose[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
     pose[:3, 3] = centre - pose[:3, :3] @ centre
     return pose
+
+
+def all_coordinates(joints: list[Joint]) -> dict[str, Coordinate]:
+    """Return every coordinate by its full name "joint.coordinate", in order."""
+    return {f"{joint.name}.{name}": facts for joint in joints for name, facts in joint.coordinates.items()}
+
+
+def resolve(
+    asked: dict[str, float], coordinates: dict[str, Coordinate], couplings: list[Coupling]
+) -> dict[str, float]:
+    """Return the value that every coordinate takes when some are asked for, by the same names [radian or scene unit].
+
+    Locked ones stay, clamped ones are cut to their range, those that follow others follow; absent ones are at rest.
+    """
+    values = {n: facts.honoured(asked[n]) if n in asked else facts.rest for n, facts in coordinates.items()}
+    for coupling in couplings:  # in an order in which what they follow is known
+        values[coupling.coordinate] = coupling.function(*(values[name] for name in coupling.of))
+    return values
+
+
+def ordered(couplings: list[Coupling]) -> list[Coupling]:
+    """Return the couplings in an order in which each follows what is known by then, or raise SceneError."""
+    by_name: dict[str, Coupling] = {}
+    for coupling in couplings:
+        if by_name.setdefault(coupling.coordinate, coupling) is not coupling:
+            raise SceneError(f"coupling of {coupling.coordinate!r} is given twice")
+    try:
+        order = list(TopologicalSorter({name: one.of for name, one in by_name.items()}).static_order())
+    except CycleError as error:
+        ring = error.args[1]
+        raise SceneError(f"coupling of {ring[0]!r} follows itself; leave one of the ring out") from None
+    return [by_name[name] for name in order if name in by_name]
+
+
+def joint_poses(
+    bones: list[str], joints: list[Joint], couplings: list[Coupling], coordinates: dict[str, float]
+) -> dict[str, np.ndarray]:
+    """Return the (4, 4) pose of every bone, rest coordinates to world; a bone without a joint is fixed."""
+    now = joint_values(joints, couplings, coordinates)
+    rest = joint_values(joints, couplings, {})
+    joint_of = {joint.child: joint for joint in joints}
+    poses = {}
+    for bone in bones:
+        chain, name = [], bone
+        while name in joint_of and name not in poses:
+            chain.append(joint_of[name])
+            name = chain[-1].parent
+        pose = poses.setdefault(name, np.eye(4))
+        for joint in reversed(chain):
+            pose = pose @ joint.motion(now[joint.name], rest[joint.name])
+            poses[joint.child] = pose
+    return {bone: poses[bone] for bone in bones}
+
+
+def bones_between(joints: list[Joint], bones: list[str]) -> set[str]:
+    """Names of these bones and of those on the way between them, from joint to joint."""
+    parents, chains = {joint.child: joint.parent for joint in joints}, []
+    for bone in dict.fromkeys(bones):
+        chain = [bone]
+        while chain[-1] in parents and parents[chain[-1]] not in chain:
+            chain.append(parents[chain[-1]])
+        chains.append(chain)
+    common = set(chains[0]).intersection(*chains)
+    root = next((bone for bone in chains[0] if bone in common), None)
+    return {bone for chain in chains for bone in chain if bone not in common} | {root or bones[0], *bones}
+
+
+def joint_values(
+    joints: list[Joint], couplings: list[Coupling], coordinates: dict[str, float]
+) -> dict[str, dict[str, float]]:
+    """Return the values that `resolve` gives, by joint and bare name."""
+    values = resolve(coordinates, all_coordinates(joints), couplings)
+    return {
+        joint.name: {name: values[f"{joint.name}.{name}"] for name in joint.coordinates} for joint in joints
+    }

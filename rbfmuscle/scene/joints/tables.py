@@ -18,9 +18,9 @@ from rbfmuscle.scene.joints.joint import (
     Coupling,
     Joint,
     TransformAxis,
+    all_coordinates,
     motion_of,
 )
-from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.options import Axis, Finite, Table, Vector
 from rbfmuscle.validation import SceneError, did_you_mean
 
@@ -71,9 +71,8 @@ class FunctionTable(Table):
         else:
             *slopes, constant = self.linear or [1.0, 0.0]
             if len(slopes) != count:
-                raise SceneError(
-                    f"{place}: linear needs a slope for each of {count} coordinates and a constant, got {self.linear}"
-                )
+                needed = f"a slope for each of {count} coordinates and a constant"
+                raise SceneError(f"{place}: linear needs {needed}, got {self.linear}")
             found = Linear(tuple(slopes), constant)
         return found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
 
@@ -143,9 +142,8 @@ class JointTable(Table):
         named = dict.fromkeys(name for _, table in tables for name in table.coordinates)
         for name in self.coordinates:
             if name not in named:
-                raise SceneError(
-                    f"{place}: coordinate {name!r} moves nothing, {did_you_mean(name, list(named))}"
-                )
+                hint = did_you_mean(name, list(named))
+                raise SceneError(f"{place}: coordinate {name!r} moves nothing, {hint}")
         slopes = [(sort, table.coordinates, table.slope()) for sort, table in tables]
         coordinates = {}
         for name in named:
@@ -164,9 +162,8 @@ class JointTable(Table):
             for motion, group in groups.items()
         )
         centre = np.array(self.centre or (0.0, 0.0, 0.0))
-        return Joint(
-            self.name, self.parent, self.child, centre, coordinates, turns, shifts, self.type, self.backward
-        )
+        bones = self.parent, self.child
+        return Joint(self.name, *bones, centre, coordinates, turns, shifts, self.type, self.backward)
 
     def _axes_of_kind(self, place):
         """Tables of the rotations and of the translations that the kind has, each of one coordinate."""
@@ -177,9 +174,8 @@ class JointTable(Table):
         count = len(axes) or len(self.coordinates)
         if not kind.least <= count <= kind.most:
             words = f"{kind.least}" if kind.least == kind.most else f"{kind.least} to {kind.most}"
-            raise SceneError(
-                f"{place}: a {self.type} joint has {words} coordinates, {count} are given; name them in axes"
-            )
+            words = f"{words} coordinates, {count} are given; name them in axes"
+            raise SceneError(f"{place}: a {self.type} joint has {words}")
         tables = [AxisTable(axis=list(axis), coordinates=[name]) for name, axis in axes.items()]
         turning = count if self.type == "ball" else len(kind.rotations)
         return {"rotation": tables[:turning], "translation": tables[turning:]}
@@ -270,12 +266,10 @@ def _function_row(function: Function, inputs: Sequence[str], output: str) -> dic
     if function == IDENTITY and inputs == [output]:
         return {}
     function = function.rescaled([1.0 / FACTORS[motion] for motion in inputs], 1.0 / FACTORS[output])
+    if isinstance(function, Linear) and not function.slopes:
+        return {"constant": function.constant}
     if isinstance(function, Linear):
-        return (
-            {"linear": [*function.slopes, function.constant]}
-            if function.slopes
-            else {"constant": function.constant}
-        )
+        return {"linear": [*function.slopes, function.constant]}
     if isinstance(function, Polynomial):
         return {"polynomial": list(function.coefficients)}
     points = {"x": list(function.x), "y": list(function.y)}

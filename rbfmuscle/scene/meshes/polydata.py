@@ -1,7 +1,5 @@
 """VTK and VTP files, read by pyvista in one process beside this one: some broken files end it."""
 
-from __future__ import annotations
-
 import atexit
 import os
 import pickle
@@ -86,10 +84,8 @@ def _cells(cells, points):
     """Where each cell begins and ends, and the numbers of its points."""
     from pyvista import convert_array
 
-    ends, numbers = (
-        convert_array(part).astype(np.int64)
-        for part in (cells.GetOffsetsArray(), cells.GetConnectivityArray())
-    )
+    parts = cells.GetOffsetsArray(), cells.GetConnectivityArray()
+    ends, numbers = (convert_array(part).astype(np.int64) for part in parts)
     if len(numbers) and (numbers.min() < 0 or numbers.max() >= points):
         raise ValueError(f"a cell names points {numbers.min()} to {numbers.max()}, there are {points}")
     if len(numbers) and (ends[0] != 0 or (np.diff(ends) < 0).any() or ends[-1] != len(numbers)):

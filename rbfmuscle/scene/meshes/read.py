@@ -1,15 +1,15 @@
-"""Reading surface meshes: STL, OBJ, PLY, VTK and VTP PolyData, mended where that is safe.
+"""Reading surface meshes: STL, OBJ, PLY, VTK and VTP PolyData, mended where that is safe; fibres from JSON.
 
 Vertex numbers in files stay usable: a read mesh knows which of its vertices each vertex of the file became.
 """
 
-from __future__ import annotations
-
 import io
 import itertools
+import json
 import os
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +20,11 @@ from rbfmuscle.validation import (
     MeshError,
     SceneError,
     check_mesh,
+    check_points,
     check_positive,
     did_you_mean,
     is_file,
+    read_text,
     shown,
     shown_path,
 )
@@ -35,23 +37,11 @@ MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
 def read_mesh(
     path: str | Path, *, name: str | None = None, scale: float = 1.0, may_be_open: bool = False
 ) -> ReadMesh:
-    """Read a surface mesh and mend what is safe to mend.
+    """Read a surface mesh (``.stl``, ``.obj``, ``.ply``, ``.vtk``, ``.vtp``) and mend what is safe to mend.
 
-    Parameters
-    ----------
-    path : path
-        ``.stl``, ``.obj``, ``.ply``, ``.vtk`` or ``.vtp``; polygons are split into triangles.
-    name : str, optional
-        What messages call the mesh, the file's stem by default.
-    scale : float
-        Factor from the file's unit to the scene's.
-    may_be_open : bool
-        Accept holes that cannot be closed safely (bones), with a note.
-
-    Raises
-    ------
-    MeshError
-        If the file is missing, unreadable or empty, or the surface cannot be made closed and manifold.
+    ``name`` is what messages call it, the file's stem by default; ``scale`` takes the file's unit to the scene's.
+    Holes that cannot be closed safely are kept, with a note, where it ``may_be_open`` (bones). MeshError if the file is
+    missing, unreadable or empty, or the surface cannot be made closed and manifold.
     """
     path = Path(path)
     vertices, faces = read_arrays(path)
@@ -76,9 +66,8 @@ def as_mesh(
         return read_mesh(mesh, name=name, scale=scale, may_be_open=may_be_open)
     vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
     vertices = np.asarray(vertices, dtype=np.float64) * scale
-    return prepare_mesh(
-        vertices, np.asarray(faces), place=f"mesh {name!r}", name=name, may_be_open=may_be_open
-    )
+    place = f"mesh {name!r}"
+    return prepare_mesh(vertices, np.asarray(faces), place=place, name=name, may_be_open=may_be_open)
 
 
 def prepare_mesh(
@@ -112,9 +101,8 @@ def read_arrays(path: Path) -> tuple[Floats, Integers]:
     """Return vertices (n, 3) and triangles (m, 3) of a mesh file as they stand, or raise MeshError."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise MeshError(
-            f"{shown_path(path)}: {shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
-        )
+        words = f"{shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
+        raise MeshError(f"{shown_path(path)}: {words}")
     if not is_file(path):
         raise MeshError(f"{shown_path(path)}: no such mesh file{_neighbours(path)}")
     try:
@@ -174,3 +162,38 @@ def _read_obj(content):
             corners = [number - 1 if number > 0 else len(vertices) + number for number in numbers]
             faces += [(corners[0], *side) for side in itertools.pairwise(corners[1:])]
     return np.array(vertices).reshape(-1, 3), np.array(faces, dtype=np.int64).reshape(-1, 3)
+
+
+def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Floats]:
+    """Return fibres as a list of (k, 3) arrays in scene units, ``scale`` from the unit of a file or of given arrays.
+
+    A JSON file holds ``{"polylines": [[[x, y, z], ...], ...]}`` or that list alone.
+    """
+    place = f"muscle {muscle!r} fibres"
+    if isinstance(fibres, (str, Path)):
+        place, fibres = f"{place}: {fibres}", _read_lines(Path(fibres), f"{place}: ")
+    lines = []
+    for number, line in enumerate(fibres):
+        try:
+            points = check_points(line, name=f"polyline {number}")
+        except (ValueError, TypeError) as error:
+            raise SceneError(f"{place}: {error}") from None
+        if len(points) < 2:
+            words = f"polyline {number} has {len(points)} points, a fibre needs two or more"
+            raise SceneError(f"{place}: {words}")
+        lines.append(points * scale)
+    if not lines:
+        raise SceneError(f"{place}: no polylines")
+    return lines
+
+
+def _read_lines(path, place):
+    text = read_text(path, place=place)
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{place}{path}: not JSON ({shown(str(error))})") from None
+    lines = found.get("polylines") if isinstance(found, dict) else found
+    if not isinstance(lines, list):
+        raise SceneError(f"{place}{path}: needs a list 'polylines'")
+    return lines

@@ -27,29 +27,15 @@ CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are droppe
 
 @dataclass
 class ReadMesh:
-    """A mesh as read and mended.
+    """A mesh as read and mended."""
 
-    Attributes
-    ----------
-    vertices : (n, 3) ndarray
-        In scene units.
-    faces : (m, 3) ndarray of int
-        Outward.
-    vertex_map : (n_file,) ndarray of int
-        The vertex that each vertex of the file became, -1 where it was dropped.
-    notes : list of str
-        What was mended.
-    closed : bool
-    source : str
-        The file.
-    """
-
-    vertices: Floats = field(repr=False)
-    faces: Integers = field(repr=False)
+    vertices: Floats = field(repr=False)  # (n, 3) in scene units
+    faces: Integers = field(repr=False)  # (m, 3), outward
+    # The vertex (n_file,) that each vertex of the file became, -1 where it was dropped.
     vertex_map: Integers = field(repr=False)
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # what was mended
     closed: bool = True
-    source: str = ""
+    source: str = ""  # the file
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
@@ -60,16 +46,9 @@ class ReadMesh:
 
 
 def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool = False) -> ReadMesh:
-    """Return the mesh closed, manifold and outward, with notes of what was done.
+    """Return the mesh closed, manifold and outward, with notes of what was done; ``place`` begins each message.
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-    place : str
-        Begins each message: the file or the object.
-    may_be_open : bool
-        Keep holes and several parts (bones) instead of refusing them by a MeshError.
+    Holes and several parts are kept where it ``may_be_open`` (bones), and refused by a MeshError elsewhere.
     """
     bad = _repeated(faces)
     state = ReadMesh(vertices, faces[~bad], np.arange(len(vertices)))
@@ -114,10 +93,7 @@ def _check_closed(state, place, may_be_open):
 
 
 def _check_inside(state, place):
-    """Refuse or note a closed surface that does not enclose a volume, once, over all of its area.
-
-    A flat or twisted surface may be closed and consistently oriented, and still have no inside.
-    """
+    """Refuse or note a surface that is closed and has no inside: flat or twisted, judged over all of its area."""
     wrong, volume = _twisted_share(state.mesh), float(_cones(state.vertices, state.faces).sum())
     if wrong > MOST_TWISTED:
         raise MeshError(
@@ -274,10 +250,7 @@ def _rims(faces: Integers) -> list[Integers]:
 
 
 def _orient(state, place):
-    """Make neighbouring faces agree, then turn what was mended, or the whole, outward.
-
-    A consistent inner shell (a cavity of a bone) rightly faces the other way and stays.
-    """
+    """Make neighbouring faces agree, then turn what was mended, or the whole, outward; consistent cavities stay."""
     faces = np.ascontiguousarray(state.faces)
     oriented, part = igl.bfs_orient(faces)
     sides = oriented * (int(faces.max()) + 1) + np.roll(oriented, -1, axis=1)

@@ -7,9 +7,8 @@ import trimesh
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.importers.opensim.read import read_osim
-from rbfmuscle.importers.opensim.scene import import_osim
+from rbfmuscle.importers.opensim.scene import import_osim, write_scene
 from rbfmuscle.importers.opensim.tubes import make_tube
-from rbfmuscle.importers.opensim.write import write_scene
 from rbfmuscle.importers.opensim.xml import read_xml
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError

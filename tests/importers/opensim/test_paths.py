@@ -5,8 +5,16 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from rbfmuscle.importers.opensim.fitted import FittedPath, exponents, fit_path, write_paths
-from rbfmuscle.paths import Samples, parse_ranges, report_fits, sample_muscles
+from rbfmuscle.paths import (
+    FittedPath,
+    Samples,
+    exponents,
+    fit_path,
+    parse_ranges,
+    report_fits,
+    sample_muscles,
+    write_paths,
+)
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import SolveError, UsageError
 

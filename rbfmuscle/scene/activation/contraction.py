@@ -1,0 +1,133 @@
+"""Muscles that contract: their slack length and tendon on the mesh, their activation along a motion."""
+
+import itertools
+import math
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.csgraph import dijkstra
+
+from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.scene.activation.keys import TENDON_STRAIN, Contraction, ContractionTable, TendonTable
+from rbfmuscle.scene.motion import interpolate
+from rbfmuscle.scene.objects import Motion, Muscle, SceneData
+from rbfmuscle.validation import SceneError, did_you_mean
+
+# A fibre that lies farther outside than this share of the muscle's diagonal is one of another muscle or frame:
+# lines that run on to the bone, beyond the mesh of the muscle, stay below.
+OUTSIDE = 0.1
+# No activation changes by more in one sub-step; smaller steps change the shapes that are reached by less than
+# 0.1 mm (tests/contract/test_contraction.py).
+STEP = 0.1
+SETTLING = 4  # further solves after activation has changed while no bone moved
+
+
+def resolve_contraction(muscle: Muscle) -> Contraction:
+    """What the keys of a muscle come to on its mesh.
+
+    SceneError on fibres outside it, or a tendon that covers all or nothing.
+    """
+    keys = muscle.contraction or ContractionTable()
+    _check_fibres(muscle)
+    stretch, tendon = keys.fibre_stretch_at_rest, keys.tendon
+    strain = TENDON_STRAIN if tendon is None else tendon.strain
+    return Contraction(stretch or 1.0, _tendon(muscle, tendon), strain, stretch is not None)
+
+
+def _check_fibres(muscle):
+    mesh = muscle.mesh
+    vertices = np.asarray(mesh.vertices, dtype=float)
+    distance = ExactDistance(vertices, np.asarray(mesh.faces))
+    limit = OUTSIDE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    for number, line in enumerate(muscle.fibres or ()):
+        outside = float(distance.signed_distance(np.asarray(line, dtype=float)).max())
+        if outside > limit:
+            raise SceneError(
+                f"muscle {muscle.name!r} fibres: polyline {number} leaves the muscle, by {outside:.4g} at worst "
+                f"({limit:.4g} is allowed); check its unit and frame"
+            )
+
+
+def _tendon(muscle: Muscle, given: TendonTable | None) -> Booleans:
+    """Vertices (n,) that are tendon: up to a length from the attachments."""
+    free = np.ones(len(muscle.mesh.vertices), dtype=bool)
+    if given is None:
+        return ~free
+    place = f"muscle {muscle.name!r} tendon"
+    bones = [attachment.bone for attachment in muscle.attachments]
+    if given.at is not None and given.at not in bones:
+        raise SceneError(f"{place}: not attached to {given.at!r}, {did_you_mean(given.at, bones)}")
+    start = np.concatenate([a.vertices for a in muscle.attachments if given.at in (None, a.bone)])
+    tendon = _along_surface(muscle.mesh, start) <= given.length
+    free[np.concatenate([a.vertices for a in muscle.attachments])] = False
+    if not (free & ~tendon).any():
+        raise SceneError(f"{place}: covers all of the muscle, leave a belly that can contract")
+    if not (free & tendon).any():
+        raise SceneError(f"{place}: holds no vertex beyond the attachments, make it longer")
+    return tendon
+
+
+def _along_surface(mesh, start):
+    """Length (n,) of the shortest path over the surface from the vertices ``start``, some per cent too long."""
+    # Along edges, and across them to the corner on the other side: along edges alone up to 15 % too long.
+    ends = np.concatenate([mesh.edges_unique, mesh.face_adjacency_unshared])
+    ends = np.unique(np.sort(ends, axis=1), axis=0)
+    lengths = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
+    count = len(mesh.vertices)
+    graph = sparse.coo_matrix((np.maximum(lengths, 1e-300), ends.T), shape=(count, count)).tocsr()
+    return dijkstra(graph, directed=False, indices=start, min_only=True)
+
+
+def activation_curve(muscle: Muscle, motion: Motion) -> Floats:
+    """Activation (n,) of one muscle in each frame, 0 to 1."""
+    values = np.atleast_1d(0.0 if muscle.contraction is None else muscle.contraction.activation)
+    return np.interp(motion.progress, np.linspace(0.0, 1.0, len(values)), values)
+
+
+class Activations:
+    """Activations of the muscles that contract in the frame loop, and the sub-steps that they need.
+
+    ``here`` is that of each muscle now, 0 before the first frame; ``target``, set by hand as a window does, overrides
+    the scene's own curves.
+    """
+
+    def __init__(self, scene: SceneData) -> None:
+        contracting = [muscle for muscle in scene.muscles if muscle.contraction is not None]
+        self.curves = {muscle.name: activation_curve(muscle, scene.motion) for muscle in contracting}
+        self.here = dict.fromkeys(self.curves, 0.0)
+        self.target: dict[str, float] = {}
+
+    def at(self, frame: int) -> dict[str, float]:
+        """Activation of each muscle that contracts in a frame."""
+        return {
+            name: self.target.get(name, float(curve[min(frame, len(curve) - 1)]))
+            for name, curve in self.curves.items()
+        }
+
+    def refine(
+        self, frame: int, stops: list[dict[str, float]]
+    ) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
+        """Sub-steps short enough in activation too.
+
+        ``stops`` are coordinates: where the bones are, then the ends of the sub-steps that they need. Returned are
+        these with further ones between them, and for each but the first the activation by muscle.
+        """
+        if not self.curves:
+            return stops, []
+        goal, start = self.at(frame), self.here
+        most = max(abs(goal[name] - start[name]) for name in goal)
+        wanted, steps = math.ceil(most / STEP - 1e-9), len(stops) - 1
+        if steps == 0 and wanted == 0:
+            return stops, []
+        each = max(1, math.ceil(wanted / max(1, steps)))
+        fine = [stops[0]]
+        for before, after in list(itertools.pairwise(stops)) or [(stops[0], stops[0])]:
+            fine += [interpolate(before, after, k / each) for k in range(1, each)] + [after]
+        count = len(fine) - 1
+        values = [interpolate(start, goal, k / count) for k in range(1, count + 1)]
+        self.here = goal
+        if steps == 0:
+            # Bones that stand still leave the muscles nothing else to settle in.
+            fine, values = fine + [stops[0]] * SETTLING, values + [goal] * SETTLING
+        return fine, values
