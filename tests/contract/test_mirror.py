@@ -13,8 +13,7 @@ from rbfmuscle.simulation.frame import MuscleModel
 def signatures(model):
     """Positional parameters of each method; keyword-only ones are a model's own affair."""
     methods = inspect.getmembers(model, inspect.isfunction)
-    named = {n: m for n, m in methods if n == "__init__" or not n.startswith("_")}
-    return {n: inspect.getfullargspec(inspect.unwrap(m)).args for n, m in named.items()}
+    return {n: inspect.getfullargspec(m).args for n, m in methods if n == "__init__" or not n.startswith("_")}
 
 
 def test_the_same_names_have_the_same_signatures():

@@ -3,16 +3,16 @@
 import csv
 import json
 import math
+import re
 
 import numpy as np
 import pytest
 from blend_model import BlendMuscle, arm_scene
 
-from rbfmuscle import compare
 from rbfmuscle.compare import compare_models
-from rbfmuscle.experiments.comparison import MEASURES, best_models
+from rbfmuscle.experiments.comparison import MEASURES, best_models, describe
 from rbfmuscle.metrics.metrics import surface_distance
-from rbfmuscle.models import build_model, model_title
+from rbfmuscle.models import build_model
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import UsageError
@@ -24,6 +24,16 @@ def test_what_does_not_count_is_a_tie():
     }
     assert best_models(found, "rest_error_rms", "mm") == ["a", "b"]
     assert best_models(found, "rest_error_rms", "m") == ["a"]
+
+
+def test_answer_says_what_the_first_keeps_at_which_price_and_who_comes_near():
+    rbf = {"penetration_max": 0.0, "bone_penetration_max": 0.031, "time_frame": 0.074}
+    pbd = {"penetration_max": 3.17, "time_frame": 0.02, "distance_rms": 31.0}
+    found = {"rbf": {"all": rbf}, "pbd": {"all": pbd}}
+    more = found | {"settled": {"all": pbd | {"time_frame": 1.406, "distance_rms": 5.71}}}
+    labels = {"rbf": "RBF", "pbd": "PBD", "settled": "PBD, converged"}
+    assert re.search(r"bones \(0\.031 mm\) at 3\.7 times .* the two lie 31 mm", describe(found, labels, "mm"))
+    assert re.search(r"converged, comes within 5\.7 mm .* 19 times its time", describe(more, labels, "mm"))
 
 
 @pytest.fixture(scope="module")
@@ -103,10 +113,3 @@ class TestFailure:
         assert table["models"] == ["pbd", "arap-pbd"] and "planted" in table["failed"]["xpbd"]
         assert "xpbd did not finish" in (tmp_path / "report.html").read_text(encoding="utf-8")
         assert not math.isnan(table["results"]["pbd"]["all"]["volume_error"])
-
-
-def test_labels_say_what_ran():
-    scene = arm_scene()
-    variants = compare._variants(scene, ["rbf", "pbd", "xpbd-converged"], {"pbd:model.iterations": 7})
-    titles = [model_title(variant.muscles[0]) for variant in variants.values()]
-    assert titles == ["RBF", "PBD, 7 sweeps", "XPBD, converged"]

@@ -110,7 +110,7 @@ class TestRun:
         table = write_table(points, folder, {"arm": "mm"})
         write_page(table, folder)
         page = (folder / "sweep.html").read_text(encoding="utf-8")
-        assert "<svg" in page and "http" not in page
+        assert "<svg" in page and "http" not in page and "the default lies" in page
         rows = {r["label"]: r for r in table["rows"]}
         assert all(r["status"] == "done" for r in rows.values())
         coarse, fine = (rows[f"model.centres=40 model.resolution={n}"] for n in (16, 24))

@@ -108,7 +108,7 @@ def test_result_does_not_depend_on_order_or_run_or_named_pairs(pressed, order):
     _, again = _run(PRESS, SlidingOptions(pairs=[["lower", "upper"]]), order=order)
     for name in ("lower", "upper"):
         assert np.array_equal(pressed[1][name].x, again[name].x)
-    with pytest.raises(SceneError, match="unknown muscle 'uper', known: lower, upper"):
+    with pytest.raises(SceneError, match="unknown muscle 'uper'"):
         _run([{}], SlidingOptions(pairs=[["lower", "uper"]]))
 
 

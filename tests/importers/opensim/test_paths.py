@@ -81,8 +81,8 @@ def test_opensim_loads_the_file_and_gives_the_same_numbers(tmp_path):
 
 @pytest.fixture(scope="module")
 def scene():
-    found = phantom_scene()
-    found.muscles = [muscle for muscle in found.muscles if muscle.name == "abductor"]
+    found = phantom_scene(model="pbd", spacing=6.0)
+    found.muscles = [found.muscle("abductor")]
     return found
 
 
