@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from toy_scene import ToyMuscle
+from toy_scene import ToyMuscle, ellipsoid, held
 
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.scene.options import OutputOptions
@@ -37,65 +37,32 @@ class BlendMuscle(ToyMuscle):
         return FinishedDrawing(ModelSurface(self.x.copy(), self.faces, quantities))
 
 
-def arm_scene(*, end=20, step=10, units="mm", **output):
+def arm_scene(*, end=20, step=10, units="mm"):
     """Two boxes with a hinge between them and an egg of a muscle above, from rest to ``end`` degrees."""
     scene = Scene("arm", units=units)
-    upper, fore = trimesh.creation.box((40, 6, 6)), trimesh.creation.box((40, 6, 6))
-    upper.apply_translation([-22, 0, 0])
-    fore.apply_translation([22, 0, 0])
-    egg = trimesh.creation.icosphere(subdivisions=3)
-    egg = trimesh.Trimesh(egg.vertices * [26, 5, 5] + [0, 0, 9.5], egg.faces, process=False)
+    for name, place in (("upper", -22), ("fore", 22)):
+        scene.add_bone(name, trimesh.creation.box((40, 6, 6)).apply_translation([place, 0, 0]))
+    egg = ellipsoid([26, 5, 5], [0, 0, 9.5], subdivisions=3)
     x = egg.vertices[:, 0]
-    attach = [
-        {"bone": "upper", "vertices": np.flatnonzero(x < -19).tolist()},
-        {"bone": "fore", "vertices": np.flatnonzero(x > 19).tolist()},
-    ]
-    scene.add_bone("upper", upper).add_bone("fore", fore)
     scene.add_joint("elbow", "upper", "fore", (0, 0, 0), {"flexion": (0, -1, 0)})
-    scene.add_muscle("biceps", egg, attach=attach)
+    scene.add_muscle("biceps", egg, attach=held(upper=x < -19, fore=x > 19))
     scene.set_motion(ramp={"elbow.flexion": {"to": float(end), "step": float(step)}})
-    scene.output = OutputOptions(**{"report": False, **output})
+    scene.output = OutputOptions(report=False)
     return scene
 
 
-ARM_FILE = """[scene]
-format = 1
-name = "arm"
-units = "{units}"
-[[bone]]
-name = "upper"
-mesh = "upper.ply"
-[[bone]]
-name = "fore"
-mesh = "fore.ply"
-[[joint]]
-name = "elbow"
-parent = "upper"
-child = "fore"
-centre = [0, 0, 0]
-axes = {{ flexion = [0, -1, 0] }}
-[motion]
-ramp = {{ "elbow.flexion" = {{ from = 0, to = {end}, step = {step} }} }}
-[defaults]
-{defaults}attach = [{{ bone = "upper", vertices = "upper.txt" }}, {{ bone = "fore", vertices = "fore.txt" }}]
-[output]
-report = false
-"""
+# A scene file with places for end, step and defaults.
+ARM_FILE = Path(__file__).parent / "data" / "arm.toml"
 
 
-def arm_files(
-    folder, name="arm.toml", *, end=10, step=5, muscles=(("biceps", 0.0),), defaults="", scale=1.0, units="mm"
-):
+def arm_files(folder, name="arm.toml", *, end=10, step=5, muscles=(("biceps", 0.0),), defaults=""):
     """Write `arm_scene` as files, its muscle once for each name and shift sideways; return the scene file's path."""
     scene = arm_scene()
     for bone in scene.bones:
-        bone.mesh.copy().apply_scale(scale).export(folder / f"{bone.name}.ply")
-    text = ARM_FILE.format(end=end, step=step, defaults=defaults, units=units)
+        bone.mesh.export(folder / f"{bone.name}.ply")
+    text = ARM_FILE.read_text(encoding="utf-8").format(end=end, step=step, defaults=defaults)
     for muscle, shift in muscles:
-        mesh = scene.muscles[0].mesh.copy()
-        mesh.apply_translation([0, shift, 0])
-        mesh.apply_scale(scale)
-        mesh.export(folder / f"{muscle}.ply")
+        scene.muscles[0].mesh.copy().apply_translation([0, shift, 0]).export(folder / f"{muscle}.ply")
         text += f'[[muscle]]\nname = "{muscle}"\nmesh = "{muscle}.ply"\n'
     for attachment in scene.muscles[0].attachments:
         np.savetxt(folder / f"{attachment.bone}.txt", attachment.vertices, fmt="%d")

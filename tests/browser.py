@@ -31,11 +31,8 @@ class Browser:
 
     def __init__(self):
         self.folder = tempfile.mkdtemp()
-        self.process = subprocess.Popen(
-            ["chromium", f"--user-data-dir={self.folder}", *OPTIONS],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        words = ["chromium", f"--user-data-dir={self.folder}", *OPTIONS]
+        self.process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         self.port = wait_for(self._port, 60)
 
     def _port(self):
@@ -64,13 +61,8 @@ class Tab:
 
         self.socket, self.count = connect(debugger, max_size=None), 0
         width, height = size
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=False,
-        )
+        screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **screen)
         self.call("Page.enable")
         self.call("Page.addScriptToEvaluateOnNewDocument", source=NO_NOTES)
         self.call("Page.navigate", url=address)
@@ -99,10 +91,6 @@ class Tab:
             "return [r.x + r.width / 2, r.y + r.height / 2] })()"
         )
 
-    def to_front(self):
-        """Only the tab in front takes input and draws."""
-        self.call("Page.bringToFront")
-
     def close(self):
         self.call("Page.close")
         self.socket.close()
@@ -112,14 +100,14 @@ class Tab:
 
     def click(self, text):
         """Click on what has this text."""
-        place = wait_for(lambda: self.place(f"!e.children.length && e.textContent.trim() == {text!r}"), 20)
-        self.mouse("mousePressed", place)
-        self.mouse("mouseReleased", place)
+        self._press(f"!e.children.length && e.textContent.trim() == {text!r}")
 
     def tick(self, label):
         """Click on the checkbox in the row of a label."""
-        row = f"e.type == 'checkbox' && e.closest('.mantine-Flex-root')?.innerText.trim() == {label!r}"
-        place = wait_for(lambda: self.place(row), 20)
+        self._press(f"e.type == 'checkbox' && e.closest('.mantine-Flex-root')?.innerText.trim() == {label!r}")
+
+    def _press(self, condition):
+        place = wait_for(lambda: self.place(condition), 20)
         self.mouse("mousePressed", place)
         self.mouse("mouseReleased", place)
 

@@ -1,6 +1,5 @@
 """What several test files share."""
 
-import importlib
 import os
 import re
 import subprocess
@@ -55,18 +54,18 @@ if MOVED:
     _move_vertices()
 
 
-def _find_hip():
-    places = [os.environ.get("RBFMUSCLE_DATA"), ROOT.parent / "shared" / "data"]
-    return next((Path(p) / "hip" for p in places if p and (Path(p) / "hip").is_dir()), None)
+def find_data(name):
+    """A folder of real data; the test is skipped where it is absent."""
+    for place in (os.environ.get("RBFMUSCLE_DATA"), ROOT.parent / "shared" / "data"):
+        if place and (Path(place) / name).is_dir():
+            return Path(place) / name
+    return pytest.skip(f"{name}/ is not here (set RBFMUSCLE_DATA to the folder that holds it)")
 
 
 @pytest.fixture(scope="session")
 def hip_data():
-    """Folder of the real hip; the test is skipped where it is absent."""
-    folder = _find_hip()
-    if folder is None:
-        pytest.skip("the real hip is not here (set RBFMUSCLE_DATA to the folder that holds hip/)")
-    return folder
+    """Folder of the real hip."""
+    return find_data("hip")
 
 
 @pytest.fixture(scope="session")
@@ -79,11 +78,8 @@ def hip_scene(hip_data):
 
 @pytest.fixture(scope="session")
 def leg_data():
-    """Folder of the whole leg; the test is skipped where it is absent."""
-    hip = _find_hip()
-    if hip is None or not (hip.parent / "leg").is_dir():
-        pytest.skip("the leg is not here (set RBFMUSCLE_DATA to the folder that holds leg/)")
-    return hip.parent / "leg"
+    """Folder of the whole leg."""
+    return find_data("leg")
 
 
 @pytest.fixture(scope="session")
@@ -110,24 +106,13 @@ def graphics():
         pytest.skip("no graphics here")
 
 
-def benchmark_script(name):
-    """The module of a script in ``benchmarks/``."""
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        return importlib.import_module(name)
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
-
-
 def pytest_terminal_summary(terminalreporter):
     """Why tests were skipped, in one line."""
     reasons = [str(report.longrepr[-1]) for report in terminalreporter.stats.get("skipped", [])]
     if reasons:
         data = sum("RBFMUSCLE_DATA" in reason for reason in reasons)
         missing = sorted({m[1] for reason in reasons if (m := re.search(r"could not import '(\w+)", reason))})
-        parts = [f"{data} need data (RBFMUSCLE_DATA names the folder that holds hip/, leg/ and osim/)"] * (
-            data > 0
-        )
-        parts += [f"packages not installed: {', '.join(missing)}"] * bool(missing)
-        line = f"{len(reasons)} skipped: {'; '.join([*parts, 'pytest -rs lists all'])}"
-        terminalreporter.write_line(line)
+        folder = "RBFMUSCLE_DATA names the folder that holds hip/, leg/ and osim/"
+        parts = [f"{data} need data ({folder})"] if data else []
+        parts += [f"packages not installed: {', '.join(missing)}"] if missing else []
+        terminalreporter.write_line(f"{len(reasons)} skipped: {'; '.join([*parts, 'pytest -rs lists all'])}")

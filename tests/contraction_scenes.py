@@ -1,18 +1,17 @@
-"""Scenes of muscles that contract, whose answers are known: by closed forms, or by finite elements.
+"""Scenes of muscles along x that contract, whose answers are known, by closed forms or finite elements [mm]."""
 
-All lengths are in millimetres. Muscles lie along x at rest.
-"""
-
+import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 import trimesh
 from peers.known_scenes import FAR, Bar, _block
+from toy_scene import held
 
 from rbfmuscle.metrics.belly import belly_measures
 from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.scene.objects import Attachment, Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom_shapes import stitch
 from rbfmuscle.scene.scene import Scene
 
@@ -36,11 +35,8 @@ class Spindle:
     tendon: float = 9.0
 
     def radius(self, x):
-        """Radius at x, and its derivative."""
-        turn = np.pi * np.clip(np.asarray(x, dtype=float) / self.belly_length, -0.5, 0.5)
-        swell = self.belly - self.tendon
-        slope = -swell * np.pi / self.belly_length * np.sin(2.0 * turn)
-        return self.tendon + swell * np.cos(turn) ** 2, slope
+        turn = np.pi * np.clip(x / self.belly_length, -0.5, 0.5)
+        return self.tendon + (self.belly - self.tendon) * np.cos(turn) ** 2
 
     def mesh(self, spacing):
         """Closed outward triangles of about equal sides: vertices (n, 3) and faces (m, 3)."""
@@ -51,29 +47,25 @@ class Spindle:
         turn = 0.5 * np.pi * np.arange(1, deep) / deep
         beyond, size = half + tip * np.sin(turn), tip * np.cos(turn)
         x = np.concatenate([[-half - tip], -beyond[::-1], middle, beyond, [half + tip]])
-        radius = np.concatenate([[0.0], size[::-1], self.radius(middle)[0], size, [0.0]])
+        radius = np.concatenate([[0.0], size[::-1], self.radius(middle), size, [0.0]])
         rings = []
         for k, (place, r) in enumerate(zip(x, radius)):
             count = 1 if r == 0.0 else max(6, round(2 * np.pi * r / spacing))
             angle = 2 * np.pi * (np.arange(count) + 0.5 * (k % 2)) / count
             rings.append(np.column_stack([np.full(count, place), r * np.cos(angle), r * np.sin(angle)]))
-        starts = np.concatenate([[0], np.cumsum([len(ring) for ring in rings])])
         vertices = np.concatenate(rings)
-        faces = [
-            stitch(vertices, np.arange(a, b), np.arange(b, c))
-            for a, b, c in zip(starts[:-2], starts[1:-1], starts[2:])
-        ]
-        return vertices, np.concatenate(faces)
+        numbers = np.split(np.arange(len(vertices)), np.cumsum([len(ring) for ring in rings])[:-1])
+        return vertices, np.concatenate([stitch(vertices, *pair) for pair in itertools.pairwise(numbers)])
 
-    def fibres(self, *, count=60):
+    def fibres(self):
         """Lines at constant shares of the radius, in the middle, at a half and at nine tenths of it."""
-        x = np.linspace(-0.5, 0.5, count) * self.length
-        radius = self.radius(x)[0]
+        x = np.linspace(-0.5, 0.5, 60) * self.length
+        radius = self.radius(x)
         lines = [np.column_stack([x, 0 * x, 0 * x])]
         for share, number in ((0.5, 6), (0.9, 12)):
             for angle in 2 * np.pi * np.arange(number) / number:
-                side = share * radius
-                lines.append(np.column_stack([x, side * math.cos(angle), side * math.sin(angle)]))
+                side = share * radius[:, None] * [math.cos(angle), math.sin(angle)]
+                lines.append(np.column_stack([x, side]))
         return lines
 
 
@@ -81,10 +73,7 @@ SPINDLE = Spindle()
 
 
 def spindle_scene(*, spacing=3.0, frames=10, model="rbf", **contraction):
-    """The spindle between two bones that stand still, with ``frames`` after the one at rest.
-
-    ``contraction`` are keys of the muscle; its activation rises from 0 to 1 where not given.
-    """
+    """The spindle between two bones that stand still, and keys of its contraction; activation rises from 0 to 1."""
     scene = Scene("spindle", units="mm")
     ends = Bar(length=SPINDLE.length, width=SPINDLE.tendon, thickness=SPINDLE.tendon, dome=SPINDLE.tendon)
     _add_slider(scene, ends)
@@ -121,10 +110,8 @@ def _add_slider(scene, bar):
 
 
 def _add(scene, vertices, faces, edge, fibres, model, contraction):
-    attach = [
-        Attachment("origin", np.flatnonzero(vertices[:, 0] <= -edge)),
-        Attachment("insertion", np.flatnonzero(vertices[:, 0] >= edge)),
-    ]
+    x = vertices[:, 0]
+    attach = held(origin=x <= -edge, insertion=x >= edge)
     scene.add_muscle(MUSCLE, (vertices, faces), attach=attach, model=model, fibres=fibres, **contraction)
 
 
@@ -134,10 +121,7 @@ def panel_pennation(stretch):
 
 
 def panel_scene(stretch, *, frames=5, model="rbf"):
-    """The panel with its upper plate slid so far that straight fibres have the stretch, fully active at the end.
-
-    The line of action is along the plates: attachments are the lower and the upper face, and fibres are given.
-    """
+    """The panel with its upper plate slid so far that straight fibres have the stretch, fully active at the end."""
     length, width = PLATES
     box = trimesh.creation.box((length, width, HEIGHT))
     for _ in range(4):
@@ -150,16 +134,10 @@ def panel_scene(stretch, *, frames=5, model="rbf"):
         plate.apply_translation((0.0 if low < 0 else LEAN, 0.0, low + 2.0))
         scene.add_bone(name, plate)
     scene.add_joint("slider", "lower", "upper", (LEAN, 0.0, HEIGHT + FAR * length), {"pull": (0, 1, 0)})
-    attach = [
-        Attachment("lower", np.flatnonzero(vertices[:, 2] <= 1e-9)),
-        Attachment("upper", np.flatnonzero(vertices[:, 2] >= HEIGHT - 1e-9)),
-    ]
+    attach = held(lower=vertices[:, 2] <= 1e-9, upper=vertices[:, 2] >= HEIGHT - 1e-9)
     share = np.linspace(0.02, 0.98, 12)[:, None]
-    fibres = [
-        np.array([x * length, y * width, 0.0]) + share * [LEAN, 0.0, HEIGHT]
-        for x in (-0.3, 0.0, 0.3)
-        for y in (-0.25, 0.25)
-    ]
+    places = itertools.product((-0.3, 0.0, 0.3), (-0.25, 0.25))
+    fibres = [np.array([x * length, y * width, 0.0]) + share * [LEAN, 0.0, HEIGHT] for x, y in places]
     scene.add_muscle(MUSCLE, (vertices, faces), attach=attach, model=model, fibres=fibres, activation=[0, 1])
     shortened = math.sqrt((FIBRE * stretch) ** 2 - HEIGHT**2)
     return with_frames(scene, np.linspace(0.0, LEAN - shortened, frames + 1), length)
@@ -175,11 +153,7 @@ def settings(model):
 
 
 def compare_spindle(vertices, faces, activation, kept):
-    """Errors of a spindle's closed surface against the arrays of finite elements that the data file kept.
-
-    ``rms`` and ``worst`` [mm] of the vertices between the held ends, ``csa`` (relative error of the greatest
-    section) and ``place`` (its place, error as a share of the length).
-    """
+    """Errors of a spindle's surface against finite elements: RMS [mm], greatest section (relative), and its place."""
     row = int(np.argmin(np.abs(kept["activations"] - activation)))
     wanted = kept["vertices"][row].astype(float)
     between = np.abs(wanted[:, 0]) < 0.5 * SPINDLE.length - 5.0
@@ -188,7 +162,6 @@ def compare_spindle(vertices, faces, activation, kept):
     theirs = belly_measures(wanted, kept["faces"], *ENDS)
     return {
         "rms": float(np.sqrt(np.mean(away**2))),
-        "worst": float(away.max()),
         "csa": mine["csa_max"] / theirs["csa_max"] - 1.0,
         "place": mine["csa_place"] - theirs["csa_place"],
     }

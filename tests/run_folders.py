@@ -17,10 +17,8 @@ def without_times(value):
     """A JSON value whose clock readings are None: their keys stay."""
     clocks = ("started", "written", "wall", "times", "frame_time")
     if isinstance(value, dict):
-        return {
-            key: (sorted(item) if isinstance(item, dict) else None)
-            if key in clocks or key.startswith("time_")
-            else without_times(item)
-            for key, item in value.items()
-        }
+        kept = {key: without_times(item) for key, item in value.items()}
+        for key in [key for key in value if key in clocks or key.startswith("time_")]:
+            kept[key] = sorted(value[key]) if isinstance(value[key], dict) else None
+        return kept
     return [without_times(item) for item in value] if isinstance(value, list) else value

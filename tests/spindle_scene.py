@@ -2,15 +2,15 @@
 
 import numpy as np
 import trimesh
+from toy_scene import held
 
 from rbfmuscle.scene.scene import Scene
 
 CENTRE = np.array([0.0, -22.0, 0.0])
 
 
-def build_scene(transform=None, scale=1.0):
+def build_scene():
     """A spindle of 90 mm before a ball of 10 mm that its two bones turn about."""
-    transform = np.eye(4) if transform is None else transform
     muscle = trimesh.creation.icosphere(subdivisions=4)
     muscle.apply_transform(np.diag([12.0, 9.0, 45.0, 1.0]))
     ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
@@ -18,13 +18,9 @@ def build_scene(transform=None, scale=1.0):
     ends = [trimesh.creation.icosphere(subdivisions=2, radius=8.0) for _ in range(2)]
     ends[0].apply_translation([0, 0, 50])
     ends[1].apply_translation([0, 0, -50])
-    held = [np.flatnonzero(side * muscle.vertices[:, 2] > 38.0) for side in (1, -1)]
-    for mesh in (muscle, ball, *ends):
-        mesh.apply_transform(transform)
-        mesh.apply_scale(scale)
-    scene = Scene("spindle", units="mm" if scale == 1.0 else "m")
+    scene = Scene("spindle", units="mm")
     for name, mesh in zip(("upper", "lower", "ball"), (*ends, ball)):
         scene.add_bone(name, mesh)
-    attach = [{"bone": name, "vertices": v.tolist()} for name, v in zip(("upper", "lower"), held)]
-    scene.add_muscle("spindle", muscle, attach=attach)
+    z = muscle.vertices[:, 2]
+    scene.add_muscle("spindle", muscle, attach=held(upper=z > 38.0, lower=z < -38.0))
     return scene

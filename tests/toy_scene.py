@@ -10,6 +10,27 @@ from rbfmuscle.scene.options import ContactOptions, DetectOptions
 from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
 
 
+class Formula:
+    """A field or a cut from a formula for its values; gradients are central differences."""
+
+    def __init__(self, formula):
+        self.formula = formula
+
+    def __call__(self, points):
+        return self.formula(points)
+
+    def value_and_gradient(self, points):
+        slopes = [(self.formula(points + e) - self.formula(points - e)) / 4e-4 for e in 2e-4 * np.eye(3)]
+        return self.formula(points), np.stack(slopes, axis=1)
+
+    def value_and_gradient_below(self, points, limit):
+        value, gradient = self.formula(points), np.zeros_like(points)
+        rows = np.flatnonzero(value < limit)
+        if len(rows):
+            value[rows], gradient[rows] = self.value_and_gradient(points[rows])
+        return value, gradient
+
+
 class AnalyticBone:
     """The query interface of a bone's distance field, for a formula in bone coordinates."""
 
@@ -87,10 +108,9 @@ def press(target, now, inverse, index, gap, normal):
 
 
 class ToyMuscle:
-    """An ellipsoid of vertices on springs to where the bones' blended motion would take them.
+    """Vertices on springs to t, where the bones' blended motion would take them; attached ones go with their bones.
 
-    Energy (x - t)' K (x - t) / 2 with K a graph Laplacian plus a share of the identity; contacts by
-    projected Gauss-Seidel through the inverse of K. Attached vertices go with their bones.
+    Energy (x - t)' K (x - t) / 2 with K a graph Laplacian plus a share of the identity.
     """
 
     def __init__(self, muscle, scene, *, sweeps=6, reach=None):
@@ -113,16 +133,12 @@ class ToyMuscle:
         for a, b in np.vstack([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]):
             laplacian[a, b] = laplacian[b, a] = -1
         laplacian -= np.diag(laplacian.sum(axis=1))
-        self.free = self.contact_bone < 0
-        weights = np.eye(len(self.names))[self.contact_bone]
-        fixed = ~self.free
-        if fixed.any():
-            inner = laplacian[np.ix_(self.free, self.free)]
-            weights[self.free] = -np.linalg.solve(inner, laplacian[np.ix_(self.free, fixed)] @ weights[fixed])
-        self.weights = weights
+        free, held = np.flatnonzero(self.contact_bone < 0), np.flatnonzero(self.contact_bone >= 0)
+        inner = laplacian[np.ix_(free, free)]
+        self.weights = np.eye(len(self.names))[self.contact_bone]
+        self.weights[free] = -np.linalg.solve(inner, laplacian[np.ix_(free, held)] @ self.weights[held])
         self.inverse = np.zeros((n, n))
-        stiff = laplacian[np.ix_(self.free, self.free)] + 0.05 * np.eye(self.free.sum())
-        self.inverse[np.ix_(self.free, self.free)] = np.linalg.inv(stiff)
+        self.inverse[np.ix_(free, free)] = np.linalg.inv(inner + 0.05 * np.eye(len(free)))
 
     def _blend(self, poses):
         moved = np.stack([self.rest @ poses[n][:3, :3].T + poses[n][:3, 3] for n in self.names], axis=1)
@@ -158,8 +174,7 @@ class ToyMuscle:
         return self.x.copy(), self.faces
 
     def drawing(self, contacts):
-        surface = ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0})
-        return FinishedDrawing(surface)
+        return FinishedDrawing(ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0}))
 
 
 def ellipsoid(half, centre=(0, 0, 0), *, subdivisions=2):
@@ -169,6 +184,11 @@ def ellipsoid(half, centre=(0, 0, 0), *, subdivisions=2):
 
 def attach(mesh, bone, where):
     return Attachment(bone, np.flatnonzero(where(mesh.vertices)))
+
+
+def held(**bones):
+    """Attachments as a scene takes them: a mask of a mesh's vertices for each bone."""
+    return [{"bone": name, "vertices": np.flatnonzero(where).tolist()} for name, where in bones.items()]
 
 
 def bone(name, field):
@@ -189,18 +209,16 @@ def muscle(name, mesh, attachments, **options):
     return Muscle(name, mesh, options=options, attachments=attachments)
 
 
-def scene(bones, joints, muscles, frames, *, initial="keep", sliding=None, tunnelling=None, substep=2.0):
-    """A scene of these parts."""
-    return SceneData(
-        "toy",
-        bones=bones,
-        joints=joints,
-        muscles=muscles,
-        motion=Motion(frames),
-        contact=ContactOptions(initial=initial, substep_angle=substep),
-        sliding=sliding,
-        detect=None if tunnelling is None else DetectOptions(tunnelling=tunnelling),
-    )
+def scene(fields, joints, muscles, frames, *, initial="keep", sliding=None, tunnelling=None):
+    """A scene of these parts, its bones from their fields by name."""
+    parts = {
+        "bones": [bone(name, field) for name, field in fields.items()],
+        "joints": joints,
+        "muscles": muscles,
+    }
+    detect = None if tunnelling is None else DetectOptions(tunnelling=tunnelling)
+    contact = ContactOptions(initial=initial)
+    return SceneData("toy", **parts, motion=Motion(frames), contact=contact, sliding=sliding, detect=detect)
 
 
 def hinged_scene(angles, **options):
@@ -209,14 +227,8 @@ def hinged_scene(angles, **options):
     mesh = ellipsoid((32, 4, 4), (0, 14, 0))
     ends = [attach(mesh, "trunk", lambda v: v[:, 0] < -24), attach(mesh, "arm", lambda v: v[:, 0] > 24)]
     frames = [{"hinge.bend": np.radians(a)} for a in angles]
-    made = scene(
-        [bone(name, field) for name, field in fields.items()],
-        [joint("hinge", "trunk", "arm", (0, 0, 0), bend=(0, 0, -1))],
-        [muscle("strap", mesh, ends)],
-        frames,
-        **options,
-    )
-    return made, fields
+    hinge = joint("hinge", "trunk", "arm", (0, 0, 0), bend=(0, 0, -1))
+    return scene(fields, [hinge], [muscle("strap", mesh, ends)], frames, **options), fields
 
 
 def box_mesh(low, high):
@@ -227,26 +239,20 @@ def box_mesh(low, high):
     return mesh
 
 
-def neighbour_scene(angles, gap=1.0, *, sliding, order=(0, 1), belly=4.0):
-    """Two long muscles side by side, "lower" and "upper": (scene, fields).
+def neighbour_scene(angles, gap=1.0, *, sliding, order=(0, 1)):
+    """Two long muscles side by side, "lower" and "upper", in a scene, and its fields.
 
-    One end of the upper hangs on an arm that presses it into the lower, lifts it off or rolls it along, by angles in
-    degrees: a dict for each frame.
+    An arm presses an end of the upper, lifts it or rolls it, by a dict of angles in degrees for each frame.
     """
     fields = {"trunk": sphere(1.0, (0, 0, -60)), "arm": box((1, 1, 1), (60, 0, -40))}
     muscles = []
     for k, (name, far) in enumerate((("lower", "trunk"), ("upper", "arm"))):
-        mesh = ellipsoid((30, belly, belly), (0, 0, (2 * belly + gap) * k), subdivisions=3)
+        mesh = ellipsoid((30, 4, 4), (0, 0, (8 + gap) * k), subdivisions=3)
         ends = [attach(mesh, "trunk", lambda v: v[:, 0] < -25), attach(mesh, far, lambda v: v[:, 0] > 25)]
         muscles.append(muscle(name, mesh, ends))
-    made = scene(
-        [bone(name, field) for name, field in fields.items()],
-        [joint("hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0), lift=(0, -1, 0), roll=(1, 0, 0))],
-        [muscles[k] for k in order],
-        [{f"hinge.{name}": np.radians(a) for name, a in angle.items()} for angle in angles],
-        sliding=sliding,
-    )
-    return made, fields
+    hinge = joint("hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0), lift=(0, -1, 0), roll=(1, 0, 0))
+    frames = [{f"hinge.{name}": np.radians(a) for name, a in angle.items()} for angle in angles]
+    return scene(fields, [hinge], [muscles[k] for k in order], frames, sliding=sliding), fields
 
 
 def neighbour_parts(made):

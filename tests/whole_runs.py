@@ -1,8 +1,4 @@
-"""Small scenes whose results are kept: no change of behaviour lands unseen.
-
-``make references`` writes ``tests/data/references/*.json`` anew; the difference is part of the change and is reviewed
-with it.
-"""
+"""Small scenes whose results are kept in ``tests/data/references``, which ``make references`` writes anew."""
 
 import json
 import math
@@ -15,6 +11,7 @@ from contraction_scenes import spindle_scene
 from peers.detectors import VoxelDetector
 from peers.serendipity import SerendipityField
 from spindle_scene import CENTRE, build_scene
+from toy_scene import held
 
 import rbfmuscle as rm
 from rbfmuscle.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
@@ -63,28 +60,22 @@ def _substeps(model):
 
 
 def _contraction(model):
-    return spindle_scene(
-        model=model, frames=2, spacing=6.0, activation=[0, 1], tendon={"length": 100.0, "strain": 0.08}
-    )
+    tendon = {"length": 100.0, "strain": 0.08}
+    return spindle_scene(model=model, frames=2, spacing=6.0, activation=[0, 1], tendon=tendon)
 
 
 def _tunnelling(model, **options):
     """A bag held at both ends is swung through a fixed plate of 6 mm, by 40 degrees in one sub-step."""
     bag = trimesh.creation.icosphere(subdivisions=3).apply_scale([25, 25, 120]).apply_translation([201, 0, 1])
     bag.apply_transform(trimesh.transformations.rotation_matrix(math.radians(-21.0), [0.1, 0, 1]))
-    ends = {
-        "upper": np.flatnonzero(bag.vertices[:, 2] > 100),
-        "lower": np.flatnonzero(bag.vertices[:, 2] < -100),
-    }
     scene = rm.Scene("plate", units="mm")
     scene.add_bone("plate", trimesh.creation.box((240, 6, 800)).apply_translation([200, 0, 0]))
     for name, height in (("upper", 0), ("lower", 100)):
         scene.add_bone(name, trimesh.creation.box((20, 20, 20)).apply_translation([600, 0, height]))
     scene.add_joint("hinge", "plate", "upper", (0, 0, 0), {"turn": (0, 0, 1)})
     scene.add_joint("second", "upper", "lower", (0, 0, 0), {"turn": (1, 0, 0)})
-    scene.add_muscle(
-        "bag", bag, model=model, attach=[{"bone": b, "vertices": held.tolist()} for b, held in ends.items()]
-    )
+    z = bag.vertices[:, 2]
+    scene.add_muscle("bag", bag, model=model, attach=held(upper=z > 100, lower=z < -100))
     scene.set_motion(ramp={"hinge.turn": {"to": 40.0, "step": 40.0}})
     scene.contact = ContactOptions(substep_angle=40.0)
     scene.detect = DetectOptions(tunnelling=TunnellingOptions(**options))
@@ -119,11 +110,7 @@ FIELDS = {"contact_pbd_serendipity": SerendipityField, "contact_pbd_voxel": Voxe
 
 
 def measure(name):
-    """What is kept of a run: some carried points, moments of each surface, rows of the metrics, points that tunnelled.
-
-    Lengths stand in shares of the muscle's longest side, areas and volumes in shares of its square and cube, so one
-    tolerance is for all.
-    """
+    """What is kept of a run, in shares of the muscle's longest side, its square and cube: one tolerance is for all."""
     scene, kind = SCENES[name](), FIELDS.get(name)
     fields = {bone.name: kind.from_mesh(bone.mesh) for bone in scene.bones} if kind else None
     run = rm.simulate(scene, fields=fields)
@@ -136,14 +123,10 @@ def measure(name):
             points = (frame.carried[muscle.name][0] - middle) / size
             surface = frame.surfaces[muscle.name]
             shown = trimesh.Trimesh((surface.vertices - middle) / size, surface.faces, process=False)
-            frames.append(
-                {
-                    "points": points[np.linspace(0, len(points) - 1, POINTS).astype(int)].ravel().tolist(),
-                    "area": float(shown.area),
-                    "volume": float(shown.volume),
-                    "moment": (shown.volume * shown.center_mass).tolist(),
-                }
-            )
+            few = points[np.linspace(0, len(points) - 1, POINTS).astype(int)].ravel().tolist()
+            moment = (shown.volume * shown.center_mass).tolist()
+            facts = {"area": float(shown.area), "volume": float(shown.volume), "moment": moment}
+            frames.append({"points": few, **facts})
         metrics = {}
         for name in QUANTITIES:
             values = np.array(run.values(muscle.name, name), dtype=float)

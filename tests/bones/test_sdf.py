@@ -4,10 +4,15 @@ import numba
 import numpy as np
 import pytest
 import trimesh
+from peers.detectors import TreeDetector
+from peers.spline import SplineField
 from scipy.spatial.transform import Rotation
 
+from rbfmuscle.bones.errors import measure_field
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.validation import MeshError
+from rbfmuscle.run import simulate
+from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.validation import MeshError, UsageError
 
 SHAPES = {
     "sphere": lambda: trimesh.creation.icosphere(4, 20.0),
@@ -56,10 +61,9 @@ def test_distances_far_from_the_bone_are_right(shape):
 def test_gradient_is_that_of_the_distance(shape):
     mesh, field = shape
     points = _near(mesh, 1.0, 3000, seed=4)
-    step = 1e-4
-    slope = np.stack(
-        [field.distance(points + step * e) - field.distance(points - step * e) for e in np.eye(3)], axis=1
-    ) / (2 * step)
+    steps = 1e-4 * np.eye(3)
+    change = [field.distance(points + step) - field.distance(points - step) for step in steps]
+    slope = np.stack(change, axis=1) / 2e-4
     gradient = field.gradient(points)
     np.testing.assert_allclose(np.linalg.norm(gradient, axis=1), 1.0, atol=1e-5)  # single precision
     difference = np.linalg.norm(slope - gradient, axis=1)
@@ -139,12 +143,9 @@ def test_smaller_tolerance_gives_smaller_errors():
 
 def test_bad_points_and_poses_are_refused():
     field = BoneSDF.from_mesh(SHAPES["box"](), cache=False)
-    with pytest.raises(ValueError, match="finite"):
-        field.distance([[np.nan, 0.0, 0.0]])
-    with pytest.raises(ValueError, match="shape"):
-        field.distance([0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match="pose"):
-        field.distance([[0.0, 0.0, 0.0]], pose=np.eye(3))
+    for points, pose in (([[np.nan, 0, 0]], None), ([0, 0, 0], None), ([[0, 0, 0]], np.eye(3))):
+        with pytest.raises(ValueError):
+            field.distance(points, pose=pose)
     assert field.distance(np.zeros((0, 3))).shape == (0,)
 
 
@@ -162,3 +163,38 @@ def test_a_moved_turned_or_scaled_bone_has_the_same_field(name, turn, scale):
     # A vertex rounded the other way (1e-8 of the size) moves single-precision records by their last digit.
     np.testing.assert_allclose(moved / scale, distance, rtol=0, atol=1e-7 * np.ptp(mesh.vertices))
     assert np.median(np.abs(turned @ rotation - gradient)) < 1e-6
+
+
+def test_measured_errors_are_those_of_the_field():
+    field = BoneSDF.from_mesh(trimesh.creation.icosphere(3, 20.0), cache=False)
+
+    class Shifted:
+        vertices, faces, closed = field.vertices, field.faces, True
+
+        def distance_and_gradient(self, points):
+            distance, gradient = field.distance_and_gradient(points)
+            return distance + 0.1, -gradient
+
+        def distance(self, points):
+            return field.distance(points) + 0.1
+
+    found = measure_field(Shifted(), count=5000)
+    assert found["error_rms"] == pytest.approx(0.1, rel=0.01)
+    assert found["sign_wrong"] > 0.01 and found["angle_median"] > 179.0
+
+
+@pytest.mark.parametrize("kind", [TreeDetector, SplineField])
+def test_other_fields_of_a_bone_agree(kind):
+    mesh = trimesh.creation.icosphere(4, 20.0)
+    pose = trimesh.transformations.rotation_matrix(0.7, [1.0, 2.0, 3.0], [30.0, -10.0, 5.0])
+    points = trimesh.transform_points(_near(mesh, 3.0, 3000), pose)
+    distance, gradient = kind.from_mesh(mesh).distance_and_gradient(points, pose)
+    wanted, direction = BoneSDF.from_mesh(mesh, cache=False).distance_and_gradient(points, pose)
+    assert np.abs(distance - wanted).max() < 0.05
+    assert np.einsum("ni,ni->n", gradient, direction).min() > 0.95
+
+
+def test_fields_of_a_run_name_each_bone():
+    scene = phantom_scene(model="pbd", end=20.0, step=20.0, spacing=6.0)
+    with pytest.raises(UsageError, match="fields must name each bone"):
+        simulate(scene, fields={"pelvis": BoneSDF.from_mesh(scene.bone("pelvis").mesh)})

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 
@@ -36,67 +35,43 @@ def ends_clean(process, code=130):
 
 
 class TestInterrupts:
-    @pytest.mark.parametrize("moment", ["import", "load", "build", "run"])
-    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-    def test_signal_ends_with_130_wherever_it_comes(self, tmp_path, moment, number):
+    @pytest.mark.parametrize(
+        ("number", "moment", "due", "lost"),
+        [
+            ("SIGINT", "builtins.__import__", "given[0] == 'cyclopts'", ""),
+            ("SIGTERM", "pbd_baseline.muscle._bone_numbers", "True", ""),
+            ("SIGINT", "rbfmuscle.output.writer.write_vtp", "len(calls) == 8", ""),
+            ("SIGTERM", "rbfmuscle.output.writer.write_vtp", "len(calls) == 8", ""),
+            # As ctypes does in a callback.
+            ("SIGINT", "rbfmuscle.output.writer.write_vtp", "len(calls) == 8", "KeyboardInterrupt"),
+        ],
+    )
+    def test_signal_ends_with_130_wherever_it_comes(self, tmp_path, number, moment, due, lost):
         """The process signals itself at a known place, so that no machine is too slow or too quick."""
-        scene = write_scene(tmp_path, end=60)
-        place = {
-            "import": "import cyclopts",
-            "load": "from rbfmuscle.scene.meshes import repair as m; name = 'repair'",
-            "build": "import pbd_baseline.muscle as m; name = '_bone_numbers'",
-            "run": "import rbfmuscle.output.writer as m; name = 'write_vtp'",
-        }[moment]
-        code = (
-            "import os, sys, builtins\n"
-            f"def strike(): os.kill(os.getpid(), {int(number)})\n"
-            "import rbfmuscle.cli as cli, rbfmuscle.interruption as interruption\n"
-        )
-        if moment == "import":
-            code += (
-                "real = builtins.__import__\n"
-                "def load(name, *rest):\n"
-                "    if name == 'cyclopts': builtins.__import__ = real; strike()\n"
-                "    return real(name, *rest)\n"
-                "builtins.__import__ = load\n"
-            )
-        else:
-            code += (
-                f"{place}\ninner, count = getattr(m, name), [0]\n"
-                "def struck(*a, **k):\n"
-                "    count[0] += 1\n"
-                f"    if count[0] == {8 if moment == 'run' else 1}: strike()\n"
-                "    return inner(*a, **k)\n"
-                "setattr(m, name, struck)\n"
-            )
-        out = tmp_path / "out"
-        code += f"sys.argv = ['rbfmuscle', 'run', {str(scene)!r}, '-o', {str(out)!r}]\ncli.main()\n"
-        process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
-        err = ends_clean(process)
+        scene, out = write_scene(tmp_path, end=60), tmp_path / "out"
+        module, _, name = moment.rpartition(".")
+        code = f"""
+import contextlib, os, signal, sys
+import rbfmuscle.cli as cli, {module} as module
+inner, calls = module.{name}, []
+def struck(*given, **named):
+    calls.append(1)
+    if {due}:
+        module.{name} = inner
+        with contextlib.suppress({lost}):
+            os.kill(os.getpid(), signal.{number})
+    return inner(*given, **named)
+module.{name} = struck
+sys.argv = ["rbfmuscle", "run", {str(scene)!r}, "-o", {str(out)!r}]
+cli.main()
+"""
+        err = ends_clean(subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True))
         assert "interrupted" in err
-        if moment == "run":
+        if name == "write_vtp":
             assert "frames are kept in" in err
             kept = SavedRun(out)
             assert kept.info["status"] == "interrupted" and 2 <= len(kept.frames) < 60
             assert export_run(out, ["stl"])
-
-    def test_interrupt_that_is_lost_in_a_callback_is_heeded_at_the_next_frame(self, tmp_path):
-        scene = write_scene(tmp_path, end=60)
-        code = (
-            "import os, signal, sys\nimport rbfmuscle.cli as cli, rbfmuscle.output.writer as m\n"
-            "inner, count = m.write_vtp, [0]\n"
-            "def struck(*a, **k):\n"
-            "    count[0] += 1\n"
-            "    if count[0] == 8:\n"
-            "        try: os.kill(os.getpid(), signal.SIGINT)\n"
-            "        except KeyboardInterrupt: pass  # as ctypes does in a callback\n"
-            "    return inner(*a, **k)\n"
-            "m.write_vtp = struck\n"
-            f"sys.argv = ['rbfmuscle', 'run', {str(scene)!r}, '-o', {str(tmp_path / 'out')!r}]\ncli.main()\n"
-        )
-        process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
-        assert "frames are kept" in ends_clean(process)
-        assert len(SavedRun(tmp_path / "out").frames) < 60
 
     def test_json_is_told_of_an_interrupt(self, tmp_path):
         code = (
@@ -116,9 +91,8 @@ class TestOutputs:
     def test_full_standard_output_is_one_line(self, tmp_path, words):
         scene = write_scene(tmp_path, end=2)
         with open("/dev/full", "w") as full:
-            done = subprocess.run(
-                [*PROGRAM, words[0], str(scene), *words[1:]], stdout=full, stderr=subprocess.PIPE, text=True
-            )
+            command = [*PROGRAM, words[0], str(scene), *words[1:]]
+            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
         # "usable" is the finding; lines that end in seconds tell what goes on, on a slow machine.
         busy = re.compile(r".* s\)|rbfmuscle: compiling loops .*")
         own = [line for line in done.stderr.splitlines() if line != "usable" and not busy.fullmatch(line)]
@@ -127,9 +101,8 @@ class TestOutputs:
 
     def test_closed_standard_output_is_one_line(self, tmp_path):
         scene = write_scene(tmp_path, end=2)
-        done = subprocess.run(
-            ["sh", "-c", '"$@" >&-', "sh", *PROGRAM, "check", str(scene)], stderr=subprocess.PIPE, text=True
-        )
+        words = ["sh", "-c", '"$@" >&-', "sh", *PROGRAM, "check", str(scene)]
+        done = subprocess.run(words, stderr=subprocess.PIPE, text=True)
         assert done.returncode == 2
         assert done.stderr == "rbfmuscle: standard output is closed; send it to a file, or to /dev/null\n"
 
@@ -137,9 +110,8 @@ class TestOutputs:
         scene = write_scene(tmp_path, end=2)
         reader, writer = os.pipe()
         os.close(reader)
-        done = subprocess.run(
-            [*PROGRAM, "check", str(scene), "--json"], stdout=writer, stderr=subprocess.PIPE, text=True
-        )
+        words = [*PROGRAM, "check", str(scene), "--json"]
+        done = subprocess.run(words, stdout=writer, stderr=subprocess.PIPE, text=True)
         os.close(writer)
         assert done.returncode == 0 and "Traceback" not in done.stderr and "Error" not in done.stderr
 
@@ -158,15 +130,13 @@ class TestKilledRuns:
         stream_run(made, tmp_path / "whole", progress=copy)
         return tmp_path / "killed"
 
-    def test_its_frames_are_found_with_their_coordinates(self, killed):
+    def test_its_frames_are_found_exported_and_rendered(self, killed, capsys):
         saved, whole = SavedRun(killed), SavedRun(killed.parent / "whole")
         assert saved.info["status"] == "running"
         assert saved.frames == [0, 1, 2, 3, 4, 5] and len(whole.frames) == 9
         for mine, complete in zip(saved.info["frames"], whole.info["frames"]):
             assert mine["coordinates"] == pytest.approx(complete["coordinates"])
         np.testing.assert_array_equal(saved.surface("biceps", 5)[0], whole.surface("biceps", 5)[0])
-
-    def test_it_is_exported_and_rendered(self, killed, capsys):
         code, _, err = call(capsys, "export", killed, "--format", "stl", "pvd")
         assert code == 0, err
         assert len(list((killed / "export" / "stl").glob("biceps_*.stl"))) == 6
@@ -174,24 +144,13 @@ class TestKilledRuns:
         assert code == 0, err
         assert (killed / "last.png").read_bytes().startswith(b"\x89PNG")
 
-    def test_it_is_scrubbed_in_the_viewer(self, killed):
-        from rbfmuscle.viewer.sources import SavedFigure
-
-        figure = SavedFigure(SavedRun(killed))
-        figure.set("frame", 5)
-        assert figure.advance().text.startswith("frame 5")
-
-    def test_what_was_cut_short_is_left_out(self, killed):
+    def test_what_was_cut_short_is_left_out_and_no_frame_at_all_is_said(self, killed):
         poses = (killed / "poses.csv").read_text(encoding="utf-8")
         (killed / "poses.csv").write_text(poses[: poses.rindex("\n", 0, -1) + 30])  # within the last line
         assert SavedRun(killed).frames == [0, 1, 2, 3, 4]
         (killed / "poses.csv").write_text(poses)
         (killed / "surfaces" / "biceps_0003.vtp").unlink()
         assert 3 not in SavedRun(killed).frames
-
-    def test_one_without_a_frame_says_so(self, killed):
-        (killed / "poses.csv").write_text(
-            (killed / "poses.csv").read_text(encoding="utf-8").splitlines()[0] + "\n"
-        )
+        (killed / "poses.csv").write_text(poses.splitlines()[0] + "\n")
         with pytest.raises(UsageError, match="no surfaces"):
             export_run(killed, ["stl"])

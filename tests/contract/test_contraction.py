@@ -1,9 +1,8 @@
 """Muscles that contract, in both models: closed forms, laws, and finite elements."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from conftest import ROOT
 from contraction_scenes import (
     HEIGHT,
     LEAN,
@@ -25,7 +24,7 @@ from rbfmuscle.scene.activation.keys import ContractionTable
 MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 SETTLED = ("rbf", "arap-volume", "arap-interleaved")
 TENDON = {"length": 100.0, "strain": 0.08}
-DATA = Path(__file__).resolve().parents[1] / "data" / "contraction_spindle.npz"
+DATA = ROOT / "tests" / "data" / "contraction_spindle.npz"
 
 
 def carried(run, frame):

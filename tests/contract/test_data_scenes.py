@@ -9,23 +9,10 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.plan import plan_scene
 
 # Muscles and bones of each scene.
-SCENES = {
-    "hip/adduction": (4, 3),
-    "hip/apriori": (4, 3),
-    "hip/extension": (4, 3),
-    "hip/external_rotation": (4, 3),
-    "hip/flexion": (4, 3),
-    "hip/gluteus": (1, 3),
-    "hip/internal_rotation": (4, 3),
-    "leg/gait": (12, 15),
-    "leg/hip_flexion": (8, 9),
-    "leg/knee_flexion": (6, 10),
-    "leg/leg": (38, 11),
-    "leg/neighbours": (4, 7),
-    "leg/quadriceps": (4, 6),
-    "leg/slender": (4, 6),
-    "leg/squat": (38, 21),
-}
+SCENES = {f"hip/{name}": (4, 3) for name in ("adduction", "apriori", "extension", "flexion")}
+SCENES |= {"hip/external_rotation": (4, 3), "hip/internal_rotation": (4, 3), "hip/gluteus": (1, 3)}
+SCENES |= {"leg/gait": (12, 15), "leg/hip_flexion": (8, 9), "leg/knee_flexion": (6, 10), "leg/leg": (38, 11)}
+SCENES |= {"leg/neighbours": (4, 7), "leg/quadriceps": (4, 6), "leg/slender": (4, 6), "leg/squat": (38, 21)}
 COARSE = {
     "rbf": {"name": "rbf", "centres": 40, "samples": 150, "resolution": 16},
     "pbd": {"name": "pbd", "iterations": 3},
@@ -38,10 +25,8 @@ def data(hip_data, leg_data):
 
 
 def test_table_names_every_scene(data):
-    found = {
-        f"{path.parent.name}/{path.stem}" for name in ("hip", "leg") for path in (data / name).glob("*.toml")
-    }
-    assert found == set(SCENES)
+    files = [*(data / "hip").glob("*.toml"), *(data / "leg").glob("*.toml")]
+    assert {f"{path.parent.name}/{path.stem}" for path in files} == set(SCENES)
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -4,11 +4,10 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from conftest import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
 import gallery  # noqa: E402
@@ -48,9 +47,8 @@ def test_pages_build_without_warnings(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     html = (tmp_path / "html" / "index.html").read_text(encoding="utf-8")
-    assert not re.findall(
-        r'(?:src|href)="https?://(?!www\.sphinx-doc|pradyunsg|github)[^"]*\.(?:js|css)"', html
-    )
+    foreign = r'(?:src|href)="https?://(?!www\.sphinx-doc|pradyunsg|github)[^"]*\.(?:js|css)"'
+    assert not re.findall(foreign, html)
 
 
 def listed(name):

@@ -3,13 +3,12 @@
 import json
 import re
 import sys
-from pathlib import Path
 
 import pytest
+from conftest import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "docs"))
-import figures  # noqa: E402
+import figures
 
 FILES = sorted((ROOT / "docs" / "evidence").glob("*.json"))
 
@@ -32,7 +31,6 @@ def test_file_is_shown_and_names_command_commit_and_machine(path):
 
 def test_scripts_that_pages_name_exist():
     for page in figures.page_files():
-        for script in re.findall(
-            r"\b((?:benchmarks|examples)/\w+(?:/\w+)?\.py)", page.read_text(encoding="utf-8")
-        ):
+        text = page.read_text(encoding="utf-8")
+        for script in re.findall(r"\b((?:benchmarks|examples)/\w+(?:/\w+)?\.py)", text):
             assert (ROOT / script).exists(), f"{page.name}: {script}"

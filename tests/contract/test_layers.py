@@ -3,17 +3,13 @@
 import ast
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
-
-LEAVES = tuple(
-    f"rbfmuscle.{name}"
-    for name in ("cache", "child", "geometry", "interruption", "jit", "progress", "validation")
-)
+NAMES = ("cache", "child", "geometry", "interruption", "jit", "progress", "validation")
+LEAVES = tuple(f"rbfmuscle.{name}" for name in NAMES)
 CORE = (*LEAVES, "rbfmuscle.bones", "rbfmuscle.scene", "rbfmuscle.simulation")
 MEASURED = (*CORE, "rbfmuscle.implicit", "rbfmuscle.metrics", "rbfmuscle.output", "rbfmuscle.experiments")
 ABOVE = (*MEASURED, "rbfmuscle.report", "rbfmuscle.__version__")
@@ -43,18 +39,11 @@ ALLOWED = {
     "rbfmuscle.compare": (*ABOVE, "rbfmuscle.models", "rbfmuscle.run"),
     "rbfmuscle.paths": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models"),
     "rbfmuscle.cli": (
-        *ABOVE,
-        "rbfmuscle.importers",
-        "rbfmuscle.models",
-        "rbfmuscle.run",
-        "rbfmuscle.compare",
-        "rbfmuscle.paths",
-        "rbfmuscle.viewer",
-        "rbfmuscle.cli",
+        *ABOVE, "rbfmuscle.importers", "rbfmuscle.models", "rbfmuscle.run", "rbfmuscle.compare", "rbfmuscle.paths",
+        "rbfmuscle.viewer", "rbfmuscle.cli",
     ),
-}
+}  # fmt: skip
 ALLOWED["rbfmuscle.__main__"] = ("rbfmuscle.cli",)
-NAMES_BOTH = "rbfmuscle.models"
 
 
 def module_name(path, root=ROOT):
@@ -87,7 +76,7 @@ def starts_with(name, prefix):
 
 
 def wrong_arrows(module, source, *, is_package=False):
-    if module in (NAMES_BOTH, "rbfmuscle"):
+    if module in ("rbfmuscle.models", "rbfmuscle"):
         return []
     package = next((package for package in ALLOWED if starts_with(module, package)), None)
     allowed = ALLOWED[package] if package else ()
@@ -100,14 +89,10 @@ def sources(root):
     return sorted([*(root / "rbfmuscle").rglob("*.py"), *(root / "pbd_baseline").rglob("*.py")])
 
 
-def wrong_arrows_of_file(path, root=ROOT):
-    source = path.read_text(encoding="utf-8")
-    return wrong_arrows(module_name(path, root), source, is_package=path.name == "__init__.py")
-
-
 @pytest.mark.parametrize("path", sources(ROOT), ids=lambda path: module_name(path))
 def test_imports_only_what_its_package_may(path):
-    assert wrong_arrows_of_file(path) == []
+    source = path.read_text(encoding="utf-8")
+    assert wrong_arrows(module_name(path), source, is_package=path.name == "__init__.py") == []
 
 
 @pytest.mark.parametrize(
@@ -170,9 +155,7 @@ def test_planted_cycle_is_found(tmp_path, late):
 
 
 def test_import_loads_nothing_heavy():
-    code = (
-        "import sys, rbfmuscle; print([m for m in ('numba', 'pyvista', 'vtk', 'trimesh', 'skimage', 'scipy', "
-        "'pydantic', 'matplotlib') if m in sys.modules])"
-    )
+    heavy = ["numba", "pyvista", "vtk", "trimesh", "skimage", "scipy", "pydantic", "matplotlib"]
+    code = f"import sys, rbfmuscle; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

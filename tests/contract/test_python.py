@@ -38,23 +38,16 @@ def test_names_are_what_a_user_needs_and_types_know_them():
 
 def test_user_script_is_typed_and_runs(tmp_path):
     planted = tmp_path / "planted.py"
-    planted.write_text(
-        "import rbfmuscle as rm\nrun = rm.simulate('phantom')\nrun.mussels\nrm.Scene(units=3)\n"
-    )
+    planted.write_text("import rbfmuscle as rm\nrm.simulate('phantom').mussels\nrm.Scene(units=3)\n")
     words = ["--strict", "--config-file=", "--follow-imports=silent", f"--cache-dir={tmp_path}"]
-    done = subprocess.run(
-        [sys.executable, "-m", "mypy", *words, str(SCRIPT), str(planted)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
+    command = [sys.executable, "-m", "mypy", *words, str(SCRIPT), str(planted)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     found = [line for line in done.stdout.splitlines() if ": error:" in line]
     assert len(found) == 2 and all("planted.py" in line for line in found), done.stdout
     done = subprocess.run([sys.executable, SCRIPT, tmp_path], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert (
-        done.stdout.startswith("2 ['abductor'] True ") and "3 nowhere.toml: no such scene file" in done.stdout
-    )
+    assert done.stdout.startswith("2 ['abductor'] True ")
+    assert "3 nowhere.toml: no such scene file" in done.stdout
 
 
 def test_run_answers_as_a_container(run):
@@ -74,9 +67,8 @@ def test_run_that_is_loaded_is_the_run_that_was_saved(run, loaded, tmp_path):
         assert other.coordinates == pytest.approx(mine.coordinates)
         np.testing.assert_array_equal(other.poses["femur"], mine.poses["femur"])
         assert list(other.surfaces) == ["abductor"]
-    np.testing.assert_allclose(
-        loaded["abductor"].surface().vertices, run["abductor"].surface().vertices, rtol=1e-6
-    )
+    found, wanted = (each["abductor"].surface().vertices for each in (loaded, run))
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
     np.testing.assert_array_equal(loaded.values("abductor", "length"), run.values("abductor", "length"))
     loaded.save(tmp_path / "copy")
     assert len(rm.Run.load(tmp_path / "copy")) == 3
@@ -90,9 +82,8 @@ def test_metrics_as_a_table_where_pandas_is_there(run, monkeypatch):
         run.table()
     fake = types.SimpleNamespace(DataFrame=lambda rows, columns: [dict(zip(columns, row)) for row in rows])
     monkeypatch.setitem(sys.modules, "pandas", fake)
-    assert [row["value"] for row in run.table() if row["quantity"] == "length"] == list(
-        run.values("abductor", "length")
-    )
+    lengths = [row["value"] for row in run.table() if row["quantity"] == "length"]
+    assert lengths == list(run.values("abductor", "length"))
 
 
 def test_plot_shows_every_value(run):
@@ -110,8 +101,3 @@ def test_notebooks_show_a_small_picture(run, loaded):
         html = shown._repr_html_()
         assert html.startswith("<figure><img ") and len(html) < 100_000 and "abductor" in html
     assert "no muscles" in rm.Scene("bare")._repr_html_()
-
-
-def test_setting_without_its_table_is_named_with_it():
-    with pytest.raises(rm.UsageError, match=r"centres: unknown setting, did you mean 'model\.centres'\?"):
-        rm.simulate("phantom", settings={"centres": 300})

@@ -4,15 +4,14 @@ import doctest
 import importlib
 import inspect
 import sys
-from pathlib import Path
 
 import pytest
+from conftest import ROOT
 
 import rbfmuscle
 
-ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "docs"))
-from gallery import TOPICS  # noqa: E402
+from gallery import TOPICS
 
 ERRORS = "Errors and warnings"
 NAMES = [name for topic, names in TOPICS.items() if topic != ERRORS for name in names] + ["RBFMuscleError"]

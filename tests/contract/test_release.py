@@ -4,13 +4,12 @@ import re
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
+from conftest import ROOT
 
 import rbfmuscle
 
-ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 
@@ -34,10 +33,8 @@ def test_typed_marker_templates_and_scripts_travel_with_the_packages():
     data = PROJECT["tool"]["setuptools"]["package-data"]
     for top in ("rbfmuscle", "pbd_baseline"):
         packed = {path for pattern in data[top] for path in (ROOT / top).glob(pattern)}
-        here = {
-            path for path in (ROOT / top).rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")
-        }
-        assert packed == here
+        files = {path for path in (ROOT / top).rglob("*") if path.is_file()}
+        assert packed == {path for path in files if path.suffix not in (".py", ".pyc")}
 
 
 def run(*command, **options):

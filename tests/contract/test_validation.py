@@ -9,7 +9,6 @@ from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene.options import Table
 from rbfmuscle.validation import (
     MeshError,
-    NotFiniteError,
     check_mesh,
     check_points,
     check_positive,
@@ -17,14 +16,13 @@ from rbfmuscle.validation import (
     check_vectors,
     did_you_mean,
     is_file,
-    shown,
-    shown_path,
 )
 
 CODES = {
     "RBFMuscleError": 1, "UsageError": 2, "SceneError": 3, "MeshError": 4, "SolveError": 5, "LimitExceededError": 6,
     "MissingPartError": 7,
 }  # fmt: skip
+NOT_FINITE = [np.insert(np.zeros((4, 3)), 3, value, axis=0) for value in (np.nan, np.inf, -np.inf)]
 TETRAHEDRON = np.vstack([np.zeros(3), np.eye(3)]), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
 
 
@@ -33,22 +31,12 @@ def test_exit_codes_are_those_promised():
     assert {name: kind.exit_code for name, kind in errors.items()} == CODES
 
 
-def test_what_is_shown_is_whole_or_its_beginning_and_end():
-    assert shown("plain") == "plain" and shown(["a", 1]) == "['a', 1]" and shown("x" * 80) == "x" * 80
-    text = "".join(map(chr, range(97, 197)))
-    assert shown(text, longest=50) == f"{text[:35]} ... {text[-10:]}" and len(shown("x" * 81)) == 80
-    assert shown(10**5000) == "a int too long to show"
-    assert shown_path("/" + "p" * 399) == "/" + "p" * 399 and len(shown_path("p" * 401)) == 400
-
-
 def test_what_passes_comes_back_as_contiguous_doubles():
     points = check_points(np.asfortranarray(np.arange(12, dtype=np.int32).reshape(4, 3)))
     assert points.dtype == np.float64 and points.flags.c_contiguous
     np.testing.assert_array_equal(points, np.arange(12).reshape(4, 3))
-    assert check_points(np.zeros((0, 3))).shape == (0, 3) and check_vectors(np.ones((2, 3)), 2).shape == (
-        2,
-        3,
-    )
+    assert check_points(np.zeros((0, 3))).shape == (0, 3)
+    assert check_vectors(np.ones((2, 3)), 2).shape == (2, 3)
     assert check_values([1, 2], 2).tolist() == [1.0, 2.0] and check_positive("0.5", name="x") == 0.5
     vertices, faces = check_mesh(*TETRAHEDRON)
     assert vertices.dtype == np.float64 and faces.dtype == np.int64 and faces.tolist() == TETRAHEDRON[1]
@@ -57,11 +45,9 @@ def test_what_passes_comes_back_as_contiguous_doubles():
 @pytest.mark.parametrize(
     ("check", "words", "wrong"),
     [
-        (
-            check_points,
-            r"must have shape \(n, 3\), got \(",
-            [np.zeros(s) for s in ((3,), (2, 2), (2, 4), (1, 3, 3))],
-        ),
+        (check_points, r"must have shape \(n, 3\)", [np.zeros(s) for s in ((3,), (2, 2), (1, 3, 3))]),
+        (check_points, "points must be finite, row 3 is", NOT_FINITE),
+        (lambda given: check_values(given[:, 1], 5), "values must be finite, row 3 is", NOT_FINITE),
         (lambda given: check_vectors(given, 3), r"one row a point \(3\), got 2", [np.ones((2, 3))]),
         (lambda given: check_values(given, 2), r"must have shape \(2,\)", [[1.0], [[1.0, 2.0]], 1.0]),
         (lambda given: check_values(given, 2), "must be an array of numbers", [["a", "b"]]),
@@ -74,23 +60,12 @@ def test_what_is_of_another_kind_is_refused(check, words, wrong):
             check(given)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_first_row_that_is_not_finite_is_named(value):
-    points = np.zeros((5, 3))
-    points[3, 1] = points[4, 0] = value
-    with pytest.raises(NotFiniteError, match="points must be finite, row 3 is"):
-        check_points(points)
-    with pytest.raises(NotFiniteError, match="values must be finite, row 3 is"):
-        check_values(points[:, 1], 5)
-
-
 @pytest.mark.parametrize(
     ("vertices", "faces", "words"),
     [
         (TETRAHEDRON[0], [[0, 1, 4]], "point outside its 4 vertices"),
         (TETRAHEDRON[0], [[0, 1, -1]], "point outside its 4 vertices"),
         (TETRAHEDRON[0], [[0, 1, 2, 3]], r"faces of rod must have shape \(m, 3\), got \(1, 4\)"),
-        (TETRAHEDRON[0], [0, 1, 2], r"faces of rod must have shape \(m, 3\), got \(3,\)"),
         (TETRAHEDRON[0], [[[0, 1, 2]] * 3], r"faces of rod must have shape \(m, 3\), got \(1, 3, 3\)"),
         (TETRAHEDRON[0], np.zeros((0, 3), int), r"rod is empty \(4 vertices, 0 faces\)"),
         (np.zeros((0, 3)), [[0, 1, 2]], r"rod is empty \(0 vertices, 1 faces\)"),

@@ -1,7 +1,4 @@
-"""Whole runs of small scenes give what they gave: what differs is a change of behaviour, and is reviewed as one.
-
-Where a difference is meant, ``make references`` writes the kept results anew.
-"""
+"""Whole runs of small scenes give what they gave: what differs is a change of behaviour, and is reviewed as one."""
 
 import numpy as np
 import pytest
@@ -29,9 +26,8 @@ def cold_cache(tmp_path_factory):
 def test_run_gives_what_is_kept(name):
     worst = differences(read(name), measure(name), name)
     limit = SETTLED if "rbf" in name else TOLERANCE
-    assert not {kind: told for kind, told in worst.items() if not told[0] <= limit}, (
-        "make references, if meant"
-    )
+    beyond = {kind: told for kind, told in worst.items() if not told[0] <= limit}
+    assert not beyond, "make references, if meant"
 
 
 def test_planted_difference_is_found():

@@ -3,43 +3,37 @@
 import csv
 import json
 import math
+import re
 
 import numpy as np
 import pytest
 from blend_model import BlendMuscle, arm_scene
 
-from rbfmuscle import compare
 from rbfmuscle.compare import compare_models
 from rbfmuscle.experiments.comparison import MEASURES, best_models, describe
 from rbfmuscle.metrics.metrics import surface_distance
-from rbfmuscle.models import model_title
+from rbfmuscle.models import build_model
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.phantom import phantom_scene
-from rbfmuscle.validation import SolveError, UsageError
+from rbfmuscle.validation import UsageError
 
 
-def results(**models):
-    return {name: {"all": values} for name, values in models.items()}
+def test_what_does_not_count_is_a_tie():
+    found = {
+        name: {"all": {"rest_error_rms": error}} for name, error in (("a", 0.0), ("b", 0.01), ("c", 0.5))
+    }
+    assert best_models(found, "rest_error_rms", "mm") == ["a", "b"]
+    assert best_models(found, "rest_error_rms", "m") == ["a"]
 
 
-class TestAnswer:
-    def test_says_what_the_first_keeps_at_which_price_and_who_comes_near(self):
-        found = results(
-            rbf={"penetration_max": 0.0, "bone_penetration_max": 0.031, "time_frame": 0.074},
-            pbd={"penetration_max": 3.17, "time_frame": 0.02, "distance_rms": 31.0},
-            settled={"penetration_max": 3.2, "time_frame": 1.406, "distance_rms": 5.71},
-        )
-        labels = {"rbf": "RBF", "pbd": "PBD, 3 sweeps as in the paper", "settled": "PBD, converged"}
-        text = describe(found, labels, "mm")
-        assert text.startswith("RBF keeps out of bones (0.031 mm) at 3.7 times the time of PBD, 3 sweeps")
-        assert "PBD, converged, comes within 5.7 mm RMS of it at 19 times its time" in text
-        turned = describe({name: found[name] for name in ("pbd", "rbf")}, labels, "mm")
-        assert "stands in bones (3.2 mm) at 0.27 times the time of RBF" in turned
-
-    def test_what_does_not_count_is_a_tie(self):
-        found = results(a={"rest_error_rms": 0.0}, b={"rest_error_rms": 0.01}, c={"rest_error_rms": 0.5})
-        assert best_models(found, "rest_error_rms", "mm") == ["a", "b"]
-        assert best_models(found, "rest_error_rms", "m") == ["a"]
+def test_answer_says_what_the_first_keeps_at_which_price_and_who_comes_near():
+    rbf = {"penetration_max": 0.0, "bone_penetration_max": 0.031, "time_frame": 0.074}
+    pbd = {"penetration_max": 3.17, "time_frame": 0.02, "distance_rms": 31.0}
+    found = {"rbf": {"all": rbf}, "pbd": {"all": pbd}}
+    more = found | {"settled": {"all": pbd | {"time_frame": 1.406, "distance_rms": 5.71}}}
+    labels = {"rbf": "RBF", "pbd": "PBD", "settled": "PBD, converged"}
+    assert re.search(r"bones \(0\.031 mm\) at 3\.7 times .* the two lie 31 mm", describe(found, labels, "mm"))
+    assert re.search(r"converged, comes within 5\.7 mm .* 19 times its time", describe(more, labels, "mm"))
 
 
 @pytest.fixture(scope="module")
@@ -63,47 +57,30 @@ class TestComparison:
                 assert abs(found["all"][quantity]) == max(abs(values).max() for values in each)
             wall = saved.series("all", "time_frame")[1][1:]
             assert found["all"]["time_frame"] == np.median(wall)
-            missing = set(MEASURES) - set(found["all"]) - {"distance_rms", "distance_max", "flicker"}
-            assert not missing
+            assert set(MEASURES) - set(found["all"]) <= {"distance_rms", "distance_max", "flicker"}
+            assert 0 <= found["all"]["return_rms"] < 1.5
         assert SavedRun(folder / "rbf").info["scene"]["muscles"][0]["model"]["centres"] == 100
-
-    def test_laws(self, compared):
-        found = compared[1]["results"]
-        for model in found:
-            assert abs(found[model]["all"]["volume_error"]) < 1e-6
-            assert found[model]["all"]["components"] == 1
-            assert 0 <= found[model]["all"]["return_rms"] < 1.5
-        assert found["pbd"]["all"]["rest_error_rms"] < 1e-9 < found["rbf"]["all"]["rest_error_rms"]
 
     def test_distances_belong_to_the_first(self, compared):
         folder, table = compared
         assert "distance_rms" not in table["results"]["rbf"]["all"]
         pbd = table["results"]["pbd"]
         assert pbd["all"]["distance_rms"] == max(v["distance_rms"] for k, v in pbd.items() if k != "all")
-        runs = [SavedRun(folder / name) for name in ("rbf", "pbd")]
-        there = [
-            surface_distance(*runs[0].surface("extensor", k), *runs[1].surface("extensor", k))
-            for k in (0, 1, 3)
-        ]
-        assert pbd["extensor"]["distance_max"] == max(worst for _, worst in there)
+        one, other = (SavedRun(folder / name) for name in ("rbf", "pbd"))
+        pairs = [(one.surface("extensor", k), other.surface("extensor", k)) for k in (0, 1, 3)]
+        assert pbd["extensor"]["distance_max"] == max(surface_distance(*a, *b)[1] for a, b in pairs)
         assert 0 < pbd["all"]["distance_rms"] <= pbd["all"]["distance_max"]
 
-    def test_tables_agree(self, compared):
+    def test_files_hold_the_table_and_the_page_begins_with_the_answer(self, compared):
         folder, table = compared
-        with open(folder / "comparison.json", encoding="utf-8") as file:
-            assert json.load(file) == json.loads(json.dumps(table))
-        with open(folder / "comparison.csv", encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        for row in rows:
+        kept = json.loads((folder / "comparison.json").read_text(encoding="utf-8"))
+        assert kept == json.loads(json.dumps(table))
+        lines = (folder / "comparison.csv").read_text(encoding="utf-8").splitlines()
+        for row in csv.DictReader(lines):
             assert float(row["value"]) == table["results"][row["model"]][row["muscle"]][row["quantity"]]
-
-    def test_page_begins_with_the_answer_and_holds_every_measure(self, compared):
-        folder, table = compared
         text = (folder / "report.html").read_text(encoding="utf-8")
         assert table["answer"].startswith("RBF keeps out of bones") and table["answer"] in text
-        assert "No pictures: they were switched off." in text and text.index(table["answer"]) < text.index(
-            "<table"
-        )
+        assert text.index(table["answer"]) < text.index("<table")
         assert all(MEASURES[quantity].title in text for quantity in table["results"]["pbd"]["all"])
 
 
@@ -127,30 +104,12 @@ class TestFailure:
         assert not list(tmp_path.iterdir())
 
     def test_a_model_that_fails_leaves_the_others(self, tmp_path, monkeypatch):
-        """The third model of three gives up in its run; it is named, and the others are compared."""
-        from rbfmuscle.models import build_model
-
-        class GivesUp(BlendMuscle):
-            def solve(self, contacts):
-                raise SolveError("planted failure")
-
         def build(muscle, scene):
-            return GivesUp(muscle, scene) if muscle.model == "xpbd" else build_model(muscle, scene)
+            return (BlendMuscle if muscle.model == "xpbd" else build_model)(muscle, scene)
 
+        monkeypatch.setattr(BlendMuscle, "fail_at", 1)
         monkeypatch.setattr("rbfmuscle.models.build_model", build)
         table = compare_models(arm_scene(), tmp_path, ["pbd", "arap-pbd", "xpbd"], pictures=False)
         assert table["models"] == ["pbd", "arap-pbd"] and "planted" in table["failed"]["xpbd"]
         assert "xpbd did not finish" in (tmp_path / "report.html").read_text(encoding="utf-8")
         assert not math.isnan(table["results"]["pbd"]["all"]["volume_error"])
-
-
-def test_labels_say_what_ran():
-    scene = arm_scene()
-    settings = {"pbd:model.iterations": 7}
-    variants = compare._variants(scene, ["rbf", "pbd", "xpbd-converged"], {})
-    assert [model_title(variant.muscles[0]) for variant in variants.values()] == [
-        "RBF", "PBD, 3 sweeps as in the paper", "XPBD, converged"
-    ]  # fmt: skip
-    assert variants["xpbd-converged"].muscles[0].model == "xpbd-converged"
-    many = compare._variants(scene, ["rbf", "pbd"], settings)["pbd"]
-    assert model_title(many.muscles[0]) == "PBD, 7 sweeps"

@@ -18,7 +18,7 @@ from rbfmuscle.cli.study import run_point
 from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep
 from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep
 from rbfmuscle.experiments.sweep_table import mark_front, pareto_front, sweep_rows, write_table
-from rbfmuscle.report.sweep_page import inside_grid, write_page
+from rbfmuscle.report.sweep_page import write_page
 from rbfmuscle.validation import UsageError
 
 GRID = ["model.centres=40,60", "model.resolution=16,24"]
@@ -29,14 +29,12 @@ CLOCKED = ("time_frame", "time_frame_p95", "time_extract", "seconds", "threads",
 
 
 def plan_of(texts=GRID, **options):
-    scenes = {"arm": arm_scene(end=10, step=5)}
-    return scenes, plan_sweep(scenes, parse_grid(texts), frames=FRAMES, **options)
+    return plan_sweep({"arm": arm_scene(end=10, step=5)}, parse_grid(texts), frames=FRAMES, **options)
 
 
 def sweep(folder, texts=GRID, runner=run_point, **options):
-    scenes, points = plan_of(texts)
-    count = run_sweep(runner, scenes, points, folder, frames=FRAMES, **{"jobs": 1, **options})
-    return points, count
+    points, scenes = plan_of(texts), {"arm": arm_scene(end=10, step=5)}
+    return points, run_sweep(runner, scenes, points, folder, frames=FRAMES, **{"jobs": 1, **options})
 
 
 def rows_of(points, folder):
@@ -57,13 +55,14 @@ def finished(tmp_path_factory):
 
 class TestGrid:
     def test_values_are_read_as_toml_or_text(self):
-        grid = parse_grid(
-            ["model.centres=100,200", "contact.substep_angle=0.5,2", "model.kernel=cubic,wendland_c2"]
-        )
-        assert list(grid.values()) == [[100, 200], [0.5, 2], ["cubic", "wendland_c2"]]
+        texts = ["model.centres=100,200", "contact.substep_angle=0.5,2", "model.kernel=cubic,wendland_c2"]
+        assert list(parse_grid(texts).values()) == [[100, 200], [0.5, 2], ["cubic", "wendland_c2"]]
+        for wrong in (["centres"], ["=1,2"], ["a="], ["model.centres=1", "model.centres=2"]):
+            with pytest.raises(UsageError):
+                parse_grid(wrong)
 
     def test_the_model_comes_first_and_all_are_measured_against_one_reference(self):
-        _, points = plan_of(["model.samples=40,60", "model=rbf,pbd"])
+        points = plan_of(["model.samples=40,60", "model=rbf,pbd"])
         (reference,) = [p for p in points if p.role == "reference"]
         assert reference.settings == {"model.samples": 60} and len(points) == 6
         assert all(next(iter(p.settings)) == "model" for p in points[2:])
@@ -71,23 +70,14 @@ class TestGrid:
 
     def test_reference_is_the_finest_of_the_grid(self):
         texts = ["model.centres=80,40", "contact.substep_angle=2,1", "model.kernel=cubic,quintic"]
-        assert plan_of(texts)[1][0].settings == {"model.centres": 80, "contact.substep_angle": 1}
-        given = plan_of(texts, reference={"model.centres": 200})[1][0]
+        assert plan_of(texts)[0].settings == {"model.centres": 80, "contact.substep_angle": 1}
+        given = plan_of(texts, reference={"model.centres": 200})[0]
         assert given.role == "reference" and given.settings["model.centres"] == 200
 
     def test_scenes_without_a_grid_are_a_point_each(self):
-        scenes = {"a": arm_scene(end=10), "b": arm_scene(end=20)}
-        points = plan_sweep(scenes, {})
-        assert [(p.scene, p.role, p.reference) for p in points] == [
-            ("a", "default", ""),
-            ("b", "default", ""),
-        ]
-        assert points[0].key != points[1].key
-
-    @pytest.mark.parametrize("texts", [["centres"], ["=1,2"], ["a="], ["model.centres=1", "model.centres=2"]])
-    def test_wrong_grid(self, texts):
-        with pytest.raises(UsageError):
-            parse_grid(texts)
+        one, other = plan_sweep({"a": arm_scene(end=10), "b": arm_scene(end=20)}, {})
+        assert (one.scene, one.role, one.reference) == ("a", "default", "") and other.scene == "b"
+        assert one.key != other.key
 
 
 def row(error, time, role=""):
@@ -100,8 +90,7 @@ def row(error, time, role=""):
 
 class TestFront:
     def test_known_front(self):
-        errors, times = [5, 3, 4, 1, 1, np.nan], [1, 2, 3, 4, 5, 0.1]
-        assert pareto_front(errors, times) == [0, 1, 3]
+        assert pareto_front([5, 3, 4, 1, 1, np.nan], [1, 2, 3, 4, 5, 0.1]) == [0, 1, 3]
 
     @pytest.mark.parametrize(
         ("error", "time", "factor", "near"),
@@ -118,7 +107,11 @@ class TestFront:
 class TestRun:
     def test_error_falls_with_refinement_and_the_reference_has_none(self, finished):
         points, folder = finished
-        rows = {r["label"]: r for r in write_table(points, folder, {"arm": "mm"})["rows"]}
+        table = write_table(points, folder, {"arm": "mm"})
+        write_page(table, folder)
+        page = (folder / "sweep.html").read_text(encoding="utf-8")
+        assert "<svg" in page and "http" not in page and "the default lies" in page
+        rows = {r["label"]: r for r in table["rows"]}
         assert all(r["status"] == "done" for r in rows.values())
         coarse, fine = (rows[f"model.centres=40 model.resolution={n}"] for n in (16, 24))
         assert 0 < fine["error_rms"] < coarse["error_rms"] < 1
@@ -141,12 +134,6 @@ class TestRun:
         failed = [r for r in rows if r["status"] == "failed"]
         assert {r["settings"]["model.centres"] for r in failed} == {-3} and all(r["error"] for r in failed)
         assert sweep(tmp_path, ["model.centres=40,-3", "model.resolution=16,24"])[1] == len(failed)
-
-    def test_page_stands_alone(self, finished):
-        points, folder = finished
-        write_page(write_table(points, folder, {"arm": "mm"}), folder)
-        page = (folder / "sweep.html").read_text(encoding="utf-8")
-        assert "<svg" in page and "http" not in page and "the default lies" in page
 
 
 def crash_or_run(scene, settings, frames):
@@ -178,9 +165,8 @@ def cluster(tmp_path):
     while not file.exists() and time.monotonic() < deadline:
         time.sleep(0.1)
     words = [*python, "distributed.cli.dask_worker", *home, "--nthreads", "1", "--no-nanny"]
-    started += [
-        subprocess.Popen([*words, "--local-directory", str(tmp_path / str(k))], **quiet) for k in (0, 1)
-    ]
+    for place in (tmp_path / "one", tmp_path / "two"):
+        started.append(subprocess.Popen([*words, "--local-directory", str(place)], **quiet))
     try:
         yield json.loads(file.read_text(encoding="utf-8"))["address"], started[1:]
     finally:
@@ -210,42 +196,27 @@ def test_no_scheduler_is_said(tmp_path, monkeypatch):
 
 
 class TestCommand:
-    @pytest.fixture
-    def scene_file(self, tmp_path):
-        return arm_files(tmp_path)
-
-    def test_several_scenes_and_a_grid(self, scene_file, tmp_path, monkeypatch, capsys):
-        use_blend_model(monkeypatch)
-        other = scene_file.with_name("other.toml")
-        other.write_text(scene_file.read_text(encoding="utf-8"))
-        words = ["sweep", str(scene_file), str(other), "-o", str(tmp_path / "out"), "--jobs", "1"]
-        assert command([*words, "--grid", "contact.substep_angle=1,2"]) == 0
-        table = json.loads((tmp_path / "out" / "sweep.json").read_text(encoding="utf-8"))
-        assert {r["scene"] for r in table["rows"]} == {scene_file.stem, "other"}
-        assert table["done"] == len(table["rows"])
-
-    def test_failed_points_end_with_five_and_are_run_again(self, scene_file, tmp_path, monkeypatch, capsys):
-        base = ["sweep", str(scene_file), "-o", str(tmp_path / "out"), "--jobs", "1"]
+    def test_failed_points_end_with_five_and_are_run_again(self, tmp_path, monkeypatch, capsys):
+        scenes = [str(arm_files(tmp_path, name)) for name in ("arm.toml", "other.toml")]
+        base = ["sweep", *scenes, "-o", str(tmp_path / "out"), "--jobs", "1"]
         base += ["--grid", "contact.substep_angle=1,2"]
         use_blend_model(monkeypatch, fail_at=6)  # half steps need more solves than whole ones
         assert command(base) == 5
         assert "planted failure" in capsys.readouterr().err
         use_blend_model(monkeypatch)
         assert command(base) == 0
+        table = json.loads((tmp_path / "out" / "sweep.json").read_text(encoding="utf-8"))
+        assert {r["scene"] for r in table["rows"]} == {"arm", "other"}
+        assert table["done"] == len(table["rows"])
 
     @pytest.mark.parametrize(
         "words", ["", "--error rms", "--jobs 0", "--grid contact.substep_angel=1,2", "--frames a:b"]
     )
-    def test_wrong_usage(self, scene_file, tmp_path, words):
+    def test_wrong_usage(self, tmp_path, words):
         grid = ["--grid", "model.iterations=1,2"] if words else []
-        assert command(["sweep", str(scene_file), "-o", str(tmp_path / "out"), *grid, *words.split()]) == 2
+        out = ["-o", str(tmp_path / "out")]
+        assert command(["sweep", str(arm_files(tmp_path)), *out, *grid, *words.split()]) == 2
         assert not (tmp_path / "out").exists()
-
-
-def test_reference_within_its_own_grid_is_noticed():
-    points = [{"role": role, "settings": {"a": a}} for role, a in (("", 1), ("default", 2), ("reference", 2))]
-    assert inside_grid(points)
-    assert not inside_grid([*points[:2], {"role": "reference", "settings": {"a": 3}}])
 
 
 def test_rows_are_those_of_their_points_in_order():

@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import igl
 import numpy as np
 
 CLEAN_CODES = (2, 3, 4, 5, 6, 7)
@@ -39,44 +40,40 @@ class WrongResult(Exception):
 
 
 def run_case(action: Callable[[], int], folder: Path) -> tuple[str, str, float]:
-    """Run one case in a forked process; its outcome, what it said, and the processor time it took [s].
-
-    The action prints what a user would see and returns an exit code; the folder is made for the case and removed after.
-    """
+    """Run one case in a forked process; its outcome, what it said, and the processor time it took [s]."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     said = folder / "said.txt"
     pid = os.fork()
     if pid == 0:
-        _be_case(action, folder, said)
+        _limit(said, folder.parent)
+        code = 1
+        try:
+            code = action()
+        except WrongResult as error:
+            print(f"wrong: {error}", file=sys.stderr)
+            code = WRONG_CODE
+        except BaseException:  # noqa: BLE001 - what reaches this is what is looked for
+            traceback.print_exc()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     _, status, usage = os.wait4(pid, 0)
     text = said.read_text(errors="replace") if said.exists() else ""
     shutil.rmtree(folder, ignore_errors=True)
     return _judge(status, usage, text), text, usage.ru_utime + usage.ru_stime
 
 
-def _be_case(action, folder, said):
-    """What the forked process does; it never returns."""
+def _limit(said, folder):
+    """Bound the time of this process, and catch what it prints, compiled libraries included."""
     resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(HANG)
-    # Also what compiled libraries print is caught.
     target = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(target, 1)
     os.dup2(target, 2)
-    os.chdir(folder.parent)
-    code = 1
-    try:
-        code = action()
-    except WrongResult as error:
-        print(f"wrong: {error}", file=sys.stderr)
-        code = WRONG_CODE
-    except BaseException:  # noqa: BLE001 - what reaches this is what is looked for
-        traceback.print_exc()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
+    os.chdir(folder)
 
 
 def _judge(status, usage, text):
@@ -113,20 +110,14 @@ def show_warnings() -> None:
     )
 
 
-def check_meshes(scene) -> None:
-    """Raise WrongResult for a muscle whose volume is not what is inside its surface."""
-    for muscle in scene.muscles:
-        check_volume(np.asarray(muscle.mesh.vertices), np.asarray(muscle.mesh.faces), muscle.name)
-    for bone in scene.bones:
-        if not np.isfinite(bone.mesh.vertices).all():
-            raise WrongResult(f"bone {bone.name} is not finite")
+def check_finite(values, name: str) -> None:
+    """Raise WrongResult unless there are values, all finite."""
+    if not (len(values) and np.isfinite(values).all()):
+        raise WrongResult(f"{name} is empty or not finite")
 
 
 def check_volume(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
-    """Raise WrongResult unless the divergence theorem agrees with places tried at random.
-
-    A place is inside where the solid angles of all triangles add up to a whole turn, summed here literally.
-    """
+    """Raise WrongResult unless the divergence theorem agrees with winding numbers of places tried at random."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     volume = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -134,20 +125,8 @@ def check_volume(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
     if not (math.isfinite(volume) and 0 < volume <= box * (1 + 1e-9)):
         raise WrongResult(f"{name}: volume {volume} in a box of {box}")
     places = low + (high - low) * np.random.default_rng(0).random((600, 3))
-    share = float((_winding(places, a, b, c) > 0.5).mean())
+    share = float((igl.winding_number(vertices, faces, places) > 0.5).mean())
     # Four deviations of a share found from 600 places, and a tenth for surfaces that cross themselves a little.
     allowed = 0.1 * volume / box + 4 * math.sqrt(max(share * (1 - share), 1e-3) / 600)
     if abs(share - volume / box) > allowed:
         raise WrongResult(f"{name}: volume {volume:.4g}, but {share * box:.4g} inside the surface")
-
-
-def _winding(places, a, b, c):
-    """Solid angle of all triangles over a full turn (Van Oosterom & Strackee 1983)."""
-    total = np.zeros(len(places))
-    for p, q, r in zip(a, b, c):
-        u, v, w = p - places, q - places, r - places
-        lu, lv, lw = (np.linalg.norm(x, axis=1) for x in (u, v, w))
-        top = np.einsum("ij,ij->i", u, np.cross(v, w))
-        dots = [np.einsum("ij,ij->i", x, y) for x, y in ((u, v), (v, w), (w, u))]
-        total += 2 * np.arctan2(top, lu * lv * lw + dots[0] * lw + dots[1] * lu + dots[2] * lv)
-    return total / (4 * np.pi)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from fuzz.base import FORMS, base_scene, suffix_of
+from fuzz.meshes import FORMS, base_scene, pick, suffix_of
 
 
 class Raw(str):
@@ -31,10 +31,7 @@ KEYS = (
 
 
 def scene_text(rng: np.random.Generator, *, deep: bool = False) -> str:
-    """A damaged scene file: one to three changes of the tables, now and then one of the text.
-
-    ``deep`` asks for changes that many scenes survive, so that what comes after reading is met too.
-    """
+    """A damaged scene file; ``deep`` asks for changes that many scenes survive, so that what follows is met too."""
     scene = base_scene()
     changes = [_motion, _joint, _attach, _model, _tables]
     if not deep:
@@ -43,11 +40,6 @@ def scene_text(rng: np.random.Generator, *, deep: bool = False) -> str:
         pick(rng, changes)(scene, rng)
     text = to_toml(scene)
     return _change_text(text, rng) if not deep and rng.random() < 0.15 else text
-
-
-def pick(rng, options):
-    """One of the options, as it is."""
-    return options[int(rng.integers(len(options)))]
 
 
 def _places(part, path=()):
@@ -83,42 +75,43 @@ def _motion(scene, rng):
     name = pick(rng, ["hip.flexion", "flexion", "hip.turn", "turn", "knee.flexion"])
     step = abs(_number(rng)) if rng.random() < 0.7 else 3.0
     count = int(rng.choice([1, 2, 5, 2000]))
-    scene["motion"] = pick(
-        rng,
-        (
-            {"ramp": {name: {"from": _number(rng), "to": _number(rng), "step": step}}},
-            {"ramp": {name: {"to": 10.0 ** rng.uniform(0, 9), "step": 10.0 ** rng.uniform(0, 8)}}},
-            {"waypoints": [{name: float(rng.normal(0, 60))} for _ in range(count)], "step": step},
-            {"waypoints": [{name: _number(rng)}, {"turn": _number(rng)}], "step": step},
-            {"file": pick(rng, ["flex.mot", "none.mot", "upper.ply", ".", "/dev/zero", "upper.txt"])},
-            pick(rng, HOSTILE),
-        ),
+    motions = (
+        {"ramp": {name: {"from": _number(rng), "to": _number(rng), "step": step}}},
+        {"ramp": {name: {"to": 10.0 ** rng.uniform(0, 9), "step": 10.0 ** rng.uniform(0, 8)}}},
+        {"waypoints": [{name: float(rng.normal(0, 60))} for _ in range(count)], "step": step},
+        {"waypoints": [{name: _number(rng)}, {"turn": _number(rng)}], "step": step},
+        {"file": pick(rng, ["flex.mot", "none.mot", "upper.ply", ".", "/dev/zero", "upper.txt"])},
+        pick(rng, HOSTILE),
     )
+    scene["motion"] = pick(rng, motions)
+
+
+def _rows(scene, kind):
+    rows = scene.get(kind)
+    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+
+def _update(scene, rng, kind, changes):
+    """Change one of the rows of a kind, where there are any."""
+    rows = _rows(scene, kind)
+    if rows:
+        pick(rng, rows).update(pick(rng, changes))
 
 
 def _joint(scene, rng):
-    joint = pick(rng, scene["joint"]) if scene.get("joint") and isinstance(scene["joint"], list) else None
-    if not isinstance(joint, dict):
-        return
     axis = [_number(rng) for _ in range(3)]
     changes = (
         {"centre": axis},
         {"axes": {"flexion": axis}},
         {"child": pick(rng, ["upper", "lower", "muscle", ""]), "parent": pick(rng, ["upper", "lower"])},
         {"type": pick(rng, ["hinge", "slider", "free", "fixed", "custom", "ball", "bal", 3])},
-        None,
     )
-    change = pick(rng, changes)
-    if change is None:
-        scene["joint"] = scene["joint"] * 2
-    else:
-        joint.update(change)
+    _update(scene, rng, "joint", changes)
+    if rng.random() < 0.2:
+        scene["joint"] = _rows(scene, "joint") * 2
 
 
 def _attach(scene, rng):
-    muscle = _first_muscle(scene)
-    if muscle is None:
-        return
     number = pick(rng, [0, 5, -1, 161, 162, 10**9, 10**19, 2**62])
     places = (
         {"vertices": [number, 1, 2]},
@@ -129,8 +122,7 @@ def _attach(scene, rng):
         {},
     )
     entry = {"bone": pick(rng, ["upper", "lower", "lowr", ""]), **pick(rng, places)}
-    if isinstance(muscle.get("attach"), list) and muscle["attach"]:
-        muscle["attach"][int(rng.integers(len(muscle["attach"])))] = entry
+    _update(scene, rng, "muscle", [{"attach": [entry, {"bone": "lower", "vertices": "lower.txt"}]}])
 
 
 OPTIONS = (
@@ -146,15 +138,13 @@ MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 
 
 def _model(scene, rng):
-    muscle = _first_muscle(scene)
-    if muscle is None:
-        return
     model = {"name": pick(rng, MODELS)}
     if model["name"] == "rbf":
         model |= {"centres": 60, "samples": 200, "resolution": 16, "iterations": 4}
     for _ in range(rng.integers(0, 3)):
         model[pick(rng, OPTIONS)] = pick(rng, SETTINGS)
-    muscle["model"] = pick(rng, [*HOSTILE[:10], "pbd", "xpbd"]) if rng.random() < 0.15 else model
+    other = pick(rng, [*HOSTILE[:10], "pbd", "xpbd"])
+    _update(scene, rng, "muscle", [{"model": other if rng.random() < 0.15 else model}])
 
 
 TABLES = (
@@ -175,30 +165,14 @@ def _tables(scene, rng):
 
 
 def _meshes(scene, rng):
-    items = [row for kind in ("bone", "muscle") for row in _rows(scene, kind)]
-    if not items:
-        return
-    item, kind = pick(rng, items), rng.integers(4)
-    if kind == 0:
-        form = pick(rng, FORMS)
-        item["mesh"] = f"muscle-{form}{suffix_of(form)}"
-    elif kind == 1:
-        item["mesh"] = pick(
-            rng, ["upper.ply", "lower.ply", "none.ply", ".", "fibres.json", "upper.txt", "/dev/zero"]
-        )
-    elif kind == 2:
-        item["scale"] = _number(rng)
-    else:
-        item["fibres"] = pick(rng, ["fibres.json", "none.json", "upper.ply", "flex.mot", ".", 3])
-
-
-def _rows(scene, kind):
-    rows = scene.get(kind)
-    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
-
-
-def _first_muscle(scene):
-    return next(iter(_rows(scene, "muscle")), None)
+    form, files = pick(rng, FORMS), ["upper.ply", "none.ply", ".", "fibres.json", "upper.txt", "/dev/zero"]
+    changes = (
+        {"mesh": f"muscle-{form}{suffix_of(form)}"},
+        {"mesh": pick(rng, files)},
+        {"scale": _number(rng)},
+        {"fibres": pick(rng, ["fibres.json", "none.json", "upper.ply", "flex.mot", ".", 3])},
+    )
+    _update(scene, rng, pick(rng, ["bone", "muscle"]), changes)
 
 
 def _change_text(text, rng):
@@ -217,14 +191,12 @@ def to_toml(scene: dict[str, Any]) -> str:
     """Tables as TOML: one level of headings, all else inline."""
     first, lines = [], []
     for name, table in scene.items():
-        rows = (
-            table if isinstance(table, list) and table and all(isinstance(r, dict) for r in table) else None
-        )
-        if rows is None and not isinstance(table, dict):
+        rows = [table] if isinstance(table, dict) else table
+        if not (isinstance(rows, list) and rows and all(isinstance(row, dict) for row in rows)):
             first.append(f"{_key(name)} = {_value(table)}")
             continue
-        for row in [table] if rows is None else rows:
-            lines.append(f"[{_key(name)}]" if rows is None else f"[[{_key(name)}]]")
+        for row in rows:
+            lines.append(f"[{_key(name)}]" if rows is not table else f"[[{_key(name)}]]")
             lines += [f"{_key(key)} = {_value(value)}" for key, value in row.items()]
     return "\n".join(first + lines) + "\n"
 

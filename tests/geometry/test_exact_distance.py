@@ -7,62 +7,35 @@ import trimesh
 
 from rbfmuscle.geometry.exact_distance import ExactDistance, faces_across
 
-
-def tree(mesh):
-    return ExactDistance(mesh.vertices, mesh.faces)
-
-
-PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-
-
-def _shapes():
-    rough = trimesh.creation.icosphere(2, 10.0)
-    rng = np.random.default_rng(3)
-    rough.vertices *= rng.uniform(0.8, 1.2, (len(rough.vertices), 1))
-    return {
-        "sphere": trimesh.creation.icosphere(3, 10.0),
-        "box": trimesh.creation.box((20.0, 30.0, 40.0)),
-        "torus": trimesh.creation.torus(20.0, 5.0),
-        "thin plate": trimesh.creation.box((40.0, 30.0, 0.5)),
-        "rough": rough,
-    }
+ROUGH = trimesh.creation.icosphere(2, 10.0)
+ROUGH.vertices *= np.random.default_rng(3).uniform(0.8, 1.2, (len(ROUGH.vertices), 1))
+SHAPES = {
+    "sphere": trimesh.creation.icosphere(3, 10.0),
+    "box": trimesh.creation.box((20.0, 30.0, 40.0)),
+    "torus": trimesh.creation.torus(20.0, 5.0),
+    "thin plate": trimesh.creation.box((40.0, 30.0, 0.5)),
+    "rough": ROUGH,
+}
 
 
-@pytest.fixture(params=_shapes().items(), ids=lambda item: item[0])
-def shape(request):
-    return request.param[1]
-
-
-def _points(mesh, count=3000, seed=0):
-    rng = np.random.default_rng(seed)
-    near = mesh.vertices[rng.integers(len(mesh.vertices), size=count)] + rng.normal(0.0, 2.0, (count, 3))
-    low, high = mesh.bounds
-    return np.concatenate([near, rng.uniform(low - 20.0, high + 20.0, (count, 3))])
-
-
-def _judge(points, mesh):
-    vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
-    distance, _, closest, _ = igl.signed_distance(points, vertices, faces, PSEUDONORMAL)[:4]
-    return distance, closest
-
-
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_distances_and_nearest_points_are_those_of_libigl(shape):
-    points = _points(shape)
-    expected, _ = _judge(points, shape)
-    distance, closest, face, _ = tree(shape).nearest(points)
+    rng = np.random.default_rng(0)
+    near = shape.vertices[rng.integers(len(shape.vertices), size=3000)] + rng.normal(0.0, 2.0, (3000, 3))
+    low, high = shape.bounds
+    points = np.concatenate([near, rng.uniform(low - 20.0, high + 20.0, (3000, 3))])
+    vertices, faces = np.array(shape.vertices), np.array(shape.faces)
+    expected = igl.signed_distance(points, vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)[0]
+    exact = ExactDistance(shape.vertices, shape.faces)
+    distance, closest, face, _ = exact.nearest(points)
     np.testing.assert_allclose(distance, expected, atol=1e-11)
     np.testing.assert_allclose(np.linalg.norm(points - closest, axis=1), np.abs(expected), atol=1e-11)
     on_face = trimesh.triangles.closest_point(shape.triangles[face], points)
     np.testing.assert_allclose(closest, on_face, atol=1e-9)
-
-
-def test_beyond_reach_the_reach_is_returned_and_nearer_distances_are_exact(shape):
-    points = _points(shape)
-    exact = tree(shape)
-    whole, near = exact.signed_distance(points), exact.signed_distance(points, reach=3.0)
-    within = np.abs(whole) < 3.0
+    # Beyond reach the reach is returned.
+    near, within = exact.signed_distance(points, reach=3.0), np.abs(distance) < 3.0
     assert 0 < within.sum() < len(points)
-    np.testing.assert_allclose(near[within], whole[within], atol=1e-12)
+    np.testing.assert_allclose(near[within], distance[within], atol=1e-12)
     assert np.all(near[~within] == 3.0)
 
 

@@ -1,11 +1,13 @@
-"""Area vectors, normals, edges and areas of triangle meshes: known answers, and laws under motion."""
+"""Points, normals, edges, areas and crossings of triangle meshes: known answers, and laws under motion."""
 
+import igl
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.crossing import FaceTree
+from rbfmuscle.geometry.rest_frame import BoneFrame, RestFrame
 from rbfmuscle.geometry.surfaces import (
     barycentric_weights,
     edge_lengths,
@@ -15,6 +17,7 @@ from rbfmuscle.geometry.surfaces import (
     vertex_areas,
     vertex_normals,
 )
+from rbfmuscle.geometry.triangles import nearest_weights
 
 BOX = trimesh.creation.box((2.0, 3.0, 4.0)).subdivide()
 VERTICES, FACES = np.array(BOX.vertices), np.array(BOX.faces)
@@ -33,15 +36,10 @@ def test_area_vectors_are_the_sides_of_a_box_and_sum_to_nothing():
 def test_everything_turns_and_scales_with_the_mesh():
     turn, scale, shift = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix(), 2.5, np.array([50.0, -20.0, 7.0])
     moved = scale * VERTICES @ turn.T + shift
-    np.testing.assert_allclose(
-        face_normals(moved, FACES), scale**2 * face_normals(VERTICES, FACES) @ turn.T, atol=1e-11
-    )
-    np.testing.assert_allclose(
-        vertex_normals(moved, FACES), vertex_normals(VERTICES, FACES) @ turn.T, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        vertex_areas(moved, FACES), scale**2 * vertex_areas(VERTICES, FACES), rtol=1e-10
-    )
+    area, normals, share = (call(VERTICES, FACES) for call in (face_normals, vertex_normals, vertex_areas))
+    np.testing.assert_allclose(face_normals(moved, FACES), scale**2 * area @ turn.T, atol=1e-11)
+    np.testing.assert_allclose(vertex_normals(moved, FACES), normals @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(vertex_areas(moved, FACES), scale**2 * share, rtol=1e-10)
     edges = unique_edges(FACES)
     np.testing.assert_allclose(edge_lengths(moved, edges), scale * edge_lengths(VERTICES, edges), rtol=1e-11)
     assert mesh_volume(moved, FACES) == pytest.approx(scale**3 * 24.0)
@@ -49,11 +47,10 @@ def test_everything_turns_and_scales_with_the_mesh():
 
 
 def test_areas_of_vertices_are_those_of_the_faces():
-    areas = vertex_areas(VERTICES, FACES)
+    areas, slow = vertex_areas(VERTICES, FACES), np.zeros(len(VERTICES))
     assert areas.sum() == pytest.approx(52.0)
-    slow = [
-        sum(BOX.area_faces[f] / 3.0 for f in range(len(FACES)) if v in FACES[f]) for v in range(len(VERTICES))
-    ]
+    for area, face in zip(BOX.area_faces, FACES):
+        slow[face] += area / 3.0
     np.testing.assert_allclose(areas, slow)
 
 
@@ -62,9 +59,8 @@ def test_weights_give_the_point_back_inside_and_the_nearest_side_weighs_nothing_
     rng = np.random.default_rng(0)
     weights = rng.dirichlet(np.ones(3), size=20)
     points = weights @ corners[0]
-    np.testing.assert_allclose(
-        barycentric_weights(points, np.repeat(corners, 20, axis=0)), weights, atol=1e-12
-    )
+    found = barycentric_weights(points, np.repeat(corners, 20, axis=0))
+    np.testing.assert_allclose(found, weights, atol=1e-12)
     beyond = corners[0].mean(axis=0) + 3.0 * (corners[0, 1] + corners[0, 2] - 2.0 * corners[0, 0])
     found = barycentric_weights(beyond[None], corners)[0]
     assert found[0] == 0.0 and found.sum() == pytest.approx(1.0)
@@ -85,3 +81,43 @@ def test_rest_frame_turns_with_its_points_whichever_of_them_comes_first(seed):
     moved = RestFrame(1e3 * points @ turn.T + [5.0, -6.0, 7.0])
     np.testing.assert_allclose(moved.local, frame.local, atol=2e-8)
     assert moved.size == pytest.approx(1e3 * frame.size)
+
+
+@pytest.mark.parametrize("scale", [1.0, 40.0])
+def test_local_units_are_the_same_wherever_a_bone_is_and_however_large(scale):
+    turn = Rotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix()
+    vertices = scale * (np.array(trimesh.creation.box((5.0, 2.0, 1.0)).vertices) @ turn.T + [3.0, 1.0, -2.0])
+    frame, pose = BoneFrame(vertices), np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.2, 0.9, -0.3]).as_matrix(), [10.0, -4.0, 7.0]
+    placed = frame.placed(pose)
+    world = vertices @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose((world - placed[:3, 3]) @ placed[:3, :3], frame.local, atol=1e-7)
+    low, high = frame.box(np.array([vertices.min(axis=0), vertices.max(axis=0)]))
+    assert (frame.local >= low - 1e-7).all() and (frame.local <= high + 1e-7).all()
+    # Along its principal axes the slab fills its own box.
+    sides = np.sort(np.ptp(frame.local, axis=0)) * frame.size
+    np.testing.assert_allclose(sides, scale * np.array([1.0, 2.0, 5.0]), rtol=1e-5)
+
+
+def test_nearest_point_of_a_triangle_is_a_mean_of_its_corners_in_every_region():
+    rng = np.random.default_rng(3)
+    seen = set()
+    for a, b, c, p in rng.normal(size=(4000, 4, 3)) * np.array([1.0, 1.0, 1.0, 2.0])[:, None]:
+        weights = np.full(3, np.nan)
+        nearest_weights(p, a, b, c, weights)
+        assert weights.min() >= 0.0 and weights.sum() == pytest.approx(1.0)
+        squared = igl.point_mesh_squared_distance(p[None], np.array([a, b, c]), np.array([[0, 1, 2]]))[0]
+        assert ((weights @ [a, b, c] - p) ** 2).sum() == pytest.approx(float(np.ravel(squared)[0]), rel=1e-9)
+        seen.add(tuple(weights > 0.0))
+    assert len(seen) == 7, "three corners, three edges, the inside"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_crossings_turn_with_the_surface(seed):
+    one, two = trimesh.creation.icosphere(2), trimesh.creation.icosphere(2, radius=0.8)
+    vertices = np.vstack([one.vertices, two.vertices + [0.9, 0.2, 0.1]])
+    faces = np.vstack([one.faces, two.faces + len(one.vertices)])
+    found = FaceTree(vertices, faces).crossing(vertices)
+    assert found.sum() > 10
+    turned = Rotation.random(random_state=seed).apply(vertices)
+    np.testing.assert_array_equal(FaceTree(turned, faces).crossing(turned), found)

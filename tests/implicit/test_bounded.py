@@ -18,30 +18,20 @@ def plate():
     """80 points and normals of a thin ellipsoid, and other points of it."""
     mesh = trimesh.creation.icosphere(subdivisions=3).apply_scale([30.0, 18.0, 4.0])
     sample = sample_surface(mesh.vertices, mesh.faces, 80, placement="adaptive")
-    return (
-        sample.points,
-        sample.normals,
-        sample_surface(mesh.vertices, mesh.faces, 600, placement="even").points,
-    )
-
-
-def literal(basis):
-    """The matrix whole, and the units of its unknowns: values 1, derivatives about the spacing."""
-    lower = np.tril(basis.matrix())
-    count = len(basis.points)
-    unit = np.r_[np.ones(count), np.full(basis.size - count, 1.0 / np.sqrt(count))]
-    return lower + np.tril(lower, -1).T, unit
+    others = sample_surface(mesh.vertices, mesh.faces, 600, placement="even")
+    return sample.points, sample.normals, others.points
 
 
 @pytest.mark.parametrize("derivatives", ["all", "normal"])
 @pytest.mark.parametrize(("kernel", "bound"), [("quintic", 1e6), ("cubic", 1e3), ("matern_52", 1e4)])
-def test_what_is_left_of_the_conditions_is_one_ridge_in_units_of_the_spacing(
-    plate, kernel, bound, derivatives
-):
+def test_what_is_left_is_one_ridge_in_units_of_the_spacing(plate, kernel, bound, derivatives):
     points, normals, _ = plate
     basis, right, *_ = hermite_system(points, normals, KERNELS[kernel], 0.1, derivatives)
     weights, coefficients, condition = solve(basis, right, condition=bound)
-    matrix, unit = literal(basis)
+    lower, count = np.tril(basis.matrix()), len(basis.points)
+    matrix = lower + np.tril(lower, -1).T
+    # Units of the unknowns: values 1, derivatives about the spacing.
+    unit = np.r_[np.ones(count), np.full(basis.size - count, 1.0 / np.sqrt(count))]
     left = right - matrix @ weights - basis.polynomials.T @ coefficients
     ridge = (unit**2 * left) @ weights / (weights @ weights)
     assert np.abs(unit**2 * left - ridge * weights).max() < 1e-5 * ridge * np.abs(weights).max()
@@ -53,16 +43,14 @@ def test_what_is_left_of_the_conditions_is_one_ridge_in_units_of_the_spacing(
     assert condition < 1.5 * (values[-1] + ridge) / (values[0] + ridge)
 
 
-def test_a_bound_that_is_not_reached_changes_next_to_nothing(plate):
+def test_a_bound_that_is_not_reached_changes_next_to_nothing_and_one_that_is_costs_little(plate):
     points, normals, others = plate
     plain = RBFField.fit_hermite(points, normals, kernel="cubic")
     bounded = RBFField.fit_hermite(points, normals, kernel="cubic", condition=1e12)
     assert bounded.condition < plain.condition  # values and slopes in comparable units
     assert np.abs(plain(others) - bounded(others)).max() < 1e-6 * spacing(points).mean()
 
-
-def test_a_bound_costs_septic_little_of_its_error(plate):
-    points, normals, others = plate
+    # Septic loses little of its error.
     reach = spacing(points).mean()
     plain = RBFField.fit_hermite(points, normals, kernel="septic")
     bounded = RBFField.fit_hermite(points, normals, kernel="septic", condition=1e10)

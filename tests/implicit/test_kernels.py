@@ -9,7 +9,6 @@ from rbfmuscle.implicit.fit.assembly import exponents, monomials
 from rbfmuscle.implicit.kernels.table import KERNELS
 
 mp.mp.dps = 50
-COMPACT = [name for name, kernel in KERNELS.items() if kernel.compact]
 
 
 def binomial(beta, sign):
@@ -58,10 +57,6 @@ def literal_radial(name, s, k):
     return (d[2] - d[1] / s) / s**2
 
 
-def test_every_row_has_a_literal_formula():
-    assert set(LITERAL) == set(KERNELS)
-
-
 @pytest.mark.parametrize("k", range(3))
 @pytest.mark.parametrize("name", KERNELS)
 def test_radial_functions_against_fifty_digits(name, k):
@@ -103,12 +98,9 @@ def test_epsilon_multiplies_the_distance(name):
     h = 1e-5
     slope = (kernel.phi(r + h, 0.5) - kernel.phi(r - h, 0.5)) / (2 * h)
     assert np.allclose(kernel.first(r, 0.5) * r, slope, rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", COMPACT)
-def test_compact_kernels_end_at_one_over_epsilon(name):
-    assert KERNELS[name].phi(0.999 / 0.3, 0.3) >= 0
-    assert KERNELS[name].phi([1 / 0.3, 5.0, 1e60], 0.3).tolist() == [0, 0, 0]
+    if kernel.compact:
+        assert kernel.phi(0.999 / 0.3, 0.3) >= 0
+        assert kernel.phi([1 / 0.3, 5.0, 1e60], 0.3).tolist() == [0, 0, 0]
 
 
 def least_eigenvalue(kernel, points, degree):
@@ -125,9 +117,5 @@ def least_eigenvalue(kernel, points, degree):
 def test_kernel_is_conditionally_definite_of_its_order(name):
     points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
     assert least_eigenvalue(KERNELS[name], points, KERNELS[name].degree) > 0
-
-
-@pytest.mark.parametrize("name", ["cubic", "multiquadric", "skala_cervenka"])
-def test_one_degree_lower_is_not_definite(name):
-    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
-    assert least_eigenvalue(KERNELS[name], points, KERNELS[name].degree - 1) < 0
+    if name in ("cubic", "multiquadric", "skala_cervenka"):
+        assert least_eigenvalue(KERNELS[name], points, KERNELS[name].degree - 1) < 0

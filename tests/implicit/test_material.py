@@ -6,18 +6,18 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
-from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction.material import CarriedMaterial, carry_material, project_to_level_set
+from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
+from rbfmuscle.implicit.extraction.material import carry_material, project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import BESIDE, PointGrid, near_triangles
-from rbfmuscle.implicit.extraction.projection import Projector
+from rbfmuscle.implicit.extraction.slivers import LEAST_ANGLE, flip_edges, mend_slivers, triangle_quality
 
 BALL = trimesh.creation.icosphere(3)
 VOLUME = 4.0 / 3.0 * np.pi
 
 
 class Sphere:
-    """Signed distance to a sphere, times a factor."""
+    """Signed distance to a sphere."""
 
     def __init__(self, radius=1.0, centre=(0.0, 0.0, 0.0)):
         self.radius, self.centre = radius, np.asarray(centre)
@@ -44,19 +44,13 @@ class Two:
         return np.minimum(f, g), np.where((f < g)[:, None], df, dg)
 
 
-class Bone:
+class Bone(Sphere):
     """A cut: outside of a sphere, exact everywhere."""
 
     steepest = 1.0
 
-    def __init__(self, radius, centre):
-        self.sphere = Sphere(radius, centre)
-
-    def __call__(self, points):
-        return self.sphere(points)
-
     def value_and_gradient_below(self, points, limit):
-        return self.sphere.value_and_gradient(points)
+        return self.value_and_gradient(points)
 
 
 def mesh_of(ball=BALL):
@@ -81,31 +75,17 @@ def test_what_the_cut_takes_away_lies_on_it():
     assert cut(found.vertices).min() > -1e-5
     on_cut = np.abs(cut(found.vertices)) < 1e-4
     assert on_cut.sum() > 50
-    assert (
-        np.ptp(np.linalg.norm(found.vertices[~on_cut], axis=1)) < 1e-4
-    )  # a level's last step is of first order
+    # A level's last step is of first order.
+    assert np.ptp(np.linalg.norm(found.vertices[~on_cut], axis=1)) < 1e-4
     assert not crossing_faces(found.vertices, found.faces).any()
-
-
-def test_the_last_step_to_the_volume_drives_nothing_into_a_bone():
-    """Beside what lies on the bone the level's last step moves vertices, here by 0.7 % of the radius."""
-    cut = Bone(5.0, (5.9, 0.0, 0.0))
-    fitting = CarriedMaterial(mesh_of(), np.asarray(BALL.vertices), Sphere(), cut, 0.0)
-    fitting.reach(0.97 * VOLUME)
-    fitting.fill(0.99 * VOLUME)
-    vertices = fitting.projector.vertices
-    assert cut(vertices).min() > -1e-9
-    assert mesh_volume(vertices, BALL.faces) == pytest.approx(0.99 * VOLUME, rel=1e-12)
 
 
 def test_bone_vertices_end_up_outside():
     edge = mesh_of().edge(np.asarray(BALL.vertices))
     middle = BALL.triangles_center[0] * 0.97 ** (1 / 3)
     spike = (middle - 0.1 * edge * BALL.face_normals[0])[None]
-    found = project_to_level_set(
-        mesh_of(), np.asarray(BALL.vertices), Sphere(), volume=0.97 * VOLUME,
-        obstacles=[(PointGrid(spike), np.eye(4))],
-    )  # fmt: skip
+    asked = {"volume": 0.97 * VOLUME, "obstacles": [(PointGrid(spike), np.eye(4))]}
+    found = project_to_level_set(mesh_of(), np.asarray(BALL.vertices), Sphere(), **asked)
     depth = trimesh.proximity.signed_distance(trimesh.Trimesh(found.vertices, found.faces), spike)
     # A hundredth of an edge is the tolerance; 0.12 without being pushed.
     assert depth[0] <= 0.01 * edge
@@ -113,7 +93,6 @@ def test_bone_vertices_end_up_outside():
 
 
 def test_sheets_that_met_do_not_pull_vertices_off_the_material():
-    """A dumbbell's waist that the field has filled: vertices stay near the waist, and none cross."""
     mesh = mesh_of()
     mesh.slope = np.ones(len(BALL.vertices))
     x = np.asarray(BALL.vertices)
@@ -148,24 +127,6 @@ def test_a_carried_surface_keeps_volume_and_leaves_the_bone(cut, noise):
     assert mesh_volume(found.vertices, found.faces) == pytest.approx(VOLUME, rel=1e-12)
 
 
-def test_what_falls_on_a_fold_of_the_field_does_not_leap():
-    class Fold:
-        """x squared: its gradient fades at 0, and points either way from there."""
-
-        def value_and_gradient(self, points):
-            return points[:, 0] ** 2 - 1.0, np.column_stack([2.0 * points[:, 0], np.zeros((len(points), 2))])
-
-    places = np.array([[1e-4, 0.0, 0.0], [-1e-4, 0.0, 0.0], [0.9, 0.0, 0.0]])
-    ends = []
-    for least in (np.zeros(3), np.full(3, 0.7)):
-        projector = Projector(Fold(), None, places.copy(), 0.5, np.zeros(3, dtype=bool))
-        projector.least = least
-        projector.project(0.0, rounds=2)
-        ends.append(projector.vertices[:, 0])
-    assert np.ptp(ends[0][:2]) > 0.5 and np.ptp(ends[1][:2]) < 0.01
-    assert ends[0][2] == ends[1][2]
-
-
 def test_a_volume_that_no_level_reaches_is_an_error():
     flat = Sphere()
     flat.value_and_gradient = lambda p: (np.tanh(Sphere()(p)), Sphere().value_and_gradient(p)[1])
@@ -195,14 +156,12 @@ def test_a_tree_made_at_rest_finds_crossings_later_and_rings_that_lie_plain_spar
     assert tree.crossing(moved, some)[some].all()
     tree.closed = False  # every pair that shares a corner is tested
     np.testing.assert_array_equal(quick, tree.crossing(moved))
-    assert (
-        not FaceTree(points, faces[1:]).closed and not FaceTree(points, np.vstack([faces, faces[:1]])).closed
-    )
+    for other in (faces[1:], np.vstack([faces, faces[:1]])):
+        assert not FaceTree(points, other).closed
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.1, -0.2])
 def test_what_is_known_of_the_cut_changes_nothing(shift):
-    """The same vertices as by asking the cut anew at every step."""
     cut, asked = Bone(5.0, (5.6, 0.0, 0.0)), Bone(5.0, (5.6, 0.0, 0.0))
     asked.steepest = np.inf
     carried = np.asarray(BALL.vertices) + [shift, 0.0, 0.0]
@@ -223,16 +182,14 @@ def test_points_near_triangles_are_those_found_one_by_one():
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([-0.5, 0.4, 0.1]).as_matrix(), [0.3, 0.2, -0.1]
     points = rng.uniform(-8.0, 8.0, (700, 3))
-    found = near_triangles(
-        [(PointGrid(points), pose), (PointGrid(points[:0]), pose)], vertices, faces, margin=0.8
-    )
+    grids = [(PointGrid(points), pose), (PointGrid(points[:0]), pose)]
+    found = near_triangles(grids, vertices, faces, margin=0.8)
     corners = ((vertices - pose[:3, 3]) @ pose[:3, :3])[faces]
     inside = np.zeros((len(points), len(faces)), dtype=bool)
     for f, (a, b, c) in enumerate(corners):
         normal = np.cross(b - a, c - a)
-        along = np.linalg.solve(
-            np.column_stack([b - a, c - a, normal / np.linalg.norm(normal)]), (points - a).T
-        )
+        frame = np.column_stack([b - a, c - a, normal / np.linalg.norm(normal)])
+        along = np.linalg.solve(frame, (points - a).T)
         beside = np.minimum(np.minimum(along[0], along[1]), 1.0 - along[0] - along[1])
         low, high = corners[f].min(axis=0) - 0.8, corners[f].max(axis=0) + 0.8
         boxed = ((points >= low) & (points <= high)).all(axis=1)
@@ -245,3 +202,54 @@ def test_points_near_triangles_are_those_found_one_by_one():
     for p, row in enumerate(rows[order]):
         near = found.faces[found.first[p] : found.first[p + 1]]
         np.testing.assert_array_equal(near, np.flatnonzero(inside[row]))
+
+
+def onto_ball(mesh, vertices):
+    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+
+
+def planted(seed, count=12):
+    """A ball some of whose vertices lie on or beyond a neighbour's far edge."""
+    points, faces = np.array(BALL.vertices), np.array(BALL.faces)
+    chosen = np.random.default_rng(seed).choice(len(faces), count, replace=False)
+    for a, b, c in faces[chosen]:
+        points[a] = 0.45 * (points[b] + points[c]) + 0.02 * (points[b] - points[a]) - 0.05 * points[a]
+    return onto_ball(None, points), faces
+
+
+def bad_triangles(vertices, faces):
+    return triangle_quality(vertices, faces, vertex_normals(vertices, faces)) < LEAST_ANGLE
+
+
+def angles(vertices, faces):
+    return np.degrees(trimesh.Trimesh(vertices, faces, process=False).face_angles).min(axis=1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_planted_slivers_go_and_the_ball_stays_closed(seed):
+    points, faces = planted(seed)
+    assert bad_triangles(points, faces).sum() >= 12
+    mesh, vertices = mend_slivers(MaterialMesh(points, faces), points, onto_ball)
+    found = trimesh.Trimesh(vertices, mesh.faces, process=False)
+    assert found.is_watertight and found.is_winding_consistent and found.euler_number == 2
+    assert len(vertices) == len(points) and len(mesh.faces) == len(faces)
+    assert angles(vertices, mesh.faces).min() > LEAST_ANGLE
+    assert np.einsum("nd,nd->n", found.face_normals, found.triangles_center).min() > 0.9
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1.0, atol=1e-12)
+    far = np.linalg.norm(vertices - points, axis=1) > 1e-12
+    assert 0 < far.sum() < 0.4 * len(points), "only what lies around a sliver moves"
+
+
+def test_a_flip_makes_no_edge_of_four_triangles():
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 0.01, 0.0], [0.5, 0.0, 1.0]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    assert bad_triangles(points, faces).any()
+    assert flip_edges(points, faces) is faces
+
+
+def test_what_cannot_be_mended_is_given_back_no_worse():
+    points, faces = planted(0)
+    mesh = MaterialMesh(points, faces)
+    spoil = np.random.default_rng(1)
+    same, vertices = mend_slivers(mesh, points, lambda m, v: v + spoil.normal(size=v.shape))
+    assert same is mesh and vertices is points

@@ -11,7 +11,6 @@ from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.refinement import fit_sample
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
 from rbfmuscle.implicit.selection import spacing
-from rbfmuscle.validation import UsageError
 
 CUBIC = FieldFit(get_kernel("cubic"), 1.0, "all")
 
@@ -48,11 +47,6 @@ def test_fitted_centres_err_less_at_points_they_have_not_seen(bean, kernel, epsi
     assert np.linalg.norm(fitted.points - plain.points, axis=1).max() < 0.25 * spacing(plain.points).mean()
     np.testing.assert_allclose(np.linalg.norm(fitted.normals, axis=1), 1.0, atol=1e-12)
     assert (fitted.control_faces == plain.control_faces).all()
-
-
-def test_a_kernel_without_hermite_fit_is_refused(bean):
-    with pytest.raises(UsageError, match="no Hermite fit"):
-        fit_sample(bean[2], *bean[:2], fit=FieldFit(get_kernel("linear"), 1.0, "all"))
 
 
 def test_units_and_place_do_not_matter(bean):

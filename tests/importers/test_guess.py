@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.importers.guess.attachments import Ends, _best_of
-from rbfmuscle.importers.guess.guess import _leave_out, guess_scene, write_scene
+from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
 from rbfmuscle.importers.guess.landmarks import CONDYLE, fit_condyles
 from rbfmuscle.importers.guess.names import name_facts
@@ -23,23 +23,18 @@ from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.joints.tables import JointTable
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import MeshError, UsageError
+from rbfmuscle.validation import UsageError
 
 
 @pytest.mark.parametrize(
     ("name", "tissue", "known", "side"),
     [
-        ("vertebrae_L5", "bone", "vertebra", ""),
         ("TibiaLinks", "bone", "tibia", "l"),
         ("Hüftbein_rechts", "bone", "pelvis", "r"),
         ("VHM_Left_Bone_Calcaneous_smooth", "bone", "calcaneus", "l"),
-        ("Right_Quadratus_Femoris", "muscle", "quadratus femoris", "r"),
         ("biceps_femoris_short_head", "muscle", "biceps femoris brevis", ""),
-        ("VHM_Left_Muscle_Illiacus_smooth", "muscle", "iliacus", "l"),
         ("VHM_Left_Muscle_ExtensorHallicusLongus_smooth", "muscle", "extensor hallucis longus", "l"),
-        ("M. obturatorius internus", "muscle", "obturator internus", ""),
         ("addmagDist_r", "muscle", "adductor magnus", "r"),
-        ("tensor_fasciae_latae_L", "muscle", "tensor fasciae latae", "l"),
         ("VHM_Left_Cartilage_TibialMedial_smooth", "other", "", "l"),
         ("quadriceps_tendon", "other", "", ""),
         ("iliac_artery_left", "other", "", "l"),
@@ -123,7 +118,6 @@ def test_ends_of_a_bent_tube_are_its_tips():
 
 
 def test_muscles_without_the_bones_of_their_names_still_make_a_scene(tmp_path):
-    """Where anatomy finds none of its bones, the nearest are taken and every muscle is doubtful."""
     for item in phantom_scene().bones:
         item.mesh.export(tmp_path / f"{'radius' if item.name == 'pelvis' else 'ulna'}.ply")
     for item, name in zip(phantom_scene().muscles, ("soleus", "plantaris", "popliteus", "sartorius")):
@@ -131,21 +125,6 @@ def test_muscles_without_the_bones_of_their_names_still_make_a_scene(tmp_path):
     guess = guess_scene(tmp_path, "mm", tmp_path)
     assert len(write_scene(guess, tmp_path / "scene.toml").muscles) == 4
     assert all(muscle.confidence <= 0.2 and "are not here" in muscle.reasons[0] for muscle in guess.muscles)
-
-
-def test_an_error_is_of_the_muscle_that_it_names_and_of_no_other_with_a_similar_file(tmp_path):
-    _phantom_meshes(tmp_path)
-    guess = guess_scene(tmp_path, "mm", tmp_path)
-    good, bad = guess.muscles[:2]
-    good.muscle.file, bad.muscle.file = "psoas.ply", "right_psoas.ply"
-    _leave_out(guess, MeshError(f"{tmp_path}/right_psoas.ply: not closed"))
-    assert bad.wrong and not good.wrong
-
-
-def test_a_folder_without_muscles_is_refused(tmp_path):
-    phantom_scene().bones[0].mesh.export(tmp_path / "femur.ply")
-    with pytest.raises(UsageError, match="holds no muscle"):
-        guess_scene(tmp_path, "mm", tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -165,13 +144,6 @@ def leg_guess(leg, tmp_path_factory):
     return guess_scene(folder, None, folder), facts, folder
 
 
-def test_bones_of_the_leg_hang_on_the_right_ones(leg_guess):
-    guess, facts, _ = leg_guess
-    found = {joint.child.name: joint.parent.name for joint in guess.joints}
-    true = {joint["child"]: joint["parent"] for joint in facts["joints"].values()}
-    assert guess.root.name == "pelvis" and found == {**true, "sacrum": "pelvis"} and guess.parts.units == "mm"
-
-
 def _leg_bones(leg, transform):
     source, facts = leg
     bones = []
@@ -182,19 +154,18 @@ def _leg_bones(leg, transform):
     return bones, facts["joints"]
 
 
-def _turned(how):
-    transform = trimesh.transformations.random_rotation_matrix(np.array([0.2, 0.7, 0.4]))
-    if how == "metres":
-        transform[:3] *= 1e-3
-    return (
-        np.eye(4) if how == "as it is" else transform @ np.diag([-1.0 if how == "mirrored" else 1.0, 1, 1, 1])
-    )
+TURN = trimesh.transformations.random_rotation_matrix(np.array([0.2, 0.7, 0.4]))
+LYING = {
+    "as it is": np.eye(4),
+    "mirrored": TURN @ np.diag([-1.0, 1, 1, 1]),
+    "metres": np.diag([1e-3, 1e-3, 1e-3, 1]) @ TURN,
+}
 
 
-@pytest.mark.parametrize("how", ["as it is", "mirrored", "turned", "metres"])
+@pytest.mark.parametrize("how", LYING)
 def test_joints_of_the_leg_however_it_lies(leg, how):
     """Limits of the issue [mm, degree]; signs and sides follow the bones, whatever the axes of the files."""
-    transform = _turned(how)
+    transform = LYING[how]
     bones, true = _leg_bones(leg, transform)
     millimetre = 1e-3 if how == "metres" else 1.0
     orientation = find_orientation(bones)
@@ -202,20 +173,16 @@ def test_joints_of_the_leg_however_it_lies(leg, how):
     linear = transform[:3, :3] / millimetre
     hand = np.sign(np.linalg.det(linear))
     assert bones[1].frame.side == bones[1].side == ("r" if hand > 0 else "l")
-    assert (
-        orientation.superior @ linear @ [0, 0, 1] > 0.95 and orientation.anterior @ linear @ [0, -1, 0] > 0.95
-    )
+    assert orientation.superior @ linear @ [0, 0, 1] > 0.95
+    assert orientation.anterior @ linear @ [0, -1, 0] > 0.95
     axes = joints["hip"].axes
     for name, axis in true["hip"]["axes"].items():  # angles of a mirrored leg keep their meaning
         assert axes[name.removeprefix("hip_")] @ (hand * linear @ axis) > 0.9
-    for name, coordinate, place, angle in (
-        ("knee", "flexion", 6.0, 5.0),
-        ("ankle", "dorsiflexion", 6.0, 5.0),
-    ):
+    for name, coordinate in (("knee", "flexion"), ("ankle", "dorsiflexion")):
         axis = hand * linear @ true[name]["axis"]
         away = joints[name].centre - transform[:3, :3] @ true[name]["centre_mm"]
-        assert np.linalg.norm(away - away @ axis * axis) < place * millimetre
-        assert np.degrees(np.arccos(min(joints[name].axes[coordinate] @ axis, 1.0))) < angle
+        assert np.linalg.norm(away - away @ axis * axis) < 6.0 * millimetre
+        assert np.degrees(np.arccos(min(joints[name].axes[coordinate] @ axis, 1.0))) < 5.0
     away = joints["hip"].centre - transform[:3, :3] @ true["hip"]["centre_mm"]
     assert np.linalg.norm(away) < 3.0 * millimetre
     # Against the estimates of data/leg, which have other methods [degree].
@@ -245,8 +212,11 @@ def test_patella_follows_the_table_that_was_computed_for_the_leg(leg):
         assert np.sqrt(np.mean(error**2)) < 6.0  # the table itself starts 4.6 mm off the scan
 
 
-def test_muscles_of_the_leg_hang_on_the_right_bones_at_the_right_places(leg_guess):
+def test_bones_and_muscles_of_the_leg_hang_on_the_right_bones_at_the_right_places(leg_guess):
     guess, facts, folder = leg_guess
+    found = {joint.child.name: joint.parent.name for joint in guess.joints}
+    true = {joint["child"]: joint["parent"] for joint in facts["joints"].values()}
+    assert guess.root.name == "pelvis" and found == {**true, "sacrum": "pelvis"} and guess.parts.units == "mm"
     right, away = 0, []
     for muscle in guess.muscles:
         true = {a["bone"]: a["centroid_mm"] for a in facts["muscles"][muscle.muscle.name]["attachments"]}
@@ -264,26 +234,20 @@ def test_muscles_of_the_leg_hang_on_the_right_bones_at_the_right_places(leg_gues
 def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess):
     """Beside the ends that carriers hold in data/leg; the quadriceps' goes on from the patella to the tibia."""
     guess, facts, _ = leg_guess
-    gaps = {
-        (muscle.muscle.name, hold.bone.name): hold.gap
-        for muscle in guess.muscles
-        for hold in muscle.holds
-        if hold.tendon is not None
-    }
+    holds = [(m.muscle, hold) for m in guess.muscles for hold in m.holds if hold.tendon is not None]
+    gaps = {(muscle.name, hold.bone.name): hold.gap for muscle, hold in holds}
     for carrier in facts["tendon_carriers"].values():
         for name, bone in carrier["muscles"].items() if isinstance(carrier, dict) else ():
             gap = next(a["gap_mm"] for a in facts["muscles"][name]["attachments"] if a["bone"] == bone)
             if gap["least"] > 50.0:
                 # The patches were chosen by other rules, so their nearest vertices differ by some millimetres.
                 assert gaps[name, bone] == pytest.approx(gap["least"], abs=8.0), name
-    for muscle in guess.muscles:  # straight to the nearest place of the bone
-        for hold in muscle.holds:
-            if hold.tendon is not None and not hold.tendon.via:
-                away = hold.bone.points - muscle.muscle.points[hold.vertices].mean(axis=0)
-                place = hold.bone.points[np.argmin((away**2).sum(axis=1))]
-                assert hold.tendon.bone is hold.bone and (hold.tendon.to == place).all()
-    rectus = next(m for m in guess.muscles if m.muscle.name == "rectus_femoris")
-    (tendon,) = [hold.tendon for hold in rectus.holds if hold.tendon is not None]
+    for muscle, hold in holds:  # straight to the nearest place of the bone
+        if not hold.tendon.via:
+            away = hold.bone.points - muscle.points[hold.vertices].mean(axis=0)
+            place = hold.bone.points[np.argmin((away**2).sum(axis=1))]
+            assert hold.tendon.bone is hold.bone and (hold.tendon.to == place).all()
+    (tendon,) = [hold.tendon for muscle, hold in holds if muscle.name == "rectus_femoris"]
     assert tendon.bone.name == "tibia" and [bone.name for bone, _ in tendon.via] == ["patella"] * 2
     ligament = np.linalg.norm(tendon.to - tendon.via[1][1])
     assert 45.0 < ligament < 65.0  # 53 to 55 mm by data/leg/README.md, between other points
@@ -291,6 +255,8 @@ def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess):
 
 def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_path):
     _phantom_meshes(tmp_path)
+    two = [trimesh.creation.icosphere(radius=6.0).apply_translation([x, 80.0, 0.0]) for x in (0.0, 20.0)]
+    trimesh.util.concatenate(two).export(tmp_path / "Segment_99.ply")
     open_mesh = phantom_scene().muscles[0].mesh.copy()
     open_mesh.update_faces(open_mesh.triangles_center[:, 2] < open_mesh.bounds[:, 2].mean())
     open_mesh.export(tmp_path / "gracilis.ply")
@@ -302,14 +268,8 @@ def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_
     scene = write_scene(guess, tmp_path / "scene.toml")
     text = (tmp_path / "scene.toml").read_text(encoding="utf-8")
     assert "# NOT USED: gracilis.ply: " in text and len(scene.muscles) == 4
-
-
-def test_a_mesh_without_a_name_that_cannot_be_a_muscle_is_a_bone(tmp_path):
-    _phantom_meshes(tmp_path, plain_names=True)
-    two = [trimesh.creation.icosphere(radius=6.0).apply_translation([x, 80.0, 0.0]) for x in (0.0, 20.0)]
-    trimesh.util.concatenate(two).export(tmp_path / "Segment_99.ply")
-    guess = guess_scene(tmp_path, "mm", tmp_path)
-    assert "segment_99" in [bone.name for bone in write_scene(guess, tmp_path / "scene.toml").bones]
+    # A mesh without a name that cannot be a muscle.
+    assert "segment_99" in [bone.name for bone in scene.bones]
 
 
 def test_nothing_is_left_behind_that_does_not_load(tmp_path):
@@ -318,8 +278,13 @@ def test_nothing_is_left_behind_that_does_not_load(tmp_path):
     dot.export(tmp_path / "sacrum.ply")
     dot.export(tmp_path / "gracilis.ply")
     guess = guess_scene(tmp_path, None, tmp_path)
-    assert guess.parts.left_out == ["sacrum"] and "1.732 mm across" in guess.parts.unusable["sacrum.ply"]
-    assert "gracilis" not in [muscle.name for muscle in write_scene(guess, tmp_path / "scene.toml").muscles]
+    assert guess.parts.left_out == ["sacrum"] and "sacrum.ply" in guess.parts.unusable
+    guess.muscles[0].holds[0].vertices = guess.muscles[0].holds[1].vertices
+    name = guess.muscles[0].muscle.name
+    scene = write_scene(guess, tmp_path / "scene.toml")
+    assert not {name, "gracilis"} & {muscle.name for muscle in scene.muscles}
+    assert "# NOT RUN: " in (tmp_path / "scene.toml").read_text(encoding="utf-8")
+    assert any(name in doubt for doubt in guess.doubts())
     for path in tmp_path.glob("*.ply"):
         if path.stem not in ("gracilis", "femur"):
             path.unlink()
@@ -329,9 +294,7 @@ def test_nothing_is_left_behind_that_does_not_load(tmp_path):
     assert not file.exists()
 
 
-def test_meshes_in_metres_make_a_scene_that_runs_and_a_bone_that_cannot_be_used_is_in_the_verdict(
-    tmp_path, capsys
-):
+def test_meshes_in_metres_make_a_scene_that_runs_and_an_unused_bone_is_in_the_verdict(tmp_path, capsys):
     meshes, out = phantom_scene(spacing=6.0), tmp_path / "out"
     for item in meshes.bones + meshes.muscles[:2]:
         item.mesh.copy().apply_scale(0.001).export(tmp_path / f"{item.name}.ply")
@@ -339,40 +302,22 @@ def test_meshes_in_metres_make_a_scene_that_runs_and_a_bone_that_cannot_be_used_
     scene = tmp_path / "scene.toml"
     code, printed, _ = call(capsys, "new", tmp_path)
     assert code == 0 and "units are m: " in printed
-    code, _, err = call(capsys, "new", tmp_path)
-    assert code == 2 and "--force" in err
-    code, printed, _ = call(capsys, "check", scene)
-    assert code == 0 and "sacrum: no mesh of this bone could be used" in printed
+    assert call(capsys, "new", tmp_path)[0] == 2
+    assert "sacrum: no mesh of this bone could be used" in call(capsys, "check", scene)[1]
     run = ("run", scene, "-o", out, "--model", "pbd", "--frames", "0:5")
     code, printed, _ = call(capsys, *run)
     verdict = json.loads((out / "run.json").read_text(encoding="utf-8"))["verdict"]
     assert code == 0 and f"verdict: {verdict}" in printed and len(SavedRun(out).frames) == 5
     assert "the bones, bones left out (sacrum) 1 at frame 0 (limit 0)" in verdict
-    report = (out / "report.html").read_text(encoding="utf-8")
-    answer, _, detail = verdict.partition(". ")
-    assert 'class="answer bad"' in report and answer[1:] in report and detail in report
     code, _, err = call(capsys, *run, "--set", "output.surfaces=false", "--fail-on", "bones_left_out")
     assert code == 6 and "bones_left_out = 1 > 0" in err
-
-
-def test_muscle_that_cannot_be_loaded_is_commented_out_with_its_reason(tmp_path):
-    _phantom_meshes(tmp_path)
-    guess = guess_scene(tmp_path, "mm", tmp_path)
-    guess.muscles[0].holds[0].vertices = guess.muscles[0].holds[1].vertices
-    name = guess.muscles[0].muscle.name
-    scene = write_scene(guess, tmp_path / "scene.toml")
-    assert name not in [muscle.name for muscle in scene.muscles]
-    text = (tmp_path / "scene.toml").read_text(encoding="utf-8")
-    assert f'# name = "{name}"' in text and "# NOT RUN: " in text
-    assert any(name in doubt for doubt in guess.doubts())
 
 
 def test_header_counts_and_bones_against_it_are_named(leg):
     bones, _ = _leg_bones(leg, np.eye(4))  # its front is -y, the header's +y
     found = find_orientation(bones, HEADER)
-    assert (found.anterior == [0, 1, 0]).all() and any(
-        "anterior by the bones" in doubt for doubt in found.doubts
-    )
+    assert (found.anterior == [0, 1, 0]).all()
+    assert any("anterior by the bones" in doubt for doubt in found.doubts)
     bones[1].side = "l"
     assert any("is it mirrored" in doubt for doubt in find_orientation(bones).doubts)
 

@@ -6,12 +6,13 @@ import json
 import numpy as np
 import pytest
 from command_line import call
+from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.importers.labels import surfaces
 from rbfmuscle.importers.labels.read import LabelVolume, read_labels, read_names
 from rbfmuscle.importers.labels.surfaces import label_surface
-from rbfmuscle.validation import MeshError, UsageError
+from rbfmuscle.validation import MeshError
 
 nibabel = pytest.importorskip("nibabel")
 nrrd = pytest.importorskip("nrrd")
@@ -70,14 +71,11 @@ def test_neighbours_that_share_a_face_neither_overlap_nor_gape():
     assert np.abs(np.concatenate(heights)).max() < 1.0 / 3.0  # of a voxel, on either side of the plane
 
 
-@pytest.mark.parametrize(
-    "turn", [np.eye(3), np.diag([-1.0, 1, 1]), np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]), "oblique"]
-)
-def test_directions_and_units_are_honoured(tmp_path, turn):
-    if isinstance(turn, str):
-        from scipy.spatial.transform import Rotation
+OBLIQUE = Rotation.from_rotvec([0.3, -0.5, 0.4]).as_matrix()
 
-        turn = Rotation.from_rotvec([0.3, -0.5, 0.4]).as_matrix()
+
+@pytest.mark.parametrize("turn", [np.eye(3), OBLIQUE, OBLIQUE @ np.diag([-1.0, 1, 1])])
+def test_directions_and_units_are_honoured(tmp_path, turn):
     labels = ball_labels(split=np.array([0.0, 0.0, 1.0])).astype(np.int16)
     affine = np.eye(4)
     affine[:3, :3], affine[:3, 3] = turn, [100.0, -50.0, 7.0]
@@ -100,15 +98,13 @@ def test_directions_and_units_are_honoured(tmp_path, turn):
 
 
 def test_thin_walls_do_not_go_through_themselves(monkeypatch):
-    """A wavy sheet two voxels thick: triangles cross where edges collapsed, and are drawn apart."""
     grid = np.stack(np.meshgrid(*[np.arange(56.0)] * 3, indexing="ij"), axis=-1) - 27.7
     x, y, z = np.moveaxis(grid, -1, 0)
     wall = (np.abs(z - 6.0 * np.sin(x / 5.0) * np.cos(y / 6.0)) < 1.105) & (np.hypot(x, y) < 22.0)
     volume = LabelVolume(wall.astype(np.int32), np.eye(4), {}, "wall.nii")
     mesh = label_surface(volume, 1).mesh
-    assert (
-        crossing_faces(mesh.vertices, mesh.faces).sum() == 0 and mesh.is_watertight and mesh.euler_number == 2
-    )
+    assert mesh.is_watertight and mesh.euler_number == 2
+    assert not crossing_faces(mesh.vertices, mesh.faces).any()
     assert mesh.volume == pytest.approx(wall.sum(), rel=5e-3)
     monkeypatch.setattr(surfaces, "UNTANGLE", 1)
     mesh = label_surface(volume, 1).mesh
@@ -123,23 +119,15 @@ def test_islands_and_holes_are_left_out_and_told():
     assert "1 islands of 8 voxels" in island and "64 voxels" in hole and surface.mesh.euler_number == 2
 
 
-def test_folder_of_masks_is_a_volume(tmp_path):
-    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.uint8)
+def test_names_from_files_header_and_tables(tmp_path):
+    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
     for value, name in ((1, "soleus"), (2, "tibia")):
         write_nifti(tmp_path / f"{name}.nii.gz", (labels == value).astype(np.uint8), np.eye(4))
     volume = read_labels(tmp_path)
     assert sorted(volume.names.values()) == ["soleus", "tibia"] and len(volume.values()) == 2
-
-
-def test_names_from_header_and_tables(tmp_path):
-    labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
     header = {"space": "left-posterior-superior", "space directions": np.eye(3), "space origin": np.zeros(3)}
-    header |= {
-        "Segment0_Name": "femur",
-        "Segment0_LabelValue": "2",
-        "Segment1_Name": "soleus",
-        "Segment1_LabelValue": "1",
-    }
+    header |= {"Segment0_Name": "femur", "Segment0_LabelValue": "2"}
+    header |= {"Segment1_Name": "soleus", "Segment1_LabelValue": "1"}
     nrrd.write(str(tmp_path / "s.seg.nrrd"), labels, header)
     assert read_labels(tmp_path / "s.seg.nrrd").names == {2: "femur", 1: "soleus"}
     (tmp_path / "n.json").write_text(json.dumps({"1": "soleus", "2": "tibia"}))
@@ -147,9 +135,6 @@ def test_names_from_header_and_tables(tmp_path):
     (tmp_path / "n.txt").write_text('# snap\n1 255 0 0 1 1 1 "soleus"\n2 0 255 0 1 1 1 "tibia"\n')
     for name in ("n.json", "n.csv", "n.txt"):
         assert read_names(tmp_path / name) == {1: "soleus", 2: "tibia"}
-    (tmp_path / "none.csv").write_text("nothing\n")
-    with pytest.raises(UsageError, match="names no label"):
-        read_names(tmp_path / "none.csv")
 
 
 def _hostile(tmp_path):

@@ -11,9 +11,8 @@ from rbfmuscle.metrics.belly import belly_measures
 
 
 def test_run_reports_what_contracts():
-    run = rm.simulate(
-        spindle_scene(spacing=5.0, frames=2, model="arap-volume", tendon={"length": 100.0, "strain": 0.08})
-    )
+    tendon = {"length": 100.0, "strain": 0.08}
+    run = rm.simulate(spindle_scene(spacing=5.0, frames=2, model="arap-volume", tendon=tendon))
     assert run.values(MUSCLE, "activation") == pytest.approx([0.0, 0.5, 1.0])
     for quantity in ("csa_max", "belly_thickness"):
         assert np.diff(run.values(MUSCLE, quantity))[-1] > 0.0, quantity
@@ -43,7 +42,6 @@ def test_greatest_section_of_an_ellipsoid_is_its_middle(scale, back, ahead):
 
 
 def test_a_belly_looked_at_from_the_other_end_is_the_same():
-    """An ellipsoid with a bulge at a third of its way."""
     vertices, faces = belly(turn=np.eye(3), shift=(0.0, 0.0, 0.0))
     bulge = 1.0 + 0.5 * np.exp(-((vertices[:, 0] - 10.0) ** 2) / 40.0)
     vertices = vertices * np.column_stack([np.ones(len(vertices)), bulge, bulge])

@@ -87,9 +87,8 @@ class TestMeshDistance:
         before.unsigned(points, near=near)
         moved = vertices * [1.1, 0.9, 1.0] + [0.5, 0.0, 0.0]
         later = MeshDistance(moved, faces, layout=before.layout)
-        np.testing.assert_array_equal(
-            later.unsigned(points, near=near), MeshDistance(moved, faces).unsigned(points)
-        )
+        anew = MeshDistance(moved, faces).unsigned(points)
+        np.testing.assert_array_equal(later.unsigned(points, near=near), anew)
 
     def test_deepest_point_is_not_believed_at_a_fold(self):
         # A flap folded flat onto the outside: the layers above it look like the inside from one face.
@@ -122,9 +121,8 @@ class TestPenetration:
         pose[:3, 3] = [3.3, 4.1, -9.0]  # apex at z = -3, that is 2 above the block's lower face
         probes = [BoneProbe("spike", spike)]
         assert surface_depth(np.array(block.vertices), probes, {"spike": pose}).max() == 0
-        assert bone_depth(MeshDistance(*arrays(block)), probes, {"spike": pose}) == pytest.approx(
-            2.0, abs=1e-9
-        )
+        depth = bone_depth(MeshDistance(*arrays(block)), probes, {"spike": pose})
+        assert depth == pytest.approx(2.0, abs=1e-9)
 
     def test_equals_a_literal_search(self, blob):
         bone = trimesh.creation.icosphere(subdivisions=4, radius=6.0)
@@ -156,20 +154,12 @@ class TestMeshMeasures:
 
 
 def rod(length=100.0, radius=8.0, rings=60, around=24):
-    """A closed cylinder along x from 0 to ``length``, with many rings, and its Trimesh."""
-    x = np.linspace(0, length, rings)
-    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
-    ring = np.stack([np.zeros(around), radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    vertices = np.concatenate([ring + [place, 0, 0] for place in x] + [[[0, 0, 0], [length, 0, 0]]])
-    k, j = np.meshgrid(np.arange(rings - 1), np.arange(around), indexing="ij")
-    a, b = k * around + j, k * around + (j + 1) % around
-    sides = np.concatenate([np.stack([a, b, b + around], -1), np.stack([a, b + around, a + around], -1)])
-    first, last = np.arange(around), (rings - 1) * around + np.arange(around)
-    caps = [
-        np.stack([np.full(around, len(vertices) - 2), np.roll(first, -1), first], -1),
-        np.stack([np.full(around, len(vertices) - 1), last, np.roll(last, -1)], -1),
-    ]
-    return trimesh.Trimesh(vertices, np.concatenate([sides.reshape(-1, 3), *caps]), process=False)
+    """A closed cylinder along x from 0 to ``length``, with many rings, as a Trimesh."""
+    turn = trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0))
+    profile = [(0, 0), *((radius, z) for z in np.linspace(0, length, rings)), (0, length)]
+    mesh = trimesh.creation.revolve(profile, sections=around).apply_transform(turn)
+    mesh.vertices[:, 0] = mesh.vertices[:, 0].round(9)
+    return mesh
 
 
 def rod_muscle(mesh, length=100.0):
@@ -214,11 +204,9 @@ class TestMomentArm:
     def arms(self, angles, lengths, name="joint.bend"):
         return [found.get(name) for found in moment_arms([{name: a} for a in angles], lengths)]
 
-    def test_string_over_a_pulley_has_the_pulleys_radius(self):
+    def test_string_over_a_pulley_has_its_radius_and_a_parabola_its_slope_however_the_steps_are(self):
         angles = np.radians([0, 5, 10, 20, 40])
         assert self.arms(angles, 200 + 23.5 * angles) == pytest.approx([-23.5] * 5)
-
-    def test_parabola_has_its_slope_however_the_steps_are(self):
         angles = np.array([0.1, 0.2, 0.5])
         assert self.arms(angles, 3 * angles**2 - angles)[1] == pytest.approx(-(6 * 0.2 - 1))
         angles = np.cumsum(np.radians([0.0, 1.0, 0.3, 2.0, 0.7, 1.1, 0.2, 3.0, 1.0]))
@@ -232,15 +220,13 @@ class TestMomentArm:
         away, before = arms - 40.0 * np.sin(angles), plain - 40.0 * np.sin(angles)
         assert np.abs(away[8:-8]).max() < 0.2 * np.abs(before[8:-8]).max()
 
-    def test_turning_point_takes_the_way_there(self):
-        assert self.arms([0.2, 0.3, 0.2], [10, 11, 10.4])[1] == pytest.approx(-10)
-
     def test_legs_of_a_path_have_their_coordinate_and_two_at_once_none(self):
         assert moment_arms([{"a": 0.0, "b": 0.0}, {"a": 0.1, "b": 0.1}], [1.0, 1.2]) == [{}, {}]
         found = moment_arms([{"a": 0.0}, {"a": 0.1}, {"a": 0.1, "b": 0.2}], [1.0, 1.1, 1.5])
         assert found[1] == {"a": pytest.approx(-1.0), "b": pytest.approx(-2.0)}
 
-    def test_unknown_lengths_and_rest_give_none(self):
+    def test_turning_point_takes_the_way_there_and_unknown_lengths_and_rest_give_none(self):
+        assert self.arms([0.2, 0.3, 0.2], [10, 11, 10.4])[1] == pytest.approx(-10)
         assert self.arms([0.0, 0.1, 0.2, 0.2], [1.0, np.nan, 2.0, 2.0]) == [None] * 4
 
 
@@ -253,9 +239,8 @@ class TestRows:
         bones = [SimpleNamespace(name="trunk", mesh=block), SimpleNamespace(name="limb", mesh=block.copy())]
         bones[1].mesh.apply_translation([500, 0, 0])
         frames = [{"joint.bend": a} for a in (0.0, 0.1, 0.2)]
-        return SimpleNamespace(
-            units="cm", motion=Motion(frames), bones=bones, couplings=[], joints=JOINTS, muscles=[rod_muscle(mesh)]
-        )  # fmt: skip
+        parts = {"bones": bones, "couplings": [], "joints": JOINTS, "muscles": [rod_muscle(mesh)]}
+        return SimpleNamespace(units="cm", motion=Motion(frames), **parts)
 
     def frame(self, scene, index):
         """The rod stretched by 10 cm a radian, the limb going with it."""

@@ -1,41 +1,33 @@
 """The RBF muscle against laws, on the embedded phantom and, where present, on the real hip."""
 
 import warnings
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import igl
 import numpy as np
 import pytest
 import trimesh
-from contraction_scenes import spindle_scene
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from spindle_scene import build_scene
 
+import rbfmuscle as rm
+from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.geometry.crossing import crossing_faces
+from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.implicit.extraction.material import carry_material
 from rbfmuscle.implicit.field_fit import wanted_derivatives
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.models import build_model
+from rbfmuscle.muscle.drawing import Configuration
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 from rbfmuscle.validation import NumericalWarning, SceneError, SolveError
-
-
-@pytest.fixture
-def hip(hip_data):
-    """The real hip with one small muscle, quick to solve."""
-    scene = Scene.load(hip_data / "flexion.toml")
-    scene.muscles = [muscle for muscle in scene.muscles if muscle.name == "adductor_brevis"]
-    return scene
-
-
-def _carried(scene, degrees, coordinate="hip.flexion"):
-    """Vertices carried by the first muscle at each angle."""
-    scene.motion = Motion([{coordinate: np.radians(angle)} for angle in degrees])
-    muscle = scene.muscles[0]
-    model = build_model(muscle, scene, "rbf")
-    return [frame.carried[muscle.name][0] for frame in simulate_frames(scene, [model], surfaces=False)]
 
 
 def _distances(points, vertices, faces):
@@ -43,13 +35,16 @@ def _distances(points, vertices, faces):
     return np.sqrt(squares)
 
 
-def test_muscle_returns_to_rest(hip):
+def test_muscle_returns_to_rest(hip_scene):
+    scene = hip_scene.copy()
+    scene.muscles = [scene.muscle("adductor_brevis")]
     there = list(range(0, 31, 5))
-    carried = _carried(hip, [*there, *there[-2::-1], 0, 0, 0])
-    rms = [
-        np.sqrt(np.square(one - carried[0]).sum(axis=1).mean())
-        for one in (carried[len(there) - 1], carried[-1])
-    ]
+    angles = [*there, *there[-2::-1], 0, 0, 0]
+    scene.motion = Motion([{"hip.flexion": np.radians(angle)} for angle in angles])
+    frames = simulate_frames(scene, [build_model(scene.muscles[0], scene, "rbf")], surfaces=False)
+    carried = [frame.carried["adductor_brevis"][0] for frame in frames]
+    away = [np.linalg.norm(one - carried[0], axis=1) for one in (carried[len(there) - 1], carried[-1])]
+    rms = [np.sqrt((one**2).mean()) for one in away]
     assert rms[0] > 2.0 and rms[1] <= 0.3
 
 
@@ -88,9 +83,8 @@ def test_a_scene_that_is_moved_and_in_another_unit_gives_the_same_surface(plain,
 
 @pytest.mark.parametrize("kernel", [k for k in KERNELS if k != "gaussian"])
 def test_any_kernel_drives_a_muscle(kernel):
-    scene = phantom_scene().with_options(
-        {"model.kernel": kernel, "model.centres": 100, "model.resolution": 32}, frames="0:6:5"
-    )
+    options = {"model.kernel": kernel, "model.centres": 100, "model.resolution": 32}
+    scene = phantom_scene().with_options(options, frames="0:6:5")
     scene.muscles = [scene.muscle("adductor_posterior")]
     smooth = get_kernel(kernel).hermite
     with warnings.catch_warnings(record=True) as said:
@@ -124,10 +118,8 @@ def test_centres_are_added_until_the_wanted_error_is_met_and_fitted_ones_err_les
     usual, few = error(placement="greedy")
     more, least = error(rest_error=0.7 * few, placement="greedy")
     assert least <= 0.7 * few < few < plain and count < usual < more < 4 * usual
-    derivatives = [
-        wanted_derivatives(count, fitted=fitted) for count, fitted in ((200, 0), (201, 0), (201, 1))
-    ]
-    assert derivatives == ["all", "normal", "all"]
+    for centres, fitted, wanted in ((200, 0, "all"), (201, 0, "normal"), (201, 1, "all")):
+        assert wanted_derivatives(centres, fitted=fitted) == wanted
     with (
         pytest.warns(NumericalWarning, match="fitted to values on and off"),
         pytest.raises(SceneError, match="placement 'fitted' needs a C2 kernel"),
@@ -137,9 +129,8 @@ def test_centres_are_added_until_the_wanted_error_is_met_and_fitted_ones_err_les
 
 @pytest.mark.filterwarnings("ignore:kernel .* does not reach")
 def test_where_no_level_set_can_be_shown_the_material_is_and_an_event_says_so():
-    scene = phantom_scene().with_options(
-        {"model.kernel": "gaussian", "model.epsilon": 1.0, "model.centres": 100, "model.surface": "marching"}
-    )
+    options = {"kernel": "gaussian", "epsilon": 1.0, "centres": 100, "surface": "marching"}
+    scene = phantom_scene().with_options({f"model.{key}": value for key, value in options.items()})
     scene.muscles = [scene.muscle("adductor_posterior")]
     message = r"adductor_posterior.*no closed surface by marching cubes with kernel 'gaussian'"
     with pytest.raises(SolveError, match=message):
@@ -157,21 +148,15 @@ def test_where_no_level_set_can_be_shown_the_material_is_and_an_event_says_so():
     assert surface.quantities["unfitted_fraction"] == 1.0
 
 
-class _Everywhere:
-    """A neighbour that fills all of space."""
-
-    def cut(self, points):
-        return np.full(len(points), -5.0), np.tile([1.0, 0.0, 0.0], (len(points), 1))
-
-    def points(self):
-        return np.zeros((0, 3))
-
-
 def test_neighbours_that_leave_no_surface_are_let_in_and_an_event_says_so():
     scene = phantom_scene()
     scene.muscles = [scene.muscle("adductor_posterior")]
+    everywhere = SimpleNamespace(
+        cut=lambda points: (np.full(len(points), -5.0), np.tile([1.0, 0.0, 0.0], (len(points), 1))),
+        points=lambda: np.zeros((0, 3)),
+    )
     shown, told = [], []
-    for cuts in ([], [_Everywhere()]):
+    for cuts in ([], [everywhere]):
         model = build_model(scene.muscles[0], scene, "rbf")
         loop = FrameLoop(scene, [model])
         loop.steppers[0].contacts.cuts += cuts
@@ -183,29 +168,82 @@ def test_neighbours_that_leave_no_surface_are_let_in_and_an_event_says_so():
 
 
 def test_a_chosen_epsilon_never_gives_a_broken_field():
-    """Gaussians so narrow do not reach from centre to centre: the muscle is refused, with the remedy."""
     narrow = {"kernel": "gaussian", "centres": 60, "samples": 300, "epsilon": 3.0, "condition": 1000.0}
     scene = phantom_scene().with_options({f"model.{key}": value for key, value in narrow.items()})
     scene.muscles = [scene.muscle("adductor_posterior")]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with pytest.raises(
-            SceneError, match=r"'gaussian' with 60 centres.*take kernel 'cubic'.*greater condition"
-        ):
+        with pytest.raises(SceneError, match=r"'gaussian' with 60 centres.*take kernel 'cubic'"):
             build_model(scene.muscles[0], scene, "rbf")
         scene.muscles[0].options |= {"kernel": "quintic", "condition": 1e6}
         model = build_model(scene.muscles[0], scene, "rbf")
         assert model.rest.fit.condition == 1e6  # without a shape parameter a ridge keeps the bound
 
 
-def test_fibres_through_a_unit_area_are_those_of_the_belly_over_its_girth():
-    scene = spindle_scene(tendon={"length": 100.0, "strain": 0.08})
-    model = RBFMuscle(scene.muscles[0], scene, RBFOptions(centres=150, nodes=600))
-    x = np.abs(model.solid.quad_points[:, 0])
-    middle, tendon = (
-        np.average(model.law.density[there], weights=model.solid.weights[there])
-        for there in (x < 10.0, (x > 90.0) & (x < 120.0))
-    )
-    assert middle == pytest.approx(1.0, abs=0.1)
-    # Radii of 15 and 9 mm; a cell is 10 mm wide.
-    assert tendon == pytest.approx((15.0 / 9.0) ** 2, rel=0.1)
+def test_a_tangle_of_the_material_is_shown_as_a_sound_surface():
+    scene = build_scene()
+    model = RBFMuscle(scene.muscles[0], scene)
+    fields = {bone.name: BoneSDF.from_mesh(bone.mesh, cache=False) for bone in scene.bones}
+    contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=model.contact_bone)
+    shown, volume = model.drawer.shown, model.rest.mesh_volume
+    tangled = shown.rest.copy()
+    tangled[tangled[:, 2] < 0.0] *= [-1.0, 1.0, 1.0]  # the lower half inside out
+    alone = carry_material(shown.mesh, tangled, volume=volume)
+    assert crossing_faces(alone.vertices, alone.faces).sum() > 20
+    now = Configuration(model.points, model.normals(), model.contact_points(), tangled)
+    surface = model.drawer.draw(Mock(side_effect=ValueError("no field")), now, contacts)
+    assert not crossing_faces(surface.vertices, np.asarray(surface.faces)).any()
+    assert mesh_volume(surface.vertices, np.asarray(surface.faces)) == pytest.approx(volume, rel=1e-10)
+    assert contacts.nearest(surface.vertices)[0].min() > -0.05
+    assert surface.quantities["unfitted_fraction"] == 1.0
+    # Far from the tangle it is where the material is.
+    far = shown.rest[:, 2] > 15.0
+    assert np.linalg.norm(surface.vertices - tangled, axis=1)[far].max() < 6.0
+
+
+COORDINATES = ("hip.flexion", "hip.adduction", "hip.internal_rotation")
+
+
+def ramp(*ends, step):
+    return {name: {"from": 0, "to": end, "step": step} for name, end in zip(COORDINATES, ends)}
+
+
+def check_shapes(run, muscle):
+    """The promises that hold in each frame, whatever the motion."""
+    assert (run.values(muscle, "euler") == 2).all()
+    assert run.values(muscle, "self_crossings").max() == 0
+    assert abs(run.values(muscle, "volume_error")).max() < 1e-10
+    assert run.values(muscle, "unfitted_fraction").max() < 0.1
+    assert not [e for e in run.events if e.action == "unresolved"]
+
+
+@pytest.mark.parametrize("muscle", ["extensor", "adductor_posterior"])
+def test_phantom_in_a_combined_motion(muscle):
+    scene = phantom_scene()
+    scene.muscles = [scene.muscle(muscle)]
+    scene.set_motion(ramp=ramp(60, -18, 15, step=6))
+    run = rm.simulate(scene)
+    check_shapes(run, muscle)
+    assert run.values(muscle, "flicker").max() < 0.5
+
+
+@pytest.mark.filterwarnings("ignore:.*drives the bones into each other")
+def test_what_folds_does_not_flicker():
+    """Fold of a rim at the end of flexion, abduction and rotation, which leapt by 3.1 mm in a frame."""
+    scene = phantom_scene()
+    scene.muscles = [scene.muscle("abductor")]
+    scene.set_motion(ramp=ramp(90, -25, 20, step=1.5))
+    run = rm.simulate(scene, frames="52:61")
+    assert run.values("abductor", "flicker").max() < 0.6
+    assert run.values("abductor", "self_crossings").max() == 0
+
+
+def test_gluteus_maximus_in_a_combined_motion(hip_scene):
+    """22 of 61 frames of such motions had a handle by marching cubes of 48 cells, rims flickered by 6 mm."""
+    scene = hip_scene.copy()
+    scene.muscles = [scene.muscle("gluteus_maximus")]
+    scene.set_motion(ramp=ramp(72, -20, 16, step=6))
+    run = rm.simulate(scene)
+    check_shapes(run, "gluteus_maximus")
+    # Steps are four times as long as those of the page on reliability, where it is 0.1 mm.
+    assert run.values("gluteus_maximus", "flicker").max() < 1.5

@@ -1,11 +1,11 @@
 """The elastic solid of an RBF muscle: quadrature, energy, equilibrium, slack, squeezed material, finite elements."""
 
-from pathlib import Path
+from importlib import import_module
 
 import numpy as np
 import pytest
 import trimesh
-from conftest import benchmark_script
+from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.rest_frame import RestFrame
@@ -18,7 +18,7 @@ from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame_loop import simulate_frames
 
-DATA = Path(__file__).resolve().parents[1] / "data"
+DATA = ROOT / "tests" / "data"
 
 
 def bar(iterations=100):
@@ -117,17 +117,12 @@ def test_right_side_is_the_derivative_of_the_energy(slack):
     solid = with_fibres(bar(), [0.8, 0.6, 0.0], ratio=4.0, slack=slack)
     rng = np.random.default_rng(1)
     base = solid.rest * [0.8, 1.1, 1.1] + rng.normal(0, 0.3, solid.rest.shape)
-    way = rng.normal(size=base.shape)
-    h = 1e-4
-    found = []
-    for sign in (1, -1):
-        solid.y = base + sign * h * way
+    way, h, found = rng.normal(size=base.shape), 1e-4, []
+    for step in (h, -h, 0.0):
+        solid.y = base + step * way
         for _ in range(30):  # rotations and stretches are found over the iterations
             solid.localise()
         found.append(solid.energy())
-    solid.y = base
-    for _ in range(30):
-        solid.localise()
     force = elastic(solid, base) - solid.right
     # Differences of an energy some 1e5 times as great.
     assert (found[0] - found[1]) / (2 * h) == pytest.approx(np.vdot(force, way), rel=1e-4)
@@ -180,7 +175,7 @@ def test_extensor_lies_near_finite_elements_of_the_same_passive_law(file, asked,
     with np.load(DATA / file) as kept:
         kept = dict(kept)
     asked = {"model.slack": 1.0, "model.fibre_ratio": float(kept.get("fibre_ratio", 1.0)), **asked}
-    rows = benchmark_script("fe_reference").distances("rbf", kept, settings=asked)
+    rows = import_module("fe_reference").distances("rbf", kept, settings=asked)
     assert [rms < limit for (_, rms, _, _), limit in zip(rows, limits, strict=True)] == [True] * 3
     # The surface is extracted at the rest volume.
     assert max(abs(volume) for *_, volume in rows) < 1e-6
@@ -212,13 +207,7 @@ def test_slack_fibres_shorten_along_themselves_almost_without_resistance():
     assert aside.energy() == pytest.approx(stiff.energy(), rel=0.1)
     assert loose.stretch.min() > 1 / 1.6 and np.average(loose.stretch, weights=loose.weights) < 0.9
     assert loose.volumes.sum() == pytest.approx(loose.rest_volumes.sum(), rel=0.01)
-
-
-def test_slack_band_ends_where_it_should():
-    """Beyond the band the solid resists: the energy grows with the square of what is left."""
-    near, far = (moved(x, ALONG, slack=1.1, steps=4).energy() for x in (-3.0, -10.0))
-    assert far > 10.0 * near
-    # Pulled, slack fibres are those of the plain solid.
+    # Pulled, they are those of the plain solid.
     tight, slack = (moved(3.0, ALONG, slack=slack, steps=1).y for slack in (1.0, 1.6))
     assert np.abs(tight - slack).max() < 0.1  # mm; near the held ends some fibres shorten
 
@@ -235,16 +224,11 @@ def test_tension_of_slack_fibres_follows_the_ends():
 
 @pytest.mark.parametrize("name", ["extensor", "adductor_posterior"])
 def test_one_pose_has_one_shape(name):
-    """Flexion and adduction at once, one after the other, and in coarser steps end in the same place."""
     flexion, adduction = {"hip.flexion": 60.0}, {"hip.adduction": -25.0}
     end = {**flexion, **adduction}
     found = []
-    for waypoints, step in (
-        ([{}, end], 2.0),
-        ([{}, flexion, end], 5.0),
-        ([{}, adduction, end], 5.0),
-        ([{}, end], 10.0),
-    ):
+    paths = ([{}, flexion, end], 5.0), ([{}, adduction, end], 5.0), ([{}, end], 10.0)
+    for waypoints, step in paths:
         scene = phantom_scene()
         scene.muscles = [scene.muscle(name)]
         scene.set_motion(waypoints=waypoints, step=step)
@@ -277,13 +261,11 @@ def test_force_of_squeezed_points_is_the_derivative_of_their_energy():
     rng = np.random.default_rng(1)
     base = solid.rest * [0.5, 0.8, 0.8] + rng.normal(0, 0.05, solid.rest.shape)
     way, h, found = rng.normal(size=base.shape), 1e-4, []
-    for sign in (1, -1):
-        solid.y = base + sign * h * way
+    for step in (h, -h, 0.0):
+        solid.y = base + step * way
         solid.localise()
         found.append(solid.squeezed)
     assert found[0] > 0.0
-    solid.y = base
-    solid.localise()
     force = np.zeros_like(base)
     for q in np.flatnonzero(solid.stiffened):
         goal = np.empty((3, 3))

@@ -3,20 +3,24 @@
 import json
 import shutil
 import struct
+import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
+from rbfmuscle.output.animation import page
+from rbfmuscle.output.animation.moving import MovingPart, MovingRun
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.vtp import write_vtp
+from rbfmuscle.report.page import Page
 from rbfmuscle.validation import MissingPartError, UsageError
 
 TOLERANCE = 1e-6  # [m]: what single precision holds at a metre, with room
-NAMES = ("biceps", "upper", "fore")
 TIMES = [1.0, 1.25, 2.0, 2.5, 3.0, 4.0, 4.25]
 
 
@@ -66,29 +70,22 @@ class TestUsd:
         return world[:, :3] * UsdGeom.GetStageMetersPerUnit(stage)
 
     def test_every_vertex_of_every_frame(self, folder, truth, tmp_path):
-        (path,) = export_run(folder, "usd", output=tmp_path)
-        stage, meshes = self.read(path)
-        assert path.suffix == ".usdc"
-        assert set(meshes) == set(NAMES)
-        for (name, frame), expected in truth.items():
-            np.testing.assert_allclose(
-                self.world(stage, meshes[name], frame), expected, rtol=0, atol=TOLERANCE
-            )
-
-    def test_topology_once_bones_rigid_units_and_axis_told(self, folder, tmp_path):
         from pxr import UsdGeom
 
         (path,) = export_run(folder, "usd", output=tmp_path, units="cm")
         stage, meshes = self.read(path)
+        assert path.suffix == ".usdc" and set(meshes) == {"biceps", "upper", "fore"}
+        for (name, frame), expected in truth.items():
+            found = self.world(stage, meshes[name], frame)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE)
         assert UsdGeom.GetStageMetersPerUnit(stage) == pytest.approx(0.01)
         assert UsdGeom.GetStageUpAxis(stage) == "Z"
         assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 6.0)
-        muscle, bone = UsdGeom.Mesh(meshes["biceps"]), UsdGeom.Mesh(meshes["fore"])
-        assert muscle.GetFaceVertexIndicesAttr().GetNumTimeSamples() == 0
-        assert muscle.GetPointsAttr().GetNumTimeSamples() == 7
-        assert bone.GetPointsAttr().GetNumTimeSamples() == 0
-        assert bone.GetOrderedXformOps()[0].GetNumTimeSamples() == 7
-        assert UsdGeom.Mesh(meshes["upper"]).GetOrderedXformOps()[0].GetNumTimeSamples() == 0
+        muscle, moved, still = (UsdGeom.Mesh(meshes[name]) for name in ("biceps", "fore", "upper"))
+        numbers = [muscle.GetFaceVertexIndicesAttr(), muscle.GetPointsAttr(), moved.GetPointsAttr()]
+        numbers += [bone.GetOrderedXformOps()[0] for bone in (moved, still)]
+        # Topology once, bones rigid.
+        assert [samples.GetNumTimeSamples() for samples in numbers] == [0, 7, 0, 7, 0]
 
     def test_changing_surface_has_its_topology_at_every_time(self, changing, tmp_path):
         from pxr import UsdGeom
@@ -123,14 +120,12 @@ def read_glb(path):
     width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
     def raw(view, offset, dtype, count, columns):
-        entry = tree["bufferViews"][view]
-        item = np.dtype(dtype).itemsize
+        entry, item = tree["bufferViews"][view], np.dtype(dtype).itemsize
         step = entry.get("byteStride", columns * item)
         start = entry["byteOffset"] + offset
         assert start % item == 0
         assert (count - 1) * step + columns * item <= entry["byteLength"]
-        shape, strides = (count, columns), (step, item)
-        return np.ndarray(shape, dtype, buffer=body, offset=start, strides=strides).copy()
+        return np.ndarray((count, columns), dtype, body, start, (step, item)).copy()
 
     def numbers(index):
         entry = tree["accessors"][index]
@@ -146,8 +141,6 @@ def read_glb(path):
 
 def morphed(tree, numbers, name, frame):
     """Vertices and normals of a node in the world in a frame, with y up."""
-    from scipy.spatial.transform import Rotation
-
     number = next(k for k, node in enumerate(tree["nodes"]) if node["name"] == name)
     node, animation = tree["nodes"][number], tree["animations"][0]
     primitive = tree["meshes"][node["mesh"]]["primitives"][0]
@@ -177,16 +170,11 @@ class TestAnimatedGlb:
             np.testing.assert_allclose(vertices, up, rtol=0, atol=TOLERANCE)
 
     def test_changing_surface_is_refused_with_a_remedy(self, changing, tmp_path):
-        with pytest.raises(
-            UsageError, match=r"'biceps' do not; run with surface = 'material', or export to usd"
-        ):
+        with pytest.raises(UsageError, match=r"'biceps' do not; run with surface = 'material'"):
             export_run(changing[0], "animated-glb", output=tmp_path)
 
 
 def test_files_with_y_up_or_z_up_stand_upright_whatever_the_data(folder, truth, tmp_path):
-    """x up and -z in front in the data: +y and +z in glTF, +z and -y in USD."""
-    import shutil
-
     copy = shutil.copytree(folder, tmp_path / "run")
     info = json.loads((copy / "run.json").read_text(encoding="utf-8"))
     info["scene"] |= {"superior": [1.0, 0, 0], "anterior": [0, 0, -1.0]}
@@ -222,6 +210,74 @@ def test_names_that_usd_does_not_know_stay_apart():
     from rbfmuscle.output.animation.usd import identifier
 
     used = set()
-    assert [identifier(name, used) for name in ("a-b", "a_b", "1x")] == [
-        "a_b", "a_b_2", "_x",
-    ]  # fmt: skip
+    assert [identifier(name, used) for name in ("a-b", "a_b", "1x")] == ["a_b", "a_b_2", "_x"]
+
+
+CAPTIONS = ["frame 0: knee 0°", "frame 1: knee 10°", "frame 2: knee 20°", "frame 5: knee 30°"]
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """Two muscles over four frames, one with other triangles in the last two; a bone that turns and one that stands."""
+    ball, box = trimesh.creation.icosphere(subdivisions=2, radius=100), trimesh.creation.box((50, 50, 300))
+    points, faces = np.array(ball.vertices), np.array(ball.faces)
+    shapes = [points * [1.0, 1.0 + 0.1 * k, 1.0 - 0.05 * k] + [0.0, 20.0 * k, 0.0] for k in range(4)]
+    cube = trimesh.creation.box((80, 80, 80))
+    other = [*shapes[:2], np.array(cube.vertices), np.array(cube.vertices) + 5.0]
+    kinds = [faces, faces, np.array(cube.faces), np.array(cube.faces)]
+    kinds[1], kinds[3] = kinds[0], kinds[2]
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(np.radians([[10.0 * k, 0, 0] for k in range(4)])).as_matrix()
+    poses[:, :3, 3] = [[0.0, 10.0 * k, 0.0] for k in range(4)]
+    corners, sides = np.array(box.vertices), [np.array(box.faces)]
+    bones = [
+        MovingPart("shin", "#e9e0cd", [corners], sides, poses),
+        MovingPart("thigh", "#e9e0cd", [corners + 300], sides, poses[:1].repeat(4, 0)),
+    ]
+    muscles = [
+        MovingPart("calf </script><b>", "#cc6677", shapes, [faces] * 4),
+        MovingPart("knee", "#cc6677", other, kinds),
+    ]
+    times = np.array([2, 3, 4, 7]) / 24.0
+    right = np.array([-1.0, 0.0, 0.0])
+    return MovingRun("knee & calf", "mm", times, False, CAPTIONS, muscles, bones, np.eye(3), right)
+
+
+@pytest.fixture(scope="module")
+def written(moving, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "knee.html"
+    Page("knee & calf", [], "", scene=page.pack_runs({"": moving})).write(path)
+    return path
+
+
+def test_no_name_ends_the_script_that_holds_it(written):
+    text = written.read_text(encoding="utf-8")
+    assert text.count("<script") == text.count("</script>") == 3 and "<b>" not in text
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no Node.js here")
+def test_every_vertex_and_triangle_of_every_frame_is_unpacked(written, moving):
+    script = Path(__file__).with_name("page_in_node.js")
+    ran = subprocess.run(["node", script, written], capture_output=True, text=True, timeout=120, check=False)
+    assert ran.returncode == 0, ran.stderr
+    found = json.loads(ran.stdout)
+    assert found["captions"] == CAPTIONS and found["panels"] == [""]
+    parts = {part["name"]: part for part in found["parts"]}
+    assert list(parts) == [*(m.name for m in moving.muscles), "shin", "thigh"]
+    # Half a step, of which 30,000 are the longest side: 450 mm.
+    for muscle in moving.muscles:
+        frames = []
+        for piece in parts[muscle.name]["pieces"]:
+            corners = np.reshape(piece["corners"], (-1, 3))
+            frames += [(p, corners) for p in np.reshape(piece["places"], (piece["frames"], -1, 3))]
+        for truth, faces, found_frame in zip(muscle.vertices, muscle.faces, frames, strict=True):
+            np.testing.assert_allclose(found_frame[0], truth, atol=0.02)
+            np.testing.assert_array_equal(found_frame[1], faces)
+    assert [len(parts[m.name]["pieces"]) for m in moving.muscles] == [1, 2]
+    for bone in moving.bones:
+        part = parts[bone.name]
+        places = np.reshape(part["pieces"][0]["places"], (-1, 3))
+        np.testing.assert_allclose(places, bone.vertices[0], atol=0.02)
+        poses = np.reshape(part["poses"], (-1, 3, 4))
+        np.testing.assert_allclose(poses, bone.poses[: len(poses), :3], atol=1e-6)
+        assert len(poses) == (4 if bone.moves else 1)

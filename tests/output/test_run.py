@@ -1,18 +1,15 @@
 """Runs in memory and to a folder: the same numbers, and what an interrupt, a failure or a limit leaves."""
 
-import csv
 import json
 
-import numpy as np
 import pytest
 import trimesh
 from blend_model import arm_scene, files_in, use_blend_model
 from run_folders import timeless
 
-from rbfmuscle.metrics.summary import parse_limits
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import simulate, stream_run
-from rbfmuscle.validation import LimitExceededError, SceneWarning, SolveError, UsageError
+from rbfmuscle.validation import LimitExceededError, SceneWarning, SolveError
 
 
 @pytest.fixture(autouse=True)
@@ -20,28 +17,12 @@ def blend(monkeypatch):
     use_blend_model(monkeypatch)
 
 
-def table(path):
-    with open(path, encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
-
-
 class TestSimulate:
-    def test_flexor_has_a_positive_moment_arm(self):
-        # The muscle runs 9.5 above the hinge and shortens as the forearm rises.
-        arms = simulate(arm_scene(step=5))["biceps"].values("moment_arm")
-        assert np.all(arms > 3)
-
     def test_notes_of_the_motion_are_warned_of(self):
         scene = arm_scene(end=10)
         scene.motion.notes = ["times are not even"]
         with pytest.warns(SceneWarning, match="motion: times are not even"):
             simulate(scene)
-
-    def test_failure_hands_over_the_frames_so_far(self, monkeypatch):
-        use_blend_model(monkeypatch, fail_at=8)
-        with pytest.raises(SolveError, match="planted") as caught:
-            simulate(arm_scene())
-        assert 0 < len(caught.value.run.frames) < 3
 
     @pytest.mark.parametrize("report", [True, False])
     def test_report_is_written_where_it_is_asked_for(self, report, tmp_path):
@@ -77,9 +58,7 @@ class TestStream:
     def test_streamed_and_saved_folders_are_the_same_but_for_times(self, tmp_path):
         made = arm_scene(end=170, step=34)
         # Thinner than the upper bone, so that it is driven into it where the elbow closes.
-        thin = trimesh.creation.box((40, 4, 4))
-        thin.apply_translation([22, 0, 0])
-        made.bones[1].mesh = thin
+        made.bones[1].mesh = trimesh.creation.box((40, 4, 4)).apply_translation([22, 0, 0])
         settings = {"contact.initial": "keep", "detect.tunnelling.action": "report"}
         with pytest.warns(SceneWarning, match="upper and fore"):
             stream_run(made, tmp_path / "streamed", settings=settings, frames="1:")
@@ -89,8 +68,7 @@ class TestStream:
         assert names == files_in(tmp_path / "saved") and "surfaces.pvd" in names
         for name in names:
             assert timeless(tmp_path / "streamed" / name) == timeless(tmp_path / "saved" / name), name
-        events = table(tmp_path / "saved" / "events.csv")
-        assert {event["action"] for event in events} >= {"bones_overlap"}
+        assert ",bones_overlap" in (tmp_path / "saved" / "events.csv").read_text(encoding="utf-8")
 
     def test_interrupt_keeps_the_frames_so_far(self, tmp_path):
         def stop(done, total):
@@ -101,8 +79,7 @@ class TestStream:
             stream_run(arm_scene(), tmp_path, progress=stop)
         saved = SavedRun(tmp_path)
         assert saved.info["status"] == "interrupted"
-        assert saved.frames == [0, 1]
-        assert {r.frame for r in saved.metrics} == {0, 1}
+        assert saved.frames == [0, 1] and {r.frame for r in saved.metrics} == {0, 1}
         assert len(saved.surface("biceps", 1)[0]) > 0
         assert (tmp_path / "surfaces.pvd").read_text(encoding="utf-8").endswith("</VTKFile>\n")
 
@@ -111,9 +88,11 @@ class TestStream:
         with pytest.raises(SolveError, match="planted"):
             stream_run(arm_scene(), tmp_path)
         saved = SavedRun(tmp_path)
-        assert saved.info["status"] == "failed"
-        assert "planted" in saved.info["message"]
-        assert saved.frames
+        assert saved.info["status"] == "failed" and "planted" in saved.info["message"]
+        use_blend_model(monkeypatch, fail_at=8)
+        with pytest.raises(SolveError, match="planted") as caught:
+            simulate(arm_scene())
+        assert 0 < len(caught.value.run.frames) == len(saved.frames) < 3
 
     def test_limit_exceeded_after_everything_is_written(self, tmp_path):
         with pytest.raises(LimitExceededError, match="biceps: length"):
@@ -123,18 +102,9 @@ class TestStream:
 
     def test_second_run_leaves_nothing_of_the_first(self, tmp_path):
         stream_run(arm_scene(), tmp_path)
-        stream_run(arm_scene(), tmp_path, frames=":1", settings={"output.surfaces": False})
-        assert not [name for name in files_in(tmp_path) if name.endswith((".vtp", ".pvd"))]
-
-    def test_only_what_is_asked_for_is_written(self, tmp_path):
-        info = stream_run(arm_scene(surfaces=False), tmp_path)
+        info = stream_run(arm_scene(), tmp_path, frames=":1", settings={"output.surfaces": False})
         assert files_in(tmp_path) == ["events.csv", "metrics.csv", "poses.csv", "run.json"]
         assert info["muscles"]["biceps"]["volume_error"]["worst"] < 1e-9
-
-    def test_unwritable_folder_is_one_line(self, tmp_path):
-        (tmp_path / "file").write_text("")
-        with pytest.raises(UsageError, match="cannot write to"):
-            stream_run(arm_scene(), tmp_path / "file" / "out")
 
     def test_disk_that_fills_up_keeps_the_frames(self, tmp_path, monkeypatch):
         import rbfmuscle.output.writer as writer
@@ -151,10 +121,3 @@ class TestStream:
         with pytest.raises(SolveError, match="frame 2: No space left"):
             stream_run(arm_scene(), tmp_path)
         assert SavedRun(tmp_path).frames == [0, 1]
-
-
-class TestLimits:
-    @pytest.mark.parametrize("text", ["penetration", "length", "volume_error=abc", "volume_error=-1"])
-    def test_wrong_ones_are_refused(self, text):
-        with pytest.raises(UsageError):
-            parse_limits(text, arm_scene())

@@ -11,7 +11,6 @@ from pbd_baseline.constraints import EdgeConstraint, VolumeConstraint
 from pbd_baseline.topology import Topology, colour
 from pbd_baseline.weights import even_weights
 from rbfmuscle.geometry.harmonic import harmonic_weights
-from rbfmuscle.validation import MeshError
 
 
 def ellipsoid(subdivisions=3, axes=(3.0, 2.0, 1.0)):
@@ -41,7 +40,6 @@ def test_constraints_of_one_colour_share_no_vertex(body):
 
 
 def test_a_sweep_over_a_mesh_is_one_edge_after_another(rng):
-    """Colours and blocks are for speed: what they hold is done in their order, each on what the last one left."""
     vertices, faces = ellipsoid(1)
     topology = Topology.from_mesh(vertices, faces)
     given, mass = vertices + 0.1 * rng.normal(size=vertices.shape), rng.uniform(0.5, 2.0, len(vertices))
@@ -106,12 +104,6 @@ def test_volume_is_met_quadratically_and_by_restoring_in_one_step(rng):
     points = vertices * 0.9 + 0.01 * rng.normal(size=vertices.shape)
     constraint.restore(points, constraint.gradient(points))
     assert constraint.volume(points) == pytest.approx(constraint.rest, rel=1e-14)
-
-
-def test_open_mesh_is_refused():
-    vertices, faces = ellipsoid(1)
-    with pytest.raises(MeshError, match="not a closed"):
-        Topology.from_mesh(vertices, faces[1:])
 
 
 def test_even_weights_stretch_less_than_harmonic_ones(body):

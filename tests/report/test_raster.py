@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.output.appearance import motion_direction, view_axes
+import rbfmuscle as rm
+from rbfmuscle.importers.guess.orientation import orient_scene
+from rbfmuscle.output.appearance import VIEWS, motion_direction, view_axes
+from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.raster import Solid, aim, draw_solids, fitted_size
+from rbfmuscle.run import stream_run
+from rbfmuscle.scene.phantom import phantom_scene
 
 RED, BLUE = "#ff0000", "#0000ff"
 FRONT = view_axes((0, -1, 0), np.eye(3))
@@ -53,25 +58,77 @@ def test_subject_is_whole_upright_and_fills_the_picture(direction):
     assert max(np.ptp(seen[:, 0]) / size[0], np.ptp(seen[:, 1]) / size[1]) == pytest.approx(0.9)
     up = camera.project(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     assert up[1, 1] < up[0, 1] and up[1, 0] == pytest.approx(up[0, 0])
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
-def turned(axis, degrees):
-    pose = np.eye(4)
-    angle = np.radians(degrees)
-    skew = np.cross(np.eye(3), np.asarray(axis, dtype=float) / np.linalg.norm(axis)).T
-    pose[:3, :3] = np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
-    return pose
+# Columns: where x, y and z of the phantom (left, posterior, superior) lie in the data.
+AXES = {
+    "z up": np.eye(3),
+    "y up, as in OpenSim": np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]]),
+    "upside down": np.diag([1.0, -1.0, -1.0]),
+    "y down": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+}
+
+
+def turned_scene(turn):
+    """The phantom's bones and muscles, turned; nothing says which way is up."""
+    scene, pose = phantom_scene(spacing=6.0), np.eye(4)
+    pose[:3, :3] = turn
+    for item in scene.bones + scene.muscles:
+        item.mesh = item.mesh.copy()
+        item.mesh.apply_transform(pose)
+    for muscle in scene.muscles:
+        muscle.fibres = None
+    return scene
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_every_view_shows_the_head_of_the_femur_above_its_condyles(name):
+    turn = AXES[name]
+    scene = orient_scene(turned_scene(turn))
+    np.testing.assert_allclose(scene.body, turn.T, atol=1e-12)  # scans lie along axes, which are taken
+    femur, plain = scene.bone("femur").mesh.vertices, phantom_scene(spacing=6.0).bone("femur").mesh.vertices
+    head, condyles = femur[plain[:, 2].argmax()], femur[plain[:, 2].argmin()]
+    for view in ("front", "back", "left", "right"):
+        camera = aim(view_axes(VIEWS[view], scene.body), np.asarray(femur), (300, 400))
+        (_, above, _), (_, below, _) = camera.project(np.stack([head, condyles]))
+        assert above < 60 and below > 340  # pixels count downwards
+    left, posterior, superior = turn.T
+    towards = {"front": -posterior, "back": posterior, "left": left, "right": -left, "top": superior}
+    for view, direction in towards.items():
+        axes = view_axes(VIEWS[view], scene.body)
+        assert axes[2] @ direction > 0.98
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+    # The body's left is at the right hand of who looks at its front or down on it with anterior up.
+    assert view_axes(VIEWS["front"], scene.body)[0] @ left == pytest.approx(1.0)
+    assert view_axes(VIEWS["top"], scene.body)[1] @ -posterior == pytest.approx(1.0)
 
 
 def test_motion_is_seen_along_the_axis_of_the_bone_that_turns_most():
-    frames = [{"femur": turned((-1, 0.2, 0), a), "tibia": turned((0, 1, 0), 0.3 * a)} for a in (0, 20, 70)]
-    wanted = np.array([-1, 0.2, 0]) / np.hypot(1, 0.2)
-    np.testing.assert_allclose(motion_direction(frames, np.eye(3)), wanted, atol=1e-12)
-    np.testing.assert_allclose(
-        motion_direction(frames[::-1], np.eye(3)), wanted, atol=1e-12
-    )  # from outside, either way
+    wanted = np.array([-1.0, 0.2, 0.0]) / np.hypot(1.0, 0.2)
+
+    def turned(axis, degrees):
+        return trimesh.transformations.rotation_matrix(np.radians(degrees), axis)
+
+    for axes in AXES.values():  # however the data lie
+        most, less = axes @ wanted, axes @ [0.0, 1.0, 0.0]
+        frames = [{"femur": turned(most, a), "tibia": turned(less, 0.3 * a)} for a in (0, 20, 70)]
+        for poses in (frames, frames[::-1]):  # from outside, either way
+            np.testing.assert_allclose(motion_direction(poses, axes.T), wanted, atol=1e-12)
     upright = [{"femur": turned((0, 0, 1), a)} for a in (0, 40)]
     for poses in (upright, frames[:1]):
         np.testing.assert_array_equal(motion_direction(poses, np.eye(3)), (-1.0, -0.12, 0.12))
+
+
+def test_a_saved_run_knows_the_directions_that_its_bones_showed(tmp_path):
+    scene = turned_scene(AXES["y up, as in OpenSim"])
+    scene.joints, scene.motion = [], rm.Scene().motion
+    stream_run(scene, tmp_path, model="pbd", settings={"output.report": False})
+    np.testing.assert_allclose(SavedRun(tmp_path).body, AXES["y up, as in OpenSim"].T, atol=1e-12)
+    assert scene.superior is None  # the caller's scene is as it was
+
+
+def test_without_a_bone_that_shows_it_z_is_up_and_minus_y_in_front():
+    scene = phantom_scene(spacing=6.0)
+    scene.bones = [scene.bone("pelvis")]
+    np.testing.assert_array_equal(orient_scene(scene).body, np.eye(3))

@@ -3,18 +3,20 @@
 import json
 import re
 import shutil
-from html.parser import HTMLParser
+from collections import Counter
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from rbfmuscle.cli.app import run_command
 from rbfmuscle.metrics.summary import describe_verdict, shown_number, within
 from rbfmuscle.output.appearance import muscle_groups
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report import render
 from rbfmuscle.report.page import Cell, Page, Section, Table, limit_state
-from rbfmuscle.report.report import _events, write_report
+from rbfmuscle.report.report import write_report
+from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import UsageError
 
 
@@ -24,52 +26,33 @@ def folder(arm_run, tmp_path_factory):
     return shutil.copytree(arm_run[1], tmp_path_factory.mktemp("report") / "run")
 
 
-class Outline(HTMLParser):
-    """Checks that every element is closed, and notes what is loaded, and the cells of the rows with lights."""
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.sources, self.lights = [], [], {}
-
-    def handle_starttag(self, tag, attrs):
-        self.sources += [value for name, value in attrs if name in ("src", "href")]
-        if tag not in ("meta", "img", "br", "input"):
-            self.open.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        assert self.open.pop()[0] == tag
-
-    def handle_data(self, text):
-        inside = any(attrs.get("class") == "lights" for tag, attrs in self.open if tag == "table")
-        if inside and self.open[-1][0] == "th":
-            self.title = text
-        elif inside and self.open[-1][0] == "td" and self.open[-1][1].get("class"):
-            self.lights[self.title] = self.open[-1][1]["class"], text
-
-
-def read(folder, name="report.html"):
-    text = (folder / name).read_text(encoding="utf-8")
-    outline = Outline()
-    outline.feed(text)
-    assert outline.open == []
-    return text, outline
+def read(folder):
+    """Text of the report, whose elements are all closed, addresses of what it loads, and its lights by title."""
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    plain = re.sub(r"<(script|style|svg).*?</\1>", "", text, flags=re.S)
+    opened, closed = (Counter(re.findall(tag, plain)) for tag in (r"<([a-z]\w*)", r"</(\w+)"))
+    assert opened - Counter({tag: 99 for tag in ("meta", "img", "br", "input", "link")}) == closed
+    table = plain.partition('class="lights"')[2].partition("</table>")[0]
+    rows = re.findall(r'<tr><th>([^<]+).*?<td class="(\w+)">(?:<i>[^<]*</i>)?([^<]*)', table, flags=re.S)
+    lights = {title: (state, said) for title, state, said in rows}
+    return text, re.findall(r'(?:src|href)="([^"]*)', plain), lights
 
 
 def test_answer_picture_and_rows_come_before_what_is_folded(folder):
     write_report(folder)
-    text, outline = read(folder)
+    text, sources, lights = read(folder)
     verdict = describe_verdict(SavedRun(folder).info["muscles"], SavedRun(folder).info["limits"])
     order = [verdict.partition(". ")[0][1:], 'data-scene="scene"', "Keeps its volume", "<details>"]
     places = [text.index(part) for part in order]
     assert places == sorted(places)
-    assert len(outline.lights) == 5 and "http" not in text
-    assert all(source.startswith("data:") for source in outline.sources)
+    assert len(lights) == 5 and "http" not in text
+    assert all(source.startswith("data:") for source in sources)
     assert len(text) < 6_000_000
 
 
 def test_lights_and_red_cells_are_those_beyond_their_limits(folder):
     write_report(folder, pictures=False)
-    text, outline = read(folder)
+    text, _, lights = read(folder)
     info = SavedRun(folder).info
     found, limits = info["muscles"]["biceps"], info["limits"]
     beyond = [n for n, limit in limits.items() if n in found and not within(n, found[n]["worst"], limit)]
@@ -78,19 +61,18 @@ def test_lights_and_red_cells_are_those_beyond_their_limits(folder):
     assert sum("bad" in cell for cell in cells) == len(beyond)
     depth = max(abs(found[name]["worst"]) for name in ("penetration_max", "bone_penetration_max"))
     kept_out = all(n not in beyond for n in ("penetration_max", "bone_penetration_max", "initial_overlap"))
-    assert (outline.lights["Stays out of bones"][0] == "bad") == (not kept_out)
-    assert kept_out or outline.lights["Stays out of bones"][1] == shown_number(depth, "mm")
+    assert (lights["Stays out of bones"][0] == "bad") == (not kept_out)
+    assert kept_out or lights["Stays out of bones"][1] == shown_number(depth, "mm")
 
 
 def test_scene_holds_every_frame_and_colour_of_the_plots(folder):
     write_report(folder)
-    text, _ = read(folder)
+    text, _, _ = read(folder)
     facts = json.loads(re.search(r'<script id="scene"[^>]*>(.*?)</script>', text, re.S)[1])
     assert len(facts["captions"]) == 7 and facts["captions"][6] == "frame 6, elbow.flexion 60°"
     colours = {part["name"]: part["colour"] for part in facts["parts"]}
-    assert re.search(
-        rf'data-muscle="biceps"><title>biceps</title>\s*<path[^>]*stroke: {colours["biceps"]}', text
-    )
+    line = rf'data-muscle="biceps"><title>biceps</title>\s*<path[^>]*stroke: {colours["biceps"]}'
+    assert re.search(line, text)
     np.testing.assert_allclose(np.abs(facts["direction"]), [0, 1, 0], atol=1e-9)  # the elbow's axis
 
 
@@ -119,23 +101,23 @@ def test_render_writes_what_the_suffix_says(folder, tmp_path, name):
         assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 7)
 
 
-@pytest.mark.parametrize("wrong", [{"views": ["side"]}, {"frame": 99}, {"output": "a.bmp"}])
-def test_render_refuses_wrong_words(folder, tmp_path, wrong):
-    words = {"output": "a.png", **wrong}
+@pytest.mark.parametrize(
+    ("name", "wrong"), [("a.png", {"views": ["side"]}), ("a.png", {"frame": 99}), ("a.bmp", {})]
+)
+def test_render_refuses_wrong_words(folder, tmp_path, name, wrong):
     with pytest.raises(UsageError):
-        render.render_run(folder, tmp_path / words.pop("output"), **words)
+        render.render_run(folder, tmp_path / name, **wrong)
 
 
 def test_muscles_are_grouped_by_the_joints_that_they_cross():
     chain = {"hip": "pelvis femur", "knee": "femur tibia", "ankle": "tibia foot", "cap": "femur patella"}
     joints = [{"name": n, **dict(zip(("parent", "child"), b.split()))} for n, b in chain.items()]
-    for bones, group in (
-        (("pelvis", "femur"), "across hip"),
-        (("pelvis", "tibia"), "across hip, knee"),
-        (("femur", "patella"), "along femur"),
-        (("femur", "foot"), "across knee"),
-    ):
-        muscle = {"name": "one", "attach": [{"bone": bone} for bone in bones]}
+    groups = {
+        "pelvis femur": "across hip", "pelvis tibia": "across hip, knee", "femur patella": "along femur",
+        "femur foot": "across knee",
+    }  # fmt: skip
+    for bones, group in groups.items():
+        muscle = {"name": "one", "attach": [{"bone": bone} for bone in bones.split()]}
         assert muscle_groups({"scene": {"joints": joints, "muscles": [muscle]}}) == {"one": group}
 
 
@@ -157,15 +139,23 @@ def test_lights_are_green_amber_from_four_fifths_and_red_beyond():
     assert limit_state("flicker", 5.0, None) == limit_state("flicker", None, 1.0) == "plain"
 
 
-def test_events_are_counted_by_kind():
-    events = [(k, "one", "bone", 1, "halved") for k in range(70)] + [(3, "", "bone", 1, "bones_overlap")]
-    assert _events(events) == "halved: 70 (one 70). bones_overlap: 1 (bone 1)."
-
-
 def test_names_stay_text(tmp_path):
     table = Table(["<b>"], [[Cell("<b>one")]])
-    Page("<b>", ["<b>"], "<b>", sections=[Section("<b>", table=table), Section("empty")]).write(
-        tmp_path / "a.html"
-    )
+    sections = [Section("<b>", table=table), Section("empty")]
+    Page("<b>", ["<b>"], "<b>", sections=sections).write(tmp_path / "a.html")
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "<b>" not in text and "&lt;b&gt;one" in text and "empty" not in text
+
+
+def test_picture_of_a_scene_shows_bones_and_patches_in_their_colours(tmp_path):
+    scene = phantom_scene(spacing=6.0)
+    for item in scene.bones + scene.muscles:
+        item.mesh.export(tmp_path / f"{item.name}.ply")
+    assert run_command(["new", str(tmp_path), "--units", "mm"]) == 0
+    assert run_command(["check", str(tmp_path / "scene.toml"), "--picture"]) == 0
+    image = np.asarray(Image.open(tmp_path / "scene.png").convert("RGB"), dtype=int)
+    # The pelvis is pale rose and the femur pale indigo: both are in every one of the four views.
+    for view in np.array_split(image[40:860], 4, axis=1):
+        assert (view.min(axis=2) < 245).mean() > 0.05
+        assert (view[..., 0] - view[..., 2] > 15).mean() > 0.01
+        assert (view[..., 2] - view[..., 0] > 5).mean() > 0.01

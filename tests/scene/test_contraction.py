@@ -24,11 +24,8 @@ def test_fibres_of_a_mesh_are_slack_pull_or_yield_by_the_law():
     fibres = build_model(made.muscle(MUSCLE), made).fibres
     belly = ~fibres.at_tendon
     assert belly.any() and fibres.at_tendon.any()
-    for activation, (low, high), strain in (
-        (0.0, (0.8, 1.0), 0.0),
-        (0.5, (0.6, 0.7), 0.025),
-        (1.0, (0.4, 0.4), 0.05),
-    ):
+    rows = (0.0, (0.8, 1.0), 0.0), (0.5, (0.6, 0.7), 0.025), (1.0, (0.4, 0.4), 0.05)
+    for activation, (low, high), strain in rows:
         fibres.activate(activation)
         assert fibres.lower[belly] == pytest.approx(low) and fibres.upper[belly] == pytest.approx(high)
         assert (fibres.active[belly] == activation).all() and (fibres.active[~belly] == 0.0).all()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from toy_scene import held
 
 from rbfmuscle.scene.joints.functions import Linear, PiecewiseLinear, Polynomial, Spline
 from rbfmuscle.scene.joints.joint import KINDS, all_coordinates, resolve
@@ -21,6 +22,8 @@ from rbfmuscle.validation import SceneError
 BOX = trimesh.creation.box((10, 10, 10))
 DEG = math.pi / 180
 Q = {"axes": {"q": (1, 0, 0)}}
+SPLINE = {"x": [-120, -60, 0, 10], "y": [3, 9, 5, 4]}
+SLOPELESS = [{"axis": [1, 0, 0], "coordinates": ["q"], "linear": [1.0]}]
 
 
 def pair(units="mm", **row):
@@ -35,11 +38,7 @@ def knee(**coordinate):
         type="custom",
         rotations=[{"axis": [0.1, 0.2, 1.0], "coordinates": ["q"]}],
         translations=[
-            {
-                "axis": [1, 0.2, -0.3],
-                "coordinates": ["q"],
-                "spline": {"x": [-120, -60, 0, 10], "y": [3, 9, 5, 4]},
-            },
+            {"axis": [1, 0.2, -0.3], "coordinates": ["q"], "spline": SPLINE},
             {"axis": [0, 1, 0], "coordinates": ["q"], "polynomial": [0.001, -0.1, 7.0]},
         ],
         coordinates={"q": {"range": [-120, 10], **coordinate}},
@@ -78,11 +77,10 @@ class TestKinds:
     def test_each_coordinate_turns_or_shifts_along_its_axis(self, kind):
         facts = KINDS[kind]
         directions = [*facts.rotations, *facts.translations]
-        names = [f"q{k}" for k in range(len(directions))]
-        scene = pair(type=kind, coordinates={name: {} for name in names})
+        scene = pair(type=kind, coordinates={f"q{k}": {} for k in range(len(directions))})
         centre = np.array([3.0, -2.0, 5.0])
-        for k, (name, axis) in enumerate(zip(names, directions)):
-            pose = bone_poses(scene, {f"j.{name}": 0.4})["b"]
+        for k, axis in enumerate(directions):
+            pose = bone_poses(scene, {f"j.q{k}": 0.4})["b"]
             if k < len(facts.rotations):
                 assert pose[:3, :3] == pytest.approx(Rotation.from_rotvec(0.4 * np.array(axis)).as_matrix())
                 assert pose[:3, :3] @ centre + pose[:3, 3] == pytest.approx(centre)
@@ -101,10 +99,7 @@ class TestKinds:
         [
             ({"type": "hinge", "axes": {"p": (1, 0, 0), "q": (0, 1, 0)}}, "a hinge joint has 1 coordinates, 2"),
             ({"type": "custom", "axes": {"q": (1, 0, 0)}}, "rotations and translations instead of axes"),
-            (
-                {"type": "custom", "rotations": [{"axis": [1, 0, 0], "coordinates": ["q"], "linear": [1.0]}]},
-                "linear needs a slope",
-            ),
+            ({"type": "custom", "rotations": SLOPELESS}, "linear needs a slope"),
             ({**Q, "coordinates": {"q": {"range": [3, 1]}}}, "range must go upwards"),
             ({**Q, "coordinates": {"q": {"motion": "translation"}}}, "'q' is a rotation here, not a translation"),
             ({**Q, "coordinates": {"p": {}}}, "coordinate 'p' moves nothing"),
@@ -115,7 +110,7 @@ class TestKinds:
             pair(**row)
 
 
-class TestRestPose:
+class TestCoordinates:
     def test_rest_pose_may_be_any_pose(self):
         """Meshes scanned at 40 degrees: the motion from there is that of meshes moved there by a scene at 0."""
         zero, scanned = knee(), knee(rest=-40.0)
@@ -126,14 +121,9 @@ class TestRestPose:
             want = bone_poses(zero, {"j.q": angle * DEG})["b"] @ np.linalg.inv(start)
             assert bone_poses(scanned, {"j.q": angle * DEG})["b"] == pytest.approx(want, abs=1e-12)
 
-
-class TestCoordinates:
     def test_locks_ranges_and_couplings_are_honoured(self):
-        scene = pair(
-            type="universal",
-            axes={"p": (1, 0, 0), "q": (0, 1, 0)},
-            coordinates={"p": {"range": [-10, 20], "clamped": True}, "q": {"locked": True, "rest": 0.0}},
-        )
+        held = {"p": {"range": [-10, 20], "clamped": True}, "q": {"locked": True, "rest": 0.0}}
+        scene = pair(type="universal", axes={"p": (1, 0, 0), "q": (0, 1, 0)}, coordinates=held)
         moved = bone_poses(scene, {"j.p": 90 * DEG, "j.q": 1.0})["b"]
         assert moved == pytest.approx(bone_poses(scene, {"j.p": 20 * DEG})["b"])
 
@@ -154,21 +144,15 @@ class TestCoordinates:
 
     def test_leaving_a_range_is_reported(self):
         scene = knee().set_motion(ramp={"q": {"from": 0, "to": 20, "step": 5}})
-        assert scene.motion.notes == [
-            "coordinate 'j.q' leaves its range -120 to 10 in 2 of 5 frames, by up to 10"
-        ]
-        assert any("leaves its range" in str(finding) for finding in scene.check())
+        (note,) = scene.motion.notes
+        assert "'j.q' leaves its range -120 to 10 in 2 of 5 frames, by up to 10" in note
+        assert any(note in str(finding) for finding in scene.check())
 
-
-class TestRows:
     def test_rows_make_the_same_joint_again(self):
         scenes = [
             knee(rest=-33.3),
             pair(axes={"flexion": (-1, 0, 0), "turn": (0.2, 0.3, 0.9)}),
-            pair(
-                type="planar",
-                coordinates={"r": {"rest": 3.0}, "x": {}, "y": {"rest": 2.5}},
-            ),
+            pair(type="planar", coordinates={"r": {"rest": 3.0}, "x": {}, "y": {"rest": 2.5}}),
             pair(type="fixed", centre=None),
             pair(axes={"q": (0, 0, 1)}, backward=True),
         ]
@@ -181,16 +165,11 @@ class TestRows:
             given = scene.joints[0].coordinates
             assert [c.rest for c in names.values()] == pytest.approx([c.rest for c in given.values()])
 
-
-class TestSteps:
     def test_a_pure_shift_is_cut_into_steps_and_reached(self):
-        from toy_scene import attach, ellipsoid
-
-        mesh = ellipsoid((30, 4, 4))
-        scene = Scene("s").add_bone("a", BOX).add_bone("b", BOX)
-        scene.add_joint("j", "a", "b", (0, 0, 0), type="slider", axes={"s": (1, 0, 0)})
-        ends = [attach(mesh, "a", lambda v: v[:, 0] < -20), attach(mesh, "b", lambda v: v[:, 0] > 20)]
-        scene.add_muscle("m", mesh, attach=[{"bone": e.bone, "vertices": e.vertices.tolist()} for e in ends])
+        mesh = trimesh.creation.icosphere(subdivisions=2).apply_scale([30, 4, 4])
+        scene = pair(centre=(0, 0, 0), type="slider", axes={"s": (1, 0, 0)})
+        x = mesh.vertices[:, 0]
+        scene.add_muscle("m", mesh, attach=held(a=x < -20, b=x > 20))
         scene.motion = Motion([{"j.s": 0.0}, {"j.s": 40.0}])
         stops = SubSteps(scene).split({"j.s": 0.0}, {"j.s": 40.0})
         values = [0.0, *(stop["j.s"] for stop in stops)]

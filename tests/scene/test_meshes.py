@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from fuzz.meshes import write_mesh
 
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.validation import MeshError
@@ -17,20 +18,12 @@ def write(path, vertices, faces):
     return path
 
 
-def write_vtk(path, mesh):
-    import pyvista
-
-    pyvista.make_tri_mesh(mesh.vertices, mesh.faces).save(path)
-    return path
-
-
 class TestFormats:
     @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".vtk", ".vtp"])
     def test_every_format_gives_the_same_surface(self, tmp_path, suffix):
         mesh = ball()
-        path = tmp_path / f"ball{suffix}"
-        write_vtk(path, mesh) if suffix in (".vtk", ".vtp") else mesh.export(path)
-        read = read_mesh(path)
+        form = "vtp-Binary-ZLib" if suffix == ".vtp" else "vtk-binary-51" if suffix == ".vtk" else suffix[1:]
+        read = read_mesh(write_mesh(tmp_path / f"ball{suffix}", mesh, form))
         assert read.closed
         assert len(read.mesh.vertices) == len(mesh.vertices)
         assert read.mesh.volume == pytest.approx(mesh.volume, rel=1e-6)  # STL and VTK hold float32
@@ -41,9 +34,8 @@ class TestFormats:
         path = tmp_path / "box.obj"
         corners = [(x, y, z) for x in (0, 9) for y in (0, 9) for z in (0, 9)]
         quads = ["1/1 2/2 4/3 3/4", "5 7 8 6", "1 5 6 2", "3//1 4//1 8//1 7//1", "1 3 7 5", "-7 -3 -1 -5"]
-        path.write_text(
-            "\n".join([*(f"v {x} {y} {z}" for x, y, z in corners), "vt 0 0", *(f"f {q}" for q in quads)])
-        )
+        lines = [*(f"v {x} {y} {z}" for x, y, z in corners), "vt 0 0", *(f"f {q}" for q in quads)]
+        path.write_text("\n".join(lines))
         read = read_mesh(path)
         np.testing.assert_allclose(read.mesh.vertices, corners, atol=1e-9)
         assert read.mesh.volume == pytest.approx(729)
@@ -74,10 +66,8 @@ class TestMending:
             faces = np.vstack([faces, [[*faces[0, :2], len(mesh.vertices)]]])
         else:
             crumb = trimesh.creation.icosphere(subdivisions=0, radius=0.5).apply_translation([50, 0, 0])
-            vertices, faces = (
-                np.vstack([vertices, crumb.vertices]),
-                np.vstack([faces, crumb.faces + len(vertices)]),
-            )
+            faces = np.vstack([faces, crumb.faces + len(vertices)])
+            vertices = np.vstack([vertices, crumb.vertices])
         read = read_mesh(write(tmp_path / "a.ply", vertices, faces))
         assert read.closed and read.mesh.volume == pytest.approx(mesh.volume, rel=1e-6)
         assert any(kind in note for note in read.notes)
@@ -109,18 +99,12 @@ class TestMending:
         assert read.vertex_map[5] == -1 and read.vertex_map[6] == 5
         assert any("2 degenerate or repeated" in note for note in read.notes)
 
-    def test_two_parts_are_refused(self, tmp_path):
-        twins = trimesh.util.concatenate([ball(), ball().apply_translation([60, 0, 0])])
-        with pytest.raises(MeshError, match="2 separate parts"):
-            read_mesh(write(tmp_path / "b.ply", twins.vertices, twins.faces))
-
     def test_cavity_of_a_bone_stays_a_cavity(self, tmp_path):
         inner = ball(8.0)
-        both = trimesh.util.concatenate(
-            [ball(), trimesh.Trimesh(inner.vertices, inner.faces[:, ::-1], process=False)]
-        )
+        inner.invert()
+        both = trimesh.util.concatenate([ball(), inner])
         read = read_mesh(write(tmp_path / "a.ply", both.vertices, both.faces), may_be_open=True)
-        assert read.mesh.volume == pytest.approx(ball().volume - inner.volume, rel=1e-6)
+        assert read.mesh.volume == pytest.approx(ball().volume + inner.volume, rel=1e-6)
 
     def test_few_triangles_at_edges_of_more_than_two_are_dropped_from_a_bone(self, tmp_path):
         mesh = ball()
@@ -128,16 +112,18 @@ class TestMending:
         extra = np.column_stack([edges, (edges[:, 0] + 90) % len(mesh.vertices)])
         file = write(tmp_path / "bone.ply", mesh.vertices, np.vstack([mesh.faces, extra]))
         read = read_mesh(file, may_be_open=True)
-        assert read.mesh.volume == pytest.approx(mesh.volume, rel=0.01) and len(read.mesh.faces) <= len(
-            mesh.faces
-        )
+        assert read.mesh.volume == pytest.approx(mesh.volume, rel=0.01)
+        assert len(read.mesh.faces) <= len(mesh.faces)
 
-    def test_non_manifold_edge_that_cannot_be_mended(self, tmp_path):
+    @pytest.mark.parametrize(
+        ("away", "words"),
+        [([10, 10, 0], "more than two triangles.*manifold"), ([60, 0, 0], "2 separate parts")],
+    )
+    def test_boxes_that_share_an_edge_or_nothing_are_refused(self, tmp_path, away, words):
         box = trimesh.creation.box((10, 10, 10))
-        other = trimesh.creation.box((10, 10, 10)).apply_translation([10, 10, 0])
-        both = trimesh.util.concatenate([box, other])
-        both.merge_vertices()  # two boxes that share one edge
-        with pytest.raises(MeshError, match=r"pair\.ply.*more than two triangles.*manifold"):
+        both = trimesh.util.concatenate([box, box.copy().apply_translation(away)])
+        both.merge_vertices()
+        with pytest.raises(MeshError, match=rf"pair\.ply.*{words}"):
             read_mesh(write(tmp_path / "pair.ply", both.vertices, both.faces))
 
     def test_one_sided_surface_is_refused(self, tmp_path):
@@ -146,27 +132,16 @@ class TestMending:
         away = 30 + width * np.cos(angle / 2)
         rim = np.column_stack([away * np.cos(angle), away * np.sin(angle), width * np.sin(angle / 2)])
         faces = [face for k in range(0, 78, 2) for face in ([k, k + 1, k + 3], [k, k + 3, k + 2])]
+        path = write(tmp_path / "moebius.ply", rim, [*faces, [78, 79, 0], [78, 0, 1]])
         with pytest.raises(MeshError, match="one side only"):
-            read_mesh(
-                write(tmp_path / "moebius.ply", rim, [*faces, [78, 79, 0], [78, 0, 1]]), may_be_open=True
-            )
+            read_mesh(path, may_be_open=True)
 
 
 CORNERS = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
-OBJ = (
-    b"v 0 0\n",
-    b"v 0 0 x\n",
-    b"\nf a b c\n",
-    *(CORNERS + b"f 1 2 " + n for n in (b"9", b"9" * 5000, b"-7")),
-)
+OBJ = (b"v 0 0 x\n", b"\nf a b c\n", *(CORNERS + b"f 1 2 " + n for n in (b"9", b"9" * 5000, b"-7")))
 
 
 class TestUnusable:
-    def test_missing_file_names_its_nearest_neighbour(self, tmp_path):
-        ball().export(tmp_path / "femur.ply")
-        with pytest.raises(MeshError, match=r"femr\.ply: no such mesh file, did you mean 'femur.ply'"):
-            read_mesh(tmp_path / "femr.ply")
-
     @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".vtk", ".vtp"])
     def test_unreadable_and_empty_files(self, tmp_path, suffix, capfd):
         path = tmp_path / f"junk{suffix}"

@@ -8,7 +8,7 @@ import zlib
 import numpy as np
 import pytest
 import trimesh
-from fuzz.base import FORMS, suffix_of, write_mesh
+from fuzz.meshes import FORMS, suffix_of, write_mesh
 
 from rbfmuscle.scene.meshes import polydata
 from rbfmuscle.scene.meshes.polydata import read_polydata

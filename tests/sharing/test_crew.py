@@ -56,12 +56,6 @@ def small_scene(mixed=0, **settings):
     return scene.with_options({"output.report": False, **settings})
 
 
-def assert_same_folders(one, other):
-    assert files_in(one) == files_in(other)
-    for name in files_in(one):
-        assert timeless(one / name) == timeless(other / name), name
-
-
 def ended(crew):
     return all(process.poll() is not None for process in crew._processes)
 
@@ -73,23 +67,10 @@ def test_folder_is_that_of_one_process_to_the_last_byte(tmp_path, two_helpers, c
     monkeypatch.setattr(recording, "helpers_for", lambda *given: 0)
     stream_run(scene, tmp_path / "one", pictures=False)
     assert len(crews) == 1
-    assert_same_folders(tmp_path / "several", tmp_path / "one")
+    assert files_in(tmp_path / "several") == files_in(tmp_path / "one")
+    for name in files_in(tmp_path / "one"):
+        assert timeless(tmp_path / "several" / name) == timeless(tmp_path / "one" / name), name
     assert SavedRun(tmp_path / "several").muscles == [muscle.name for muscle in scene.muscles]
-
-
-def test_frames_in_memory_have_all_muscles_in_the_scenes_order(two_helpers, crews):
-    scene = small_scene()
-    run = simulate(scene)
-    names = [muscle.name for muscle in scene.muscles]
-    assert len(crews) == 1 and len(run.frames) == 4
-    for frame in run.frames:
-        for found in (frame.surfaces, frame.carried, frame.times, frame.work):
-            assert list(found) == names
-    assert [r.muscle for r in run.metrics if r.frame == 1 and r.quantity == "length"] == names
-    alone = MuscleGroup(scene, names[1:2])
-    for frame, solved in zip(run.frames, alone.frames()):
-        surface = solved.frame.surfaces[names[1]]
-        np.testing.assert_array_equal(surface.vertices, frame.surfaces[names[1]].vertices)
 
 
 def test_a_muscle_that_cannot_be_built_raises_the_error_of_one_process(two_helpers, crews):
@@ -107,9 +88,7 @@ def test_helper_that_is_killed_ends_the_run_with_the_frames_so_far(tmp_path, two
             os.kill(crews[0]._processes[1].pid, signal.SIGKILL)
             crews[0]._processes[1].wait()
 
-    with pytest.raises(
-        SolveError, match=r"helper process was ended by signal 9; memory.*NUMBA_NUM_THREADS=1"
-    ):
+    with pytest.raises(SolveError, match=r"helper process was ended by signal 9"):
         stream_run(small_scene(), tmp_path, pictures=False, progress=kill)
     saved = SavedRun(tmp_path)
     assert saved.info["status"] == "failed" and saved.frames and ended(crews[0])
@@ -117,11 +96,8 @@ def test_helper_that_is_killed_ends_the_run_with_the_frames_so_far(tmp_path, two
 
 
 def test_helper_ends_with_the_process_that_started_it():
-    """It waits for the word to begin, and nobody is left to say it: its standard input is closed."""
-    scene = small_scene()
-    helper = subprocess.Popen(
-        [sys.executable, "-m", "rbfmuscle.sharing.helper"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
+    scene, words = small_scene(), [sys.executable, "-m", "rbfmuscle.sharing.helper"]
+    helper = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     pickle.dump((scene, [scene.muscles[0].name]), helper.stdin)
     helper.stdin.close()
     try:
@@ -135,9 +111,8 @@ def test_helper_ends_with_the_process_that_started_it():
     ("raised", "expected"),
     [
         ("MemoryError('asked for 7 GB')", MemoryError("asked for 7 GB")),
-        ("OSError(28, 'No space left', 'cache')", OSError(28, "No space left", "cache")),
         ("SolveError('frame 3')", SolveError("frame 3")),
-        ("ZeroDivisionError('a bug')", RuntimeError),
+        ("ZeroDivisionError('a bug')", RuntimeError("ZeroDivisionError: a bug")),
     ],
 )
 def test_errors_of_a_helper_are_reported_as_they_are(raised, expected):
@@ -148,44 +123,30 @@ def test_errors_of_a_helper_are_reported_as_they_are(raised, expected):
         "helper.MuscleGroup = share\n"
         "helper.main()"
     )
-    job = pickle.dumps((None, []))
+    words = [sys.executable, "-c", code]
     # Its standard input stays open: it has to end by itself.
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as process:
-        process.stdin.write(job)
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdin.write(pickle.dumps((None, [])))
         process.stdin.flush()
         kind, what = pickle.load(process.stdout)
     assert kind == "failed"
-    if isinstance(expected, Exception):
-        assert type(what) is type(expected) and what.args == expected.args and str(what) == str(expected)
-    else:
-        assert type(what) is expected and "ZeroDivisionError: a bug" in str(what)
+    assert type(what) is type(expected) and str(expected) in str(what)
 
 
-class TestHelpersFor:
-    def scene(self, muscles, frames, sliding=None):
-        return SimpleNamespace(
-            muscles=range(muscles), motion=SimpleNamespace(frames=range(frames)), sliding=sliding
-        )
-
-    def test_one_process_where_another_costs_more_than_it_brings(self):
-        assert helpers_for(self.scene(4, 1000), 4) < 2
-        assert helpers_for(self.scene(38, 5), 4) < 2
-        assert helpers_for(phantom_scene(), 4) < 2
-
-    def test_no_more_than_cores_or_muscles_feed(self):
-        assert helpers_for(self.scene(38, 37), 4) == 4
-        assert helpers_for(self.scene(12, 100), 4) == 2
-        assert helpers_for(self.scene(38, 37), 2) == 2
-        assert helpers_for(self.scene(38, 37), 1) < 2
-
-    def test_muscles_that_slide_stay_together(self):
-        assert helpers_for(self.scene(38, 37, sliding=object()), 4) < 2
+@pytest.mark.parametrize(
+    ("muscles", "frames", "sliding", "cores", "wanted"),
+    [
+        (4, 1000, None, 4, 1), (38, 5, None, 4, 1), (38, 37, object(), 4, 1), (38, 37, None, 1, 1),
+        (38, 37, None, 4, 4), (12, 100, None, 4, 2), (38, 37, None, 2, 2),
+    ],
+)  # fmt: skip
+def test_helpers_are_as_many_as_bring_more_than_they_cost(muscles, frames, sliding, cores, wanted):
+    motion = SimpleNamespace(frames=range(frames))
+    scene = SimpleNamespace(muscles=range(muscles), motion=motion, sliding=sliding)
+    assert max(helpers_for(scene, cores), 1) == wanted
 
 
 def test_a_message_that_is_cut_is_the_last_one():
-    """What follows it would be read as its rest: the process ends, and its end tells."""
     said = """
 from rbfmuscle.child import Outbox
 box = Outbox()

@@ -14,25 +14,27 @@ from rbfmuscle.simulation.substeps import SubSteps
 from rbfmuscle.validation import SceneError, SolveError
 
 
-def _run(angles, **options):
-    made, fields = hinged_scene(angles, **options)
-    model = ToyMuscle(made.muscles[0], made)
-    return list(simulate_frames(made, [model], fields=fields)), model
-
-
 def test_frames_carry_what_they_promise():
-    frames, model = _run([0, 10, 20], tunnelling=TunnellingOptions())
+    made, fields = hinged_scene([0, 10, 20], tunnelling=TunnellingOptions())
+    model = ToyMuscle(made.muscles[0], made)
+    frames = list(simulate_frames(made, [model], fields=fields))
     assert [frame.index for frame in frames] == [0, 1, 2]
     assert frames[2].coordinates == {"hinge.bend": np.radians(20)}
     last = frames[-1]
-    assert np.array_equal(last.surfaces["strap"].vertices, model.x)
-    assert np.array_equal(last.carried["strap"][0], model.x)
+    for shown in (last.surfaces["strap"].vertices, last.carried["strap"][0]):
+        assert np.array_equal(shown, model.x)
     assert np.allclose(last.poses["trunk"], np.eye(4))
     times = last.times["strap"]
     assert set(times) == {"time_predict", "time_solve", "time_tunnelling", "time_surface", "time_frame"}
-    assert times["time_frame"] == pytest.approx(sum(v for k, v in times.items() if k != "time_frame"))
-    assert times["time_frame"] > 0.0
+    assert 0.0 < times["time_frame"] == pytest.approx(sum(v for k, v in times.items() if k != "time_frame"))
     assert sum(f.wall for f in frames) >= sum(f.times["strap"].get("time_solve", 0.0) for f in frames)
+    made.detect, model.drawing = (
+        None,
+        None,
+    )  # without surfaces and tables nothing is extracted, slid or looked for
+    *_, last = simulate_frames(made, [model], fields=fields, surfaces=False)
+    assert last.surfaces == {}
+    assert not {"time_surface", "time_sliding", "time_tunnelling"} & set(last.times["strap"])
 
 
 def test_sub_steps_bound_turn_and_travel():
@@ -61,10 +63,8 @@ def test_sub_steps_end_at_the_same_angles_however_frames_are_spaced():
 
     whole = np.array(path([30]))
     np.testing.assert_array_equal(path([10, 20, 30]), whole)
-    with_seven = np.array(path([7, 30]))
-    np.testing.assert_allclose(
-        np.setdiff1d(with_seven.round(9), np.radians([7]).round(9)), whole.round(9), rtol=0
-    )
+    others = np.setdiff1d(np.round(path([7, 30]), 9), np.radians([7]).round(9))
+    np.testing.assert_allclose(others, whole.round(9), rtol=0)
     back = np.array([s["hinge.bend"] for s in SubSteps(made).split(end, start)])
     np.testing.assert_allclose(back[-2::-1], whole[:-1], rtol=0, atol=1e-12)
 
@@ -86,10 +86,10 @@ class _Breaking(ToyMuscle):
 
     def solve(self, contacts):
         super().solve(contacts)
-        if self.solves > 12 and self.breaks is not None:
-            raise self.breaks
         if self.solves > 12:
             self.x = self.x * np.nan
+            if self.breaks is not None:
+                raise self.breaks
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -101,9 +101,7 @@ class _Breaking(ToyMuscle):
         (KeyboardInterrupt(), KeyboardInterrupt, None),
     ],
 )
-def test_failing_solve_names_muscle_frame_and_coordinate_and_keeps_the_frames(
-    monkeypatch, count, breaks, error, message
-):
+def test_failing_solve_keeps_the_frames(monkeypatch, count, breaks, error, message):
     monkeypatch.setattr(_Breaking, "breaks", breaks)
     made, fields = hinged_scene([0, 10, 20, 30, 40])
     parts = [_Breaking(made.muscles[0], made) for _ in range(count)]
@@ -124,15 +122,6 @@ def test_leaving_early_begins_no_frame_and_an_overlap_is_refused():
     made.muscles[0].mesh.apply_translation([0, -4.0, 0])
     with pytest.raises(SceneError, match="overlaps bone 'trunk' at rest"):
         FrameLoop(made, [ToyMuscle(made.muscles[0], made) for _ in range(3)], fields=fields)
-
-
-def test_without_surfaces_and_tables_nothing_is_extracted_slid_or_looked_for():
-    made, fields = hinged_scene([0, 10])
-    model = ToyMuscle(made.muscles[0], made)
-    model.drawing = None
-    *_, last = simulate_frames(made, [model], fields=fields, surfaces=False)
-    assert last.surfaces == {}
-    assert not {"time_surface", "time_sliding", "time_tunnelling"} & set(last.times["strap"])
 
 
 def test_frames_that_are_skipped_leave_the_muscle_where_shown_ones_would():

@@ -1,5 +1,7 @@
 """Neighbouring muscles that slide: surfaces, virtual edges, and what the frame loop makes of them."""
 
+from types import SimpleNamespace
+
 import igl
 import numpy as np
 import pytest
@@ -17,22 +19,13 @@ from rbfmuscle.simulation.stepper import MuscleStepper
 from rbfmuscle.validation import SceneError
 
 
-class _Mesh:
+def _model(mesh):
     """The part of a model that a surface reads."""
-
-    def __init__(self, mesh):
-        self.vertices, self.faces = np.array(mesh.vertices), np.array(mesh.faces)
-        self.contact_bone = np.full(len(self.vertices), -1)
-
-    def contact_points(self):
-        return self.vertices
-
-    def material_mesh(self):
-        return self.vertices, self.faces
-
-
-def _ball(radius=10.0):
-    return _Mesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    return SimpleNamespace(
+        vertices=vertices, contact_bone=np.full(len(vertices), -1),
+        contact_points=lambda: vertices, material_mesh=lambda: (vertices, faces),
+    )  # fmt: skip
 
 
 def _all(points):
@@ -40,57 +33,40 @@ def _all(points):
 
 
 @pytest.mark.parametrize(
-    ("scale", "subdivisions", "reach", "share"), [([10, 10, 10], 3, 3.0, 1.0), ([24, 9, 4], 2, 1.5, 0.95)]
+    ("scale", "subdivisions", "reach", "share"),
+    [([10, 10, 10], 3, 3.0, 1.0), ([24, 9, 4], 2, 1.5, 0.95), ([10, 10, 2.5], 3, 4.0, 0.9)],
 )
 def test_distances_are_those_of_the_triangles(scale, subdivisions, reach, share):
-    """Three extents, so that no axis of the cells can stand for another; what is left is nearer to another ring."""
+    """A ball, three extents, and a lens, beside whose rim the normals of two sides disagree."""
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
     mesh.vertices = mesh.vertices * np.array(scale)
-    surface = NeighbourSurface(_Mesh(mesh), reach=reach)
+    surface = NeighbourSurface(_model(mesh), reach=reach)
     rng = np.random.default_rng(7)
     points = np.tile(mesh.vertices, (3, 1)) * rng.uniform(0.85, 1.4, (3 * len(mesh.vertices), 1))
     index, distance, normal, nearest = surface.query(points, _all(points), reach)
-    squared = igl.point_mesh_squared_distance(points, surface.vertices, surface.faces)[0]
-    assert set(np.flatnonzero(squared < (0.95 * reach) ** 2)) <= set(index)
-    right = np.abs(np.abs(distance) - np.sqrt(squared[index])) < 1e-9
-    assert right.mean() >= share
-    if share == 1.0:  # a ball
-        outward = points[index] / np.linalg.norm(points[index], axis=1, keepdims=True)
-        assert np.einsum("ij,ij->i", normal, outward).min() > 0.99
+    exact, _, foot, _ = igl.signed_distance(points, surface.vertices, surface.faces)
+    assert set(np.flatnonzero(np.abs(exact) < 0.95 * reach)) <= set(index)
+    exact, way = exact[index], (points - foot)[index] * np.sign(exact[index])[:, None]
+    assert np.array_equal(distance < 0.0, exact < 0.0) and (exact < 0.0).any()
+    # What is left is nearer to another ring of triangles than the one looked at.
+    assert (np.abs(distance - exact) < 1e-9).mean() >= share and np.allclose(distance, exact, atol=0.2)
+    far = exact > 1.0
+    assert (np.einsum("ij,ij->i", normal[far], way[far]) > 0.0).all()
     assert np.linalg.norm(surface.vertices[nearest] - points[index], axis=1).max() < reach + 2 * surface.edge
 
 
 def test_surface_follows_the_model_and_asks_only_what_it_is_asked():
-    model = _ball()
+    model = _model(toy.ellipsoid((10, 10, 10), subdivisions=3))
     surface = NeighbourSurface(model, reach=3.0)
     for points in (np.array([[100.0, 0, 0]]), np.zeros((0, 3)), np.zeros((1, 3))):
         assert len(surface.query(points, _all(points), 3.0)[0]) == 0
     turn = rotation_about([1, 2, 3], 1.0, np.array([50.0, 0, 0]))
-    model.vertices = model.vertices @ turn[:3, :3].T + turn[:3, 3]
+    model.vertices[:] = model.vertices @ turn[:3, :3].T + turn[:3, 3]
     surface.refresh()
     points = (np.array([[11.0, 0, 0], [0, 9, 0], [0, 0, 12]])) @ turn[:3, :3].T + turn[:3, 3]
     index, distance, _, _ = surface.query(points, np.array([True, True, False]), 3.0)
     assert index.tolist() == [0, 1]
     assert np.allclose(distance, [1, -1], atol=0.08)
-
-
-def test_side_and_distance_around_a_sharp_rim_are_those_of_the_mesh():
-    """Beside the rim of a lens the normals of its two sides disagree."""
-    lens = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
-    lens.apply_scale((1.0, 1.0, 0.25))
-    surface = NeighbourSurface(_Mesh(lens), reach=4.0)
-    rng = np.random.default_rng(3)
-    angle, away = rng.uniform(0, 2 * np.pi, 600), rng.uniform(9.0, 13.0, 600)
-    points = np.column_stack([away * np.cos(angle), away * np.sin(angle), rng.uniform(-3, 3, 600)])
-    index, distance, normal, _ = surface.query(points, _all(points), 4.0)
-    exact, _, foot, _ = igl.signed_distance(points[index], lens.vertices, lens.faces)
-    assert len(index) > 500 and (exact < 0.0).any()
-    assert np.array_equal(distance < 0.0, exact < 0.0)
-    # The nearest point is looked for around the nearest vertex, which on long triangles may be another's.
-    assert np.allclose(distance, exact, atol=0.2)
-    way = (points[index] - foot) * np.sign(exact)[:, None]
-    far = exact > 1.0
-    assert (np.einsum("ij,ij->i", normal[far], way[far]) > 0.0).all()
 
 
 def _run(angles, sliding, **options):
@@ -132,10 +108,7 @@ def test_result_does_not_depend_on_order_or_run_or_named_pairs(pressed, order):
     _, again = _run(PRESS, SlidingOptions(pairs=[["lower", "upper"]]), order=order)
     for name in ("lower", "upper"):
         assert np.array_equal(pressed[1][name].x, again[name].x)
-
-
-def test_unknown_names_of_pairs_are_refused():
-    with pytest.raises(SceneError, match="unknown muscle 'uper', known: lower, upper"):
+    with pytest.raises(SceneError, match="unknown muscle 'uper'"):
         _run([{}], SlidingOptions(pairs=[["lower", "uper"]]))
 
 
@@ -165,7 +138,7 @@ def test_linked_points_keep_near_their_neighbour(monkeypatch):
 
 
 def test_what_is_pulled_away_hard_is_let_go(monkeypatch):
-    lift = [{"lift": a} for a in (0, 10, 20)]
+    lift = [{"lift": a} for a in (0, 10)]
     monkeypatch.setattr(links, "STRIP", 0.1)
     monkeypatch.setattr(links, "RELEASE", 0.01)
     _, parts = _run(lift, SlidingOptions())
@@ -189,7 +162,7 @@ def test_neighbours_may_join(monkeypatch, met):
 
 
 def test_sliding_along_the_neighbour_is_free():
-    roll = [{"roll": a} for a in (0, 10, 20)]
+    roll = [{"roll": a} for a in (0, 10)]
     _, parts = _run(roll, SlidingOptions())
     _, alone = _run(roll, None)
     moved = np.linalg.norm(parts["upper"].x - alone["upper"].x, axis=1)
@@ -234,13 +207,9 @@ def test_points_near_a_bone_may_be_held_there(monkeypatch):
     ends = [toy.attach(mesh, b, lambda v, k=k: k * v[:, 0] > 20) for b, k in (("plate", -1), ("arm", 1))]
 
     def lifted(sliding):
-        made = toy.scene(
-            [toy.bone(n, f) for n, f in fields.items()],
-            [toy.joint("hinge", "plate", "arm", (-25, 0, 0), lift=(0, -1, 0))],
-            [toy.muscle("strap", mesh, ends)],
-            [{"hinge.lift": np.radians(a)} for a in (0, 6)],
-            sliding=sliding,
-        )
+        hinge = toy.joint("hinge", "plate", "arm", (-25, 0, 0), lift=(0, -1, 0))
+        frames = [{"hinge.lift": np.radians(a)} for a in (0, 6)]
+        made = toy.scene(fields, [hinge], [toy.muscle("strap", mesh, ends)], frames, sliding=sliding)
         part = toy.ToyMuscle(made.muscles[0], made)
         near = fields["plate"].distance(part.rest) < 2.0
         list(simulate_frames(made, [part], fields=fields))
@@ -252,10 +221,8 @@ def test_points_near_a_bone_may_be_held_there(monkeypatch):
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_who_slides_does_not_depend_on_the_order_of_bones(order):
-    """Two muscles of the trunk 40 mm apart meet or not, however an arm that one also hangs on swings."""
-    made, _ = toy.neighbour_scene(
-        [{"press": a} for a in range(0, 120, 5)], gap=32.0, sliding=SlidingOptions()
-    )
+    press = [{"press": a} for a in range(0, 120, 5)]
+    made, _ = toy.neighbour_scene(press, gap=32.0, sliding=SlidingOptions())
     made.bones = [made.bones[k] for k in order]
     made.muscles[1].attachments.pop()
     assert sliding_pairs(made, ["lower", "upper"], 5.0) == set()
@@ -271,13 +238,9 @@ def _spike_into_a_belly(sliding):
         toy.muscle("belly", belly, [toy.attach(belly, "trunk", lambda v: np.abs(v[:, 0]) > 24)]),
         toy.muscle("spike", spike, [toy.attach(spike, "arm", lambda v: np.abs(v[:, 2] - 25) > 3)]),
     ]
-    made = toy.scene(
-        [toy.bone(name, field) for name, field in fields.items()],
-        [toy.joint("hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0))],
-        muscles,
-        [{"hinge.press": np.radians(angle)} for angle in range(0, 9, 2)],
-        sliding=sliding,
-    )
+    hinge = toy.joint("hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0))
+    frames = [{"hinge.press": np.radians(angle)} for angle in range(0, 9, 2)]
+    made = toy.scene(fields, [hinge], muscles, frames, sliding=sliding)
     parts = toy.neighbour_parts(made)
     list(simulate_frames(made, parts.values(), fields=fields))
     return -igl.signed_distance(parts["spike"].x, parts["belly"].x, parts["belly"].faces)[0].min()

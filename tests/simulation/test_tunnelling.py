@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from toy_scene import ToyMuscle, attach, bone, box, cylinder, ellipsoid, joint, muscle, scene, sphere
+from toy_scene import ToyMuscle, attach, box, cylinder, ellipsoid, joint, muscle, scene, sphere
 
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.motion import bone_poses
@@ -33,7 +33,7 @@ SHAPES = {"cylinder": (cylinder(1.0, 500.0), [0, 1]), "sphere": (sphere(1.0), [0
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("step", [1.0, 2.05, 3.0, 6.0, 20.0])
+@pytest.mark.parametrize("step", [1.0, 3.0, 20.0])
 def test_swept_test_misses_nothing_and_raises_no_false_alarm(shape, step):
     field, axes = SHAPES[shape]
     start, end = random_segments(step)
@@ -61,14 +61,7 @@ def test_swept_test_sees_every_point_that_passes_a_thin_plate(step, thickness):
 
 @pytest.mark.parametrize(
     ("shape", "step", "recall"),
-    [
-        ("cylinder", 2.05, 0.097),
-        ("cylinder", 3.0, 0.46),
-        ("cylinder", 6.0, 0.90),
-        ("sphere", 2.05, 0.038),
-        ("sphere", 3.0, 0.24),
-        ("sphere", 6.0, 0.83),
-    ],
+    [("cylinder", 2.05, 0.097), ("cylinder", 6.0, 0.90), ("sphere", 3.0, 0.24), ("sphere", 6.0, 0.83)],
 )
 def test_angle_test_has_the_known_recall(shape, step, recall):
     field, axes = SHAPES[shape]
@@ -81,7 +74,6 @@ def test_angle_test_has_the_known_recall(shape, step, recall):
 
 
 def test_angle_test_alone_decides_where_it_is_asked_for():
-    """Straight across a cylinder, across beside its middle (a turn of 131 degrees), and past it."""
     start = np.array([[-1.1, 0.0, 0.0], [-1.1, 0.5, 0.0], [-1.1, 1.1, 0.0]])
     end = start * [-1.0, 1.0, 1.0]
     contacts = BoneContacts(["bone"], [cylinder(1.0)], contact_bone=np.full(3, -1))
@@ -102,9 +94,7 @@ def test_sliding_around_a_bone_is_no_crossing():
     sweep = sweep_paths(sphere(1.0), start, end, tolerance=TOLERANCE)
     assert sweep.lowest.min() < -TOLERANCE
     assert not sweep.through.any()
-
-
-def test_point_that_ends_deep_beyond_the_middle_is_through():
+    # One that ends deep beyond the middle is through.
     start, end = np.array([[0, 0, 2.0]]), np.array([[0, 0, -0.5]])
     assert sweep_paths(box((9, 9, 1.0)), start, end, tolerance=TOLERANCE).through.all()
 
@@ -142,13 +132,9 @@ def _swing(action):
     mesh = ellipsoid((2.5, 2.5, 12), (20, 0, 0), subdivisions=3)
     mesh.apply_transform(rotation_about([0, 0, 1], np.radians(-20), np.zeros(3)))
     ends = [attach(mesh, "frame", lambda v: np.abs(v[:, 2]) > 10)]
-    made = scene(
-        [bone(name, field) for name, field in fields.items()],
-        [joint("hinge", "plate", "frame", (0, 0, 0), turn=(0, 0, 1))],
-        [muscle("bag", mesh, ends)],
-        [{}],
-        tunnelling=None if action is None else TunnellingOptions(action=action),
-    )
+    hinge = joint("hinge", "plate", "frame", (0, 0, 0), turn=(0, 0, 1))
+    options = None if action is None else TunnellingOptions(action=action)
+    made = scene(fields, [hinge], [muscle("bag", mesh, ends)], [{}], tunnelling=options)
     model = ToyMuscle(made.muscles[0], made)
     model.reach = 15.0
     contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=model.contact_bone)

@@ -10,17 +10,7 @@ import numpy as np
 import pytest
 from command_line import call
 
-import rbfmuscle as rm
 from rbfmuscle.report.render import render_run
-from rbfmuscle.run import stream_run
-
-
-@pytest.fixture(scope="module")
-def run_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    scene = rm.phantom_scene(end=40.0, step=20.0, spacing=6.0)
-    stream_run(scene, folder, model="pbd", pictures=False)
-    return folder
 
 
 def image(path):

@@ -89,8 +89,8 @@ def test_opensim_loads_the_file_and_gives_the_same_numbers(tmp_path):
 
 @pytest.fixture(scope="module")
 def scene():
-    found = phantom_scene()
-    found.muscles = [muscle for muscle in found.muscles if muscle.name == "abductor"]
+    found = phantom_scene(model="pbd", spacing=6.0)
+    found.muscles = [found.muscle("abductor")]
     return found
 
 
@@ -98,9 +98,8 @@ RANGES = {"hip.flexion": (0.0, 0.4), "hip.adduction": (-0.1, 0.1), "hip.internal
 
 
 def test_muscle_is_sampled_over_what_moves_it_and_fitted(scene, tmp_path):
-    told = []
-    (found,) = sample_muscles(scene, RANGES, samples=15, progress=lambda *done: told.append(done))
-    assert found.coordinates == tuple(RANGES) and told[-1] == (15, 15)
+    (found,) = sample_muscles(scene, RANGES, samples=15)
+    assert found.coordinates == tuple(RANGES)
     assert found.values.shape == (15, 3) == found.arms.shape and np.ptp(found.lengths) > 0
     low, high = np.array(list(RANGES.values())).T
     assert (found.values >= low).all() and (found.values <= high).all()
