@@ -86,7 +86,8 @@ def _listen(reader):
         number = os.read(reader, 1)
         if not number:
             return
-        if number[0] in (signal.SIGINT, signal.SIGTERM) and not _must_finish():
+        # An interrupt that the handler has taken is not this thread's, however late it wakes.
+        if number[0] in (signal.SIGINT, signal.SIGTERM) and not _State.asked and not _must_finish():
             _end()
 
 

@@ -288,15 +288,20 @@ def solve_contact_forces(gram, need, force, sweeps, tolerance, most):
         Stop when no gap moves by more.
     most : (c,) ndarray
     """
+    lacking = need.copy()
+    for c in range(len(need)):
+        if force[c] != 0.0:
+            for d in range(len(need)):
+                lacking[d] -= gram[c, d] * force[c]
     for _ in range(sweeps):
         largest = 0.0
         for c in range(len(need)):
-            residual = need[c]
-            for d in range(len(need)):
-                residual -= gram[c, d] * force[d]
-            new = min(max(0.0, force[c] + residual / gram[c, c]), most[c])
-            largest = max(largest, abs(new - force[c]) * gram[c, c])
-            force[c] = new
+            change = min(max(0.0, force[c] + lacking[c] / gram[c, c]), most[c]) - force[c]
+            if change != 0.0:
+                force[c] += change
+                largest = max(largest, abs(change) * gram[c, c])
+                for d in range(len(need)):
+                    lacking[d] -= gram[c, d] * change
         if largest < tolerance:
             break
 

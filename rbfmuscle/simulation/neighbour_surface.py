@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 # Index, distance, outward normal and nearest vertex of the points that are near a surface.
 Found = tuple[Integers, Floats, Floats, Integers]
+# Fraction of a muscle's last correction that is expected again. With all of it neighbours that pull and push each other
+# oscillate without damping; with none each reacts to a prediction that lies a millimetre or two from the equilibrium.
+MOMENTUM = 0.5
 # Greatest thickness of a muscle, relative to rest.
 DEEPER = 1.5
 # Least cosine between the surface normal and the direction to a point for which the normal is used.
@@ -94,8 +97,7 @@ class NeighbourSurface:
     def refresh(self, *path: Mapping[str, float]) -> None:
         """Update from the model's present state.
 
-        For a path from coordinates to others the prediction is extrapolated: neighbours that react to plain
-        predictions, which lie a millimetre or two from the equilibrium, accumulate these errors.
+        For a path from coordinates to others the prediction is extrapolated by the last correction.
         """
         self._predicted = self._present()
         share = self._share(_change(*path)) if path and self._correction else 0.0
@@ -117,10 +119,10 @@ class NeighbourSurface:
         return [np.array(self.model.contact_points()), np.array(self.model.material_mesh()[0])]
 
     def _share(self, change: dict[str, float]) -> float:
-        """Fraction of the last correction to apply: 1 for the same change of coordinates, 0 across or back."""
+        """Fraction of the last correction to apply: `MOMENTUM` for the same change of coordinates, 0 across or back."""
         square = sum(value**2 for value in self._change.values())
         along = sum(value * self._change.get(name, 0.0) for name, value in change.items())
-        return min(max(along / square, 0.0), 1.0) if square else 0.0
+        return MOMENTUM * min(max(along / square, 0.0), 1.0) if square else 0.0
 
     def apart(self, other: NeighbourSurface, reach: float) -> bool:
         """Whether no point of the other muscle can be nearer than ``reach`` to this surface, by their boxes."""

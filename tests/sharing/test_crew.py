@@ -22,7 +22,6 @@ from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.sharing.crew import WorkerPool, helpers_for
-from rbfmuscle.sharing.share import MuscleGroup
 from rbfmuscle.validation import MeshError, SceneWarning, SolveError
 
 

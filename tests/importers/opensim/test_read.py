@@ -8,15 +8,8 @@ import pytest
 import rbfmuscle as rm
 from rbfmuscle.importers.opensim.elements import frame_at
 from rbfmuscle.importers.opensim.read import read_osim
-<<<<<<< HEAD
 from rbfmuscle.importers.opensim.scene import import_osim, write_scene
-from rbfmuscle.scene.joints.joint import all_coordinates, motion_of, resolve, rotation_about
-=======
-from rbfmuscle.importers.opensim.scene import import_osim
-from rbfmuscle.importers.opensim.write import write_scene
-from rbfmuscle.scene.joints.joint import rotation_about
-from rbfmuscle.scene.joints.skeleton import all_coordinates, resolve
->>>>>>> cutC
+from rbfmuscle.scene.joints.joint import all_coordinates, resolve, rotation_about
 from rbfmuscle.scene.motion import bone_poses
 
 MODELS = (
