@@ -1,10 +1,8 @@
 """Models on one scene, measured alike: what each keeps, how far apart they are, what each costs."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,10 +12,7 @@ from rbfmuscle.output.runinfo import machine, versions
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.writer import write_json
 from rbfmuscle.scene.objects import MM_PER_UNIT
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-
+from rbfmuscle.scene.scene import Scene
 
 FORMAT = 3
 LAW, MESH, FIRST, COST = "law", "input mesh", "first model", "cost"

@@ -3,8 +3,6 @@
 Accuracy, conditioning and time are measured together, since each can be bought with the others.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 import warnings

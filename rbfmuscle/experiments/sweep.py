@@ -1,20 +1,16 @@
 """A sweep: one or several scenes under a grid of settings, laid out as points that are run once each."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_value
 from rbfmuscle.validation import UsageError
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
 
 # Values of each setting that is varied.
 Grid = dict[str, list[Any]]

@@ -19,12 +19,12 @@ from rbfmuscle.experiments.workers import threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.output.writer import check_writable, write_json
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, SolveError, UsageError
 
 if TYPE_CHECKING:
     from distributed import Client
 
-    from rbfmuscle.scene.scene import Scene
 
 CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
 Runner = Callable[["Scene", dict[str, Any], str | None], Any]

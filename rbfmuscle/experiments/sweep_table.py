@@ -1,7 +1,5 @@
 """The tables of a sweep, and its Pareto front with the default's place."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Mapping, Sequence

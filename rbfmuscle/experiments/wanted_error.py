@@ -4,8 +4,6 @@ The error falls with the number of centres by a power, but for some per cent of 
 number and a bisection narrows it to 4 %. Other kernels take part where they may need fewer centres.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Threads that a run of an experiment may use."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """How a field through centres with normals is fitted, again and again, as in motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ scanned and the best valley narrowed by golden sections. Points on a surface say
 zero sets of the best are extracted in their order, until one is a single closed sheet.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import warnings

@@ -1,7 +1,5 @@
 """Greatest section of a muscle across its line of action."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers

@@ -1,9 +1,6 @@
 """Length of a muscle: a line through the slices of a harmonic field between its origin and its insertion."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sparse
@@ -12,14 +9,12 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.surfaces import vertex_areas
+from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.joints.skeleton import all_coordinates
+from rbfmuscle.scene.objects import Attachment, Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.taut_line import line_length
 from rbfmuscle.scene.tendons import TendonLine
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.joints.joint import Joint
-    from rbfmuscle.scene.objects import Attachment, Muscle
-    from rbfmuscle.scene.scene import Scene
 
 _LEVELS = 120  # by which the line is measured at rest
 

@@ -1,7 +1,5 @@
 """Whether points lie inside a closed mesh, from the triangles on one side of each of them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

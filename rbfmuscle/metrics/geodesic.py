@@ -5,8 +5,6 @@ squared lengths is least while each is on the outer side of the plane that touch
 taken again until the nodes are where they were one or two rounds before.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats

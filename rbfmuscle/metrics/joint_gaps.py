@@ -1,18 +1,13 @@
 """How far the bones of a joint part in a motion."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.motion import bone_poses
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.scene import Scene
 
 # Bones of a joint that are nearer than this at rest [mm] meet there; others, as a tendon's end, are held apart.
 MEETING = 10.0

@@ -1,7 +1,5 @@
 """Distances that are measured: exact, and sure of their side where a mesh is folded on itself or open."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cached_property
 

@@ -1,9 +1,7 @@
 """What is measured of every muscle in a written frame."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -18,11 +16,8 @@ from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES
 from rbfmuscle.metrics.topology import SurfaceForm
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.frame import Frame
-
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Frame
 
 Values = dict[str, float]
 

@@ -1,7 +1,5 @@
 """What is measured of a frame, in which unit, and a row of it; for those who read what others measured."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 # Quantity: kind of unit (volume and length follow the scene's unit), meaning; in the order of the tables.

@@ -1,20 +1,15 @@
 """Rows of ``metrics.csv``, made from what was recorded: of a frame, and of moment arms along the motion."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from rbfmuscle.metrics.moment_arms import REACH, moment_arms
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
 from rbfmuscle.scene.joints.skeleton import all_coordinates
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.objects import MM_PER_UNIT
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.frame import Frame
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Frame
 
 Coordinates = Mapping[str, float]
 

@@ -1,20 +1,16 @@
 """What a run amounts to: least, greatest and mean of each quantity, the limits it is held to, and its verdict."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row
 from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import LimitExceededError, UsageError, did_you_mean
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
 
 # Of a run: muscle -> quantity -> facts, as `Summary.table` gives them.
 Table = Mapping[str, Mapping[str, Mapping[str, Any]]]

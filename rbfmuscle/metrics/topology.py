@@ -1,15 +1,11 @@
 """Whether a surface is what a muscle should be: in one piece without handles, and nowhere through itself."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.surfaces import label_sheets
-
-if TYPE_CHECKING:
-    from rbfmuscle.simulation.frame import ModelSurface
+from rbfmuscle.simulation.frame import ModelSurface
 
 
 def euler_characteristic(faces: Integers) -> int:

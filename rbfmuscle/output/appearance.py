@@ -1,7 +1,5 @@
 """How muscles, bones and views look in files, pictures, plots and pages: colours, groups, directions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

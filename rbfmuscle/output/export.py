@@ -1,7 +1,5 @@
 """A saved run in other formats and units: files for each frame, or an animation in one file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

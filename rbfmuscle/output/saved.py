@@ -1,7 +1,5 @@
 """A saved run, read from its folder."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Tendons as closed tubes that taper from the end of a muscle's belly."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """VTK files written and read directly: PolyData (.vtp) and collections over time (.pvd), without loading VTK."""
 
-from __future__ import annotations
-
 import os
 import re
 import zlib

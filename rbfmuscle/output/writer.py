@@ -1,12 +1,10 @@
 """Writes a run to a folder while it goes on: whatever ends it, the frames so far can be read."""
 
-from __future__ import annotations
-
 import csv
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +15,9 @@ from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.tubes import tendon_mesh, tendon_name
 from rbfmuscle.output.vtp import Collection, write_vtp, write_whole
 from rbfmuscle.scene.motion import shown_value
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Frame
 from rbfmuscle.validation import SolveError, UsageError
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.frame import Frame
-
 
 TABLES = {
     "poses.csv": ("frame", "bone", *(f"m{i}{j}" for i in range(4) for j in range(4))),

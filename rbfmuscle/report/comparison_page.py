@@ -1,7 +1,5 @@
 """The page of a comparison: what it amounts to, the models moving beside each other, five rows; all else folded."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import cycle
 from pathlib import Path

@@ -1,21 +1,15 @@
 """The kernel study of one or several surfaces as files: tables and a page."""
 
-from __future__ import annotations
-
 import csv
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from rbfmuscle.experiments.kernel_study import ALIKE, cost, describe, row_name, row_toml
+from rbfmuscle.experiments.kernel_study import ALIKE, KernelStudy, cost, describe, row_name, row_toml
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.writer import json_text
 from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, number_cell
 from rbfmuscle.report.plots import Point, front_plot
-
-if TYPE_CHECKING:
-    from rbfmuscle.experiments.kernel_study import KernelStudy
 
 # Quantity: heading, factor.
 COLUMNS = {

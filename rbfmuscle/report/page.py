@@ -1,7 +1,5 @@
 """The page of a run, a comparison, a kernel study or a sweep: answer, picture, rows with lights, all else folded."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

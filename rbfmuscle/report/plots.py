@@ -12,11 +12,11 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
+from rbfmuscle.output.saved import SavedRun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rbfmuscle.output.saved import SavedRun
 
 _SOFT, _LIMIT = "#5f646b", "#a3281f"
 _STYLE = {

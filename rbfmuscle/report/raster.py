@@ -15,6 +15,7 @@ from rbfmuscle.output.appearance import rgb
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+
 # Each pixel is the mean of so many by so many.
 _FINER = 2
 _MARGIN = 0.05

@@ -17,6 +17,8 @@ from rbfmuscle.output import appearance as look
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.tubes import tendon_mesh
 from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids, fitted_size, labelled
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import AT_REST
 from rbfmuscle.validation import SolveError, UsageError
 
@@ -24,8 +26,6 @@ if TYPE_CHECKING:
     from PIL.Image import Image
     from PIL.ImageDraw import ImageDraw
 
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
 
 # Views where none are asked for; muscles that are named, more are named by their groups; pixels of a view.
 USUAL_VIEWS, _MOST_CHIPS, _AREA = ("front", "right", "back"), 8, 220_000

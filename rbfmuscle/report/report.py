@@ -1,7 +1,5 @@
 """The report of a run: its verdict, the moving scene, five rows with limits; plots and tables folded."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The page of a sweep: the default's place, the Pareto front with labelled points, rows to choose from, every point."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

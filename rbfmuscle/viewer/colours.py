@@ -1,8 +1,6 @@
 """How muscles are coloured, and what the colours mean."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,9 +8,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import edge_lengths, unique_edges
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.metrics.penetration import BoneProbe, surface_depth
-
-if TYPE_CHECKING:
-    from rbfmuscle.viewer.sources import Picture
+from rbfmuscle.viewer.sources import Picture
 
 
 class Colouring(NamedTuple):

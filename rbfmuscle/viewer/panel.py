@@ -1,7 +1,5 @@
 """The controls of the page, of viser's own elements; values are read from these when they are needed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
+
 LOOPBACK = "127.0.0.1"
 
 

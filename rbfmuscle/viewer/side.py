@@ -1,7 +1,5 @@
 """One of the models that stand beside each other: its bones and muscles in the browser's scene."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Chords that cut through a convex bone: vertices of the surface moved until no bone vertex is inside it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

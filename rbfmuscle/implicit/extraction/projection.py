@@ -1,7 +1,5 @@
 """Vertices of an extracted mesh moved onto the surface itself, and with its level to a wanted volume."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers

@@ -4,8 +4,6 @@ A triangulation that was contracted from a muscle's own and then brought onto a 
 the folds of its rims. The material carries them through all frames, so they are mended once, at rest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -4,8 +4,6 @@ The surface is the zero set of F = max(f - s, -d): f the field (negative inside)
 bones (negative inside them). Marching cubes give its topology, and Newton steps put each vertex onto the zero set.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

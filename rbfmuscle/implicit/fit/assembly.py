@@ -5,20 +5,14 @@ derivatives), so that every column of every block is one contiguous run. Only th
 order) is filled.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.implicit.evaluation import _offsets_loop
 from rbfmuscle.implicit.kernels.radial import _radial_loop
+from rbfmuscle.implicit.kernels.table import Kernel
 from rbfmuscle.jit import compiled
 from rbfmuscle.validation import UsageError
-
-if TYPE_CHECKING:
-    from rbfmuscle.implicit.kernels.table import Kernel
 
 
 def exponents(degree: int) -> Integers:

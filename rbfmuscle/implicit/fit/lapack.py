@@ -4,8 +4,6 @@ SciPy's Python wrapper holds the lock while it works, so that muscles fitted sid
 the same routine called by its published address does not.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable
 from functools import cache

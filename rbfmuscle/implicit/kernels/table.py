@@ -16,8 +16,6 @@ SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-ha
 was not checked against the original of 2019, and neither was the default exponent.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from fractions import Fraction

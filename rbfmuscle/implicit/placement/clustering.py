@@ -1,7 +1,5 @@
 """Cells of equal size on a closed mesh: long edges split, farthest points, clustering."""
 
-from __future__ import annotations
-
 import heapq
 from typing import NamedTuple
 

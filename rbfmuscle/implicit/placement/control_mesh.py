@@ -5,8 +5,6 @@ exactly two neighbours; Dey et al. 1999); what cannot be contracted goes to a ne
 closed, 2-manifold and of the input's genus for any clustering.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers

@@ -4,8 +4,6 @@ The lattice belongs to the muscle's shape alone, not to its centres, so what is 
 however many centres there are. Where material is, the signed distance to the rest mesh tells.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

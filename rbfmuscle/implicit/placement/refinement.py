@@ -5,11 +5,9 @@ field smallest at many points of the surface; a centre of value v_j then moves b
 field is still one of zeros and unit normals.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,17 +17,12 @@ from scipy.spatial.distance import cdist
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.field_fit import FieldFit
 from rbfmuscle.implicit.fit import assembly
-from rbfmuscle.implicit.fit.assembly import hermite_system
+from rbfmuscle.implicit.fit.assembly import Basis, hermite_system
 from rbfmuscle.implicit.fit.fitting import bounding_ridge
-from rbfmuscle.implicit.placement.sampling import spread_points
+from rbfmuscle.implicit.kernels.table import Kernel
+from rbfmuscle.implicit.placement.sampling import SurfaceSample, spread_points
 from rbfmuscle.implicit.selection import spacing, surface_error
 from rbfmuscle.validation import UsageError
-
-if TYPE_CHECKING:
-    from rbfmuscle.implicit.fit.assembly import Basis
-    from rbfmuscle.implicit.kernels.table import Kernel
-    from rbfmuscle.implicit.placement.sampling import SurfaceSample
-
 
 # Name of this placement of centres beside those of `sampling.PLACEMENTS`.
 FITTED = "fitted"

@@ -1,7 +1,5 @@
 """Centres on a closed mesh: even cover, normals, areas, and the control triangulation over them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A saved run as muscles and bones over time, which exports turn into files."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Positions are whole numbers of a step, kept as second differences along the fram
 the vertices; all arrays follow each other in one deflated stream, their bytes sorted by place, as base64.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import zlib

@@ -1,7 +1,5 @@
 """A moving run as one USD file (.usdc): meshes whose points are sampled over time, bones that move as rigid bodies."""
 
-from __future__ import annotations
-
 from itertools import count
 from pathlib import Path
 from typing import Any
