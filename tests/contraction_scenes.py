@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from peers.known_scenes import FAR, Bar, _block
 
-from rbfmuscle.metrics.belly import belly_measures
+from rbfmuscle.metrics.centreline import belly_measures
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.scene.objects import Attachment, Motion
 from rbfmuscle.scene.phantom_shapes import stitch

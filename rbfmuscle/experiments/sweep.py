@@ -102,13 +102,8 @@ def scene_content(scene: Scene, frames: str | None = None) -> str:
         facts.pop(part)
     for item in [*facts["bones"], *facts["muscles"]]:
         item.pop("mesh")
-    held = [
-        [
-            (a.bone, [int(v) for v in a.vertices], a.tendon and a.tendon.model_dump())
-            for a in muscle.attachments
-        ]
-        for muscle in scene.muscles
-    ]
+    ends = [muscle.attachments for muscle in scene.muscles]
+    held = [[(a.bone, a.vertices.tolist(), a.tendon and a.tendon.model_dump()) for a in end] for end in ends]
     fibres = [[line.tolist() for line in muscle.fibres or []] for muscle in scene.muscles]
     track = [sorted(frame.items()) for frame in scene.motion.frames]
     return _hash([facts, held, fibres, track, str(frames or "")])

@@ -1,7 +1,10 @@
-"""Distances that are measured: exact, and sure of their side where a mesh is folded on itself or open."""
+"""Distances that are measured: exact, sure of their side where a mesh is folded or open; depths in each other."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +16,9 @@ from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.jit import compiled
 from rbfmuscle.metrics.columns import Columns
 from rbfmuscle.validation import check_mesh, check_points
+
+if TYPE_CHECKING:
+    import trimesh
 
 _HERE = np.eye(4)
 
@@ -97,3 +103,49 @@ def _distance_loop(points, tree, near, out):
         square = np.inf if best < 0 else record_square(tree.records, best, x, y, z)
         best, square = nearest_triangle(tree, (x, y, z), best, square, 0.0, stack)
         near[i], out[i] = best, np.sqrt(square)
+
+
+class BoneProbe(MeshDistance):
+    """One bone, prepared once in its own coordinates, faces outward; it may have holes."""
+
+    def __init__(self, name: str, mesh: trimesh.Trimesh) -> None:
+        super().__init__(mesh.vertices, mesh.faces, closed=bool(mesh.is_watertight))
+        self.name = name
+        self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> Floats:
+    """Greatest depth (n,) of vertices (n, 3) in the bones, of poses (4, 4) by name; 0 where in none [scene unit]."""
+    out = np.zeros(len(vertices))
+    for probe in bones_about(vertices, probes, poses):
+        np.maximum(out, probe.depth(vertices, pose=inverse_pose(poses[probe.name])), out=out)
+    return out
+
+
+def inverse_pose(pose: Floats) -> Floats:
+    """The pose (4, 4) that takes a rigid one back."""
+    back = np.eye(4)
+    back[:3, :3] = pose[:3, :3].T
+    back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return back
+
+
+def bones_about(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> list[BoneProbe]:
+    """The bones whose boxes, where they are now, meet the box of the points (n, 3)."""
+    if not probes or len(vertices) == 0:
+        return []
+    # Column by column, which takes a tenth of the time of both at once.
+    low, high = (np.array([end(column) for column in vertices.T]) for end in (np.min, np.max))
+    placed = np.array([poses[probe.name] for probe in probes])
+    ends = np.array([probe.bounds for probe in probes])
+    middle = np.einsum("bij,bj->bi", placed[:, :3, :3], ends.mean(axis=1)) + placed[:, :3, 3]
+    half = np.einsum("bij,bj->bi", np.abs(placed[:, :3, :3]), 0.5 * (ends[:, 1] - ends[:, 0]))
+    met = np.all((middle - half < high) & (middle + half > low), axis=1)
+    return [probe for probe, near in zip(probes, met) if near]
+
+
+def bone_depth(surface: MeshDistance, probes: list[BoneProbe], poses: dict[str, Floats]) -> float:
+    """Greatest depth of any bone vertex in a closed, outward surface in the world, 0 where none is [scene unit]."""
+    near = bones_about(surface.vertices, probes, poses)
+    depths = [surface.depth(probe.vertices, pose=poses[probe.name]).max(initial=0.0) for probe in near]
+    return float(max(depths, default=0.0))

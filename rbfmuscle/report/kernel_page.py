@@ -92,10 +92,8 @@ def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
         chosen = [("recommended", row, GOOD) for _, row, _ in chosen]
         chosen += [("", row, GOOD if row["rms"] <= ALIKE * good[0]["rms"] else PLAIN) for row in others]
         chosen = chosen[:_MOST_LIGHTS]
-    return [
-        Light(row_name(row), [number_cell(row["rms"], units, state), number_cell(cost(row), "s")], note=note)
-        for note, row, state in chosen
-    ]
+    cells = [[number_cell(row["rms"], units, s), number_cell(cost(row), "s")] for _, row, s in chosen]
+    return [Light(row_name(row), pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
 
 
 def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from rbfmuscle.metrics.summary import shown_number, within
+from rbfmuscle.metrics.summary import COUNTS, shown_number, within
 from rbfmuscle.validation import SolveError
 
 GOOD, NEAR, BAD, PLAIN = "good", "near", "bad", "plain"
-COUNTS = ("components", "euler", "self_crossings", "tunnelled")
 # From this share of a limit a value is near it.
 _NEAR_LIMIT = 0.8
 

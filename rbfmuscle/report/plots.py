@@ -83,10 +83,7 @@ def line_plot(
 
 
 def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
-    """Markup of error against time on logarithmic axes: the front joined, its points and the default labelled.
-
-    Each group has a colour, named where there are several, and its own front; ``labels`` are those of the axes.
-    """
+    """Markup of error against time on logarithmic axes: each group's front joined, it and the default labelled."""
     from matplotlib import style
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
@@ -148,10 +145,7 @@ def _svg(figure: Figure, title: str) -> str:
 
 
 def motion_axis(saved: SavedRun) -> tuple[dict[int, float], str]:
-    """Place of each frame on the axis that plots run along, and its label.
-
-    It is the only coordinate that moves, in degrees, if it goes one way; else the frame number.
-    """
+    """Place of each frame on plots and their label: the only coordinate that moves, if one way, or frame numbers."""
     rows, units = saved.info["frames"], saved.info["scene"].get("coordinate_units", {})
     names = sorted({name for row in rows for name in row["coordinates"]})
     tracks = {name: np.array([row["coordinates"].get(name, 0.0) for row in rows]) for name in names}

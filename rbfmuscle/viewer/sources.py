@@ -10,9 +10,8 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
-from rbfmuscle.output.appearance import muscle_colours, muscle_groups
+from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh, tendon_name
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.tubes import tendon_mesh, tendon_name
 from rbfmuscle.scene.activation.curve import STEP
 from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -35,10 +34,7 @@ class Control(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One picture's content, by bone or muscle.
-
-    Tendons, ``activation`` and ``depth`` in the bones [scene unit] are those of the muscles that have them.
-    """
+    """One picture's content by bone or muscle; tendons, activation and depth [scene unit] of those that have them."""
 
     poses: dict[str, Floats]
     surfaces: dict[str, Mesh]
@@ -51,17 +47,8 @@ class Picture(NamedTuple):
 class LiveSource:
     """A scene whose coordinates and activations are set by hand, by its own model or the one named.
 
-    Attributes
-    ----------
-    choices : list of str
-        Models.
-    body : (3, 3) ndarray
-        Left, posterior and superior.
-    bones, muscles : dict of str to (vertices, faces)
-        At rest.
-    controls : dict of str to Control
-    motion : list of dict of str to float
-        What the controls are set to in each frame of the scene's motion.
+    ``choices`` are models; bones and muscles (vertices, faces) by name are those at rest; ``body`` (3, 3) is left,
+    posterior and superior. ``motion`` holds what the controls are set to in each frame of the scene's motion.
     """
 
     def __init__(self, scene: Scene, model: str | None = None) -> None:
@@ -83,10 +70,8 @@ class LiveSource:
             name: _coordinate(scene, name, (*limits, session.rest[name]))
             for name, limits in session.limits.items()
         } | {ACTIVATION + name: Control("Activation", name, 0.0, 1.0, 0.0) for name in session.activation}
-        self.motion = [
-            {name: shown_value(scene, name, x) for name, x in frame.items() if name in session.limits}
-            for frame in scene.motion.frames
-        ]
+        moved = [{n: x for n, x in frame.items() if n in session.limits} for frame in scene.motion.frames]
+        self.motion = [{n: shown_value(scene, n, x) for n, x in frame.items()} for frame in moved]
 
     def figure(self, choice: str) -> LiveFigure:
         """A model of every muscle, at rest."""
@@ -144,13 +129,7 @@ class LiveFigure:
 
 
 class SavedSource:
-    """Saved runs of one scene by name, scrubbed by frame; attributes as of `LiveSource`.
-
-    Raises
-    ------
-    UsageError
-        If one holds no surfaces.
-    """
+    """Saved runs of one scene by name, scrubbed by frame; as `LiveSource`. UsageError if one holds no surfaces."""
 
     def __init__(self, runs: dict[str, SavedRun]) -> None:
         for saved in runs.values():

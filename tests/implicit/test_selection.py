@@ -9,8 +9,7 @@ import trimesh
 
 from rbfmuscle.implicit.extraction.marching import find_sheets
 from rbfmuscle.implicit.extraction.surface import extract_surface
-from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.field_fit import FieldFit
+from rbfmuscle.implicit.field import FieldFit, RBFField
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import (

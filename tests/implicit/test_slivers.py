@@ -5,8 +5,13 @@ import pytest
 import trimesh
 
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
-from rbfmuscle.implicit.extraction.slivers import LEAST_ANGLE, flip_edges, mend_slivers, triangle_quality
+from rbfmuscle.implicit.extraction.material_mesh import (
+    LEAST_ANGLE,
+    MaterialMesh,
+    flip_edges,
+    mend_slivers,
+    triangle_quality,
+)
 
 BALL = trimesh.creation.icosphere(subdivisions=3)
 

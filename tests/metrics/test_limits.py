@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from blend_model import arm_scene, use_blend_model
 
-from rbfmuscle.metrics.joint_gaps import joint_gaps
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
+from rbfmuscle.metrics.rows import joint_gaps
 from rbfmuscle.metrics.summary import (
     LIMITS,
     Summary,

@@ -10,7 +10,7 @@ from contraction_scenes import spindle_scene
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.implicit.field_fit import wanted_derivatives
+from rbfmuscle.implicit.field import wanted_derivatives
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.models import build_model
 from rbfmuscle.muscle.muscle import RBFMuscle

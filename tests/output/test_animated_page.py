@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.output.animation import page
-from rbfmuscle.output.animation.moving import MovingPart, MovingRun
+from rbfmuscle.output.saved import MovingPart, MovingRun
 from rbfmuscle.report.page import Page
 
 CAPTIONS = ["frame 0: knee 0°", "frame 1: knee 10°", "frame 2: knee 20°", "frame 5: knee 30°"]

@@ -7,7 +7,7 @@ import rbfmuscle as rm
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.output.appearance import VIEWS, motion_direction, view_axes
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.raster import aim
+from rbfmuscle.report.render import aim
 from rbfmuscle.run import stream_run
 from rbfmuscle.scene.phantom import phantom_scene
 

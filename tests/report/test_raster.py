@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from rbfmuscle.output.appearance import motion_direction, view_axes
-from rbfmuscle.report.raster import Solid, aim, draw_solids, fitted_size
+from rbfmuscle.report.render import Solid, aim, draw_solids, fitted_size
 
 RED, BLUE = "#ff0000", "#0000ff"
 FRONT = view_axes((0, -1, 0), np.eye(3))

@@ -5,12 +5,12 @@ import pytest
 import toy_scene
 
 import rbfmuscle as rm
-from rbfmuscle.metrics.penetration import BoneProbe
+from rbfmuscle.metrics.mesh_distance import BoneProbe
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import stream_run
 from rbfmuscle.simulation.live import LiveSession
 from rbfmuscle.validation import UsageError
-from rbfmuscle.viewer.colours import vertex_values
+from rbfmuscle.viewer.side import vertex_values
 from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource
 
 

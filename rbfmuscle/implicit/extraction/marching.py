@@ -77,9 +77,7 @@ class Grid:
             values[nodes] = function(points)
             if np.isnan(values[nodes]).any():
                 where = points[np.argmax(np.isnan(values[nodes]))]
-                raise ValueError(
-                    f"field or cut is NaN at {where}; check the fit (its condition) and the bone fields"
-                )
+                raise ValueError(f"field or cut is NaN at {where}; check the fit and the bone fields")
         return values.reshape(self.shape)
 
 
@@ -92,10 +90,7 @@ class LevelSet:
         self._c = None if cut is None else grid.evaluate(cut)
 
     def march(self, level: float) -> tuple[Floats, Integers]:
-        """Vertices (n, 3) in grid coordinates and outward triangles (m, 3); none where the values have one sign.
-
-        They are closed but for edges on the border of the grid.
-        """
+        """Vertices (n, 3) in grid coordinates and outward triangles (m, 3), closed but on the grid's border."""
         from skimage.measure import marching_cubes
 
         value = self._f - np.float32(level)
@@ -131,17 +126,11 @@ class Sheets(NamedTuple):
 
 
 def find_sheets(field: Field, points: Floats, distance: Callable[[Floats], Floats]) -> Sheets:
-    """Sheets of a field's zero set in a box around a surface, 7.5 % larger than it on every side.
+    """Sheets of a field's zero set (negative inside) in a box around a surface, 7.5 % larger than it on every side.
 
-    Parameters
-    ----------
-    field : Field
-        Negative inside.
-    points : (n, 3) ndarray
-        Points of the surface, which give the box [length].
-    distance : callable
-        ``(n, 3) -> (n,)``, distance to the surface, signed or not. Where a muscle is thinner than a cell, its own sheet
-        falls into pieces on the grid: these lie within a cell of it and do not count.
+    Points (n, 3) of the surface give the box [length]; ``distance`` maps points (n, 3) to their distances (n,) from the
+    surface, signed or not. Where a muscle is thinner than a cell, its own sheet falls into pieces on the grid: these
+    lie within a cell of it and do not count.
     """
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     grid = Grid.around(points, resolution=SEARCHED, padding=round(MARGIN * SEARCHED), axes=axes)

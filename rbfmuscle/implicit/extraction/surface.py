@@ -23,21 +23,10 @@ NEAR_CUT = 1.2
 
 @dataclass(frozen=True)
 class ExtractedSurface:
-    """A closed outward mesh.
+    """A closed outward mesh: vertices (n, 3) in the world [scene unit], faces (m, 3), and the volume that it holds.
 
-    Attributes
-    ----------
-    vertices : (n, 3) ndarray
-        World positions [scene unit].
-    faces : (m, 3) ndarray of int
-    level : float
-        Level s of the field that was extracted.
-    volume : float
-        Enclosed by the mesh [scene unit cubed].
-    components : int
-        Sheets in the box; all but the one nearest to the points are left out.
-    spacing : float
-        Edge of a grid cell [scene unit].
+    ``level`` is that of the field that was extracted, ``components`` the number of sheets in the box, of which all but
+    the one nearest to the points are left out, ``spacing`` the edge of a grid cell [scene unit].
     """
 
     vertices: np.ndarray
@@ -71,25 +60,19 @@ def extract_surface(
         Grid cells along the longest side of the points' box.
     cut : ClipDistance, optional
         Distances, negative inside what is to be cut away; beyond 1.2 cells a lower bound of more than that will do.
-    volume : float, optional
-        Wanted volume of the mesh; the level is then moved from ``level`` until the mesh has it, to 1e-9.
-    level : float
-        Level of the field, or the first guess of it.
+    volume, level : float
+        The level is moved from ``level`` until the mesh has the volume, if one is wanted, to 1e-9.
     axes : (3, 3) array_like, optional
         Rotation whose rows are the grid's axes. In a frame that moves with the scene the mesh does too.
     obstacles : list of pairs of PointGrid and (4, 4) ndarray, optional
-        Vertices of the bones behind ``cut``, each bone in its own coordinates with its pose: triangles whose
-        chords cut across a convex bone are moved until no vertex is inside the mesh by more than 1 % of a cell.
-
-    Returns
-    -------
-    ExtractedSurface
+        Vertices of the bones behind ``cut``, each bone in its own coordinates with its pose: triangles whose chords cut
+        across a convex bone are moved until no vertex is inside the mesh by more than 1 % of a cell.
 
     Raises
     ------
     ValueError
-        On bad arguments, NaN in field or cut, an empty level set, or one that is not closed within twice
-        the box of the points; on a volume that no level reaches.
+        On bad arguments, NaN in field or cut, an empty level set, or one that is not closed within twice the box of the
+        points; on a volume that no level reaches.
     """
     points = check_points(points)
     level = float(level)
@@ -142,22 +125,17 @@ def _reach_volume(
 
 
 def _finish(
-    projector: Projector,
-    faces: Integers,
-    target: float | None,
-    level: float,
-    components: int,
-    obstacles: Obstacles,
+    projector: Projector, faces: Integers, target: float | None, level: float, sheets: int, bones: Obstacles
 ) -> ExtractedSurface:
     spacing = projector.spacing
-    projector.push_off(faces, obstacles, spacing, 0.01 * spacing)
+    projector.push_off(faces, bones, spacing, 0.01 * spacing)
     if target is not None:
         step = projector.volume_step(faces, target, steps=3)
         level += step
         projector.shift(step)
     vertices = projector.vertices
     check_finite(vertices, name="extracted vertices")
-    return ExtractedSurface(vertices, faces, level, mesh_volume(vertices, faces), components, spacing)
+    return ExtractedSurface(vertices, faces, level, mesh_volume(vertices, faces), sheets, spacing)
 
 
 def _nearest_sheet(level_set: LevelSet, points: Floats, level: float) -> tuple[Floats, Integers, int] | None:

@@ -15,8 +15,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.output.animation.moving import MovingPart, MovingRun
 from rbfmuscle.output.appearance import linear_rgb, rgb
+from rbfmuscle.output.saved import MovingPart, MovingRun
 from rbfmuscle.validation import UsageError
 
 _FLOAT, _INT = 5126, 5125
@@ -24,13 +24,7 @@ _VERTICES, _INDICES = 34962, 34963  # what a view is bound as
 
 
 def animated_glb(run: MovingRun) -> bytes:
-    """The content of an animated ``.glb``.
-
-    Raises
-    ------
-    UsageError
-        If a muscle's surface has other vertices in other frames.
-    """
+    """The content of an animated ``.glb``; UsageError if a muscle's surface has other vertices in other frames."""
     changing = [muscle.name for muscle in run.muscles if not muscle.keeps_vertices]
     if changing:
         raise UsageError(

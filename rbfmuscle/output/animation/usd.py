@@ -8,8 +8,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingPart, MovingRun
 from rbfmuscle.output.appearance import linear_rgb, rgb
+from rbfmuscle.output.saved import FRAMES_A_SECOND, MovingPart, MovingRun
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingPartError
 
@@ -26,11 +26,9 @@ def check_usd() -> None:
 def write_usd(path: Path, run: MovingRun) -> None:
     """Write a run as one ``.usdc`` file; usd-core must be there (`check_usd`).
 
-    Notes
-    -----
-    Time codes count 24 a second. A surface that keeps its vertices has its topology once and its points at every
-    time; another one has both at every time. Lengths stay in the run's unit, named by ``metersPerUnit``;
-    the root brings superior to z.
+    Time codes count 24 a second. A surface that keeps its vertices has its topology once and its points at every time;
+    another one has both at every time. Lengths stay in the run's unit, named by ``metersPerUnit``; the root brings
+    superior to z.
     """
     from pxr import Gf, Usd, UsdGeom
 
