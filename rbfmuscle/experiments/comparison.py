@@ -1,6 +1,5 @@
 """Models on one scene, measured alike: what each keeps, how far apart they are, what each costs."""
 
-import csv
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +8,7 @@ import numpy as np
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, unit_text
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.writer import machine, versions, write_json
+from rbfmuscle.output.writer import machine, versions, write_csv, write_json
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 
@@ -124,13 +123,12 @@ def write_tables(
         "machine": machine(), "versions": versions(),
     }  # fmt: skip
     write_json(folder / "comparison.json", table)
-    with open(folder / "comparison.csv", "w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(("model", "muscle", "quantity", "value", "unit", "against"))
-        for model, muscles in results.items():
-            for muscle, values in muscles.items():
-                for name in [name for name in MEASURES if name in values]:
-                    rows.writerow((model, muscle, name, values[name], units[name], MEASURES[name].against))
+    rows: list[tuple[Any, ...]] = [("model", "muscle", "quantity", "value", "unit", "against")]
+    for model, muscles in results.items():
+        for muscle, values in muscles.items():
+            known = [(name, m.against) for name, m in MEASURES.items() if name in values]
+            rows += [(model, muscle, name, values[name], units[name], against) for name, against in known]
+    write_csv(folder / "comparison.csv", rows)
     return table
 
 

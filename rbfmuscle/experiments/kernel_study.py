@@ -16,8 +16,7 @@ from rbfmuscle.experiments.sweep_run import Progress, pareto_front, threads_limi
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.surfaces import face_normals, mesh_volume, vertex_areas
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.implicit.extraction.marching import find_sheets
-from rbfmuscle.implicit.extraction.surface import extract_surface
+from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField, wanted_derivatives
 from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample

@@ -1,8 +1,5 @@
 """Running the points of a sweep side by side, in processes or on a Dask cluster; tables and Pareto front."""
 
-from __future__ import annotations
-
-import csv
 import json
 import math
 import os
@@ -19,7 +16,7 @@ from rbfmuscle.experiments.sweep import SweepPoint
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import shown_number
-from rbfmuscle.output.writer import check_writable, write_json
+from rbfmuscle.output.writer import check_writable, write_csv, write_json
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, SolveError, UsageError
 
@@ -119,7 +116,7 @@ def run_sweep(
     return len(left)
 
 
-def _connect_cluster(address: str) -> Client:
+def _connect_cluster(address: str) -> "Client":
     """A client of a Dask scheduler, as soon as two workers are there: to one alone joblib sends nothing."""
     try:
         from distributed import Client
@@ -313,13 +310,12 @@ def write_table(
     verdicts = mark_front(rows, quantity)
     keys = list(dict.fromkeys(key for row in rows for key in row["settings"]))
     columns = [name for name in rows[0] if name not in ("settings", "label")]
-    with open(folder.directory / "sweep.csv", "w", encoding="utf-8", newline="") as file:
-        lines = csv.writer(file, lineterminator="\n")
-        lines.writerow([*keys, *columns])
-        for row in rows:
-            values = [row["settings"].get(key, "") for key in keys] + [row[name] for name in columns]
-            # Digits beyond nine places are rounding.
-            lines.writerow([f"{round(v, 9):.6g}" if isinstance(v, float) else v for v in values])
+    lines: list[list[Any]] = [[*keys, *columns]]
+    for row in rows:
+        values = [row["settings"].get(key, "") for key in keys] + [row[name] for name in columns]
+        # Digits beyond nine places are rounding.
+        lines.append([f"{round(v, 9):.6g}" if isinstance(v, float) else v for v in values])
+    write_csv(folder.directory / "sweep.csv", lines)
     counts = {status: sum(r["status"] == status for r in rows) for status in ("done", "failed", "missing")}
     table = {"quantity": quantity, **counts, "verdicts": verdicts, "rows": rows}
     write_json(folder.directory / "sweep.json", table)

@@ -3,8 +3,6 @@
 f(x) = sum_j a_j phi(|x - c_j|) - B_j . grad phi(x - c_j) + p(x), with B = 0 for a fit to values.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -93,7 +91,7 @@ class RBFField:
         epsilon: float = 1.0,
         smoothing: float = 0.0,
         condition: float = np.inf,
-    ) -> RBFField:
+    ) -> "RBFField":
         """Interpolate values at points.
 
         Parameters
@@ -111,10 +109,8 @@ class RBFField:
 
         Raises
         ------
-        UsageError
-            For an unknown kernel.
-        numpy.linalg.LinAlgError
-            If the system is singular; the message names the likely cause.
+        UsageError, numpy.linalg.LinAlgError
+            For an unknown kernel; if the system is singular (the message names the likely cause).
         """
         points = check_points(points)
         values = check_values(values, len(points))
@@ -133,7 +129,7 @@ class RBFField:
         smoothing: float = 0.0,
         derivatives: str = "all",
         condition: float = np.inf,
-    ) -> RBFField:
+    ) -> "RBFField":
         """Fit f = 0 and grad f = normal at every point (Hermite RBF, Macedo 2011).
 
         Parameters
@@ -150,10 +146,8 @@ class RBFField:
 
         Raises
         ------
-        UsageError
-            For a kernel that is not smooth enough, a normal of length zero, or a condition below 1.
-        numpy.linalg.LinAlgError
-            If the system is singular.
+        UsageError, numpy.linalg.LinAlgError
+            For a kernel that is not smooth enough, a normal of length zero, or a condition below 1; as in `fit`.
         """
         points = check_points(points)
         normals = check_vectors(normals, len(points))
@@ -182,7 +176,7 @@ class RBFField:
         """Value (n,) and gradient (n, 3) at (n, 3) points, for little more than the value alone."""
         return evaluate(check_points(points), self._terms, self.kernel, True)
 
-    def surface(self, resolution: int = 64) -> trimesh.Trimesh:
+    def surface(self, resolution: int = 64) -> "trimesh.Trimesh":
         """Zero set as a closed outward ``trimesh.Trimesh``; resolution in cells along the longest side."""
         import trimesh
 

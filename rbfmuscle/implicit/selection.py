@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.extraction.marching import find_sheets
+from rbfmuscle.implicit.extraction.surface import find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField
 from rbfmuscle.validation import NumericalWarning, UsageError, check_points, check_vectors
 
@@ -99,7 +99,7 @@ def choose_epsilon(
     fitted.
     """
     if not fit.kernel.has_epsilon:
-        raise UsageError(f"kernel '{fit.kernel.name}' has no shape parameter, its interpolant no epsilon")
+        raise UsageError(f"kernel '{fit.kernel.name}' has no shape parameter: epsilon changes nothing")
     points = check_points(points)
     normals, reach = check_vectors(normals, len(points)), float(spacing(points).mean())
     order = _search(points, normals, fit, check_points(held_out, name="held_out"), reach)

@@ -164,11 +164,6 @@ def euler_characteristic(faces: Integers) -> int:
     return len(np.unique(faces)) - len(edges) + len(faces)
 
 
-def count_components(count: int, faces: Integers) -> int:
-    """Number of connected pieces among ``count`` vertices; vertices that no face uses do not count."""
-    return len(np.unique(label_sheets(faces, count)[1][faces[:, 0]]))
-
-
 class SurfaceForm:
     """Pieces, handles and crossings of one muscle's surfaces, looked for again only where they can have changed."""
 
@@ -182,7 +177,8 @@ class SurfaceForm:
         vertices, faces = surface.vertices, np.asarray(surface.faces)
         if self._tree is None or not same_faces:
             self._tree = FaceTree(vertices, faces)
-            self._found["components"] = count_components(len(vertices), faces)
+            label = label_sheets(faces, len(vertices))[1]
+            self._found["components"] = len(np.unique(label[faces[:, 0]]))
             self._found["euler"] = euler_characteristic(faces)
         drawn = surface.origin[0] if surface.origin is not None else surface
         if self._drawn is not drawn:

@@ -1,14 +1,12 @@
 """Writes a run to a folder while it goes on: whatever ends it, the frames so far can be read; ``run.json``."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import importlib.metadata
 import os
 import platform
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -69,7 +67,7 @@ class RunWriter:
         try:
             self._clear()
             for name, head in TABLES.items():
-                self._add_rows(name, [head], mode="w")
+                write_csv(self.directory / name, [head])
             names = ("surfaces", "bones") if self.meshes else ()
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
         except OSError as error:
@@ -90,7 +88,7 @@ class RunWriter:
     def close(self, rows: Sequence[Any] = ()) -> None:
         """Write the last rows of metrics; after a frame that could not be written, nothing."""
         try:
-            self._add_rows("metrics.csv", () if self._failed else rows)
+            write_csv(self.directory / "metrics.csv", () if self._failed else rows, mode="a")
         except OSError as error:
             raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
 
@@ -110,14 +108,12 @@ class RunWriter:
             self._collections["bones"].add(step, self._write_bones(frame))
             self._collections["surfaces"].add(step, surfaces)
         # A frame's surfaces are on the disk before its poses: readers of a run that was killed rely on it.
-        poses = [(bone.name, frame.poses[bone.name].ravel().tolist()) for bone in self.scene.bones]
-        self._add_rows("poses.csv", [(frame.index, name, *pose) for name, pose in poses])
-        self._add_rows("events.csv", [(e.frame, e.muscle, e.bone, e.count, e.action) for e in frame.events])
-        self._add_rows("metrics.csv", rows)
-
-    def _add_rows(self, name, rows, mode="a"):
-        with (self.directory / name).open(mode, encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows(rows)
+        poses = [
+            (frame.index, bone.name, *frame.poses[bone.name].ravel().tolist()) for bone in self.scene.bones
+        ]
+        events = [(e.frame, e.muscle, e.bone, e.count, e.action) for e in frame.events]
+        for name, table in {"poses": poses, "events": events, "metrics": rows}.items():
+            write_csv(self.directory / f"{name}.csv", table, mode="a")
 
     def _write_surfaces(self, frame):
         """Surfaces of a frame, side by side: most of the time goes into packing them."""
@@ -164,6 +160,12 @@ class RunWriter:
             (self.directory / folder).mkdir(exist_ok=True)
 
 
+def write_csv(path: Path, rows: Iterable[Sequence[Any]], *, mode: str = "w") -> None:
+    """Write rows to a CSV file, or add them in mode "a"."""
+    with path.open(mode, encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
 def write_json(path: Path, data: dict[str, Any]) -> None:
     """Write JSON in one move, so that whoever reads it finds the old or the new; NaN and infinity become null."""
     try:
@@ -183,7 +185,7 @@ def json_text(data: Any) -> str:
 
 
 def build_info(
-    scene: Scene, started: datetime, neighbours: Neighbours, summary: dict[str, Any], **facts: Any
+    scene: Scene, started: datetime, neighbours: "Neighbours", summary: dict[str, Any], **facts: Any
 ) -> dict[str, Any]:
     """Assemble ``run.json``; ``summary`` is from `Summary.table`.
 

@@ -36,16 +36,12 @@ def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) ->
 def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
     first = next(iter(runs.values()))
     failed = [f"{name} did not finish: {reason}" for name, reason in found["failed"].items()]
-    counts = {
-        "muscles": len(first.muscles),
-        "frames": found["frames"],
-        "threads": found["machine"]["threads"],
-    }
+    counts = {"muscles": len(first.muscles), "frames": found["frames"], **found["machine"]}
     # Of the slack each muscle has a limit of its own.
     limits, terms = first.info["limits"] | {"slack": None}, [(m.title, m.meaning) for m in MEASURES.values()]
     return Page(
         f"{found['scene']}: models compared",
-        [f"{number} {what}" for what, number in counts.items()],
+        [f"{counts[what]} {what}" for what in ("muscles", "frames", "threads")],
         " ".join([found["answer"], *failed]),
         BAD if failed else PLAIN,
         lights=[_light(found, name, limits.get(name)) for name in LIGHTS if _values(found, name)],

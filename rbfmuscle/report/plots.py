@@ -1,7 +1,5 @@
 """Plots as SVG: lines along a motion, and points of error against time."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Sequence
@@ -131,7 +129,7 @@ def _label_beside(axes, points, groups, row):
         top -= row
 
 
-def _svg(figure: Figure, title: str) -> str:
+def _svg(figure: "Figure", title: str) -> str:
     """Markup of a figure, without what only a file of its own needs; lines of muscles bear their names."""
     from markupsafe import escape
 

@@ -1,7 +1,5 @@
 """The page in the browser, its server for this machine alone, and the thread that keeps its picture up to date."""
 
-from __future__ import annotations
-
 import contextlib
 import http
 import io
@@ -45,7 +43,7 @@ class Gate:
         self.token = token
         self.inner: Callable[..., Response | None] | None = None  # what answers requests that are let in
 
-    def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
+    def __call__(self, connection: "ServerConnection", request: "Request") -> "Response | None":
         """Answer a request; None lets a websocket begin."""
         hosts = [f"{name}:{connection.local_address[1]}" for name in (LOOPBACK, "localhost")]
         host, origin = (request.headers.get(key, "") for key in ("Host", "Origin"))
@@ -76,7 +74,7 @@ def _every_request_through(gate: Gate) -> Iterator[None]:
         module.serve = plain
 
 
-def open_server(port: int = 0) -> tuple[ViserServer, str]:
+def open_server(port: int = 0) -> "tuple[ViserServer, str]":
     """Start a server on the loopback address, at any free port for 0; return it and its address with the token.
 
     MissingPartError if viser is not installed, or does not let its requests be checked.
@@ -94,7 +92,7 @@ def open_server(port: int = 0) -> tuple[ViserServer, str]:
     return server, f"http://{LOOPBACK}:{server.get_port()}/{gate.token}/"
 
 
-def show(shown: Scene | SavedRun, *, model: str | None = None) -> Page:
+def show(shown: Scene | SavedRun, *, model: str | None = None) -> "Page":
     """Show a scene or a saved run in a browser or a notebook, to begin with by a ``model`` other than the scene's own.
 
     A notebook shows the page as the last value of a cell; elsewhere open its ``address``. ``close()`` ends it.

@@ -1,7 +1,5 @@
 """What a viewer shows: a scene moved by hand, or saved runs scrubbed by frame; no browser here."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -73,7 +71,7 @@ class LiveSource:
         moved = [{n: x for n, x in frame.items() if n in session.limits} for frame in scene.motion.frames]
         self.motion = [{n: shown_value(scene, n, x) for n, x in frame.items()} for frame in moved]
 
-    def figure(self, choice: str) -> LiveFigure:
+    def figure(self, choice: str) -> "LiveFigure":
         """A model of every muscle, at rest."""
         scene = self.scene if choice == self.choices[0] else self.scene.with_options(model=choice)
         return LiveFigure(LiveSession(scene, fields=self.fields), build_models(scene))
@@ -144,7 +142,7 @@ class SavedSource:
         self.motion = [{"frame": float(frame)} for frame in first.frames]
         self.controls = {"frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])}
 
-    def figure(self, choice: str) -> SavedFigure:
+    def figure(self, choice: str) -> "SavedFigure":
         """A run at its first frame."""
         return SavedFigure(self.runs[choice])
 

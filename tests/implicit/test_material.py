@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction.material import CarriedMaterial, carry_material, project_to_level_set
+from rbfmuscle.implicit.extraction.material import CarriedMaterial, project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import BESIDE, PointGrid, near_triangles
 from rbfmuscle.implicit.extraction.projection import Projector
@@ -142,7 +142,7 @@ def test_tangled_triangles_are_smoothed_until_none_cross(radius, seed):
 def test_a_carried_surface_keeps_volume_and_leaves_the_bone(cut, noise):
     """Vertices that were smoothed stay when the level changes: with much noise nothing else was left to be blown up."""
     carried = BALL.vertices + noise * np.random.default_rng(5).normal(size=BALL.vertices.shape)
-    found = carry_material(mesh_of(), carried, volume=VOLUME, cut=cut)
+    found = project_to_level_set(mesh_of(), carried, None, volume=VOLUME, cut=cut)
     assert found.left == len(BALL.vertices) and found.crossing == 0
     assert cut is None or cut(found.vertices).min() > -1e-3
     assert mesh_volume(found.vertices, found.faces) == pytest.approx(VOLUME, rel=1e-12)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.implicit.extraction.marching import find_sheets
-from rbfmuscle.implicit.extraction.surface import extract_surface
+from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.sampling import sample_surface

@@ -10,8 +10,7 @@ import trimesh
 
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.metrics.centreline import Centreline, split_ends
-from rbfmuscle.metrics.columns import Columns
-from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bone_depth, surface_depth
+from rbfmuscle.metrics.mesh_distance import BoneProbe, Columns, MeshDistance, bone_depth, surface_depth
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
 from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows, moment_arms
 from rbfmuscle.run import simulate

@@ -7,7 +7,7 @@ from spindle_scene import build_scene
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction.material import carry_material
+from rbfmuscle.implicit.extraction.material import project_to_level_set
 from rbfmuscle.muscle.drawing import Configuration
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.simulation.contact import BoneContacts
@@ -32,7 +32,7 @@ def test_a_tangle_of_the_material_is_shown_as_a_sound_surface(drawn):
     tangled = shown.rest.copy()
     # The lower half inside out.
     tangled[tangled[:, 2] < 0.0] *= [-1.0, 1.0, 1.0]
-    alone = carry_material(shown.mesh, tangled, volume=volume)
+    alone = project_to_level_set(shown.mesh, tangled, None, volume=volume)
     assert crossing_faces(alone.vertices, alone.faces).sum() > 20
     now = Configuration(model.points, model.normals(), model.contact_points(), tangled)
     surface = model.drawer.draw(no_fit, now, contacts)

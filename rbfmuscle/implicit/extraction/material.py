@@ -63,7 +63,7 @@ class FittedMesh(ExtractedSurface):
 def project_to_level_set(
     mesh: MaterialMesh,
     vertices: Floats,
-    field: Field,
+    field: Field | None,
     *,
     volume: float,
     level: float = 0.0,
@@ -73,29 +73,15 @@ def project_to_level_set(
     """Bring a triangulation onto the zero set of max(field - level, -cut) that has a volume.
 
     ``vertices`` (n, 3) are where the material carries them [scene unit]; field, cut, volume, level and obstacles are
-    those of `rbfmuscle.implicit.extraction.surface.extract_surface`. ValueError on NaN in field or cut, and where no
-    level gives the volume.
+    those of `rbfmuscle.implicit.extraction.surface.extract_surface`. Without a field the triangulation stays where the
+    material is, blown up to the volume out of the bones, and all vertices are ``left``. ValueError on NaN in field or
+    cut, and where nothing has the volume.
     """
     fitting = CarriedMaterial(mesh, vertices, field, cut, float(level))
-    fitting.reach(volume)
-    return fitting.finish(volume, obstacles or [])
-
-
-def carry_material(
-    mesh: MaterialMesh,
-    vertices: Floats,
-    *,
-    volume: float,
-    cut: ClipDistance | None = None,
-    obstacles: Obstacles | None = None,
-) -> FittedMesh:
-    """A triangulation where the material is, out of the bones and blown up to a volume: for want of a level set.
-
-    Arguments as for `project_to_level_set`. All vertices of the result are ``left``. ValueError where so much of it is
-    in the bones that nothing can be blown up to the volume.
-    """
-    fitting = CarriedMaterial(mesh, vertices, None, cut, 0.0)
-    fitting.inflate(volume)
+    if field is None:
+        fitting.inflate(volume)
+    else:
+        fitting.reach(volume)
     return fitting.finish(volume, obstacles or [])
 
 

@@ -169,7 +169,7 @@ def _push_loop(vertices, faces, near_points, spacing, tolerance, moved):
 
 @compiled(error_model="numpy")
 def _shadow(vertices, faces, f, x, y, z):
-    """Normal of a triangle, its square, and times its length a point's height and its shadow's areas at B and C."""
+    """A triangle's normal, its square, and of a point height and shadow areas at B and C, times the normal's length."""
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
     ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
     ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az

@@ -11,8 +11,6 @@ R b = Q^T (y - A w). The condition of M is that of A on those weights, as gamma 
 adding a multiple of P^T P to A instead costs two digits at 2,000 centres.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 import warnings
@@ -72,7 +70,7 @@ def bounding_ridge(basis: Basis, condition: float) -> Floats:
     return np.asarray(factor.norm / condition / scale**2)
 
 
-def _factorise_bounded(basis: Basis, condition: float, smoothing: float) -> tuple[Factor, Floats]:
+def _factorise_bounded(basis: Basis, condition: float, smoothing: float) -> "tuple[Factor, Floats]":
     """Factor with a ridge, and the units (size,) of its unknowns."""
     # about the spacing of so many centres in the unit ball; a factor of three either way changes little
     count, unit = len(basis.points), 1.0 / math.sqrt(len(basis.points))
@@ -132,7 +130,7 @@ def _smoothed(basis: Basis, smoothing: float) -> Floats:
     return matrix
 
 
-def _factorise(matrix: Floats, polynomials: Floats, condition: float = math.inf) -> Factor | None:
+def _factorise(matrix: Floats, polynomials: Floats, condition: float = math.inf) -> "Factor | None":
     """Factor of A (size, size), lower triangle valid, Fortran order, overwritten; polynomials (q, size).
 
     The largest eigenvalue, ``norm``, over the bound of the condition is added to the diagonal. None where the matrix is

@@ -7,9 +7,8 @@ and Hermite fits need are ``2**k d^k phi / du^k``::
     k = 1   first   phi'/r
     k = 2   second  (phi'' - phi'/r) / r**2
 
-All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A and B of
-degree four at most. A row lists j, A and B of phi, the others follow; the loops in ``radial.py`` know the bases
-and no kernel.
+All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A and B of degree four
+at most. A row lists j, A and B of phi, the others follow; the loops in ``radial.py`` know the bases and no kernel.
 
 Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann (2000);
 SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: the formula r^2 (r^a - 1)

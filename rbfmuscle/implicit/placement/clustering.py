@@ -232,11 +232,6 @@ def contract_clusters(
 
 
 @compiled
-def _following(h):
-    return h - 2 if h % 3 == 2 else h + 1
-
-
-@compiled
 def _preceding(h):
     return h + 2 if h % 3 == 0 else h - 1
 
@@ -281,7 +276,8 @@ def _contract(h, tail, twin, out, parent, weight):
         if g == last:
             break
     for side in (h, last):
-        first, second = twin[_following(side)], twin[_preceding(side)]
+        following = side - 2 if side % 3 == 2 else side + 1
+        first, second = twin[following], twin[_preceding(side)]
         twin[first], twin[second] = second, first
         out[tail[first]] = first
         out[tail[second]] = second

@@ -4,8 +4,6 @@ glTF is in metres with y up, and knows no other animation of vertices than morph
 go from 0 to 1 and back one after the other.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Sequence
@@ -41,7 +39,7 @@ def animated_glb(run: MovingRun) -> bytes:
     return file.content({"name": run.name, "nodes": [file.append("nodes", root)]})
 
 
-def _add_part(file: _File, part: MovingPart) -> int:
+def _add_part(file: "_File", part: MovingPart) -> int:
     """Number of a new node: a muscle has a morph target for each frame but the first, a bone a pose for each."""
     base, faces = part.vertices[0], part.faces[0]
     normals, targets = vertex_normals(base, faces), []
