@@ -93,9 +93,18 @@ def open_server(port: int = 0) -> "tuple[ViserServer, str]":
 
 
 def show(shown: Scene | SavedRun, *, model: str | None = None) -> "Page":
-    """Show a scene or a saved run in a browser or a notebook, to begin with by a ``model`` other than the scene's own.
+    """Show a scene or a saved run in a browser or a notebook.
 
-    A notebook shows the page as the last value of a cell; elsewhere open its ``address``. ``close()`` ends it.
+    Parameters
+    ----------
+    shown : Scene or SavedRun
+    model : str, optional
+        To begin with, in place of the scene's own.
+
+    Returns
+    -------
+    Page
+        Shown by a notebook as the last value of a cell; elsewhere open its ``address``. ``close()`` ends it.
 
     Examples
     --------
