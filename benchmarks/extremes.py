@@ -10,7 +10,7 @@ import warnings
 import numpy as np
 
 from rbfmuscle.implicit.extraction.surface import extract_surface
-from rbfmuscle.implicit.field_fit import FieldFit
+from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.validation import NumericalWarning

@@ -15,9 +15,8 @@ import numpy as np
 import trimesh
 
 from rbfmuscle.experiments.kernel_study import VOLUME_BOUND, ReferenceSurface, measure_row
-from rbfmuscle.experiments.workers import threads_limited
-from rbfmuscle.implicit.extraction.marching import find_sheets
-from rbfmuscle.implicit.extraction.surface import extract_surface
+from rbfmuscle.experiments.sweep_run import threads_limited
+from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN, spacing, surface_error

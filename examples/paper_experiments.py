@@ -20,8 +20,7 @@ import numpy as np
 
 from pbd_baseline.muscle import PBDMuscle
 from pbd_baseline.options import PBDOptions
-from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bone_depth, surface_depth
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.scene.phantom import phantom_scene

@@ -11,10 +11,9 @@ import numba
 
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
-from rbfmuscle.metrics.joint_gaps import joint_gaps
 from rbfmuscle.metrics.metrics import Values
 from rbfmuscle.metrics.quantities import ALL, Row
-from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
+from rbfmuscle.metrics.rows import frame_rows, joint_gaps, moment_arm_rows
 from rbfmuscle.metrics.summary import (
     LIMITS,
     Summary,
@@ -24,8 +23,7 @@ from rbfmuscle.metrics.summary import (
     require_limits,
 )
 from rbfmuscle.models import configure_scene
-from rbfmuscle.output.runinfo import Neighbours, build_info, frame_facts
-from rbfmuscle.output.writer import RunWriter
+from rbfmuscle.output.writer import Neighbours, RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
 from rbfmuscle.scene.scene import Scene

@@ -4,8 +4,9 @@ import numpy as np
 import trimesh
 
 from rbfmuscle.jit import compiled
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.tables import JointTable
-from rbfmuscle.scene.objects import Attachment, Bone, Motion, Muscle, SceneData
+from rbfmuscle.scene.objects import Attachment, Motion, Muscle, SceneData
 from rbfmuscle.scene.options import ContactOptions, DetectOptions
 from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
 

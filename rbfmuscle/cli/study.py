@@ -254,7 +254,7 @@ def run_point(scene: Scene, settings: dict[str, Any], frames: str | None) -> Run
 
 
 def _finish(points, output, units, error):
-    from rbfmuscle.experiments.sweep_table import write_table
+    from rbfmuscle.experiments.sweep_run import write_table
     from rbfmuscle.report.sweep_page import write_page
 
     table = write_table(points, output, units, quantity=error)

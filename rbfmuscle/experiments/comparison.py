@@ -1,23 +1,16 @@
 """Models on one scene, measured alike: what each keeps, how far apart they are, what each costs."""
 
-from __future__ import annotations
-
-import csv
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, unit_text
-from rbfmuscle.output.runinfo import machine, versions
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.writer import write_json
+from rbfmuscle.output.writer import machine, versions, write_csv, write_json
 from rbfmuscle.scene.objects import MM_PER_UNIT
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-
+from rbfmuscle.scene.scene import Scene
 
 FORMAT = 3
 LAW, MESH, FIRST, COST = "law", "input mesh", "first model", "cost"
@@ -45,9 +38,7 @@ MEASURES = {
     "penetration_max": Measure("surface in a bone", "length", LAW, 0.02, "deepest surface vertex in a bone"),
     "bone_penetration_max": Measure("bone in the muscle", "length", LAW, 0.02, "deepest bone vertex in it"),
     "solver_penetration_max": Measure("before the cut", "length", LAW, 0.02, "model in a bone by then"),
-    "initial_overlap": Measure(
-        "overlap left at rest", "length", LAW, 0.02, "of muscle and bones before the motion"
-    ),
+    "initial_overlap": Measure("overlap left at rest", "length", LAW, 0.02, "of muscle and bones at first"),
     "slack": Measure("bowing", "1", LAW, 0.005, "centreline over shortest path", 1.0),
     "components": Measure("pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"),
     "euler": Measure("Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle", 2.0),
@@ -102,11 +93,7 @@ def measure_run(saved: SavedRun, extra: dict[str, Any]) -> dict[str, Any]:
 
 
 def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> None:
-    """Add the distances of each model's surfaces to those of the first, the worst of some poses.
-
-    ``results`` holds what `measure_run` found by model, and takes ``distance_rms`` and ``distance_max``; the folder
-    holds a run of each model.
-    """
+    """Add the distances of each model's surfaces to those of the first, the worst of some poses of a folder's runs."""
     first, *others = (SavedRun(folder / name) for name in results)
     for found, run in zip(list(results.values())[1:], others):
         for muscle in first.muscles:
@@ -125,16 +112,10 @@ def write_tables(
     labels: dict[str, str],
     poses: list[int],
 ) -> dict[str, Any]:
-    """Write ``comparison.json`` and ``comparison.csv``; what the JSON file holds.
-
-    ``results`` are values by model, muscle or "all", and quantity; ``failed`` says by model why it did not finish,
-    ``labels`` what it is called.
-    """
+    """Write ``comparison.json``, which is returned, and ``comparison.csv``: values by model, muscle and quantity."""
     units = {name: unit_text(m.kind, scene.units) for name, m in MEASURES.items()}
-    measures = {
-        name: {"title": m.title, "unit": units[name], "against": m.against, "meaning": m.meaning}
-        for name, m in MEASURES.items()
-    }
+    facts = ("title", "against", "meaning")
+    measures = {n: {"unit": units[n], **{key: getattr(m, key) for key in facts}} for n, m in MEASURES.items()}
     table = {
         "format": FORMAT, "scene": scene.name, "units": scene.units, "frames": len(scene.motion), "poses": poses,
         "models": list(results), "labels": {name: labels[name] for name in results}, "failed": failed,
@@ -142,24 +123,20 @@ def write_tables(
         "machine": machine(), "versions": versions(),
     }  # fmt: skip
     write_json(folder / "comparison.json", table)
-    with open(folder / "comparison.csv", "w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(("model", "muscle", "quantity", "value", "unit", "against"))
-        for model, muscles in results.items():
-            for muscle, values in muscles.items():
-                for name in [name for name in MEASURES if name in values]:
-                    rows.writerow((model, muscle, name, values[name], units[name], MEASURES[name].against))
+    rows: list[tuple[Any, ...]] = [("model", "muscle", "quantity", "value", "unit", "against")]
+    for model, muscles in results.items():
+        for muscle, values in muscles.items():
+            known = [(name, m.against) for name, m in MEASURES.items() if name in values]
+            rows += [(model, muscle, name, values[name], units[name], against) for name, against in known]
+    write_csv(folder / "comparison.csv", rows)
     return table
 
 
 def best_models(results: dict[str, Any], quantity: str, units: str) -> list[str]:
     """Models that are as good as the best in a measure: within 5 %, or within what does not count."""
     measure = MEASURES[quantity]
-    values = {
-        name: abs(found[ALL][quantity] - measure.ideal)
-        for name, found in results.items()
-        if quantity in found[ALL]
-    }
+    known = {name: found[ALL][quantity] for name, found in results.items() if quantity in found[ALL]}
+    values = {name: abs(value - measure.ideal) for name, value in known.items()}
     if measure.against == FIRST or len(values) < 2:
         return []
     scale = 1.0 / MM_PER_UNIT[units] if measure.kind == "length" else 1.0

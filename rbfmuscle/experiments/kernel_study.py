@@ -3,8 +3,6 @@
 Accuracy, conditioning and time are measured together, since each can be bought with the others.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 import warnings
@@ -14,15 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.experiments.sweep_table import pareto_front
-from rbfmuscle.experiments.workers import threads_limited
+from rbfmuscle.experiments.sweep_run import Progress, pareto_front, threads_limited
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.surfaces import face_normals, mesh_volume, vertex_areas
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.implicit.extraction.marching import find_sheets
-from rbfmuscle.implicit.extraction.surface import extract_surface
-from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.field_fit import FieldFit, wanted_derivatives
+from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
+from rbfmuscle.implicit.field import FieldFit, RBFField, wanted_derivatives
 from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface, spread_points
@@ -226,7 +221,7 @@ def study_kernels(
     placement: str = FITTED,
     resolution: int = 0,
     units: str = "",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> KernelStudy:
     """Fit a surface with many kernels and numbers of centres, and measure each fit.
 
@@ -242,21 +237,13 @@ def study_kernels(
         (`fit_sample`); kernels that are not C2 have greedy ones.
     resolution : int
         Cells along the longest side of the extracted surfaces; as many as a muscle so slender needs by default.
-    units : str
-        Name of the mesh's unit, for the page.
-    progress : callable, optional
-        Called as ``progress(done, total)``.
-
-    Returns
-    -------
-    KernelStudy
+    units, progress : str, callable, optional
+        Name of the mesh's unit, for the page. ``progress(done, total)`` is called along the way.
 
     Raises
     ------
-    UsageError
-        On an unknown kernel or placement, or a number of centres below 8.
-    MeshError
-        On an unusable mesh.
+    UsageError, MeshError
+        On an unknown kernel or placement, or a number of centres below 8; on an unusable mesh.
 
     Examples
     --------
@@ -288,9 +275,7 @@ def study_kernels(
 
 
 def _measure_all(
-    judge: ReferenceSurface,
-    calls: list[tuple[SurfaceSample, Kernel, str]],
-    progress: Callable[[int, int], None] | None,
+    judge: ReferenceSurface, calls: list[tuple[SurfaceSample, Kernel, str]], progress: Progress | None
 ) -> list[Measured]:
     """What the rows of calls found, in their order, measured side by side on threads."""
     from threadpoolctl import threadpool_limits
@@ -328,8 +313,7 @@ def cost(row: dict) -> float:
 def recommend(rows: list[dict]) -> dict | None:
     """The quickest of the rows that err at most 5 % more than the best, None where every one is unfit.
 
-    Sound conditions come first; of rows alike in time, within 15 %, those without a parameter to choose. Rows hold
-    ``rms, fit_time, evaluation_time, condition, epsilon, unfit``.
+    Sound conditions come first; of rows alike in time, within 15 %, those without a parameter to choose.
     """
     good = [row for row in rows if not row["unfit"]]
     if not good:
@@ -338,7 +322,5 @@ def recommend(rows: list[dict]) -> dict | None:
     alike = [row for row in good if row["rms"] <= ALIKE * least]
     sound = [row for row in alike if row["condition"] <= SOUND] or alike
     quick = min(cost(row) for row in sound)
-    return min(
-        (row for row in sound if cost(row) <= 1.15 * quick),
-        key=lambda row: (bool(row["epsilon"]), row["condition"]),
-    )
+    alike = [row for row in sound if cost(row) <= 1.15 * quick]
+    return min(alike, key=lambda row: (bool(row["epsilon"]), row["condition"]))

@@ -1,20 +1,16 @@
 """A sweep: one or several scenes under a grid of settings, laid out as points that are run once each."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_value
 from rbfmuscle.validation import UsageError
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
 
 # Values of each setting that is varied.
 Grid = dict[str, list[Any]]
@@ -106,13 +102,8 @@ def scene_content(scene: Scene, frames: str | None = None) -> str:
         facts.pop(part)
     for item in [*facts["bones"], *facts["muscles"]]:
         item.pop("mesh")
-    held = [
-        [
-            (a.bone, [int(v) for v in a.vertices], a.tendon and a.tendon.model_dump())
-            for a in muscle.attachments
-        ]
-        for muscle in scene.muscles
-    ]
+    ends = [muscle.attachments for muscle in scene.muscles]
+    held = [[(a.bone, a.vertices.tolist(), a.tendon and a.tendon.model_dump()) for a in end] for end in ends]
     fibres = [[line.tolist() for line in muscle.fibres or []] for muscle in scene.muscles]
     track = [sorted(frame.items()) for frame in scene.motion.frames]
     return _hash([facts, held, fibres, track, str(frames or "")])

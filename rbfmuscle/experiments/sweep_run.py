@@ -1,33 +1,31 @@
-"""Running the points of a sweep side by side by joblib, in processes or on a Dask cluster."""
-
-from __future__ import annotations
+"""Running the points of a sweep side by side, in processes or on a Dask cluster; tables and Pareto front."""
 
 import json
 import math
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.experiments.sweep import SweepPoint
-from rbfmuscle.experiments.workers import threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
-from rbfmuscle.metrics.quantities import ALL
-from rbfmuscle.output.writer import check_writable, write_json
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES
+from rbfmuscle.metrics.summary import shown_number
+from rbfmuscle.output.writer import check_writable, write_csv, write_json
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, SolveError, UsageError
 
 if TYPE_CHECKING:
     from distributed import Client
 
-    from rbfmuscle.scene.scene import Scene
-
 CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
-Runner = Callable[["Scene", dict[str, Any], str | None], Any]
+Runner = Callable[[Scene, dict[str, Any], str | None], Any]
+Progress = Callable[[int, int], None]  # of what is done and the total
 # What a point may fail with and leave the others standing.
 POINT_ERRORS = (RBFMuscleError, ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, ValueError)
 # Worst over muscles and frames, by magnitude.
@@ -37,13 +35,14 @@ WORST = (
 )  # fmt: skip
 TIMES = ("time_frame", "time_frame_p95", "time_extract")
 VALUES = ("error_rms", "error_max", *WORST, *TIMES)
+# The default may be this much worse than the front, in error and in time at once.
+NEAR = 1.1
+# In the scene's unit.
+LENGTHS = ("error_rms", "error_max", *(name for name in WORST if QUANTITIES[name][0] == "length"))
 
 
 class SweepFolder:
-    """``points/KEY.json`` (a result each) and ``references/KEY.npz`` (surfaces that errors are measured against).
-
-    The folder is made where it is missing; UsageError where it cannot be written to.
-    """
+    """``points/KEY.json``, a result each, and ``references/KEY.npz``, surfaces that errors are measured against."""
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(os.path.abspath(directory))
@@ -82,7 +81,7 @@ def run_sweep(
     frames: str | None = None,
     jobs: int | None = None,
     cluster: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> int:
     """Run the points that the folder does not hold done, references first; how many were run.
 
@@ -117,17 +116,13 @@ def run_sweep(
     return len(left)
 
 
-def _connect_cluster(address: str) -> Client:
-    """A client of a Dask scheduler, as soon as two workers are there: to one alone joblib sends nothing.
-
-    MissingPartError if Dask is not installed, UsageError if no scheduler with two workers answers.
-    """
+def _connect_cluster(address: str) -> "Client":
+    """A client of a Dask scheduler, as soon as two workers are there: to one alone joblib sends nothing."""
     try:
         from distributed import Client
     except ImportError as error:
-        raise MissingPartError(
-            "Dask is not installed, which --cluster needs: pip install 'rbfmuscle[cluster]'"
-        ) from error
+        message = "Dask is not installed, which --cluster needs: pip install 'rbfmuscle[cluster]'"
+        raise MissingPartError(message) from error
     try:
         client = Client(address, timeout=CONNECT_WITHIN)
         client.wait_for_workers(2, timeout=CONNECT_WITHIN)
@@ -170,11 +165,8 @@ def measure_point(
         with threads_limited(threads):
             run = runner(scene, point.settings, frames)
             values = _values(run)
-            shown = {
-                f"{_pose(frame)}|{name}": (surface.vertices, surface.faces)
-                for frame in run.frames
-                for name, surface in frame.surfaces.items()
-            }
+            every = [(frame, *named) for frame in run.frames for named in frame.surfaces.items()]
+            shown = {f"{_pose(frame)}|{name}": (s.vertices, s.faces) for frame, name, s in every}
             if point.role == "reference":
                 arrays = {f"{place}|{k}": mesh[k] for place, mesh in shown.items() for k in (0, 1)}
                 fresh = folder.references / f".{point.key}.{os.getpid()}.npz"
@@ -213,11 +205,118 @@ def _errors(shown, path):
     if not path.exists():
         raise UsageError("its reference is missing: that point failed, or the folder is not shared")
     with np.load(path) as kept:
-        met = {place: mesh for place, mesh in shown.items() if f"{place}|0" in kept}
-        pairs = [
-            surface_distance(*mesh, *(kept[f"{place}|{k}"] for k in (0, 1))) for place, mesh in met.items()
-        ]
+        met = [(mesh, place) for place, mesh in shown.items() if f"{place}|0" in kept]
+        pairs = [surface_distance(*mesh, kept[f"{place}|0"], kept[f"{place}|1"]) for mesh, place in met]
     found = np.array(pairs)
     if not len(found):
         raise UsageError("no frame of this point is at a pose of the reference")
     return {"error_rms": math.sqrt(np.mean(found[:, 0] ** 2)), "error_max": float(found[:, 1].max())}
+
+
+@contextmanager
+def threads_limited(count: int) -> Iterator[None]:
+    """Context in which loops and BLAS use so many threads."""
+    import numba
+    from threadpoolctl import threadpool_limits
+
+    before = numba.get_num_threads()
+    numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))
+    try:
+        with threadpool_limits(count):
+            yield
+    finally:
+        numba.set_num_threads(before)
+
+
+def sweep_rows(
+    points: Sequence[SweepPoint], folder: SweepFolder, units: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """One dict a point: scene, its units, role, status, settings, values, threads, error; NaN where unknown."""
+    rows = []
+    for point in points:
+        result = folder.read(point.key)
+        values = result.get("values", {})
+        row = {
+            "scene": point.scene, "units": units[point.scene], "role": point.role,
+            "status": result.get("status", "missing"), "front": False, "settings": point.settings,
+            **{name: math.nan if values.get(name) is None else values[name] for name in VALUES},
+            **{name: result.get(name, "") for name in ("seconds", "threads", "machine", "error")},
+            "label": point.label, "reference": point.reference, "key": point.key,
+        }  # fmt: skip
+        rows.append(row)
+    return rows
+
+
+def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
+    """Indices, by growing time, of points that no other beats in error or time without loss; NaN takes no part."""
+    front, least = [], math.inf
+    for k in sorted(range(len(errors)), key=lambda k: (times[k], errors[k])):
+        if math.isfinite(errors[k]) and math.isfinite(times[k]) and errors[k] < least:
+            front.append(k)
+            least = errors[k]
+    return front
+
+
+def mark_front(rows: list[dict[str, Any]], quantity: str = "error_rms") -> list[dict[str, Any]]:
+    """Mark the front among the points of each reference, and judge the default of each against ``time_frame``.
+
+    References take no part: their error is zero by definition. A verdict holds ``factor``: the least by which both
+    error and time of the default must fall to lie on the front, 1 on it; ``near``: up to `NEAR`; ``faster``,
+    ``better``: keys of the quickest point of no greater error and the most accurate of no greater time, None where
+    there is none; ``text``: all of it in words.
+    """
+    verdicts = []
+    for group in dict.fromkeys(row["reference"] for row in rows if row["reference"]):
+        mine = [row for row in rows if row["reference"] == group and row["role"] != "reference"]
+        usable = [row for row in mine if row["status"] == "done"]
+        for k in pareto_front([r[quantity] for r in usable], [r["time_frame"] for r in usable]):
+            usable[k]["front"] = True
+        verdicts += [_judge(row, usable, quantity) for row in usable if row["role"] == "default"]
+    return verdicts
+
+
+def _judge(default: dict[str, Any], rows: list[dict[str, Any]], quantity: str) -> dict[str, Any]:
+    error, time = default[quantity], default["time_frame"]
+    others = [r for r in rows if r is not default and math.isfinite(r[quantity])]
+    factor = max([1.0, *(min(_ratio(error, r[quantity]), _ratio(time, r["time_frame"])) for r in others)])
+    quicker = [r for r in others if r[quantity] <= error and r["time_frame"] < time]
+    finer = [r for r in others if r["time_frame"] <= time and r[quantity] < error]
+    faster = min(quicker, key=lambda r: r["time_frame"], default=None)
+    better = min(finer, key=lambda r: r[quantity], default=None)
+    off = "within 10 % of" if factor <= NEAR else f"a factor of {factor:.2g} off"
+    where = "on" if default["front"] else off
+    text = f"{default['scene']}: the default lies {where} the Pareto front ({_figures(default, quantity)})"
+    for row, words in ((faster, "as accurate and quicker"), (better, "as quick and more accurate")):
+        text += f"; {words}: {row['label']} ({_figures(row, quantity)})" if row else ""
+    keys = {"faster": faster and faster["key"], "better": better and better["key"], "default": default["key"]}
+    return {"scene": default["scene"], "factor": factor, "near": factor <= NEAR, **keys, "text": f"{text}."}
+
+
+def _ratio(mine: float, other: float) -> float:
+    return mine / other if other > 0 else (math.inf if mine > 0 else 1.0)
+
+
+def _figures(row: dict[str, Any], quantity: str) -> str:
+    unit = row["units"] if quantity in LENGTHS else ""
+    return f"{shown_number(row[quantity], unit)} at {shown_number(row['time_frame'], 's')} per frame"
+
+
+def write_table(
+    points: Sequence[SweepPoint], directory: str | Path, units: dict[str, str], *, quantity: str = "error_rms"
+) -> dict[str, Any]:
+    """Write ``sweep.csv``, a line a point, and ``sweep.json``; what the latter holds: counts, verdicts, rows."""
+    folder = SweepFolder(directory)
+    rows = sweep_rows(points, folder, units)
+    verdicts = mark_front(rows, quantity)
+    keys = list(dict.fromkeys(key for row in rows for key in row["settings"]))
+    columns = [name for name in rows[0] if name not in ("settings", "label")]
+    lines: list[list[Any]] = [[*keys, *columns]]
+    for row in rows:
+        values = [row["settings"].get(key, "") for key in keys] + [row[name] for name in columns]
+        # Digits beyond nine places are rounding.
+        lines.append([f"{round(v, 9):.6g}" if isinstance(v, float) else v for v in values])
+    write_csv(folder.directory / "sweep.csv", lines)
+    counts = {status: sum(r["status"] == status for r in rows) for status in ("done", "failed", "missing")}
+    table = {"quantity": quantity, **counts, "verdicts": verdicts, "rows": rows}
+    write_json(folder.directory / "sweep.json", table)
+    return table

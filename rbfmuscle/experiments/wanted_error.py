@@ -4,16 +4,15 @@ The error falls with the number of centres by a power, but for some per cent of 
 number and a bisection narrows it to 4 %. Other kernels take part where they may need fewer centres.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 
 import numpy as np
 
 from rbfmuscle.experiments import kernel_study
+from rbfmuscle.experiments.sweep_run import Progress
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.implicit.kernels.table import Kernel
 from rbfmuscle.implicit.placement.refinement import FITTED
@@ -60,7 +59,7 @@ def reach_error(
     *,
     kernels: Sequence[str] | None = None,
     placement: str = FITTED,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> WantedError:
     """Find the fewest centres, 20 to 1000, the kernel and its setting that meet a surface to a wanted error.
 
@@ -77,16 +76,10 @@ def reach_error(
     progress : callable, optional
         Called as ``progress(done, total)``; the total grows with what is found.
 
-    Returns
-    -------
-    WantedError
-
     Raises
     ------
-    UsageError
-        On an error that is not positive, or an unknown kernel or placement.
-    MeshError
-        On an unusable mesh.
+    UsageError, MeshError
+        On an error that is not positive, or an unknown kernel or placement; on an unusable mesh.
 
     Examples
     --------
@@ -109,11 +102,7 @@ class _Search:
     """Rows by kernel and number of centres, and the best so far."""
 
     def __init__(
-        self,
-        judge: kernel_study.ReferenceSurface,
-        error: float,
-        placement: str,
-        progress: Callable[[int, int], None] | None,
+        self, judge: kernel_study.ReferenceSurface, error: float, placement: str, progress: Progress | None
     ) -> None:
         self.judge, self.error, self.placement, self.progress = judge, error, placement, progress
         self.sample = cache(partial(sample_surface, judge.vertices, judge.faces, placement="greedy"))
@@ -156,10 +145,7 @@ class _Search:
         found = min(self.found.values(), key=_error) if self.best is None else self.found[self.best]
         if not found.row["unfit"]:
             kernel_study.time_row(found, self.judge.points)
-        tried = [
-            {"kernel": kernel, "centres": count, "error": _error(one)}
-            for (kernel, count), one in self.found.items()
-        ]
+        tried = [{"kernel": k, "centres": n, "error": _error(one)} for (k, n), one in self.found.items()]
         return WantedError(self.best is not None, found.row, _error(found), self.error, tried)
 
 

@@ -3,19 +3,15 @@
 Points are handled in blocks that stay in the first-level cache; the inner loops run over the points of a block.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.implicit.kernels.radial import _radial_loop
+from rbfmuscle.implicit.kernels.table import Kernel
 from rbfmuscle.jit import compiled
-
-if TYPE_CHECKING:
-    from rbfmuscle.implicit.kernels.table import Kernel
 
 # Points of a block, and pairs of points and centres below which a thread does not pay.
 _BLOCK, _SERIAL = 256, 200_000

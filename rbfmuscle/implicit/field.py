@@ -1,20 +1,20 @@
-"""RBFField: a scalar field f, negative inside, whose zero set is the surface.
+"""RBFField: a scalar field f, negative inside, whose zero set is the surface; how those of muscles are fitted.
 
 f(x) = sum_j a_j phi(|x - c_j|) - B_j . grad phi(x - c_j) + p(x), with B = 0 for a fit to values.
 """
 
-from __future__ import annotations
-
 import warnings
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.surfaces import touching_balls
 from rbfmuscle.implicit.evaluation import Terms, evaluate
-from rbfmuscle.implicit.fit.assembly import Basis, centre_weights, check_count, frame, hermite_system
+from rbfmuscle.implicit.fit.assembly import Basis, hermite_system
 from rbfmuscle.implicit.fit.fitting import solve
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.validation import (
@@ -29,6 +29,11 @@ from rbfmuscle.validation import (
 if TYPE_CHECKING:
     import trimesh
 
+# With more centres than these a fit to normal derivatives alone errs less for the same time.
+MOST_WITH_ALL_DERIVATIVES = 200
+# Part of the touching ball's radius that a step off the surface may use.
+SAFETY = 0.5
+
 
 class RBFField:
     """An RBF field; made by `fit` or `fit_hermite`.
@@ -37,15 +42,12 @@ class RBFField:
     ----------
     centres : (K, 3) ndarray
         In the coordinates of the caller.
-    kernel : Kernel
-    epsilon : float
-        Shape parameter [1/length]; multiplies r.
+    kernel, epsilon : Kernel, float
+        Its shape parameter [1/length] multiplies r.
     weights : (K,) or (K, 4) ndarray
-        a_j, or for a Hermite fit a_j and B_j, for centred and scaled coordinates.
+        a_j, or for a Hermite fit a_j and B_j, for scaled coordinates (x - ``origin``) / ``scale``.
     coefficients : (q,) ndarray
         Of the monomials ``powers`` in scaled coordinates.
-    origin, scale : (3,) ndarray, float
-        Scaled coordinates are (x - origin) / scale.
     condition : float
         Estimate for the matrix that was factored.
 
@@ -61,28 +63,17 @@ class RBFField:
     """
 
     def __init__(
-        self,
-        centres: Floats,
-        epsilon: float,
-        place: tuple[Floats, float],
-        system: tuple[Basis, Floats],
-        smoothing: float,
-        condition: float,
+        self, centres: Floats, epsilon: float, basis: Basis, right: Floats, smoothing: float, condition: float
     ) -> None:
         if not (np.isfinite(smoothing) and smoothing >= 0.0):
             raise UsageError(f"smoothing must be a number of at least 0, got {smoothing}")
         if not condition >= 1.0:
             raise UsageError(f"condition must be at least 1, got {condition}")
-        basis, right = system
-        found, self.coefficients, self.condition = solve(
-            basis, right, smoothing=smoothing, condition=condition
-        )
+        found = solve(basis, right, smoothing=smoothing, condition=condition)
+        weights, self.coefficients, self.condition = found
         self.centres, self.kernel, self.epsilon = centres, basis.kernel, epsilon
-        self.weights, self.powers, (self.origin, self.scale) = (
-            centre_weights(basis, found),
-            basis.powers,
-            place,
-        )
+        self.weights, self.powers = basis.centre_weights(weights), basis.powers
+        self.origin, self.scale = basis.origin, basis.scale
         rows = np.ascontiguousarray(self.weights.reshape(len(centres), -1).T)
         self._terms = Terms(
             self.origin, self.scale, np.ascontiguousarray(basis.points.T),
@@ -100,7 +91,7 @@ class RBFField:
         epsilon: float = 1.0,
         smoothing: float = 0.0,
         condition: float = np.inf,
-    ) -> RBFField:
+    ) -> "RBFField":
         """Interpolate values at points.
 
         Parameters
@@ -116,25 +107,16 @@ class RBFField:
         condition : float
             Bound, at least 1 [1]: a ridge keeps it (see `solve`).
 
-        Returns
-        -------
-        RBFField
-
         Raises
         ------
-        UsageError
-            For an unknown kernel.
-        numpy.linalg.LinAlgError
-            If the system is singular; the message names the likely cause.
+        UsageError, numpy.linalg.LinAlgError
+            For an unknown kernel; if the system is singular (the message names the likely cause).
         """
         points = check_points(points)
         values = check_values(values, len(points))
         kernel, epsilon = get_kernel(kernel), check_positive(epsilon, name="epsilon")
-        check_count(kernel, len(points))
-        origin, scale = frame(points)
-        shape = epsilon * scale if kernel.has_epsilon else 1.0
-        basis = Basis((points - origin) / scale, kernel, shape)
-        return cls(points, epsilon, (origin, scale), (basis, values), smoothing, condition)
+        basis = Basis(points, kernel, epsilon)
+        return cls(points, epsilon, basis, values, smoothing, condition)
 
     @classmethod
     def fit_hermite(
@@ -147,7 +129,7 @@ class RBFField:
         smoothing: float = 0.0,
         derivatives: str = "all",
         condition: float = np.inf,
-    ) -> RBFField:
+    ) -> "RBFField":
         """Fit f = 0 and grad f = normal at every point (Hermite RBF, Macedo 2011).
 
         Parameters
@@ -159,33 +141,27 @@ class RBFField:
         kernel, epsilon, smoothing, condition
             As in `fit`; the kernel must be C2.
         derivatives : {"all", "normal"}
-            "normal" asks only for the derivative along the normal: 2K unknowns in place of 4K, a quarter
-            of the time for nearly the same surface (see ``docs/field.md``).
-
-        Returns
-        -------
-        RBFField
+            "normal" asks only for the derivative along the normal: 2K unknowns in place of 4K, a quarter of the time
+            for nearly the same surface (see ``docs/field.md``).
 
         Raises
         ------
-        UsageError
-            For a kernel that is not smooth enough, a normal of length zero, or a condition below 1.
-        numpy.linalg.LinAlgError
-            If the system is singular.
+        UsageError, numpy.linalg.LinAlgError
+            For a kernel that is not smooth enough, a normal of length zero, or a condition below 1; as in `fit`.
         """
         points = check_points(points)
         normals = check_vectors(normals, len(points))
         kernel, epsilon = get_kernel(kernel), check_positive(epsilon, name="epsilon")
         if not kernel.hermite:
             raise UsageError(
-                f"kernel '{kernel.name}' is C{kernel.smoothness} only and a Hermite fit needs C2; use fit"
+                f"kernel '{kernel.name}' is C{kernel.smoothness}: use fit, as fit_hermite needs C2"
             )
         if derivatives not in ("all", "normal"):
             raise UsageError(f"derivatives must be 'all' or 'normal', got {derivatives!r}")
-        basis, right, origin, scale = hermite_system(points, normals, kernel, epsilon, derivatives)
-        fitted = cls(points, epsilon, (origin, scale), (basis, right), smoothing, condition)
+        basis, right = hermite_system(points, normals, kernel, epsilon, derivatives)
+        fitted = cls(points, epsilon, basis, right, smoothing, condition)
         if kernel.has_epsilon:
-            warn_if_narrow(fitted, points, normals)
+            _warn_if_narrow(fitted, points, normals)
         return fitted
 
     def __call__(self, points: ArrayLike) -> Floats:
@@ -200,7 +176,7 @@ class RBFField:
         """Value (n,) and gradient (n, 3) at (n, 3) points, for little more than the value alone."""
         return evaluate(check_points(points), self._terms, self.kernel, True)
 
-    def surface(self, resolution: int = 64) -> trimesh.Trimesh:
+    def surface(self, resolution: int = 64) -> "trimesh.Trimesh":
         """Zero set as a closed outward ``trimesh.Trimesh``; resolution in cells along the longest side."""
         import trimesh
 
@@ -210,9 +186,8 @@ class RBFField:
         return trimesh.Trimesh(result.vertices, result.faces, process=False)
 
 
-def warn_if_narrow(fitted: RBFField, points: ArrayLike, normals: ArrayLike) -> None:
+def _warn_if_narrow(fitted: RBFField, points: Floats, normals: Floats) -> None:
     """Warn where the field does not rise outwards between its centres: the kernel does not reach that far."""
-    points, normals = check_points(points), check_vectors(normals, len(points))
     if len(points) < 20:
         return  # too few to say what lies between them
     near = cKDTree(points).query(points, k=6)[1][:, 5]
@@ -224,3 +199,51 @@ def warn_if_narrow(fitted: RBFField, points: ArrayLike, normals: ArrayLike) -> N
             NumericalWarning,
             stacklevel=4,
         )
+
+
+@dataclass(frozen=True)
+class FieldFit:
+    """How the field through a muscle's centres is fitted.
+
+    ``epsilon`` is the kernel's shape parameter [1 / length], ``derivatives`` ("all" or "normal") what the fit meets at
+    a centre, ``condition`` the bound that a ridge keeps.
+    """
+
+    kernel: Kernel
+    epsilon: float
+    derivatives: str
+    condition: float = np.inf
+
+    def fit(self, centres: Floats, normals: Floats) -> RBFField:
+        """The field through centres (K, 3) with unit normals (K, 3).
+
+        A Hermite fit where the kernel is C2. Else a fit to values on the surface and off it: three centres for each
+        point, and normals only as good as finite differences.
+        """
+        how: dict[str, Any] = {"kernel": self.kernel, "epsilon": self.epsilon, "condition": self.condition}
+        if self.kernel.hermite:
+            return RBFField.fit_hermite(centres, normals, derivatives=self.derivatives, **how)
+        fitted = RBFField.fit(*off_surface_points(centres, normals), **how)
+        if self.kernel.has_epsilon:
+            _warn_if_narrow(fitted, centres, normals)
+        return fitted
+
+
+def wanted_derivatives(count: int, *, fitted: bool) -> str:
+    """What a fit to so many centres meets: all derivatives of few ones and of those fitted to the whole surface."""
+    return "all" if fitted or count <= MOST_WITH_ALL_DERIVATIVES else "normal"
+
+
+def off_surface_points(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
+    """Points (3K, 3) on, outside and inside a surface with signed distances (3K,) 0, +d and -d, for fits to values.
+
+    Each point x (K, 3), two or more, with unit outward normal n gives f(x) = 0, f(x + d n) = d and f(x - d n) = -d
+    (Carr et al. 2001). The step d is half the median distance to the nearest other point, and at most half the radius
+    of the empty ball that touches the surface in x, so that x stays the nearest of all points to x + d n.
+    """
+    steps = np.empty((2, len(points)))
+    nearest = np.empty(len(points))
+    touching_balls(points, normals, steps, nearest)
+    outside, inside = np.minimum(SAFETY * steps, 0.5 * np.median(nearest))
+    where = np.vstack([points, points + outside[:, None] * normals, points - inside[:, None] * normals])
+    return where, np.concatenate([np.zeros(len(points)), outside, -inside])

@@ -5,8 +5,6 @@ scanned and the best valley narrowed by golden sections. Points on a surface say
 zero sets of the best are extracted in their order, until one is a single closed sheet.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import warnings
@@ -19,9 +17,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.extraction.marching import find_sheets
-from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.field_fit import FieldFit
+from rbfmuscle.implicit.extraction.surface import find_sheets
+from rbfmuscle.implicit.field import FieldFit, RBFField
 from rbfmuscle.validation import NumericalWarning, UsageError, check_points, check_vectors
 
 SPAN = (0.02, 20.0)
@@ -51,10 +48,9 @@ class Trial(NamedTuple):
 
 
 class EpsilonChoice(NamedTuple):
-    """A chosen shape parameter [1/length].
+    """A chosen shape parameter [1/length] and its root mean square ``error`` at the held-out points [length].
 
-    ``error`` is the root mean square distance of the held-out points [length]; ``broken`` says why no zero set that was
-    extracted is that of the surface, empty where one is.
+    ``broken`` says why no zero set that was extracted is that of the surface, empty where one is.
     """
 
     epsilon: float
@@ -97,34 +93,19 @@ def choose_epsilon(
 ) -> EpsilonChoice:
     """Search the epsilon of a fit to points with normals (K, 3).
 
-    Parameters
-    ----------
-    points, normals : (K, 3) array_like
-    fit : FieldFit
-        Of any epsilon; its condition should be bounded.
-    held_out : (n, 3) array_like
-        Other points of the surface, spread evenly over it.
-    distance : callable, optional
-        ``(n, 3) -> (n,)``, distance to the surface, signed or not; with it zero sets are extracted.
-
-    Raises
-    ------
-    UsageError
-        For a kernel without a shape parameter.
-    numpy.linalg.LinAlgError
-        Where no epsilon can be fitted.
+    ``fit`` is of any epsilon; its condition should be bounded. ``held_out`` (n, 3) are other points of the surface,
+    spread evenly over it. ``distance`` maps points (n, 3) to their distances (n,) from the surface, signed or not; with
+    it zero sets are extracted. UsageError for a kernel without a shape parameter, LinAlgError where no epsilon can be
+    fitted.
     """
     if not fit.kernel.has_epsilon:
-        raise UsageError(
-            f"kernel '{fit.kernel.name}' has no shape parameter: epsilon does not change its interpolant"
-        )
+        raise UsageError(f"kernel '{fit.kernel.name}' has no shape parameter: epsilon changes nothing")
     points = check_points(points)
     normals, reach = check_vectors(normals, len(points)), float(spacing(points).mean())
     order = _search(points, normals, fit, check_points(held_out, name="held_out"), reach)
     if not order:
-        raise np.linalg.LinAlgError(
-            f"no epsilon of kernel '{fit.kernel.name}' gives a fit; take another kernel or spread the centres"
-        )
+        message = f"no epsilon of kernel '{fit.kernel.name}' gives a fit; take another or spread the centres"
+        raise np.linalg.LinAlgError(message)
     found, broken = (order[0], "") if distance is None else _first_sound(order, points, reach, distance)
     return EpsilonChoice((found or order[0]).epsilon, (found or order[0]).error, broken)
 

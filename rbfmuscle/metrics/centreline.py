@@ -1,30 +1,42 @@
-"""Length of a muscle: a line through the slices of a harmonic field between its origin and its insertion."""
+"""Length and sections of a muscle, and the shortest path over the bones between its ends.
 
-from __future__ import annotations
+The length is that of a line through the slices of a harmonic field between origin and insertion. The path is a taut
+string of `NODES` nodes that starts along it: the nodes take the places where the sum of the segments' squared lengths
+is least while each is on the outer side of the plane that touches the nearest bone there. Planes are taken again until
+the nodes are where they were one or two rounds before.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sparse
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.surfaces import vertex_areas
-from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.jit import compiled
+from rbfmuscle.metrics.mesh_distance import BoneProbe, bones_about, inverse_pose
+from rbfmuscle.scene.joints.joint import Joint, all_coordinates
+from rbfmuscle.scene.objects import Attachment, Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import TendonLine, line_length
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.joints.joint import Joint
-    from rbfmuscle.scene.objects import Attachment, Muscle
-    from rbfmuscle.scene.scene import Scene
 
 _LEVELS = 120  # by which the line is measured at rest
 
 # Of origin or insertion each attachment: its bone or tendon, attached vertices (k, 3) at rest, and their areas (k,):
 # where triangles are small there are more vertices, which must not draw the end of a line there.
 End = list[tuple[str, Floats, Floats]]
+STATIONS = 48  # sections along the line of action
+CALIPERS = 36  # directions in which a section's width is taken
+NODES = 33
+ROUNDS = 40  # in which planes are taken, at most
+STILL = 1e-4  # of the string's length: what counts as the same place
+SWEEPS, OVER_RELAXATION = 100, 1.8  # of a round
+RENEWED = 0.1  # of its distance to the nearest bone: a node that has moved farther gets another plane
+# Nearer to a bone than this its distance is no way to tell the normal, in lengths of the string.
+TOUCHING = 1e-9
 
 
 class Centreline:
@@ -46,12 +58,10 @@ class Centreline:
         moving: Collection[str] | None = None,
         slices: int = 16,
     ) -> None:
-        areas = vertex_areas(np.asarray(muscle.mesh.vertices, dtype=float), np.asarray(muscle.mesh.faces))
+        rest = np.asarray(muscle.mesh.vertices, dtype=float)
+        areas = vertex_areas(rest, np.asarray(muscle.mesh.faces))
         self.ends: list[End] = [
-            [
-                (a.holder, np.asarray(muscle.mesh.vertices[a.vertices], dtype=float), areas[a.vertices])
-                for a in group
-            ]
+            [(a.holder, rest[a.vertices], areas[a.vertices]) for a in group]
             for group in split_ends(muscle, joints, moving)
         ]
         sides = _sides(muscle, self.ends, vertices)
@@ -61,15 +71,31 @@ class Centreline:
         along = distance_along(fine @ vertices)
         even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
         self.operator = slice_operator(vertices, faces, field, even)
+        self._pulled: Floats | None = None  # from the points along the line to the last shortest path
 
     def points(self, vertices: Floats, poses: Mapping[str, Floats]) -> Floats:
         """The line now, (k, 3), from the carried mesh (n, 3) and the poses (4, 4) of the bones."""
-        first, last = (carried_middle(end, poses) for end in self.ends)
+        first, last = (_carried_middle(end, poses) for end in self.ends)
         return np.vstack([first, self.operator @ vertices, last])
 
     def length(self, vertices: Floats, poses: Mapping[str, Floats]) -> float:
         """Length of the line now, without tendons [scene unit]."""
         return float(distance_along(self.points(vertices, poses))[-1])
+
+    def measure(
+        self, vertices: Floats, poses: dict[str, Floats], probes: list[BoneProbe]
+    ) -> tuple[float, float]:
+        """Length of the line now, and over that of the shortest path, which begins beside it as in the last frame."""
+        line = self.points(vertices, poses)
+        path = shortest_path(line, probes, poses, offset=self._pulled)
+        self._pulled = path - resampled(line, NODES - 1) if len(path) == NODES else None
+        length, shortest = float(distance_along(line)[-1]), float(distance_along(path)[-1])
+        return length, length / shortest if shortest > 0.0 else np.nan
+
+    def section(self, vertices: ArrayLike, faces: ArrayLike, poses: Mapping[str, Floats]) -> dict[str, float]:
+        """`belly_measures` of a surface across the line between the middles of origin and insertion."""
+        first, last = (_carried_middle(end, poses) for end in self.ends)
+        return belly_measures(np.asarray(vertices), np.asarray(faces), first, last)
 
     def tendon_length(self, tendons: Mapping[str, TendonLine]) -> float:
         """Length of the tendons at both ends now [scene unit]; of several attachments of an end the mean by area."""
@@ -121,9 +147,7 @@ def split_ends(
 def moving_joints(scene: Scene) -> set[str]:
     """Names of the joints that a scene's motion moves, those that follow others among them."""
     facts = all_coordinates(scene.joints)
-    names = {
-        name for frame in scene.motion.frames for name, value in frame.items() if value != facts[name].rest
-    }
+    names = {name for frame in scene.motion.frames for name, x in frame.items() if x != facts[name].rest}
     for coupling in scene.couplings:  # in an order in which what they follow is known
         if names & set(coupling.of):
             names.add(coupling.coordinate)
@@ -185,11 +209,102 @@ def _sides(muscle, ends, vertices):
     return [np.setdiff1d(sides[0], sides[1]), sides[1]]
 
 
-def carried_middle(end: End, poses: Mapping[str, Floats]) -> Floats:
+def _carried_middle(end: End, poses: Mapping[str, Floats]) -> Floats:
     """Middle (3,) of an end's patches where its bones (their poses (4, 4)) carry them."""
-    total = sum(areas.sum() for _, _, areas in end)
-    moved = [
-        poses[bone][:3, :3] @ (areas @ points) + areas.sum() * poses[bone][:3, 3]
-        for bone, points, areas in end
-    ]
-    return np.sum(moved, axis=0) / total
+    placed = [(poses[bone], points, areas) for bone, points, areas in end]
+    moved = [pose[:3, :3] @ (areas @ points) + areas.sum() * pose[:3, 3] for pose, points, areas in placed]
+    return np.sum(moved, axis=0) / sum(areas.sum() for *_, areas in placed)
+
+
+def belly_measures(vertices: Floats, faces: Integers, first: Floats, last: Floats) -> dict[str, float]:
+    """Greatest section of a closed surface across the line between two points (3,): area [unit²], place, width."""
+    length = float(np.linalg.norm(last - first))
+    axis = (last - first) / length
+    height = (vertices - first) @ axis
+    places = height.min() + np.ptp(height) * (np.arange(STATIONS) + 0.5) / STATIONS
+    start, end, station = isolines(vertices, faces, height, places)
+    areas = np.abs(np.bincount(station, 0.5 * np.cross(start - first, end - first) @ axis, STATIONS))
+    best = int(np.argmax(areas))
+    area, place = areas[best], places[best]
+    if 0 < best < STATIONS - 1:
+        before, after = areas[best - 1], areas[best + 1]
+        bend = before - 2.0 * area + after
+        shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+        place += shift * (places[1] - places[0])
+        area -= 0.25 * (before - after) * shift
+    thickness = _thickness(start[station == best], axis)
+    return {"csa_max": float(area), "csa_place": float(place / length), "belly_thickness": thickness}
+
+
+def _thickness(points: Floats, axis: Floats) -> float:
+    """Least width of a section's points over all directions across the axis."""
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    u = np.cross(axis, helper)
+    u /= np.linalg.norm(u)
+    v = np.cross(axis, u)
+    angle = np.pi * np.arange(CALIPERS) / CALIPERS
+    directions = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
+    return float(np.ptp(points @ directions.T, axis=0).min())
+
+
+def shortest_path(
+    line: Floats, probes: list[BoneProbe], poses: dict[str, Floats], *, offset: Floats | None = None
+) -> Floats:
+    """Nodes (`NODES`, 3) of the shortest path over the bones between the ends of a line, beside which it begins.
+
+    ``line`` (n, 3) says which side of the bones the path takes; the bones have poses (4, 4) by name. ``offset``
+    (`NODES`, 3) leads from the points at even distances along the line to where the string begins: what it did in the
+    frame before. Two nodes only where nothing lies between the ends.
+    """
+    chord = np.linspace(line[0], line[-1], NODES)
+    near = bones_about(line, probes, poses)
+    inner = chord[1:-1]
+    if not any(probe.inside(inner, pose=inverse_pose(poses[probe.name])).any() for probe in near):
+        return chord[[0, -1]]
+    string = resampled(line, NODES - 1) + (0.0 if offset is None else offset)
+    size, earlier = float(distance_along(line)[-1]), [string]
+    gap, normal = _planes(string, near, poses, TOUCHING * size)
+    taken, offsets = string.copy(), np.einsum("ij,ij->i", normal, string) - gap
+    for _ in range(ROUNDS):
+        string = string.copy()
+        _tighten_loop(string, normal, offsets, SWEEPS, OVER_RELAXATION)
+        # A node between two planes can go to and fro.
+        if min(np.abs(string - other).max() for other in earlier) < STILL * size:
+            break
+        earlier = [earlier[-1], string]
+        renewed = np.abs(string - taken).max(axis=1) > RENEWED * np.abs(gap)
+        gap[renewed], normal[renewed] = _planes(string[renewed], near, poses, TOUCHING * size)
+        taken[renewed] = string[renewed]
+        offsets[renewed] = np.einsum("ij,ij->i", normal, string)[renewed] - gap[renewed]
+    return string
+
+
+def _planes(
+    points: Floats, probes: list[BoneProbe], poses: dict[str, Floats], least: float
+) -> tuple[Floats, Floats]:
+    """Signed distance (n,) to the nearest bone and the unit normal (n, 3) of the plane that touches it there."""
+    gap, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
+    for probe in probes:
+        pose = poses[probe.name]
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        distance, closest, outward = probe.nearest(local)
+        far = np.abs(distance) > least
+        outward[far] = (local[far] - closest[far]) / distance[far, None]
+        here = distance < gap
+        gap[here], normal[here] = distance[here], outward[here] @ pose[:3, :3].T
+    return gap, normal
+
+
+@compiled(error_model="numpy")
+def _tighten_loop(string, normal, offset, sweeps, relaxation):
+    """Move inner nodes to where the squared segments are least with normal · node >= offset, by projected SOR."""
+    for _ in range(sweeps):
+        for n in range(1, len(string) - 1):
+            along = -offset[n]
+            for a in range(3):
+                middle = 0.5 * (string[n - 1, a] + string[n + 1, a])
+                string[n, a] += relaxation * (middle - string[n, a])
+                along += normal[n, a] * string[n, a]
+            if along < 0.0:
+                for a in range(3):
+                    string[n, a] -= along * normal[n, a]

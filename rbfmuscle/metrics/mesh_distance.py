@@ -1,22 +1,163 @@
-"""Distances that are measured: exact, and sure of their side where a mesh is folded on itself or open."""
-
-from __future__ import annotations
+"""Distances that are measured: exact, sure of their side where a mesh is folded or open; depths in each other."""
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, Layout, nearest_triangle, record_square
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.jit import compiled
-from rbfmuscle.metrics.columns import Columns
 from rbfmuscle.validation import check_mesh, check_points
 
+if TYPE_CHECKING:
+    import trimesh
+
+# Cells along the longer side, at most; below that the square root of the number of triangles.
+_MOST_CELLS = 512
 _HERE = np.eye(4)
+
+
+class _Grid(NamedTuple):
+    """Cells of the plane across the columns and the triangles whose boxes meet each.
+
+    ``axes`` are x and y of the plane and z along the columns; ``items[starts[c] : starts[c + 1]]`` are the triangles
+    of cell ``c``, between heights ``ends[c]``; ``width`` is the number of cells along x.
+    """
+
+    axes: NDArray[np.int64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    fine: float
+    width: int
+    starts: NDArray[np.int64]
+    items: NDArray[np.int64]
+    ends: NDArray[np.float64]
+
+
+class Columns:
+    """Counts how often a closed, consistently oriented mesh winds around points, along a line from each of them.
+
+    A triangle that the line leaves the mesh through counts one, one that it enters by minus one; the sum is the winding
+    number, exact also where the mesh is folded on itself. Edges are half open, so that a line through an edge or a
+    vertex is counted once. The line runs along the shortest side of the mesh's box.
+    """
+
+    def __init__(self, vertices: Floats, faces: Integers) -> None:
+        self.vertices, self.faces = vertices, faces
+        # Column by column, which takes a tenth of the time of all at once.
+        low, high = (np.array([end(column) for column in vertices.T]) for end in (np.min, np.max))
+        along = int(np.argmin(high - low))
+        axes = np.array([(along + 1) % 3, (along + 2) % 3, along])  # a right-handed turn of x, y, z
+        cells = min(max(int(len(faces) ** 0.5), 1), _MOST_CELLS)
+        fine = cells / max(float((high - low).max()), 1e-300)
+        width, height = (int((high[k] - low[k]) * fine) + 1 for k in axes[:2])
+        starts = np.zeros(width * height + 1, dtype=np.int64)
+        ends = np.repeat([[np.inf, -np.inf]], width * height, axis=0)
+        self._grid = _Grid(axes, low, high, fine, width, starts, np.empty(0, dtype=np.int64), ends)
+        covered = np.empty((len(faces), 4), dtype=np.int64)
+        _count_loop(vertices, faces, self._grid, covered)
+        np.cumsum(starts, out=starts)
+        self._grid = self._grid._replace(items=np.empty(starts[-1], dtype=np.int64))
+        _sort_loop(covered, width, starts, self._grid.items)
+
+    def inside(self, points: Floats, pose: Floats) -> Booleans:
+        """Mask (n,) of the points (n, 3) that lie inside once a pose (4, 4) has carried them."""
+        out = np.zeros(len(points), dtype=np.bool_)
+        _inside_loop(points, pose, self.vertices, self.faces, self._grid, out)
+        return out
+
+
+@compiled(error_model="numpy")
+def _count_loop(vertices, faces, grid, covered):
+    """Cells that each triangle's box covers, by column and row, and in ``starts`` how many triangles each cell has."""
+    u, v, w = grid.axes[0], grid.axes[1], grid.axes[2]
+    x, y, fine = grid.low[u], grid.low[v], grid.fine
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        left = int((min(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
+        right = int((max(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
+        near = int((min(vertices[a, v], vertices[b, v], vertices[c, v]) - y) * fine)
+        far = int((max(vertices[a, v], vertices[b, v], vertices[c, v]) - y) * fine)
+        bottom = min(vertices[a, w], vertices[b, w], vertices[c, w])
+        top = max(vertices[a, w], vertices[b, w], vertices[c, w])
+        covered[f, 0], covered[f, 1], covered[f, 2], covered[f, 3] = left, right, near, far
+        for j in range(near, far + 1):
+            for cell in range(j * grid.width + left, j * grid.width + right + 1):
+                grid.starts[cell] += 1
+                grid.ends[cell, 0] = min(grid.ends[cell, 0], bottom)
+                grid.ends[cell, 1] = max(grid.ends[cell, 1], top)
+
+
+@compiled(error_model="numpy")
+def _sort_loop(covered, width, starts, items):
+    """Put the triangles into their cells, each cell's from its end on."""
+    for f in range(len(covered)):
+        for j in range(covered[f, 2], covered[f, 3] + 1):
+            for cell in range(j * width + covered[f, 0], j * width + covered[f, 1] + 1):
+                starts[cell] -= 1
+                items[starts[cell]] = f
+
+
+@compiled(error_model="numpy")
+def _inside_loop(points, pose, vertices, faces, grid, out):
+    low, high, fine = grid.low, grid.high, grid.fine
+    u, v, w = grid.axes[0], grid.axes[1], grid.axes[2]
+    at = np.empty(3)
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        outside = False
+        for k in range(3):
+            at[k] = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
+            outside |= not (low[k] <= at[k] <= high[k])
+        if outside:
+            continue
+        i, j = int((at[u] - low[u]) * fine), int((at[v] - low[v]) * fine)
+        cell, count = j * grid.width + i, 0
+        if not (grid.ends[cell, 0] <= at[w] <= grid.ends[cell, 1]):
+            continue
+        for m in range(grid.starts[cell], grid.starts[cell + 1]):
+            count += _above(at, vertices, faces, grid.items[m], grid.axes)
+        out[n] = count > 0
+
+
+@compiled(error_model="numpy")
+def _above(at, vertices, faces, f, axes):
+    """One where a triangle lies above a point and looks up, minus one where it looks down, else zero."""
+    u, v, w = axes[0], axes[1], axes[2]
+    x, y, z = at[u], at[v], at[w]
+    if max(vertices[faces[f, 0], w], vertices[faces[f, 1], w], vertices[faces[f, 2], w]) <= z:
+        return 0
+    found = 0
+    west, west_height, west_falls, east, east_height, east_falls = 0.0, 0.0, False, 0.0, 0.0, False
+    for k in range(3):
+        a, b = faces[f, k], faces[f, (k + 1) % 3]
+        if (vertices[a, v] <= y) == (vertices[b, v] <= y):
+            continue
+        # Computed alike for both triangles of the edge, so that both find the same place.
+        p, q = min(a, b), max(a, b)
+        t = (y - vertices[p, v]) / (vertices[q, v] - vertices[p, v])
+        place = vertices[p, u] + t * (vertices[q, u] - vertices[p, u])
+        height = vertices[p, w] + t * (vertices[q, w] - vertices[p, w])
+        falls = vertices[a, v] > vertices[b, v]
+        if found == 0:
+            west, west_height, west_falls = place, height, falls
+        else:
+            east, east_height, east_falls = place, height, falls
+        found += 1
+    if found < 2:
+        return 0
+    if east < west:
+        west, west_height, west_falls, east, east_height = east, east_height, east_falls, west, west_height
+    if not (west <= x < east):
+        return 0
+    if west_height + (x - west) / (east - west) * (east_height - west_height) <= z:
+        return 0
+    return 1 if west_falls else -1
 
 
 class MeshDistance:
@@ -99,3 +240,49 @@ def _distance_loop(points, tree, near, out):
         square = np.inf if best < 0 else record_square(tree.records, best, x, y, z)
         best, square = nearest_triangle(tree, (x, y, z), best, square, 0.0, stack)
         near[i], out[i] = best, np.sqrt(square)
+
+
+class BoneProbe(MeshDistance):
+    """One bone, prepared once in its own coordinates, faces outward; it may have holes."""
+
+    def __init__(self, name: str, mesh: "trimesh.Trimesh") -> None:
+        super().__init__(mesh.vertices, mesh.faces, closed=bool(mesh.is_watertight))
+        self.name = name
+        self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> Floats:
+    """Greatest depth (n,) of vertices (n, 3) in the bones, of poses (4, 4) by name; 0 where in none [scene unit]."""
+    out = np.zeros(len(vertices))
+    for probe in bones_about(vertices, probes, poses):
+        np.maximum(out, probe.depth(vertices, pose=inverse_pose(poses[probe.name])), out=out)
+    return out
+
+
+def inverse_pose(pose: Floats) -> Floats:
+    """The pose (4, 4) that takes a rigid one back."""
+    back = np.eye(4)
+    back[:3, :3] = pose[:3, :3].T
+    back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return back
+
+
+def bones_about(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> list[BoneProbe]:
+    """The bones whose boxes, where they are now, meet the box of the points (n, 3)."""
+    if not probes or len(vertices) == 0:
+        return []
+    # Column by column, which takes a tenth of the time of both at once.
+    low, high = (np.array([end(column) for column in vertices.T]) for end in (np.min, np.max))
+    placed = np.array([poses[probe.name] for probe in probes])
+    ends = np.array([probe.bounds for probe in probes])
+    middle = np.einsum("bij,bj->bi", placed[:, :3, :3], ends.mean(axis=1)) + placed[:, :3, 3]
+    half = np.einsum("bij,bj->bi", np.abs(placed[:, :3, :3]), 0.5 * (ends[:, 1] - ends[:, 0]))
+    met = np.all((middle - half < high) & (middle + half > low), axis=1)
+    return [probe for probe, near in zip(probes, met) if near]
+
+
+def bone_depth(surface: MeshDistance, probes: list[BoneProbe], poses: dict[str, Floats]) -> float:
+    """Greatest depth of any bone vertex in a closed, outward surface in the world, 0 where none is [scene unit]."""
+    near = bones_about(surface.vertices, probes, poses)
+    depths = [surface.depth(probe.vertices, pose=poses[probe.name]).max(initial=0.0) for probe in near]
+    return float(max(depths, default=0.0))

@@ -1,28 +1,20 @@
 """What is measured of every muscle in a written frame."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
+from rbfmuscle.geometry.crossing import FaceTree
+from rbfmuscle.geometry.surfaces import edge_lengths, label_sheets, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.metrics.belly import belly_measures
-from rbfmuscle.metrics.centreline import Centreline, carried_middle, distance_along, moving_joints, resampled
-from rbfmuscle.metrics.geodesic import NODES, shortest_path
-from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.metrics.centreline import Centreline, moving_joints
+from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES
-from rbfmuscle.metrics.topology import SurfaceForm
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.frame import Frame
-
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Frame, ModelSurface
 
 Values = dict[str, float]
 
@@ -38,19 +30,12 @@ _OVERLAPS = ("penetration_max", "bone_penetration_max", "solver_penetration_max"
 
 
 class MuscleMeasures:
-    """Measures muscles frame by frame; memory does not grow with surfaces.
-
-    ``carried`` holds the carried meshes (vertices, faces) at rest, before the motion, of the models that are measured
-    here.
-    """
+    """Measures muscles frame by frame, those with a carried mesh (vertices, faces) at rest; keeps no surfaces."""
 
     def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
         self.probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
-        self.trackers = {
-            muscle.name: _Tracker(muscle, scene, *carried[muscle.name])
-            for muscle in scene.muscles
-            if muscle.name in carried
-        }
+        mine = [muscle for muscle in scene.muscles if muscle.name in carried]
+        self.trackers = {muscle.name: _Tracker(muscle, scene, *carried[muscle.name]) for muscle in mine}
 
     def measure(self, frame: Frame) -> dict[str, Values]:
         """Measure a frame: for each muscle its values by quantity, in the order of `QUANTITIES`."""
@@ -78,19 +63,6 @@ class _Tracker:
         self.distance: MeshDistance | None = None
         self.offset: Floats | None = None
         self.near: Integers | None = None
-        # Of the last shortest path, from the points along the centreline.
-        self.pulled: Floats | None = None
-
-    def _of_line(self, carried: Floats, probes: list[BoneProbe], frame: Frame) -> dict[str, float]:
-        """Length from bone to bone, and of the belly's centreline over the shortest path between its ends."""
-        if self.line is None:
-            return {}
-        line = self.line.points(carried, frame.poses)
-        path = shortest_path(line, probes, frame.poses, offset=self.pulled)
-        self.pulled = path - resampled(line, NODES - 1) if len(path) == NODES else None
-        belly, shortest = distance_along(line)[-1], distance_along(path)[-1]
-        length = belly + self.line.tendon_length(frame.tendons)
-        return {"length": length, "slack": belly / shortest if shortest > 0.0 else math.nan}
 
     def measure(self, frame: Frame, probes: list[BoneProbe], at_rest: bool) -> dict[str, float]:
         """What there is to measure of this muscle in a frame."""
@@ -108,11 +80,13 @@ class _Tracker:
         edges = self.edges @ carried
         stretch = np.sqrt(np.einsum("ij,ij->i", edges, edges))
         found["edge_strain_rms"] = math.sqrt(np.mean((stretch - 1.0) ** 2))
-        found.update(self._of_line(carried, probes, frame))
+        if self.line is not None:
+            belly, found["slack"] = self.line.measure(carried, frame.poses, probes)
+            found["length"] = belly + self.line.tendon_length(frame.tendons)
         if self.contracts:
             found["activation"] = frame.activations[self.name]
             if surface is not None and self.line is not None:
-                found.update(self._section(surface.vertices, surface.faces, frame.poses))
+                found.update(self.line.section(surface.vertices, surface.faces, frame.poses))
         times = frame.times.get(self.name, {})
         if times:
             found["time_solve"] = times.get("time_predict", 0.0) + times.get("time_solve", 0.0)
@@ -155,13 +129,8 @@ class _Tracker:
         gaps = [bones[a.bone].unsigned(mesh[0][a.vertices]).min() for a in held]
         found = {"rest_error_rms": rms, "rest_error_max": worst, "end_gap": max(gaps, default=0.0)}
         if self.line is not None:
-            found["thickness"] = self._section(*mesh, poses)["belly_thickness"]
+            found["thickness"] = self.line.section(*mesh, poses)["belly_thickness"]
         return found
-
-    def _section(self, vertices, faces, poses):
-        """The greatest section of a surface across the line between the middles of origin and insertion."""
-        first, last = (carried_middle(end, poses) for end in self.line.ends)
-        return belly_measures(np.asarray(vertices), np.asarray(faces), first, last)
 
 
 def _edge_operator(vertices: Floats, faces: Integers) -> sparse.csr_matrix:
@@ -185,3 +154,34 @@ def surface_distance(
     back = MeshDistance(vertices, faces).unsigned(other_vertices)
     rms = math.sqrt((np.mean(there**2) + np.mean(back**2)) / 2)
     return rms, float(max(there.max(), back.max()))
+
+
+def euler_characteristic(faces: Integers) -> int:
+    """Vertices less edges plus triangles, of those that faces (m, 3) use; 2 for a sphere, two less for each handle."""
+    faces = np.asarray(faces, dtype=np.int64)
+    ends = np.sort(np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]]), axis=1)
+    edges = np.unique(ends[:, 0] * (faces.max(initial=0) + 1) + ends[:, 1])
+    return len(np.unique(faces)) - len(edges) + len(faces)
+
+
+class SurfaceForm:
+    """Pieces, handles and crossings of one muscle's surfaces, looked for again only where they can have changed."""
+
+    def __init__(self) -> None:
+        self._drawn: ModelSurface | None = None
+        self._tree: FaceTree | None = None
+        self._found: dict[str, float] = {}
+
+    def measure(self, surface: "ModelSurface", *, same_faces: bool) -> dict[str, float]:
+        """``components``, ``euler`` and ``self_crossings``; ``same_faces`` where the last surface had these faces."""
+        vertices, faces = surface.vertices, np.asarray(surface.faces)
+        if self._tree is None or not same_faces:
+            self._tree = FaceTree(vertices, faces)
+            label = label_sheets(faces, len(vertices))[1]
+            self._found["components"] = len(np.unique(label[faces[:, 0]]))
+            self._found["euler"] = euler_characteristic(faces)
+        drawn = surface.origin[0] if surface.origin is not None else surface
+        if self._drawn is not drawn:
+            self._found["self_crossings"] = int(self._tree.crossing(vertices).sum())
+        self._drawn = drawn
+        return dict(self._found)

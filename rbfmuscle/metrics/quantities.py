@@ -1,7 +1,5 @@
 """What is measured of a frame, in which unit, and a row of it; for those who read what others measured."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 # Quantity: kind of unit (volume and length follow the scene's unit), meaning; in the order of the tables.
@@ -16,10 +14,7 @@ QUANTITIES = {
     "components": ("1", "closed pieces of the surface"),
     "euler": ("1", "Euler characteristic of the surface: 2 for a sphere, two less for each handle"),
     "self_crossings": ("1", "triangles of the surface that cross others of it"),
-    "unfitted_fraction": (
-        "1",
-        "share of the surface's vertices kept off the level set; 1 where none is shown",
-    ),
+    "unfitted_fraction": ("1", "share of surface vertices kept off the level set; 1 where none is shown"),
     "flicker": ("length", "greatest change since the frame before of carried mesh to surface distances"),
     "tunnelled": ("1", "points that passed through a bone and were not brought back"),
     "rest_error_rms": ("length", "distance between surface and input mesh at rest, in both directions"),

@@ -1,32 +1,36 @@
-"""Rows of ``metrics.csv``, made from what was recorded: of a frame, and of moment arms along the motion."""
+"""Rows of ``metrics.csv``, made from what was recorded: of a frame, and of moment arms and joints along the motion."""
 
-from __future__ import annotations
-
+import itertools
 import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
 
-from rbfmuscle.metrics.moment_arms import REACH, moment_arms
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
 from rbfmuscle.scene.joints.joint import all_coordinates
-from rbfmuscle.scene.motion import shown_value
+from rbfmuscle.scene.motion import bone_poses, shown_value
 from rbfmuscle.scene.objects import MM_PER_UNIT
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.frame import Frame
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Frame
 
 Coordinates = Mapping[str, float]
+# A slope is fitted over the frames within so many degrees, or millimetres of a shift, and over the frames next to it.
+# In motions by one degree moment arms then ripple about smooth curves by at most 0.3 mm RMS (docs/validation.md).
+REACH = 8.0
+# Coordinates that change by less [radian or scene unit] rest.
+_STILL = 1e-9
+# Bones of a joint that are nearer than this at rest [mm] meet there; others, as a tendon's end, are held apart.
+MEETING = 10.0
+# Vertices of a bone whose distance to the other is taken, at most.
+_VERTICES = 2000
 
 
 def frame_rows(
     scene: Scene, frame: Frame, before: Coordinates | None, measured: Mapping[str, Mapping[str, float]]
 ) -> list[Row]:
-    """Rows of one frame.
-
-    ``before`` are the coordinates of the frame before [radian or scene unit], None at the first; ``measured`` the
-    values by muscle (`ALL` for the whole scene) and quantity.
-    """
+    """Rows of one frame from values by muscle and quantity; ``before`` are the last frame's coordinates, or None."""
     name, angle = _leading_coordinate(scene, frame, before)
     together = dict(measured.get(ALL, {}))
     if scene.motion.times is not None:
@@ -43,18 +47,11 @@ def frame_rows(
 def moment_arm_rows(
     scene: Scene, path: Mapping[int, Coordinates], lengths: Mapping[str, Mapping[int, float]]
 ) -> list[Row]:
-    """Rows of the moment arms of all frames.
-
-    ``path`` holds the coordinates of each frame [radian or scene unit], in the order of the motion; ``lengths`` the
-    length of each muscle in each frame [scene unit].
-    """
+    """Rows of the moment arms, from each frame's coordinates [radian or scene unit] and muscles' lengths by frame."""
     facts, rows = all_coordinates(scene.joints), []
     shifts = {name for name, fact in facts.items() if fact.motion == "translation"}
-    reach = {
-        name: REACH / MM_PER_UNIT[scene.units] if name in shifts else math.radians(REACH)
-        for coordinates in path.values()
-        for name in coordinates
-    }
+    names, near = {name for row in path.values() for name in row}, REACH / MM_PER_UNIT[scene.units]
+    reach = {name: near if name in shifts else math.radians(REACH) for name in names}
     for muscle, found in lengths.items():
         along: Sequence[float] = [found.get(index, math.nan) for index in path]
         moments_along = moment_arms(list(path.values()), along, reach)
@@ -76,3 +73,64 @@ def _leading_coordinate(scene, frame, before):
     if before is not None:
         name = max(names, key=lambda n: abs(now.get(n, 0.0) - before.get(n, 0.0)))
     return name, shown_value(scene, name, now.get(name, 0.0))
+
+
+def moment_arms(
+    path: Sequence[Mapping[str, float]], lengths: Sequence[float], reach: Mapping[str, float] | None = None
+) -> list[dict[str, float]]:
+    """Moment arms -dl/dq along a motion, for each frame by coordinate that moves alone before or after it.
+
+    A parabola is fitted to the ``lengths`` [scene unit] of the frames within ``reach`` [radian or scene unit, `REACH`
+    degrees by default], and always of both neighbours, as far as the coordinate goes on alone and in one direction:
+    with two neighbours it is the central difference, at an end the difference to the one. ``path`` holds the
+    coordinates of each frame; lengths are NaN where not known. Moment arms are in scene units per radian, or 1.
+    """
+    values, found = np.asarray(lengths, dtype=float), [dict[str, float]() for _ in path]
+    for name, first, last in _single_motions(path, values):
+        at = np.array([path[k].get(name, 0.0) for k in range(first, last + 1)])
+        wide = math.radians(REACH) if reach is None else reach[name]
+        for k in range(first, last + 1):
+            near = np.abs(at - at[k - first]) <= wide
+            near[max(0, k - first - 1) : k - first + 2] = True
+            away, long = at[near] - at[k - first], values[first : last + 1][near]
+            slope = np.polyfit(away, long, min(2, len(away) - 1))[-2]
+            found[k].setdefault(name, -float(slope))
+    return found
+
+
+def _single_motions(path, lengths):
+    """Name, first and last frame of each stretch in which one coordinate moves alone and in one direction."""
+    stretches = []
+    for k, (before, after) in enumerate(itertools.pairwise(path)):
+        moved = {n: after.get(n, 0.0) - before.get(n, 0.0) for n in {*before, *after}}
+        moved = {name: change for name, change in moved.items() if abs(change) > _STILL}
+        if len(moved) != 1 or not np.isfinite(lengths[k : k + 2]).all():
+            continue
+        ((name, change),) = moved.items()
+        if stretches and stretches[-1][:2] == (name, change > 0) and stretches[-1][3] == k:
+            stretches[-1] = (*stretches[-1][:3], k + 1)
+        else:
+            stretches.append((name, change > 0, k, k + 1))
+    return [(name, first, last) for name, _, first, last in stretches]
+
+
+def joint_gaps(scene: Scene, frames: Iterable[int]) -> list[tuple[int, str, str, float]]:
+    """How much wider than at rest the bones of a joint are apart, by their vertices, where they meet at rest.
+
+    For each frame and such joint: (frame, parent, child, opening [scene unit]).
+    """
+    vertices = {bone.name: np.asarray(bone.mesh.vertices, dtype=float) for bone in scene.bones}
+    pairs = [(j.parent, j.child) for j in scene.joints if j.parent in vertices and j.child in vertices]
+    trees = {parent: cKDTree(vertices[parent]) for parent, _ in pairs}
+    points = {child: vertices[child][:: -(-len(vertices[child]) // _VERTICES)] for _, child in pairs}
+    rest = {(p, c): float(trees[p].query(points[c])[0].min()) for p, c in pairs}
+    meeting = [pair for pair in pairs if rest[pair] < scene.length(MEETING)]
+    found = []
+    for frame in frames:
+        poses: Mapping[str, Floats] = bone_poses(scene, scene.motion.frames[frame])
+        for parent, child in meeting:
+            relative = np.linalg.solve(poses[parent], poses[child])
+            moved = points[child] @ relative[:3, :3].T + relative[:3, 3]
+            gap = float(trees[parent].query(moved)[0].min())
+            found.append((frame, parent, child, gap - rest[parent, child]))
+    return found

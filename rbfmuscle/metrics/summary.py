@@ -1,20 +1,16 @@
 """What a run amounts to: least, greatest and mean of each quantity, the limits it is held to, and its verdict."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row
 from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import LimitExceededError, UsageError, did_you_mean
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
 
 # Of a run: muscle -> quantity -> facts, as `Summary.table` gives them.
 Table = Mapping[str, Mapping[str, Mapping[str, Any]]]
@@ -39,9 +35,7 @@ LIMITS = {
     "initial_overlap": Limit(0.3, "overlap left at rest", "move muscle or bone apart: rbfmuscle check SCENE"),
     "components": Limit(1.0, "pieces", f"{_LOOK}; {_MORE_CENTRES}"),
     "euler": Limit(2.0, "Euler characteristic", f"{_LOOK}; {_MORE_CENTRES}"),
-    "self_crossings": Limit(
-        0.0, "self-crossing triangles", "raise model.iterations, or take pbd-converged or rbf"
-    ),
+    "self_crossings": Limit(0.0, "self-crossing triangles", "raise model.iterations, or take pbd-converged"),
     "unfitted_fraction": Limit(0.999, "surface shown without a fit", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"),
     "flicker": Limit(0.5, "flicker", _SMALLER_STEPS),
     "slack": Limit(1.03, "centreline over shortest path", _LOOK),
@@ -54,6 +48,7 @@ LIMITS = {
 }
 # Quantities of which too little is wrong: their limit is the least allowed value.
 LEAST = {"euler"}
+COUNTS = ("components", "euler", "self_crossings", "tunnelled")
 # A muscle thinner than this [mm] may have this rest error [mm].
 THIN, THIN_REST_ERROR = 10.0, 1.0
 # A muscle that is slack at rest may be so by this much more.
@@ -112,17 +107,9 @@ class Summary:
 def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> dict[str, float]:
     """Limits as a dict of quantity to greatest allowed magnitude.
 
-    Parameters
-    ----------
-    limits : str, list of str or None
-        ``"penetration_max=0.5,volume_error"``: a quantity with a value in the unit of ``metrics.csv``, or
-        alone with the limit of `LIMITS`; ``"all"`` for every one of `LIMITS`.
-    scene : Scene
-
-    Raises
-    ------
-    UsageError
-        On an unknown quantity, a value that is no number, or limits that are no text.
+    ``limits`` are like ``"penetration_max=0.5,volume_error"``, or a list of such: a quantity with a value in the unit
+    of ``metrics.csv``, or alone with the limit of `LIMITS`; ``"all"`` for every one of `LIMITS`. UsageError on an
+    unknown quantity, a value that is no number, or limits that are no text.
     """
     if isinstance(limits, Mapping):
         raise UsageError("limits are text, for instance 'penetration_max=0.5,volume_error'")
@@ -165,11 +152,7 @@ def _in_unit(value, quantity, unit):
 
 
 def muscle_limit(quantity: str, limit: float, found: Mapping[str, Mapping[str, Any]]) -> float:
-    """Limit of one muscle: thin ones and those that are slack at rest have their own in place of the default.
-
-    ``limit`` is that of all muscles, in the unit of ``metrics.csv``; ``found`` holds the facts of the muscle by
-    quantity.
-    """
+    """Limit of one muscle: thin ones and those slack at rest have their own, by its facts, in place of the default."""
     unit = found[quantity]["unit"]
     if quantity not in LIMITS or limit != _in_unit(LIMITS[quantity].value, quantity, unit):
         return limit
@@ -209,10 +192,7 @@ def excess(quantity: str, worst: float, limit: float) -> float:
 
 
 def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequence[str] = ()) -> str:
-    """Which muscles are within all limits and which are not, the worst value of each, and what to do.
-
-    ``left_out`` names the bones of which no mesh could be used.
-    """
+    """Which muscles are within all limits, the worst value of the others, and what to do; bones ``left_out``."""
     muscles, found = [name for name in table if name != ALL], exceeded(table, limits)
     wrong = [name for name in dict.fromkeys(row[0] for row in found) if name != ALL]
     if not muscles:
@@ -229,9 +209,7 @@ def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequen
     text += "; the bones are not" if any(row[0] == ALL for row in found) and not wrong else ""
     # The worst of each muscle first, then whatever else is beyond a limit.
     first = {row[0]: row for row in reversed(found)}.values()
-    named = [*(row for row in found if row in first), *(row for row in found if row not in first)][
-        :MOST_NAMED
-    ]
+    named = sorted(found, key=lambda row: row not in first)[:MOST_NAMED]
     remedies = dict.fromkeys(_remedy(row, table) for row in named if row[1] in LIMITS)
     values = "; ".join(_describe_excess(row, table, left_out) for row in named)
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
@@ -278,10 +256,9 @@ def shown_number(value: float | None, unit: str = "") -> str:
 
 def require_limits(table: Table, limits: Mapping[str, float]) -> None:
     """Raise LimitExceededError naming everything beyond the limits."""
-    found = exceeded(table, limits)
-    if found:
-        text = "; ".join(
-            f"{m}: {q} = {v:.4g} {'<' if q in LEAST else '>'} {limit:g} at frame {f}"
-            for m, q, v, limit, f in found
-        )
-        raise LimitExceededError(text)
+    texts = [
+        f"{m}: {q} = {v:.4g} {'<' if q in LEAST else '>'} {limit:g} at frame {f}"
+        for m, q, v, limit, f in exceeded(table, limits)
+    ]
+    if texts:
+        raise LimitExceededError("; ".join(texts))

@@ -8,8 +8,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.geometry.rotations import smooth_displacement
 from rbfmuscle.implicit.extraction.material import project_to_level_set
-from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
-from rbfmuscle.implicit.extraction.slivers import mend_slivers
+from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh, mend_slivers
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import cached_sample
 from rbfmuscle.muscle.rest import RestState

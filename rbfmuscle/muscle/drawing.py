@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fields import ClipDistance, LevelField
-from rbfmuscle.implicit.extraction.material import FittedMesh, carry_material, project_to_level_set
+from rbfmuscle.implicit.extraction.material import FittedMesh, project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import Obstacles, PointGrid
 from rbfmuscle.implicit.extraction.surface import ExtractedSurface, extract_surface
@@ -177,7 +177,7 @@ class SurfaceBuilder:
         for sweeps in (0, *CALM):
             start = carried if sweeps == 0 else self.shown.smooth_displacement(carried, sweeps)
             try:
-                result = carry_material(mesh, start, volume=volume, **where)
+                result = project_to_level_set(mesh, start, None, volume=volume, **where)
             except ValueError as error:
                 reason = error
                 continue

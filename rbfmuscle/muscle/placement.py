@@ -15,7 +15,7 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.surface import extract_surface
-from rbfmuscle.implicit.field_fit import FieldFit, wanted_derivatives
+from rbfmuscle.implicit.field import FieldFit, wanted_derivatives
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface

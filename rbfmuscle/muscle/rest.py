@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.implicit.field_fit import FieldFit
+from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import choose_centres, place_points
 from rbfmuscle.scene.objects import Muscle

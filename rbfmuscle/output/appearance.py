@@ -1,13 +1,14 @@
-"""How muscles, bones and views look in files, pictures, plots and pages: colours, groups, directions."""
-
-from __future__ import annotations
+"""How muscles, tendons, bones and views look in files, pictures and pages: colours, groups, directions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.tubes import tube_mesh
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.tendons import TendonLine
 
 BONE_COLOUR, TENDON_COLOUR = "#e9e0cd", "#cfd8dc"
 # People who are colour-blind can distinguish them (P. Tol, "muted"); its sand is left out, as bones have that colour.
@@ -23,6 +24,10 @@ VIEWS: dict[str, tuple[float, float, float]] = {
     "top": (0.0, 0.0, 1.0),
     "bottom": (0.0, 0.0, -1.0),
 }
+# Length over which a tube tapers, in radii of the belly's end.
+TAPER = 2.5
+# No taper is longer than this share of the tendon.
+LONGEST_TAPER = 0.6
 
 
 def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
@@ -87,10 +92,7 @@ def linear_rgb(colour: Floats) -> Floats:
 
 
 def view_axes(direction: Sequence[float] | Floats, body: Floats) -> Floats:
-    """Right, up and towards the camera (3, 3) of a picture from a direction along the body's axes.
-
-    Superior is up; seen from above or below anterior is.
-    """
+    """Right, up (superior, else anterior) and towards the camera (3, 3), from a direction along the body's axes."""
     ahead = np.asarray(direction, dtype=float) @ body
     ahead /= np.linalg.norm(ahead)
     right = np.cross(body[2] if abs(ahead @ body[2]) < 0.99 else -body[1], ahead)
@@ -116,3 +118,26 @@ def motion_direction(poses: Sequence[Mapping[str, Floats]], body: Floats) -> Flo
         return usual
     axis = widest / angle
     return axis if axis @ usual > 0 or (axis @ usual == 0 and axis[1] < 0) else -axis
+
+
+def tendon_name(muscle: str) -> str:
+    """Name of the mesh of a muscle's tendons in files and viewers."""
+    return f"{muscle}_tendon"
+
+
+def tendon_mesh(muscle: Muscle, tendons: Mapping[str, TendonLine]) -> tuple[Floats, Integers] | None:
+    """Vertices (n, 3) and outward faces (m, 3), always the same, of all tendons of a muscle; None where it has none."""
+    tubes = [_tube(tendons[end.name]) for end in muscle.tendons if end.name in tendons]
+    if not tubes:
+        return None
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in tubes[:-1])])
+    return np.concatenate([v for v, _ in tubes]), np.concatenate([f + n for (_, f), n in zip(tubes, starts)])
+
+
+def _tube(tendon: TendonLine) -> tuple[Floats, Integers]:
+    """One tendon, tapering from the belly's end on."""
+    line, (wide, thin) = tendon.points, tendon.radii
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    share = np.clip(along / max(min(TAPER * wide, LONGEST_TAPER * along[-1]), 1e-300), 0.0, 1.0)
+    radii = wide + (thin - wide) * share**2 * (3.0 - 2.0 * share)
+    return tube_mesh(line, radii)

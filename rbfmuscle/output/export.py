@@ -1,15 +1,12 @@
 """A saved run in other formats and units: files for each frame, or an animation in one file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.animation.gltf import animated_glb
-from rbfmuscle.output.animation.moving import MovingRun, read_moving
 from rbfmuscle.output.animation.usd import check_usd, write_usd
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.saved import MovingRun, SavedRun, read_moving
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import SolveError, UsageError
@@ -27,7 +24,7 @@ def export_run(
     units: str | None = None,
     frames: slice | None = None,
 ) -> list[Path]:
-    """Write the muscles and bones of a saved run in one or more formats.
+    """Write the muscles and bones of a saved run in one or more formats; every file written.
 
     Parameters
     ----------
@@ -43,19 +40,12 @@ def export_run(
     frames : slice, optional
         Of the written frames; all where not given.
 
-    Returns
-    -------
-    list of pathlib.Path
-        Every file written.
-
     Raises
     ------
     UsageError
         If the folder holds no run, or a format or unit is unknown, or a surface does not keep its vertices.
-    SolveError
-        If a file cannot be written.
-    MissingPartError
-        If a format needs a package that is absent.
+    SolveError, MissingPartError
+        If a file cannot be written; if a format needs a package that is absent.
     """
     saved = SavedRun(directory)
     formats = [formats] if isinstance(formats, str) else list(formats)

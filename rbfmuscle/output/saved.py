@@ -1,6 +1,4 @@
-"""A saved run, read from its folder."""
-
-from __future__ import annotations
+"""A saved run, read from its folder, and its muscles and bones over time, which exports turn into files."""
 
 import csv
 import io
@@ -8,6 +6,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,15 +15,16 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.output.appearance import muscle_colours, muscle_groups
-from rbfmuscle.output.tubes import tendon_name
+from rbfmuscle.output import appearance as look
 from rbfmuscle.output.vtp import read_vtp
-from rbfmuscle.scene.objects import body_axes
+from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
 from rbfmuscle.validation import UsageError
 
 # Coordinates that a caption names at most.
 MOST_SHOWN = 4
+# Frames a second of a motion that has no times of its own: frame k of the run is frame k of the animation.
+FRAMES_A_SECOND = 24.0
 
 
 class SavedRun:
@@ -47,11 +47,11 @@ class SavedRun:
             muscles, output = self.info["scene"]["muscles"], self.info["scene"]["output"]
             self.muscles = [muscle["name"] for muscle in muscles]
             self.bones = [bone["name"] for bone in self.info["scene"]["bones"]]
-            self.groups = muscle_groups(self.info)
-            self.colours = muscle_colours(self.muscles, self.groups)
+            self.groups = look.muscle_groups(self.info)
+            self.colours = look.muscle_colours(self.muscles, self.groups)
             self._meshes = bool(output["surfaces"])
             held = [m["name"] for m in muscles if any("tendon" in end for end in m.get("attach", ()))]
-            self.tendons = [tendon_name(name) for name in held if output.get("tendons")]
+            self.tendons = [look.tendon_name(name) for name in held if output.get("tendons")]
             self.frames = [frame["frame"] for frame in self.info["frames"]]
         except OSError:
             message = f"{self.directory} holds no run (no run.json); give the folder of 'run -o'"
@@ -66,10 +66,8 @@ class SavedRun:
     @cached_property
     def metrics(self) -> list[Row]:
         """Rows of ``metrics.csv``."""
-        return [
-            Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6])
-            for r in self._table("metrics.csv")
-        ]
+        table = self._table("metrics.csv")
+        return [Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6]) for r in table]
 
     @cached_property
     def events(self) -> list[Any]:
@@ -180,3 +178,81 @@ def saved_frames(saved: SavedRun) -> list[Frame]:
         surfaces = _SavedSurfaces(saved, index)
         found.append(Frame(index, angles, saved.poses[index], surfaces, {}, events, {}, entry["wall"]))
     return found
+
+
+@dataclass(frozen=True)
+class MovingPart:
+    """The surface of a muscle or of its tendons in each frame, or a rigid bone.
+
+    Vertices (n, 3) and faces (m, 3) are those of each frame, with the same array of faces where it stays; of a bone
+    there is one of each, at rest, and poses (T, 4, 4) from there to the world. ``colour`` is "#rrggbb"; muscles of one
+    ``group`` cross the same joints.
+    """
+
+    name: str
+    colour: str
+    vertices: list[Floats]
+    faces: list[Integers]
+    poses: Floats | None = None
+    group: str = ""
+
+    @property
+    def keeps_vertices(self) -> bool:
+        """Whether all frames have the same triangles of the same vertices."""
+        return all(faces is self.faces[0] for faces in self.faces)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is a bone that is ever anywhere else than in the first frame."""
+        return self.poses is not None and bool(np.ptp(self.poses, axis=0).max() > 0.0)
+
+    def mesh(self, k: int) -> tuple[Floats, Integers]:
+        """Vertices and faces in the k-th frame."""
+        if self.poses is None:
+            return self.vertices[k], self.faces[k]
+        return self.vertices[0] @ self.poses[k, :3, :3].T + self.poses[k, :3, 3], self.faces[0]
+
+
+@dataclass(frozen=True)
+class MovingRun:
+    """All muscles and bones of a run over time; ``name`` is the scene's, all lengths are in ``unit``: m, cm or mm.
+
+    ``times`` (T,) of the frames [s] are the motion's own where ``timed``, ``captions`` those of the frames. ``body``
+    (3, 3) is left, posterior and superior; the motion is seen in its plane from ``direction`` (3,) along these.
+    """
+
+    name: str
+    unit: str
+    times: Floats
+    timed: bool
+    captions: list[str]
+    muscles: list[MovingPart]
+    bones: list[MovingPart]
+    body: Floats
+    direction: Floats
+
+
+def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
+    """Some frames of a saved run at once, lengths in ``unit``."""
+    factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[unit]
+    groups = saved.groups | dict.fromkeys(saved.tendons, "tendons")
+    colours = saved.colours | dict.fromkeys(saved.tendons, look.TENDON_COLOUR)
+    muscles = [MovingPart(name, colour, [], [], group=groups[name]) for name, colour in colours.items()]
+    bones = []
+    for muscle in muscles:
+        for frame in frames:
+            points, faces = saved.surface(muscle.name, frame)
+            same = muscle.faces and np.array_equal(muscle.faces[0], faces)
+            muscle.vertices.append(points * factor)
+            muscle.faces.append(muscle.faces[0] if same else faces)
+    for name in saved.bones:
+        vertices, faces = saved.bone(name)
+        poses = np.array([saved.poses[frame][name] for frame in frames])
+        poses[:, :3, 3] *= factor
+        bones.append(MovingPart(name, look.BONE_COLOUR, [vertices * factor], [faces], poses))
+    times = saved.info["scene"].get("motion", {}).get("times")
+    name = str(saved.info["scene"].get("name") or saved.directory.name)
+    at = np.array([k / FRAMES_A_SECOND if times is None else times[k] for k in frames], dtype=float)
+    captions = [saved.caption(frame) for frame in frames]
+    direction = look.motion_direction([saved.poses[frame] for frame in frames], saved.body)
+    return MovingRun(name, unit, at, times is not None, captions, muscles, bones, saved.body, direction)

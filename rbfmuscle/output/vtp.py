@@ -1,7 +1,5 @@
 """VTK files written and read directly: PolyData (.vtp) and collections over time (.pvd), without loading VTK."""
 
-from __future__ import annotations
-
 import os
 import re
 import zlib
@@ -33,15 +31,7 @@ _BEFORE_DATA, _AFTER_DATA = b'<AppendedData encoding="raw">\n_', b"\n</AppendedD
 
 
 def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
-    """Write a triangle mesh as VTK XML PolyData.
-
-    Parameters
-    ----------
-    path : path
-    vertices : (n, 3) array_like
-        Written in single precision where they are float32, else in double precision rounded to 1e-11 of each number.
-    faces : (m, 3) array_like of int
-    """
+    """Write vertices (n, 3), single precision as it is, double rounded to 1e-11 of each number, and faces (m, 3)."""
     points = np.ascontiguousarray(vertices)
     points = _rounded(points) if points.dtype != np.float32 else points
     corners = np.ascontiguousarray(faces, dtype="<i4")
@@ -62,20 +52,13 @@ def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
 
 
 def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
-    """Vertices (n, 3) and faces (m, 3) of a file that `write_vtp` has written.
-
-    Raises
-    ------
-    MeshError
-        If it is missing, another file, or damaged.
-    """
+    """Vertices (n, 3) and faces (m, 3) of what `write_vtp` has written; MeshError if missing, another or damaged."""
     try:
         text, _, data = Path(path).read_bytes().partition(_BEFORE_DATA)
         starts = re.findall(rb'type="(\w+)" Name="(Points|connectivity)"[^>]*offset="(\d+)"', text)
         found = {name: _unpacked(data, kind.decode(), int(start)) for kind, name, start in starts}
-        return found[b"Points"].reshape(-1, 3).astype(float), found[b"connectivity"].reshape(-1, 3).astype(
-            int
-        )
+        points, corners = (found[name].reshape(-1, 3) for name in (b"Points", b"connectivity"))
+        return points.astype(float), corners.astype(int)
     except FileNotFoundError:
         raise MeshError(f"{path} is missing") from None
     except (KeyError, ValueError, IndexError, zlib.error):
@@ -95,13 +78,7 @@ def _rounded(points):
 
 
 class Collection:
-    """A .pvd file that is complete after every frame, so that an interrupted run can be opened.
-
-    Parameters
-    ----------
-    path : path
-        The files that it names are relative to its folder.
-    """
+    """A .pvd file, complete after every frame, as runs are interrupted; it names files relative to its folder."""
 
     def __init__(self, path: str | Path) -> None:
         self._path, self._lines = Path(path), ""

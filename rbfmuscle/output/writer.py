@@ -1,28 +1,30 @@
-"""Writes a run to a folder while it goes on: whatever ends it, the frames so far can be read."""
-
-from __future__ import annotations
+"""Writes a run to a folder while it goes on: whatever ends it, the frames so far can be read; ``run.json``."""
 
 import csv
+import hashlib
+import importlib.metadata
+import os
+import platform
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+import rbfmuscle
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.output.tubes import tendon_mesh, tendon_name
+from rbfmuscle.metrics.quantities import ALL, Row
+from rbfmuscle.output.appearance import tendon_mesh, tendon_name
 from rbfmuscle.output.vtp import Collection, write_vtp, write_whole
 from rbfmuscle.scene.motion import shown_value
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Frame
 from rbfmuscle.validation import SolveError, UsageError
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.frame import Frame
-
 
 TABLES = {
     "poses.csv": ("frame", "bone", *(f"m{i}{j}" for i in range(4) for j in range(4))),
@@ -33,16 +35,12 @@ TABLES = {
 LIGHT = 1600  # triangles of a bone that moves
 # Of an earlier run in the same folder.
 _OLD_FILES = ("run.json", "surfaces.pvd", "bones.pvd", "metrics.csv", "report.html", "preview.webp")
+FORMAT = 2
+_PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
 
 
 def check_writable(directory: str | Path) -> None:
-    """Write to a folder, or to the one that it would be made in, before what takes time is begun.
-
-    Raises
-    ------
-    UsageError
-        If the folder cannot be written to.
-    """
+    """Write to a folder, or where it would be made, before what takes time is begun; UsageError where that fails."""
     path = Path(directory).absolute()
     there = next(place for place in (path, *path.parents) if place.exists())
     try:
@@ -53,10 +51,9 @@ def check_writable(directory: str | Path) -> None:
 
 
 class RunWriter:
-    """Streams frames to a folder; nothing of a frame is kept in memory.
+    """Streams frames to a folder and keeps none of them; the scene's ``output`` table says which parts are written.
 
-    The folder is made where it is missing, UsageError where that fails; a run that lies there already is replaced. The
-    scene's ``output`` table says which parts are written.
+    The folder is made where it is missing, UsageError where that fails; a run that lies there already is replaced.
     """
 
     def __init__(self, directory: str | Path, scene: Scene) -> None:
@@ -70,7 +67,7 @@ class RunWriter:
         try:
             self._clear()
             for name, head in TABLES.items():
-                self._add_rows(name, [head], mode="w")
+                write_csv(self.directory / name, [head])
             names = ("surfaces", "bones") if self.meshes else ()
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
         except OSError as error:
@@ -78,13 +75,7 @@ class RunWriter:
             raise UsageError(message) from None
 
     def write(self, frame: Frame, rows: Sequence[Any] = ()) -> None:
-        """Write one frame and the rows of metrics that are complete by now.
-
-        Raises
-        ------
-        SolveError
-            If the disk refuses; the frames before stand.
-        """
+        """Write one frame, and the rows of metrics that are complete; SolveError if the disk refuses."""
         try:
             self._write(frame, rows)
         except OSError as error:
@@ -97,20 +88,15 @@ class RunWriter:
     def close(self, rows: Sequence[Any] = ()) -> None:
         """Write the last rows of metrics; after a frame that could not be written, nothing."""
         try:
-            self._add_rows("metrics.csv", () if self._failed else rows)
+            write_csv(self.directory / "metrics.csv", () if self._failed else rows, mode="a")
         except OSError as error:
             raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
 
     def write_info(self, info: dict[str, Any]) -> None:
-        """Write ``run.json`` in one piece: a reader finds the old one or the new one, never half of it.
-
-        While the run goes on it holds the coordinates of all frames to come, for readers of a run that was killed.
-        """
+        """Write ``run.json`` in one piece; while the run goes on with the coordinates of all frames to come."""
         if info.get("status") == "running":
-            planned = [
-                {name: shown_value(self.scene, name, value) for name, value in frame.items()}
-                for frame in self.scene.motion.frames
-            ]
+            frames = self.scene.motion.frames
+            planned = [{name: shown_value(self.scene, name, x) for name, x in k.items()} for k in frames]
             info = {**info, "planned": planned}
         write_json(self.directory / "run.json", info)
 
@@ -122,14 +108,12 @@ class RunWriter:
             self._collections["bones"].add(step, self._write_bones(frame))
             self._collections["surfaces"].add(step, surfaces)
         # A frame's surfaces are on the disk before its poses: readers of a run that was killed rely on it.
-        poses = [(bone.name, frame.poses[bone.name].ravel().tolist()) for bone in self.scene.bones]
-        self._add_rows("poses.csv", [(frame.index, name, *pose) for name, pose in poses])
-        self._add_rows("events.csv", [(e.frame, e.muscle, e.bone, e.count, e.action) for e in frame.events])
-        self._add_rows("metrics.csv", rows)
-
-    def _add_rows(self, name, rows, mode="a"):
-        with (self.directory / name).open(mode, encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows(rows)
+        poses = [
+            (frame.index, bone.name, *frame.poses[bone.name].ravel().tolist()) for bone in self.scene.bones
+        ]
+        events = [(e.frame, e.muscle, e.bone, e.count, e.action) for e in frame.events]
+        for name, table in {"poses": poses, "events": events, "metrics": rows}.items():
+            write_csv(self.directory / f"{name}.csv", table, mode="a")
 
     def _write_surfaces(self, frame):
         """Surfaces of a frame, side by side: most of the time goes into packing them."""
@@ -142,10 +126,7 @@ class RunWriter:
         return entries
 
     def _write_bones(self, frame):
-        """Bones where they are now: the mesh at rest, written once; one that has moved with few triangles, in a series.
-
-        Whoever wants more takes the mesh at rest and the pose.
-        """
+        """Bones where they are now: the mesh at rest once, and few triangles of one that has moved, in a series."""
         for bone in self.scene.bones:
             name, mesh, pose = bone.name, bone.mesh, frame.poses[bone.name]
             if name not in self._bones:
@@ -179,6 +160,12 @@ class RunWriter:
             (self.directory / folder).mkdir(exist_ok=True)
 
 
+def write_csv(path: Path, rows: Iterable[Sequence[Any]], *, mode: str = "w") -> None:
+    """Write rows to a CSV file, or add them in mode "a"."""
+    with path.open(mode, encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
 def write_json(path: Path, data: dict[str, Any]) -> None:
     """Write JSON in one move, so that whoever reads it finds the old or the new; NaN and infinity become null."""
     try:
@@ -195,3 +182,91 @@ def json_text(data: Any) -> str:
         return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else str(value)
 
     return to_json(data, indent=1, inf_nan_mode="null", fallback=plain).decode()
+
+
+def build_info(
+    scene: Scene, started: datetime, neighbours: "Neighbours", summary: dict[str, Any], **facts: Any
+) -> dict[str, Any]:
+    """Assemble ``run.json``; ``summary`` is from `Summary.table`.
+
+    Other facts are kept as they are: ``status`` ("running", "complete", "interrupted" or "failed"), ``message`` (why it
+    did not complete), ``options`` of the caller, ``times`` of the parts of the run [s], ``limits``, ``verdict``,
+    ``beyond`` (muscle, quantity, worst value, limit, frame) and ``frames`` (`frame_facts`).
+    """
+    return {
+        "format": FORMAT,
+        "started": started.isoformat(timespec="seconds"),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "scene": scene.resolved(),
+        "versions": versions(),
+        "machine": machine(),
+        "inputs": input_hashes(scene),
+        **({"neighbours": neighbours.table()} if neighbours.pairs else {}),
+        "muscles": {name: found for name, found in summary.items() if name != ALL},
+        "frame_time": summary.get(ALL, {}).get("time_frame"),
+        **facts,
+    }
+
+
+def frame_facts(scene: Scene, frame: Frame) -> dict:
+    """What ``run.json`` says of a written frame; coordinates in degrees, those of shifts in scene units."""
+    times = scene.motion.times
+    return {
+        "frame": frame.index,
+        **({} if times is None else {"time": times[frame.index]}),
+        "coordinates": {name: shown_value(scene, name, value) for name, value in frame.coordinates.items()},
+        "wall": frame.wall,
+    }
+
+
+class Neighbours:
+    """Pairs of muscles that slide: worst overlap and its frame, worst gap and its frame."""
+
+    def __init__(self) -> None:
+        self.pairs: dict[tuple[str, str], tuple[float, int, float, int]] = {}
+
+    def add(self, frame: Frame) -> None:
+        """Take in what a frame holds of them."""
+        for pair, (overlap, gap) in frame.neighbours.items():
+            deepest, at, widest, there = self.pairs.get(pair, (-1.0, 0, -1.0, 0))
+            deepest, at = max((deepest, at), (overlap, frame.index), key=lambda found: found[0])
+            widest, there = max((widest, there), (gap, frame.index), key=lambda found: found[0])
+            self.pairs[pair] = deepest, at, widest, there
+
+    def table(self) -> list[dict[str, Any]]:
+        """Pairs of neighbours, the deepest overlap first [scene unit]."""
+        names = ("overlap_max", "overlap_frame", "gap_rms", "gap_frame")
+        found = [{"muscles": list(pair), **dict(zip(names, worst))} for pair, worst in self.pairs.items()]
+        return sorted(found, key=lambda row: -row["overlap_max"])
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this library and what it computes with."""
+    found = {"python": platform.python_version(), "rbfmuscle": rbfmuscle.__version__}
+    for name in _PACKAGES:
+        # Some distributions of VTK bring no metadata.
+        with suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
+
+
+def machine() -> dict[str, Any]:
+    """What the times belong to."""
+    import numba
+
+    return {
+        "system": platform.platform(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": numba.get_num_threads(),
+    }
+
+
+def input_hashes(scene: Scene) -> dict[str, Any]:
+    """SHA-256 of the scene file and of the meshes and motion that it names; files that are gone are left out."""
+    motion = scene.motion.options.file
+    if motion is not None:
+        motion = (Path(scene.path).parent if scene.path else Path()) / motion
+    sources = [scene.path, motion, *(b.source for b in scene.bones), *(m.source for m in scene.muscles)]
+    paths = [Path(source) for source in dict.fromkeys(str(source) for source in sources if source)]
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.is_file()}

@@ -1,7 +1,5 @@
 """The page of a comparison: what it amounts to, the models moving beside each other, five rows; all else folded."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import cycle
 from pathlib import Path
@@ -25,10 +23,7 @@ model keeps the overlap with bones that its mesh has at rest; the first sentence
 
 
 def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:
-    """Write ``report.html`` to a folder with a run of each model; raises SolveError where that fails.
-
-    ``found`` is from `rbfmuscle.experiments.comparison.write_tables`.
-    """
+    """Write ``report.html`` of what `write_tables` found to the folder of its runs; raises SolveError."""
     runs = {found["labels"][name]: SavedRun(folder / name) for name in found["models"]}
     page = _page(found, runs)
     if pictures:
@@ -41,27 +36,18 @@ def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) ->
 def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
     first = next(iter(runs.values()))
     failed = [f"{name} did not finish: {reason}" for name, reason in found["failed"].items()]
-    limits, terms = first.info["limits"], [(m.title, m.meaning) for m in MEASURES.values()]
+    counts = {"muscles": len(first.muscles), "frames": found["frames"], **found["machine"]}
+    # Of the slack each muscle has a limit of its own.
+    limits, terms = first.info["limits"] | {"slack": None}, [(m.title, m.meaning) for m in MEASURES.values()]
     return Page(
         f"{found['scene']}: models compared",
-        [
-            f"{len(first.muscles)} muscles",
-            f"{found['frames']} frames",
-            f"{found['machine']['threads']} threads",
-        ],
+        [f"{counts[what]} {what}" for what in ("muscles", "frames", "threads")],
         " ".join([found["answer"], *failed]),
         BAD if failed else PLAIN,
-        # Of the slack each muscle has a limit of its own.
-        lights=[
-            _light(found, name, None if name == "slack" else limits.get(name))
-            for name in LIGHTS
-            if _values(found, name)
-        ],
+        lights=[_light(found, name, limits.get(name)) for name in LIGHTS if _values(found, name)],
         heads=list(runs),
         sections=[
-            Section(
-                "Every measure", "worst over muscles and frames; the best in green", table=_measures(found)
-            ),
+            Section("Every measure", "worst of muscles and frames, best in green", table=_measures(found)),
             Section("Over the motion", plots=_plots(runs)),
             Section("How to read this", text=_READING, terms=terms),
         ],

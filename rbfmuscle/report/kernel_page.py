@@ -1,21 +1,15 @@
 """The kernel study of one or several surfaces as files: tables and a page."""
 
-from __future__ import annotations
-
 import csv
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from rbfmuscle.experiments.kernel_study import ALIKE, cost, describe, row_name, row_toml
+from rbfmuscle.experiments.kernel_study import ALIKE, KernelStudy, cost, describe, row_name, row_toml
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.writer import json_text
 from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, number_cell
 from rbfmuscle.report.plots import Point, front_plot
-
-if TYPE_CHECKING:
-    from rbfmuscle.experiments.kernel_study import KernelStudy
 
 # Quantity: heading, factor.
 COLUMNS = {
@@ -98,10 +92,8 @@ def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
         chosen = [("recommended", row, GOOD) for _, row, _ in chosen]
         chosen += [("", row, GOOD if row["rms"] <= ALIKE * good[0]["rms"] else PLAIN) for row in others]
         chosen = chosen[:_MOST_LIGHTS]
-    return [
-        Light(row_name(row), [number_cell(row["rms"], units, state), number_cell(cost(row), "s")], note=note)
-        for note, row, state in chosen
-    ]
+    cells = [[number_cell(row["rms"], units, s), number_cell(cost(row), "s")] for _, row, s in chosen]
+    return [Light(row_name(row), pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
 
 
 def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:

@@ -1,17 +1,14 @@
 """The page of a run, a comparison, a kernel study or a sweep: answer, picture, rows with lights, all else folded."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from rbfmuscle.metrics.summary import shown_number, within
+from rbfmuscle.metrics.summary import COUNTS, shown_number, within
 from rbfmuscle.validation import SolveError
 
 GOOD, NEAR, BAD, PLAIN = "good", "near", "bad", "plain"
-COUNTS = ("components", "euler", "self_crossings", "tunnelled")
 # From this share of a limit a value is near it.
 _NEAR_LIMIT = 0.8
 

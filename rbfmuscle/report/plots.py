@@ -1,7 +1,5 @@
 """Plots as SVG: lines along a motion, and points of error against time."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Sequence
@@ -12,11 +10,11 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
+from rbfmuscle.output.saved import SavedRun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rbfmuscle.output.saved import SavedRun
 
 _SOFT, _LIMIT = "#5f646b", "#a3281f"
 _STYLE = {
@@ -83,10 +81,7 @@ def line_plot(
 
 
 def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
-    """Markup of error against time on logarithmic axes: the front joined, its points and the default labelled.
-
-    Each group has a colour, named where there are several, and its own front; ``labels`` are those of the axes.
-    """
+    """Markup of error against time on logarithmic axes: each group's front joined, it and the default labelled."""
     from matplotlib import style
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
@@ -134,7 +129,7 @@ def _label_beside(axes, points, groups, row):
         top -= row
 
 
-def _svg(figure: Figure, title: str) -> str:
+def _svg(figure: "Figure", title: str) -> str:
     """Markup of a figure, without what only a file of its own needs; lines of muscles bear their names."""
     from markupsafe import escape
 
@@ -148,10 +143,7 @@ def _svg(figure: Figure, title: str) -> str:
 
 
 def motion_axis(saved: SavedRun) -> tuple[dict[int, float], str]:
-    """Place of each frame on the axis that plots run along, and its label.
-
-    It is the only coordinate that moves, in degrees, if it goes one way; else the frame number.
-    """
+    """Place of each frame on plots and their label: the only coordinate that moves, if one way, or frame numbers."""
     rows, units = saved.info["frames"], saved.info["scene"].get("coordinate_units", {})
     names = sorted({name for row in rows for name in row["coordinates"]})
     tracks = {name: np.array([row["coordinates"].get(name, 0.0) for row in rows]) for name in names}

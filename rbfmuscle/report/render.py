@@ -1,31 +1,26 @@
-"""Pictures and animations of saved runs; a scene before it runs as one picture."""
-
-from __future__ import annotations
+"""Pictures of saved runs and scenes, drawn by a depth buffer in memory: neither graphics nor a display is needed."""
 
 import base64
 import html
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.jit import compiled
 from rbfmuscle.output import appearance as look
+from rbfmuscle.output.appearance import rgb, tendon_mesh
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.tubes import tendon_mesh
-from rbfmuscle.report.raster import Camera, Solid, aim, draw_solids, fitted_size, labelled
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import AT_REST
 from rbfmuscle.validation import SolveError, UsageError
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
-    from PIL.ImageDraw import ImageDraw
-
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
 
 # Views where none are asked for; muscles that are named, more are named by their groups; pixels of a view.
 USUAL_VIEWS, _MOST_CHIPS, _AREA = ("front", "right", "back"), 8, 220_000
@@ -33,6 +28,125 @@ USUAL_VIEWS, _MOST_CHIPS, _AREA = ("front", "right", "back"), 8, 220_000
 _SCENE_SIZE, _SCENE_SIDES, _PALE = (480, 860), ("front", "right", "back", "left"), 0.72
 _SMALL = 900, 600  # pixels of a picture in a notebook, at most
 _MUSCLE, _OPACITY, _AXIS = "#9a8f8f", 0.12, "#0057d9"
+# Each pixel is the mean of so many by so many.
+_FINER = 2
+_MARGIN = 0.05
+# Height of a row of labels, and width of a colour before one [pixel].
+_LINE, _CHIP = 22, 17
+
+
+class Solid(NamedTuple):
+    """What is drawn: vertices (n, 3), faces (m, 3), colour "#rrggbb", and opacity from 0 to 1."""
+
+    vertices: Floats
+    faces: Integers
+    colour: str
+    opacity: float = 1.0
+
+
+class Camera(NamedTuple):
+    """A parallel projection: ``axes`` (3, 3) are right, up and towards the camera; ``scale`` is pixels per unit."""
+
+    axes: Floats
+    centre: Floats
+    scale: float
+    size: tuple[int, int]
+
+    def project(self, points: Floats) -> Floats:
+        """Pixel to the right, pixel downwards and distance towards the camera of points (n, 3)."""
+        found = (points - self.centre) @ self.axes.T
+        found[:, 0] = 0.5 * self.size[0] + self.scale * found[:, 0]
+        found[:, 1] = 0.5 * self.size[1] - self.scale * found[:, 1]
+        return found
+
+
+def aim(axes: Floats, points: Floats, size: tuple[int, int]) -> Camera:
+    """A camera of these axes that sees all points (n, 3), as large as a picture of ``size`` holds them."""
+    seen = points @ axes.T
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    wide, tall, _ = np.maximum(high - low, 1e-9)
+    scale = (1.0 - 2.0 * _MARGIN) * min(size[0] / wide, size[1] / tall)
+    return Camera(axes, 0.5 * (low + high) @ axes, float(scale), size)
+
+
+def fitted_size(axes: Floats, points: Floats, area: float) -> tuple[int, int]:
+    """Width and height of so many pixels, in the proportions of what is seen; even numbers, as films ask for."""
+    wide, tall, _ = np.maximum(np.ptp(points @ axes.T, axis=0), 1e-9)
+    shape = float(np.clip(tall / wide, 0.6, 2.2))
+    return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)
+
+
+def draw_solids(solids: Sequence[Solid], camera: Camera) -> Integers:
+    """Picture (h, w, 3) of uint8; what is not opaque is laid over all that is."""
+    width, height = camera.size
+    fine = camera._replace(scale=camera.scale * _FINER, size=(_FINER * width, _FINER * height))
+    depth = np.full(fine.size[::-1], -np.inf, dtype=np.float32)
+    image = np.ones((*depth.shape, 3), dtype=np.float32)
+    for solid in sorted(solids, key=lambda solid: -solid.opacity):
+        points, shades = fine.project(np.asarray(solid.vertices, dtype=float)), _shaded(solid, camera.axes)
+        _raster_loop(points, np.asarray(solid.faces, dtype=np.int64), shades, solid.opacity, depth, image)
+    mean = image.reshape(height, _FINER, width, _FINER, 3).mean(axis=(1, 3))
+    return np.round(255.0 * np.clip(mean, 0.0, 1.0)).astype(np.uint8)
+
+
+def _shaded(solid: Solid, axes: Floats) -> Floats:
+    """Colours (n, 3) in the light of a lamp up and left of the camera."""
+    normals = vertex_normals(solid.vertices, solid.faces)
+    lamp = np.array([-0.35, 0.45, 1.0]) @ axes
+    lamp /= np.linalg.norm(lamp)
+    half = lamp + axes[2]
+    facing = np.clip(normals @ lamp, 0.0, 1.0)[:, None]
+    gloss = np.clip(normals @ (half / np.linalg.norm(half)), 0.0, 1.0)[:, None] ** 24
+    return rgb(solid.colour) * (0.42 + 0.62 * facing) + 0.1 * gloss
+
+
+def labelled(image: Integers, text: str, titles: Sequence[str], chips: Mapping[str, str]) -> Image.Image:
+    """Image (h, w, 3) with a strip above that has a title for each column, and one below: text and colours."""
+    font = ImageFont.load_default(13)
+    height, width = image.shape[:2]
+    x, y, places = 8, height + _LINE + 5, []
+    for name, colour in [*((part, "") for part in text.split(", ")), *chips.items()]:
+        wide = int(font.getlength(name)) + (_CHIP if colour else 0)
+        if places and x + wide > width:
+            x, y = 8, y + _LINE
+        places.append((x, y, name, colour))
+        x += wide + 20
+    sheet = Image.new("RGB", (width, y + _LINE + 3), "white")
+    sheet.paste(Image.fromarray(image), (0, _LINE))
+    pen = ImageDraw.Draw(sheet)
+    for k, title in enumerate(titles):
+        pen.text((k * width // len(titles) + 8, 4), title, fill="#5f646b", font=font)
+    for x, y, name, colour in places:
+        if colour:
+            pen.rectangle((x, y + 2, x + 12, y + 14), fill=colour)
+        pen.text((x + (_CHIP if colour else 0), y), name, fill="#26282b", font=font)
+    return sheet
+
+
+@compiled
+def _raster_loop(points, faces, shades, opacity, depth, image):
+    height, width = depth.shape
+    for f in range(len(faces)):
+        i, j, k = faces[f]
+        a, b, c = points[i], points[j], points[k]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if area == 0.0:
+            continue
+        left, right = max(0.0, min(a[0], b[0], c[0])), min(width - 1.0, max(a[0], b[0], c[0]))
+        top, bottom = max(0.0, min(a[1], b[1], c[1])), min(height - 1.0, max(a[1], b[1], c[1]))
+        for y in range(int(np.ceil(top)), int(np.floor(bottom)) + 1):
+            for x in range(int(np.ceil(left)), int(np.floor(right)) + 1):
+                u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
+                v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
+                w = 1.0 - u - v
+                z = u * a[2] + v * b[2] + w * c[2]
+                if u < 0.0 or v < 0.0 or w < 0.0 or z <= depth[y, x]:
+                    continue
+                if opacity >= 1.0:
+                    depth[y, x] = z
+                for m in range(3):
+                    shade = u * shades[i, m] + v * shades[j, m] + w * shades[k, m]
+                    image[y, x, m] += opacity * (shade - image[y, x, m])
 
 
 def render_run(
@@ -45,29 +159,12 @@ def render_run(
     most: int | None = None,
     seconds: float = 5.0,
 ) -> None:
-    """Draw a saved run to a picture or an animation.
+    """Draw a saved run to a picture (``.png``, one frame) or an animation (``.gif`` or ``.webp``, all of them).
 
-    Parameters
-    ----------
-    directory : path
-        Folder of the run.
-    output : path
-        ``.png`` for one frame, ``.gif`` or ``.webp`` for all.
-    frame : int, optional
-        Of a picture; the last one where not given.
-    views : list of str, optional
-        Of `VIEWS`, or "motion" for its plane, side by side; `USUAL_VIEWS` where not given.
-    area : int
-        Pixels of one view.
-    most : int, optional
-        Frames of an animation, chosen evenly; all where not given.
-    seconds : float
-        Length of an animation.
-
-    Raises
-    ------
-    UsageError
-        If the folder holds nothing to draw, or the suffix, frame or view is unknown.
+    ``frame`` is that of a picture, by default the last. ``views``, side by side, are of `VIEWS`, or "motion" for the
+    plane of the motion; `USUAL_VIEWS` where not given. A view has ``area`` pixels. An animation of so many ``seconds``
+    has at ``most`` so many frames, chosen evenly. UsageError if the folder holds nothing to draw, or the suffix, frame
+    or view is unknown.
     """
     saved, output = SavedRun(directory), Path(output)
     if output.suffix not in (".png", ".gif", ".webp"):
@@ -79,10 +176,8 @@ def render_run(
         ends = f"{saved.frames[0]} to {saved.frames[-1]}"
         raise UsageError(f"frame {frame} was not written; the run has {ends}")
     poses = [saved.poses[k] for k in saved.frames]
-    directions: dict[str, Sequence[float] | Floats] = {
-        **look.VIEWS,
-        "motion": look.motion_direction(poses, saved.body),
-    }
+    motion = look.motion_direction(poses, saved.body)
+    directions: dict[str, Sequence[float] | Floats] = {**look.VIEWS, "motion": motion}
     for view in views or ():
         if view not in directions:
             raise UsageError(f"unknown view {view!r}; known: {', '.join(directions)}")
@@ -91,7 +186,9 @@ def render_run(
     save_images(_draw_views(saved, axes, frames, area), output, seconds)
 
 
-def _draw_views(run: SavedRun, axes: Mapping[str, Floats], frames: Sequence[int], area: float) -> list[Image]:
+def _draw_views(
+    run: SavedRun, axes: Mapping[str, Floats], frames: Sequence[int], area: float
+) -> list[Image.Image]:
     """A picture of each frame: views of so many pixels side by side, with titles, caption and colours."""
     some = {run.frames[0], run.frames[len(run.frames) // 2], run.frames[-1]}
     names = [*run.muscles, *run.tendons]
@@ -101,7 +198,7 @@ def _draw_views(run: SavedRun, axes: Mapping[str, Floats], frames: Sequence[int]
     if len(chips) > _MOST_CHIPS:
         chips = {run.groups[name]: chips[name] for name in reversed(run.muscles)}
 
-    def draw(frame: int) -> Image:
+    def draw(frame: int) -> Image.Image:
         image = np.concatenate([_draw_frame(run, camera, frame) for camera in cameras], axis=1)
         return labelled(image, run.caption(frame), list(axes), chips)
 
@@ -124,10 +221,8 @@ def chosen_frames(frames: Sequence[int], most: int) -> list[int]:
     return list(frames[(len(frames) - 1) % stride :: stride])
 
 
-def save_images(images: Sequence[Image], path: Path, seconds: float) -> None:
+def save_images(images: Sequence[Image.Image], path: Path, seconds: float) -> None:
     """Save one picture, or several of one width as an animation of so many seconds; raises SolveError if it fails."""
-    from PIL import ImageOps
-
     size = images[0].width, max(image.height for image in images)
     sheets = [ImageOps.pad(image, size, color="white", centering=(0, 0)) for image in images]
     kind: dict[str, Any] = {"quality": 82, "method": 2} if path.suffix == ".webp" else {}
@@ -142,31 +237,24 @@ def save_images(images: Sequence[Image], path: Path, seconds: float) -> None:
 
 def draw_scene(scene: Scene, path: str | Path) -> None:
     """Draw a scene in its rest pose to a PNG file, from four sides of the body."""
-    from PIL import Image, ImageDraw
-
     names = [bone.name for bone in scene.bones]
     colours = look.muscle_colours(names, {name: str(k % 8) for k, name in enumerate(names)})
-    solids = [
-        Solid(np.asarray(bone.mesh.vertices), bone.mesh.faces, look.mixed_colour(colours[bone.name], _PALE))
-        for bone in scene.bones
-    ]
+    pale = {name: look.mixed_colour(colour, _PALE) for name, colour in colours.items()}
+    solids = [Solid(np.asarray(b.mesh.vertices), b.mesh.faces, pale[b.name]) for b in scene.bones]
     solids += [solid for muscle in scene.muscles for solid in _muscle_solids(muscle, colours)]
     points, images = np.concatenate([solid.vertices for solid in solids]), []
     for side in _SCENE_SIDES:
         camera = aim(look.view_axes(look.VIEWS[side], scene.body), points, _SCENE_SIZE)
-        images.append(Image.fromarray(draw_solids(solids, camera)))
-        _draw_joints(ImageDraw.Draw(images[-1]), camera, scene)
+        image = Image.fromarray(draw_solids(solids, camera))
+        _draw_joints(ImageDraw.Draw(image), camera, scene)
+        images.append(np.asarray(image))
     text = f"{scene.name}: held patches in the colour of their bone"
     chips = {**colours, "joint centres and axes": _AXIS}
-    labelled(np.concatenate([np.asarray(image) for image in images], axis=1), text, _SCENE_SIDES, chips).save(
-        path
-    )
+    labelled(np.concatenate(images, axis=1), text, _SCENE_SIDES, chips).save(path)
 
 
 def figure_html(draw: Callable[[Path], None], caption: str) -> str:
     """HTML of a picture that a function writes to a PNG file, made small, and its caption."""
-    from PIL import Image
-
     with tempfile.TemporaryDirectory() as folder:
         file, small = Path(folder) / "picture.png", Path(folder) / "picture.webp"
         draw(file)
@@ -192,10 +280,8 @@ def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:
     return [Solid(vertices, faces[free], _MUSCLE, _OPACITY), *solids]
 
 
-def _draw_joints(pen: ImageDraw, camera: Camera, scene: Scene) -> None:
+def _draw_joints(pen: ImageDraw.ImageDraw, camera: Camera, scene: Scene) -> None:
     """Centres, axes and names of the joints, each name below the one before."""
-    from PIL import ImageFont
-
     font, row = ImageFont.load_default(13), -np.inf
     for joint in sorted(scene.joints, key=lambda joint: -float(camera.axes[1] @ joint.centre)):
         if not joint.coordinates:

@@ -1,7 +1,5 @@
 """The report of a run: its verdict, the moving scene, five rows with limits; plots and tables folded."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -11,22 +9,10 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
-from rbfmuscle.metrics.summary import LEAST, exceeded, excess, muscle_limit, shown_number, within
-from rbfmuscle.output.animation.moving import read_moving
+from rbfmuscle.metrics.summary import COUNTS, LEAST, exceeded, excess, muscle_limit, shown_number, within
 from rbfmuscle.output.animation.page import pack_runs
-from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.page import (
-    BAD,
-    COUNTS,
-    GOOD,
-    Cell,
-    Light,
-    Page,
-    Section,
-    Table,
-    limit_state,
-    number_cell,
-)
+from rbfmuscle.output.saved import SavedRun, read_moving
+from rbfmuscle.report.page import BAD, GOOD, Cell, Light, Page, Section, Table, limit_state, number_cell
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, render_run
 
@@ -58,13 +44,7 @@ shift to move it; names below it switch muscles and their lines on and off."""
 
 
 def write_report(directory: str | Path, *, pictures: bool = True) -> None:
-    """Write ``report.html`` of a saved run, and with ``pictures`` its moving scene and ``preview.webp``.
-
-    Raises
-    ------
-    SolveError
-        If the files cannot be written.
-    """
+    """Write a saved run's ``report.html``, with ``pictures`` a moving scene and ``preview.webp``; raises SolveError."""
     saved = SavedRun(directory)
     page = _page(saved)
     if not pictures or not saved.has_surfaces():

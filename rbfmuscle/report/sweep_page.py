@@ -1,12 +1,10 @@
 """The page of a sweep: the default's place, the Pareto front with labelled points, rows to choose from, every point."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rbfmuscle.experiments.sweep_table import LENGTHS
+from rbfmuscle.experiments.sweep_run import LENGTHS
 from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, Table, number_cell
 from rbfmuscle.report.plots import Point, front_plot
 
@@ -50,10 +48,7 @@ def inside_grid(rows: Iterable[dict[str, Any]]) -> bool:
 
 
 def front_picture(rows: Iterable[dict[str, Any]], quantity: str) -> str:
-    """SVG of the error against time per frame: a colour for each scene and model, fronts joined and labelled.
-
-    Points that are their own reference, but for rounding, are left out.
-    """
+    """SVG of error against time per frame: a colour for each scene and model, fronts joined; no reference itself."""
     points = []
     for row in rows:
         if row["role"] != "reference" and row["status"] == "done" and row[quantity] > ROUNDING:
@@ -67,9 +62,8 @@ def _short(row: dict[str, Any]) -> str:
     """A point's settings without what names the table that they are in."""
     if row["role"] == "default":
         return "default"
-    return ", ".join(
-        f"{key.rpartition('.')[2]} {value}" for key, value in row["settings"].items() if key != "model"
-    )
+    named = {key.rpartition(".")[2]: value for key, value in row["settings"].items() if key != "model"}
+    return ", ".join(f"{key} {value}" for key, value in named.items())
 
 
 def _lights(rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity: str) -> list[Light]:

@@ -12,9 +12,10 @@ from pydantic import BeforeValidator, ValidationInfo
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_areas
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import bones_between
-from rbfmuscle.scene.meshes.read import ReadMesh
-from rbfmuscle.scene.objects import Attachment, Bone, LineTable, Muscle, SceneData, ViaTable, find_named
+from rbfmuscle.scene.meshes.repair import ReadMesh
+from rbfmuscle.scene.objects import Attachment, LineTable, Muscle, SceneData, ViaTable, find_named
 from rbfmuscle.scene.options import NotNegative, Positive, Table, Vector, in_folder
 from rbfmuscle.scene.tendons import BonePoint, TendonEnd
 from rbfmuscle.validation import SceneError, read_text, shown, shown_path

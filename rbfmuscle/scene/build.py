@@ -10,11 +10,13 @@ from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.scene.activation.contraction import resolve_contraction
 from rbfmuscle.scene.activation.keys import contraction_keys
 from rbfmuscle.scene.attachments import AttachTable, resolve_attachments, tendon_ends
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import Coupling, Joint, all_coordinates, ordered
 from rbfmuscle.scene.joints.tables import CouplingTable, JointTable, make_coupling
-from rbfmuscle.scene.meshes.read import ReadMesh, as_mesh, read_fibres
+from rbfmuscle.scene.meshes.read import as_mesh, read_fibres
+from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.motion import make_motion
-from rbfmuscle.scene.objects import Attachment, Bone, Muscle, SceneData, find_named
+from rbfmuscle.scene.objects import Attachment, Muscle, SceneData, find_named
 from rbfmuscle.scene.options import MotionOptions
 from rbfmuscle.validation import SceneError, did_you_mean, shown
 

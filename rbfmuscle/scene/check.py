@@ -10,10 +10,11 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.build import validate
-from rbfmuscle.scene.meshes.read import ReadMesh
+from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.objects import Bone, Muscle, SceneData
+from rbfmuscle.scene.objects import Muscle, SceneData
 from rbfmuscle.validation import MeshError, RBFMuscleError, SceneError
 
 Item: TypeAlias = Bone | Muscle | ReadMesh

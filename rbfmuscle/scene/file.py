@@ -11,13 +11,14 @@ from pydantic import Field
 
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.attachments import AttachTable
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.build import add_bone, add_muscle, place_coupling, place_joint, validate
 from rbfmuscle.scene.check import check_centre, check_place, check_size
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.joints.tables import CouplingTable, JointTable, coupling_row, joint_row, make_coupling
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.motion import make_motion, unit_sign
-from rbfmuscle.scene.objects import Bone, Muscle, SceneData
+from rbfmuscle.scene.objects import Muscle, SceneData
 from rbfmuscle.scene.options import (
     ContactOptions,
     DetectOptions,

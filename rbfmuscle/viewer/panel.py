@@ -1,7 +1,5 @@
 """The controls of the page, of viser's own elements; values are read from these when they are needed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -9,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.output.appearance import VIEWS
-from rbfmuscle.viewer.colours import COLOURINGS, Look, legend
-from rbfmuscle.viewer.side import Side
+from rbfmuscle.viewer.side import COLOURINGS, Look, Side, legend
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 WIDTH = 350  # [pixel]
@@ -18,19 +15,7 @@ HISTORY, LINES = 200, 8  # Pictures and lines in a plot.
 
 
 class Panel:
-    """Sliders by joint, play bar, choices, numbers and plot.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    source : LiveSource or SavedSource
-    at : dict of str to float
-        Controls that begin elsewhere than at rest.
-    colour : str
-        Of `COLOURINGS`, to begin with.
-    touch : callable
-        Called whenever something was changed.
-    """
+    """Sliders by joint, play bar, choices, numbers and plot; ``touch`` is called whenever something was changed."""
 
     def __init__(
         self, server: Any, source: LiveSource | SavedSource, at: dict[str, float], colour: str,
@@ -46,12 +31,8 @@ class Panel:
         with tabs.add_tab("Show"):
             self._add_choices(colour)
         with tabs.add_tab("Plot") as self._tab:
-            quantities = (
-                "none",
-                "volume error [%]",
-                f"depth in bones [{source.units}]",
-                "mean of the colour",
-            )
+            depth = f"depth in bones [{source.units}]"
+            quantities = ("none", "volume error [%]", depth, "mean of the colour")
             self.quantity = self._watch(self.gui.add_dropdown("Quantity", quantities))
             self._plot: Any = None
             self._lines, self._history = [], []
@@ -78,10 +59,8 @@ class Panel:
 
     def _add_choices(self, colour: str) -> None:
         gui, choices = self.gui, self.source.choices
-        self.models = [
-            self._watch(gui.add_dropdown("Model", choices)),
-            self._watch(gui.add_dropdown("Beside it", ("none", *choices))),
-        ]
+        places = {"Model": choices, "Beside it": ("none", *choices)}
+        self.models = [self._watch(gui.add_dropdown(*place)) for place in places.items()]
         self.colour = self._watch(gui.add_dropdown("Colour", tuple(COLOURINGS), initial_value=colour))
         self.view = gui.add_button_group("View", [view.capitalize() for view in VIEWS])
         self.cut = self._watch(gui.add_dropdown("Cut along", ("none", "x", "y", "z")))

@@ -1,36 +1,105 @@
-"""One of the models that stand beside each other: its bones and muscles in the browser's scene."""
-
-from __future__ import annotations
+"""One of the models that stand beside each other: its bones and muscles in the browser's scene, and their colours."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
-from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.metrics.penetration import BoneProbe
-from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, linear_rgb
-from rbfmuscle.output.tubes import tendon_name
-from rbfmuscle.viewer.colours import COLOURINGS, Look, shades, vertex_values
+from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
+from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, surface_depth
+from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, linear_rgb, tendon_name
 from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
 
 BONE_TRIANGLES = 6000  # Software drawing pays for each of them in every picture.
 
 
+class Colouring(NamedTuple):
+    """A quantity's title, the limits of its scale (of lengths in mm), and its colour map."""
+
+    title: str
+    low: float
+    high: float
+    colours: str
+    length: bool = False
+
+
+COLOURINGS = {
+    "group": None,
+    "activation": Colouring("Activation", 0.0, 1.0, "viridis"),
+    "stretch": Colouring("Stretch of the edges", -0.5, 0.5, "coolwarm"),
+    "penetration": Colouring("Depth in a bone", 0.0, 2.0, "inferno", length=True),
+    "distance": Colouring("Distance to the other model", 0.0, 5.0, "viridis", length=True),
+}
+
+
+class Look(NamedTuple):
+    """Colouring, hidden muscles and bones, axis and place [scene unit] of a cut, choices that ask for a new picture."""
+
+    colour: str
+    hidden: frozenset[str]
+    cut: tuple[int, float] | None
+    others: tuple[str, ...]
+
+
+def vertex_values(
+    colouring: str, name: str, picture: Picture, rest: Picture, probes: list[BoneProbe], other: Picture | None
+) -> Floats:
+    """One number for each vertex of a muscle, NaN where it is not known; ``other`` is the model beside it."""
+    vertices, faces = picture.surfaces[name]
+    if colouring == "activation":
+        return np.full(len(vertices), picture.activation.get(name, np.nan))
+    if colouring == "stretch" and np.array_equal(faces, rest.surfaces[name][1]):
+        return _stretch(vertices, *rest.surfaces[name])
+    if colouring == "penetration":
+        return surface_depth(vertices, probes, picture.poses)
+    if colouring == "distance" and other is not None:
+        return MeshDistance(*other.surfaces[name]).unsigned(vertices)
+    return np.full(len(vertices), np.nan)
+
+
+def _stretch(now: Floats, rest: Floats, faces: Integers) -> Floats:
+    """Mean change of length of the edges about each vertex, relative to rest."""
+    edges = unique_edges(faces)
+    change = edge_lengths(now, edges) / edge_lengths(rest, edges) - 1.0
+    total, count = (np.bincount(edges.T.ravel(), x, len(now)) for x in (np.tile(change, 2), None))
+    return total / np.maximum(count, 1)
+
+
+def shades(colouring: Colouring, values: Floats, millimetre: float) -> Floats:
+    """Colours (n, 3) from 0 to 1 of values (n,); grey for NaN."""
+    from matplotlib import colormaps
+
+    low, high = _limits(colouring, millimetre)
+    return colormaps[colouring.colours].with_extremes(bad="#b3b3b3")((values - low) / (high - low))[:, :3]
+
+
+def legend(colouring: Colouring, units: str, millimetre: float) -> str:
+    """The scale of a colouring as HTML."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    low, high = _limits(colouring, millimetre)
+    stops = ",".join(to_hex(colormaps[colouring.colours](share)) for share in np.linspace(0, 1, 9))
+    ends = "".join(f"<span>{value:.3g}</span>" for value in (low, (low + high) / 2, high))
+    return (
+        f"<b>{colouring.title}{f' [{units}]' if colouring.length else ''}</b>"
+        f"<div style='height:12px;background:linear-gradient(90deg,{stops})'></div>"
+        f"<div style='display:flex;justify-content:space-between'>{ends}</div>"
+    )
+
+
+def _limits(colouring: Colouring, millimetre: float) -> Floats:
+    return np.array([colouring.low, colouring.high]) * (millimetre if colouring.length else 1.0)
+
+
 class Side:
     """A model, or a run, under a node of a viser server; in metres, as the browser shows nothing far away.
 
-    Attributes
-    ----------
-    choice : str
-        Which of the source's models or runs; "none" for none.
-    figure : LiveFigure, SavedFigure or None
-        The one chosen.
-    picture, rest : Picture or None
-        What is shown of it, and what it began with.
-    numbers : dict of str to dict of str to float
-        Volume error [%], depth in bones and mean of the coloured quantity of each muscle, NaN where not known.
+    ``choice`` is which of the source's models or runs, "none" for none, ``figure`` the one chosen; ``picture`` is what
+    is shown of it, ``rest`` what it began with. ``numbers`` are by muscle volume error [%], depth in bones and mean of
+    the coloured quantity, NaN where not known.
     """
 
     def __init__(self, server: Any, root: str, source: LiveSource | SavedSource) -> None:
@@ -40,9 +109,7 @@ class Side:
         self.rest: Any = None
         self.numbers: dict[str, dict[str, float]] = {}
         self.frame = server.scene.add_frame(root, show_axes=False, visible=False)
-        self._bones = {
-            name: clustered(mesh[0], mesh[1], BONE_TRIANGLES) for name, mesh in source.bones.items()
-        }
+        self._bones = {name: clustered(v, f, BONE_TRIANGLES) for name, (v, f) in source.bones.items()}
         self._volumes = {name: mesh_volume(*mesh) for name, mesh in source.muscles.items()}
         self._nodes: dict[str, Any] = {}
         self._painted: list[Any] = []
@@ -102,10 +169,7 @@ class Side:
             node.vertices, node.faces = mesh
 
     def _paint(self, painted: list[Any]) -> None:
-        """Show meshes (vertices, faces, colours) as glTF, the only form in which viser takes vertices' colours.
-
-        The browser needs a moment to read it, so what was shown before stays until the next picture.
-        """
+        """Show coloured meshes as glTF, which the browser needs a moment to read: the last stays until the next."""
         import trimesh
 
         while len(self._painted) > bool(painted):

@@ -1,7 +1,5 @@
 """What a viewer shows: a scene moved by hand, or saved runs scrubbed by frame; no browser here."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -10,9 +8,8 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
-from rbfmuscle.output.appearance import muscle_colours, muscle_groups
+from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh, tendon_name
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.tubes import tendon_mesh, tendon_name
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -35,10 +32,7 @@ class Control(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One picture's content, by bone or muscle.
-
-    Tendons, ``activation`` and ``depth`` in the bones [scene unit] are those of the muscles that have them.
-    """
+    """One picture's content by bone or muscle; tendons, activation and depth [scene unit] of those that have them."""
 
     poses: dict[str, Floats]
     surfaces: dict[str, Mesh]
@@ -51,17 +45,8 @@ class Picture(NamedTuple):
 class LiveSource:
     """A scene whose coordinates and activations are set by hand, by its own model or the one named.
 
-    Attributes
-    ----------
-    choices : list of str
-        Models.
-    body : (3, 3) ndarray
-        Left, posterior and superior.
-    bones, muscles : dict of str to (vertices, faces)
-        At rest.
-    controls : dict of str to Control
-    motion : list of dict of str to float
-        What the controls are set to in each frame of the scene's motion.
+    ``choices`` are models; bones and muscles (vertices, faces) by name are those at rest; ``body`` (3, 3) is left,
+    posterior and superior. ``motion`` holds what the controls are set to in each frame of the scene's motion.
     """
 
     def __init__(self, scene: Scene, model: str | None = None) -> None:
@@ -83,12 +68,10 @@ class LiveSource:
             name: _coordinate(scene, name, (*limits, session.rest[name]))
             for name, limits in session.limits.items()
         } | {ACTIVATION + name: Control("Activation", name, 0.0, 1.0, 0.0) for name in session.activation}
-        self.motion = [
-            {name: shown_value(scene, name, x) for name, x in frame.items() if name in session.limits}
-            for frame in scene.motion.frames
-        ]
+        moved = [{n: x for n, x in frame.items() if n in session.limits} for frame in scene.motion.frames]
+        self.motion = [{n: shown_value(scene, n, x) for n, x in frame.items()} for frame in moved]
 
-    def figure(self, choice: str) -> LiveFigure:
+    def figure(self, choice: str) -> "LiveFigure":
         """A model of every muscle, at rest."""
         scene = self.scene if choice == self.choices[0] else self.scene.with_options(model=choice)
         return LiveFigure(LiveSession(scene, fields=self.fields), build_models(scene))
@@ -144,13 +127,7 @@ class LiveFigure:
 
 
 class SavedSource:
-    """Saved runs of one scene by name, scrubbed by frame; attributes as of `LiveSource`.
-
-    Raises
-    ------
-    UsageError
-        If one holds no surfaces.
-    """
+    """Saved runs of one scene by name, scrubbed by frame; as `LiveSource`. UsageError if one holds no surfaces."""
 
     def __init__(self, runs: dict[str, SavedRun]) -> None:
         for saved in runs.values():
@@ -165,7 +142,7 @@ class SavedSource:
         self.motion = [{"frame": float(frame)} for frame in first.frames]
         self.controls = {"frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])}
 
-    def figure(self, choice: str) -> SavedFigure:
+    def figure(self, choice: str) -> "SavedFigure":
         """A run at its first frame."""
         return SavedFigure(self.runs[choice])
 

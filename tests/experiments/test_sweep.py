@@ -16,8 +16,14 @@ from blend_model import arm_files, arm_scene, use_blend_model
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.study import run_point
 from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep
-from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep
-from rbfmuscle.experiments.sweep_table import mark_front, pareto_front, sweep_rows, write_table
+from rbfmuscle.experiments.sweep_run import (
+    SweepFolder,
+    mark_front,
+    pareto_front,
+    run_sweep,
+    sweep_rows,
+    write_table,
+)
 from rbfmuscle.report.sweep_page import write_page
 from rbfmuscle.validation import UsageError
 

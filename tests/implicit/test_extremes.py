@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.field_fit import FieldFit
+from rbfmuscle.implicit.field import FieldFit, RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import spacing

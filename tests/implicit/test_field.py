@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import RBFInterpolator
 
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.fit.assembly import Basis, frame
+from rbfmuscle.implicit.fit.assembly import Basis
 from rbfmuscle.implicit.fit.fitting import solve
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.validation import UsageError
@@ -102,8 +102,7 @@ def test_smoothed_fit_minimises_residual_and_energy(kernel):
     """min |f - y|^2 + smoothing w^T A w over the weights with P w = 0, as one stacked least-squares problem."""
     rng, kernel, smoothing = np.random.default_rng(0), get_kernel(kernel), 0.02
     points, values = rng.uniform(-1, 1, (40, 3)), rng.normal(size=40)
-    origin, scale = frame(points)
-    basis = Basis((points - origin) / scale, kernel, 1.5 * scale if kernel.has_epsilon else 1.0)
+    basis = Basis(points, kernel, 1.5)
     full, block = basis.full_matrix()[:40, :40], basis.polynomials
     null = np.linalg.svd(block)[2][len(block) :].T if len(block) else np.eye(40)
     root = np.linalg.cholesky(null.T @ full @ null)

@@ -7,10 +7,15 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
-from rbfmuscle.implicit.extraction.material import carry_material, project_to_level_set
-from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
+from rbfmuscle.implicit.extraction.material import project_to_level_set
+from rbfmuscle.implicit.extraction.material_mesh import (
+    LEAST_ANGLE,
+    MaterialMesh,
+    flip_edges,
+    mend_slivers,
+    triangle_quality,
+)
 from rbfmuscle.implicit.extraction.obstacles import BESIDE, PointGrid, near_triangles
-from rbfmuscle.implicit.extraction.slivers import LEAST_ANGLE, flip_edges, mend_slivers, triangle_quality
 
 BALL = trimesh.creation.icosphere(3)
 VOLUME = 4.0 / 3.0 * np.pi
@@ -121,7 +126,7 @@ def test_tangled_triangles_are_smoothed_until_none_cross(radius, seed):
 def test_a_carried_surface_keeps_volume_and_leaves_the_bone(cut, noise):
     """Vertices that were smoothed stay when the level changes: with much noise nothing else was left to be blown up."""
     carried = BALL.vertices + noise * np.random.default_rng(5).normal(size=BALL.vertices.shape)
-    found = carry_material(mesh_of(), carried, volume=VOLUME, cut=cut)
+    found = project_to_level_set(mesh_of(), carried, None, volume=VOLUME, cut=cut)
     assert found.left == len(BALL.vertices) and found.crossing == 0
     assert cut is None or cut(found.vertices).min() > -1e-3
     assert mesh_volume(found.vertices, found.faces) == pytest.approx(VOLUME, rel=1e-12)

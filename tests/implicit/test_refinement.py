@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.implicit.field_fit import FieldFit
+from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.refinement import fit_sample
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points

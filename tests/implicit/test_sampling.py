@@ -5,9 +5,8 @@ import pytest
 import trimesh
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.field_fit import off_surface_points
-from rbfmuscle.implicit.placement.control_mesh import contract_clusters
+from rbfmuscle.implicit.field import RBFField, off_surface_points
+from rbfmuscle.implicit.placement.clustering import contract_clusters
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
 from rbfmuscle.validation import MeshError
 

@@ -8,10 +8,8 @@ import pytest
 import trimesh
 from toy_scene import Formula
 
-from rbfmuscle.implicit.extraction.marching import find_sheets
-from rbfmuscle.implicit.extraction.surface import extract_surface
-from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.field_fit import FieldFit
+from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
+from rbfmuscle.implicit.field import FieldFit, RBFField
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import BOUND, SPAN, choose_epsilon, spacing, surface_error

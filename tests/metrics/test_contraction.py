@@ -7,7 +7,7 @@ from contraction_scenes import MUSCLE, spindle_scene
 from scipy.spatial.transform import Rotation
 
 import rbfmuscle as rm
-from rbfmuscle.metrics.belly import belly_measures
+from rbfmuscle.metrics.centreline import belly_measures
 
 
 def test_run_reports_what_contracts():

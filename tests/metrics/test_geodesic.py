@@ -5,9 +5,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.metrics.centreline import distance_along, resampled
-from rbfmuscle.metrics.geodesic import NODES, shortest_path
-from rbfmuscle.metrics.penetration import BoneProbe
+from rbfmuscle.metrics.centreline import NODES, distance_along, resampled, shortest_path
+from rbfmuscle.metrics.mesh_distance import BoneProbe
 
 RADIUS, FAR = 10.0, 25.0
 

@@ -10,13 +10,9 @@ import trimesh
 
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.metrics.centreline import Centreline, split_ends
-from rbfmuscle.metrics.columns import Columns
-from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.metrics.metrics import MuscleMeasures
-from rbfmuscle.metrics.moment_arms import moment_arms
-from rbfmuscle.metrics.penetration import BoneProbe, bone_depth, surface_depth
-from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows
-from rbfmuscle.metrics.topology import SurfaceForm, euler_characteristic
+from rbfmuscle.metrics.mesh_distance import BoneProbe, Columns, MeshDistance, bone_depth, surface_depth
+from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
+from rbfmuscle.metrics.rows import frame_rows, moment_arm_rows, moment_arms
 from rbfmuscle.run import simulate
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.objects import Attachment, Motion

@@ -16,8 +16,8 @@ import rbfmuscle as rm
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction.material import carry_material
-from rbfmuscle.implicit.field_fit import wanted_derivatives
+from rbfmuscle.implicit.extraction.material import project_to_level_set
+from rbfmuscle.implicit.field import wanted_derivatives
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.models import build_model
 from rbfmuscle.muscle.drawing import Configuration
@@ -188,7 +188,7 @@ def test_a_tangle_of_the_material_is_shown_as_a_sound_surface():
     shown, volume = model.drawer.shown, model.rest.mesh_volume
     tangled = shown.rest.copy()
     tangled[tangled[:, 2] < 0.0] *= [-1.0, 1.0, 1.0]  # the lower half inside out
-    alone = carry_material(shown.mesh, tangled, volume=volume)
+    alone = project_to_level_set(shown.mesh, tangled, None, volume=volume)
     assert crossing_faces(alone.vertices, alone.faces).sum() > 20
     now = Configuration(model.points, model.normals(), model.contact_points(), tangled)
     surface = model.drawer.draw(Mock(side_effect=ValueError("no field")), now, contacts)

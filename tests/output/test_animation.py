@@ -13,9 +13,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.output.animation import page
-from rbfmuscle.output.animation.moving import MovingPart, MovingRun
 from rbfmuscle.output.export import export_run
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.saved import MovingPart, MovingRun, SavedRun
 from rbfmuscle.output.vtp import write_vtp
 from rbfmuscle.report.page import Page
 from rbfmuscle.validation import MissingPartError, UsageError

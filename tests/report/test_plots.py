@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.output.runinfo import Neighbours
 from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.writer import Neighbours
 from rbfmuscle.report.plots import Point, Track, front_plot, line_plot, motion_axis
 from rbfmuscle.report.report import _tracks
 

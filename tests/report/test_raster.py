@@ -8,7 +8,7 @@ import rbfmuscle as rm
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.output.appearance import VIEWS, motion_direction, view_axes
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.raster import Solid, aim, draw_solids, fitted_size
+from rbfmuscle.report.render import Solid, aim, draw_solids, fitted_size
 from rbfmuscle.run import stream_run
 from rbfmuscle.scene.phantom import phantom_scene
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import (
     FAR_AWAY,
     FARTHEST_CENTRE,
@@ -24,7 +25,6 @@ from rbfmuscle.scene.check import (
     check_size,
 )
 from rbfmuscle.scene.motion import turned_angle
-from rbfmuscle.scene.objects import Bone
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, SolveError
 

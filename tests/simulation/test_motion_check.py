@@ -5,7 +5,7 @@ import pytest
 from toy_scene import box_mesh, ellipsoid, held
 
 import rbfmuscle as rm
-from rbfmuscle.scene.motion import Motion
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.simulation.motion_check import check_motion, motion_findings
 
 

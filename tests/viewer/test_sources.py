@@ -6,11 +6,11 @@ import toy_scene
 import trimesh
 
 import rbfmuscle as rm
-from rbfmuscle.metrics.penetration import BoneProbe
+from rbfmuscle.metrics.mesh_distance import BoneProbe
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession
-from rbfmuscle.viewer.colours import vertex_values
+from rbfmuscle.viewer.side import vertex_values
 from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource
 
 

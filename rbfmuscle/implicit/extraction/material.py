@@ -54,11 +54,7 @@ MEET = 4
 
 @dataclass(frozen=True)
 class FittedMesh(ExtractedSurface):
-    """A material mesh on a level set.
-
-    ``left`` counts vertices that were kept from a level set far from where the material carries them, ``crossing`` the
-    triangles that still cross others.
-    """
+    """A material mesh on a level set; ``left`` counts vertices kept from it, ``crossing`` faces that cross others."""
 
     left: int = 0
     crossing: int = 0
@@ -67,7 +63,7 @@ class FittedMesh(ExtractedSurface):
 def project_to_level_set(
     mesh: MaterialMesh,
     vertices: Floats,
-    field: Field,
+    field: Field | None,
     *,
     volume: float,
     level: float = 0.0,
@@ -77,56 +73,30 @@ def project_to_level_set(
     """Bring a triangulation onto the zero set of max(field - level, -cut) that has a volume.
 
     ``vertices`` (n, 3) are where the material carries them [scene unit]; field, cut, volume, level and obstacles are
-    those of `rbfmuscle.implicit.extraction.surface.extract_surface`. ValueError on NaN in field or cut, and where no
-    level gives the volume.
+    those of `rbfmuscle.implicit.extraction.surface.extract_surface`. Without a field the triangulation stays where the
+    material is, blown up to the volume out of the bones, and all vertices are ``left``. ValueError on NaN in field or
+    cut, and where nothing has the volume.
     """
     fitting = CarriedMaterial(mesh, vertices, field, cut, float(level))
-    fitting.reach(volume)
-    return fitting.finish(volume, obstacles or [])
-
-
-def carry_material(
-    mesh: MaterialMesh,
-    vertices: Floats,
-    *,
-    volume: float,
-    cut: ClipDistance | None = None,
-    obstacles: Obstacles | None = None,
-) -> FittedMesh:
-    """A triangulation where the material is, out of the bones and blown up to a volume: for want of a level set.
-
-    Arguments as for `project_to_level_set`. All vertices of the result are ``left``. ValueError where so much of it is
-    in the bones that nothing can be blown up to the volume.
-    """
-    fitting = CarriedMaterial(mesh, vertices, None, cut, 0.0)
-    fitting.inflate(volume)
+    if field is None:
+        fitting.inflate(volume)
+    else:
+        fitting.reach(volume)
     return fitting.finish(volume, obstacles or [])
 
 
 class CarriedMaterial:
-    """A material mesh on its way from where the material takes it, ``vertices`` (n, 3) [scene unit].
+    """A material mesh on its way from where the material takes it.
 
-    Attributes
-    ----------
-    carried : (n, 3) ndarray
-        The vertices as given.
-    projector : Projector
-        Holds the vertices where they are now.
-    edge : float
-        Mean length of an edge [scene unit].
-    sunk, outside, pushed, left : (n,) ndarray of bool
-        What the material takes deep into a bone, what it leaves outside all bones, what a bone's vertex pushed off,
-        and what was kept from a level set that is too far away.
+    Its vertices (n, 3) there [scene unit] are kept as ``carried``; ``projector`` holds the vertices where they are now,
+    ``edge`` is the mean length of an edge [scene unit]. Masks (n,) say what the material takes deep into a bone
+    (``sunk``), what it leaves outside all bones (``outside``), what a bone's vertex pushed off (``pushed``), and what
+    was kept from a level set that is too far away (``left``).
     """
 
     def __init__(
-        self,
-        mesh: MaterialMesh,
-        vertices: Floats,
-        field: Field | None,
-        cut: ClipDistance | None,
-        level: float,
-    ) -> None:
+        self, mesh: MaterialMesh, vertices: Floats, field: Field | None, cut: ClipDistance | None, level: float
+    ) -> None:  # fmt: skip
         self.mesh, self.carried, self.level = mesh, np.ascontiguousarray(vertices, dtype=np.float64), level
         self.field, self.cut = field, cut
         self.edge = mesh.edge(self.carried)
@@ -152,19 +122,13 @@ class CarriedMaterial:
         near, self.outside = distance < limit, distance >= 0.0
         self.projector = Projector(self.field, cut if near.any() else None, vertices, self.edge, near)
         if np.isfinite(cut.steepest):
-            self.projector.bounds = CutBounds(
-                self.carried, np.minimum(distance, FAR * self.edge), cut.steepest
-            )
-        if near.any():
-            self.projector.clearance = self._clearance(near, distance, outward)
-
-    def _clearance(self, near: Booleans, distance: Floats, outward: Floats) -> Floats:
-        """How far from the bones vertices that sink into them end: those that look away keep off the others."""
-        normals, clearance = vertex_normals(self.carried, self.mesh.faces), np.zeros(len(self.carried))
-        away = near & (np.einsum("nd,nd->n", normals, outward) > 0.0)
-        clearance[away] = LAMELLA * self.edge
-        self.sunk = near & (distance < -SUNK * self.edge)
-        return clearance
+            bounds = np.minimum(distance, FAR * self.edge)
+            self.projector.bounds = CutBounds(self.carried, bounds, cut.steepest)
+        if near.any():  # of what sinks into a bone, what looks away from it keeps off the rest
+            normals = vertex_normals(self.carried, self.mesh.faces)
+            away = near & (np.einsum("nd,nd->n", normals, outward) > 0.0)
+            self.projector.clearance = np.where(away, LAMELLA * self.edge, 0.0)
+            self.sunk = near & (distance < -SUNK * self.edge)
 
     def lift(self, rows: Integers) -> None:
         """Bring vertices out of the bones, where they stay."""
@@ -175,13 +139,11 @@ class CarriedMaterial:
         """Move the corners of triangles that a bone's vertices came through."""
         if not obstacles:
             return
-        vertices, faces = self.projector.vertices, self.mesh.faces
+        vertices, faces, bounds = self.projector.vertices, self.mesh.faces, self.projector.bounds
         # So large that no corner is farther than 1.3 of it from its triangle's middle.
         spacing = max(self.edge, 0.52 * self.mesh.longest(vertices))
-        if self.projector.bounds is not None:
-            near = (
-                self.projector.bounds.below(vertices) < self.projector.bounds.steepest * NEAR_BONE * spacing
-            )
+        if bounds is not None:
+            near = bounds.below(vertices) < bounds.steepest * NEAR_BONE * spacing
             faces = faces[near[faces].any(axis=1)]
         if len(faces):
             self.pushed |= self.projector.push_off(faces, obstacles, spacing, PUSHED * self.edge)
@@ -219,10 +181,7 @@ class CarriedMaterial:
         return moved
 
     def _suspicious(self) -> Booleans | None:
-        """Mask of the triangles that may cross others without being folded at a corner; None where it can be any.
-
-        These are where the field's slope has sunk, as between sheets that met, and what was held back, sunk or pushed.
-        """
+        """Mask of the triangles that may cross others without a fold at a corner; None where it can be any."""
         if self.field is None or self.mesh.slope is None:
             return None
         faded = SURE * self.projector.slope * self.mesh.slope >= 1.0

@@ -1,7 +1,5 @@
 """Chords that cut through a convex bone: vertices of the surface moved until no bone vertex is inside it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -21,14 +19,8 @@ CELLS, ROUNDS = 5, 4
 class PointGrid:
     """Points (k, 3), sorted by the cells of a grid: some times as many as points, as a surface leaves most empty.
 
-    Attributes
-    ----------
-    points : (k, 3) ndarray
-        Cell by cell.
-    start : (c + 1,) ndarray of int
-        First point of each cell.
-    low, edge, shape : (3,) ndarray, float, (3,) ndarray of int
-        Corner, edge length and number of cells.
+    ``points`` are those given, cell by cell, ``start`` (c + 1,) the first of each cell; ``low`` (3,), ``edge`` and
+    ``shape`` (3,) are corner, edge length and number of cells.
     """
 
     def __init__(self, points: Floats) -> None:
@@ -58,10 +50,7 @@ class NearTriangles(NamedTuple):
 
 
 def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, margin: float) -> NearTriangles:
-    """Obstacle points right above or below triangles, or nearly, by no more than ``margin`` [scene unit].
-
-    Vertices (n, 3) are in the world, faces (m, 3) of int.
-    """
+    """Obstacle points right above or below triangles in the world, or nearly, by at most ``margin`` [scene unit]."""
     points, counts, near = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for grid, pose in obstacles:
         local = np.ascontiguousarray((vertices - pose[:3, 3]) @ pose[:3, :3])
@@ -180,10 +169,7 @@ def _push_loop(vertices, faces, near_points, spacing, tolerance, moved):
 
 @compiled(error_model="numpy")
 def _shadow(vertices, faces, f, x, y, z):
-    """Normal of a triangle, its square, the height of a point above it, and twice the areas at B and C.
-
-    The areas are those of the point's shadow in the triangle's plane, times the length of the normal, as the height is.
-    """
+    """A triangle's normal, its square, and of a point height and shadow areas at B and C, times the normal's length."""
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
     ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
     ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az

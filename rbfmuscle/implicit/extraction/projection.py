@@ -1,7 +1,5 @@
 """Vertices of an extracted mesh moved onto the surface itself, and with its level to a wanted volume."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
@@ -34,13 +32,8 @@ class Projector:
     """
 
     def __init__(
-        self,
-        field: Field | None,
-        cut: ClipDistance | None,
-        vertices: Floats,
-        spacing: float,
-        near_cut: Booleans,
-    ) -> None:
+        self, field: Field | None, cut: ClipDistance | None, vertices: Floats, spacing: float, near_cut: Booleans
+    ) -> None:  # fmt: skip
         self.vertices, self.spacing = vertices, spacing
         self._field, self._cut, self._near_cut = field, cut, near_cut
         # What is known before the first step: the field with its gradient, and the cut by values or lower bounds.
@@ -62,10 +55,8 @@ class Projector:
             x = self.vertices[todo]
             f, gradient = self._field.value_and_gradient(x) if self.known is None else self.known
             self.known = None
-            step, slope = np.empty_like(x), np.empty(len(x))
-            _newton_loop(
-                f, np.ascontiguousarray(gradient), level, self.least[todo], todo, step, slope, self._direction
-            )
+            step, slope, gradient = np.empty_like(x), np.empty(len(x)), np.ascontiguousarray(gradient)
+            _newton_loop(f, gradient, level, self.least[todo], todo, step, slope, self._direction)
             self.slope[todo] = slope
             if self._cut is not None:
                 self._turn_to_cut(todo, (f - level) * slope, step, on_field)
@@ -134,10 +125,7 @@ class Projector:
         return rows
 
     def volume_step(self, faces: Integers, target: float, steps: int = 1) -> float:
-        """Change of level that brings the mesh to the target volume, its vertices moving along their directions.
-
-        By Newton steps on the volume, a cubic polynomial of the change.
-        """
+        """Change of level that brings the mesh to a volume, a cubic polynomial of the change, by Newton steps."""
         c0, c1, c2, c3 = volume_cubic(self.vertices, faces, self._direction, self.vertices.mean(axis=0))
         change = 0.0
         for _ in range(steps):
@@ -146,17 +134,12 @@ class Projector:
                 break
             rate = c1 + change * (2.0 * c2 + change * 3.0 * c3)
             if not rate > 0:
-                raise ValueError(
-                    f"no level gives a volume of {target:g}: the cut leaves no surface of the field"
-                )
+                raise ValueError(f"no level gives a volume of {target:g}: the cut leaves no surface")
             change += lack / rate
         return change
 
     def push_off(self, faces: Integers, obstacles: Obstacles, spacing: float, tolerance: float) -> Booleans:
-        """Move the vertices around points that came through a triangle; these (n,) no longer follow the level.
-
-        ``faces`` (m, 3) are the triangles that are looked at; spacing and tolerance are those of `push_off_points`.
-        """
+        """Move vertices around points that came through faces (m, 3); a mask (n,) of these, which leave the level."""
         pushed = np.zeros(len(self.vertices), dtype=np.bool_)
         near = near_triangles(obstacles, self.vertices, faces, MARGIN * spacing)
         for _ in range(2):

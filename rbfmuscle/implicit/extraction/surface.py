@@ -4,42 +4,166 @@ The surface is the zero set of F = max(f - s, -d): f the field (negative inside)
 bones (negative inside them). Marching cubes give its topology, and Newton steps put each vertex onto the zero set.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
-from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction.marching import Grid, LevelSet, nearest_sheet
+from rbfmuscle.geometry.surfaces import label_sheets, mesh_volume
 from rbfmuscle.implicit.extraction.obstacles import Obstacles
 from rbfmuscle.implicit.extraction.projection import Projector
 from rbfmuscle.validation import check_finite, check_points, check_positive
 
+# More nodes than this are refused; so many are evaluated at a time.
+MAX_NODES, SLAB = 50_000_000, 500_000
+# Values nearer to zero than this share of their mean are moved away from it: no vertex then lies on a node.
+LEAST_VALUE = 1e-6
+# Cells along the longest side of the points when stray sheets are looked for, and the share of it added on every side.
+SEARCHED, MARGIN = 64, 0.075
 # A vertex farther than this from the cut, in cells, stays clear of it.
 NEAR_CUT = 1.2
 
 
 @dataclass(frozen=True)
-class ExtractedSurface:
-    """A closed outward mesh.
+class Grid:
+    """A regular grid of cubic cells.
 
-    Attributes
-    ----------
-    vertices : (n, 3) ndarray
-        World positions [scene unit].
-    faces : (m, 3) ndarray of int
-    level : float
-        Level s of the field that was extracted.
-    volume : float
-        Enclosed by the mesh [scene unit cubed].
-    components : int
-        Sheets in the box; all but the one nearest to the points are left out.
-    spacing : float
-        Edge of a grid cell [scene unit].
+    ``origin`` (3,) is the position of node (0, 0, 0), ``spacing`` the edge of a cell [scene unit], ``shape`` the number
+    of nodes along each axis. Rows of ``axes`` (3, 3) are the grid's unit axes in world coordinates.
+    """
+
+    origin: np.ndarray
+    spacing: float
+    shape: tuple[int, ...]
+    axes: np.ndarray
+
+    @classmethod
+    def around(
+        cls, points: ArrayLike, *, resolution: int = 48, padding: int = 3, axes: ArrayLike | None = None
+    ) -> "Grid":
+        """Grid around points (n, 3), with so many cells (at least 4) along their longest side.
+
+        ``padding`` cells, at least 1, are added on each side. Rows of ``axes`` (3, 3), a rotation, are the grid's axes;
+        those of the world by default. ValueError on no or coinciding points, numbers out of range, or too many nodes.
+        """
+        points = check_points(points)
+        axes = np.eye(3) if axes is None else np.asarray(axes, dtype=np.float64)
+        if axes.shape != (3, 3) or not np.abs(axes @ axes.T - np.eye(3)).max() < 1e-5:
+            raise ValueError("axes must be a (3, 3) rotation")
+        if int(resolution) < 4 or int(padding) < 1:
+            raise ValueError(f"resolution must be >= 4 and padding >= 1, got {resolution} and {padding}")
+        if len(points) == 0:
+            raise ValueError("points must hold at least one point on the surface")
+        along = points @ axes.T
+        low, high = along.min(axis=0), along.max(axis=0)
+        spacing = float((high - low).max()) / int(resolution)
+        if not spacing > 0:
+            raise ValueError("points must not all coincide: the grid's size is taken from them")
+        cells = np.maximum(np.ceil((high - low) / spacing - 1e-9).astype(int), 1) + 2 * int(padding)
+        if np.prod(cells + 1.0) > MAX_NODES:
+            raise ValueError(f"a grid of {cells} cells is too large; lower the resolution")
+        corner = 0.5 * (low + high) - 0.5 * spacing * cells
+        return cls(corner @ axes, spacing, tuple(int(n) + 1 for n in cells), axes)
+
+    def positions(self, coordinates: Floats) -> Floats:
+        """World positions (n, 3) of grid coordinates, in cells from the origin."""
+        return coordinates @ (self.spacing * self.axes) + self.origin
+
+    def evaluate(self, function: Callable[[Floats], Floats]) -> NDArray[np.float32]:
+        """Values of a function of points (n, 3) at the nodes, in single precision as marching cubes has them."""
+        values = np.empty(int(np.prod(self.shape)), dtype=np.float32)
+        for low in range(0, len(values), SLAB):
+            nodes = np.arange(low, min(low + SLAB, len(values)))
+            points = self.positions(np.stack(np.unravel_index(nodes, self.shape), 1))
+            values[nodes] = function(points)
+            if np.isnan(values[nodes]).any():
+                where = points[np.argmax(np.isnan(values[nodes]))]
+                raise ValueError(f"field or cut is NaN at {where}; check the fit and the bone fields")
+        return values.reshape(self.shape)
+
+
+class LevelSet:
+    """Triangles of the zero set of max(field - level, -cut) on a grid; the field is negative inside."""
+
+    def __init__(self, grid: Grid, field: Field, cut: ClipDistance | None = None) -> None:
+        self.grid, self.field, self.cut = grid, field, cut
+        self._f = grid.evaluate(field)
+        self._c = None if cut is None else grid.evaluate(cut)
+
+    def march(self, level: float) -> tuple[Floats, Integers]:
+        """Vertices (n, 3) in grid coordinates and outward triangles (m, 3), if any, closed but on the grid's border."""
+        from skimage.measure import marching_cubes
+
+        value = self._f - np.float32(level)
+        if self._c is not None:
+            value = np.maximum(value, -self._c)
+        inside = value < 0.0
+        if inside.all() or not inside.any():
+            return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+        least = LEAST_VALUE * np.abs(value[np.isfinite(value)]).mean()
+        value = np.where(inside, np.minimum(value, -least), np.maximum(value, least))
+        vertices, faces, _, _ = marching_cubes(value, 0.0)
+        return vertices.astype(np.float64), faces.astype(np.int64)
+
+    def on_border(self, coordinates: Floats) -> Booleans:
+        """Mask (n,) of the vertices on the border of the grid, where a surface leaves it."""
+        return np.any((coordinates <= 0.0) | (coordinates >= np.array(self.grid.shape) - 1.0), axis=1)
+
+
+class Sheets(NamedTuple):
+    """Sheets of a level set beside a surface.
+
+    ``stray`` counts those, beside the one nearest to most points, that stand off the surface by more than a cell;
+    ``is_open`` says whether a sheet leaves the box, ``found`` whether there is any.
+    """
+
+    stray: int
+    is_open: bool
+    found: bool
+
+    def sound(self) -> bool:
+        """Whether there are sheets, all of them closed and on the surface."""
+        return self.found and not self.is_open and self.stray == 0
+
+
+def find_sheets(field: Field, points: Floats, distance: Callable[[Floats], Floats]) -> Sheets:
+    """Sheets of a field's zero set (negative inside) in a box around a surface, 7.5 % larger than it on every side.
+
+    Points (n, 3) of the surface give the box [length]; ``distance`` maps points (n, 3) to their distances (n,) from the
+    surface, signed or not. Where a muscle is thinner than a cell, its own sheet falls into pieces on the grid: these
+    lie within a cell of it and do not count.
+    """
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    grid = Grid.around(points, resolution=SEARCHED, padding=round(MARGIN * SEARCHED), axes=axes)
+    level_set = LevelSet(grid, field)
+    coordinates, faces = level_set.march(0.0)
+    if len(faces) == 0:
+        return Sheets(0, False, False)
+    vertices = grid.positions(coordinates)
+    number, label, own = nearest_sheet(vertices, faces, points)
+    off = np.zeros(number)
+    np.maximum.at(off, label, np.abs(distance(vertices)))
+    stray = int((off > grid.spacing).sum() - (off[own] > grid.spacing))
+    return Sheets(stray, bool(level_set.on_border(coordinates).any()), True)
+
+
+def nearest_sheet(vertices: Floats, faces: Integers, points: Floats) -> tuple[int, Integers, int]:
+    """Number of connected sheets, the sheet (n,) of each vertex, and the sheet that lies nearest to most points."""
+    number, label = label_sheets(faces, len(vertices))
+    return number, label, int(np.bincount(label[cKDTree(vertices).query(points)[1]]).argmax())
+
+
+@dataclass(frozen=True)
+class ExtractedSurface:
+    """A closed outward mesh: vertices (n, 3) in the world [scene unit], faces (m, 3), and the volume that it holds.
+
+    ``level`` is that of the field that was extracted, ``components`` the number of sheets in the box, of which all but
+    the one nearest to the points are left out, ``spacing`` the edge of a grid cell [scene unit].
     """
 
     vertices: np.ndarray
@@ -61,37 +185,18 @@ def extract_surface(
     axes: ArrayLike | None = None,
     obstacles: Obstacles | None = None,
 ) -> ExtractedSurface:
-    """Extract the zero set of max(field - level, -cut) as a closed mesh.
+    """Extract the zero set of max(field - level, -cut) as a closed mesh; the field is negative inside.
 
-    Parameters
-    ----------
-    field : Field
-        Negative inside.
-    points : (n, 3) array_like
-        Predicted surface points: give the grid's extent, and which sheet is the surface's [scene unit].
-    resolution : int
-        Grid cells along the longest side of the points' box.
-    cut : ClipDistance, optional
-        Distances, negative inside what is to be cut away; beyond 1.2 cells a lower bound of more than that will do.
-    volume : float, optional
-        Wanted volume of the mesh; the level is then moved from ``level`` until the mesh has it, to 1e-9.
-    level : float
-        Level of the field, or the first guess of it.
-    axes : (3, 3) array_like, optional
-        Rotation whose rows are the grid's axes. In a frame that moves with the scene the mesh does too.
-    obstacles : list of pairs of PointGrid and (4, 4) ndarray, optional
-        Vertices of the bones behind ``cut``, each bone in its own coordinates with its pose: triangles whose
-        chords cut across a convex bone are moved until no vertex is inside the mesh by more than 1 % of a cell.
+    Predicted surface ``points`` (n, 3) [scene unit] give the grid, with ``resolution`` cells along the longest side of
+    their box, and which sheet is the surface's. ``cut`` gives distances, negative inside what is to be cut away; beyond
+    1.2 cells a lower bound of more than that will do. The level is moved from ``level`` until the mesh has the
+    ``volume``, if one is wanted, to 1e-9. Rows of ``axes`` (3, 3), a rotation, are the grid's axes: in a frame that
+    moves with the scene the mesh does too. ``obstacles`` are vertices of the bones behind ``cut``, each in its own
+    coordinates with its pose: triangles whose chords cut across a convex bone are moved until no vertex is inside the
+    mesh by more than 1 % of a cell.
 
-    Returns
-    -------
-    ExtractedSurface
-
-    Raises
-    ------
-    ValueError
-        On bad arguments, NaN in field or cut, an empty level set, or one that is not closed within twice
-        the box of the points; on a volume that no level reaches.
+    ValueError on bad arguments, NaN in field or cut, an empty level set, or one that is not closed within twice the box
+    of the points; on a volume that no level reaches.
     """
     points = check_points(points)
     level = float(level)
@@ -117,7 +222,7 @@ def _reach_volume(
     """Mesh at the level that gives the target volume; None where the surface leaves the grid."""
     spacing = level_set.grid.spacing
     for _ in range(20):
-        found = _nearest_sheet(level_set, points, level)
+        found = _sheet_at(level_set, points, level)
         if found is None:
             return None
         vertices, faces, components = found
@@ -144,25 +249,20 @@ def _reach_volume(
 
 
 def _finish(
-    projector: Projector,
-    faces: Integers,
-    target: float | None,
-    level: float,
-    components: int,
-    obstacles: Obstacles,
+    projector: Projector, faces: Integers, target: float | None, level: float, sheets: int, bones: Obstacles
 ) -> ExtractedSurface:
     spacing = projector.spacing
-    projector.push_off(faces, obstacles, spacing, 0.01 * spacing)
+    projector.push_off(faces, bones, spacing, 0.01 * spacing)
     if target is not None:
         step = projector.volume_step(faces, target, steps=3)
         level += step
         projector.shift(step)
     vertices = projector.vertices
     check_finite(vertices, name="extracted vertices")
-    return ExtractedSurface(vertices, faces, level, mesh_volume(vertices, faces), components, spacing)
+    return ExtractedSurface(vertices, faces, level, mesh_volume(vertices, faces), sheets, spacing)
 
 
-def _nearest_sheet(level_set: LevelSet, points: Floats, level: float) -> tuple[Floats, Integers, int] | None:
+def _sheet_at(level_set: LevelSet, points: Floats, level: float) -> tuple[Floats, Integers, int] | None:
     """The sheet that lies nearest to most points: vertices, faces, and the number of sheets; None where it is open."""
     coordinates, faces = level_set.march(level)
     if len(faces) == 0:

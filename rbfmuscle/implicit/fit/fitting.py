@@ -11,10 +11,11 @@ R b = Q^T (y - A w). The condition of M is that of A on those weights, as gamma 
 adding a multiple of P^T P to A instead costs two digits at 2,000 centres.
 """
 
-from __future__ import annotations
-
+import ctypes
 import math
 import warnings
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,6 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.fit.assembly import Basis
-from rbfmuscle.implicit.fit.lapack import factor_cholesky
 from rbfmuscle.validation import NumericalWarning
 
 DOUBTFUL = 1e13
@@ -37,37 +37,16 @@ _DEPENDENT = 1e-9
 def solve(
     basis: Basis, right: Floats, *, smoothing: float = 0.0, condition: float = math.inf
 ) -> tuple[Floats, Floats, float]:
-    """Weights, polynomial coefficients and an estimate of the condition.
+    """Weights (size,), polynomial coefficients (q,) and an estimate of the condition, for a right side (size,).
 
-    Parameters
-    ----------
-    basis : Basis
-    right : (size,) ndarray
-    smoothing : float
-        Added to the diagonal (scaled coordinates).
-    condition : float
-        Bound [1]: a ridge of the largest eigenvalue over it, with derivatives in units of the centres' spacing, keeps
-        it; the conditions of the fit are then met to about one part in so many.
+    ``smoothing`` is added to the diagonal (scaled coordinates). ``condition`` is a bound [1]: a ridge of the largest
+    eigenvalue over it, with derivatives in units of the centres' spacing, keeps it; the conditions of the fit are then
+    met to about one part in so many.
 
-    Returns
-    -------
-    weights : (size,) ndarray
-    coefficients : (q,) ndarray
-    condition : float
-        Of the matrix on the weights that annihilate polynomials, 2-norm, by power iteration (a lower bound, usually
-        within 10). With a bound, of the matrix with its ridge in units of the spacing. Without one, where it is beyond
-        `DOUBTFUL` that number, and a ridge keeps it at `KEPT`.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the system is singular (the message names the likely cause), or the bound is more than floating-point
-        numbers hold.
-
-    Warns
-    -----
-    NumericalWarning
-        Where a ridge was needed without a bound.
+    The estimate is that of the matrix on the weights that annihilate polynomials, 2-norm, by power iteration (a lower
+    bound, usually within 10). With a bound, of the matrix with its ridge in units of the spacing. Without one, where it
+    is beyond `DOUBTFUL` that number, and a ridge keeps it at `KEPT`, with a NumericalWarning. LinAlgError if the system
+    is singular (the message names the likely cause), or the bound is more than floating-point numbers hold.
     """
     bound = condition
     if math.isinf(bound):
@@ -91,7 +70,7 @@ def bounding_ridge(basis: Basis, condition: float) -> Floats:
     return np.asarray(factor.norm / condition / scale**2)
 
 
-def _factorise_bounded(basis: Basis, condition: float, smoothing: float) -> tuple[Factor, Floats]:
+def _factorise_bounded(basis: Basis, condition: float, smoothing: float) -> "tuple[Factor, Floats]":
     """Factor with a ridge, and the units (size,) of its unknowns."""
     # about the spacing of so many centres in the unit ball; a factor of three either way changes little
     count, unit = len(basis.points), 1.0 / math.sqrt(len(basis.points))
@@ -104,9 +83,8 @@ def _factorise_bounded(basis: Basis, condition: float, smoothing: float) -> tupl
     factor = _factorise(matrix, np.ascontiguousarray(basis.polynomials * scale), condition)
     if factor is None:
         _raise_if_singular(basis)
-        raise np.linalg.LinAlgError(
-            f"no Cholesky factor with a condition of {condition:g}; lower the bound or raise epsilon"
-        )
+        message = f"no Cholesky factor with a condition of {condition:g}; lower the bound or raise epsilon"
+        raise np.linalg.LinAlgError(message)
     return factor, scale
 
 
@@ -152,12 +130,11 @@ def _smoothed(basis: Basis, smoothing: float) -> Floats:
     return matrix
 
 
-def _factorise(matrix: Floats, polynomials: Floats, condition: float = math.inf) -> Factor | None:
+def _factorise(matrix: Floats, polynomials: Floats, condition: float = math.inf) -> "Factor | None":
     """Factor of A (size, size), lower triangle valid, Fortran order, overwritten; polynomials (q, size).
 
-    The largest eigenvalue on the weights that annihilate polynomials, over the bound of the condition, is added to the
-    diagonal, and is ``norm``. None where the matrix is not definite in floating-point numbers, or the polynomials are
-    dependent.
+    The largest eigenvalue, ``norm``, over the bound of the condition is added to the diagonal. None where the matrix is
+    not definite in floating-point numbers, or the polynomials are dependent.
     """
     q, size = polynomials.shape
     start = np.ones(size)
@@ -196,11 +173,7 @@ def _largest_eigenvalue(matrix: Floats, vector: Floats, steps: int) -> float:
 
 
 def _probe(pivots: Floats) -> Floats:
-    """Vector (size,) of length about one that holds some of the smallest eigenvector, from the factor's diagonal.
-
-    Random signs, and the unit vector of the smallest pivot; the length of the solution for it is an estimate of
-    1 / (smallest eigenvalue).
-    """
+    """Vector (size,) of random signs and the smallest pivot's unit vector: it holds some of the weakest eigenvector."""
     size = len(pivots)
     signs = np.where((np.arange(size) * 0x9E3779B1) >> 7 & 1, 1.0, -1.0) / math.sqrt(2 * size)
     weakest = int(np.argmin(pivots))
@@ -238,9 +211,8 @@ def _raise_if_singular(basis: Basis) -> None:
     if apart < 1e-15:
         same = np.flatnonzero((np.abs(points - points[first]) < 1e-15).all(axis=1))
         first, second = (same[0], same[1]) if len(same) > 1 else (first, second)
-        raise np.linalg.LinAlgError(
-            f"singular fit: centres {first} and {second} coincide; remove duplicates (or use smoothing)"
-        )
+        pair = f"centres {first} and {second} coincide"
+        raise np.linalg.LinAlgError(f"singular fit: {pair}; remove duplicates (or use smoothing)")
     if q and np.linalg.matrix_rank(basis.polynomials, tol=_DEPENDENT * math.sqrt(basis.size)) < q:
         degree = int(basis.powers.sum(axis=1).max())
         flat = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -253,3 +225,21 @@ def _raise_if_singular(basis: Basis) -> None:
             f"singular fit: the {len(points)} centres are {shape}, so a polynomial of degree {degree} "
             f"({q} terms) is not determined; degree too high: lower it or use a kernel of lower order"
         )
+
+
+@cache
+def _dpotrf() -> Callable[..., None]:
+    from numba.extending import get_cython_function_address
+
+    address = get_cython_function_address("scipy.linalg.cython_lapack", "dpotrf")
+    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 5)(address)
+
+
+def factor_cholesky(matrix: Floats) -> int:
+    """Put the Cholesky factor in the lower triangle of a Fortran-ordered matrix; 0, or the first minor that fails."""
+    if matrix.dtype != np.float64 or not matrix.flags.f_contiguous or matrix.ndim != 2:
+        raise ValueError("LAPACK needs a two-dimensional float64 array in Fortran order")
+    lower, size, failed = ctypes.c_char(b"L"), ctypes.c_int(len(matrix)), ctypes.c_int(0)
+    order = ctypes.byref(size)
+    _dpotrf()(ctypes.byref(lower), order, matrix.ctypes.data, order, ctypes.byref(failed))
+    return failed.value

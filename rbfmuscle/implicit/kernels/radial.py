@@ -32,28 +32,14 @@ _TINY = 2.2250738585072014e-308
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def _exp(x):
-    """exp(x), relative error below 3e-16; 0 where x < -708.
-
-    x = n log 2 + r with r below 0.35, a polynomial for exp r, and n added to the exponent's bits.
-    """
+    """exp(x), relative error below 3e-16; 0 where x < -708: x = n log 2 + r, n goes into the exponent's bits."""
     t = min(max(x, -708.0), 709.0)
     whole = np.float64(t * _LOG2E + _SHIFTER)
     n = whole - _SHIFTER
     r = (t - n * _LN2_HIGH) - n * _LN2_LOW
-    p = 1.0 / 6227020800.0
-    p = p * r + 1.0 / 479001600.0
-    p = p * r + 1.0 / 39916800.0
-    p = p * r + 1.0 / 3628800.0
-    p = p * r + 1.0 / 362880.0
-    p = p * r + 1.0 / 40320.0
-    p = p * r + 1.0 / 5040.0
-    p = p * r + 1.0 / 720.0
-    p = p * r + 1.0 / 120.0
-    p = p * r + 1.0 / 24.0
-    p = p * r + 1.0 / 6.0
-    p = p * r + 0.5
-    p = p * r + 1.0
-    p = p * r + 1.0
+    p = ((1.0 / 6227020800.0 * r + 1.0 / 479001600.0) * r + 1.0 / 39916800.0) * r + 1.0 / 3628800.0
+    p = (((p * r + 1.0 / 362880.0) * r + 1.0 / 40320.0) * r + 1.0 / 5040.0) * r + 1.0 / 720.0
+    p = (((((p * r + 1.0 / 120.0) * r + 1.0 / 24.0) * r + 1.0 / 6.0) * r + 0.5) * r + 1.0) * r + 1.0
     power = np.int64((whole.view(np.int64) + np.int64(1023)) << np.int64(52)).view(np.float64)
     return p * power if x >= -708.0 else 0.0
 
@@ -67,17 +53,9 @@ def _log(x):
     f = m - 1.0
     s = f / (m + 1.0)
     z = s * s
-    p = 1.0 / 23.0
-    p = p * z + 1.0 / 21.0
-    p = p * z + 1.0 / 19.0
-    p = p * z + 1.0 / 17.0
-    p = p * z + 1.0 / 15.0
-    p = p * z + 1.0 / 13.0
-    p = p * z + 1.0 / 11.0
-    p = p * z + 1.0 / 9.0
-    p = p * z + 1.0 / 7.0
-    p = p * z + 1.0 / 5.0
-    p = p * z + 1.0 / 3.0
+    p = (((1.0 / 23.0 * z + 1.0 / 21.0) * z + 1.0 / 19.0) * z + 1.0 / 17.0) * z + 1.0 / 15.0
+    p = (((p * z + 1.0 / 13.0) * z + 1.0 / 11.0) * z + 1.0 / 9.0) * z + 1.0 / 7.0
+    p = (p * z + 1.0 / 5.0) * z + 1.0 / 3.0
     # log m = 2s + 2s^3 p with 2s = f - s f, so that the leading term is exact
     return exponent * _LN2_HIGH + (f - s * (f - 2.0 * z * p) + exponent * _LN2_LOW)
 
@@ -172,10 +150,9 @@ def _inner_loop(base, row, u, s, b, out):
 
 @compiled(error_model="numpy")
 def _radial_loop(form, wanted, u, work, out):
-    """Fill out[k] (3, n) with the k-th radial function of s**2 = u for every bit k set in wanted.
+    """Fill out[k] (3, n) with the k-th radial function of u = s**2 for each bit k of wanted; work (3, n) is scratch.
 
-    work is a (3, n) scratch array. Where a function is infinite at u = 0 a finite value stands in: it is
-    only ever multiplied by components of the zero vector.
+    Where a function is infinite at u = 0 a finite value stands in: it is only ever multiplied by zero vectors.
     """
     base, parameter, compact, table = form
     s, b, more = work[0][: u.size], work[1][: u.size], work[2][: u.size]

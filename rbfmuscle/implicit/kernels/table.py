@@ -7,16 +7,13 @@ and Hermite fits need are ``2**k d^k phi / du^k``::
     k = 1   first   phi'/r
     k = 2   second  (phi'' - phi'/r) / r**2
 
-All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A and B of
-degree four at most. A row lists j, A and B of phi, the others follow; the loops in ``radial.py`` know the bases
-and no kernel.
+All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A and B of degree four
+at most. A row lists j, A and B of phi, the others follow; the loops in ``radial.py`` know the bases and no kernel.
 
 Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann (2000);
 SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: the formula r^2 (r^a - 1)
 was not checked against the original of 2019, and neither was the default exponent.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
@@ -37,19 +34,10 @@ _TERMS = 5
 class Kernel:
     """One row of the kernel table.
 
-    Attributes
-    ----------
-    name : str
-    order : int
-        Order m of conditional positive definiteness; polynomials of degree m - 1 must be added.
-    compact : bool
-        Whether phi vanishes for r >= 1/epsilon.
-    smoothness : int
-        phi is C^k at the origin; 99 stands for infinitely often.
-    has_epsilon : bool
-        False where epsilon only rescales the weights (polyharmonic kernels).
-    parameter : float
-        The kernel's own exponent (beta, a), 0 where it has none.
+    ``order`` m is that of conditional positive definiteness: polynomials of degree m - 1 must be added. Phi is C^k at
+    the origin for k = ``smoothness``, 99 for infinitely often; if ``compact`` it vanishes for r >= 1/epsilon.
+    ``has_epsilon`` is False where epsilon only rescales the weights (polyharmonic kernels). ``parameter`` is the
+    kernel's own exponent (beta, a), 0 where it has none.
     """
 
     name: str
@@ -160,10 +148,7 @@ _ROWS = [
 
 
 def _radial_rows(base: int, parameter: float, phi: _Phi) -> Floats:
-    """Rows (3, 2 + 2 * `_TERMS`) for k = 0, 1, 2: j, the base's own exponent, A, B; each is (1/s) d/ds of the last.
-
-    In fractions, so that what cancels is zero.
-    """
+    """Rows (3, 2 + 2 `_TERMS`): j, the base's own exponent, A, B; each (1/s) d/ds of the last, in exact fractions."""
     rows, exponent, size = np.zeros((3, 2 + 2 * _TERMS)), Fraction(parameter), _TERMS + 2
     power, inner, outer, extra = phi
     if base == radial.ONE and any(inner):

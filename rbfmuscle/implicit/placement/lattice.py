@@ -4,8 +4,6 @@ The lattice belongs to the muscle's shape alone, not to its centres, so what is 
 however many centres there are. Where material is, the signed distance to the rest mesh tells.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,18 +33,9 @@ class Lattice:
     """Cells of a box along a mesh's principal axes that hold some of its volume, and their nodes.
 
     Of vertices (n, 3) and faces (m, 3) of the rest mesh; ``nodes`` says about how many are wanted. Shape functions are
-    quadratic B-splines along each axis.
-
-    Attributes
-    ----------
-    rest : (N, 3) ndarray
-        Nodes at rest: the places that the shape functions reproduce linear functions from.
-    points, weights : (Q, 3), (Q,) ndarray
-        Quadrature of the material [volume of the mesh's unit].
-    cell : (Q,) ndarray of int
-        Cell of each quadrature point.
-    spacing : (3,) ndarray
-        Sides of a cell.
+    quadratic B-splines along each axis, which reproduce linear functions from the nodes at rest, ``rest`` (N, 3).
+    ``points`` (Q, 3) and ``weights`` (Q,) [volume of the mesh's unit] are the quadrature of the material, ``cell`` (Q,)
+    the cell of each point; ``spacing`` (3,) holds the sides of a cell.
     """
 
     def __init__(self, vertices: Floats, faces: Integers, nodes: int) -> None:
@@ -72,7 +61,7 @@ class Lattice:
     def _lay_cells(self, surface: Floats, side: float) -> None:
         self.count = np.maximum(1, np.ceil(self.extent / side - 1e-9).astype(int))
         self.spacing = self.extent / self.count
-        every = np.stack(np.meshgrid(*(np.arange(n) for n in self.count), indexing="ij"), -1).reshape(-1, 3)
+        every = np.indices(self.count).reshape(3, -1).T
         middle = self.low + (every + 0.5) * self.spacing
         depth = self.distance(middle @ self.axes)
         half = 0.5 * float(np.linalg.norm(self.spacing))
@@ -83,16 +72,14 @@ class Lattice:
         self.cells = every[used]
 
     def _key(self, cells: Integers) -> Integers:
-        return (cells[:, 0] * self.count[1] + cells[:, 1]) * self.count[2] + cells[:, 2]
+        return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(self.count)))
 
     def _number_nodes(self) -> None:
-        steps = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(-1, 3)
-        corner = self.cells[:, None, :] + steps
-        size = self.count + 2
-        flat = (corner[..., 0] * size[1] + corner[..., 1]) * size[2] + corner[..., 2]
+        corner = self.cells[:, None, :] + np.indices((3, 3, 3)).reshape(3, -1).T
+        flat = np.ravel_multi_index(np.moveaxis(corner, -1, 0), self.count + 2)
         known, self.nodes = np.unique(flat, return_inverse=True)
         self.nodes = self.nodes.reshape(flat.shape).astype(np.int64)
-        self.place = np.stack([known // (size[1] * size[2]), known // size[2] % size[1], known % size[2]], 1)
+        self.place = np.stack(np.unravel_index(known, self.count + 2), 1)
         self.rest = (self.low + (self.place - 0.5) * self.spacing) @ self.axes
         self.tree = cKDTree(self.cells + 0.5)
 
@@ -124,7 +111,7 @@ class Lattice:
 
     def _integrate(self) -> None:
         """Eight points a cell with the volume, the middle and the spread of the material in it."""
-        fine = (np.stack(np.meshgrid(*[np.arange(FINE)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / FINE
+        fine = (np.indices((FINE, FINE, FINE)).reshape(3, -1).T + 0.5) / FINE
         # Those of a full cell are Gauss's.
         whole = _split(fine)
         points, weights, cells, local = [], [], [], []
@@ -152,8 +139,7 @@ class Lattice:
     def regions(self, count: int) -> Integers:
         """Region of each quadrature point: whole cells, halved by volume until there are ``count`` regions.
 
-        A group of cells of which no part is large enough, by `LEAST_REGION`, stays whole: the pressure of a sliver
-        would grow without bounds.
+        A group of which no part is large enough stays whole: the pressure of a sliver would grow without bounds.
         """
         volume = np.bincount(self.cell, self.weights, minlength=len(self.cells))
         least = LEAST_REGION * volume.sum() / count
@@ -177,10 +163,9 @@ class Lattice:
         return out[self.cell]
 
     def second_differences(self) -> Floats:
-        """Σ over axes of the squared second differences of the nodes along them, (N, N).
+        """Σ over axes of the squared second differences of the nodes along them, (N, N), zero for every linear map.
 
-        Zero for every linear map of the nodes, so that it resists neither turning nor stretching; it carries
-        nodes whose support holds hardly any material along with their neighbours.
+        It carries nodes whose support holds hardly any material along with their neighbours.
         """
         known = {tuple(p): k for k, p in enumerate(self.place)}
         out = np.zeros((len(self.rest), len(self.rest)))

@@ -5,11 +5,9 @@ field smallest at many points of the surface; a centre of value v_j then moves b
 field is still one of zeros and unit normals.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,19 +15,12 @@ from scipy import linalg
 from scipy.spatial.distance import cdist
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.field_fit import FieldFit
-from rbfmuscle.implicit.fit import assembly
-from rbfmuscle.implicit.fit.assembly import hermite_system
+from rbfmuscle.implicit.field import FieldFit
+from rbfmuscle.implicit.fit.assembly import Basis, hermite_system, monomials
 from rbfmuscle.implicit.fit.fitting import bounding_ridge
-from rbfmuscle.implicit.placement.sampling import spread_points
+from rbfmuscle.implicit.placement.sampling import SurfaceSample, spread_points
 from rbfmuscle.implicit.selection import spacing, surface_error
 from rbfmuscle.validation import UsageError
-
-if TYPE_CHECKING:
-    from rbfmuscle.implicit.fit.assembly import Basis
-    from rbfmuscle.implicit.kernels.table import Kernel
-    from rbfmuscle.implicit.placement.sampling import SurfaceSample
-
 
 # Name of this placement of centres beside those of `sampling.PLACEMENTS`.
 FITTED = "fitted"
@@ -42,13 +33,7 @@ _CHUNK = 1000
 
 
 def fit_sample(
-    sample: SurfaceSample,
-    vertices: ArrayLike,
-    faces: ArrayLike,
-    *,
-    fit: FieldFit,
-    seed: int = 0,
-    rounds: int = ROUNDS,
+    sample: SurfaceSample, vertices: ArrayLike, faces: ArrayLike, *, fit: FieldFit, seed: int = 0
 ) -> SurfaceSample:
     """Centres moved along their normals, and normals turned, so that the field is small on the whole mesh.
 
@@ -60,7 +45,7 @@ def fit_sample(
     """
     if not fit.kernel.hermite or fit.derivatives != "all":
         raise UsageError(
-            f"kernel '{fit.kernel.name}' has no Hermite fit to all derivatives, whose centres could be fitted"
+            f"kernel '{fit.kernel.name}' has no Hermite fit to all derivatives: take greedy centres"
         )
     where, _ = spread_points(np.asarray(vertices), np.asarray(faces), SAMPLES, seed=seed)
     points, normals = sample.points, sample.normals
@@ -72,7 +57,7 @@ def fit_sample(
 
     value, least = fitted(points, normals)
     best, problem = sample, _problem(points, normals, where, fit, reach)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         points, normals = _step(points, normals, value, problem)
         value, now = fitted(points, normals)
         if now < least:
@@ -90,23 +75,23 @@ class _Problem(NamedTuple):
 
 def _problem(points: Floats, normals: Floats, samples: Floats, fit: FieldFit, reach: float) -> _Problem:
     """The problem of some centres."""
-    count, kernel = len(points), fit.kernel
-    basis, _, origin, scale = hermite_system(points, normals, kernel, fit.epsilon, "all")
-    scaled, shape = (samples - origin) / scale, fit.epsilon * scale if kernel.has_epsilon else 1.0
+    count = len(points)
+    basis, _ = hermite_system(points, normals, fit.kernel, fit.epsilon, "all")
+    scaled = (samples - basis.origin) / basis.scale
     full = basis.full_matrix()
     if math.isfinite(fit.condition):
         full[np.diag_indices(basis.size)] += bounding_ridge(basis, fit.condition)
     factor = linalg.lu_factor(full, overwrite_a=True, check_finite=False)
     cardinal = np.empty((basis.size, len(scaled)), order="F")
     for low in range(0, len(scaled), _CHUNK):
-        rows = _rows(basis, kernel, shape, scaled[low : low + _CHUNK])
+        rows = _rows(basis, scaled[low : low + _CHUNK])
         found = linalg.lu_solve(factor, rows.T, trans=1, check_finite=False)
         cardinal[:, low : low + _CHUNK] = found[: basis.size]
     matrix = cardinal @ cardinal.T
     weight = np.full(basis.size, STIFFNESS)
-    weight[count:] *= reach / scale  # derivatives are by scaled coordinates
+    weight[count:] *= reach / basis.scale  # derivatives are by scaled coordinates
     matrix[np.diag_indices(basis.size)] += weight**2 * len(samples) / count
-    return _Problem(cardinal, linalg.cho_factor(matrix, overwrite_a=True, check_finite=False), scale)
+    return _Problem(cardinal, linalg.cho_factor(matrix, overwrite_a=True, check_finite=False), basis.scale)
 
 
 def _step(points: Floats, normals: Floats, value: Floats, problem: _Problem) -> tuple[Floats, Floats]:
@@ -119,10 +104,10 @@ def _step(points: Floats, normals: Floats, value: Floats, problem: _Problem) -> 
     return points - (change[:count] / size)[:, None] * turned, turned
 
 
-def _rows(basis: Basis, kernel: Kernel, shape: float, at: Floats) -> Floats:
+def _rows(basis: Basis, at: Floats) -> Floats:
     """Rows (n, size + q) of the field at scaled points: for the weights a, B and the polynomial."""
     offset = at[:, None, :] - basis.points[None]
-    r = cdist(at, basis.points)
-    first = kernel.first(r, shape)
-    parts = [kernel.phi(r, shape), *(-first * offset[:, :, k] for k in range(3))]
-    return np.hstack([*parts, assembly.monomials(at, basis.powers).T])
+    r, kernel = cdist(at, basis.points), basis.kernel
+    first = kernel.first(r, basis.epsilon)
+    parts = [kernel.phi(r, basis.epsilon), *(-first * offset[:, :, k] for k in range(3))]
+    return np.hstack([*parts, monomials(at, basis.powers).T])

@@ -1,21 +1,12 @@
 """Centres on a closed mesh: even cover, normals, areas, and the control triangulation over them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbfmuscle.geometry import surfaces
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.surfaces import (
-    barycentric_weights,
-    face_normals,
-    opposite_half_edges,
-    split_pinched_vertices,
-    unique_edges,
-    vertex_normals,
-)
 from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.clustering import FineMesh, cluster_mesh, refine_mesh
@@ -33,10 +24,7 @@ PLACEMENTS = ("even", "adaptive", "greedy")
 
 @dataclass(frozen=True)
 class SurfaceSample:
-    """Points (K, 3) on a closed mesh [scene unit] with unit outward normals (K, 3) there.
-
-    ``control_faces`` (m, 3) is a closed, outward, 2-manifold triangulation over the points.
-    """
+    """Points (K, 3) [scene unit] on a closed mesh, unit outward normals, a closed, outward triangulation of them."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -46,36 +34,17 @@ class SurfaceSample:
 def sample_surface(
     vertices: ArrayLike, faces: ArrayLike, count: int, *, seed: int = 0, placement: str = "adaptive"
 ) -> SurfaceSample:
-    """Cover a closed mesh with ``count`` points.
+    """Cover a closed, outward mesh (vertices (n, 3) [scene unit], faces (m, 3)) with ``count`` points.
 
-    The mesh is split into ``count`` connected cells of equal size (farthest points by distance along the
-    surface, then clustering as in Valette & Chassery 2004); each cell gives one point. Cells never reach
-    through a thin sheet, as distance and connection are those of the surface.
+    The mesh is split into ``count`` connected cells of equal size (farthest points by distance along the surface, then
+    clustering as in Valette & Chassery 2004); each cell gives one point. Cells never reach through a thin sheet, as
+    distance and connection are those of the surface. ``count`` is at least 4 for each connected component; ``seed``
+    chooses the first point, the rest follows.
 
-    Parameters
-    ----------
-    vertices : (n, 3) array_like
-        Vertices of a closed, outward surface, each edge between two triangles [scene unit].
-    faces : (m, 3) array_like of int
-        Its triangles.
-    count : int
-        Points wanted, at least 4 for each connected component.
-    seed : int
-        Chooses the first point; the rest follows.
-    placement : {"even", "adaptive", "greedy"}
-        Cells of equal size; smaller where the surface bends; smaller where a cubic Hermite fit misses the
-        mesh (the most accurate, at 0.2 to 1 s; beyond 1000 points as adaptive).
-
-    Returns
-    -------
-    SurfaceSample
-
-    Raises
-    ------
-    MeshError
-        If the mesh is not a closed 2-manifold, or its topology needs more points.
-    ValueError
-        If ``count`` or ``placement`` is not allowed.
+    ``placement`` is "even" (cells of equal size), "adaptive" (smaller where the surface bends) or "greedy" (smaller
+    where a cubic Hermite fit misses the mesh: the most accurate, at 0.2 to 1 s; beyond 1000 points as adaptive).
+    MeshError if the mesh is not a closed 2-manifold, or its topology needs more points; ValueError if ``count`` or
+    ``placement`` is not allowed.
     """
     vertices, faces = check_mesh(vertices, faces)
     count = int(count)
@@ -83,9 +52,9 @@ def sample_surface(
         raise ValueError(f"count must be at least 4, got {count}")
     if placement not in PLACEMENTS:
         raise ValueError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
-    if (opposite_half_edges(faces) < 0).any():
+    if (surfaces.opposite_half_edges(faces) < 0).any():
         raise MeshError("mesh must be a closed, consistently oriented 2-manifold; repair it first")
-    fine = refine_mesh(*split_pinched_vertices(vertices, faces), count)
+    fine = refine_mesh(*surfaces.split_pinched_vertices(vertices, faces), count)
     if placement == "greedy" and count <= GREEDY_LARGEST:
         return _greedy_sample(fine, count, seed)
     density = np.ones(len(fine.vertices)) if placement == "even" else curvature_density(fine, count)
@@ -95,9 +64,8 @@ def sample_surface(
 def _greedy_sample(fine: FineMesh, count: int, seed: int) -> SurfaceSample:
     """Cells made smaller, round by round, where a cubic Hermite fit misses the mesh.
 
-    Each round fits the field to the centres, takes |f| at the mesh's vertices as the distance missed, and
-    raises the density of a cell by how much worse it is than the rest. Of all rounds, that with the smallest
-    sum of root mean square and a fifth of the largest miss is returned.
+    Each round raises the density of a cell by how much worse |f| at the mesh's vertices is there than elsewhere. Of all
+    rounds, that with the smallest sum of root mean square and a fifth of the largest miss is returned.
     """
     best: SurfaceSample | None = None
     least = np.inf
@@ -114,9 +82,7 @@ def _greedy_sample(fine: FineMesh, count: int, seed: int) -> SurfaceSample:
             factor = np.clip(worst / (3 * rms), 0.7, 2.5)
             np.clip(density * factor[labels], 1, LARGEST_DENSITY, out=density)
     if best is None:
-        raise MeshError(
-            "no field fits centres placed on this mesh: every fit was NaN; try placement = 'even'"
-        )
+        raise MeshError("no field fits centres on this mesh: every fit was NaN; try placement = 'even'")
     return best
 
 
@@ -127,9 +93,9 @@ def curvature_density(fine: FineMesh, count: int) -> Floats:
     squared principal curvatures up to a factor. The density is 1 + 4 (curvature x cell size)^2, so that flat parts keep
     their even cover.
     """
-    area = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1)
-    normals = vertex_normals(fine.vertices, fine.faces)
-    i, j = unique_edges(fine.faces).T
+    area = np.linalg.norm(surfaces.face_normals(fine.vertices, fine.faces), axis=1)
+    normals = surfaces.vertex_normals(fine.vertices, fine.faces)
+    i, j = surfaces.unique_edges(fine.faces).T
     length = np.linalg.norm(fine.vertices[i] - fine.vertices[j], axis=1)
     turn = ((normals[i] - normals[j]) ** 2).sum(axis=1)
     size = len(fine.vertices)
@@ -139,10 +105,8 @@ def curvature_density(fine: FineMesh, count: int) -> Floats:
     rounds = int(np.ceil(0.25 * cell / np.mean(length) ** 2))
     valence = np.maximum(_edge_sum(i, j, np.ones(len(i)), size), 1)
     for _ in range(rounds):
-        density = (
-            0.5 * density
-            + 0.5 * (np.bincount(i, density[j], size) + np.bincount(j, density[i], size)) / valence
-        )
+        beside = np.bincount(i, density[j], size) + np.bincount(j, density[i], size)
+        density = 0.5 * density + 0.5 * beside / valence
     return np.clip(density, 1, LARGEST_DENSITY)
 
 
@@ -163,7 +127,7 @@ def spread_points(vertices: Floats, faces: Integers, count: int, *, seed: int = 
 
 def _gather(fine: FineMesh, count: int, labels: Integers, control: Integers) -> SurfaceSample:
     """Points and normals of the cells."""
-    third = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1) / 3
+    third = np.linalg.norm(surfaces.face_normals(fine.vertices, fine.faces), axis=1) / 3
     corner = labels[fine.faces]
     areas = np.bincount(corner.ravel(), np.repeat(third, 3), count)
     middle = fine.vertices[fine.faces].mean(axis=1)
@@ -182,15 +146,11 @@ def _gather(fine: FineMesh, count: int, labels: Integers, control: Integers) -> 
 
 
 def _normals_at(fine: FineMesh, points: Floats, piece: Integers, corner: Integers) -> Floats:
-    """Normals in triangles ``piece``, drawn towards the mean of each point's cell.
-
-    The mean alone flattens what the field shows between the points; the normal of the point alone makes the
-    field bulge far out where a few points stand on a sharp rim.
-    """
+    """Normals in triangles ``piece``, drawn towards the mean of each point's cell."""
     corners = fine.faces[piece]
-    weights = barycentric_weights(points, fine.vertices[corners])
-    here = np.einsum("kc,kcd->kd", weights, vertex_normals(fine.vertices, fine.faces)[corners])
-    vectors = face_normals(fine.vertices, fine.faces)
+    weights = surfaces.barycentric_weights(points, fine.vertices[corners])
+    here = np.einsum("kc,kcd->kd", weights, surfaces.vertex_normals(fine.vertices, fine.faces)[corners])
+    vectors = surfaces.face_normals(fine.vertices, fine.faces)
     sums = [np.bincount(corner.ravel(), np.repeat(vectors[:, k], 3), len(points)) for k in range(3)]
     mean: Floats = np.stack(sums, axis=1).astype(np.float64)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), np.finfo(float).tiny)[:, None]
@@ -202,10 +162,7 @@ def _normals_at(fine: FineMesh, points: Floats, piece: Integers, corner: Integer
 
 @compiled
 def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distance):
-    """Of the triangles wholly in cell k, the point nearest to target[k].
-
-    Triangles between cells are left out: at a thin rim two cells would take the same point of one.
-    """
+    """Point nearest to target[k] of the triangles wholly in cell k: at a thin rim two would else take the same."""
     q, share = np.empty(3), np.empty(3)
     for f in range(len(faces)):
         k = corner[f, 0]

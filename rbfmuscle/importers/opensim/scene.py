@@ -12,7 +12,8 @@ from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.tubes import make_tube
 from rbfmuscle.importers.toml_text import table_text
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
-from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, ReadMesh, prepare_mesh, read_arrays
+from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_arrays
+from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, check_mesh
 

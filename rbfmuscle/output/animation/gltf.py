@@ -4,8 +4,6 @@ glTF is in metres with y up, and knows no other animation of vertices than morph
 go from 0 to 1 and back one after the other.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Sequence
@@ -15,8 +13,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.output.animation.moving import MovingPart, MovingRun
 from rbfmuscle.output.appearance import linear_rgb, rgb
+from rbfmuscle.output.saved import MovingPart, MovingRun
 from rbfmuscle.validation import UsageError
 
 _FLOAT, _INT = 5126, 5125
@@ -24,13 +22,7 @@ _VERTICES, _INDICES = 34962, 34963  # what a view is bound as
 
 
 def animated_glb(run: MovingRun) -> bytes:
-    """The content of an animated ``.glb``.
-
-    Raises
-    ------
-    UsageError
-        If a muscle's surface has other vertices in other frames.
-    """
+    """The content of an animated ``.glb``; UsageError if a muscle's surface has other vertices in other frames."""
     changing = [muscle.name for muscle in run.muscles if not muscle.keeps_vertices]
     if changing:
         raise UsageError(
@@ -47,7 +39,7 @@ def animated_glb(run: MovingRun) -> bytes:
     return file.content({"name": run.name, "nodes": [file.append("nodes", root)]})
 
 
-def _add_part(file: _File, part: MovingPart) -> int:
+def _add_part(file: "_File", part: MovingPart) -> int:
     """Number of a new node: a muscle has a morph target for each frame but the first, a bone a pose for each."""
     base, faces = part.vertices[0], part.faces[0]
     normals, targets = vertex_normals(base, faces), []

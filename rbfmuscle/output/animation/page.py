@@ -4,8 +4,6 @@ Positions are whole numbers of a step, kept as second differences along the fram
 the vertices; all arrays follow each other in one deflated stream, their bytes sorted by place, as base64.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import zlib
@@ -17,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingPart, MovingRun
 from rbfmuscle.output.appearance import VIEWS
+from rbfmuscle.output.saved import FRAMES_A_SECOND, MovingPart, MovingRun
 
 # Whole numbers of which the longest side of all that moves has so many: 0.03 mm of 900.
 _STEPS = 30_000
@@ -30,18 +28,14 @@ def scene_file(name: str) -> str:
 
 
 def pack_runs(runs: Mapping[str, MovingRun]) -> str:
-    """JSON of one or several runs of the same frames and bones, by what stands above each, for ``scene.js``.
-
-    They are shown beside each other, first in the plane of the motion.
-    """
+    """JSON of runs of the same frames and bones, side by side, by what stands above each, for ``scene.js``."""
     first = next(iter(runs.values()))
     packer = _Packer(runs)
     parts = [packer.part(muscle, k) for k, run in enumerate(runs.values()) for muscle in run.muscles]
     parts += [packer.part(bone, -1) for bone in first.bones]
     facts = {
         "panels": list(runs), "captions": first.captions, "parts": parts, "step": packer.step,
-        "views": VIEWS, "body": first.body.tolist(),
-        "direction": first.direction.tolist(),
+        "views": VIEWS, "body": first.body.tolist(), "direction": first.direction.tolist(),
         "origin": packer.origin.tolist(), "rate": FRAMES_A_SECOND / 2.0, "bytes": packer.text(),
     }  # fmt: skip
     # No name may end the script that holds it.
@@ -52,11 +46,9 @@ class _Packer:
     """Arrays on their way into one stream."""
 
     def __init__(self, runs: Mapping[str, MovingRun]) -> None:
-        sets = [
-            points for run in runs.values() for part in (*run.bones, *run.muscles) for points in part.vertices
-        ]
-        low = np.min([points.min(axis=0) for points in sets], axis=0)
-        high = np.max([points.max(axis=0) for points in sets], axis=0)
+        drawn = [part for run in runs.values() for part in (*run.bones, *run.muscles)]
+        low = np.min([points.min(axis=0) for part in drawn for points in part.vertices], axis=0)
+        high = np.max([points.max(axis=0) for part in drawn for points in part.vertices], axis=0)
         self.origin, self.step = low, float((high - low).max()) / _STEPS or 1.0
         self.parts: list[bytes] = []
 

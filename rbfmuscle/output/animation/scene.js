@@ -12,7 +12,6 @@ const element = (kind, parent, words) => parent.appendChild(Object.assign(docume
 const add = (a, b, share) => a.map((x, k) => x + share * b[k]);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const unit = (a) => a.map((x) => x / Math.hypot(...a));
 
 async function inflate(text) {
   const packed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));

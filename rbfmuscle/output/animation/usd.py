@@ -1,17 +1,14 @@
 """A moving run as one USD file (.usdc): meshes whose points are sampled over time, bones that move as rigid bodies."""
 
-from __future__ import annotations
-
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.output.animation.moving import FRAMES_A_SECOND, MovingPart, MovingRun
 from rbfmuscle.output.appearance import linear_rgb, rgb
+from rbfmuscle.output.saved import FRAMES_A_SECOND, MovingPart, MovingRun
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingPartError
 
@@ -28,11 +25,9 @@ def check_usd() -> None:
 def write_usd(path: Path, run: MovingRun) -> None:
     """Write a run as one ``.usdc`` file; usd-core must be there (`check_usd`).
 
-    Notes
-    -----
-    Time codes count 24 a second. A surface that keeps its vertices has its topology once and its points at every
-    time; another one has both at every time. Lengths stay in the run's unit, named by ``metersPerUnit``;
-    the root brings superior to z.
+    Time codes count 24 a second. A surface that keeps its vertices has its topology once and its points at every time;
+    another one has both at every time. Lengths stay in the run's unit, named by ``metersPerUnit``; the root brings
+    superior to z.
     """
     from pxr import Gf, Usd, UsdGeom
 
@@ -68,8 +63,14 @@ def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
     for k, (vertices, faces) in enumerate(zip(part.vertices, part.faces)):
         at = (codes[k],) if part.poses is None else ()
         if k == 0 or not part.keeps_vertices:
-            _set_faces(mesh, faces, () if part.keeps_vertices else at)
-        _set_points(mesh, vertices, at)
+            topology_at = () if part.keeps_vertices else at
+            corners = np.ascontiguousarray(faces, dtype=np.int32).ravel()
+            mesh.CreateFaceVertexCountsAttr().Set(Vt.IntArray(len(faces), 3), *topology_at)
+            mesh.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(corners), *topology_at)
+        points = np.ascontiguousarray(vertices, dtype=np.float32)
+        extent = np.stack([points.min(axis=0), points.max(axis=0)])
+        mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(points), *at)
+        mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), *at)
     if part.poses is not None:
         # Without normals a surface that is no subdivision surface is drawn facet by facet.
         normals = np.ascontiguousarray(vertex_normals(part.vertices[0], part.faces[0]), dtype=np.float32)
@@ -78,24 +79,6 @@ def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
         place = mesh.AddTransformOp()
         for code, pose in zip(codes, part.poses):
             place.Set(Gf.Matrix4d(pose.T), *((code,) if part.moves else ()))
-
-
-def _set_faces(mesh: Any, faces: Integers, at: tuple[float, ...]) -> None:
-    """Set triangles, at a time code or for all times."""
-    from pxr import Vt
-
-    mesh.CreateFaceVertexCountsAttr().Set(Vt.IntArray(len(faces), 3), *at)
-    numbers = np.ascontiguousarray(faces, dtype=np.int32).ravel()
-    mesh.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(numbers), *at)
-
-
-def _set_points(mesh: Any, vertices: Floats, at: tuple[float, ...]) -> None:
-    from pxr import Vt
-
-    points = np.ascontiguousarray(vertices, dtype=np.float32)
-    extent = np.stack([points.min(axis=0), points.max(axis=0)])
-    mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(points), *at)
-    mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), *at)
 
 
 def identifier(name: str, used: set[str]) -> str:
