@@ -211,9 +211,9 @@ def normals_loop(y, columns, slopes, normals, out):
 
 
 @compiled(error_model="numpy")
-def _rows_loop(index, normal, response, columns, shares, rows):
-    """Motion along its normal that each contact makes for a unit of each region's whitened pressure."""
-    for c in range(len(index)):
+def _rows_loop(start, index, normal, response, columns, shares, rows):
+    """Motion along its normal that each contact from ``start`` on makes for a unit of each whitened pressure."""
+    for c in range(start, len(index)):
         i = index[c]
         for r in range(response.shape[0]):
             value = 0.0
@@ -228,10 +228,10 @@ def _rows_loop(index, normal, response, columns, shares, rows):
 
 
 @compiled(error_model="numpy")
-def _answers_loop(index, columns, shares, inverse, answers):
-    """Motion of the nodes for a unit force at each contact: rows of W A⁻¹."""
-    answers[:] = 0.0
-    for c in range(len(index)):
+def _answers_loop(start, index, columns, shares, inverse, answers):
+    """Motion of the nodes for a unit force at each contact from ``start`` on: rows of W A⁻¹."""
+    for c in range(start, len(index)):
+        answers[c] = 0.0
         for k in range(columns.shape[1]):
             share, row = shares[index[c], k], inverse[columns[index[c], k]]
             for j in range(len(row)):
@@ -239,11 +239,9 @@ def _answers_loop(index, columns, shares, inverse, answers):
 
 
 @compiled(error_model="numpy")
-def _pairs_loop(index, normal, rows, answers, columns, shares, yielding):
-    """Motion at contact c for a unit force at contact d, the regions' volumes kept."""
-    size = len(index)
-    gram = np.empty((size, size))
-    for c in range(size):
+def _pairs_loop(start, index, normal, rows, answers, columns, shares, gram, own):
+    """Motion at contact c >= ``start`` for a unit force at contact d, the regions' volumes kept; ``own`` for d = c."""
+    for c in range(start, len(index)):
         for d in range(c + 1):
             value = 0.0
             for k in range(columns.shape[1]):
@@ -253,10 +251,7 @@ def _pairs_loop(index, normal, rows, answers, columns, shares, yielding):
                 value -= rows[c, r] * rows[d, r]
             gram[c, d] = value
             gram[d, c] = value
-    least = 1e-7 * np.abs(np.diag(gram)).max()
-    for c in range(size):
-        gram[c, c] += least + yielding[c]
-    return gram
+        own[c] = gram[c, c]
 
 
 @compiled(error_model="numpy")
@@ -382,6 +377,9 @@ def contact_loop(
     is_chosen = force > 0.0
     chosen = np.flatnonzero(is_chosen)
     lacking = need.copy()
+    done, most_chosen = 0, len(chosen) + rounds * batch
+    rows, answers = np.empty((most_chosen, response.shape[0])), np.empty((most_chosen, len(push)))
+    gram, own = np.empty((most_chosen, most_chosen)), np.empty(most_chosen)
     for _ in range(rounds):
         added = _deepest(lacking, is_chosen, tolerance, batch)
         if len(added) == 0 and len(chosen) == 0:
@@ -389,16 +387,20 @@ def contact_loop(
         for c in added:
             is_chosen[c] = True
         chosen = np.concatenate((chosen, added))
-        rows = np.empty((len(chosen), response.shape[0]))
-        _rows_loop(index[chosen], normal[chosen], response, columns, shares, rows)
-        answers = np.empty((len(chosen), len(push)))
-        _answers_loop(index[chosen], columns, shares, inverse, answers)
-        gram = _pairs_loop(index[chosen], normal[chosen], rows, answers, columns, shares, yielding[chosen])
+        points, ways = index[chosen], normal[chosen]
+        _rows_loop(done, points, ways, response, columns, shares, rows)
+        _answers_loop(done, points, columns, shares, inverse, answers)
+        _pairs_loop(done, points, ways, rows, answers, columns, shares, gram, own)
+        done, least = len(chosen), 0.0
+        for k in range(done):
+            least = max(least, 1e-7 * abs(own[k]))
+        for k in range(done):
+            gram[k, k] = own[k] + least + yielding[chosen[k]]
         strength = force[chosen]
         solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance, most[chosen])
         for k in range(len(chosen)):
             force[chosen[k]] = strength[k]
-        _push_loop(normal[chosen], strength, rows, answers, response, push, taken)
+        _push_loop(ways, strength, rows, answers, response, push, taken)
         if len(added) == 0:
             break
         _lacking_loop(index, normal, need, columns, shares, push, lacking)
