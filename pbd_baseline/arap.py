@@ -28,22 +28,9 @@ LEAST_WEIGHT = 1e-9
 
 
 class ARAP:
-    """ARAP energy of a mesh with its current rotations.
+    """ARAP energy of a mesh, with the rotation (w, x, y, z) of each vertex in ``quaternions`` (n, 4).
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        Rest positions.
-    topology : Topology
-    stiffer : float or (e,) ndarray
-        Factor of the edges' weights.
-
-    Attributes
-    ----------
-    quaternions : (n, 4) ndarray
-        Rotation of each vertex, (w, x, y, z); identity at rest.
-    laplacian : (n, n) scipy.sparse.csc_matrix
-        Cotangent weights, clamped from below.
+    The ``laplacian`` (n, n) has cotangent weights, clamped from below, times the edges' factor ``stiffer``.
     """
 
     def __init__(self, vertices: Floats, topology: Topology, *, stiffer: Floats | float = 1.0) -> None:
@@ -73,12 +60,8 @@ class ARAP:
 class ARAPConstraint:
     """The ARAP energy as PBD constraints, a vector one an edge: the paper's section 6.2, first option.
 
-    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component, compliance
-    1 / w_ij: at convergence the gradient of the sum is that of the ARAP energy.
-
-    Parameters
-    ----------
-    arap : ARAP
+    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component, compliance 1 /
+    w_ij: at convergence the gradient of the sum is that of the ARAP energy.
     """
 
     def __init__(self, arap: ARAP) -> None:

@@ -25,16 +25,8 @@ class BendingConstraint:
     bound towards a fold; a projection turns by 90 degrees at most. grad C = (1 + C^2 / 4) grad t, with the
     gradient of t by Bridson et al. 2003: for edge (0, 1) of length |e|, wings 2 and 3 and unnormalised face
     normals n_2 and n_3, grad_2 t = -|e| n_2 / |n_2|^2 and grad_3 t = -|e| n_3 / |n_3|^2; the edge's ends take
-    the opposite, split by where the wings' feet fall.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        Rest positions.
-    edges, wings : (e, 2) ndarray of int
-        As in :class:`~pbd_baseline.topology.Topology`.
-    stiffness, compliance : float or (e,) ndarray
-        As in :class:`~pbd_baseline.constraints.EdgeConstraint`; the compliance is per radian squared.
+    the opposite, split by where the wings' feet fall. Edges and wings (e, 2) are those of a `Topology`; the
+    compliance is per radian squared.
     """
 
     def __init__(

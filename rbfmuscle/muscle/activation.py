@@ -28,19 +28,7 @@ LEAST_STRAIN = 1e-3
 
 
 class FibrePull:
-    """Gives the solid's fibres the stiffness and the slack length of an activation.
-
-    Parameters
-    ----------
-    solid : EmbeddedSolid
-        With its passive fibres.
-    muscle : Muscle
-        With keys of contraction.
-
-    Attributes
-    ----------
-    activation : float
-    """
+    """Gives the solid's fibres the stiffness and the slack length of an activation."""
 
     def __init__(self, solid: EmbeddedSolid, muscle: Muscle) -> None:
         self.solid, self.passive = solid, solid.fibres

@@ -18,15 +18,7 @@ from rbfmuscle.scene.scene import Scene
 def build_solid(
     muscle: Muscle, scene: Scene, rest: RestState, options: RBFOptions
 ) -> tuple[EmbeddedSolid, FibrePull | None]:
-    """The solid that carries the centres, and the law of its fibres where the muscle contracts.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-    rest : RestState
-    options : RBFOptions
-    """
+    """The solid that carries the centres, and the law of its fibres where the muscle contracts."""
     frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
     points, centres, owner = rest.contact_points(), len(rest.centres), rest.attached_bone
     held = centres + np.flatnonzero(owner[centres:] >= 0)

@@ -32,15 +32,7 @@ Regions = dict[tuple[str, str], Floats]
 
 
 def swept_boxes(muscle: Muscle, bones: Sequence[str], poses: Sequence[Mapping[str, Floats]]) -> Floats:
-    """Boxes (b, 2, 3) in the coordinates of some bones that hold a muscle through a motion.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    bones : sequence of str
-    poses : list of dict
-        Poses of all bones, the rest pose among them.
-    """
+    """Boxes (b, 2, 3), in the coordinates of some bones, that hold a muscle in all these poses of the bones."""
     there = np.linalg.inv(np.array([[pose[name] for pose in poses] for name in bones]))
     held = np.array([[pose[name] for pose in poses] for name in {a.holder for a in muscle.attachments}])
     bounds = np.asarray(muscle.mesh.bounds, dtype=np.float64)

@@ -185,24 +185,10 @@ def simulate_frames(
     written: Collection[int] | None = None,
     fields: Mapping[str, BoneField] | None = None,
 ) -> Iterator[Frame]:
-    """Run models through a scene's motion, from the rest pose on, and yield its frames one by one.
+    """Run models, from their rest state, through a scene's motion and yield its frames one by one.
 
-    Frames yielded before an interrupt or a ``SolveError`` stay valid.
-
-    Parameters
-    ----------
-    scene : Scene
-    models, surfaces, fields
-        As for `FrameLoop`.
-    written : collection of int, optional
-        Indices of the frames to yield; all where not given. The others are simulated and not shown.
-
-    Raises
-    ------
-    SolveError
-        If a muscle cannot be solved, naming muscle, frame and coordinates.
-    SceneError
-        If muscles overlap bones at rest and the scene's ``initial`` is ``"error"``.
+    Only frames whose index is in ``written`` are yielded, all where it is None. Frames yielded before an
+    interrupt or an error stay valid. Raises as `FrameLoop` does.
     """
     loop = FrameLoop(scene, models, fields=fields, surfaces=surfaces)
     for index, coordinates in enumerate(scene.motion.frames):
@@ -219,22 +205,9 @@ def solve_pose(
     *,
     fields: Mapping[str, BoneField] | None = None,
 ) -> Frame:
-    """Solve one pose straight from rest, so that the shapes depend on the pose alone.
+    """Solve one pose (coordinates in radian) straight from rest, so that the shapes depend on the pose alone.
 
-    Parameters
-    ----------
-    scene : Scene
-    models : collection of MuscleModel
-        In their rest state, to which they return.
-    coordinates : mapping of str to float
-        Target coordinates [radian]; absent ones are at rest.
-    fields : mapping of str to BoneField, optional
-        As for `FrameLoop`.
-
-    Raises
-    ------
-    SolveError
-        If a muscle cannot be solved.
+    The models return to their rest state. Raises SolveError if a muscle cannot be solved.
     """
     rest = [model.snapshot() for model in models]
     try:
@@ -247,8 +220,7 @@ def solve_pose(
 def _obstacles(scene, models, fields):
     """One BoneContacts for each model, with fields of the bones that it can reach.
 
-    A field covers the reach of all muscles of the scene, also those without a model here, so that it does not depend on
-    which muscles are simulated.
+    A field covers the reach of all muscles of the scene, so that it does not depend on which are simulated.
     """
     regions = find_contact_pairs(scene) if fields is None else None
     here = {model.name for model in models}

@@ -30,27 +30,14 @@ APART = 0.3
 
 
 class Fault(NamedTuple):
-    """An attachment that the motion moves into another bone, or two that it moves too far apart or together.
-
-    Attributes
-    ----------
-    muscle : str
-    bones : (str, str)
-        The bone that holds the attachment and the one that it enters, or those that hold the two.
-    rest : float
-        Distance between the two at rest [scene unit]; 0 for one that enters a bone.
-    value : float
-        Greatest depth beyond that at rest, or the distance farthest from that at rest [scene unit].
-    frame, first : int
-        Where it is so, and the first frame of too great a value.
-    """
+    """An attachment that the motion moves into another bone, or two that it moves too far apart or together."""
 
     muscle: str
-    bones: tuple[str, str]
-    rest: float
-    value: float
-    frame: int
-    first: int
+    bones: tuple[str, str]  # that holds the attachment and that it enters, or those that hold the two
+    rest: float  # distance between the two at rest [scene unit]; 0 for one that enters a bone
+    value: float  # greatest depth beyond that at rest, or the distance farthest from that at rest
+    frame: int  # where it is so
+    first: int  # first frame of too great a value
 
 
 def check_motion(scene: Scene) -> list[Fault]:

@@ -17,19 +17,11 @@ if TYPE_CHECKING:
 
 
 def plan_scene(scene: Scene) -> dict[str, Any]:
-    """Return what a run of the scene would build.
+    """Frames, sub-steps, muscles and fields of a run, by these names.
 
-    Returns
-    -------
-    dict
-        ``frames`` of the motion; ``substeps`` of the muscle that takes most; ``fields``: of each bone that a muscle can
-        reach the triangles and the share of its box; ``muscles``: name, model, vertices, ``bones`` within reach, and
-        the ``substeps`` in which it is solved.
-
-    Notes
-    -----
-    A listed bone need not be touched. A bone that comes near a muscle is not foreseen: the muscle may then
-    be solved in more sub-steps.
+    Muscles have the ``bones`` within reach and the ``substeps`` in which they are solved, fields the
+    triangles and the share of the bone's box. A listed bone need not be touched. A bone that comes near a
+    muscle is not foreseen: the muscle may then be solved in more sub-steps.
     """
     regions, poses = find_contact_pairs(scene), PoseCache(scene)
     muscles: list[dict[str, Any]] = []

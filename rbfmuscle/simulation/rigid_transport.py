@@ -31,36 +31,19 @@ ARC = 0.5
 
 
 class MuscleStatus(NamedTuple):
-    """How a muscle came to a frame.
+    """How a muscle came to a frame."""
 
-    Attributes
-    ----------
-    state : {"solved", "carried", "skipped"}
-        Carried: moved rigidly with its bones. Skipped: not moved.
-    substeps : int
-        Number of sub-steps in which it was solved.
-    """
-
-    state: str
-    substeps: int
+    state: str  # solved, carried (moved rigidly with its bones) or skipped (not moved)
+    substeps: int  # number in which it was solved
 
 
 class RigidTransport:
-    """Moves one muscle rigidly where its bones do; for a muscle that neither slides on neighbours nor contracts.
+    """Moves one muscle rigidly where its bones do; for a muscle that neither slides on neighbours nor
+    contracts.
 
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-
-    Attributes
-    ----------
-    names : list of str
-        Bones, and ends of tendons, that hold the muscle; the first holds most of it.
-    solved : mapping of str to (4, 4) ndarray, or None
-        Poses of the bones when the muscle was solved last; None before it was.
-    since : (4, 4) ndarray
-        Rigid motion since its surface was drawn last.
+    ``names`` holds the bones, and ends of tendons, that hold it, first that of most of it; ``solved`` their
+    poses when it was solved last, or None; ``since`` the rigid motion (4, 4) since its surface was drawn
+    last.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene) -> None:

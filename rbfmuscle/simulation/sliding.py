@@ -31,24 +31,10 @@ Coordinates = dict[str, float]
 
 
 class Sliding:
-    """Muscles that exchange their surfaces, in all sliding pairs of a scene.
+    """Muscles, in their rest state, that exchange their surfaces in all sliding pairs of a scene.
 
-    Parameters
-    ----------
-    scene : Scene
-        With ``sliding`` options.
-    steppers : list of MuscleStepper
-        In their rest state.
-
-    Attributes
-    ----------
-    pairs : dict of (str, str) to (float, float)
-        For each pair that met by the last drawings: overlap, and RMS gap opened where they touched at rest.
-
-    Raises
-    ------
-    SceneError
-        If ``pairs`` names an unknown muscle.
+    ``pairs`` has, for each that met by the last drawings, the overlap, and the RMS gap opened where they
+    touched at rest. Raises SceneError if the scene's ``pairs`` name an unknown muscle.
     """
 
     def __init__(self, scene: Scene, steppers: list[MuscleStepper]) -> None:

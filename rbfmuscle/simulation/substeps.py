@@ -43,17 +43,8 @@ class SubSteps:
 
     No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far against a
     bone. Where one coordinate moves alone, sub-steps end at multiples of that angle, however the frames are
-    spaced: a muscle that can settle in several ways then comes to a pose by the same path.
-
-    Parameters
-    ----------
-    scene : Scene
-    muscle : Muscle, optional
-        Cut as this muscle's own bones move against each other; as the whole scene does where not given.
-    bones : sequence of str
-        Other bones that it can meet.
-    poses : callable, optional
-        Poses of the bones for coordinates; those of the scene where not given.
+    spaced: a muscle that can settle in several ways then comes to a pose by the same path. For one ``muscle``
+    only its own bones and the others that it can meet, ``bones``, count.
     """
 
     def __init__(
@@ -87,13 +78,7 @@ class SubSteps:
         self._travel, self._corners = TRAVEL * np.array(sizes), np.array(corners).reshape(-1, 8, 3)
 
     def split(self, before: Coordinates, after: Coordinates) -> list[Coordinates]:
-        """Coordinates of the sub-steps from one frame to the next, ``before`` left out and ``after`` last.
-
-        Returns
-        -------
-        list of dict
-            Empty where nothing moves.
-        """
+        """Coordinates of the sub-steps to the next frame, ``before`` left out; empty where nothing moves."""
         before, after = completed(self.scene, before), completed(self.scene, after)
         moving = [k for k in {*before, *after} if before.get(k, 0.0) != after.get(k, 0.0)]
         if not moving:
@@ -220,13 +205,7 @@ def _moving_apart(scene: Scene, bones: Sequence[str]) -> set[str]:
 
 
 def check_substeps(scene: Scene) -> None:
-    """Refuse a motion of more sub-steps than `MOST_SUBSTEPS`, before anything grows with their number.
-
-    Raises
-    ------
-    SceneError
-        With the number, and the coordinate that takes most of it.
-    """
+    """Raise SceneError for a motion of more than `MOST_SUBSTEPS`, before anything grows with their number."""
     cut, frames, rest = SubSteps(scene), scene.motion.frames, rest_coordinates(scene)
     for name in sorted({name for frame in frames for name in frame}):
         start = rest.get(name, 0.0)
