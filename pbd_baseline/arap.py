@@ -5,21 +5,13 @@ at rest, each R_i the rotation that makes E least (Sorkine and Alexa 2007). With
 gradient of E is its partial derivative with R frozen: grad_i E = sum_j w_ij (e_ij - (R_i + R_j) E_ij / 2).
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from pbd_baseline.topology import colour
+from pbd_baseline.topology import Topology, colour
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import cotangent_laplacian, graph_laplacian
 from rbfmuscle.geometry.rotations import quaternion_matrix, rotate
 from rbfmuscle.jit import compiled
-
-if TYPE_CHECKING:
-    from pbd_baseline.topology import Topology
-
 
 # Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.
 ROTATION_STEPS = 8

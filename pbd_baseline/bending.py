@@ -1,7 +1,5 @@
 """Dihedral bending: constraints of one colour are gathered in blocks and projected by vector instructions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pbd_baseline.topology import colour, spread

@@ -6,8 +6,6 @@ is the hard constraint of PBD, and k in [0, 1] its stiffness (Müller 2007). w i
 vertex is held.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

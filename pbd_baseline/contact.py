@@ -1,7 +1,5 @@
 """Collision response of a mesh to the half-spaces of its contacts."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats

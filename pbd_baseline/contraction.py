@@ -1,7 +1,5 @@
 """Rest lengths of edges along and across the fibres: slack fibres of a passive muscle, active ones, tendon."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pbd_baseline.rest import RestState

@@ -1,7 +1,5 @@
 """Directions of the fibres, softness of edges along them, and thickness of the muscle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

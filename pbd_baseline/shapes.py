@@ -1,7 +1,5 @@
 """What gives a mesh muscle its shape: one class for each method of the paper."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -3,8 +3,6 @@
 Harmonic weights (p = 2) are singular at the rim of a small patch that is held, and stretch edges there fivefold.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu

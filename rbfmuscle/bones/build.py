@@ -5,8 +5,6 @@ outer band about the surface or errs; half blocks in the outer band; fine cells,
 the inner band.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """What a bone's mesh allows: which triangles count, and where the sign of the distance comes from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -3,8 +3,6 @@
 The tree is a balanced binary heap over triangles in an order that halves them along the longest extent.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import NamedTuple
 

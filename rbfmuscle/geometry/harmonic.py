@@ -1,7 +1,5 @@
 """Harmonic weights on a closed mesh: how much of each bone's motion a surface point takes over."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Coordinates of a rest mesh that stay the same wherever its scene lies."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

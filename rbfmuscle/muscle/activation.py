@@ -10,8 +10,6 @@ more. At the slack length a fully active fibre bears `PEAK` shear moduli (Blemke
 spring that this tension stretches by ``tendon_strain``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 

@@ -1,7 +1,5 @@
 """Builds the elastic solid of an RBF muscle from its mesh, its attachments and its settings."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.rest_frame import RestFrame

@@ -1,7 +1,5 @@
 """The mesh of a muscle's material that shows it: where its vertices lie at rest."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats

@@ -1,7 +1,5 @@
 """How an RBF muscle is shown: its field refitted, the bones cut away, the closed surface brought onto the level set."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import NamedTuple, TypedDict

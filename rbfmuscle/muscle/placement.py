@@ -1,7 +1,5 @@
 """Where the centres and samples of an RBF muscle lie, and the fit that its field is made by."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import asdict, replace
 from typing import NamedTuple

@@ -6,8 +6,6 @@ exact distances at the nodes of a lattice: smoothed over about a cell (a kernel 
 its gradient turns steadily. Only blocks of the lattice that are asked for are ever filled.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers

@@ -20,8 +20,6 @@ Each iteration minimises over R and t at each point, then over y with the matrix
 pressures are kept from iteration to iteration, so that the fixed point of the iteration is the equilibrium.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple

@@ -6,8 +6,6 @@ muscle on a bone has not. So the solid settles with contacts that yield a little
 volumes kept. The next sub-step starts from the settled shape, not from the lifted one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 

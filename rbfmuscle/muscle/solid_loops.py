@@ -1,7 +1,5 @@
 """Loops over the quadrature points and the contacts of a muscle's elastic solid."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Steps of the iteration that brings a muscle's elastic solid to equilibrium, compiled, and its acceleration."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats

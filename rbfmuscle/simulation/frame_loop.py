@@ -1,7 +1,5 @@
 """The frame loop: any muscle model against any bones."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager

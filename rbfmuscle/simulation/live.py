@@ -1,11 +1,8 @@
 """A scene whose coordinates are set interactively."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,14 +10,11 @@ from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
+from rbfmuscle.simulation.frame import Frame, MuscleModel
 from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.validation import UsageError
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.frame import Frame, MuscleModel
-
 
 # Range of a coordinate around rest where the scene's motion does not exceed it [degree, mm].
 FREE_RANGE = 30.0

@@ -1,11 +1,9 @@
 """Checks a motion before the run: attachments that it moves into another bone, too far apart or too close together."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,10 +12,8 @@ from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import Finding
 from rbfmuscle.scene.motion import bone_poses
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 
 # Greatest numbers of frames and of vertices of an attachment that are checked.
 MOST_FRAMES, MOST_VERTICES = 25, 60

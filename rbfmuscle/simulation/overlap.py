@@ -1,18 +1,12 @@
 """What overlaps at rest, as bones and muscles come from different sources: kept, resolved or refused."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.simulation.stepper import MuscleStepper
 from rbfmuscle.validation import SceneError
-
-if TYPE_CHECKING:
-    from rbfmuscle.simulation.stepper import MuscleStepper
-
 
 # Depth [mm] below which nothing overlaps, and the movement [mm] below which a muscle has settled.
 DEPTH = 0.02

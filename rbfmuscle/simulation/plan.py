@@ -1,19 +1,15 @@
 """What a run of a scene would build and solve, without building it."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rbfmuscle.scene.motion import completed, rest_coordinates
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import bone_regions, find_contact_pairs
 from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
 
 
 def plan_scene(scene: Scene) -> dict[str, Any]:

@@ -4,23 +4,18 @@ Such a muscle keeps its shape and moves with its bones. The relative pose of the
 solve. If another bone comes near, the muscle is solved.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.scene.motion import turned_angle
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.contact import BoneContacts
-    from rbfmuscle.simulation.frame import MuscleModel
-
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.frame import MuscleModel
 
 # Bones farther than this [mm] from a muscle do not act on it.
 CLEAR = 2.0

@@ -8,24 +8,19 @@ of two muscles may use half of the gap between them, or moves back by half of th
 on the order of the muscles or on the number of threads.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
 from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
 from rbfmuscle.simulation.sliding_pair import BoneLink, SlidingLimits, SlidingPair
 from rbfmuscle.simulation.stepper import MuscleStepper, TimedDrawing
 from rbfmuscle.validation import SceneError
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
 
 Coordinates = dict[str, float]
 

@@ -8,25 +8,21 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fields import Field
 from rbfmuscle.scene.motion import interpolate, shown_value, step_angle, unit_sign
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
-from rbfmuscle.simulation.frame import Drawing, Event, ModelSurface
+from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.frame import Drawing, Event, ModelSurface, MuscleModel
 from rbfmuscle.simulation.rigid_transport import MuscleStatus, RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 from rbfmuscle.simulation.tunnelling import find_crossings, one_sided_planes, only_grazed, rotate_with_bone
 from rbfmuscle.validation import NotFiniteError, SolveError
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.contact import BoneContacts
-    from rbfmuscle.simulation.frame import MuscleModel
-
 
 # Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
 TOUCH = 0.1

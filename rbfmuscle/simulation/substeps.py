@@ -1,10 +1,9 @@
 """How the way from one frame to the next is cut into sub-steps."""
 
-from __future__ import annotations
-
 import itertools
 import math
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -19,15 +18,10 @@ from rbfmuscle.scene.motion import (
     step_angle,
     turned_angle,
 )
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
-
 
 Coordinates: TypeAlias = dict[str, float]
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.

@@ -6,24 +6,19 @@ as the text means it: below cos 135 degrees); it misses most short crossings. Th
 by sphere tracing (Hart 1996) in the bone's distance field and cannot miss what is thicker than its tolerance.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rotations import rigid_fit
+from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, Planes
-
-if TYPE_CHECKING:
-    from rbfmuscle.bones.sdf import BoneSDF
-    from rbfmuscle.scene.options import TunnellingOptions
-    from rbfmuscle.simulation.frame import MuscleModel
-
+from rbfmuscle.simulation.frame import MuscleModel
 
 # 135 degrees, the bound of the angle test.
 RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
