@@ -74,15 +74,9 @@ class ARAPConstraint:
     def project(self, points: Floats, inverse_mass: Floats, *, time: float = 1.0) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place, with the arap's rotations."""
         _constraint_loop(
-            points,
-            inverse_mass,
-            self.edges,
-            self.rest,
-            self.arap.quaternions,
-            self.compliance,
-            time,
+            points, inverse_mass, self.edges, self.rest, self.arap.quaternions, self.compliance, time,
             self.multiplier,
-        )
+        )  # fmt: skip
 
 
 @compiled

@@ -61,15 +61,9 @@ class BendingConstraint:
     def project(self, points: Floats, inverse_mass: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""
         _sweep_loop(
-            points,
-            inverse_mass,
-            self.colours,
-            self.members,
-            self.rest,
-            self.stiffness,
-            self.compliance,
+            points, inverse_mass, self.colours, self.members, self.rest, self.stiffness, self.compliance,
             self.multiplier,
-        )
+        )  # fmt: skip
 
 
 @compiled(error_model="numpy")

@@ -57,15 +57,9 @@ class EdgeConstraint:
     def project(self, points: Floats, inverse_mass: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""
         _edge_loop(
-            points,
-            inverse_mass,
-            self.edges,
-            self.rest,
-            self.limits,
-            self.stiffness,
-            self.compliance,
+            points, inverse_mass, self.edges, self.rest, self.limits, self.stiffness, self.compliance,
             self.multiplier,
-        )
+        )  # fmt: skip
 
 
 class VolumeConstraint:

@@ -51,19 +51,11 @@ class RestState:
             )
         attached_bone = np.concatenate([held_by.centres, held_by.samples])
         return cls(
-            points,
-            frame.directions(centres.normals),
-            frame.points(samples.points),
-            samples.control_faces,
-            fit,
-            held_by.bones,
-            attached_bone,
-            free,
-            held,
-            float(muscle.mesh.volume),
+            points, frame.directions(centres.normals), frame.points(samples.points), samples.control_faces, fit,
+            held_by.bones, attached_bone, free, held, float(muscle.mesh.volume),
             # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
             frame.directions(_principal_axes(samples.points)),
-        )
+        )  # fmt: skip
 
     def contact_points(self) -> np.ndarray:
         """Centres, then samples, (K + S, 3)."""

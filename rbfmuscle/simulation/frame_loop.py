@@ -16,6 +16,7 @@ from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
 from rbfmuscle.simulation.overlap import resolve_initial_overlap
 from rbfmuscle.simulation.rigid_transport import RigidTransport
+from rbfmuscle.simulation.sliding import Sliding
 from rbfmuscle.simulation.stepper import MuscleStepper, TimedDrawing
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 
@@ -77,7 +78,7 @@ class FrameLoop:
         self._next_index, self._wall, self._blas = 0, 0.0, ThreadpoolController()
         with self.working():
             each(resolve_initial_overlap, self.steppers)
-            self._sliding = _sliding(scene, self.steppers)
+            self._sliding = None if scene.sliding is None else Sliding(scene, self.steppers)
 
     def advance(self, coordinates: Mapping[str, float]) -> Frame:
         """Advance to the given coordinates and return the frame.
@@ -196,25 +197,6 @@ def simulate_frames(
             loop.skip(coordinates)
 
 
-def solve_pose(
-    scene: Scene,
-    models: Collection[MuscleModel],
-    coordinates: Mapping[str, float],
-    *,
-    fields: Mapping[str, BoneField] | None = None,
-) -> Frame:
-    """Solve one pose (coordinates in radian) straight from rest, so that the shapes depend on the pose alone.
-
-    The models return to their rest state. Raises SolveError if a muscle cannot be solved.
-    """
-    rest = [model.snapshot() for model in models]
-    try:
-        return FrameLoop(scene, models, fields=fields).advance(coordinates)
-    finally:
-        for model, state in zip(models, rest):
-            model.restore(state)
-
-
 def _obstacles(scene, models, fields):
     """One BoneContacts for each model, with fields of the bones that it can reach.
 
@@ -229,12 +211,3 @@ def _obstacles(scene, models, fields):
     for model in models:
         reached = [fields.get(n) if regions is None or (model.name, n) in regions else None for n in names]
         yield BoneContacts(names, reached, contact_bone=model.contact_bone)
-
-
-def _sliding(scene, steppers):
-    """Sliding between muscles, or None."""
-    if scene.sliding is None:
-        return None
-    from rbfmuscle.simulation.sliding import Sliding
-
-    return Sliding(scene, steppers)

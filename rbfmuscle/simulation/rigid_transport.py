@@ -59,11 +59,7 @@ class RigidTransport:
         return not any(self._moves(before, after, root, name) for name in self.names[1:])
 
     def try_carry(
-        self,
-        model: MuscleModel,
-        contacts: BoneContacts,
-        before: dict[str, Floats],
-        after: dict[str, Floats],
+        self, model: MuscleModel, contacts: BoneContacts, before: dict[str, Floats], after: dict[str, Floats]
     ) -> bool:
         """Move the muscle rigidly from one set of poses to the next if it need not be solved; return whether it was."""
         self.solved, root = self.solved or before, self.names[0]
