@@ -52,8 +52,8 @@ class ARAP:
 class ARAPConstraint:
     """The ARAP energy as PBD constraints, a vector one an edge: the paper's section 6.2, first option.
 
-    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component, compliance 1 /
-    w_ij: at convergence the gradient of the sum is that of the ARAP energy.
+    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component, compliance 1 / w_ij: at
+    convergence the gradient of the sum is that of the ARAP energy.
     """
 
     def __init__(self, arap: ARAP) -> None:

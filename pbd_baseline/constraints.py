@@ -23,9 +23,9 @@ TINY = 1e-12
 class EdgeConstraint:
     """Keeps edge lengths: C = |x_i - x_j| - l, grad_i C = (x_i - x_j) / |x_i - x_j| = -grad_j C.
 
-    ``edges`` (e, 2) has each once. One PBD projection removes the share ``stiffness`` of an error;
-    ``compliance`` is that of XPBD times inverse time, 0 is hard. Beyond the ratios ``limits`` of length to
-    rest length an edge is hard whatever its stiffness.
+    ``edges`` (e, 2) has each once. One PBD projection removes the share ``stiffness`` of an error; ``compliance`` is
+    that of XPBD times inverse time, 0 is hard. Beyond the ratios ``limits`` of length to rest length an edge is hard
+    whatever its stiffness.
     """
 
     def __init__(
@@ -63,9 +63,7 @@ class EdgeConstraint:
 
 
 class VolumeConstraint:
-    """Keeps the volume in closed, outward faces: C = V(x) - V_0, V = (1/6) sum a . (b x c), grad_a V = (1/6)
-    sum b x c.
-    """
+    """Keeps the enclosed volume: C = V(x) - V_0, V = (1/6) sum a . (b x c), grad_a V = (1/6) sum b x c."""
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         self.faces = np.ascontiguousarray(faces)

@@ -16,17 +16,16 @@ TENDON_WEIGHT = 20.0
 class MeshFibres:
     """Fibres of a mesh muscle: a frame along the fibre at each edge, and what the edge should be in it.
 
-    An edge with the rest vector E, the fibre direction a and the target stretches t along and s across (means
-    of its two vertices) is wanted as T E, T = t aaᵀ + s (1 - aaᵀ). With λ the stretch against the scan and a
-    the activation,
+    An edge with the rest vector E, the fibre direction a and the target stretches t along and s across (means of its
+    two vertices) is wanted as T E, T = t aaᵀ + s (1 - aaᵀ). With λ the stretch against the scan and a the activation,
 
         t = min(max(λ, lower), upper),    s = (t + a (λ - t))^(-1/2).
 
-    A passive fibre is slack, where nothing pulls, between its stretch in the scan, 1, and 1 / stretch_at_rest
-    (or 1 / slack, where the muscle does not say). Activation moves both ends of this band in proportion
-    towards the stretch at which a fully active fibre has no tension. An active fibre pulls along itself
-    alone: with the girth of t it would push outwards too, and the widest place of a belly would take all the
-    shortening. Tendon keeps its length, but may stretch by its strain at full activation.
+    A passive fibre is slack, where nothing pulls, between its stretch in the scan, 1, and 1 / stretch_at_rest (or
+    1 / slack, where the scene does not say). Activation moves both ends of this band in proportion towards the stretch
+    at which a fully active fibre has no tension. An active fibre pulls along itself alone: with the girth of t it would
+    push outwards too, and the widest place of a belly would take all the shortening. Tendon keeps its length, but may
+    stretch by its strain at full activation.
     """
 
     def __init__(self, muscle: Muscle, rest: RestState, *, slack: float) -> None:

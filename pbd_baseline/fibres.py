@@ -22,8 +22,8 @@ def fibre_directions(
 ) -> np.ndarray:
     """Unit direction (n, 3) of the fibres at each point, zero where there is none.
 
-    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the last
-    bone's weight.
+    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the last bone's
+    weight.
     """
     if not fibres:
         return _normalised(along)

@@ -37,8 +37,8 @@ STEP_ANGLE = math.radians(2.0)
 class PBDMuscle:
     """A mesh muscle of any of the paper's kinds; implements ``rbfmuscle.simulation.frame.MuscleModel``.
 
-    Raises SceneError on a muscle that nothing holds, MeshError if its mesh is not a closed, consistently
-    oriented surface.
+    Raises SceneError on a muscle that nothing holds, MeshError if its mesh is not a closed, consistently oriented
+    surface.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene, options: PBDOptions | None = None) -> None:

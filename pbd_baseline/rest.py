@@ -42,8 +42,8 @@ class RestState:
     def from_muscle(cls, muscle: Muscle, scene: Scene, options: PBDOptions) -> RestState:
         """Measure a muscle of a scene.
 
-        Raises MeshError if its mesh is not closed, or no smooth weights can be found on it, SceneError if
-        nothing holds it.
+        Raises MeshError if its mesh is not closed, or no smooth weights can be found on it, SceneError if nothing
+        holds it.
         """
         if not muscle.attachments:
             raise SceneError(f"muscle {muscle.name!r} has no attachment, give attach a place on two bones")

@@ -19,8 +19,7 @@ class Topology:
 
     faces: np.ndarray  # (m, 3)
     edges: np.ndarray  # (e, 2) each undirected edge once, the smaller vertex first
-    # (e, 2) vertices opposite to an edge: of the face that runs along it, then of the one that runs against
-    # it
+    # (e, 2) vertices opposite to an edge: in the face that runs along it, then in the one against it
     wings: np.ndarray
     ring_start: np.ndarray  # (n + 1,)
     ring: np.ndarray  # (2 e,) sorted neighbours of vertex i: ring[ring_start[i] : ring_start[i + 1]]
@@ -76,10 +75,9 @@ def _one_rings(edges, count):
 def colour(members: Integers, count: int) -> tuple[Integers, Integers]:
     """Order constraints, given by their vertices (c, k), so that those of one colour share no vertex.
 
-    Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints of one
-    colour may be projected in any order, or at once, with the same result to the last bit. Returns the order
-    (c,), by colour and then by the first vertex for the sake of the cache, and where each colour starts,
-    (colours + 1,).
+    Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints of one colour may
+    be projected in any order, or at once, with the same result to the last bit. Returns the order (c,), by colour and
+    then by the first vertex for the sake of the cache, and where each colour starts, (colours + 1,).
     """
     members = np.ascontiguousarray(members, dtype=np.int64)
     if len(members) == 0:

@@ -134,13 +134,12 @@ def build_cells(
     region: Floats | None = None,
     doubtful: Booleans | None = None,
 ) -> tuple[FieldData, bool]:
-    """What queries read: sparse cells about the mesh of an exact tree; and whether signs agree with the
-    distances.
+    """What queries read: sparse cells about the mesh of an exact tree; and whether signs agree with the distances.
 
-    ``spacing`` is the edge of a fine cell; fine cells cover all points nearer than ``band``, coarse ones
-    serve outside of the box ``region`` (2, 3). ``inside`` gives the sign where the mesh itself has no
-    reliable one, ``doubtful`` (m,) marks faces whose pseudonormals are not to be believed. Records are in
-    single precision and relative to the grid's origin, where that loses nothing.
+    ``spacing`` is the edge of a fine cell; fine cells cover all points nearer than ``band``, coarse ones serve
+    outside of the box ``region`` (2, 3). ``inside`` gives the sign where the mesh itself has no reliable one,
+    ``doubtful`` (m,) marks faces whose pseudonormals are not to be believed. Records are in single precision and
+    relative to the grid's origin, where that loses nothing.
     """
     block, coarse = BLOCK * spacing, BLOCK * BLOCK * spacing
     low, high = exact.vertices.min(axis=0), exact.vertices.max(axis=0)

@@ -31,8 +31,8 @@ class BoneMesh:
 def prepare_bone(vertices: Floats, faces: Integers, *, name: str = "bone") -> BoneMesh:
     """Clean arrays for a distance field: no degenerate or duplicate faces, outward as far as can be told.
 
-    Closed meshes are taken as they are. Of others equal vertices are merged, and patches oriented alike.
-    Raises MeshError on NaN, indices out of range, an empty mesh, or one whose faces all have no area.
+    Closed meshes are taken as they are. Of others equal vertices are merged, and patches oriented alike. Raises
+    MeshError on NaN, indices out of range, an empty mesh, or one whose faces all have no area.
     """
     vertices, faces = check_mesh(vertices, faces, name=name)
     mesh = BoneMesh(vertices, faces, np.zeros(len(faces), dtype=np.bool_))

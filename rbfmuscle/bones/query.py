@@ -60,8 +60,8 @@ class Found(NamedTuple):
 
 @compiled(error_model="numpy", inline="always")
 def _square(n, x, y, z, records):
-    """Squared distance to record n of a point relative to the origin, in single precision; without branches,
-    as they are a toss-up.
+    """Squared distance to record n of a point relative to the origin, in single precision; without branches, as they
+    are a toss-up.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     qx, qy, qz = np.float32(x) - records[n, 0], np.float32(y) - records[n, 1], np.float32(z) - records[n, 2]

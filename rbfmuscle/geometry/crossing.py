@@ -41,8 +41,8 @@ class FaceTree:
     def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
         """Which triangles cross others, as `crossing_faces` says, for places of the vertices (n, 3) now.
 
-        With ``among`` (m,) only pairs with one of these, or with one at a corner whose triangles do not lie
-        side by side.
+        With ``among`` (m,) only pairs with one of these, or with one at a corner whose triangles do not lie side by
+        side.
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         faces, count = self._corners, len(self._corners)
@@ -78,8 +78,8 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
     """Which triangles (m,) cross others of the same surface.
 
     An edge crosses a triangle where its ends lie on either side of it and its line passes through the inside.
-    Triangles that share an edge are never counted, those that share a corner are where the far edge of one
-    goes through the other. Triangles that lie in one plane and only overlap do not cross.
+    Triangles that share an edge are never counted, those that share a corner are where the far edge of one goes
+    through the other. Triangles that lie in one plane and only overlap do not cross.
     """
     if len(faces) == 0:
         return np.zeros(0, dtype=bool)

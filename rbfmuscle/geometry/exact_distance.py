@@ -245,10 +245,10 @@ def record_feature(records, n, x, y, z):
 def nearest_triangle(tree, at, best, square, slack, stack):
     """Record of the triangle of a `Tree` nearest to a point ``at``, and the squared distance.
 
-    ``best`` and ``square`` are a record known to be as near as that, or -1 and the squared reach. Of
-    triangles whose squared distances differ by a smaller share than ``slack`` that of the least face number
-    is taken, so that rounding and the order of the questions decide nothing. ``stack`` is two (STACK,) arrays
-    to work in, of int64 and float64.
+    ``best`` and ``square`` are a record known to be as near as that, or -1 and the squared reach. Of triangles whose
+    squared distances differ by a smaller share than ``slack`` that of the least face number is taken, so that
+    rounding and the order of the questions decide nothing. ``stack`` is two (STACK,) arrays to work in, of int64 and
+    float64.
     """
     boxes, starts, records, order = tree
     x, y, z = at

@@ -14,8 +14,8 @@ from rbfmuscle.jit import compiled
 def cotangent_laplacian(vertices: Floats, faces: Integers) -> sparse.csc_matrix:
     """Positive semi-definite cotangent Laplacian (n, n) with weights clamped from below.
 
-    Negative cotangents (22 % on a long muscle mesh) would break the maximum principle, so that weights would
-    leave [0, 1]; they are raised to a small positive share of the mean weight.
+    Negative cotangents (22 % on a long muscle mesh) would break the maximum principle, so that weights would leave
+    [0, 1]; they are raised to a small positive share of the mean weight.
     """
     rows, cols, values = [], [], []
     for k in range(3):
@@ -44,8 +44,8 @@ def graph_laplacian(first: Integers, second: Integers, weights: Floats, count: i
 def harmonic_weights(vertices: Floats, faces: Integers, groups: Sequence[Integers]) -> Floats:
     """Weights (n, groups) in [0, 1] that sum to one, by Laplace's equation on the surface for each group.
 
-    Group g has weight 1 on its own vertices and 0 on the others'; groups are disjoint. Raises LinAlgError if
-    a part of the surface has no fixed vertex.
+    Group g has weight 1 on its own vertices and 0 on the others'; groups are disjoint. Raises LinAlgError if a part
+    of the surface has no fixed vertex.
     """
     count = len(vertices)
     weights = np.zeros((count, len(groups)))
@@ -83,9 +83,8 @@ def surface_gradient(vertices: Floats, faces: Array, values: Floats) -> Floats:
 def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
     """Move each point (n, 3) by a mean of rigid motions (b, 4, 4) with weights (n, b) that sum to one.
 
-    The motions' twists (logarithms in se(3)) are averaged with the point's weights and exponentiated, so a
-    motion that all bones share moves every point rigidly, and a weight of one gives that bone's motion
-    exactly.
+    The motions' twists (logarithms in se(3)) are averaged with the point's weights and exponentiated, so a motion
+    that all bones share moves every point rigidly, and a weight of one gives that bone's motion exactly.
     """
     twists = _twists(motions)
     out = np.empty((len(points), 3))

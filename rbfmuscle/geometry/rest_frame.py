@@ -27,13 +27,11 @@ def moved_box(bounds: Floats, poses: Floats) -> Floats:
 
 
 class RestFrame:
-    """Coordinates of a rest mesh that do not change when the scene is moved, turned or written in another
-    unit.
+    """Coordinates of a rest mesh that do not change when the scene is moved, turned or written in another unit.
 
-    Sampling and binding choose between points; two that are equally good must not be told apart by rounding,
-    or a moved scene would get other centres. Here they see the same numbers, ``local`` (n, 3), wherever the
-    scene lies: vertices in a frame spanned by the first of them, in units of the mesh's size, rounded to
-    1e-8.
+    Sampling and binding choose between points; two that are equally good must not be told apart by rounding, or a
+    moved scene would get other centres. Here they see the same numbers, ``local`` (n, 3), wherever the scene lies:
+    vertices in a frame spanned by the first of them, in units of the mesh's size, rounded to 1e-8.
     """
 
     def __init__(self, vertices: Floats) -> None:
@@ -83,8 +81,8 @@ def _principal_axes(points: Floats) -> Floats:
 class BoneFrame:
     """The rest frame of a bone, along its principal axes so that a grid in it is small.
 
-    ``axes`` are rows in bone coordinates, ``size`` is the length of a local unit, and ``local`` the vertices
-    (n, 3) in these, rounded to 1e-8. They must not all lie on one line.
+    ``axes`` are rows in bone coordinates, ``size`` is the length of a local unit, and ``local`` the vertices (n, 3)
+    in these, rounded to 1e-8. They must not all lie on one line.
     """
 
     def __init__(self, vertices: Floats) -> None:

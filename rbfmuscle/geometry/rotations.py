@@ -21,8 +21,7 @@ def rigid_fit(points: Floats, targets: Floats) -> Floats:
 
 
 def smooth_displacement(rest: Floats, points: Floats, smooth: Callable[[Floats], None]) -> Floats:
-    """The shape at rest, moved as the points on the whole, and deformed as they are where that is smooth, (n,
-    3).
+    """The shape at rest, moved as the points on the whole, and deformed as they are where that is smooth, (n, 3).
 
     ``smooth`` smooths, in place, what the points do beside the rigid motion.
     """

@@ -72,8 +72,7 @@ def opposite_half_edges(faces: Integers) -> Integers:
 def split_pinched_vertices(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
     """Repeat each vertex where several fans of triangles meet, so that every fan has its own.
 
-    For closed and consistently oriented faces, which keep their order; repeated vertices come after those
-    given.
+    For closed and consistently oriented faces, which keep their order; repeated vertices come after those given.
     """
     size, twin = len(vertices), opposite_half_edges(faces)
     # the corner after the opposite side, in the neighbouring triangle, is at the same vertex
@@ -183,8 +182,8 @@ def volume_cubic(vertices, faces, direction, origin):
 
 @compiled
 def touching_balls(points, normals, steps, nearest):
-    """Radii ``steps`` (2, n) of the empty balls that touch each point from outside and inside, infinite where
-    no point limits them, and how far the nearest other point is.
+    """Radii ``steps`` (2, n) of the empty balls that touch each point from outside and inside, infinite where no
+    point limits them, and how far the nearest other point is.
     """
     for i in range(len(points)):
         steps[:, i] = np.inf

@@ -17,8 +17,8 @@ def fibre_directions(
 ) -> np.ndarray:
     """Unit direction of the fibres at each point (n, 3).
 
-    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the harmonic
-    field from the first attachment to the last; where neither has a direction the ``fallback`` (3,).
+    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the harmonic field
+    from the first attachment to the last; where neither has a direction the ``fallback`` (3,).
     """
     if fibres:
         middles = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in fibres])

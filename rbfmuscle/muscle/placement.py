@@ -62,11 +62,10 @@ class Chosen(NamedTuple):
 
 
 def choose_centres(muscle: Muscle, scene: Scene, options: RBFOptions, *, known_only: bool = False) -> Chosen:
-    """How many centres a muscle has: as many as the scene says, else as its area and the error at rest ask
-    for.
+    """How many centres a muscle has: as many as the scene says, else as its area and the error at rest ask for.
 
-    The number is kept on disk; with ``known_only`` nothing is fitted, and where it is not on disk it is the
-    least that it can be.
+    The number is kept on disk; with ``known_only`` nothing is fitted, and where it is not on disk it is the least
+    that it can be.
     """
     if options.centres:
         return Chosen(options.centres, np.nan, "as given")

@@ -25,8 +25,8 @@ LEAST_SLOPE = 0.3  # where the distance's slope is less, inside a thin bone, the
 class RoundedField:
     """The rounded distance to one bone, in place of its `BoneSDF` where a muscle settles.
 
-    ``frame`` gives the axes and the origin of the lattice, which are then those of the muscle wherever the
-    scene lies; ``edge`` is that of a cell [scene unit].
+    ``frame`` gives the axes and the origin of the lattice, which are then those of the muscle wherever the scene
+    lies; ``edge`` is that of a cell [scene unit].
     """
 
     def __init__(self, field: BoneField, frame: RestFrame, edge: float) -> None:

@@ -75,11 +75,11 @@ class SolidState(NamedTuple):
 class EmbeddedSolid:
     """An elastic solid on a lattice, with volume and contact solved inside the iteration.
 
-    Contact points (n, 3) at rest [scene unit] are ``count`` centres, then samples of the surface, each of
-    which stands for an ``area``; ``owner`` (n,) is the bone that each is attached to, -1 where it is free.
-    The bones hold the muscle by the points ``held``; ``free`` centres move. Nodes ``y`` (N, 3) are in
-    equilibrium with contacts that yield a little, ``shown`` are the same nodes with what is left in a bone
-    moved out. ``history`` holds the greatest motion of a node in each iteration of the last solve.
+    Contact points (n, 3) at rest [scene unit] are ``count`` centres, then samples of the surface, each of which
+    stands for an ``area``; ``owner`` (n,) is the bone that each is attached to, -1 where it is free. The bones hold
+    the muscle by the points ``held``; ``free`` centres move. Nodes ``y`` (N, 3) are in equilibrium with contacts that
+    yield a little, ``shown`` are the same nodes with what is left in a bone moved out. ``history`` holds the greatest
+    motion of a node in each iteration of the last solve.
     """
 
     def __init__(

@@ -75,8 +75,7 @@ class NearPoints(NamedTuple):
 
 
 class SolidContact:
-    """Contact of an `EmbeddedSolid`: forces of a linear complementarity problem through the inverse of its
-    matrix.
+    """Contact of an `EmbeddedSolid`: forces of a linear complementarity problem through the inverse of its matrix.
 
     ``area`` is that of the surface per sample, ``bones`` has their (vertices, faces) by name.
     """
@@ -93,8 +92,7 @@ class SolidContact:
     def _greatest_forces(self, area: float) -> Floats:
         """Greatest force on each contact point, less where it moves less than the median for a unit force.
 
-        What a bone that is driven into an attachment would need to lift the points beside it bends the whole
-        muscle.
+        What a bone that is driven into an attachment would need to lift the points beside it bends the whole muscle.
         """
         mobility = self.solid.mobility()
         free = self.solid.owner < 0

@@ -261,9 +261,8 @@ def mobility_loop(columns, shares, inverse, out):
 def solve_contact_forces(gram, need, force, sweeps, tolerance, most):
     """Contact forces with 0 <= force <= most and gram · force >= need where force < most.
 
-    By projected Gauss-Seidel from a first guess, in place, until no gap moves by more than the tolerance.
-    ``gram`` (c, c) is the motion at contact i for a unit force at contact j, ``need`` (c,) the motion that
-    each asks for.
+    By projected Gauss-Seidel from a first guess, in place, until no gap moves by more than the tolerance. ``gram``
+    (c, c) is the motion at contact i for a unit force at contact j, ``need`` (c,) the motion that each asks for.
     """
     lacking = need.copy()
     for c in range(len(need)):

@@ -11,8 +11,7 @@ from rbfmuscle.muscle.solid_loops import press_loop, stress_loop, swell_loop, ta
 class Anderson:
     """Anderson acceleration of a fixed-point map (Walker & Ni 2011), plain steps until it has memory.
 
-    ``memory`` steps are combined, 0 for plain ones; the first ``measured`` of a state's components are the
-    residual.
+    ``memory`` steps are combined, 0 for plain ones; the first ``measured`` of a state's components are the residual.
     """
 
     def __init__(self, memory: int, size: int, measured: int) -> None:

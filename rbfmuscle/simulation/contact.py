@@ -63,9 +63,9 @@ class Planes:
 class BoneContacts:
     """The obstacles of one muscle, in one pose.
 
-    ``fields`` has one entry for each bone of the scene, None where the muscle cannot reach it; muscles may
-    share fields. ``contact_bone`` (n,) holds the bone that each contact point is attached to, -1 where it is
-    free; attached points take no contact.
+    ``fields`` has one entry for each bone of the scene, None where the muscle cannot reach it; muscles may share
+    fields. ``contact_bone`` (n,) holds the bone that each contact point is attached to, -1 where it is free; attached
+    points take no contact.
     """
 
     def __init__(self, names: list[str], fields: list[Any], *, contact_bone: ArrayLike | None = None) -> None:
@@ -133,12 +133,11 @@ class BoneContacts:
     def nearest(
         self, points: ArrayLike, limit: Floats | float = np.inf, *, neighbours: bool = True
     ) -> tuple[Floats, Floats]:
-        """Smallest distance (n,) over bones and neighbours, and its gradient (n, 3) in world axes, for
-        clipping.
+        """Smallest distance (n,) over bones and neighbours, and its gradient (n, 3) in world axes, for clipping.
 
-        [scene unit], negative inside a bone, infinity where none is in reach. Beyond ``limit``, a number or
-        (n,), it is only a lower bound above the limit, without a gradient. Against a sliding neighbour it is
-        half the difference of the two muscles' distances, so that both are cut alike.
+        [scene unit], negative inside a bone, infinity where none is in reach. Beyond ``limit``, a number or (n,), it
+        is only a lower bound above the limit, without a gradient. Against a sliding neighbour it is half the
+        difference of the two muscles' distances, so that both are cut alike.
         """
         points = check_points(points)
         apart = np.empty(len(self.reached))
@@ -219,8 +218,8 @@ class BoneContacts:
         return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)
 
     def _bounds(self, count):
-        """Positions (r, n, 3) of the last queries, in bone coordinates, and lower bounds (r, n) of the
-        distances there; -infinity where nothing is known.
+        """Positions (r, n, 3) of the last queries, in bone coordinates, and lower bounds (r, n) of the distances
+        there; -infinity where nothing is known.
         """
         if self._known[1].shape[1] != count:
             rows = len(self.reached)

@@ -53,8 +53,7 @@ class Frame:
     surfaces: Mapping[str, ModelSurface] = field(repr=False)  # by muscle; empty where none were asked for
     carried: dict = field(repr=False)  # (vertices, faces) by muscle: material surfaces of constant topology
     events: list  # since the frame written before
-    # Of each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the frame
-    # before.
+    # Of each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the last frame.
     times: dict = field(repr=False)
     wall: float  # time for all muscles together [s], since the frame before
     activations: dict = field(default_factory=dict)  # of the muscles that contract

@@ -186,8 +186,8 @@ def simulate_frames(
 ) -> Iterator[Frame]:
     """Run models, from their rest state, through a scene's motion and yield its frames one by one.
 
-    Only frames whose index is in ``written`` are yielded, all where it is None. Frames yielded before an
-    interrupt or an error stay valid. Raises as `FrameLoop` does.
+    Only frames whose index is in ``written`` are yielded, all where it is None. Frames yielded before an interrupt or
+    an error stay valid. Raises as `FrameLoop` does.
     """
     loop = FrameLoop(scene, models, fields=fields, surfaces=surfaces)
     for index, coordinates in enumerate(scene.motion.frames):

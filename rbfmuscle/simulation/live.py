@@ -24,8 +24,8 @@ class LiveSession:
     """Models that follow coordinates set interactively.
 
     Coordinates at ``rest``, ``here`` and at their ``target`` are in radian, as are the ``limits`` of each;
-    ``activation`` holds the target, 0 to 1, of the muscles that contract. ``fields`` are as `live_fields`
-    builds them.
+    ``activation`` holds the target, 0 to 1, of the muscles that contract. ``fields`` are as `live_fields` builds
+    them.
     """
 
     def __init__(self, scene: Scene, *, fields: Mapping[str, BoneField] | None = None) -> None:
@@ -75,8 +75,8 @@ class LiveSession:
     def advance(self, stride: float = math.inf, *, surfaces: bool = True) -> Frame:
         """Move towards the target and return the frame reached.
 
-        No coordinate changes by more than ``stride`` [radian], and, if that is finite, no activation by more
-        than a sub-step's. Raises SolveError if a muscle cannot be solved; `reset` goes back to rest.
+        No coordinate changes by more than ``stride`` [radian], and, if that is finite, no activation by more than a
+        sub-step's. Raises SolveError if a muscle cannot be solved; `reset` goes back to rest.
         """
         if self._loop is None:
             self._loop = FrameLoop(_wide_scene(self.scene), self.models, fields=self.fields)

@@ -19,8 +19,8 @@ MOST_SOLVES = 60
 def resolve_initial_overlap(stepper: MuscleStepper) -> None:
     """Deal with overlap at rest as the scene's ``[contact] initial`` says; for a muscle in its rest pose.
 
-    ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model holds its
-    shape and volume, ``"keep"`` measures every gap from the depth at rest, ``"error"`` raises SceneError.
+    ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model holds its shape and
+    volume, ``"keep"`` measures every gap from the depth at rest, ``"error"`` raises SceneError.
     """
     contacts, scene = stepper.contacts, stepper.scene
     least, initial = scene.length(DEPTH), scene.contact.initial

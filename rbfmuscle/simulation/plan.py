@@ -15,9 +15,9 @@ from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 def plan_scene(scene: Scene) -> dict[str, Any]:
     """Frames, sub-steps, muscles and fields of a run, by these names.
 
-    Muscles have the ``bones`` within reach and the ``substeps`` in which they are solved, fields the
-    triangles and the share of the bone's box. A listed bone need not be touched. A bone that comes near a
-    muscle is not foreseen: the muscle may then be solved in more sub-steps.
+    Muscles have the ``bones`` within reach and the ``substeps`` in which they are solved, fields the triangles and
+    the share of the bone's box. A listed bone need not be touched. A bone that comes near a muscle is not foreseen:
+    the muscle may then be solved in more sub-steps.
     """
     regions, poses = find_contact_pairs(scene), PoseCache(scene)
     muscles: list[dict[str, Any]] = []

@@ -33,12 +33,10 @@ class MuscleStatus(NamedTuple):
 
 
 class RigidTransport:
-    """Moves one muscle rigidly where its bones do; for a muscle that neither slides on neighbours nor
-    contracts.
+    """Moves one muscle rigidly where its bones do; for a muscle that neither slides on neighbours nor contracts.
 
-    ``names`` holds the bones, and ends of tendons, that hold it, first that of most of it; ``solved`` their
-    poses when it was solved last, or None; ``since`` the rigid motion (4, 4) since its surface was drawn
-    last.
+    ``names`` holds the bones, and ends of tendons, that hold it, first that of most of it; ``solved`` their poses
+    when it was solved last, or None; ``since`` the rigid motion (4, 4) since its surface was drawn last.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene) -> None:

@@ -28,8 +28,8 @@ Coordinates = dict[str, float]
 class Sliding:
     """Muscles, in their rest state, that exchange their surfaces in all sliding pairs of a scene.
 
-    ``pairs`` has, for each that met by the last drawings, the overlap, and the RMS gap opened where they
-    touched at rest. Raises SceneError if the scene's ``pairs`` name an unknown muscle.
+    ``pairs`` has, for each that met by the last drawings, the overlap, and the RMS gap opened where they touched at
+    rest. Raises SceneError if the scene's ``pairs`` name an unknown muscle.
     """
 
     def __init__(self, scene: Scene, steppers: list[MuscleStepper]) -> None:

@@ -72,8 +72,8 @@ class CarriedDrawing:
 class MuscleStepper:
     """Advances one model through sub-steps, against obstacles of its own.
 
-    ``cut`` gives sub-steps by the relative motion of the muscle's own bones, None for one that contracts;
-    ``carrier`` moves the muscle rigidly where it need not be solved, None where it is always solved.
+    ``cut`` gives sub-steps by the relative motion of the muscle's own bones, None for one that contracts; ``carrier``
+    moves the muscle rigidly where it need not be solved, None where it is always solved.
     """
 
     def __init__(
@@ -112,9 +112,7 @@ class MuscleStepper:
     def go(
         self, stops: list[dict[str, float]], activations: Sequence[Mapping[str, float]] = ()
     ) -> MuscleStepper:
-        """Advance through a list of coordinates, the present ones first; ``activations`` by muscle at each
-        end.
-        """
+        """Advance through a list of coordinates, the present ones first; ``activations`` by muscle at each end."""
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
             self.set_activation(activation or {})
             poses = self.poses(before), self.poses(after)

@@ -35,10 +35,10 @@ PIECES = 8
 class SubSteps:
     """How a scene's motion is cut into sub-steps.
 
-    No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far against a
-    bone. Where one coordinate moves alone, sub-steps end at multiples of that angle, however the frames are
-    spaced: a muscle that can settle in several ways then comes to a pose by the same path. For one ``muscle``
-    only its own bones and the others that it can meet, ``bones``, count.
+    No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far against a bone.
+    Where one coordinate moves alone, sub-steps end at multiples of that angle, however the frames are spaced: a
+    muscle that can settle in several ways then comes to a pose by the same path. For one ``muscle`` only its own
+    bones and the others that it can meet, ``bones``, count.
     """
 
     def __init__(

@@ -125,8 +125,7 @@ def rotate_with_bone(
 ) -> None:
     """Move points that crossed back to where they were relative to the bone: rotated with it about its joint.
 
-    The model has predicted already; it gets the rigid transform from the predicted to the corrected
-    positions.
+    The model has predicted already; it gets the rigid transform from the predicted to the corrected positions.
     """
     for crossing in crossings:
         motion = after[names[crossing.bone]] @ np.linalg.inv(before[names[crossing.bone]])
@@ -165,11 +164,10 @@ def only_grazed(
     after: Floats,
     tolerance: float,
 ) -> bool:
-    """Whether, by the exact distance to the bone's triangles, no path was deeper than ``tolerance`` [scene
-    unit].
+    """Whether, by the exact distance to the bone's triangles, no path was deeper than ``tolerance`` [scene unit].
 
-    Paths hold contact points (n, 3) before and after the step in world coordinates, ``before`` and ``after``
-    the bone's poses (4, 4).
+    Paths hold contact points (n, 3) before and after the step in world coordinates, ``before`` and ``after`` the
+    bone's poses (4, 4).
     """
     exact = ExactDistance(mesh.vertices, mesh.faces)
     if (exact.across < 0).any():  # not closed
