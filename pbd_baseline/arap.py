@@ -5,21 +5,13 @@ at rest, each R_i the rotation that makes E least (Sorkine and Alexa 2007). With
 gradient of E is its partial derivative with R frozen: grad_i E = sum_j w_ij (e_ij - (R_i + R_j) E_ij / 2).
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from pbd_baseline.topology import colour
+from pbd_baseline.topology import Topology, colour
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import cotangent_laplacian, graph_laplacian
 from rbfmuscle.geometry.rotations import quaternion_matrix, rotate
 from rbfmuscle.jit import compiled
-
-if TYPE_CHECKING:
-    from pbd_baseline.topology import Topology
-
 
 # Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.
 ROTATION_STEPS = 8
@@ -28,22 +20,9 @@ LEAST_WEIGHT = 1e-9
 
 
 class ARAP:
-    """ARAP energy of a mesh with its current rotations.
+    """ARAP energy of a mesh, with the rotation (w, x, y, z) of each vertex in ``quaternions`` (n, 4).
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        Rest positions.
-    topology : Topology
-    stiffer : float or (e,) ndarray
-        Factor of the edges' weights.
-
-    Attributes
-    ----------
-    quaternions : (n, 4) ndarray
-        Rotation of each vertex, (w, x, y, z); identity at rest.
-    laplacian : (n, n) scipy.sparse.csc_matrix
-        Cotangent weights, clamped from below.
+    The ``laplacian`` (n, n) has cotangent weights, clamped from below, times the edges' factor ``stiffer``.
     """
 
     def __init__(self, vertices: Floats, topology: Topology, *, stiffer: Floats | float = 1.0) -> None:
@@ -73,12 +52,8 @@ class ARAP:
 class ARAPConstraint:
     """The ARAP energy as PBD constraints, a vector one an edge: the paper's section 6.2, first option.
 
-    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component, compliance
-    1 / w_ij: at convergence the gradient of the sum is that of the ARAP energy.
-
-    Parameters
-    ----------
-    arap : ARAP
+    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component, compliance 1 / w_ij: at
+    convergence the gradient of the sum is that of the ARAP energy.
     """
 
     def __init__(self, arap: ARAP) -> None:
@@ -99,15 +74,9 @@ class ARAPConstraint:
     def project(self, points: Floats, inverse_mass: Floats, *, time: float = 1.0) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place, with the arap's rotations."""
         _constraint_loop(
-            points,
-            inverse_mass,
-            self.edges,
-            self.rest,
-            self.arap.quaternions,
-            self.compliance,
-            time,
+            points, inverse_mass, self.edges, self.rest, self.arap.quaternions, self.compliance, time,
             self.multiplier,
-        )
+        )  # fmt: skip
 
 
 @compiled

@@ -1,7 +1,5 @@
 """Dihedral bending: constraints of one colour are gathered in blocks and projected by vector instructions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pbd_baseline.topology import colour, spread
@@ -21,20 +19,11 @@ ROWS = 31
 class BendingConstraint:
     """Keeps dihedral angles: C = 2 tan((t - t0) / 2), t the signed angle between the faces at an edge.
 
-    C is t - t0 to third order, is defined by sine and cosine alone (no arc cosine to clamp) and grows without
-    bound towards a fold; a projection turns by 90 degrees at most. grad C = (1 + C^2 / 4) grad t, with the
-    gradient of t by Bridson et al. 2003: for edge (0, 1) of length |e|, wings 2 and 3 and unnormalised face
-    normals n_2 and n_3, grad_2 t = -|e| n_2 / |n_2|^2 and grad_3 t = -|e| n_3 / |n_3|^2; the edge's ends take
-    the opposite, split by where the wings' feet fall.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        Rest positions.
-    edges, wings : (e, 2) ndarray of int
-        As in :class:`~pbd_baseline.topology.Topology`.
-    stiffness, compliance : float or (e,) ndarray
-        As in :class:`~pbd_baseline.constraints.EdgeConstraint`; the compliance is per radian squared.
+    C is t - t0 to third order, is defined by sine and cosine alone (no arc cosine to clamp) and grows without bound
+    towards a fold; a projection turns by 90 degrees at most. grad C = (1 + C^2 / 4) grad t, with the gradient of t by
+    Bridson et al. 2003: for edge (0, 1) of length |e|, wings 2 and 3 and unnormalised face normals n_2 and n_3,
+    grad_2 t = -|e| n_2 / |n_2|^2 and grad_3 t = -|e| n_3 / |n_3|^2; the edge's ends take the opposite, split by where
+    the wings' feet fall. Edges and wings (e, 2) are those of a `Topology`; the compliance is per radian squared.
     """
 
     def __init__(
@@ -71,15 +60,9 @@ class BendingConstraint:
     def project(self, points: Floats, inverse_mass: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""
         _sweep_loop(
-            points,
-            inverse_mass,
-            self.colours,
-            self.members,
-            self.rest,
-            self.stiffness,
-            self.compliance,
+            points, inverse_mass, self.colours, self.members, self.rest, self.stiffness, self.compliance,
             self.multiplier,
-        )
+        )  # fmt: skip
 
 
 @compiled(error_model="numpy")

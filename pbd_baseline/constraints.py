@@ -6,8 +6,6 @@ is the hard constraint of PBD, and k in [0, 1] its stiffness (Müller 2007). w i
 vertex is held.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -25,18 +23,9 @@ TINY = 1e-12
 class EdgeConstraint:
     """Keeps edge lengths: C = |x_i - x_j| - l, grad_i C = (x_i - x_j) / |x_i - x_j| = -grad_j C.
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        Rest positions.
-    edges : (e, 2) ndarray of int
-        Each undirected edge once.
-    stiffness : float or (e,) ndarray
-        Share of the error that one PBD projection removes, 0 to 1.
-    compliance : float or (e,) ndarray
-        XPBD compliance times inverse time; 0 is hard.
-    limits : (low, high)
-        Ratios of length to rest length beyond which an edge is hard whatever its stiffness.
+    ``edges`` (e, 2) has each once. One PBD projection removes the share ``stiffness`` of an error; ``compliance`` is
+    that of XPBD times inverse time, 0 is hard. Beyond the ratios ``limits`` of length to rest length an edge is hard
+    whatever its stiffness.
     """
 
     def __init__(
@@ -68,27 +57,13 @@ class EdgeConstraint:
     def project(self, points: Floats, inverse_mass: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""
         _edge_loop(
-            points,
-            inverse_mass,
-            self.edges,
-            self.rest,
-            self.limits,
-            self.stiffness,
-            self.compliance,
+            points, inverse_mass, self.edges, self.rest, self.limits, self.stiffness, self.compliance,
             self.multiplier,
-        )
+        )  # fmt: skip
 
 
 class VolumeConstraint:
-    """Keeps the enclosed volume: C = V(x) - V_0, V = (1/6) sum a . (b x c), grad_a V = (1/6) sum b x c.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        Rest positions.
-    faces : (m, 3) ndarray of int
-        Closed, outward.
-    """
+    """Keeps the enclosed volume: C = V(x) - V_0, V = (1/6) sum a . (b x c), grad_a V = (1/6) sum b x c."""
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         self.faces = np.ascontiguousarray(faces)

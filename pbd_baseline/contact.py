@@ -1,7 +1,5 @@
 """Collision response of a mesh to the half-spaces of its contacts."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
@@ -15,13 +13,8 @@ TOUCHING = 1e-9
 class ContactConstraint:
     """Keeps vertices out of bones: C = gap + n . (x - x_0) >= 0, linearised where the contacts were asked.
 
-    Parameters
-    ----------
-    reach : float
-        Distance within which contacts are looked for [scene unit].
-    nearest_only : bool
-        A vertex in several bones moves by the longest of its ways out alone, as in the authors' papers, not by
-        their sum.
+    They are looked for within ``reach`` [scene unit]. With ``nearest_only`` a vertex in several bones moves by the
+    longest of its ways out alone, as in the authors' papers, not by their sum.
     """
 
     def __init__(self, *, reach: float, nearest_only: bool = False) -> None:

@@ -1,7 +1,5 @@
 """Rest lengths of edges along and across the fibres: slack fibres of a passive muscle, active ones, tendon."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pbd_baseline.rest import RestState
@@ -28,13 +26,6 @@ class MeshFibres:
     at which a fully active fibre has no tension. An active fibre pulls along itself alone: with the girth of t it would
     push outwards too, and the widest place of a belly would take all the shortening. Tendon keeps its length, but may
     stretch by its strain at full activation.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    rest : RestState
-    slack : float
-        Of the passive fibres where the muscle gives none of its own, 1 or more.
     """
 
     def __init__(self, muscle: Muscle, rest: RestState, *, slack: float) -> None:

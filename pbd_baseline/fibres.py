@@ -1,7 +1,5 @@
 """Directions of the fibres, softness of edges along them, and thickness of the muscle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,20 +20,10 @@ NEAREST = 6
 def fibre_directions(
     points: np.ndarray, along: np.ndarray, fibres: Sequence[np.ndarray] | None
 ) -> np.ndarray:
-    """Unit direction of the fibres at each point.
+    """Unit direction (n, 3) of the fibres at each point, zero where there is none.
 
-    Parameters
-    ----------
-    points : (n, 3) ndarray
-    along : (n, 3) ndarray
-        Gradient of the last bone's harmonic weight: the fibres follow it where none are given.
-    fibres : list of (k, 3) ndarray, or None
-        Polylines.
-
-    Returns
-    -------
-    (n, 3) ndarray
-        Zero where there is no direction.
+    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the last bone's
+    weight.
     """
     if not fibres:
         return _normalised(along)
@@ -51,13 +39,7 @@ def fibre_directions(
 
 
 def edge_stiffness(vertices: Floats, edges: Integers, directions: Floats, exponent: float) -> Floats:
-    """k = (1 - |cos(edge, fibre)|)^a: edges along the fibres are soft (Cervenka and Kohout, a = 0.5).
-
-    Returns
-    -------
-    (e,) ndarray
-        In [0, 1]; 1 everywhere for exponent 0.
-    """
+    """k = (1 - |cos(edge, fibre)|)^a, (e,): edges along the fibres are soft (Cervenka and Kohout, a = 0.5)."""
     if exponent == 0.0:
         return np.ones(len(edges))
     along = _normalised(vertices[edges[:, 1]] - vertices[edges[:, 0]])
@@ -69,18 +51,9 @@ def edge_stiffness(vertices: Floats, edges: Integers, directions: Floats, expone
 
 
 def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Booleans) -> Floats:
-    """How far the surface moves at each vertex when the muscle swells: its local half thickness.
+    """How far the surface moves at each vertex when the muscle swells: its local half thickness (n,).
 
-    Parameters
-    ----------
-    vertices, faces, normals : ndarray
-    held : (n,) ndarray of bool
-        Vertices that do not move.
-
-    Returns
-    -------
-    (n,) ndarray
-        Smooth, [unit of the vertices], 0 at held vertices.
+    Smooth, [unit of the vertices], 0 at held vertices.
     """
     radius = _inner_balls(vertices, normals)
     reach = SMOOTHING * float(np.linalg.norm(np.ptp(vertices, axis=0)))

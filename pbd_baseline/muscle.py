@@ -37,20 +37,8 @@ STEP_ANGLE = math.radians(2.0)
 class PBDMuscle:
     """A mesh muscle of any of the paper's kinds; implements ``rbfmuscle.simulation.frame.MuscleModel``.
 
-    Parameters
-    ----------
-    muscle : Muscle
-        Mesh, attachments and fibres, from a scene.
-    scene : Scene
-    options : PBDOptions
-        ``method`` chooses the kind.
-
-    Raises
-    ------
-    SceneError
-        On a muscle that nothing holds.
-    MeshError
-        If the mesh is not a closed, consistently oriented surface.
+    Raises SceneError on a muscle that nothing holds, MeshError if its mesh is not a closed, consistently oriented
+    surface.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene, options: PBDOptions | None = None) -> None:
@@ -164,10 +152,7 @@ class PBDMuscle:
         return np.sqrt(((self.points - before) ** 2).sum(axis=1).max()) if self.still > 0.0 else np.inf
 
     def _finish(self, contacts):
-        """Contact and volume in turn until both hold where the bones are now known to be.
-
-        The half-spaces are found again where the last round still left something to do.
-        """
+        """Contact and volume in turn, half-spaces found again, until both hold where the bones are now known to be."""
         for _ in range(FINISHING_ROUNDS):
             self.penetration = self.contact.find(contacts, self.points, reach=self.finishing_reach)
             self.contact.project(self.points)

@@ -25,56 +25,25 @@ VERSION = 4
 
 @dataclass(frozen=True)
 class RestState:
-    """A muscle at rest, its vertices renumbered for the cache.
+    """A muscle at rest, its vertices renumbered for the cache."""
 
-    Attributes
-    ----------
-    order : (n,) ndarray of int
-        The mesh's number of each vertex.
-    vertices : (n, 3) ndarray
-    topology : Topology
-    bones : list of str
-        Bones that hold the muscle.
-    weights : (n, len(bones)) ndarray
-        Weights of their motions, 1 on a bone's own vertices.
-    attached_bone : (n,) ndarray of int
-        Position in ``bones`` of the bone that holds a vertex, -1 where it is free.
-    inverse_mass : (n,) ndarray
-        0 where held, else 1.
-    fibres : (n, 3) ndarray
-        Unit directions of the fibres.
-    room : (n,) ndarray
-        Local half thickness, falling to 0 at held vertices.
-    volume : VolumeConstraint
-    """
-
-    order: np.ndarray
-    vertices: np.ndarray
+    order: np.ndarray  # (n,) the mesh's number of each vertex
+    vertices: np.ndarray  # (n, 3)
     topology: Topology
-    bones: list[str]
-    weights: np.ndarray
-    attached_bone: np.ndarray
-    inverse_mass: np.ndarray
-    fibres: np.ndarray
-    room: np.ndarray
+    bones: list[str]  # that hold the muscle
+    weights: np.ndarray  # (n, bones) of their motions, 1 on a bone's own vertices
+    attached_bone: np.ndarray  # (n,) position in ``bones`` of what holds a vertex, -1 where free
+    inverse_mass: np.ndarray  # (n,) 0 where held, else 1
+    fibres: np.ndarray  # (n, 3) unit directions
+    room: np.ndarray  # (n,) local half thickness, falling to 0 at held vertices
     volume: VolumeConstraint
 
     @classmethod
     def from_muscle(cls, muscle: Muscle, scene: Scene, options: PBDOptions) -> RestState:
         """Measure a muscle of a scene.
 
-        Parameters
-        ----------
-        muscle : Muscle
-        scene : Scene
-        options : PBDOptions
-
-        Raises
-        ------
-        MeshError
-            If its mesh is not closed, or no smooth weights can be found on it.
-        SceneError
-            If nothing holds it.
+        Raises MeshError if its mesh is not closed, or no smooth weights can be found on it, SceneError if nothing
+        holds it.
         """
         if not muscle.attachments:
             raise SceneError(f"muscle {muscle.name!r} has no attachment, give attach a place on two bones")

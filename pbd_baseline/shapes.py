@@ -1,7 +1,5 @@
 """What gives a mesh muscle its shape: one class for each method of the paper."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,17 +28,7 @@ LIMITS = 0.6, 2.2
 class Shape:
     """What all methods have in common: how the volume is restored, and what a snapshot holds.
 
-    Parameters
-    ----------
-    rest : RestState
-    options : PBDOptions
-    stiffer : float or (e,) ndarray
-        Factor of the edges' weights, of use to the ARAP models.
-
-    Attributes
-    ----------
-    volume_in_sweeps : bool
-        Whether the volume is restored in every sweep, not after the last one alone.
+    ``stiffer`` is a factor of the edges' weights (e,), of use to the ARAP models.
     """
 
     volume_in_sweeps = True
@@ -239,19 +227,11 @@ class InterleavedARAPShape(GlobalARAPShape):
 
 
 class Method(NamedTuple):
-    """One method: its shape and its number of sweeps per solve.
-
-    Attributes
-    ----------
-    shape : type of Shape
-    sweeps : int
-        The authors' three for PBD; sub-steps of one sweep for XPBD.
-    as_printed : bool
-        As the paper prints it: vertices keep their velocity and answer to the deepest bone alone.
-    """
+    """One method: its shape and its number of sweeps per solve."""
 
     shape: type[Shape]
-    sweeps: int
+    sweeps: int  # the authors' three for PBD; sub-steps of one sweep for XPBD
+    # As the paper prints it: vertices keep their velocity and answer to the deepest bone alone.
     as_printed: bool = False
 
 

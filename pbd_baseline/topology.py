@@ -15,38 +15,19 @@ from rbfmuscle.validation import MeshError, check_mesh
 
 @dataclass(frozen=True)
 class Topology:
-    """Connections of a closed, consistently oriented mesh; every array is read only.
+    """Connections of a closed, consistently oriented mesh; every array is read only."""
 
-    Attributes
-    ----------
-    faces : (m, 3) ndarray of int
-    edges : (e, 2) ndarray of int
-        Each undirected edge once, the smaller vertex first.
-    wings : (e, 2) ndarray of int
-        Vertices opposite to an edge: first in the face that runs along it from ``edges[:, 0]`` to
-        ``edges[:, 1]``, then in the face that runs against it.
-    ring_start, ring : (n + 1,), (2 e,) ndarray of int
-        Neighbours of vertex i are ``ring[ring_start[i]:ring_start[i + 1]]``, sorted.
-    ring_edge : (2 e,) ndarray of int
-        Edge that leads to each neighbour.
-    """
-
-    faces: np.ndarray
-    edges: np.ndarray
+    faces: np.ndarray  # (m, 3)
+    edges: np.ndarray  # (e, 2) each undirected edge once, the smaller vertex first
+    # (e, 2) vertices opposite to an edge: in the face that runs along it, then in the one against it
     wings: np.ndarray
-    ring_start: np.ndarray
-    ring: np.ndarray
-    ring_edge: np.ndarray
+    ring_start: np.ndarray  # (n + 1,)
+    ring: np.ndarray  # (2 e,) sorted neighbours of vertex i: ring[ring_start[i] : ring_start[i + 1]]
+    ring_edge: np.ndarray  # (2 e,) edge that leads to each neighbour
 
     @classmethod
     def from_mesh(cls, vertices: Floats, faces: Integers) -> Topology:
-        """Connect a mesh.
-
-        Raises
-        ------
-        MeshError
-            If it is not closed and consistently oriented, or a vertex belongs to no face.
-        """
+        """Connect a mesh; MeshError if it is not closed and consistently oriented, or a vertex has no face."""
         vertices, faces = check_mesh(vertices, faces)
         edges, wings = _edges_and_wings(faces)
         ring_start, ring, ring_edge = _one_rings(edges, len(vertices))
@@ -92,24 +73,11 @@ def _one_rings(edges, count):
 
 
 def colour(members: Integers, count: int) -> tuple[Integers, Integers]:
-    """Order constraints so that those of one colour share no vertex.
+    """Order constraints, given by their vertices (c, k), so that those of one colour share no vertex.
 
-    Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints of one
-    colour may be projected in any order, or at once, with the same result to the last bit.
-
-    Parameters
-    ----------
-    members : (c, k) ndarray of int
-        Vertices of each constraint.
-    count : int
-        Number of vertices.
-
-    Returns
-    -------
-    order : (c,) ndarray of int
-        Constraints sorted by colour, then by their first vertex for the sake of the cache.
-    start : (colours + 1,) ndarray of int
-        Colour q is ``order[start[q]:start[q + 1]]``.
+    Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints of one colour may
+    be projected in any order, or at once, with the same result to the last bit. Returns the order (c,), by colour and
+    then by the first vertex for the sake of the cache, and where each colour starts, (colours + 1,).
     """
     members = np.ascontiguousarray(members, dtype=np.int64)
     if len(members) == 0:
@@ -149,18 +117,7 @@ def _colour_loop(members, taken, colours):
 
 
 def cache_order(faces: Integers, count: int) -> Integers:
-    """Order of vertices in which neighbours lie near each other in memory (reverse Cuthill and McKee 1969).
-
-    Parameters
-    ----------
-    faces : (m, 3) ndarray of int
-    count : int
-        Number of vertices.
-
-    Returns
-    -------
-    (count,) ndarray of int
-    """
+    """Order (count,) of vertices that puts neighbours near each other in memory (reverse Cuthill and McKee 1969)."""
     ends = np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]])
     degree = np.bincount(ends.ravel(), minlength=count)
     # SciPy's own reverse_cuthill_mckee begins at a vertex that depends on the processor, by an unstable sort.

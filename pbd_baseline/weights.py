@@ -3,8 +3,6 @@
 Harmonic weights (p = 2) are singular at the rim of a small patch that is held, and stretch edges there fivefold.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
@@ -22,18 +20,7 @@ FLATTEST = 1e-6
 
 
 def even_weights(vertices: Floats, faces: Integers, groups: list[Integers]) -> Floats:
-    """Weights in [0, 1] that sum to one, 1 on a group's own vertices, by re-weighted Laplace solves.
-
-    Parameters
-    ----------
-    vertices, faces : (n, 3), (m, 3) ndarray
-    groups : list of (k_g,) int arrays
-        Vertices held by each bone.
-
-    Returns
-    -------
-    (n, len(groups)) ndarray
-    """
+    """Weights (n, groups) in [0, 1] that sum to one, 1 on a group's own vertices, by re-weighted Laplace solves."""
     weights = harmonic_weights(vertices, faces, groups)
     held = np.zeros(len(vertices), dtype=bool)
     for group in groups:

@@ -5,8 +5,6 @@ outer band about the surface or errs; half blocks in the outer band; fine cells,
 the inner band.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -138,22 +136,10 @@ def build_cells(
 ) -> tuple[FieldData, bool]:
     """What queries read: sparse cells about the mesh of an exact tree; and whether signs agree with the distances.
 
-    Records are in single precision and relative to the grid's origin, where that loses nothing.
-
-    Parameters
-    ----------
-    exact : ExactDistance
-    spacing : float
-        Edge of a fine cell [unit of the mesh].
-    band : float
-        Fine cells cover all points nearer than this.
-    inside : callable, optional
-        ``inside(points) -> (n,) bool``, where the mesh itself gives no reliable sign.
-    region : (2, 3) ndarray, optional
-        Box outside of which coarse cells serve.
-    doubtful : (m,) ndarray of bool, optional
-        Faces whose pseudonormals are not to be believed.
-
+    ``spacing`` is the edge of a fine cell; fine cells cover all points nearer than ``band``, coarse ones serve
+    outside of the box ``region`` (2, 3). ``inside`` gives the sign where the mesh itself has no reliable one,
+    ``doubtful`` (m,) marks faces whose pseudonormals are not to be believed. Records are in single precision and
+    relative to the grid's origin, where that loses nothing.
     """
     block, coarse = BLOCK * spacing, BLOCK * BLOCK * spacing
     low, high = exact.vertices.min(axis=0), exact.vertices.max(axis=0)
@@ -345,8 +331,9 @@ def _active_loop(ids, distance, centre, edge, band, side, active):
 
 @compiled
 def _near_loop(blocks, offsets, lists, records, cut, active):
-    """Unmark small cells that a block's triangles show to be out of the band, unless the surface is
-    folded. ``cut`` holds origin, edge of a block, width of the band and small cells along an edge.
+    """Unmark small cells that a block's triangles show to be out of the band, unless the surface is folded.
+
+    ``cut`` holds origin, edge of a block, width of the band and small cells along an edge.
     """
     origin, edge, band, side = cut
     small = edge / side

@@ -10,18 +10,8 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 def measure_field(field: BoneSDF, *, count: int = 50_000) -> dict[str, float]:
     """Errors of a field against exact distances at random points near the surface.
 
-    Parameters
-    ----------
-    field : BoneSDF
-        Or anything with its ``distance_and_gradient``, ``closed``, ``vertices`` and ``faces``.
-    count : int
-
-    Returns
-    -------
-    dict of str to float
-        ``width``: a mean edge of the mesh, up to which points lie away; ``error_rms``, ``error_max``;
-        ``sign_wrong``, a share of the points; ``angle_median`` [degree] between the gradient and the exact
-        direction.
+    ``width`` is a mean edge of the mesh, up to which points lie away; ``error_rms``, ``error_max``; ``sign_wrong`` a
+    share of the points; ``angle_median`` [degree] between the gradient and the exact direction.
     """
     exact = ExactDistance(field.vertices, field.faces)
     width = mean_edge(field.vertices, field.faces)

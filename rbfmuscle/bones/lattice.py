@@ -1,7 +1,5 @@
 """Corners of the cells of a bone's distance field: which there are, and which cells share them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

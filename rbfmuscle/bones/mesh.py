@@ -1,7 +1,5 @@
 """What a bone's mesh allows: which triangles count, and where the sign of the distance comes from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,21 +15,12 @@ LEAST_SHAPE = 1e-12
 
 @dataclass
 class BoneMesh:
-    """A bone's mesh as its field takes it.
-
-    Attributes
-    ----------
-    vertices, faces : (n, 3) and (m, 3) ndarray
-    doubtful : (m,) ndarray of bool
-        Faces at a border, whose pseudonormals give no sign.
-    notes : list of str
-        What was found and done, for the log.
-    """
+    """A bone's mesh as its field takes it."""
 
     vertices: np.ndarray
     faces: np.ndarray
-    doubtful: np.ndarray
-    notes: list = field(default_factory=list)
+    doubtful: np.ndarray  # (m,) faces at a border, whose pseudonormals give no sign
+    notes: list = field(default_factory=list)  # what was found and done, for the log
 
     @property
     def closed(self) -> bool:
@@ -40,15 +29,10 @@ class BoneMesh:
 
 
 def prepare_bone(vertices: Floats, faces: Integers, *, name: str = "bone") -> BoneMesh:
-    """Clean arrays for a distance field: no degenerate or duplicate faces, outward as far as that can be
-    told.
+    """Clean arrays for a distance field: no degenerate or duplicate faces, outward as far as can be told.
 
-    Closed meshes are taken as they are. Of others equal vertices are merged, and patches oriented alike.
-
-    Raises
-    ------
-    MeshError
-        On NaN, indices out of range, an empty mesh, or one whose faces all have no area.
+    Closed meshes are taken as they are. Of others equal vertices are merged, and patches oriented alike. Raises
+    MeshError on NaN, indices out of range, an empty mesh, or one whose faces all have no area.
     """
     vertices, faces = check_mesh(vertices, faces, name=name)
     mesh = BoneMesh(vertices, faces, np.zeros(len(faces), dtype=np.bool_))

@@ -31,43 +31,22 @@ LEAST_TOGETHER = 16
 
 
 class FieldData(NamedTuple):
-    """What a query reads.
+    """What a query reads: integers are int32, the rest but ``grid`` is float32."""
 
-    Attributes
-    ----------
-    grid : (5,) ndarray
-        Origin, 1 / edge of a block, and the unit of the lower bounds in ``lists``.
-    blocks : (a, b, c) ndarray of int32
-        For each block the offset of its list, or -1 - k where it is cut into the fine cells k.
-    cells : (k, 64) ndarray of int32
-        Offsets of the fine cells' lists.
-    lists : (l,) ndarray of int32
-        Header and triangles of each cell; of mixed cells the row of ``corners`` after them.
-    corners : (q, 12) ndarray of float32
-        Signed distances at the corners of cells where the mesh itself gives no sign, least corner, 1 / edge.
-    far : (f,) ndarray of int32
-        Triangles that face the outside, for points beyond the grid.
-    records : (m, 16) ndarray of float32
-        Frames of the triangles, relative to the grid's origin.
-    edge_normals, vertex_normals : (m, 3, 3) and (n, 3) ndarray of float32
-        Pseudonormals, edges in the order of the records.
-    vertices : (m, 3) ndarray of int32
-        Corners A, B and C of each record.
-    across : (m, 3) ndarray of int32
-        Records across the edges AB, BC and CA, -1 where there is none.
-    """
-
-    grid: np.ndarray
+    grid: np.ndarray  # (5,) origin, 1 / edge of a block, and the unit of the lower bounds in ``lists``
+    # (a, b, c) offset of each block's list, or -1 - k where it is cut into the fine cells k
     blocks: np.ndarray
-    cells: np.ndarray
+    cells: np.ndarray  # (k, 64) offsets of the fine cells' lists
+    # (l,) header and triangles of each cell; of mixed cells the row of ``corners`` after them
     lists: np.ndarray
+    # (q, 12) signed distances at the corners of cells where the mesh gives no sign, least corner, 1 / edge
     corners: np.ndarray
-    far: np.ndarray
-    records: np.ndarray
-    edge_normals: np.ndarray
-    vertex_normals: np.ndarray
-    vertices: np.ndarray
-    across: np.ndarray
+    far: np.ndarray  # (f,) triangles that face the outside, for points beyond the grid
+    records: np.ndarray  # (m, 16) frames of the triangles, relative to the grid's origin
+    edge_normals: np.ndarray  # (m, 3, 3) pseudonormals, edges in the order of the records
+    vertex_normals: np.ndarray  # (n, 3) pseudonormals
+    vertices: np.ndarray  # (m, 3) corners A, B and C of each record
+    across: np.ndarray  # (m, 3) records across the edges AB, BC and CA, -1 where there is none
 
 
 class Found(NamedTuple):

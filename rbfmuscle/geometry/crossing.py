@@ -26,13 +26,7 @@ def morton_order(points: Floats) -> Integers:
 
 
 class FaceTree:
-    """Boxes around the triangles of a mesh, by nearness at one moment; good for later ones with the same faces.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-    """
+    """Boxes around the triangles of a mesh, by nearness at one moment; good for later ones with the same faces."""
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         self.faces = np.ascontiguousarray(faces, dtype=np.int64)
@@ -45,13 +39,10 @@ class FaceTree:
         self._room = 16 * self.leaves
 
     def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
-        """Which triangles cross others, as `crossing_faces` says, for places of the vertices now.
+        """Which triangles cross others, as `crossing_faces` says, for places of the vertices (n, 3) now.
 
-        Parameters
-        ----------
-        vertices : (n, 3) ndarray
-        among : (m,) ndarray of bool, optional
-            Only pairs with one of these triangles, or with one at a corner whose triangles do not lie side by side.
+        With ``among`` (m,) only pairs with one of these, or with one at a corner whose triangles do not lie side by
+        side.
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         faces, count = self._corners, len(self._corners)
@@ -84,21 +75,11 @@ class FaceTree:
 
 
 def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
-    """Which triangles cross others of the same surface.
+    """Which triangles (m,) cross others of the same surface.
 
     An edge crosses a triangle where its ends lie on either side of it and its line passes through the inside.
-    Triangles that share an edge are never counted, those that share a corner are where the far edge of one
-    goes through the other. Triangles that lie in one plane and only overlap do not cross.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        [scene unit]
-    faces : (m, 3) ndarray of int
-
-    Returns
-    -------
-    (m,) ndarray of bool
+    Triangles that share an edge are never counted, those that share a corner are where the far edge of one goes
+    through the other. Triangles that lie in one plane and only overlap do not cross.
     """
     if len(faces) == 0:
         return np.zeros(0, dtype=bool)

@@ -3,8 +3,6 @@
 The tree is a balanced binary heap over triangles in an order that halves them along the longest extent.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import NamedTuple
 
@@ -96,13 +94,9 @@ class ExactDistance:
         return Tree(self.boxes, self.starts, self.records, self.order)
 
     def signed_distance(self, points: ArrayLike, *, reach: float = np.inf) -> NDArray[np.float64]:
-        """Signed distance, (n,) [unit of the mesh], negative inside; ``reach`` where the mesh is further.
+        """Signed distance (n,) of points (n, 3) [unit of the mesh], negative inside.
 
-        Parameters
-        ----------
-        points : (n, 3) array_like
-        reach : float
-            Distances beyond it are not looked for, which is much faster.
+        Distances beyond ``reach`` are not looked for, which is much faster, and come out as ``reach``.
         """
         return self.nearest(points, reach=reach)[0]
 
@@ -249,20 +243,12 @@ def record_feature(records, n, x, y, z):
 
 @compiled
 def nearest_triangle(tree, at, best, square, slack, stack):
-    """Record of the triangle nearest to a point, and the squared distance.
+    """Record of the triangle of a `Tree` nearest to a point ``at``, and the squared distance.
 
-    Parameters
-    ----------
-    tree : Tree
-    at : tuple of three floats
-        The point.
-    best, square : int, float
-        A record known to be as near as this, or -1 and the squared reach.
-    slack : float
-        Of triangles whose squared distances differ by a smaller share, that of the least face number is taken, so
-        that rounding and the order of the questions decide nothing.
-    stack : pair of (STACK,) arrays of int64 and float64
-        Working space.
+    ``best`` and ``square`` are a record known to be as near as that, or -1 and the squared reach. Of triangles whose
+    squared distances differ by a smaller share than ``slack`` that of the least face number is taken, so that
+    rounding and the order of the questions decide nothing. ``stack`` is two (STACK,) arrays to work in, of int64 and
+    float64.
     """
     boxes, starts, records, order = tree
     x, y, z = at

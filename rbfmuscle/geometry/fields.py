@@ -18,11 +18,8 @@ class Field(Protocol):
 class ClipDistance(Protocol):
     """What cuts a surface: a signed distance, negative inside, that need not be exact far away.
 
-    Attributes
-    ----------
-    steepest : float
-        No value changes by more than this for each unit of way, so that answers bound those nearby; infinity where
-        that is not known.
+    No value changes by more than ``steepest`` for each unit of way, so that answers bound those nearby; infinity
+    where that is not known.
     """
 
     steepest: float
@@ -37,15 +34,9 @@ class ClipDistance(Protocol):
 
 
 class BoneField(Protocol):
-    """What tells how far points are from a bone, in bone coordinates or, with a pose (4, 4), in the world.
+    """What tells how far points are from a bone, in bone coordinates or, with a pose (4, 4), in the world."""
 
-    Attributes
-    ----------
-    bounds : (2, 3) ndarray
-        Box of the bone, at rest.
-    """
-
-    bounds: np.ndarray
+    bounds: np.ndarray  # (2, 3) box of the bone, at rest
 
     def distance(
         self, points: np.ndarray, pose: np.ndarray | None = None, *, reach: np.ndarray | float = np.inf
@@ -59,13 +50,7 @@ class BoneField(Protocol):
 
 
 class LevelField:
-    """A field less a level: its zero set is the field's set of that level.
-
-    Parameters
-    ----------
-    field : Field
-    level : float
-    """
+    """A field less a level: its zero set is the field's set of that level."""
 
     def __init__(self, field: Field, level: float) -> None:
         self.field, self.level = field, level

@@ -1,7 +1,5 @@
 """Harmonic weights on a closed mesh: how much of each bone's motion a surface point takes over."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,21 +12,10 @@ from rbfmuscle.jit import compiled
 
 
 def cotangent_laplacian(vertices: Floats, faces: Integers) -> sparse.csc_matrix:
-    """Positive semi-definite cotangent Laplacian with weights clamped from below.
+    """Positive semi-definite cotangent Laplacian (n, n) with weights clamped from below.
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-
-    Returns
-    -------
-    (n, n) scipy.sparse.csc_matrix
-
-    Notes
-    -----
-    Negative cotangents (22 % on a long muscle mesh) would break the maximum principle, so that weights would
-    leave [0, 1]; they are raised to a small positive share of the mean weight.
+    Negative cotangents (22 % on a long muscle mesh) would break the maximum principle, so that weights would leave
+    [0, 1]; they are raised to a small positive share of the mean weight.
     """
     rows, cols, values = [], [], []
     for k in range(3):
@@ -55,24 +42,10 @@ def graph_laplacian(first: Integers, second: Integers, weights: Floats, count: i
 
 
 def harmonic_weights(vertices: Floats, faces: Integers, groups: Sequence[Integers]) -> Floats:
-    """Solve Laplace's equation on the surface once for each group of fixed vertices.
+    """Weights (n, groups) in [0, 1] that sum to one, by Laplace's equation on the surface for each group.
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-    groups : list of (k_g,) int arrays
-        Disjoint vertex indices; group g has weight 1 on its own vertices and 0 on the others'.
-
-    Returns
-    -------
-    (n, len(groups)) ndarray
-        Weights in [0, 1] that sum to one in each row.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If a part of the surface has no fixed vertex.
+    Group g has weight 1 on its own vertices and 0 on the others'; groups are disjoint. Raises LinAlgError if a part
+    of the surface has no fixed vertex.
     """
     count = len(vertices)
     weights = np.zeros((count, len(groups)))
@@ -93,13 +66,7 @@ def harmonic_weights(vertices: Floats, faces: Integers, groups: Sequence[Integer
 
 
 def surface_gradient(vertices: Floats, faces: Array, values: Floats) -> Floats:
-    """Area-weighted gradient of a piecewise linear function at each vertex of a surface.
-
-    Returns
-    -------
-    (n, 3) ndarray
-        Tangential gradient [1 / length unit of the vertices].
-    """
+    """Area-weighted tangential gradient (n, 3) of a piecewise linear function at the vertices of a surface."""
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     normal = np.cross(b - a, c - a)
     squared = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-300)[:, None]
@@ -114,22 +81,10 @@ def surface_gradient(vertices: Floats, faces: Array, values: Floats) -> Floats:
 
 
 def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
-    """Move each point by a weighted mean of rigid motions.
+    """Move each point (n, 3) by a mean of rigid motions (b, 4, 4) with weights (n, b) that sum to one.
 
     The motions' twists (logarithms in se(3)) are averaged with the point's weights and exponentiated, so a motion
     that all bones share moves every point rigidly, and a weight of one gives that bone's motion exactly.
-
-    Parameters
-    ----------
-    points : (n, 3) ndarray
-    weights : (n, b) ndarray
-        Rows sum to one.
-    motions : (b, 4, 4) ndarray
-        Rigid motions from the old to the new positions.
-
-    Returns
-    -------
-    (n, 3) ndarray
     """
     twists = _twists(motions)
     out = np.empty((len(points), 3))

@@ -1,7 +1,5 @@
 """Coordinates of a rest mesh that stay the same wherever its scene lies."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np
@@ -31,17 +29,9 @@ def moved_box(bounds: Floats, poses: Floats) -> Floats:
 class RestFrame:
     """Coordinates of a rest mesh that do not change when the scene is moved, turned or written in another unit.
 
-    Sampling and binding choose between points; two that are equally good must not be told apart by rounding, or
-    a moved scene would get other centres. Here they see the same rounded numbers wherever the scene lies.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-
-    Attributes
-    ----------
-    local : (n, 3) ndarray
-        Vertices in a frame spanned by the first of them, in units of the mesh's size, rounded to 1e-8.
+    Sampling and binding choose between points; two that are equally good must not be told apart by rounding, or a
+    moved scene would get other centres. Here they see the same numbers, ``local`` (n, 3), wherever the scene lies:
+    vertices in a frame spanned by the first of them, in units of the mesh's size, rounded to 1e-8.
     """
 
     def __init__(self, vertices: Floats) -> None:
@@ -91,20 +81,8 @@ def _principal_axes(points: Floats) -> Floats:
 class BoneFrame:
     """The rest frame of a bone, along its principal axes so that a grid in it is small.
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        Not all on one line.
-
-    Attributes
-    ----------
-    origin : (3,) ndarray
-    axes : (3, 3) ndarray
-        Rows are unit axes in bone coordinates.
-    size : float
-        Length of a local unit.
-    local : (n, 3) ndarray
-        Vertices in local units, rounded to 1e-8.
+    ``axes`` are rows in bone coordinates, ``size`` is the length of a local unit, and ``local`` the vertices (n, 3)
+    in these, rounded to 1e-8. They must not all lie on one line.
     """
 
     def __init__(self, vertices: Floats) -> None:

@@ -23,12 +23,7 @@ def rigid_fit(points: Floats, targets: Floats) -> Floats:
 def smooth_displacement(rest: Floats, points: Floats, smooth: Callable[[Floats], None]) -> Floats:
     """The shape at rest, moved as the points on the whole, and deformed as they are where that is smooth, (n, 3).
 
-    Parameters
-    ----------
-    rest, points : (n, 3) ndarray
-        [scene unit]
-    smooth : callable
-        Smooths, in place, what the points do beside the rigid motion.
+    ``smooth`` smooths, in place, what the points do beside the rigid motion.
     """
     motion = rigid_fit(rest, points)
     moved = rest @ motion[:3, :3].T + motion[:3, 3]

@@ -72,18 +72,7 @@ def opposite_half_edges(faces: Integers) -> Integers:
 def split_pinched_vertices(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
     """Repeat each vertex where several fans of triangles meet, so that every fan has its own.
 
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-        Closed and consistently oriented.
-
-    Returns
-    -------
-    vertices : (n + k, 3) ndarray
-        Those given, then the repeated ones.
-    faces : (m, 3) ndarray of int
-        The same triangles in the same order.
+    For closed and consistently oriented faces, which keep their order; repeated vertices come after those given.
     """
     size, twin = len(vertices), opposite_half_edges(faces)
     # the corner after the opposite side, in the neighbouring triangle, is at the same vertex
@@ -130,18 +119,7 @@ def barycentric_weights(points: Floats, corners: Floats) -> Floats:
 
 
 def mesh_volume(vertices: Floats, faces: Integers) -> float:
-    """Volume enclosed by a closed, outward mesh.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-        [scene unit]
-    faces : (m, 3) ndarray of int
-
-    Returns
-    -------
-    float
-        [scene unit cubed]. Summed about the mean vertex, so that a far origin costs no digits.
+    """Volume enclosed by a closed, outward mesh, about the mean vertex, so that a far origin costs no digits.
 
     Examples
     --------
@@ -204,8 +182,8 @@ def volume_cubic(vertices, faces, direction, origin):
 
 @compiled
 def touching_balls(points, normals, steps, nearest):
-    """Radii ``steps`` (2, n) of the empty balls that touch each point from outside and inside, infinite where no point
-    limits them, and how far the nearest other point is.
+    """Radii ``steps`` (2, n) of the empty balls that touch each point from outside and inside, infinite where no
+    point limits them, and how far the nearest other point is.
     """
     for i in range(len(points)):
         steps[:, i] = np.inf

@@ -1,7 +1,5 @@
 """Large loops over points, split over a few threads; the loops themselves are serial and release the lock."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache

@@ -122,15 +122,8 @@ def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
 def pseudonormals(vertices: Floats, faces: Integers, across: Integers) -> tuple[Floats, Floats]:
     """Directions that sign a distance, of edges (m, 3, 3) and of vertices (n, 3).
 
-    Edge k of a face takes the sum of the two unit face normals, a vertex the normals weighted by their angle.
-
-    Parameters
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-        Those without area have no normal.
-    across : (m, 3) ndarray of int
-        Face across edge k of each face, below zero where there is none.
+    Edge k of a face takes the sum of the unit normals of the face and of that ``across`` (m, 3) it, below zero where
+    there is none; a vertex takes the normals weighted by their angle. Faces without area have no normal.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     u, v = b - a, c - a

@@ -10,8 +10,6 @@ more. At the slack length a fully active fibre bears `PEAK` shear moduli (Blemke
 spring that this tension stretches by ``tendon_strain``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -28,19 +26,7 @@ LEAST_STRAIN = 1e-3
 
 
 class FibrePull:
-    """Gives the solid's fibres the stiffness and the slack length of an activation.
-
-    Parameters
-    ----------
-    solid : EmbeddedSolid
-        With its passive fibres.
-    muscle : Muscle
-        With keys of contraction.
-
-    Attributes
-    ----------
-    activation : float
-    """
+    """Gives the solid's fibres the stiffness and the slack length of an activation."""
 
     def __init__(self, solid: EmbeddedSolid, muscle: Muscle) -> None:
         self.solid, self.passive = solid, solid.fibres

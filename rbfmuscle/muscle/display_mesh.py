@@ -1,7 +1,5 @@
 """The mesh of a muscle's material that shows it: where its vertices lie at rest."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
@@ -21,13 +19,9 @@ VERTICES_AN_EDGE = 1.15
 
 
 def display_vertices(muscle: Muscle, resolution: int) -> int:
-    """Vertices of the shown mesh of a muscle: three edges through its mean thickness, or as wide as cells.
+    """Vertices of the shown mesh of a muscle: three edges through its mean thickness.
 
-    Parameters
-    ----------
-    muscle : Muscle
-    resolution : int
-        Edges along the longest side; 0 for as many as the thickness wants.
+    With a ``resolution`` above 0, so many edges along its longest side.
     """
     mesh, (low, high) = muscle.mesh, WANTED if resolution else USUAL
     edge = 2.0 * float(mesh.volume) / (float(mesh.area) * EDGES_THROUGH)
@@ -41,17 +35,7 @@ def display_vertices(muscle: Muscle, resolution: int) -> int:
 class DisplayMesh:
     """A triangulation of the rest surface that the solid carries along.
 
-    Parameters
-    ----------
-    muscle : Muscle
-    rest : RestState
-    options : RBFOptions
-
-    Attributes
-    ----------
-    mesh : MaterialMesh
-    rest : (n, 3) ndarray
-        Vertices at rest, on the level set that has the mesh's volume.
+    Its vertices ``rest`` (n, 3) lie on the level set that has the mesh's volume.
     """
 
     def __init__(self, muscle: Muscle, rest: RestState, options: RBFOptions) -> None:
@@ -80,14 +64,9 @@ class DisplayMesh:
         return vertices
 
     def smooth_displacement(self, vertices: np.ndarray, sweeps: int) -> np.ndarray:
-        """The shape at rest, moved as the material on the whole and deformed as it is where that is smooth.
+        """The shape at rest, moved to vertices (n, 3) and deformed as these are where that is smooth.
 
-        Parameters
-        ----------
-        vertices : (n, 3) ndarray
-            Where the material is.
-        sweeps : int
-            Of smoothing of what the material does beside the rigid motion.
+        What the material does beside the rigid motion is smoothed in so many sweeps.
         """
         rows = np.arange(len(vertices))
         return smooth_displacement(self.rest, vertices, lambda beside: self.mesh.smooth(beside, rows, sweeps))

@@ -1,7 +1,5 @@
 """How an RBF muscle is shown: its field refitted, the bones cut away, the closed surface brought onto the level set."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import NamedTuple, TypedDict
@@ -37,21 +35,12 @@ CALM, SUNKEN, LOST = (30, 120, 500, 2000, 10_000), 0.01, 1e-10
 
 
 class Configuration(NamedTuple):
-    """Where a muscle's points are at one moment.
+    """Where a muscle's points are at one moment."""
 
-    Attributes
-    ----------
-    centres, normals : (K, 3) ndarray
-    points : (K + S, 3) ndarray
-        Contact points.
-    carried : (n, 3) ndarray or None
-        Vertices of the shown mesh where the material takes them.
-    """
-
-    centres: np.ndarray
-    normals: np.ndarray
-    points: np.ndarray
-    carried: np.ndarray | None
+    centres: np.ndarray  # (K, 3)
+    normals: np.ndarray  # (K, 3)
+    points: np.ndarray  # (K + S, 3), contact points
+    carried: np.ndarray | None  # (n, 3) vertices of the shown mesh where the material takes them
 
 
 class _Neighbours(NamedTuple):
@@ -71,19 +60,8 @@ class _Surroundings(TypedDict):
 class SurfaceBuilder:
     """Draws the surface of one muscle, from frame to frame.
 
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-    rest : RestState
-    options : RBFOptions
-
-    Attributes
-    ----------
-    level : float
-        Of the field that met the rest volume last: where the next search for it begins.
-    shown : DisplayMesh or None
-        The material's mesh, where it is not marching cubes that show the surface.
+    ``level`` is that of the field that met the rest volume last, where the next search begins; ``shown`` the
+    material's mesh, None where marching cubes show the surface.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene, rest: RestState, options: RBFOptions) -> None:
@@ -94,20 +72,9 @@ class SurfaceBuilder:
         self.shown = DisplayMesh(muscle, rest, options) if options.surface == "material" else None
 
     def draw(self, fit: Callable[[], RBFField], now: Configuration, contacts: BoneContacts) -> ModelSurface:
-        """The closed surface at the rest volume.
+        """The closed surface at the rest volume, of the field that ``fit`` gives, cut by the contacts.
 
-        Parameters
-        ----------
-        fit : callable
-            Gives the field.
-        now : Configuration
-        contacts : BoneContacts
-            What cuts the surface.
-
-        Raises
-        ------
-        SolveError
-            If marching cubes find no closed surface.
+        Raises SolveError if marching cubes find no closed surface.
         """
         notes: list[tuple[str, int, str]] = []
         if self.shown is None or now.carried is None:
@@ -248,15 +215,7 @@ def _faults(result: FittedMesh, cut: ClipDistance | None, volume: float) -> floa
 
 
 class RBFDrawing:
-    """An RBF muscle as it was at one moment; its field is fitted when it is first asked for.
-
-    Parameters
-    ----------
-    drawer : SurfaceBuilder
-    now : Configuration
-    contacts : BoneContacts
-        As they stand.
-    """
+    """An RBF muscle as it was at one moment; its field is fitted when it is first asked for."""
 
     def __init__(self, drawer: SurfaceBuilder, now: Configuration, contacts: BoneContacts) -> None:
         self._drawer, self._now = drawer, now

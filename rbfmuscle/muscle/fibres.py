@@ -15,22 +15,10 @@ NEAREST = 3
 def fibre_directions(
     points: np.ndarray, along: np.ndarray, fibres: Sequence[np.ndarray] | None, *, fallback: np.ndarray
 ) -> np.ndarray:
-    """Unit direction of the fibres at each point.
+    """Unit direction of the fibres at each point (n, 3).
 
-    Parameters
-    ----------
-    points : (n, 3) ndarray
-    along : (n, 3) ndarray
-        Gradient of the harmonic field from the first attachment to the last: the fibres follow it where none
-        are given.
-    fibres : list of (k, 3) ndarray, or None
-        Polylines.
-    fallback : (3,) ndarray
-        Direction where none can be told.
-
-    Returns
-    -------
-    (n, 3) ndarray
+    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the harmonic field
+    from the first attachment to the last; where neither has a direction the ``fallback`` (3,).
     """
     if fibres:
         middles = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in fibres])

@@ -5,8 +5,6 @@ has it: the energy gains μ Σ_q w_q `STIFFNESS` min over G of |F_q - G|² with 
 points. Its matrix, as for the other terms, is constant, but has only the points that need it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.jit import compiled

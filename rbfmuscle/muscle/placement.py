@@ -1,7 +1,5 @@
 """Where the centres and samples of an RBF muscle lie, and the fit that its field is made by."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import asdict, replace
 from typing import NamedTuple
@@ -56,34 +54,18 @@ def wanted_error(muscle: Muscle, scene: Scene, options: RBFOptions) -> float:
 
 
 class Chosen(NamedTuple):
-    """Number of centres of a muscle, and why.
-
-    Attributes
-    ----------
-    centres : int
-    error : float
-        Of the surface at rest with them, RMS [scene unit]; not a number where nothing was fitted.
-    reason : str
-    """
+    """Number of centres of a muscle, and why."""
 
     centres: int
-    error: float
+    error: float  # of the surface at rest, RMS [scene unit]; NaN where nothing was fitted
     reason: str
 
 
 def choose_centres(muscle: Muscle, scene: Scene, options: RBFOptions, *, known_only: bool = False) -> Chosen:
-    """How many centres a muscle has.
+    """How many centres a muscle has: as many as the scene says, else as its area and the error at rest ask for.
 
-    As many as the scene says; else those that its area asks for, and more until the surface at rest errs by no more
-    than is wanted. The number is kept on disk.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-    options : RBFOptions
-    known_only : bool
-        Fit nothing: where the number is not on disk, the least that it can be.
+    The number is kept on disk; with ``known_only`` nothing is fitted, and where it is not on disk it is the least
+    that it can be.
     """
     if options.centres:
         return Chosen(options.centres, np.nan, "as given")
@@ -134,28 +116,9 @@ def _rest_miss(frame: RestFrame, centres: SurfaceSample, fit: FieldFit) -> float
 def place_points(
     muscle: Muscle, frame: RestFrame, options: RBFOptions, count: int
 ) -> tuple[SurfaceSample, SurfaceSample, FieldFit]:
-    """Centres, samples and fit of a muscle, in its own frame.
+    """Centres and samples of a muscle in the coordinates of its frame, and their fit in the scene's.
 
-    Parameters
-    ----------
-    muscle : Muscle
-    frame : RestFrame
-        Of its vertices.
-    options : RBFOptions
-    count : int
-        Of centres.
-
-    Returns
-    -------
-    centres, samples : SurfaceSample
-        In the frame's coordinates.
-    fit : FieldFit
-        In the scene's.
-
-    Raises
-    ------
-    SceneError
-        If the placement cannot be had with this kernel.
+    Raises SceneError if the placement cannot be had with this kernel.
     """
     fitted = options.placement == FITTED
     faces = np.asarray(muscle.mesh.faces)

@@ -22,55 +22,23 @@ LEAST_ATTACHED = 4
 
 @dataclass(frozen=True)
 class RestState:
-    """An RBF muscle at rest: K centres, whose field is its surface, and S samples of the surface.
+    """An RBF muscle at rest: K centres, whose field is its surface, and S samples of the surface."""
 
-    Attributes
-    ----------
-    centres, normals : (K, 3) ndarray
-    samples : (S, 3) ndarray
-    sample_faces : (m, 3) ndarray of int
-        A closed outward triangulation of the samples.
-    fit : FieldFit
-        How the field through the centres is fitted.
-    bones : list of str
-        Bones, and ends of tendons, that hold the muscle, in the order of the scene.
-    holder : (K + S,) ndarray of int
-        Position in ``bones`` of the bone that holds a contact point (centres, then samples), -1 where it is free.
-    free, held : ndarray of int
-        Centres that move, and those that their bones carry.
-    mesh_volume : float
-        Of the muscle's mesh [scene unit cubed].
-    axes : (3, 3) ndarray
-        The muscle's principal axes as rows.
-    """
-
-    centres: np.ndarray
-    normals: np.ndarray
-    samples: np.ndarray
-    sample_faces: np.ndarray
-    fit: FieldFit
-    bones: list[str]
-    attached_bone: np.ndarray
-    free: np.ndarray
-    held: np.ndarray
-    mesh_volume: float
-    axes: np.ndarray
+    centres: np.ndarray  # (K, 3)
+    normals: np.ndarray  # (K, 3)
+    samples: np.ndarray  # (S, 3)
+    sample_faces: np.ndarray  # (m, 3) closed outward triangulation of the samples
+    fit: FieldFit  # how the field through the centres is fitted
+    bones: list[str]  # bones, and ends of tendons, that hold the muscle, in the order of the scene
+    attached_bone: np.ndarray  # (K + S,) position in ``bones`` of what holds a contact point, -1 where free
+    free: np.ndarray  # centres that move
+    held: np.ndarray  # centres that their bones carry
+    mesh_volume: float  # of the muscle's mesh [scene unit cubed]
+    axes: np.ndarray  # (3, 3) principal axes as rows
 
     @classmethod
     def from_muscle(cls, muscle: Muscle, scene: Scene, options: RBFOptions) -> RestState:
-        """Measure a muscle of a scene.
-
-        Parameters
-        ----------
-        muscle : Muscle
-        scene : Scene
-        options : RBFOptions
-
-        Raises
-        ------
-        SceneError
-            If the placement cannot be had or no centre is left free to move.
-        """
+        """Measure a muscle; SceneError if the placement cannot be had or no centre is left free to move."""
         frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         count = choose_centres(muscle, scene, options).centres
         centres, samples, fit = place_points(muscle, frame, options, count)
@@ -83,19 +51,11 @@ class RestState:
             )
         attached_bone = np.concatenate([held_by.centres, held_by.samples])
         return cls(
-            points,
-            frame.directions(centres.normals),
-            frame.points(samples.points),
-            samples.control_faces,
-            fit,
-            held_by.bones,
-            attached_bone,
-            free,
-            held,
-            float(muscle.mesh.volume),
+            points, frame.directions(centres.normals), frame.points(samples.points), samples.control_faces, fit,
+            held_by.bones, attached_bone, free, held, float(muscle.mesh.volume),
             # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
             frame.directions(_principal_axes(samples.points)),
-        )
+        )  # fmt: skip
 
     def contact_points(self) -> np.ndarray:
         """Centres, then samples, (K + S, 3)."""

@@ -6,8 +6,6 @@ exact distances at the nodes of a lattice: smoothed over about a cell (a kernel 
 its gradient turns steadily. Only blocks of the lattice that are asked for are ever filled.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
@@ -27,13 +25,8 @@ LEAST_SLOPE = 0.3  # where the distance's slope is less, inside a thin bone, the
 class RoundedField:
     """The rounded distance to one bone, in place of its `BoneSDF` where a muscle settles.
 
-    Parameters
-    ----------
-    field : BoneSDF
-    frame : RestFrame
-        The axes and the origin of the lattice, which are then those of the muscle wherever the scene lies.
-    edge : float
-        Of a cell [scene unit].
+    ``frame`` gives the axes and the origin of the lattice, which are then those of the muscle wherever the scene
+    lies; ``edge`` is that of a cell [scene unit].
     """
 
     def __init__(self, field: BoneField, frame: RestFrame, edge: float) -> None:
@@ -81,15 +74,6 @@ def bone_thickness(field: BoneField, vertices: Floats, faces: Integers, most: fl
     """Thickness that nine tenths of a bone's surface exceed, at most ``most`` [scene unit].
 
     Twice the depth that a path into the bone, from the middle of a face against its normal, reaches.
-
-    Parameters
-    ----------
-    field : BoneSDF
-        Or any other field of the bone.
-    vertices, faces : ndarray
-        Of the bone at rest.
-    most : float
-        [scene unit]
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)

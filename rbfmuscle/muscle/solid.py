@@ -20,8 +20,6 @@ Each iteration minimises over R and t at each point, then over y with the matrix
 pressures are kept from iteration to iteration, so that the fixed point of the iteration is the equilibrium.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
@@ -77,38 +75,11 @@ class SolidState(NamedTuple):
 class EmbeddedSolid:
     """An elastic solid on a lattice, with volume and contact solved inside the iteration.
 
-    Parameters
-    ----------
-    lattice : Lattice
-        In the units of ``frame``.
-    frame : RestFrame
-    points : (n, 3) ndarray
-        Contact points at rest [scene unit]: K centres, then samples of the surface.
-    owner : (n,) ndarray of int
-        Bone that each contact point is attached to, -1 where it is free.
-    held : (h,) ndarray of int
-        Contact points by which the bones hold the muscle.
-    free : (f,) ndarray of int
-        Centres that are free to move.
-    count : int
-        K.
-    area : float
-        Area of the surface per sample [scene unit squared].
-    iterations : int
-        Greatest number of iterations in a solve.
-    bones : mapping of str to (vertices, faces)
-        Meshes of the bones that are obstacles.
-
-    Attributes
-    ----------
-    y : (N, 3) ndarray
-        Nodes in equilibrium with contacts that yield a little.
-    shown : (N, 3) ndarray
-        The same nodes, with what is left in a bone moved out.
-    pressure : (M,) ndarray
-        Of the regions, over 2 μ.
-    history : list of float
-        Greatest motion of a node in each iteration of the last solve [scene unit].
+    Contact points (n, 3) at rest [scene unit] are ``count`` centres, then samples of the surface, each of which
+    stands for an ``area``; ``owner`` (n,) is the bone that each is attached to, -1 where it is free. The bones hold
+    the muscle by the points ``held``; ``free`` centres move. Nodes ``y`` (N, 3) are in equilibrium with contacts that
+    yield a little, ``shown`` are the same nodes with what is left in a bone moved out. ``history`` holds the greatest
+    motion of a node in each iteration of the last solve.
     """
 
     def __init__(
@@ -340,13 +311,7 @@ class EmbeddedSolid:
     # --- equilibrium ------------------------------------------------------------------------------------------
 
     def settle(self, contacts: BoneContacts) -> None:
-        """Bring the nodes to equilibrium under pressures and contacts.
-
-        Raises
-        ------
-        FloatingPointError
-            If the iteration diverges.
-        """
+        """Bring the nodes to equilibrium under pressures and contacts; FloatingPointError if it diverges."""
         self.history, self._pull = [], self.spring @ self.anchor
         self._begin()
         near = self.contact.near(contacts, None)
@@ -414,10 +379,7 @@ class EmbeddedSolid:
     def localise(self) -> bool:
         """Find deformation gradients, targets, volumes and forces for the present nodes.
 
-        Returns
-        -------
-        bool
-            Whether points are squeezed that the matrix does not know of yet.
+        Returns whether points are squeezed that the matrix does not know of yet.
         """
         cells = self.quad_columns, self.slopes, self.weights, self.region, self.slot
         state = self.quaternion, self.stretch

@@ -6,8 +6,6 @@ muscle on a bone has not. So the solid settles with contacts that yield a little
 volumes kept. The next sub-step starts from the settled shape, not from the lifted one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
@@ -56,37 +54,18 @@ class Solid(Protocol):
 
 
 class NearPoints(NamedTuple):
-    """Contact points near an obstacle, and what they meet.
+    """Contact points near an obstacle, and what they meet."""
 
-    Attributes
-    ----------
-    which : (m,) ndarray of int
-    columns, shares : (m, w) ndarray
-        Their nodes and shape functions.
-    forces : (m, sources) ndarray
-        Changed in place.
-    contacts, exact : BoneContacts
-        Obstacles with rounded bones, and as they are.
-    y : (N, 3) ndarray
-        Nodes when the points were chosen.
-    reach : float
-        Distance within which points were chosen [scene unit].
-    most : (m,) ndarray
-        Greatest force on each, over 2 μ.
-    softness : (sources,) ndarray
-        Of each obstacle, relative to that of a bone.
-    """
-
-    which: Integers
-    columns: Integers
-    shares: Floats
-    forces: Floats
-    contacts: BoneContacts
-    exact: BoneContacts
-    y: Floats
-    reach: float
-    most: Floats
-    softness: Floats
+    which: Integers  # (m,)
+    columns: Integers  # (m, w) their nodes
+    shares: Floats  # (m, w) shape functions
+    forces: Floats  # (m, sources), changed in place
+    contacts: BoneContacts  # obstacles with rounded bones
+    exact: BoneContacts  # obstacles as they are
+    y: Floats  # (N, 3) nodes when the points were chosen
+    reach: float  # distance within which points were chosen [scene unit]
+    most: Floats  # (m,) greatest force on each, over 2 μ
+    softness: Floats  # (sources,) of each obstacle, relative to that of a bone
 
     def carry(self, y: Floats) -> Floats:
         """Positions (m, 3) for nodes (N, 3)."""
@@ -98,13 +77,7 @@ class NearPoints(NamedTuple):
 class SolidContact:
     """Contact of an `EmbeddedSolid`: forces of a linear complementarity problem through the inverse of its matrix.
 
-    Parameters
-    ----------
-    solid : Solid
-    area : float
-        Area of the surface per sample [scene unit squared].
-    bones : mapping of str to (vertices, faces)
-        Meshes of the bones.
+    ``area`` is that of the surface per sample, ``bones`` has their (vertices, faces) by name.
     """
 
     def __init__(self, solid: Solid, area: float, bones: Mapping[str, tuple[Floats, Integers]]) -> None:
@@ -117,10 +90,9 @@ class SolidContact:
         self._last_push = np.zeros_like(solid.rest)
 
     def _greatest_forces(self, area: float) -> Floats:
-        """Greatest force on each contact point.
+        """Greatest force on each contact point, less where it moves less than the median for a unit force.
 
-        It is less in proportion where the attachments let a point move less than the median for a unit force: what a
-        bone that is driven into an attachment would need to lift the points beside it bends the whole muscle.
+        What a bone that is driven into an attachment would need to lift the points beside it bends the whole muscle.
         """
         mobility = self.solid.mobility()
         free = self.solid.owner < 0
@@ -170,13 +142,9 @@ class SolidContact:
         return max(thickness, LEAST_ROUNDING * self.edge)
 
     def push(self, near: NearPoints, y: Floats, step: Floats, part: float) -> tuple[Floats, Floats]:
-        """Contact correction of a step of the nodes from ``y`` to ``step`` (N, 3), ``part`` of the way of a full one.
+        """Contact correction (N, 3) of a step of the nodes from ``y`` to ``step``, ``part`` of a full one.
 
-        Returns
-        -------
-        push : (N, 3) ndarray
-        taken : (M,) ndarray
-            What the contacts take from the whitened pressures.
+        Also what the contacts take from the whitened pressures, (M,).
         """
         here, motion = np.empty((2, len(near.which), 3))
         reach = np.empty(len(near.which))

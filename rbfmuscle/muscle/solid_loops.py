@@ -1,7 +1,5 @@
 """Loops over the quadrature points and the contacts of a muscle's elastic solid."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -11,24 +9,14 @@ from rbfmuscle.jit import compiled
 
 
 class Fibres(NamedTuple):
-    """Springs along the fibres at the quadrature points, stiffnesses over twice the shear modulus.
+    """Springs along the fibres at the quadrature points, stiffnesses over twice the shear modulus."""
 
-    Attributes
-    ----------
-    direction : (Q, 3) ndarray
-        At rest, unit.
-    passive, active : (Q,) ndarray
-        Stiffness of a spring that is slack from ``lower`` to ``upper``, and of one that is content at ``content``.
-    lower, upper, content : (Q,) ndarray
-        Stretches against rest.
-    """
-
-    direction: np.ndarray
-    passive: np.ndarray
-    active: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    content: np.ndarray
+    direction: np.ndarray  # (Q, 3) at rest, unit
+    passive: np.ndarray  # (Q,) stiffness of a spring that is slack from lower to upper
+    active: np.ndarray  # (Q,) stiffness of a spring that is content at ``content``
+    lower: np.ndarray  # (Q,) stretch against rest
+    upper: np.ndarray  # (Q,)
+    content: np.ndarray  # (Q,)
 
 
 @compiled(error_model="numpy")
@@ -268,20 +256,8 @@ def mobility_loop(columns, shares, inverse, out):
 def solve_contact_forces(gram, need, force, sweeps, tolerance, most):
     """Contact forces with 0 <= force <= most and gram · force >= need where force < most.
 
-    By projected Gauss-Seidel.
-
-    Parameters
-    ----------
-    gram : (c, c) ndarray
-        Motion at contact i for a unit force at contact j; symmetric, positive diagonal.
-    need : (c,) ndarray
-        Motion each contact asks for.
-    force : (c,) ndarray
-        First guess, changed in place to the solution.
-    sweeps : int
-    tolerance : float
-        Stop when no gap moves by more.
-    most : (c,) ndarray
+    By projected Gauss-Seidel from a first guess, in place, until no gap moves by more than the tolerance. ``gram``
+    (c, c) is the motion at contact i for a unit force at contact j, ``need`` (c,) the motion that each asks for.
     """
     lacking = need.copy()
     for c in range(len(need)):

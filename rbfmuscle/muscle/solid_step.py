@@ -1,7 +1,5 @@
 """Steps of the iteration that brings a muscle's elastic solid to equilibrium, compiled, and its acceleration."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
@@ -13,12 +11,7 @@ from rbfmuscle.muscle.solid_loops import press_loop, stress_loop, swell_loop, ta
 class Anderson:
     """Anderson acceleration of a fixed-point map (Walker & Ni 2011), plain steps until it has memory.
 
-    Parameters
-    ----------
-    memory : int
-        Number of steps that are combined; 0 for plain steps.
-    size, measured : int
-        Components of a state; the first so many form the residual.
+    ``memory`` steps are combined, 0 for plain ones; the first ``measured`` of a state's components are the residual.
     """
 
     def __init__(self, memory: int, size: int, measured: int) -> None:

@@ -31,35 +31,18 @@ NONE_ALLOWED: Floats = np.zeros(0)
 
 @dataclass(frozen=True)
 class HalfSpaces:
-    """Linearised contacts: moving point ``index`` by ``dp`` is admissible where ``gap + normal . dp >= 0``.
+    """Linearised contacts: moving point ``index`` by ``dp`` is admissible where ``gap + normal . dp >= 0``."""
 
-    Attributes
-    ----------
-    index : (c,) ndarray of int
-        Contact point.
-    gap : (c,) ndarray
-        Signed distance now [scene unit]; negative is violated.
-    normal : (c, 3) ndarray
-        Unit direction of growing distance, world axes.
-    source : (c,) ndarray of int
-        Index of the bone, or ``-1 - k`` for virtual edges of family k.
-    """
-
-    index: np.ndarray
-    gap: np.ndarray
-    normal: np.ndarray
-    source: np.ndarray
+    index: np.ndarray  # (c,) contact point
+    gap: np.ndarray  # (c,) signed distance now [scene unit], negative is violated
+    normal: np.ndarray  # (c, 3) unit direction of growing distance, world axes
+    source: np.ndarray  # (c,) index of the bone, or -1 - k for virtual edges of family k
 
 
 class Planes:
-    """Half-spaces of one kind against one obstacle, fixed through a sub-step.
+    """Half-spaces of one kind against one obstacle, at points ``anchor`` (c, 3), fixed through a sub-step.
 
-    Attributes
-    ----------
-    index, gap, normal
-        As in :class:`HalfSpaces`, at the points ``anchor`` (c, 3).
-    softness : float
-        How far they yield to a force, relative to a bone; for models that solve for forces.
+    ``softness`` says how far they yield to a force, relative to a bone; for models that solve for forces.
     """
 
     def __init__(self, softness: float = 1.0) -> None:
@@ -80,23 +63,9 @@ class Planes:
 class BoneContacts:
     """The obstacles of one muscle, in one pose.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Names of all bones of the scene.
-    fields : sequence of BoneField or None
-        One for each name; None where the muscle cannot reach the bone. Fields may be shared between muscles.
-    contact_bone : (n,) array_like of int, optional
-        Bone that contact point i is attached to, -1 where free. Attached points take no contact.
-
-    Attributes
-    ----------
-    reached : list of int
-        Indices of the bones with a field.
-    neighbours : list of Planes
-        Of sliding neighbours, and those that hold points on their side of a bone.
-    cuts : list of SlidingPair
-        What clips the muscle's surface beside the bones.
+    ``fields`` has one entry for each bone of the scene, None where the muscle cannot reach it; muscles may share
+    fields. ``contact_bone`` (n,) holds the bone that each contact point is attached to, -1 where it is free; attached
+    points take no contact.
     """
 
     def __init__(self, names: list[str], fields: list[Any], *, contact_bone: ArrayLike | None = None) -> None:
@@ -111,8 +80,9 @@ class BoneContacts:
         self.contact_bone = None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
         self.move(AtRest((name, np.eye(4)) for name in self.names))
         self.allowed: dict[int, Floats] = {}
+        #: Planes of sliding neighbours, and those that hold points on their side of a bone.
         self.neighbours: list[Any] = []
-        self.cuts: list[Any] = []
+        self.cuts: list[Any] = []  # sliding pairs that clip the muscle's surface beside the bones
         self._known: tuple[Floats, ...] = (
             np.zeros((len(self.reached), 0, 3)),
             np.zeros((len(self.reached), 0)),
@@ -163,24 +133,11 @@ class BoneContacts:
     def nearest(
         self, points: ArrayLike, limit: Floats | float = np.inf, *, neighbours: bool = True
     ) -> tuple[Floats, Floats]:
-        """Smallest distance over all bones and neighbours, by which an extracted surface is clipped.
+        """Smallest distance (n,) over bones and neighbours, and its gradient (n, 3) in world axes, for clipping.
 
-        Parameters
-        ----------
-        points : (n, 3) array_like
-        limit : float or (n,) ndarray
-            Where the smallest distance exceeds it, the value is only a lower bound above the limit, without a gradient
-            [scene unit].
-        neighbours : bool
-            Count sliding neighbours.
-
-        Returns
-        -------
-        distance : (n,) ndarray
-            [scene unit], negative inside a bone; infinity where no bone is in reach. Against a sliding
-            neighbour it is half the difference of the two muscles' distances, so that both are cut alike.
-        gradient : (n, 3) ndarray
-            World axes.
+        [scene unit], negative inside a bone, infinity where none is in reach. Beyond ``limit``, a number or (n,), it
+        is only a lower bound above the limit, without a gradient. Against a sliding neighbour it is half the
+        difference of the two muscles' distances, so that both are cut alike.
         """
         points = check_points(points)
         apart = np.empty(len(self.reached))
@@ -208,15 +165,7 @@ class BoneContacts:
         return found
 
     def half_spaces(self, points: ArrayLike, reach: ArrayLike) -> HalfSpaces:
-        """All pairs of contact point and obstacle nearer than ``reach``, as :class:`HalfSpaces`.
-
-        Parameters
-        ----------
-        points : (n, 3) array_like
-            The model's contact points, in their order.
-        reach : float or (n,) array_like
-            For all, or for each point [scene unit].
-        """
+        """Pairs of contact point (n, 3) and obstacle nearer than ``reach``, one or (n,) [scene unit]."""
         points = check_points(points)
         reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
         near = self.near(points, reach[None])
@@ -238,13 +187,9 @@ class BoneContacts:
         return HalfSpaces(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts))))
 
     def near(self, points: Floats, reach: Floats) -> list[tuple[int, Integers]]:
-        """Bones in reach, each with the free contact points that may be nearer to it than their reach.
+        """Bones in reach, each with the free contact points (n, 3) that may be nearer to it than their reach.
 
-        Parameters
-        ----------
-        points : (n, 3) ndarray
-        reach : (1, n) or (r, n) ndarray
-            For all bones, or for each of the bones ``reached``.
+        ``reach`` is (1, n) for all bones, or (r, n) for each of the bones ``reached``.
         """
         found = np.empty((len(self.reached), len(points)), dtype=np.int64)
         counts = np.zeros(len(self.reached), dtype=np.int64)
@@ -273,8 +218,8 @@ class BoneContacts:
         return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)
 
     def _bounds(self, count):
-        """Positions (r, n, 3) of the last queries, in the coordinates of each bone in reach, and bounds (r, n) of the
-        distances there; -infinity where nothing is known.
+        """Positions (r, n, 3) of the last queries, in bone coordinates, and lower bounds (r, n) of the distances
+        there; -infinity where nothing is known.
         """
         if self._known[1].shape[1] != count:
             rows = len(self.reached)

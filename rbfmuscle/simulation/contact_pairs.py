@@ -1,11 +1,8 @@
 """Which muscles can reach which bones in a motion, by swept boxes; the fields of these bones."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,13 +11,10 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.motion import bone_poses, completed, interpolate, rest_coordinates
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.substeps import check_substeps, path_angle
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
-
 
 # Poses of a motion that a swept box is made of; arcs between them are covered by the padding.
 SAMPLED_POSES = 48
@@ -32,15 +26,7 @@ Regions = dict[tuple[str, str], Floats]
 
 
 def swept_boxes(muscle: Muscle, bones: Sequence[str], poses: Sequence[Mapping[str, Floats]]) -> Floats:
-    """Boxes (b, 2, 3) in the coordinates of some bones that hold a muscle through a motion.
-
-    Parameters
-    ----------
-    muscle : Muscle
-    bones : sequence of str
-    poses : list of dict
-        Poses of all bones, the rest pose among them.
-    """
+    """Boxes (b, 2, 3), in the coordinates of some bones, that hold a muscle in all these poses of the bones."""
     there = np.linalg.inv(np.array([[pose[name] for pose in poses] for name in bones]))
     held = np.array([[pose[name] for pose in poses] for name in {a.holder for a in muscle.attachments}])
     bounds = np.asarray(muscle.mesh.bounds, dtype=np.float64)

@@ -33,70 +33,34 @@ class Event:
 
 @dataclass(frozen=True)
 class ModelSurface:
-    """A closed, outward surface and its quantities.
+    """A closed, outward surface and its quantities."""
 
-    Attributes
-    ----------
-    vertices : (n, 3) ndarray
-    faces : (m, 3) ndarray of int
-    quantities : dict of str to float
-        For example ``solver_penetration_max``, ``condition``, ``time_fit``, ``time_extract``.
-    notes : list of (bone, count, action)
-        Turned into events of the frame.
-    origin : tuple of (ModelSurface, (4, 4) ndarray) or None
-        An earlier surface and the rigid motion since, where the muscle moved rigidly.
-    """
-
-    vertices: np.ndarray = field(repr=False)
-    faces: np.ndarray = field(repr=False)
-    quantities: dict = field(default_factory=dict)
-    notes: list = field(default_factory=list)
+    vertices: np.ndarray = field(repr=False)  # (n, 3)
+    faces: np.ndarray = field(repr=False)  # (m, 3)
+    quantities: dict = field(default_factory=dict)  # ``condition``, ``time_fit`` and others by name
+    notes: list = field(default_factory=list)  # (bone, count, action), turned into events of the frame
+    # An earlier ModelSurface and the rigid motion (4, 4) since, where the muscle moved rigidly; else None.
     origin: Any = field(default=None, repr=False)
 
 
 @dataclass
 class Frame:
-    """One written frame.
+    """One written frame."""
 
-    Attributes
-    ----------
-    index : int
-        Index in the scene's motion.
-    coordinates : dict of str to float
-        [radian].
-    poses : dict of str to (4, 4) ndarray
-    surfaces : dict of str to ModelSurface
-        Empty where no surfaces were asked for.
-    carried : dict of str to (vertices, faces)
-        Material surfaces of constant topology.
-    events : list of Event
-        Since the frame written before.
-    times : dict of str to dict
-        For each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the
-        frame before.
-    wall : float
-        Time for all muscles together [s], since the frame before.
-    activations : dict of str to float
-        Of the muscles that contract.
-    work : dict of str to MuscleStatus
-        Whether each muscle was solved, moved rigidly or skipped, and why.
-    neighbours : dict of (str, str) to (float, float)
-        For each pair that slides: overlap, and RMS gap opened where they touched at rest.
-    tendons : dict of str to TendonLine
-        By the end that each holds; the poses have these too.
-    """
-
-    index: int
-    coordinates: dict
-    poses: dict = field(repr=False)
-    surfaces: Mapping[str, ModelSurface] = field(repr=False)
-    carried: dict = field(repr=False)
-    events: list
+    index: int  # in the scene's motion
+    coordinates: dict  # [radian]
+    poses: dict = field(repr=False)  # (4, 4) by bone
+    surfaces: Mapping[str, ModelSurface] = field(repr=False)  # by muscle; empty where none were asked for
+    carried: dict = field(repr=False)  # (vertices, faces) by muscle: material surfaces of constant topology
+    events: list  # since the frame written before
+    # Of each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the last frame.
     times: dict = field(repr=False)
-    wall: float
-    activations: dict = field(default_factory=dict)
-    work: dict = field(default_factory=dict)
+    wall: float  # time for all muscles together [s], since the frame before
+    activations: dict = field(default_factory=dict)  # of the muscles that contract
+    work: dict = field(default_factory=dict)  # MuscleStatus by muscle
+    # Of each pair that slides: overlap, and RMS gap opened where they touched at rest.
     neighbours: dict = field(default_factory=dict)
+    # TendonLine by the end that each holds; the poses have these too
     tendons: dict = field(default_factory=dict)
 
 
@@ -125,18 +89,10 @@ class FinishedDrawing:
 
 
 class MuscleModel(Protocol):
-    """The interface of a muscle to the frame loop.
-
-    Attributes
-    ----------
-    name : str
-        The muscle's name.
-    contact_bone : (n,) ndarray of int
-        Index of the bone that a contact point is attached to, -1 where it is free.
-    """
+    """The interface of a muscle to the frame loop."""
 
     name: str
-    contact_bone: np.ndarray
+    contact_bone: np.ndarray  # (n,) bone that a contact point is attached to, -1 where it is free
 
     def contact_points(self) -> np.ndarray:
         """Present contact points (n, 3); their number and order never change."""

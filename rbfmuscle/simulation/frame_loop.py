@@ -1,7 +1,5 @@
 """The frame loop: any muscle model against any bones."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -18,6 +16,7 @@ from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
 from rbfmuscle.simulation.overlap import resolve_initial_overlap
 from rbfmuscle.simulation.rigid_transport import RigidTransport
+from rbfmuscle.simulation.sliding import Sliding
 from rbfmuscle.simulation.stepper import MuscleStepper, TimedDrawing
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 
@@ -79,7 +78,7 @@ class FrameLoop:
         self._next_index, self._wall, self._blas = 0, 0.0, ThreadpoolController()
         with self.working():
             each(resolve_initial_overlap, self.steppers)
-            self._sliding = _sliding(scene, self.steppers)
+            self._sliding = None if scene.sliding is None else Sliding(scene, self.steppers)
 
     def advance(self, coordinates: Mapping[str, float]) -> Frame:
         """Advance to the given coordinates and return the frame.
@@ -185,24 +184,10 @@ def simulate_frames(
     written: Collection[int] | None = None,
     fields: Mapping[str, BoneField] | None = None,
 ) -> Iterator[Frame]:
-    """Run models through a scene's motion, from the rest pose on, and yield its frames one by one.
+    """Run models, from their rest state, through a scene's motion and yield its frames one by one.
 
-    Frames yielded before an interrupt or a ``SolveError`` stay valid.
-
-    Parameters
-    ----------
-    scene : Scene
-    models, surfaces, fields
-        As for `FrameLoop`.
-    written : collection of int, optional
-        Indices of the frames to yield; all where not given. The others are simulated and not shown.
-
-    Raises
-    ------
-    SolveError
-        If a muscle cannot be solved, naming muscle, frame and coordinates.
-    SceneError
-        If muscles overlap bones at rest and the scene's ``initial`` is ``"error"``.
+    Only frames whose index is in ``written`` are yielded, all where it is None. Frames yielded before an interrupt or
+    an error stay valid. Raises as `FrameLoop` does.
     """
     loop = FrameLoop(scene, models, fields=fields, surfaces=surfaces)
     for index, coordinates in enumerate(scene.motion.frames):
@@ -212,43 +197,10 @@ def simulate_frames(
             loop.skip(coordinates)
 
 
-def solve_pose(
-    scene: Scene,
-    models: Collection[MuscleModel],
-    coordinates: Mapping[str, float],
-    *,
-    fields: Mapping[str, BoneField] | None = None,
-) -> Frame:
-    """Solve one pose straight from rest, so that the shapes depend on the pose alone.
-
-    Parameters
-    ----------
-    scene : Scene
-    models : collection of MuscleModel
-        In their rest state, to which they return.
-    coordinates : mapping of str to float
-        Target coordinates [radian]; absent ones are at rest.
-    fields : mapping of str to BoneField, optional
-        As for `FrameLoop`.
-
-    Raises
-    ------
-    SolveError
-        If a muscle cannot be solved.
-    """
-    rest = [model.snapshot() for model in models]
-    try:
-        return FrameLoop(scene, models, fields=fields).advance(coordinates)
-    finally:
-        for model, state in zip(models, rest):
-            model.restore(state)
-
-
 def _obstacles(scene, models, fields):
     """One BoneContacts for each model, with fields of the bones that it can reach.
 
-    A field covers the reach of all muscles of the scene, also those without a model here, so that it does not depend on
-    which muscles are simulated.
+    A field covers the reach of all muscles of the scene, so that it does not depend on which are simulated.
     """
     regions = find_contact_pairs(scene) if fields is None else None
     here = {model.name for model in models}
@@ -259,12 +211,3 @@ def _obstacles(scene, models, fields):
     for model in models:
         reached = [fields.get(n) if regions is None or (model.name, n) in regions else None for n in names]
         yield BoneContacts(names, reached, contact_bone=model.contact_bone)
-
-
-def _sliding(scene, steppers):
-    """Sliding between muscles, or None."""
-    if scene.sliding is None:
-        return None
-    from rbfmuscle.simulation.sliding import Sliding
-
-    return Sliding(scene, steppers)

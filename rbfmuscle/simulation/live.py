@@ -1,11 +1,8 @@
 """A scene whose coordinates are set interactively."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,14 +10,11 @@ from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
+from rbfmuscle.simulation.frame import Frame, MuscleModel
 from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.validation import UsageError
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.frame import Frame, MuscleModel
-
 
 # Range of a coordinate around rest where the scene's motion does not exceed it [degree, mm].
 FREE_RANGE = 30.0
@@ -29,20 +23,9 @@ FREE_RANGE = 30.0
 class LiveSession:
     """Models that follow coordinates set interactively.
 
-    Parameters
-    ----------
-    scene : Scene
-    fields : mapping of str to BoneField, optional
-        Distance fields of the bones, as `live_fields` builds them.
-
-    Attributes
-    ----------
-    limits : dict of str to (float, float)
-        Range of each coordinate [radian].
-    rest, here, target : dict of str to float
-        Coordinates at rest, at present and to be reached [radian].
-    activation : dict of str to float
-        Target activation of the muscles that contract, 0 to 1.
+    Coordinates at ``rest``, ``here`` and at their ``target`` are in radian, as are the ``limits`` of each;
+    ``activation`` holds the target, 0 to 1, of the muscles that contract. ``fields`` are as `live_fields` builds
+    them.
     """
 
     def __init__(self, scene: Scene, *, fields: Mapping[str, BoneField] | None = None) -> None:
@@ -92,21 +75,8 @@ class LiveSession:
     def advance(self, stride: float = math.inf, *, surfaces: bool = True) -> Frame:
         """Move towards the target and return the frame reached.
 
-        Parameters
-        ----------
-        stride : float
-            Greatest change of a coordinate [radian]. If finite, no activation changes by more than one sub-step's.
-        surfaces : bool
-            Whether the frame has surfaces in addition to the material.
-
-        Returns
-        -------
-        Frame
-
-        Raises
-        ------
-        SolveError
-            If a muscle cannot be solved; `reset` goes back to rest.
+        No coordinate changes by more than ``stride`` [radian], and, if that is finite, no activation by more than a
+        sub-step's. Raises SolveError if a muscle cannot be solved; `reset` goes back to rest.
         """
         if self._loop is None:
             self._loop = FrameLoop(_wide_scene(self.scene), self.models, fields=self.fields)
@@ -125,18 +95,9 @@ class LiveSession:
 
 
 def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
-    """Range of each free coordinate: its own, or the motion's and 30 degrees (30 mm) both ways.
+    """Range [radian] of each free coordinate: its own, or the motion's and 30 degrees (30 mm) both ways.
 
     Coordinates that are coupled or locked are left out.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    dict of str to (float, float)
-        [radian]
     """
     followers = {coupling.coordinate for coupling in scene.couplings}
     limits = {}
@@ -154,16 +115,7 @@ def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
 
 
 def live_fields(scene: Scene) -> Mapping[str, BoneField]:
-    """Distance fields of the bones in reach of a muscle within the coordinates' ranges.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    dict of str to BoneSDF
-    """
+    """Distance fields of the bones in reach of a muscle within the coordinates' ranges."""
     return build_fields(scene, find_contact_pairs(_wide_scene(scene)))
 
 

@@ -1,11 +1,9 @@
 """Checks a motion before the run: attachments that it moves into another bone, too far apart or too close together."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,10 +12,8 @@ from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import Finding
 from rbfmuscle.scene.motion import bone_poses
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 
 # Greatest numbers of frames and of vertices of an attachment that are checked.
 MOST_FRAMES, MOST_VERTICES = 25, 60
@@ -30,27 +26,14 @@ APART = 0.3
 
 
 class Fault(NamedTuple):
-    """An attachment that the motion moves into another bone, or two that it moves too far apart or together.
-
-    Attributes
-    ----------
-    muscle : str
-    bones : (str, str)
-        The bone that holds the attachment and the one that it enters, or those that hold the two.
-    rest : float
-        Distance between the two at rest [scene unit]; 0 for one that enters a bone.
-    value : float
-        Greatest depth beyond that at rest, or the distance farthest from that at rest [scene unit].
-    frame, first : int
-        Where it is so, and the first frame of too great a value.
-    """
+    """An attachment that the motion moves into another bone, or two that it moves too far apart or together."""
 
     muscle: str
-    bones: tuple[str, str]
-    rest: float
-    value: float
-    frame: int
-    first: int
+    bones: tuple[str, str]  # that holds the attachment and that it enters, or those that hold the two
+    rest: float  # distance between the two at rest [scene unit]; 0 for one that enters a bone
+    value: float  # greatest depth beyond that at rest, or the distance farthest from that at rest
+    frame: int  # where it is so
+    first: int  # first frame of too great a value
 
 
 def check_motion(scene: Scene) -> list[Fault]:

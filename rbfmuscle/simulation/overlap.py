@@ -1,18 +1,12 @@
 """What overlaps at rest, as bones and muscles come from different sources: kept, resolved or refused."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.simulation.stepper import MuscleStepper
 from rbfmuscle.validation import SceneError
-
-if TYPE_CHECKING:
-    from rbfmuscle.simulation.stepper import MuscleStepper
-
 
 # Depth [mm] below which nothing overlaps, and the movement [mm] below which a muscle has settled.
 DEPTH = 0.02
@@ -25,13 +19,8 @@ MOST_SOLVES = 60
 def resolve_initial_overlap(stepper: MuscleStepper) -> None:
     """Deal with overlap at rest as the scene's ``[contact] initial`` says; for a muscle in its rest pose.
 
-    ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model holds its
-    shape and volume. ``"keep"`` measures every gap from the depth at rest.
-
-    Raises
-    ------
-    SceneError
-        With ``"error"``, naming muscle, bone and depth.
+    ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model holds its shape and
+    volume, ``"keep"`` measures every gap from the depth at rest, ``"error"`` raises SceneError.
     """
     contacts, scene = stepper.contacts, stepper.scene
     least, initial = scene.length(DEPTH), scene.contact.initial

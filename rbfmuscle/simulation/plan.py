@@ -1,35 +1,23 @@
 """What a run of a scene would build and solve, without building it."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rbfmuscle.scene.motion import completed, rest_coordinates
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import bone_regions, find_contact_pairs
 from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 
-if TYPE_CHECKING:
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
-
 
 def plan_scene(scene: Scene) -> dict[str, Any]:
-    """Return what a run of the scene would build.
+    """Frames, sub-steps, muscles and fields of a run, by these names.
 
-    Returns
-    -------
-    dict
-        ``frames`` of the motion; ``substeps`` of the muscle that takes most; ``fields``: of each bone that a muscle can
-        reach the triangles and the share of its box; ``muscles``: name, model, vertices, ``bones`` within reach, and
-        the ``substeps`` in which it is solved.
-
-    Notes
-    -----
-    A listed bone need not be touched. A bone that comes near a muscle is not foreseen: the muscle may then
-    be solved in more sub-steps.
+    Muscles have the ``bones`` within reach and the ``substeps`` in which they are solved, fields the triangles and
+    the share of the bone's box. A listed bone need not be touched. A bone that comes near a muscle is not foreseen:
+    the muscle may then be solved in more sub-steps.
     """
     regions, poses = find_contact_pairs(scene), PoseCache(scene)
     muscles: list[dict[str, Any]] = []

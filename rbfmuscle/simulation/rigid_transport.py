@@ -4,23 +4,18 @@ Such a muscle keeps its shape and moves with its bones. The relative pose of the
 solve. If another bone comes near, the muscle is solved.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.scene.motion import turned_angle
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.contact import BoneContacts
-    from rbfmuscle.simulation.frame import MuscleModel
-
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.frame import MuscleModel
 
 # Bones farther than this [mm] from a muscle do not act on it.
 CLEAR = 2.0
@@ -31,36 +26,17 @@ ARC = 0.5
 
 
 class MuscleStatus(NamedTuple):
-    """How a muscle came to a frame.
+    """How a muscle came to a frame."""
 
-    Attributes
-    ----------
-    state : {"solved", "carried", "skipped"}
-        Carried: moved rigidly with its bones. Skipped: not moved.
-    substeps : int
-        Number of sub-steps in which it was solved.
-    """
-
-    state: str
-    substeps: int
+    state: str  # solved, carried (moved rigidly with its bones) or skipped (not moved)
+    substeps: int  # number in which it was solved
 
 
 class RigidTransport:
     """Moves one muscle rigidly where its bones do; for a muscle that neither slides on neighbours nor contracts.
 
-    Parameters
-    ----------
-    muscle : Muscle
-    scene : Scene
-
-    Attributes
-    ----------
-    names : list of str
-        Bones, and ends of tendons, that hold the muscle; the first holds most of it.
-    solved : mapping of str to (4, 4) ndarray, or None
-        Poses of the bones when the muscle was solved last; None before it was.
-    since : (4, 4) ndarray
-        Rigid motion since its surface was drawn last.
+    ``names`` holds the bones, and ends of tendons, that hold it, first that of most of it; ``solved`` their poses
+    when it was solved last, or None; ``since`` the rigid motion (4, 4) since its surface was drawn last.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene) -> None:
@@ -81,11 +57,7 @@ class RigidTransport:
         return not any(self._moves(before, after, root, name) for name in self.names[1:])
 
     def try_carry(
-        self,
-        model: MuscleModel,
-        contacts: BoneContacts,
-        before: dict[str, Floats],
-        after: dict[str, Floats],
+        self, model: MuscleModel, contacts: BoneContacts, before: dict[str, Floats], after: dict[str, Floats]
     ) -> bool:
         """Move the muscle rigidly from one set of poses to the next if it need not be solved; return whether it was."""
         self.solved, root = self.solved or before, self.names[0]

@@ -8,47 +8,28 @@ of two muscles may use half of the gap between them, or moves back by half of th
 on the order of the muscles or on the number of threads.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
 from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
 from rbfmuscle.simulation.sliding_pair import BoneLink, SlidingLimits, SlidingPair
 from rbfmuscle.simulation.stepper import MuscleStepper, TimedDrawing
 from rbfmuscle.validation import SceneError
 
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-
 Coordinates = dict[str, float]
 
 
 class Sliding:
-    """Muscles that exchange their surfaces, in all sliding pairs of a scene.
+    """Muscles, in their rest state, that exchange their surfaces in all sliding pairs of a scene.
 
-    Parameters
-    ----------
-    scene : Scene
-        With ``sliding`` options.
-    steppers : list of MuscleStepper
-        In their rest state.
-
-    Attributes
-    ----------
-    pairs : dict of (str, str) to (float, float)
-        For each pair that met by the last drawings: overlap, and RMS gap opened where they touched at rest.
-
-    Raises
-    ------
-    SceneError
-        If ``pairs`` names an unknown muscle.
+    ``pairs`` has, for each that met by the last drawings, the overlap, and the RMS gap opened where they touched at
+    rest. Raises SceneError if the scene's ``pairs`` name an unknown muscle.
     """
 
     def __init__(self, scene: Scene, steppers: list[MuscleStepper]) -> None:

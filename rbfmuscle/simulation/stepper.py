@@ -8,25 +8,21 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fields import Field
 from rbfmuscle.scene.motion import interpolate, shown_value, step_angle, unit_sign
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
-from rbfmuscle.simulation.frame import Drawing, Event, ModelSurface
+from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.frame import Drawing, Event, ModelSurface, MuscleModel
 from rbfmuscle.simulation.rigid_transport import MuscleStatus, RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 from rbfmuscle.simulation.tunnelling import find_crossings, one_sided_planes, only_grazed, rotate_with_bone
 from rbfmuscle.validation import NotFiniteError, SolveError
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-    from rbfmuscle.simulation.contact import BoneContacts
-    from rbfmuscle.simulation.frame import MuscleModel
-
 
 # Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
 TOUCH = 0.1
@@ -37,13 +33,7 @@ SMALLEST_STEP = math.radians(0.1)
 
 
 class TimedDrawing:
-    """A muscle's drawing, whose surface is computed once.
-
-    Parameters
-    ----------
-    stepper : MuscleStepper
-    drawing : Drawing
-    """
+    """A muscle's drawing, whose surface is computed once."""
 
     def __init__(self, stepper: MuscleStepper, drawing: Drawing) -> None:
         self.stepper, self.drawing = stepper, drawing
@@ -80,23 +70,10 @@ class CarriedDrawing:
 
 
 class MuscleStepper:
-    """Advances one model through sub-steps.
+    """Advances one model through sub-steps, against obstacles of its own.
 
-    Parameters
-    ----------
-    model : MuscleModel
-    contacts : BoneContacts
-        Of this muscle alone.
-    scene : Scene
-    poses : callable, optional
-        Poses of the bones for coordinates; those of the scene where not given.
-
-    Attributes
-    ----------
-    cut : SubSteps or None
-        Sub-steps by the relative motion of the muscle's own bones; None for one that contracts.
-    carrier : RigidTransport or None
-        Moves the muscle rigidly where it need not be solved; None where it is always solved.
+    ``cut`` gives sub-steps by the relative motion of the muscle's own bones, None for one that contracts; ``carrier``
+    moves the muscle rigidly where it need not be solved, None where it is always solved.
     """
 
     def __init__(
@@ -135,10 +112,7 @@ class MuscleStepper:
     def go(
         self, stops: list[dict[str, float]], activations: Sequence[Mapping[str, float]] = ()
     ) -> MuscleStepper:
-        """Advance through a list of coordinates; the first are the present ones.
-
-        ``activations`` holds, for muscles that contract, the activation by muscle at the end of each.
-        """
+        """Advance through a list of coordinates, the present ones first; ``activations`` by muscle at each end."""
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
             self.set_activation(activation or {})
             poses = self.poses(before), self.poses(after)
@@ -178,13 +152,7 @@ class MuscleStepper:
             self.carrier.solved = self.poses(after)
 
     def solve(self, coordinates: Mapping[str, float]) -> None:
-        """Solve, and refuse what is not finite.
-
-        Raises
-        ------
-        SolveError
-            Naming muscle, mesh, frame and coordinates.
-        """
+        """Solve; raise SolveError with muscle, mesh, frame and coordinates where that fails or is not finite."""
         try:
             with self.timed("solve"):
                 self.model.solve(self.contacts)

@@ -1,10 +1,9 @@
 """How the way from one frame to the next is cut into sub-steps."""
 
-from __future__ import annotations
-
 import itertools
 import math
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -19,15 +18,10 @@ from rbfmuscle.scene.motion import (
     step_angle,
     turned_angle,
 )
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from rbfmuscle.scene.objects import Muscle
-    from rbfmuscle.scene.scene import Scene
-
 
 Coordinates: TypeAlias = dict[str, float]
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.
@@ -41,19 +35,10 @@ PIECES = 8
 class SubSteps:
     """How a scene's motion is cut into sub-steps.
 
-    No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far against a
-    bone. Where one coordinate moves alone, sub-steps end at multiples of that angle, however the frames are
-    spaced: a muscle that can settle in several ways then comes to a pose by the same path.
-
-    Parameters
-    ----------
-    scene : Scene
-    muscle : Muscle, optional
-        Cut as this muscle's own bones move against each other; as the whole scene does where not given.
-    bones : sequence of str
-        Other bones that it can meet.
-    poses : callable, optional
-        Poses of the bones for coordinates; those of the scene where not given.
+    No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far against a bone.
+    Where one coordinate moves alone, sub-steps end at multiples of that angle, however the frames are spaced: a
+    muscle that can settle in several ways then comes to a pose by the same path. For one ``muscle`` only its own
+    bones and the others that it can meet, ``bones``, count.
     """
 
     def __init__(
@@ -87,13 +72,7 @@ class SubSteps:
         self._travel, self._corners = TRAVEL * np.array(sizes), np.array(corners).reshape(-1, 8, 3)
 
     def split(self, before: Coordinates, after: Coordinates) -> list[Coordinates]:
-        """Coordinates of the sub-steps from one frame to the next, ``before`` left out and ``after`` last.
-
-        Returns
-        -------
-        list of dict
-            Empty where nothing moves.
-        """
+        """Coordinates of the sub-steps to the next frame, ``before`` left out; empty where nothing moves."""
         before, after = completed(self.scene, before), completed(self.scene, after)
         moving = [k for k in {*before, *after} if before.get(k, 0.0) != after.get(k, 0.0)]
         if not moving:
@@ -220,13 +199,7 @@ def _moving_apart(scene: Scene, bones: Sequence[str]) -> set[str]:
 
 
 def check_substeps(scene: Scene) -> None:
-    """Refuse a motion of more sub-steps than `MOST_SUBSTEPS`, before anything grows with their number.
-
-    Raises
-    ------
-    SceneError
-        With the number, and the coordinate that takes most of it.
-    """
+    """Raise SceneError for a motion of more than `MOST_SUBSTEPS`, before anything grows with their number."""
     cut, frames, rest = SubSteps(scene), scene.motion.frames, rest_coordinates(scene)
     for name in sorted({name for frame in frames for name in frame}):
         start = rest.get(name, 0.0)

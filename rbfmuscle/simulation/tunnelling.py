@@ -6,24 +6,19 @@ as the text means it: below cos 135 degrees); it misses most short crossings. Th
 by sphere tracing (Hart 1996) in the bone's distance field and cannot miss what is thicker than its tolerance.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rotations import rigid_fit
+from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, Planes
-
-if TYPE_CHECKING:
-    from rbfmuscle.bones.sdf import BoneSDF
-    from rbfmuscle.scene.options import TunnellingOptions
-    from rbfmuscle.simulation.frame import MuscleModel
-
+from rbfmuscle.simulation.frame import MuscleModel
 
 # 135 degrees, the bound of the angle test.
 RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
@@ -41,24 +36,12 @@ GRAZE_STRIDE = 0.2
 
 @dataclass(frozen=True)
 class Sweep:
-    """Result of following the paths of some points at one bone.
+    """Result of following the paths of some points at one bone."""
 
-    Attributes
-    ----------
-    index : (c,) ndarray of int
-        Points whose paths may have touched the bone.
-    lowest : (c,) ndarray
-        Smallest distance found along the path [scene unit]; negative inside.
-    through : (c,) ndarray of bool
-        Entered deeper than the tolerance, and left (or ended) in another direction than it entered.
-    flagged : (c,) ndarray of bool
-        Result of the angle test: directions at the two ends differ by more than its angle.
-    """
-
-    index: np.ndarray
-    lowest: np.ndarray
-    through: np.ndarray
-    flagged: np.ndarray
+    index: np.ndarray  # (c,) points whose paths may have touched the bone
+    lowest: np.ndarray  # (c,) smallest distance along the path [scene unit], negative inside
+    through: np.ndarray  # (c,) entered deeper than the tolerance, and left (or ended) in another direction
+    flagged: np.ndarray  # (c,) directions at the two ends differ by more than the angle test's bound
 
 
 @dataclass(frozen=True)
@@ -73,21 +56,10 @@ class Crossing:
 def sweep_paths(
     field: BoneSDF, start: Floats, end: Floats, *, tolerance: float, angle: float = RIGHT_ANGLE_AND_HALF
 ) -> Sweep:
-    """Follow straight paths through a bone's distance field.
+    """Follow straight paths (n, 3) in bone coordinates through a bone's distance field.
 
-    Parameters
-    ----------
-    field : BoneSDF
-    start, end : (n, 3) ndarray
-        Ends of each path in bone coordinates.
-    tolerance : float
-        Depth below which nothing counts, the field's own error [scene unit].
-    angle : float
-        Bound of the angle test [radian].
-
-    Returns
-    -------
-    Sweep
+    No depth below ``tolerance``, the field's own error [scene unit], counts; ``angle`` bounds the angle test
+    [radian].
     """
     length = np.linalg.norm(end - start, axis=1)
     distance = field.distance(start, reach=float(length.max(initial=0.0)))
@@ -124,24 +96,9 @@ def find_crossings(
     *,
     tolerance: float,
 ) -> list[Crossing]:
-    """Points that passed through bones while the bones went from one set of poses to another.
+    """Bones that points (n, 3) crossed, or that the angle test flags, while the bones went between two poses.
 
-    Parameters
-    ----------
-    contacts : BoneContacts
-        In the poses ``after``.
-    start, end : (n, 3) ndarray
-        Contact points before and after the step, world coordinates.
-    before, after : dict of str to (4, 4) ndarray
-    options : TunnellingOptions
-        ``angle`` in degrees; with ``swept`` false the angle test alone decides.
-    tolerance : float
-        [scene unit].
-
-    Returns
-    -------
-    list of Crossing
-        One for each bone that was crossed or flagged.
+    Points are in world coordinates, the contacts in the poses ``after``, the tolerance in the scene's unit.
     """
     crossings = []
     # A path that is shorter than the distance of its end touches nothing.
@@ -168,8 +125,7 @@ def rotate_with_bone(
 ) -> None:
     """Move points that crossed back to where they were relative to the bone: rotated with it about its joint.
 
-    The bone's motion from ``before`` to ``after`` is the rotation about the joint centre by the step's angle. The model
-    has predicted already; it gets the rigid transform from the predicted to the corrected positions.
+    The model has predicted already; it gets the rigid transform from the predicted to the corrected positions.
     """
     for crossing in crossings:
         motion = after[names[crossing.bone]] @ np.linalg.inv(before[names[crossing.bone]])
@@ -186,7 +142,7 @@ def one_sided_planes(
     before: dict[str, Floats],
     after: dict[str, Floats],
 ) -> Planes:
-    """Planes that hold points which crossed on their side of the bone, a half-space for each.
+    """A half-space for each point that crossed, to hold it on its side of the bone.
 
     The plane lies between the point and the bone, normal to the distance's gradient, and moves with the bone.
     """
@@ -208,19 +164,10 @@ def only_grazed(
     after: Floats,
     tolerance: float,
 ) -> bool:
-    """Whether, by the exact distance to the bone's triangles, no path was deeper than the tolerance.
+    """Whether, by the exact distance to the bone's triangles, no path was deeper than ``tolerance`` [scene unit].
 
-    Parameters
-    ----------
-    crossing : Crossing
-    mesh : trimesh.Trimesh
-        Of the bone, in its coordinates.
-    paths : pair of (n, 3) ndarray
-        Contact points before and after the step, world coordinates.
-    before, after : (4, 4) ndarray
-        Poses of the bone.
-    tolerance : float
-        [scene unit].
+    Paths hold contact points (n, 3) before and after the step in world coordinates, ``before`` and ``after`` the
+    bone's poses (4, 4).
     """
     exact = ExactDistance(mesh.vertices, mesh.faces)
     if (exact.across < 0).any():  # not closed
