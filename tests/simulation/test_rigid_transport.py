@@ -11,7 +11,7 @@ from toy_scene import box_mesh, ellipsoid, held
 import rbfmuscle as rm
 from rbfmuscle.models import build_model, build_models
 from rbfmuscle.scene.objects import Motion
-from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
+from rbfmuscle.simulation.frame_loop import simulate_frames, solve_pose
 from rbfmuscle.simulation.plan import plan_scene
 from rbfmuscle.simulation.substeps import SubSteps
 
@@ -130,24 +130,15 @@ POSE = {"hip.flexion": np.radians(24.0), "hip.adduction": np.radians(-10.0)}
 OTHER = {"hip.flexion": np.radians(30.0)}
 
 
-def _solve_pose(scene, models, pose):
-    """One pose straight from rest, to which the models return."""
-    rest = [model.snapshot() for model in models]
-    frame = FrameLoop(scene, models).advance(pose)
-    for model, state in zip(models, rest):
-        model.restore(state)
-    return frame
-
-
 @pytest.mark.parametrize("model", ["pbd", {"name": "rbf", "centres": 80, "samples": 300, "resolution": 16}])
 def test_a_pose_is_the_same_whatever_was_solved_before(model):
     scene = rm.phantom_scene(model=model, spacing=6.0)
     scene.muscles = [scene.muscle("extensor")]
     scene.motion = Motion([POSE, OTHER])
     models = build_models(scene)
-    first = _solve_pose(scene, models, POSE)
-    _solve_pose(scene, models, OTHER)
-    again = _solve_pose(scene, models, POSE)
+    first = solve_pose(scene, models, POSE)
+    solve_pose(scene, models, OTHER)
+    again = solve_pose(scene, models, POSE)
     (alone, _) = simulate_frames(scene, build_models(scene))
     for frame in (again, alone):
         np.testing.assert_array_equal(frame.carried["extensor"][0], first.carried["extensor"][0])
