@@ -16,7 +16,9 @@ Settings = Annotated[
         help="KEY=VALUE, for instance model.centres=200 or contact.substep_angle=1; may be repeated.",
     ),
 ]
-Frames = Annotated[str | None, Parameter(help="Frames of the motion, as A:B:S (B not included).")]
+Frames = Annotated[
+    str | None, Parameter(help="Frames FIRST:END:STEP of the motion, as a Python slice: END not included.")
+]
 Json = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON and nothing else.")]
 Flag = Annotated[bool, Parameter(negative="")]
 Force = Annotated[bool, Parameter(negative="", help="Replace a scene file that exists.")]
