@@ -7,7 +7,10 @@ from cyclopts import Parameter
 
 SceneName = Annotated[Path, Parameter(help='Scene file (TOML), or "phantom" for the embedded hip.')]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Folder for the results.")]
-Model = Annotated[str | None, Parameter(help="Model of every muscle, in place of the scene's.")]
+Model = Annotated[
+    str | None,
+    Parameter(help="Model of every muscle, in place of the scene's: rbf, pbd, pbd-converged, xpbd, ..."),
+]
 Settings = Annotated[
     list[str] | None,
     Parameter(

@@ -34,8 +34,8 @@ def compare(
     Parameters
     ----------
     models
-        Names, separated by commas; distances are measured to the first. A mesh model with "-converged" after its name
-        sweeps until no vertex moves.
+        Models, separated by commas, for instance rbf,pbd; distances are measured to the first. All but pbd-paper
+        by default; this takes long. A mesh model with "-converged" after its name sweeps until no vertex moves.
     pictures
         Draw pictures and the animation.
     """

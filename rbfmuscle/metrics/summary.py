@@ -206,7 +206,7 @@ def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequen
     else:
         right = len(muscles) - len(wrong)
         count = f"{right} of {len(muscles)} muscles {'is' if right == 1 else 'are'} within all limits"
-        text = f"{count}; these are not: {_listed(wrong)}"
+        text = f"{count}; {_listed(wrong)} {'is' if len(wrong) == 1 else 'are'} not"
     if not found:
         return text
     text += "; the bones are not" if any(row[0] == ALL for row in found) and not wrong else ""
