@@ -36,17 +36,15 @@ MODEL_NAMES = tuple(_HOME)
 COMPARED = ("rbf", "pbd", "pbd-converged", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 # What models are called where it is not their name.
 _TITLES = {"rbf": "RBF", "pbd": "PBD", "pbd-paper": "PBD of the paper", "xpbd": "XPBD"}
-_PAPER_SWEEPS = 3
+_SWEEPS = {"pbd": 3}  # where the settings name none
 
 
 def model_title(muscle: Muscle) -> str:
-    """What the model of a muscle is called in tables and pictures, with its sweeps where they are its own."""
+    """What the model of a muscle is called in tables and pictures, with its sweeps where they are known."""
     base = muscle.model.removesuffix(_SUFFIX)
-    title, sweeps = _TITLES.get(base, base), muscle.options.get("iterations", 0)
+    title, sweeps = _TITLES.get(base, base), muscle.options.get("iterations", 0) or _SWEEPS.get(base, 0)
     if base != muscle.model:
         return f"{title}, converged"
-    if base == "pbd" and sweeps in (0, _PAPER_SWEEPS):
-        return f"{title}, {_PAPER_SWEEPS} sweeps as in the paper"
     return f"{title}, {sweeps} sweeps" if sweeps and base != "rbf" else title
 
 
@@ -68,6 +66,13 @@ def solved_points(muscle: Muscle, scene: Scene) -> str:
     home = _HOME[check_model_name(muscle.model)]
     options = _read_options(muscle, home, muscle.options)
     return _part(home, "rest", "solved_points")(muscle, scene, options)
+
+
+def kernel_names(scene: Scene) -> dict[str, str]:
+    """Kernel of each muscle whose model has one, by the muscle's name; nothing is built."""
+    homes = {muscle.name: _HOME[check_model_name(muscle.model)] for muscle in scene.muscles}
+    options = {m.name: _read_options(m, homes[m.name], m.options) for m in scene.muscles}
+    return {name: found.kernel for name, found in options.items() if hasattr(found, "kernel")}
 
 
 def build_models(scene: Scene, names: Collection[str] | None = None) -> list[MuscleModel]:

@@ -22,7 +22,7 @@ from rbfmuscle.metrics.summary import (
     exceeded,
     require_limits,
 )
-from rbfmuscle.models import configure_scene
+from rbfmuscle.models import configure_scene, kernel_names
 from rbfmuscle.output.writer import Neighbours, RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
@@ -174,6 +174,7 @@ class Recording:
             status=status or self.status,
             message=self.message,
             options=self.options,
+            kernels=kernel_names(self.scene),
             times={part: here.get(part, 0.0) + shared.get(part, 0.0) for part in {**here, **shared}},
             limits=limits,
             verdict=describe_verdict(table, limits, self.scene.left_out),

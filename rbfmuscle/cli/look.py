@@ -29,13 +29,13 @@ def view(
     scene
         Scene file (TOML), "phantom" for the embedded hip, or the folder of a run or of a comparison.
     at
-        COORDINATE=DEGREES to begin at, for instance hip.flexion=60; may be repeated. Of a saved run: frame=N.
+        Where to begin: COORDINATE=DEGREES, for instance hip.flexion=60; may be repeated. For a saved run: frame=N.
     colour
         What muscles are coloured by at first, in the browser.
     browser
-        Open the browser; without, the address is printed only.
+        Open the browser; --no-browser prints the address only.
     port
-        Of the address, on this machine alone; any free one by default.
+        Port of the address, which this machine alone can open; any free one by default.
     screenshot
         Draw this PNG at --at, without a display, and open nothing.
     """
@@ -128,14 +128,14 @@ def export(
     directory
         Folder of the run.
     formats
-        pvd, vtp, ply, stl, obj or glb: files for each frame; usd or animated-glb: all frames as an animation.
-        Several may be given.
+        pvd, vtp, ply, stl, obj or glb: files for each frame; animated-glb (Blender) or usd: all frames in one
+        animated file. Several may be given.
     output
         Folder to write to, DIR/export by default.
     units
         m, cm or mm; the scene's by default (glb, animated-glb: m).
     frames
-        Of the written frames, as A:B:S.
+        Some of the written frames, FIRST:END:STEP as a Python slice.
     """
     with Progress(f"export {directory}"):
         from rbfmuscle.output.export import export_run
@@ -164,7 +164,7 @@ def render(
     output
         File to draw.
     frame
-        Of a picture; the last one by default.
+        Frame of a picture; the last one by default.
     view
         front, back, left, right, top, bottom or motion (in its plane); may be repeated; front, right and back
         by default.

@@ -24,14 +24,14 @@ def new(
     ----------
     source
         Folder with STL, OBJ, PLY, VTK or VTP files, one bone or muscle each (or in folders bones and muscles);
-        or a segmentation: .nii, .nii.gz, .nrrd, or a folder with one mask a file.
+        or a segmentation: .nii, .nii.gz, .nrrd, or a folder with one file for each mask.
     units
-        Unit of the meshes, by the size of the bones where it is left out; label volumes become millimetres.
+        Unit of the meshes; by default chosen from the size of the bones. Label volumes are always in mm.
     labels
         Names of a segmentation's labels: JSON, CSV, TSV or ITK-SNAP's descriptions, or a known table, as
         totalsegmentator, musclemap-thigh.
     output
-        Scene file to write, scene.toml beside the meshes by default.
+        Scene file (.toml) to write, or a folder for scene.toml; the folder of the meshes by default.
     """
     from rbfmuscle.importers.guess.guess import guess_scene, write_scene
     from rbfmuscle.importers.guess.orientation import HEADER
@@ -42,13 +42,13 @@ def new(
     if labels is not None and not volume:
         raise UsageError(f"--labels names the labels of a segmentation, {source} is a folder of meshes")
     folder = _beside(source, output) if volume else source
-    output = output or folder / "scene.toml"
+    output = _scene_file(output, folder)
     _check_target(output, force)
     if volume:
         folder = _write_surfaces(source, labels, folder)
     guess = guess_scene(folder, "mm" if volume else units, output.parent, header=HEADER if volume else None)
     scene = write_scene(guess, output)
-    print(f"{output} written; every guess in it is marked, look them over")
+    print(f"{output} written; check the lines marked GUESS")
     for note in guess.parts.notes:
         print(f"note: {note}")
     for doubt in guess.doubts():
@@ -93,6 +93,12 @@ def import_(
     print(f"next: rbfmuscle check {written}, then rbfmuscle run {written} -o out")
 
 
+def _scene_file(output, folder):
+    """The scene file to write: an ``output`` that does not end in .toml is a folder."""
+    output = output or folder
+    return output if output.suffix.lower() == ".toml" else output / "scene.toml"
+
+
 def _check_target(file, force):
     if file.exists() and not force:
         raise UsageError(f"{file} exists; give another --output, or --force to replace it")
@@ -112,7 +118,7 @@ def _is_segmentation(source):
 def _beside(source, output):
     """Folder of the scene of a segmentation."""
     if output is not None:
-        return output.parent
+        return _scene_file(output, None).parent
     name = source.name.split(".")[0] or "scene"
     return source / "scene" if source.is_dir() else source.parent / f"{name}_scene"
 

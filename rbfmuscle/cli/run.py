@@ -22,6 +22,7 @@ def run(
     output: Output,
     model: Model = None,
     settings: Settings = None,
+    muscle: str | None = None,
     frames: Frames = None,
     fail_on: str | None = None,
     as_json: Json = False,
@@ -30,8 +31,11 @@ def run(
 
     Parameters
     ----------
+    muscle
+        Name of one muscle to simulate, without the others and without [sliding]; all by default.
     fail_on
-        Limits that end with exit code 6, for instance volume_error=0.001,penetration_max, or all.
+        Limits, by commas: a value beyond one of them makes the exit code 6. For instance
+        volume_error=0.001,penetration_max, or all.
     """
     from rbfmuscle import interruption
 
@@ -51,10 +55,12 @@ def run(
         from rbfmuscle.scene.phantom import open_scene
         from rbfmuscle.scene.settings import parse_settings
 
-        changes = parse_settings(settings)
+        changes, loaded = parse_settings(settings), open_scene(scene)
+        if muscle is not None:
+            loaded.muscles, loaded.sliding = [loaded.muscle(muscle)], None
         options: dict[str, Any] = {"model": model, "frames": frames, "fail_on": fail_on}
         try:
-            info = stream_run(open_scene(scene), output, settings=changes, progress=advance, **options)
+            info = stream_run(loaded, output, settings=changes, progress=advance, **options)
         except SolveError as error:
             raise SolveError("; ".join(filter(None, [str(error), kept()]))) from None
     if as_json:

@@ -34,8 +34,8 @@ def compare(
     Parameters
     ----------
     models
-        Names with commas between; distances are measured to the first. The sweeps of a mesh model with "-converged"
-        after its name go on until no vertex moves.
+        Models, separated by commas, for instance rbf,pbd; distances are measured to the first. All but pbd-paper
+        by default; this takes long. A mesh model with "-converged" after its name sweeps until no vertex moves.
     pictures
         Draw pictures and the animation.
     """
@@ -94,19 +94,19 @@ def kernels(
     source
         A mesh (STL, OBJ, PLY, VTK, VTP), a scene file, or ``phantom``.
     names
-        Kernels; all by default. Separate by commas or blanks.
+        Kernels; all by default. Separate them by commas or blanks.
     centres
-        Numbers of centres; 150 and 300 by default. Separate by commas or blanks.
+        Numbers of centres; 150 and 300 by default. Separate them by commas or blanks.
     muscle
-        Of a scene; every one by default.
+        Name of one muscle of a scene; all by default.
     placement
-        fitted or greedy; fitted centres lie beside the surface and meet all of it best.
+        Places of the centres: fitted (moved off the surface until the whole surface is met) or greedy (on it).
     resolution
-        Cells along the longest side; 128, more for slender muscles, by default.
+        Cells along the longest side of extracted surfaces; 0 for 128, and more for slender muscles.
     units
-        Name of the unit of a mesh, for the text only.
+        Name of the mesh's unit, for tables and plots; nothing is converted.
     error
-        In place of a table: the fewest centres and the kernel that reach this RMS distance, in the mesh's unit.
+        Find the fewest centres, and the kernel, that reach this RMS distance (in the mesh's unit), in place of a table.
     """
     from rbfmuscle.output.writer import check_writable
 
@@ -153,7 +153,9 @@ def _study(meshes, output, options):
         if study.recommended is not None:
             print(f"{name}: {describe(study.rows)}")
             print(f"to paste at the end of its [[muscle]]:\n\n{row_toml(study.recommended)}\n")
-    print(f"{answer(studies)}\npage in {output / 'kernels.html'}")
+    if len(studies) > 1 or not next(iter(studies.values())).recommended:
+        print(answer(studies))
+    print(f"all rows: open {output / 'kernels.html'}")
 
 
 def _find_wanted(meshes, output, error, options, units):
@@ -193,7 +195,7 @@ def sweep(
 ) -> None:
     """Run scenes under a grid of settings: errors, time per frame, Pareto front.
 
-    Points that the folder holds done are not run again.
+    Points that are already done in the folder are not run again.
 
     Parameters
     ----------
@@ -205,11 +207,11 @@ def sweep(
         KEY=VALUE settings of the reference that errors are measured against; by default the finest values
         of the grid.
     jobs
-        Points beside each other; all cores by default. The cores are shared out among them.
+        Points that run at the same time; as many as cores by default. Each gets cores / jobs threads.
     cluster
         Address of a Dask scheduler, for instance tcp://127.0.0.1:8786; its workers must see the folder.
     error
-        The quantity that the front trades against time.
+        The error on the axis of the Pareto front; the other axis is time.
     """
     from rbfmuscle import interruption
     from rbfmuscle.experiments.sweep import parse_grid, plan_sweep
@@ -287,7 +289,7 @@ def paths(
     samples
         Poses for each muscle, of which every fifth is held out of the fit.
     muscles
-        Names by commas; all of the scene by default.
+        Names, separated by commas; all by default.
     ranges
         COORDINATE=LOW:HIGH in degrees or scene units; else the coordinate's range, or what the motion covers.
     """

@@ -43,7 +43,7 @@ MEASURES = {
     "components": Measure("pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"),
     "euler": Measure("Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle", 2.0),
     "self_crossings": Measure("self-crossings", "1", LAW, 0.0, "triangles that cross others of the surface"),
-    "flicker": Measure("flicker", "length", LAW, 0.05, "surface against carried mesh, frame to frame"),
+    "flicker": Measure("flicker", "length", LAW, 0.05, "surface against material mesh, frame to frame"),
     "tunnelled": Measure("tunnelled points", "1", LAW, 0.0, "points beyond a bone"),
     "return_rms": Measure("return error (RMS)", "length", LAW, 0.02, "first pose before and after motion"),
     "return_max": Measure("return error (greatest)", "length", LAW, 0.1, "the same, greatest distance"),
@@ -151,29 +151,32 @@ def _deepened(values: dict[str, float]) -> float:
 
 
 def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str:
-    """One sentence: how the first model keeps out of bones at which price, and how near another comes at which price.
+    """Whether the first model keeps out of bones, its time against the quickest other one, which is nearest in shape.
 
     Arguments are those of `write_tables`; distances are to the first model.
     """
     first, *others = results
     whole = {name: found[ALL] for name, found in results.items()}
     depth = {name: max(map(_deepened, found.values())) for name, found in results.items()}
-    verb = "keeps out of" if depth[first] <= KEPT_OUT / MM_PER_UNIT[units] else "stands in"
-    text = f"{labels[first]} {verb} bones ({depth[first]:.2g} {units})"
+    verb = "keeps out of" if depth[first] <= KEPT_OUT / MM_PER_UNIT[units] else "enters"
+    texts = [
+        f"{labels[first]} {verb} bones: {depth[first]:.2g} {units} deep at most, without the overlap at rest"
+    ]
     timed = [name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]]
     quick = min(timed, key=lambda name: whole[name]["time_frame"], default=None)
     if quick:
         ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
-        text += f" at {ratio:.2g} times the time of {labels[quick]} ({depth[quick]:.2g} {units})"
+        name = f"{labels[quick]}{', the quickest of the others' if len(others) > 1 else ''}"
+        texts.append(f"It takes {ratio:.2g} times the time of {name} ({depth[quick]:.2g} {units} deep)")
     apart = {name: whole[name]["distance_rms"] for name in others if "distance_rms" in whole[name]}
-    if not apart:
-        return f"{text}."
-    near = min(apart, key=apart.__getitem__)
-    away = f"{apart[near]:.2g} {units} RMS"
-    if near == quick:
-        text += f"; the two lie {away} apart" if len(others) == 1 else f", which comes nearest to it ({away})"
-    else:
-        text += f"; {labels[near]}{',' if ',' in labels[near] else ''} comes within {away} of it"
-        if near in timed:
-            text += f" at {whole[near]['time_frame'] / whole[first]['time_frame']:.2g} times its time"
-    return f"{text}."
+    if apart:
+        near = min(apart, key=apart.__getitem__)
+        away = f"{apart[near]:.2g} {units} RMS"
+        if len(others) == 1:
+            texts.append(f"The two surfaces are {away} apart")
+        else:
+            texts.append(f"Nearest to it in shape is {labels[near]} ({away})")
+            if near in timed and near != quick:
+                ratio = whole[near]["time_frame"] / whole[first]["time_frame"]
+                texts[-1] += f", which takes {ratio:.2g} times the time of {labels[first]}"
+    return f"{'. '.join(texts)}."

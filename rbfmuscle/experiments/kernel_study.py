@@ -198,14 +198,14 @@ def describe(rows: list[dict]) -> str:
     good = [row for row in rows if not row["unfit"] and row["centres"] == best["centres"]]
     least = min(row["rms"] for row in good)
     tied = [row for row in good if row["rms"] <= ALIKE * least]
-    use = f"use {best['kernel']} with {best['centres']} centres"
+    use = f"Use {best['kernel']} with {best['centres']} centres"
     if len(tied) == 1:
         less = 100 * (1 - best["rms"] / min((row["rms"] for row in good if row is not best), default=np.inf))
-        behind = f", whose error is {less:.0f} % less than the next" if len(good) > 1 else ""
-        return f"{use[0].upper()}{use[1:]}{behind}."
-    spread = 100 * (max(row["rms"] for row in tied) / least - 1)
-    reason = "without a shape parameter to choose" if not best["epsilon"] else "of sound condition"
-    return f"{len(tied)} kernels tie within {max(spread, 1):.0f} %: {use}, the quickest {reason}."
+        behind = f": its error is {less:.0f} % less than that of the next kernel" if len(good) > 1 else ""
+        return f"{use}{behind}."
+    near = f"the errors of {len(tied)} kernels are within {100 * (ALIKE - 1):.0f} % of the least one"
+    shape = "" if best["epsilon"] else " and needs no shape parameter"
+    return f"{use}: {near}, and of these {best['kernel']} is among the quickest{shape}."
 
 
 def row_name(row: dict) -> str:

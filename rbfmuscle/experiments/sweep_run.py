@@ -121,7 +121,9 @@ def _connect_cluster(address: str) -> "Client":
     try:
         from distributed import Client
     except ImportError as error:
-        message = "Dask is not installed, which --cluster needs: pip install 'rbfmuscle[cluster]'"
+        message = (
+            "Dask is not installed, which --cluster needs: pip install -e '.[cluster]' in rbfmuscle's folder"
+        )
         raise MissingPartError(message) from error
     try:
         client = Client(address, timeout=CONNECT_WITHIN)

@@ -26,7 +26,7 @@ class Limit(NamedTuple):
 
 _SMALLER_STEPS = "lower contact.substep_angle"
 _MORE_CENTRES = "raise model.centres"
-_LOOK = "draw that frame: rbfmuscle render RUN --frame FRAME -o frame.png"
+_LOOK = "look at that frame: rbfmuscle render RUN --frame FRAME -o frame.png"
 _JOINT = "correct the joint's centre, axes or range"
 LIMITS = {
     "volume_error": Limit(1e-9, "volume error", "let the model settle: raise its iterations or sweeps"),
@@ -35,7 +35,9 @@ LIMITS = {
     "initial_overlap": Limit(0.3, "overlap left at rest", "move muscle or bone apart: rbfmuscle check SCENE"),
     "components": Limit(1.0, "pieces", f"{_LOOK}; {_MORE_CENTRES}"),
     "euler": Limit(2.0, "Euler characteristic", f"{_LOOK}; {_MORE_CENTRES}"),
-    "self_crossings": Limit(0.0, "self-crossing triangles", "raise model.iterations, or take pbd-converged"),
+    "self_crossings": Limit(
+        0.0, "self-crossing triangles", "raise model.iterations, or use model pbd-converged"
+    ),
     "unfitted_fraction": Limit(0.999, "surface shown without a fit", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"),
     "flicker": Limit(0.5, "flicker", _SMALLER_STEPS),
     "slack": Limit(1.03, "centreline over shortest path", _LOOK),
@@ -44,7 +46,7 @@ LIMITS = {
     "end_gap": Limit(25.0, "end away from its bone", "correct the attachment, or give it a tendon"),
     "bone_overlap": Limit(0.0, "bones in each other", _JOINT),
     "joint_gap": Limit(5.0, "joint that opens", _JOINT),
-    "bones_left_out": Limit(0.0, "bones left out", "mend their meshes and add them to the scene"),
+    "bones_left_out": Limit(0.0, "bones left out", "repair their meshes and add them to the scene"),
 }
 # Quantities of which too little is wrong: their limit is the least allowed value.
 LEAST = {"euler"}
@@ -203,7 +205,8 @@ def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequen
         text = f"{muscles[0]} is not within all limits"
     else:
         right = len(muscles) - len(wrong)
-        text = f"{right} of {len(muscles)} muscles are within all limits, not {_listed(wrong)}"
+        count = f"{right} of {len(muscles)} muscles {'is' if right == 1 else 'are'} within all limits"
+        text = f"{count}; {_listed(wrong)} {'is' if len(wrong) == 1 else 'are'} not"
     if not found:
         return text
     text += "; the bones are not" if any(row[0] == ALL for row in found) and not wrong else ""

@@ -190,8 +190,8 @@ def build_info(
     """Assemble ``run.json``; ``summary`` is from `Summary.table`.
 
     Other facts are kept as they are: ``status`` ("running", "complete", "interrupted" or "failed"), ``message`` (why it
-    did not complete), ``options`` of the caller, ``times`` of the parts of the run [s], ``limits``, ``verdict``,
-    ``beyond`` (muscle, quantity, worst value, limit, frame) and ``frames`` (`frame_facts`).
+    did not complete), ``options`` of the caller, ``kernels`` by muscle, ``times`` of the parts of the run [s],
+    ``limits``, ``verdict``, ``beyond`` (muscle, quantity, worst value, limit, frame), ``frames`` (`frame_facts`).
     """
     return {
         "format": FORMAT,

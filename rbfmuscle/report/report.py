@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
-from rbfmuscle.metrics.summary import COUNTS, LEAST, exceeded, excess, muscle_limit, shown_number, within
+from rbfmuscle.metrics.summary import (
+    COUNTS,
+    LEAST,
+    LIMITS,
+    exceeded,
+    excess,
+    muscle_limit,
+    shown_number,
+    within,
+)
 from rbfmuscle.output.animation.page import pack_runs
 from rbfmuscle.output.saved import SavedRun, read_moving
 from rbfmuscle.report.page import BAD, GOOD, Cell, Light, Page, Section, Table, limit_state, number_cell
@@ -31,14 +40,14 @@ PANELS = (
     ("Volume error", "volume_error", 100.0, "%"),
     ("Surface inside a bone", "penetration_max", 1.0, None),
     ("Bone inside the muscle", "bone_penetration_max", 1.0, None),
-    ("Edge strain of the carried mesh (RMS)", "edge_strain_rms", 100.0, "%"),
+    ("Edge strain of the material mesh (RMS)", "edge_strain_rms", 100.0, "%"),
     ("Time per frame after the first", "time_frame", 1000.0, "ms"),
 )
 # Points of all muscles in all frames that a page holds.
 _MOST_POINTS = 2_600_000
 # Tables or plots of their own.
 _ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
-_READING = """Depths in bones are exact distances to the bone meshes. A row is amber from four fifths of its limit.
+_READING = """Depths in bones are exact distances to the bone meshes. A row is amber from 80 % of its limit on.
 Times are medians, as the first frame may load and compile. Drag to turn the picture, scroll or pinch to zoom, drag with
 shift to move it; names below it switch muscles and their lines on and off."""
 
@@ -94,9 +103,12 @@ def _facts(saved: SavedRun) -> list[str]:
     info = saved.info
     models = sorted({muscle["model"]["name"] for muscle in info["scene"]["muscles"]})
     median = (info.get("frame_time") or {}).get("median")
-    counts = [f"{len(saved.muscles)} muscles", f"{len(saved.frames)} frame{'s'[: len(saved.frames) != 1]}"]
+    numbers = {"muscle": len(saved.muscles), "frame": len(saved.frames)}
+    counts = [f"{number} {word}{'s'[: number != 1]}" for word, number in numbers.items()]
     times = [f"{shown_number(median, 's')} per frame", f"{info['times']['wall']:.1f} s in all"]
-    return [f"model {', '.join(models)}", *counts, *times]
+    kernels = sorted(set(info.get("kernels", {}).values()))
+    kernel = [f"kernel{'s'[: len(kernels) > 1]} {', '.join(kernels)}"] if kernels else []
+    return [f"model {', '.join(models)}", *kernel, *counts, *times]
 
 
 def _lights(saved: SavedRun) -> list[Light]:
@@ -124,8 +136,14 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
     _, muscle, name, worst, facts, limit = max(found, key=lambda entry: entry[0])
     unit, place = facts["unit"], f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}"
     allowed = f"{'≥' if name in LEAST else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}"
-    cells, note = [number_cell(worst, unit, limit_state(name, worst, limit))], name.replace("_", " ")
+    cells, note = [number_cell(worst, unit, limit_state(name, worst, limit))], _title(name)
     return Light(title, cells, allowed, note + place if worst else note)
+
+
+def _title(name: str) -> str:
+    """A quantity in the words of the verdict, with its name in ``metrics.csv`` where that is another."""
+    title = LIMITS[name].title if name in LIMITS else name
+    return title if title.replace(" ", "_") == name else f"{title} ({name})"
 
 
 def _plots(saved: SavedRun) -> list[Section]:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 LOOPBACK = "127.0.0.1"
+INSTALL = 'python -m pip install "viser>=1.1,<2"'  # as the extra `web` in pyproject.toml has it
 COSTLY = 0.1  # Where a picture takes longer [s], those on the way to the controls' places are drawn coarse.
 PACE = 0.04  # Least time of a picture while a motion is played [s].
 FIELD_OF_VIEW = 0.5
@@ -82,13 +83,13 @@ def open_server(port: int = 0) -> "tuple[ViserServer, str]":
     try:
         import viser
     except ImportError:
-        raise MissingPartError("the viewer needs viser; install it with pip install -e '.[web]'") from None
+        raise MissingPartError(f"the viewer needs viser, which is not installed; run: {INSTALL}") from None
     gate = Gate(secrets.token_urlsafe(16))
     with _every_request_through(gate), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=LOOPBACK, port=port, label="rbfmuscle", verbose=False)
     if gate.inner is None:
         server.stop()
-        raise MissingPartError(f"requests to viser {viser.__version__} cannot be checked; install viser 1.1")
+        raise MissingPartError(f"requests to viser {viser.__version__} cannot be checked; run: {INSTALL}")
     return server, f"http://{LOOPBACK}:{server.get_port()}/{gate.token}/"
 
 

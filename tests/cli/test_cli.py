@@ -62,6 +62,14 @@ class TestRun:
         assert info["scene"]["muscles"][0]["model"] == {"name": "rbf", "centres": 80}
         assert info["scene"]["contact"]["initial"] == "keep"
 
+    def test_one_muscle_alone(self, folder, tmp_path, capsys):
+        command = ("run", "phantom", "-o", tmp_path / "o", "--model", "pbd", "--frames", "0:1")
+        code, _, _ = call(capsys, *command, "--muscle", "extensor", "--set", "sliding.threshold=2")
+        info = json.loads((tmp_path / "o" / "run.json").read_text(encoding="utf-8"))
+        assert code == 0 and list(info["muscles"]) == ["extensor"] and info["kernels"] == {}
+        code, _, err = call(capsys, *command, "--muscle", "extenso")
+        assert code == 3 and "did you mean 'extensor'?" in one_line(err)
+
     def test_limit_exceeded(self, folder, tmp_path, capsys):
         arguments = ("run", folder / "arm.toml", "-o", tmp_path / "o", "--frames", "0:1", "--fail-on")
         code, _, err = call(capsys, *arguments, "rest_error_rms=1e-9")

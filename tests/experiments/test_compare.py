@@ -32,8 +32,12 @@ def test_answer_says_what_the_first_keeps_at_which_price_and_who_comes_near():
     found = {"rbf": {"all": rbf}, "pbd": {"all": pbd}}
     more = found | {"settled": {"all": pbd | {"time_frame": 1.406, "distance_rms": 5.71}}}
     labels = {"rbf": "RBF", "pbd": "PBD", "settled": "PBD, converged"}
-    assert re.search(r"bones \(0\.031 mm\) at 3\.7 times .* the two lie 31 mm", describe(found, labels, "mm"))
-    assert re.search(r"converged, comes within 5\.7 mm .* 19 times its time", describe(more, labels, "mm"))
+    said = describe(found, labels, "mm")
+    assert re.search(
+        r"bones: 0\.031 mm .* 3\.7 times the time of PBD \(3\.2 mm deep\)\. .* 31 mm RMS apart\.", said
+    )
+    said = describe(more, labels, "mm")
+    assert re.search(r"PBD, the quickest .* PBD, converged \(5\.7 mm RMS\), which takes 19 times", said)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +91,7 @@ class TestComparison:
 def test_pictures_show_every_model(tmp_path):
     compare_models(arm_scene(), tmp_path, ["pbd", "arap-volume"])
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert '"panels":["PBD, 3 sweeps as in the paper","arap-volume"]' in text
+    assert '"panels":["PBD, 3 sweeps","arap-volume"]' in text
 
 
 class TestFailure:

@@ -303,6 +303,8 @@ def test_meshes_in_metres_make_a_scene_that_runs_and_an_unused_bone_is_in_the_ve
     code, printed, _ = call(capsys, "new", tmp_path)
     assert code == 0 and "units are m: " in printed
     assert call(capsys, "new", tmp_path)[0] == 2
+    assert call(capsys, "new", tmp_path, "-o", tmp_path / "folder")[0] == 0
+    assert (tmp_path / "folder" / "scene.toml").exists()
     assert "sacrum: no mesh of this bone could be used" in call(capsys, "check", scene)[1]
     run = ("run", scene, "-o", out, "--model", "pbd", "--frames", "0:5")
     code, printed, _ = call(capsys, *run)

@@ -80,7 +80,7 @@ def test_the_worst_by_its_limit_is_named_first_and_bones_are_named_too():
     values = {"penetration_max": [0.2], "volume_error": [1e-6]}
     table = facts(values, teres={"flicker": [0.0, 3.0]}, **{ALL: {"joint_gap": [0.0, 8.0]}})
     said = describe_verdict(table, {name: limit.value for name, limit in LIMITS.items()})
-    assert said.startswith("1 of 3 muscles are within all limits, not psoas, teres. Worst: psoas, volume")
+    assert said.startswith("1 of 3 muscles is within all limits; psoas, teres are not. Worst: psoas, volume")
     assert "; teres, flicker 3 mm at frame 1 (limit 0.5); the bones, joint that opens 8 mm at frame 1" in said
     assert [said.count(LIMITS[name].remedy) for name in ("flicker", "joint_gap")] == [1, 1]
 

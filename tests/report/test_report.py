@@ -46,6 +46,7 @@ def test_answer_picture_and_rows_come_before_what_is_folded(folder):
     places = [text.index(part) for part in order]
     assert places == sorted(places)
     assert len(lights) == 5 and "http" not in text
+    assert "<small>rest error (rest_error_rms)" in text  # as the verdict has it, and as metrics.csv has it
     assert all(source.startswith("data:") for source in sources)
     assert len(text) < 6_000_000
 

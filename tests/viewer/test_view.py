@@ -57,7 +57,7 @@ def test_missing_viser_is_one_line(run_folder, capsys, monkeypatch):
     code, _, err = call(capsys, "view", run_folder, "--no-browser")
     assert code == 7
     lines = [line for line in err.splitlines() if line.startswith("rbfmuscle:")]
-    assert len(lines) == 1 and "pip install -e '.[web]'" in lines[0]
+    assert len(lines) == 1 and 'run: python -m pip install "viser>=1.1,<2"' in lines[0]
 
 
 def test_address_is_printed_and_answers_until_interrupted(run_folder):

@@ -208,12 +208,12 @@ def _hold(bone, distance, ends, end, millimetre):
         limit = max(least, 0.0) + TOUCH
         chosen = np.flatnonzero(at_end & (distance <= limit))
         if len(chosen) >= FEWEST:
-            return AttachmentGuess(bone, chosen, least, f"lies within {limit:.3g} mm")
+            return AttachmentGuess(bone, chosen, least, f"within {limit:.3g} mm of the bone")
     chosen = np.flatnonzero(ends.away[end] <= min(CAP * millimetre, CAP_SHARE * ends.length))
     if len(chosen) < FEWEST:
         chosen = np.sort(np.argsort(ends.away[end], kind="stable")[:FEWEST])
     gap = float(distance[chosen].min())
-    return AttachmentGuess(bone, chosen, gap, f"the end that points there, {gap:.3g} mm short of it")
+    return AttachmentGuess(bone, chosen, gap, f"at the end that points to the bone, {gap:.3g} mm from it")
 
 
 def _tendon(hold, muscle, joints):

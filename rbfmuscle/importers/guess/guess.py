@@ -144,7 +144,7 @@ def _head(guess):
     folder, parts = guess.folder, guess.parts
     lines = [
         f"# Scene guessed from the meshes in {folder.name or folder}. "
-        "Lines marked GUESS want a look; the number is how sure it is, of 1.",
+        "Check every line marked GUESS; the number is its confidence, 0 to 1.",
         "# All keys: docs/scene_file.md. Then: rbfmuscle check --picture, rbfmuscle run.",
         *(f"# NOT USED: {file}: {reason}" for file, reason in parts.unusable.items()),
     ]

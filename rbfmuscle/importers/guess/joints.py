@@ -137,7 +137,8 @@ def _fit(parent, child, millimetre, area):
     if kind == "ball":
         sure = 1.0 - 0.5 * ball.misfit / (BALL_MISFIT * ball.radii[0]) if fits_ball else 0.1
         share = 100 * min(ball.cover, 1.0)
-        why = f"ball of radius {ball.radii[0]:.4g}, misfit {ball.misfit:.2g}, of a hemisphere {share:.0f} %"
+        why = f"sphere of radius {ball.radii[0] / millimetre:.4g} mm, misfit {ball.misfit / millimetre:.2g} mm, "
+        why += f"on {share:.0f} % of a hemisphere"
         why += "" if allowed else f"; anatomy has {low:g} to {high:g} mm"
         axes = {f"rotation_{word}": axis for word, axis in zip("xyz", np.eye(3))}
         return JointGuess(parent, child, "ball", ball.centre, axes, sure, why)
