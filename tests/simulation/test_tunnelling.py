@@ -175,6 +175,19 @@ def test_what_cannot_be_turned_back_is_held_on_its_side(monkeypatch):
     assert {event.action for event in stepper.collect()[1]} == {"held_back", "angle_flag"}
 
 
+def test_steps_are_not_halved_again_while_points_stay_across_a_bone(monkeypatch):
+    monkeypatch.setattr("rbfmuscle.simulation.stepper.rotate_with_bone", lambda *given: None)
+    monkeypatch.setattr("rbfmuscle.simulation.stepper.FENCES", 0)
+    monkeypatch.setattr("rbfmuscle.simulation.stepper.SMALLEST_STEP", np.radians(10.0))
+    stepper, _ = _swing("substep")
+    _, events, first = stepper.collect()
+    assert {"halved", "unresolved"} <= {event.action for event in events}
+    stepper.step({"hinge.turn": np.radians(40)}, {"hinge.turn": 0.0})
+    _, events, second = stepper.collect()
+    actions = {event.action for event in events}
+    assert "unresolved" in actions and "halved" not in actions and second.substeps < first.substeps
+
+
 @pytest.mark.parametrize("thickness, touched", [(0.15, True), (0.25, False), (3.0, False)])
 def test_only_a_path_that_the_triangles_call_shallow_has_grazed(thickness, touched):
     """Straight through a plate: half its thickness is how deep a path was. What the field says plays no part."""
