@@ -82,8 +82,8 @@ def _tunnelling(model, **options):
     return scene
 
 
-# No RBF muscle slides here or is swung through a plate: its shape then depends on rounding errors, after 20 degrees of
-# sliding by 0.07 of its size. `test_models_contract` asserts what holds for any shape.
+# No RBF muscle is swung through a plate here: its shape then depends on rounding errors. `test_models_contract` asserts
+# what holds for any shape.
 SCENES = {
     "contact_rbf": lambda: _contact(RBF),
     "contact_rbf_marching": lambda: _contact({**RBF, "surface": "marching"}),
@@ -95,6 +95,7 @@ SCENES = {
     "contact_xpbd": lambda: _bent("xpbd"),
     "contact_arap_pbd": lambda: _bent("arap-pbd"),
     "contact_arap_volume": lambda: _bent("arap-volume"),
+    "sliding_rbf": lambda: _sliding(RBF),
     "sliding_xpbd": lambda: _sliding("xpbd"),
     "substeps_rbf": lambda: _substeps(RBF),
     "substeps_arap_interleaved": lambda: _substeps("arap-interleaved"),
