@@ -98,7 +98,6 @@ def main():
     parser.add_argument("--joints", default="hip,knee,ankle")
     arguments = parser.parse_args()
     leg, models = data_folder("leg"), arguments.models.split(",")
-    facts = json.loads((leg / "scene.json").read_text(encoding="utf-8"))
     reference = leg.parent.parent / "reference" / "anatomy" / "gait2392_moment_arms.json"
     if not reference.is_file():
         raise SystemExit(f"{reference} is not here: it lies beside the folder of the data")
@@ -115,7 +114,7 @@ def main():
     print("|" + "---|" * (2 + len(heads)))
     differences = []
     with tempfile.TemporaryDirectory() as folder:
-        file = convert(leg / "squat.toml", facts, Path(folder))
+        file = convert(leg / "squat.toml", Path(folder))
         for joint in arguments.joints.split(","):
             results = {model: our_arms(joint_scene(file, joint), joint, model) for model in models}
             angles, first = results[models[0]]

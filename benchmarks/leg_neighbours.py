@@ -14,7 +14,6 @@ without what slid past its rim (the way to the neighbour is more than 60 degrees
 
 import argparse
 import itertools
-import json
 import tempfile
 import time
 from pathlib import Path
@@ -41,10 +40,8 @@ class Bench:
     """The scene with and without sliding; models and bones' fields are built once for all runs."""
 
     def __init__(self, arguments):
-        leg = data_folder("leg")
-        facts = json.loads((leg / "scene.json").read_text(encoding="utf-8"))
         with tempfile.TemporaryDirectory() as folder:
-            scene = Scene.load(convert(leg / arguments.scene, facts, Path(folder)))
+            scene = Scene.load(convert(data_folder("leg") / arguments.scene, Path(folder)))
         asked = {key: float(value) for key, value in (pair.split("=") for pair in arguments.set)}
         self.scenes = {
             True: scene.with_options({"sliding.threshold": THRESHOLD, **asked}, model=arguments.model),
@@ -81,7 +78,7 @@ class Touching:
     ----------
     surfaces : dict of str to (vertices, faces)
         At rest.
-    holder : dict of str to (n,) ndarray of str
+    attached_bone : dict of str to (n,) ndarray of str
         Bones that hold vertices, empty where none does.
     """
 
@@ -173,12 +170,10 @@ def pairs(bench, arguments):
     loop = bench.loop(sliding=not arguments.without)
     for k, coordinates in enumerate(bench.path[: max(wanted) + 1]):
         begin = time.process_time()
-        if k not in wanted:
-            loop.skip(coordinates)
-            spent += time.process_time() - begin
-            continue
-        frame = loop.advance(coordinates)
+        frame = loop.advance(coordinates) if k in wanted else loop.skip(coordinates)
         spent += time.process_time() - begin
+        if frame is None:
+            continue
         surfaces = _surfaces(frame)
         touching = touching or Touching(surfaces, holders(bench.scenes[True], bench.models, surfaces))
         opened = touching.opened(surfaces)

@@ -113,8 +113,9 @@ TENDONS = {
 FREE_NECK = {"obturator_internus pelvis": 40.0}
 
 
-def convert(source: Path, facts: dict, out: Path) -> Path:
-    """Write a scene with tendons; return its file."""
+def convert(source: Path, out: Path) -> Path:
+    """Write a scene of data/leg with tendons; return its file."""
+    facts = json.loads((source.parent / "scene.json").read_text(encoding="utf-8"))
     data = tomllib.loads(source.read_text(encoding="utf-8"))
     carriers = set(facts["tendon_carriers"])
     data["bone"] = [bone for bone in data["bone"] if bone["name"] not in carriers]
@@ -158,10 +159,8 @@ def _attachment(muscle: str, entry: dict, bones: set[str], folder: Path) -> dict
 def _without_neck(muscle: dict, entry: dict) -> list[int]:
     """Attached vertices that are not too near to the muscle's other end."""
     vertices = trimesh.load(muscle["mesh"], process=False).vertices
-    own, other = (
-        np.loadtxt(e["vertices"], dtype=int)
-        for e in sorted(muscle["attach"], key=lambda each: each is not entry)
-    )
+    own = np.loadtxt(entry["vertices"], dtype=int)
+    (other,) = [np.loadtxt(end["vertices"], dtype=int) for end in muscle["attach"] if end is not entry]
     away = cKDTree(vertices[other]).query(vertices[own])[0]
     return own[away > FREE_NECK[f"{muscle['name']} {entry['bone']}"]].tolist()
 
@@ -204,9 +203,8 @@ def main() -> None:
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     leg = data_folder("leg")
-    facts = json.loads((leg / "scene.json").read_text(encoding="utf-8"))
     for name in given.scenes:
-        print(convert(leg / f"{name}.toml", facts, given.out))
+        print(convert(leg / f"{name}.toml", given.out))
 
 
 if __name__ == "__main__":
