@@ -296,7 +296,6 @@ def paths(
     from rbfmuscle.models import configure_scene
     from rbfmuscle.output.writer import check_writable
     from rbfmuscle.paths import parse_ranges, report_fits, sample_muscles
-    from rbfmuscle.progress import Progress
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.experiments.sweep_run import Progress, pareto_front, threads_limited
+from rbfmuscle.experiments.sweep_run import OnProgress, pareto_front, threads_limited
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.surfaces import face_normals, mesh_volume, vertex_areas
 from rbfmuscle.geometry.threads import each
@@ -221,7 +221,7 @@ def study_kernels(
     placement: str = FITTED,
     resolution: int = 0,
     units: str = "",
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> KernelStudy:
     """Fit a surface with many kernels and numbers of centres, and measure each fit.
 
@@ -275,7 +275,7 @@ def study_kernels(
 
 
 def _measure_all(
-    judge: ReferenceSurface, calls: list[tuple[SurfaceSample, Kernel, str]], progress: Progress | None
+    judge: ReferenceSurface, calls: list[tuple[SurfaceSample, Kernel, str]], progress: OnProgress | None
 ) -> list[Measured]:
     """What the rows of calls found, in their order, measured side by side on threads."""
     from threadpoolctl import threadpool_limits

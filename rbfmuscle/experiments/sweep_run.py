@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
 Runner = Callable[[Scene, dict[str, Any], str | None], Any]
-Progress = Callable[[int, int], None]  # of what is done and the total
+OnProgress = Callable[[int, int], None]  # of what is done and the total
 # What a point may fail with and leave the others standing.
 POINT_ERRORS = (RBFMuscleError, ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, ValueError)
 # Worst over muscles and frames, by magnitude.
@@ -81,7 +81,7 @@ def run_sweep(
     frames: str | None = None,
     jobs: int | None = None,
     cluster: str | None = None,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> int:
     """Run the points that the folder does not hold done, references first; how many were run.
 

@@ -12,7 +12,7 @@ from functools import cache, partial
 import numpy as np
 
 from rbfmuscle.experiments import kernel_study
-from rbfmuscle.experiments.sweep_run import Progress
+from rbfmuscle.experiments.sweep_run import OnProgress
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.implicit.kernels.table import Kernel
 from rbfmuscle.implicit.placement.refinement import FITTED
@@ -59,7 +59,7 @@ def reach_error(
     *,
     kernels: Sequence[str] | None = None,
     placement: str = FITTED,
-    progress: Progress | None = None,
+    progress: OnProgress | None = None,
 ) -> WantedError:
     """Find the fewest centres, 20 to 1000, the kernel and its setting that meet a surface to a wanted error.
 
@@ -102,7 +102,7 @@ class _Search:
     """Rows by kernel and number of centres, and the best so far."""
 
     def __init__(
-        self, judge: kernel_study.ReferenceSurface, error: float, placement: str, progress: Progress | None
+        self, judge: kernel_study.ReferenceSurface, error: float, placement: str, progress: OnProgress | None
     ) -> None:
         self.judge, self.error, self.placement, self.progress = judge, error, placement, progress
         self.sample = cache(partial(sample_surface, judge.vertices, judge.faces, placement="greedy"))

@@ -1,4 +1,4 @@
-"""Closed tubes of varying radius about a line."""
+"""Lines of points, and closed tubes of varying radius about them."""
 
 import numpy as np
 
@@ -6,6 +6,22 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 
 # Vertices around a tube.
 SIDES = 12
+
+
+def distance_along(line: Floats) -> Floats:
+    """Distance along a line (n, 3) from its first point to each (n,)."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def line_length(line: Floats) -> float:
+    """Length of a line (n, 3)."""
+    return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+
+
+def points_along(line: Floats, places: Floats) -> Floats:
+    """Points (k, 3) at distances (k,) along a line (n, 3) from its first point."""
+    along = distance_along(line)
+    return np.stack([np.interp(places, along, line[:, axis]) for axis in range(3)], axis=1)
 
 
 def tube_mesh(line: Floats, radii: Floats) -> tuple[Floats, Integers]:

@@ -16,12 +16,13 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.surfaces import vertex_areas
+from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.jit import compiled
 from rbfmuscle.metrics.mesh_distance import BoneProbe, bones_about, inverse_pose
 from rbfmuscle.scene.joints.joint import Joint, all_coordinates
 from rbfmuscle.scene.objects import Attachment, Muscle
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.scene.tendons import TendonLine, line_length
+from rbfmuscle.scene.tendons import TendonLine
 
 _LEVELS = 120  # by which the line is measured at rest
 
@@ -107,16 +108,9 @@ class Centreline:
         return total
 
 
-def distance_along(line: Floats) -> Floats:
-    """How far along a line each of its points (n, 3) lies, (n,); the last is its length."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-
-
 def resampled(line: Floats, segments: int) -> Floats:
     """Points (segments + 1, 3) at even distances along a line (n, 3)."""
-    along = distance_along(line)
-    even = np.linspace(0.0, along[-1], segments + 1)
-    return np.stack([np.interp(even, along, column) for column in line.T], axis=1)
+    return points_along(line, np.linspace(0.0, distance_along(line)[-1], segments + 1))
 
 
 def split_ends(

@@ -214,9 +214,10 @@ def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequen
     first = {row[0]: row for row in reversed(found)}.values()
     named = sorted(found, key=lambda row: row not in first)[:MOST_NAMED]
     remedies: dict[str, str] = {}
-    for row in (row for row in named if row[1] in LIMITS):
-        remedy = _remedy(row, table)
-        remedies.setdefault(remedy, remedy.replace("FRAME", str(row[4])))
+    for row in named:
+        if row[1] in LIMITS:
+            remedy = _remedy(row, table)
+            remedies.setdefault(remedy, remedy.replace("FRAME", str(row[4])))
     values = "; ".join(_describe_excess(row, table, left_out) for row in named)
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
     to_do = f". What to do: {'; '.join(remedies.values())}" if remedies else ""

@@ -13,7 +13,7 @@ class Fibres(NamedTuple):
 
     direction: np.ndarray  # (Q, 3) at rest, unit
     passive: np.ndarray  # (Q,) stiffness of a spring that is slack from lower to upper
-    active: np.ndarray  # (Q,) stiffness of a spring that is content at ``content``
+    active: np.ndarray  # (Q,) stiffness of a spring whose target stretch is ``content``
     lower: np.ndarray  # (Q,) stretch against rest
     upper: np.ndarray  # (Q,)
     content: np.ndarray  # (Q,)
@@ -353,9 +353,9 @@ def contact_loop(
     is_chosen = force > 0.0
     chosen = np.flatnonzero(is_chosen)
     lacking = need.copy()
-    done, most_chosen = 0, len(chosen) + rounds * batch
-    rows, answers = np.empty((most_chosen, response.shape[0])), np.empty((most_chosen, len(push)))
-    gram, own = np.empty((most_chosen, most_chosen)), np.empty(most_chosen)
+    done, room = 0, len(chosen) + rounds * batch
+    rows, answers = np.empty((room, response.shape[0])), np.empty((room, len(push)))
+    gram, own = np.empty((room, room)), np.empty(room)
     for _ in range(rounds):
         added = _deepest(lacking, is_chosen, tolerance, batch)
         if len(added) == 0 and len(chosen) == 0:

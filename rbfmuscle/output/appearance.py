@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.tubes import tube_mesh
+from rbfmuscle.geometry.tubes import distance_along, tube_mesh
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.tendons import TendonLine
 
@@ -137,7 +137,7 @@ def tendon_mesh(muscle: Muscle, tendons: Mapping[str, TendonLine]) -> tuple[Floa
 def _tube(tendon: TendonLine) -> tuple[Floats, Integers]:
     """One tendon, tapering from the belly's end on."""
     line, (wide, thin) = tendon.points, tendon.radii
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    along = distance_along(line)
     share = np.clip(along / max(min(TAPER * wide, LONGEST_TAPER * along[-1]), 1e-300), 0.0, 1.0)
     radii = wide + (thin - wide) * share**2 * (3.0 - 2.0 * share)
     return tube_mesh(line, radii)

@@ -104,10 +104,10 @@ def _facts(saved: SavedRun) -> list[str]:
     models = sorted({muscle["model"]["name"] for muscle in info["scene"]["muscles"]})
     median = (info.get("frame_time") or {}).get("median")
     numbers = {"muscle": len(saved.muscles), "frame": len(saved.frames)}
-    counts = [f"{number} {word}{'s'[: number != 1]}" for word, number in numbers.items()]
+    counts = [f"{number} {word}{'' if number == 1 else 's'}" for word, number in numbers.items()]
     times = [f"{shown_number(median, 's')} per frame", f"{info['times']['wall']:.1f} s in all"]
     kernels = sorted(set(info.get("kernels", {}).values()))
-    kernel = [f"kernel{'s'[: len(kernels) > 1]} {', '.join(kernels)}"] if kernels else []
+    kernel = [f"kernel{'s' if len(kernels) > 1 else ''} {', '.join(kernels)}"] if kernels else []
     return [f"model {', '.join(models)}", *kernel, *counts, *times]
 
 

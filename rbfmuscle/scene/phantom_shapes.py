@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.tubes import distance_along
 
 
 @dataclass(frozen=True)
@@ -105,8 +106,7 @@ def _stations(tube, spacing):
     centre, wide, thin = tube.sections(fine)
     path = np.zeros(len(fine))
     for line in (centre + wide, centre + thin, centre - wide, centre - thin):
-        steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-        path = np.maximum(path, np.concatenate([[0], np.cumsum(steps)]))
+        path = np.maximum(path, distance_along(line))
     count = max(8, round(path[-1] / spacing))
     return np.interp(np.linspace(0, path[-1], count + 1), path, fine)
 
@@ -115,7 +115,7 @@ def _ring(centre, wide, thin, spacing):
     """Points at equal arcs of an ellipse."""
     angle = np.linspace(0, 2 * np.pi, 361)
     points = centre + np.cos(angle)[:, None] * wide + np.sin(angle)[:, None] * thin
-    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    arc = distance_along(points)
     count = max(6, round(arc[-1] / spacing))
     angle = np.interp(np.arange(count) * arc[-1] / count, arc, angle)
     return centre + np.cos(angle)[:, None] * wide + np.sin(angle)[:, None] * thin

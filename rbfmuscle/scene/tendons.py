@@ -18,6 +18,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.jit import compiled
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.bone import Bone
@@ -215,7 +216,7 @@ class TendonEnd:
 
 def _with_nodes(line: Floats) -> Floats:
     """`NODES` points along a line (n, 3), its corners among them, the others at even distances."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    along = distance_along(line)
     places = np.linspace(0.0, along[-1], NODES)
     free = places.copy()
     free[[0, -1]] = np.inf
@@ -313,14 +314,3 @@ def _upper_hull(points: Floats) -> Floats:
             hull.pop()
         hull.append(point)
     return np.array(hull)
-
-
-def line_length(points: Floats) -> float:
-    """Length of the line through points (n, 3)."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
-def points_along(line: Floats, places: Floats) -> Floats:
-    """Points (k, 3) at distances (k,) along a line (n, 3) from its beginning."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    return np.stack([np.interp(places, along, line[:, axis]) for axis in range(3)], axis=1)

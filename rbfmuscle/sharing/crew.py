@@ -37,7 +37,7 @@ def helpers_for(scene: Scene, threads: int) -> int:
 
 
 class WorkerPool:
-    """Several `MuscleGroup` in at least two processes, with the frames of one of all muscles, to the last digit.
+    """Several `MuscleGroup` in two or more processes; the frames are those of one process, to the last digit.
 
     A process continues while its last frame is taken, and waits with the next one until it is asked for: memory is
     bounded by the pipes. ``times`` are wall times so far [s], of the helper that spent most.

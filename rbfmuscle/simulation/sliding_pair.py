@@ -76,8 +76,8 @@ class SlidingPair:
         apart[index] = distance
         #: Points that may be held, the nearest of each cell.
         self.sparse = _nearest_by_cell(self.own.points, apart, SPARSE * own.edge)
-        kept = float(self.sparse.sum() / max(1, self.free.sum()))
-        self.push, self.pull = Planes(PUSH_YIELDS), Planes(PULL_YIELDS * kept)
+        share = float(self.sparse.sum() / max(1, self.free.sum()))
+        self.push, self.pull = Planes(PUSH_YIELDS), Planes(PULL_YIELDS * share)
 
     def update(self) -> None:
         """Recompute the planes from the extrapolated surfaces."""

@@ -5,7 +5,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.metrics.centreline import NODES, distance_along, resampled, shortest_path
+from rbfmuscle.geometry.tubes import distance_along
+from rbfmuscle.metrics.centreline import NODES, resampled, shortest_path
 from rbfmuscle.metrics.mesh_distance import BoneProbe
 
 RADIUS, FAR = 10.0, 25.0

@@ -8,11 +8,12 @@ import trimesh
 from toy_scene import held
 
 import rbfmuscle as rm
+from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.tendons import STIFFNESS_RATIO, line_length, taut_line
+from rbfmuscle.scene.tendons import STIFFNESS_RATIO, taut_line
 
 END = "strap tendon 2 to limb"
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.geometry.tubes import SIDES, tube_mesh
+from rbfmuscle.geometry.tubes import SIDES, distance_along, line_length, points_along, tube_mesh
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
-from rbfmuscle.scene.tendons import line_length, points_along
 from rbfmuscle.validation import SceneError
 
 # Sections along a tube; radius at the ends against the middle; share of the length held at an end.
@@ -42,11 +41,10 @@ def make_tube(muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[st
         if body not in bones:
             raise SceneError(f"muscle {muscle.name!r}: body {body!r} has no mesh to hold it")
     points = np.array([places[body][:3, :3] @ at + places[body][:3, 3] for body, at in muscle.points])
-    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    along = distance_along(points)
     line = points_along(points, np.linspace(0.0, along[-1], SECTIONS))
-    fixed = np.rint(along / max(along[-1], 1e-300) * (SECTIONS - 1)).astype(
-        int
-    )  # the path's points in the line
+    # The path's points in the line.
+    fixed = np.rint(along / max(along[-1], 1e-300) * (SECTIONS - 1)).astype(int)
     length = line_length(line)
     share = END_RADIUS + (1.0 - END_RADIUS) * np.sin(np.pi * np.linspace(0.0, 1.0, len(line)))
     radius = share * np.sqrt(muscle.volume / (np.pi * length * np.mean(share**2)))
