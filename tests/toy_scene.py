@@ -212,11 +212,8 @@ def muscle(name, mesh, attachments, **options):
 
 def scene(fields, joints, muscles, frames, *, initial="keep", sliding=None, tunnelling=None):
     """A scene of these parts, its bones from their fields by name."""
-    parts = {
-        "bones": [bone(name, field) for name, field in fields.items()],
-        "joints": joints,
-        "muscles": muscles,
-    }
+    bones = [bone(name, field) for name, field in fields.items()]
+    parts = {"bones": bones, "joints": joints, "muscles": muscles}
     detect = None if tunnelling is None else DetectOptions(tunnelling=tunnelling)
     contact = ContactOptions(initial=initial)
     return SceneData("toy", **parts, motion=Motion(frames), contact=contact, sliding=sliding, detect=detect)

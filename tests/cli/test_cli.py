@@ -14,7 +14,7 @@ from command_line import call
 import rbfmuscle as rm
 from rbfmuscle import progress
 from rbfmuscle.cli.app import GROUPS
-from rbfmuscle.progress import Progress, stage
+from rbfmuscle.progress import Progress
 from rbfmuscle.scene.check import check_extents
 from rbfmuscle.validation import MeshError
 
@@ -208,39 +208,12 @@ def test_remedy_of_a_wrong_unit_makes_the_size_it_says(factor, remedy):
     assert f"({remedy:g} times the present one would make it {size * remedy:.4g} mm)" in text
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """A clock that stands still until it is set."""
-    now = [100.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    return now
-
-
-def test_counts_are_shown_after_two_seconds_then_every_ten_and_at_the_end(clock, capsys):
+def test_counts_are_shown_after_two_seconds_then_every_ten_and_at_the_end(monkeypatch, capsys):
+    clock = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
     with Progress("hip") as shown:
         for done, seconds in enumerate((1.0, 2.5, 8.0, 12.4, 12.6, 13.0), 1):
             clock[0] = 100.0 + seconds
             shown(done, 6)
     shown = capsys.readouterr().err.splitlines()
     assert shown == ["hip: frame 2 of 6 (2 s)", "hip: frame 5 of 6 (13 s)", "hip: frame 6 of 6 (13 s)"]
-
-
-def test_stages_and_what_is_inside_are_shown_under_the_outermost_title(clock, capsys):
-    with pytest.raises(ValueError), Progress("sweep", what="point"), stage("building"):
-        with Progress("hip") as inner:
-            inner(3, 3)
-        raise ValueError
-    with stage("alone"):
-        pass
-    with Progress("next") as following:
-        following(1, 2)
-    assert capsys.readouterr().err == "sweep: building (0 s)\nsweep: frame 3 of 3 (0 s)\n"
-
-
-def test_terminal_gets_a_bar(monkeypatch, capsys):
-    monkeypatch.setattr(progress.sys.stderr, "isatty", lambda: True, raising=False)
-    with Progress("hip") as shown, stage("building"):
-        shown(1, 4)
-        (task,) = shown.bar.tasks
-        assert (task.description, task.completed, task.total) == ("hip: frame 1 of 4", 1, 4)
-    assert Progress.shown is None

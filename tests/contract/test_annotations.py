@@ -30,9 +30,8 @@ def lacking(source, *, core=False):
     for name, node, public in functions(ast.parse(source).body):
         given = node.args
         named = [*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg]
-        said = [x.annotation for x in named if x is not None and x.arg not in ("self", "cls")] + [
-            node.returns
-        ]
+        said = [x.annotation for x in named if x is not None and x.arg not in ("self", "cls")]
+        said.append(node.returns)
         vague = core and any("Any" in re.findall(r"\w+", ast.unparse(part)) for part in said if part)
         found += [name] if (public and None in said) or vague else []
     return found

@@ -13,10 +13,8 @@ SCENES = {f"hip/{name}": (4, 3) for name in ("adduction", "apriori", "extension"
 SCENES |= {"hip/external_rotation": (4, 3), "hip/internal_rotation": (4, 3), "hip/gluteus": (1, 3)}
 SCENES |= {"leg/gait": (12, 15), "leg/hip_flexion": (8, 9), "leg/knee_flexion": (6, 10), "leg/leg": (38, 11)}
 SCENES |= {"leg/neighbours": (4, 7), "leg/quadriceps": (4, 6), "leg/slender": (4, 6), "leg/squat": (38, 21)}
-COARSE = {
-    "rbf": {"name": "rbf", "centres": 40, "samples": 150, "resolution": 16},
-    "pbd": {"name": "pbd", "iterations": 3},
-}
+RBF = {"name": "rbf", "centres": 40, "samples": 150, "resolution": 16}
+COARSE = {"rbf": RBF, "pbd": {"name": "pbd", "iterations": 3}}
 
 
 @pytest.fixture(scope="module")

@@ -135,10 +135,8 @@ def test_folders_that_are_unused_are_removed(place):
     run(place)
     used = {path.parent for path in files(place)}
     names = {"loops.old-" + 24 * "0": 61, "loops.new-" + 24 * "1": 59, "foreign": 999}
-    for path, days in [
-        *((place / "cache" / name, days) for name, days in names.items()),
-        *((p, 2) for p in used),
-    ]:
+    ages = {place / "cache" / name: days for name, days in names.items()} | dict.fromkeys(used, 2)
+    for path, days in ages.items():
         path.mkdir(exist_ok=True)
         then = path.stat().st_mtime - days * 86400.0
         os.utime(path, (then, then))

@@ -40,9 +40,7 @@ def test_typed_marker_templates_and_scripts_travel_with_the_packages():
 
 def run(*command, **options):
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=1800, check=False, env=clean, **options
-    )
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1800, env=clean, **options)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return done.stdout
 

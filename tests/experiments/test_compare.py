@@ -19,9 +19,7 @@ from rbfmuscle.validation import UsageError
 
 
 def test_what_does_not_count_is_a_tie():
-    found = {
-        name: {"all": {"rest_error_rms": error}} for name, error in (("a", 0.0), ("b", 0.01), ("c", 0.5))
-    }
+    found = {name: {"all": {"rest_error_rms": e}} for name, e in (("a", 0.0), ("b", 0.01), ("c", 0.5))}
     assert best_models(found, "rest_error_rms", "mm") == ["a", "b"]
     assert best_models(found, "rest_error_rms", "m") == ["a"]
 
@@ -33,9 +31,8 @@ def test_answer_says_what_the_first_keeps_at_which_price_and_who_comes_near():
     more = found | {"settled": {"all": pbd | {"time_frame": 1.406, "distance_rms": 5.71}}}
     labels = {"rbf": "RBF", "pbd": "PBD", "settled": "PBD, converged"}
     said = describe(found, labels, "mm")
-    assert re.search(
-        r"bones: 0\.031 mm .* 3\.7 times the time of PBD \(3\.2 mm deep\)\. .* 31 mm RMS apart\.", said
-    )
+    words = r"bones: 0\.031 mm .* 3\.7 times the time of PBD \(3\.2 mm deep\)\. .* 31 mm RMS apart\."
+    assert re.search(words, said)
     said = describe(more, labels, "mm")
     assert re.search(r"PBD, the quickest .* PBD, converged \(5\.7 mm RMS\), which takes 19 times", said)
 

@@ -227,11 +227,9 @@ class TestCommand:
 
 def test_rows_are_those_of_their_points_in_order():
     points = [SweepPoint(f"k{n}", "s", {"a": n} if n else {}, "" if n else "default", "r") for n in range(3)]
-    results = {
-        "k0": {"status": "done", "values": {"error_rms": 0.25}},
-        "k1": {"status": "failed", "error": "no"},
-    }
-    rows = sweep_rows(points, SimpleNamespace(read=lambda key: results.get(key, {})), {"s": "cm"})
+    done, failed = {"status": "done", "values": {"error_rms": 0.25}}, {"status": "failed", "error": "no"}
+    folder = SimpleNamespace(read=lambda key: {"k0": done, "k1": failed}.get(key, {}))
+    rows = sweep_rows(points, folder, {"s": "cm"})
     assert [r["status"] for r in rows] == ["done", "failed", "missing"]
     assert [r["label"] for r in rows] == ["default", "a=1", "a=2"]
     assert [r["error"] for r in rows] == ["", "no", ""] and rows[0]["units"] == "cm"

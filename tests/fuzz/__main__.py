@@ -16,12 +16,7 @@ for _name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "M
 import numpy as np  # noqa: E402
 
 from fuzz import harness  # noqa: E402
-from fuzz.meshes import (  # noqa: E402
-    base_scene,
-    suffix_of,
-    write_base,
-    write_damaged,
-)
+from fuzz.meshes import base_scene, suffix_of, write_base, write_damaged  # noqa: E402
 from fuzz.scenes import scene_text, to_toml  # noqa: E402
 
 MODELS = ("rbf", "pbd")

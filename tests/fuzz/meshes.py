@@ -103,16 +103,12 @@ def base_scene() -> dict:
     axes = {"flexion": [0.0, 1.0, 0.0], "turn": [0.0, 0.0, 1.0]}
     model = {"name": "rbf", "centres": 60, "samples": 200, "resolution": 16, "iterations": 4}
     attach = [{"bone": bone, "vertices": f"{bone}.txt"} for bone in ("upper", "lower")]
+    bones = (("upper", {}), ("lower", {"scale": 1.0}))
     return {
         "scene": {"format": 1, "name": "small", "units": "mm"},
         "defaults": {"model": "rbf"},
-        "bone": [
-            {"name": "upper", "mesh": "upper.ply"},
-            {"name": "lower", "mesh": "lower.ply", "scale": 1.0},
-        ],
-        "joint": [
-            {"name": "hip", "parent": "upper", "child": "lower", "centre": [0.0, 0.0, 0.0], "axes": axes}
-        ],
+        "bone": [{"name": name, "mesh": f"{name}.ply"} | scale for name, scale in bones],
+        "joint": [{"name": "hip", "parent": "upper", "child": "lower", "centre": [0.0] * 3, "axes": axes}],
         "motion": {"ramp": {"hip.flexion": {"from": 0.0, "to": 6.0, "step": 3.0}}},
         "muscle": [{"name": "muscle", "mesh": "muscle-ply.ply", "model": model, "attach": attach}],
         "contact": {"initial": "resolve", "substep_angle": 3.0},

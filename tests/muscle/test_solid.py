@@ -207,6 +207,9 @@ def test_slack_fibres_shorten_along_themselves_almost_without_resistance():
     assert aside.energy() == pytest.approx(stiff.energy(), rel=0.1)
     assert loose.stretch.min() > 1 / 1.6 and np.average(loose.stretch, weights=loose.weights) < 0.9
     assert loose.volumes.sum() == pytest.approx(loose.rest_volumes.sum(), rel=0.01)
+    # Beyond the band the energy grows with the square of what is left.
+    near, far = (moved(x, ALONG, slack=1.1, steps=4).energy() for x in (-3.0, -10.0))
+    assert far > 10.0 * near
     # Pulled, they are those of the plain solid.
     tight, slack = (moved(3.0, ALONG, slack=slack, steps=1).y for slack in (1.0, 1.6))
     assert np.abs(tight - slack).max() < 0.1  # mm; near the held ends some fibres shorten

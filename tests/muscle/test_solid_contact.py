@@ -43,6 +43,14 @@ def test_rounded_distance_is_near_the_exact_one_and_its_direction_nearer_to_the_
     assert np.sqrt((turned[1] ** 2).mean()) < 0.6 * np.sqrt((turned[0] ** 2).mean())
 
 
+def test_where_the_rounded_distance_is_flat_the_exact_field_answers(ball):
+    field, rounded, pose = ball
+    middle = trimesh.transform_points(field.bounds.mean(axis=0)[None], pose)
+    exact = field.distance_and_gradient(middle, pose)
+    for found, wanted in zip(rounded.distance_and_gradient(middle, pose), exact):
+        assert np.array_equal(found, wanted)
+
+
 def test_direction_is_the_slope_of_the_distance(ball):
     _, rounded, pose = ball
     points, _ = around(pose)

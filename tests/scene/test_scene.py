@@ -150,9 +150,7 @@ class TestOptions:
         assert other.muscles[0].options == {"centres": 10} and scene.muscles[0].options == {}
         assert len(other.motion) == 2 and len(scene.motion) == 4
 
-    def test_another_model_drops_the_options_of_the_first_and_a_table_without_a_name_adds_to_them(
-        self, folder
-    ):
+    def test_another_model_drops_the_options_and_a_table_without_a_name_adds_to_them(self, folder):
         scene = load(folder, ('mesh = "biceps.ply"', 'mesh = "biceps.ply"\nmodel = { kernel = "cubic" }'))
         assert scene.muscles[0].options == {"centres": 60, "kernel": "cubic"}
         scene = load(folder)

@@ -28,10 +28,7 @@ def test_frames_carry_what_they_promise():
     assert set(times) == {"time_predict", "time_solve", "time_tunnelling", "time_surface", "time_frame"}
     assert 0.0 < times["time_frame"] == pytest.approx(sum(v for k, v in times.items() if k != "time_frame"))
     assert sum(f.wall for f in frames) >= sum(f.times["strap"].get("time_solve", 0.0) for f in frames)
-    made.detect, model.drawing = (
-        None,
-        None,
-    )  # without surfaces and tables nothing is extracted, slid or looked for
+    made.detect = model.drawing = None  # without surfaces and tables nothing is extracted or looked for
     *_, last = simulate_frames(made, [model], fields=fields, surfaces=False)
     assert last.surfaces == {}
     assert not {"time_surface", "time_sliding", "time_tunnelling"} & set(last.times["strap"])

@@ -50,6 +50,9 @@ def test_distances_are_those_of_the_triangles(scale, subdivisions, reach, share)
     assert np.array_equal(distance < 0.0, exact < 0.0) and (exact < 0.0).any()
     # What is left is nearer to another ring of triangles than the one looked at.
     assert (np.abs(distance - exact) < 1e-9).mean() >= share and np.allclose(distance, exact, atol=0.2)
+    if share == 1.0:  # a ball
+        outward = points[index] / np.linalg.norm(points[index], axis=1, keepdims=True)
+        assert np.einsum("ij,ij->i", normal, outward).min() > 0.99
     far = exact > 1.0
     assert (np.einsum("ij,ij->i", normal[far], way[far]) > 0.0).all()
     assert np.linalg.norm(surface.vertices[nearest] - points[index], axis=1).max() < reach + 2 * surface.edge
