@@ -39,26 +39,31 @@ def view(
     screenshot
         Draw this PNG at --at, without a display, and open nothing.
     """
-    from rbfmuscle.scene.phantom import open_scene
-
     stops = dict(_parse_stop(text) for text in at or [])
     with Progress(f"view {scene.name}"):
-        opened = _open_runs(scene) if scene.is_dir() else open_scene(scene)
         if screenshot is not None:
             with stage("drawing the picture"):
-                _draw(opened, model, stops, screenshot)
+                _draw(_open(scene), model, stops, screenshot)
             print(screenshot)
             return
+        from rbfmuscle.scene.file import read_scene_file
+        from rbfmuscle.scene.phantom import PHANTOM
+        from rbfmuscle.viewer.server import open_server
+
+        if not scene.is_dir() and str(scene) != PHANTOM:
+            read_scene_file(scene)  # its errors are shown before a browser opens
+        served = open_server(port)
+        print(f"{served[1]}  (Ctrl-C ends)", flush=True)
+        if browser:
+            webbrowser.open(served[1])
+        opened = _open(scene)
         from rbfmuscle.viewer.page import Page
         from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
         with stage("building"):
             source = SavedSource(opened) if isinstance(opened, dict) else LiveSource(opened, model)
             _check_stops(stops, source.controls)
-            page = Page(source, at=stops, colour=colour, port=port)
-    print(f"{page.address}  (Ctrl-C ends)", flush=True)
-    if browser:
-        webbrowser.open(page.address)
+            Page(source, at=stops, colour=colour, served=served)
     threading.Event().wait()
 
 
@@ -74,6 +79,13 @@ def _check_stops(stops, known):
     for name in stops:
         if name not in known:
             raise UsageError(f"--at: unknown coordinate {name!r}, {did_you_mean(name, list(known))}")
+
+
+def _open(path):
+    """A scene, or the runs in a folder."""
+    from rbfmuscle.scene.phantom import open_scene
+
+    return _open_runs(path) if path.is_dir() else open_scene(path)
 
 
 def _open_runs(folder):

@@ -1,13 +1,10 @@
-"""The page in the browser, its server for this machine alone, and the thread that keeps its picture up to date."""
+"""The page in the browser, and the thread that keeps its picture up to date."""
 
 import contextlib
-import http
 import io
 import math
-import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,81 +13,20 @@ from rbfmuscle.metrics.mesh_distance import BoneProbe
 from rbfmuscle.output.appearance import VIEWS, view_axes
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import MissingPartError, RBFMuscleError, SolveError
+from rbfmuscle.validation import RBFMuscleError, SolveError
 from rbfmuscle.viewer.panel import Panel
+from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.side import Look, Side
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 if TYPE_CHECKING:
-    from viser import ViserServer
-    from websockets.asyncio.server import ServerConnection
-    from websockets.http11 import Request, Response
+    from viser import ClientHandle, ViserServer
 
-LOOPBACK = "127.0.0.1"
-INSTALL = 'python -m pip install "viser>=1.1,<2"'  # as the extra `web` in pyproject.toml has it
 COSTLY = 0.1  # Where a picture takes longer [s], those on the way to the controls' places are drawn coarse.
 PACE = 0.04  # Least time of a picture while a motion is played [s].
 FIELD_OF_VIEW = 0.5
+BUILDING = "Building the models …"
 FIRST = (-1.4, 1.6, 0.5)  # Where the camera stands at first, along the body's axes.
-
-
-class Gate:
-    """Refuses requests whose path does not begin with the token, and websockets of pages of another origin.
-
-    The ``Host`` is checked as well, because a foreign name can be made to point to the loopback address.
-    """
-
-    def __init__(self, token: str) -> None:
-        self.token = token
-        self.inner: Callable[..., Response | None] | None = None  # what answers requests that are let in
-
-    def __call__(self, connection: "ServerConnection", request: "Request") -> "Response | None":
-        """Answer a request; None lets a websocket begin."""
-        hosts = [f"{name}:{connection.local_address[1]}" for name in (LOOPBACK, "localhost")]
-        host, origin = (request.headers.get(key, "") for key in ("Host", "Origin"))
-        _, token, *rest = request.path.partition("?")[0].split("/")
-        known = secrets.compare_digest(token.encode(), self.token.encode())
-        foreign = host not in hosts or ("Upgrade" in request.headers and origin != f"http://{host}")
-        if not known or foreign or self.inner is None:
-            return connection.respond(http.HTTPStatus.FORBIDDEN, "Open the address that rbfmuscle printed.\n")
-        request.path = "/" + "/".join(rest)
-        return self.inner(connection, request)
-
-
-@contextlib.contextmanager
-def _every_request_through(gate: Gate) -> Iterator[None]:
-    """Put the gate before any websocket server that starts meanwhile; viser has no setting for it."""
-    from websockets.asyncio import server as module
-
-    plain = module.serve
-
-    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
-        gate.inner = process_request
-        return plain(*arguments, process_request=gate, **options)
-
-    module.serve = serve
-    try:
-        yield
-    finally:
-        module.serve = plain
-
-
-def open_server(port: int = 0) -> "tuple[ViserServer, str]":
-    """Start a server on the loopback address, at any free port for 0; return it and its address with the token.
-
-    MissingPartError if viser is not installed, or does not let its requests be checked.
-    """
-    try:
-        import viser
-    except ImportError:
-        raise MissingPartError(f"the viewer needs viser, which is not installed; run: {INSTALL}") from None
-    gate = Gate(secrets.token_urlsafe(16))
-    with _every_request_through(gate), contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=LOOPBACK, port=port, label="rbfmuscle", verbose=False)
-    if gate.inner is None:
-        server.stop()
-        raise MissingPartError(f"requests to viser {viser.__version__} cannot be checked; run: {INSTALL}")
-    return server, f"http://{LOOPBACK}:{server.get_port()}/{gate.token}/"
 
 
 def show(shown: Scene | SavedRun, *, model: str | None = None) -> "Page":
@@ -121,32 +57,33 @@ def show(shown: Scene | SavedRun, *, model: str | None = None) -> "Page":
 class Page:
     """A scene or saved runs in a browser; a notebook shows it where it is the value of a cell.
 
-    ``at`` are controls that begin elsewhere than at rest, ``colour`` is of `COLOURINGS`, ``port`` the server's, any
-    free one for 0. A browser opens the ``address``, which holds a secret token.
+    ``at`` are controls that begin elsewhere than at rest, ``colour`` is of `COLOURINGS`, ``served`` is what
+    `open_server` returned, called where not given. A browser opens the ``address``, which holds a secret token. Models
+    are built once one is there.
     """
 
     def __init__(
         self, source: LiveSource | SavedSource, *, at: dict[str, float] | None = None,
-        colour: str = "group", port: int = 0,
+        colour: str = "group", served: "tuple[ViserServer, str] | None" = None,
     ) -> None:  # fmt: skip
         import trimesh
 
-        self.source, (self.server, self.address) = source, open_server(port)
+        self.source, (self.server, self.address) = source, served or open_server()
         self._probes = [BoneProbe(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()]
         self._wake, self._closed, self._resting = threading.Event(), False, False
-        self._cost, self._message, self._place = 0.0, "", 0
+        self._cost, self._message, self._place = 0.0, BUILDING, 0
         self._shown: Look | None = None
-        # Software drawing takes long for shadows.
-        self.server.scene.configure_default_lights(cast_shadow=False)
         self.sides = [Side(self.server, f"/{name}", source) for name in ("first", "second")]
         self.panel = Panel(self.server, source, at or {}, colour, self._touch)
         self.panel.rest.on_click(lambda _: self._touch(rest=True))
         self.panel.view.on_click(lambda e: self._aim(VIEWS[e.target.value.lower()], e.client.camera))
         self.server.scene.set_up_direction(source.body[2])
+        self.sides[0].picture = self.sides[0].rest = source.rest
         self._aim(FIRST, self.server.initial_camera)
+        self._draw(self.sides[:1], self.panel.look())
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
-        self._touch()
+        self.server.on_client_connect(self._welcome)
 
     def close(self) -> None:
         """Stop the server."""
@@ -161,6 +98,10 @@ class Page:
 
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.address}" width="100%" height="640" style="border:0"></iframe>'
+
+    def _welcome(self, client: "ClientHandle") -> None:
+        self._aim(FIRST, client.camera)  # one that loaded the page before the scene was read looks elsewhere
+        self._touch()
 
     def _touch(self, *, rest: bool = False) -> None:
         self._resting |= rest
@@ -206,6 +147,8 @@ class Page:
         """Show the next picture if there is a new one; returns whether more follow."""
         panel = self.panel
         changed = [side.choose(model.value) for side, model in zip(self.sides, panel.models)]
+        if any(changed) and self._message == BUILDING:
+            self._message = ""
         if changed[1]:
             for client in self.server.get_clients().values():
                 self._aim(FIRST, client.camera)
@@ -255,6 +198,6 @@ class Page:
             self.panel.plot_on(sides)
 
     def _write(self) -> None:
-        sides = [side for side in self.sides if side.picture is not None]
+        sides = [side for side in self.sides if side.figure is not None]
         cost = f"{1e3 * self._cost:.0f} ms per picture"
         self.panel.write(sides, [self._message, *(side.picture.text for side in sides), cost])

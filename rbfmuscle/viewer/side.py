@@ -108,9 +108,9 @@ class Side:
         self.picture: Any = None
         self.rest: Any = None
         self.numbers: dict[str, dict[str, float]] = {}
-        self.frame = server.scene.add_frame(root, show_axes=False, visible=False)
+        self.frame = server.scene.add_frame(root, show_axes=False)
         self._bones = {name: clustered(v, f, BONE_TRIANGLES) for name, (v, f) in source.bones.items()}
-        self._volumes = {name: mesh_volume(*mesh) for name, mesh in source.muscles.items()}
+        self._volumes: dict[str, float] = {}
         self._nodes: dict[str, Any] = {}
         self._painted: list[Any] = []
 
@@ -122,6 +122,7 @@ class Side:
         picture = None if figure is None else figure.advance()
         self.choice, self.figure = choice, figure
         self.rest = self.picture = picture
+        self._volumes = {name: mesh_volume(*mesh) for name, mesh in self.source.muscles.items()}
         self.frame.visible = figure is not None
         return True
 
@@ -139,9 +140,10 @@ class Side:
         painted, colouring = [], COLOURINGS[look.colour]
         for name, mesh in self.picture.surfaces.items():
             values = vertex_values(look.colour, name, self.picture, self.rest, probes, other)
-            error = 100.0 * (mesh_volume(*mesh) / self._volumes[name] - 1.0)
-            depth = self.picture.depth.get(name, math.nan)
-            self.numbers[name] = {"volume": error, "depth": depth, "mean": float(values.mean())}
+            if self.figure is not None:
+                error = 100.0 * (mesh_volume(*mesh) / self._volumes[name] - 1.0)
+                depth = self.picture.depth.get(name, math.nan)
+                self.numbers[name] = {"volume": error, "depth": depth, "mean": float(values.mean())}
             part, shown = self._part(mesh, look.cut), name not in look.hidden
             self._show(name, part, self.source.colours[name], visible=shown and colouring is None)
             if shown and colouring is not None:
@@ -150,6 +152,9 @@ class Side:
             part = self._part(mesh, look.cut)
             self._show(tendon_name(name), part, TENDON_COLOUR, visible=name not in look.hidden)
         self._paint(painted)
+        for node in self._nodes.values():
+            # The inside is seen in a cut alone, and software drawing pays for it.
+            node.side = "front" if look.cut is None else "double"
 
     def _part(self, mesh: Mesh, cut: tuple[int, float] | None) -> Mesh:
         """The part of a mesh that is shown, in metres."""
@@ -161,8 +166,8 @@ class Side:
     def _show(self, name: str, mesh: Mesh, colour: str, *, visible: bool) -> None:
         """Show a mesh in one colour."""
         if name not in self._nodes:
-            look: dict[str, Any] = {"color": tuple(bytes.fromhex(colour[1:])), "side": "double"}
-            self._nodes[name] = self.server.scene.add_mesh_simple(f"{self.root}/{name}", *mesh, **look)
+            shade = tuple(bytes.fromhex(colour[1:]))
+            self._nodes[name] = self.server.scene.add_mesh_simple(f"{self.root}/{name}", *mesh, color=shade)
         node = self._nodes[name]
         node.visible = visible
         if visible:
@@ -184,9 +189,7 @@ class Side:
             self._painted.append(self.server.scene.add_glb(f"{self.root}/painted_{free}", glb))
 
     def points(self) -> list[Any]:
-        """Vertices (n, 3) of bones and muscles, where they are shown; at rest before the first picture."""
-        if self.picture is None:
-            return [vertices for vertices, _ in (self.source.bones | self.source.muscles).values()]
+        """Vertices (n, 3) of bones and muscles, where they are shown."""
         poses = [(vertices, self.picture.poses[name]) for name, (vertices, _) in self._bones.items()]
         bones = [vertices @ pose[:3, :3].T + pose[:3, 3] for vertices, pose in poses]
         return bones + [vertices for vertices, _ in self.picture.surfaces.values()]

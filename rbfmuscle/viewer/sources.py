@@ -1,23 +1,28 @@
 """What a viewer shows: a scene moved by hand, or saved runs scrubbed by frame; no browser here."""
 
 import math
+from collections.abc import Mapping
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.coarse import clustered
+from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
 from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh, tendon_name
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.activation.contraction import STEP
-from rbfmuscle.scene.motion import inner_value, shown_value, unit_sign
+from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.live import LiveSession, live_fields
 from rbfmuscle.validation import UsageError
 
 Mesh = tuple[Floats, Integers]
+REST_TRIANGLES = 3000  # of a muscle, until its model is built
 ACTIVATION = "activation "  # what the name of a muscle's control begins with
 
 
@@ -46,7 +51,8 @@ class LiveSource:
     """A scene whose coordinates and activations are set by hand, by its own model or the one named.
 
     ``choices`` are models; bones and muscles (vertices, faces) by name are those at rest; ``body`` (3, 3) is left,
-    posterior and superior. ``motion`` holds what the controls are set to in each frame of the scene's motion.
+    posterior and superior; ``rest`` is shown until a model is built. ``motion`` holds what the controls are set to in
+    each frame of the scene's motion.
     """
 
     def __init__(self, scene: Scene, model: str | None = None) -> None:
@@ -62,14 +68,20 @@ class LiveSource:
         held = [{"name": m.name, "attach": [{"bone": a.bone} for a in m.attachments]} for m in scene.muscles]
         groups = muscle_groups({"scene": {"joints": list(map(vars, scene.joints)), "muscles": held}})
         self.colours = muscle_colours(list(self.muscles), groups)
-        self.fields = live_fields(scene)
-        session = LiveSession(scene, fields=self.fields)
+        coarse = {name: clustered(*mesh, REST_TRIANGLES) for name, mesh in self.muscles.items()}
+        self.rest = Picture(bone_poses(scene, {}), coarse, {}, {}, {}, "")
+        session = LiveSession(scene, fields={})
         self.controls = {
             name: _coordinate(scene, name, (*limits, session.rest[name]))
             for name, limits in session.limits.items()
         } | {ACTIVATION + name: Control("Activation", name, 0.0, 1.0, 0.0) for name in session.activation}
         moved = [{n: x for n, x in frame.items() if n in session.limits} for frame in scene.motion.frames]
         self.motion = [{n: shown_value(scene, n, x) for n, x in frame.items()} for frame in moved]
+
+    @cached_property
+    def fields(self) -> Mapping[str, BoneField]:
+        """Distance fields of the bones, built when a model first asks for them."""
+        return live_fields(self.scene)
 
     def figure(self, choice: str) -> "LiveFigure":
         """A model of every muscle, at rest."""
@@ -138,7 +150,7 @@ class SavedSource:
         self.millimetre = 1.0 / MM_PER_UNIT[first.units]
         self.bones = {name: first.bone(name) for name in first.bones}
         self.muscles = {name: first.surface(name, first.frames[0]) for name in first.muscles}
-        self.colours = first.colours
+        self.colours, self.rest = first.colours, SavedFigure(first).advance()
         self.motion = [{"frame": float(frame)} for frame in first.frames]
         self.controls = {"frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])}
 

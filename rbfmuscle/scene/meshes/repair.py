@@ -143,7 +143,8 @@ def _parts(faces: Integers) -> Integers:
 def _repeated(faces):
     """Which faces name a vertex twice, or the vertices of a face before them."""
     degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    rows = np.sort(faces, axis=1).astype(np.int64).view("V24")  # bytes sort faster than rows
+    _, first = np.unique(rows, return_index=True)
     again = np.ones(len(faces), dtype=bool)
     again[first] = False
     return degenerate | again
@@ -254,7 +255,8 @@ def _orient(state, place):
     faces = np.ascontiguousarray(state.faces)
     oriented, part = igl.bfs_orient(faces)
     sides = oriented * (int(faces.max()) + 1) + np.roll(oriented, -1, axis=1)
-    if len(np.unique(sides)) < sides.size:
+    sides = np.sort(sides, axis=None)  # takes a tenth of what np.unique does
+    if (sides[1:] == sides[:-1]).any():
         raise MeshError(f"{place}: the surface has one side only (no consistent orientation); remesh it")
     turned = (oriented != faces).any(axis=1)
     turned ^= (np.bincount(part, weights=turned) * 2 > np.bincount(part))[part]
