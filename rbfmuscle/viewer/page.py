@@ -20,12 +20,11 @@ from rbfmuscle.viewer.side import Look, Side
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 if TYPE_CHECKING:
-    from viser import ClientHandle, ViserServer
+    from viser import ViserServer
 
 COSTLY = 0.1  # Where a picture takes longer [s], those on the way to the controls' places are drawn coarse.
 PACE = 0.04  # Least time of a picture while a motion is played [s].
 FIELD_OF_VIEW = 0.5
-BUILDING = "Building the models …"
 FIRST = (-1.4, 1.6, 0.5)  # Where the camera stands at first, along the body's axes.
 
 
@@ -58,8 +57,7 @@ class Page:
     """A scene or saved runs in a browser; a notebook shows it where it is the value of a cell.
 
     ``at`` are controls that begin elsewhere than at rest, ``colour`` is of `COLOURINGS`, ``served`` is what
-    `open_server` returned, called where not given. A browser opens the ``address``, which holds a secret token. Models
-    are built once one is there.
+    `open_server` returned, called where not given. A browser opens the ``address``, which holds a secret token.
     """
 
     def __init__(
@@ -71,7 +69,7 @@ class Page:
         self.source, (self.server, self.address) = source, served or open_server()
         self._probes = [BoneProbe(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()]
         self._wake, self._closed, self._resting = threading.Event(), False, False
-        self._cost, self._message, self._place = 0.0, BUILDING, 0
+        self._cost, self._message, self._place = 0.0, "Building the models …", 0
         self._shown: Look | None = None
         self.sides = [Side(self.server, f"/{name}", source) for name in ("first", "second")]
         self.panel = Panel(self.server, source, at or {}, colour, self._touch)
@@ -83,7 +81,9 @@ class Page:
         self._draw(self.sides[:1], self.panel.look())
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
-        self.server.on_client_connect(self._welcome)
+        self._touch()
+        # Browsers that came before the scene was read look elsewhere.
+        self.server.on_client_connect(lambda client: self._aim(FIRST, client.camera))
 
     def close(self) -> None:
         """Stop the server."""
@@ -98,10 +98,6 @@ class Page:
 
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.address}" width="100%" height="640" style="border:0"></iframe>'
-
-    def _welcome(self, client: "ClientHandle") -> None:
-        self._aim(FIRST, client.camera)  # one that loaded the page before the scene was read looks elsewhere
-        self._touch()
 
     def _touch(self, *, rest: bool = False) -> None:
         self._resting |= rest
@@ -147,7 +143,7 @@ class Page:
         """Show the next picture if there is a new one; returns whether more follow."""
         panel = self.panel
         changed = [side.choose(model.value) for side, model in zip(self.sides, panel.models)]
-        if any(changed) and self._message == BUILDING:
+        if any(changed):
             self._message = ""
         if changed[1]:
             for client in self.server.get_clients().values():

@@ -94,6 +94,12 @@ def _limits(colouring: Colouring, millimetre: float) -> Floats:
     return np.array([colouring.low, colouring.high]) * (millimetre if colouring.length else 1.0)
 
 
+def _make_matt(tree: Any) -> None:
+    """Give a glTF its material: one without is a metal, which is dark under plain lights."""
+    tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0}}]
+    tree["meshes"][0]["primitives"][0]["material"] = 0
+
+
 class Side:
     """A model, or a run, under a node of a viser server; in metres, as the browser shows nothing far away.
 
@@ -185,7 +191,7 @@ class Side:
             starts = np.repeat(np.cumsum([0, *counts[:-1]]), [len(part) for _, part, _ in painted])
             mesh = trimesh.Trimesh(vertices, faces + starts[:, None], vertex_colors=colours, process=False)
             free = "a" if self._painted and self._painted[0].name.endswith("b") else "b"
-            glb = mesh.export(file_type="glb")
+            glb = mesh.export(file_type="glb", tree_postprocessor=_make_matt)
             self._painted.append(self.server.scene.add_glb(f"{self.root}/painted_{free}", glb))
 
     def points(self) -> list[Any]:

@@ -138,6 +138,10 @@ def test_colouring_shows_its_scale_and_changes_the_picture(page, tab):
     wait_for(lambda: "Depth in a bone [mm]" in tab.text(), SLOW)
     wait_for(lambda: changed(before, canvas(tab)) > 0.01, SLOW)
     coloured = canvas(tab)
+    page.panel.colour.value = "stretch"  # none, which is light grey
+    wait_for(lambda: changed(coloured, canvas(tab)) > 0.01, SLOW)
+    coloured = canvas(tab)
+    assert (coloured.max(axis=2) < 60).mean() < 1e-3
     page.panel.colour.value = "group"
     wait_for(lambda: changed(coloured, canvas(tab)) > 0.01, SLOW)
 
@@ -243,6 +247,7 @@ def test_notebook_shows_a_scene_and_a_run():
     try:
         assert f'<iframe src="{shown.address}"' in shown._repr_html_()
         names = {muscle.name for muscle in rm.phantom_scene().muscles}
-        assert set(shown.sides[0].picture.surfaces) == names  # at rest, until a browser is there
+        assert set(shown.sides[0].picture.surfaces) == names  # at rest: the models are not built yet
+        wait_for(lambda: set(shown.sides[0].numbers) == names, SLOW)
     finally:
         shown.close()
