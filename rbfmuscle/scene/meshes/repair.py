@@ -250,13 +250,18 @@ def _rims(faces: Integers) -> list[Integers]:
     return loops
 
 
+def _agree(faces):
+    """Whether no two faces run along an edge in the same direction."""
+    sides = np.sort(faces * (int(faces.max()) + 1) + np.roll(faces, -1, axis=1), axis=None)
+    return not (sides[1:] == sides[:-1]).any()
+
+
 def _orient(state, place):
     """Make neighbouring faces agree, then turn what was mended, or the whole, outward; consistent cavities stay."""
     faces = np.ascontiguousarray(state.faces)
-    oriented, part = igl.bfs_orient(faces)
-    sides = oriented * (int(faces.max()) + 1) + np.roll(oriented, -1, axis=1)
-    sides = np.sort(sides, axis=None)  # takes a tenth of what np.unique does
-    if (sides[1:] == sides[:-1]).any():
+    # Most meshes agree, and bfs_orient, which would leave these as they are, takes long.
+    oriented, part = (faces, np.zeros(len(faces), int)) if _agree(faces) else igl.bfs_orient(faces)
+    if oriented is not faces and not _agree(oriented):
         raise MeshError(f"{place}: the surface has one side only (no consistent orientation); remesh it")
     turned = (oriented != faces).any(axis=1)
     turned ^= (np.bincount(part, weights=turned) * 2 > np.bincount(part))[part]
