@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 COSTLY = 0.1  # Where a picture takes longer [s], those on the way to the controls' places are drawn coarse.
+READ = 1.0  # Time in which a browser has read a coloured mesh [s]; the one before it is removed then.
 PACE = 0.04  # Least time of a picture while a motion is played [s].
 FIELD_OF_VIEW = 0.5
 FIRST = (-1.4, 1.6, 0.5)  # Where the camera stands at first, along the body's axes.
@@ -122,7 +123,10 @@ class Page:
 
     def _run(self) -> None:
         while True:
-            self._wake.wait()
+            if not self._wake.wait(READ):
+                for side in self.sides:
+                    side.forget()
+                self._wake.wait()
             self._wake.clear()
             if self._closed:
                 return

@@ -183,8 +183,7 @@ class Side:
         """Show coloured meshes as glTF, which the browser needs a moment to read: the last stays until the next."""
         import trimesh
 
-        while len(self._painted) > bool(painted):
-            self._painted.pop(0).remove()
+        self.forget(bool(painted))
         if painted:
             counts = [len(vertices) for vertices, _, _ in painted]
             vertices, faces, colours = (np.concatenate(parts) for parts in zip(*painted))
@@ -193,6 +192,11 @@ class Side:
             free = "a" if self._painted and self._painted[0].name.endswith("b") else "b"
             glb = mesh.export(file_type="glb", tree_postprocessor=_make_matt)
             self._painted.append(self.server.scene.add_glb(f"{self.root}/painted_{free}", glb))
+
+    def forget(self, kept: int = 1) -> None:
+        """Remove all coloured meshes but the last ones."""
+        while len(self._painted) > kept:
+            self._painted.pop(0).remove()
 
     def points(self) -> list[Any]:
         """Vertices (n, 3) of bones and muscles, where they are shown."""

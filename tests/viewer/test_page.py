@@ -142,6 +142,7 @@ def test_colouring_shows_its_scale_and_changes_the_picture(page, tab):
     wait_for(lambda: changed(coloured, canvas(tab)) > 0.01, SLOW)
     coloured = canvas(tab)
     assert (coloured.max(axis=2) < 60).mean() < 1e-3
+    wait_for(lambda: len(page.sides[0]._painted) == 1, SLOW)  # what it replaced is gone
     page.panel.colour.value = "group"
     wait_for(lambda: changed(coloured, canvas(tab)) > 0.01, SLOW)
 
