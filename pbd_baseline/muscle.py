@@ -58,6 +58,7 @@ class PBDMuscle:
             self.sweeps = method.sweeps
             self.most_sweeps = self.options.iterations or MOST_SWEEPS
         self.still = self.options.tolerance * diameter(self.rest.vertices)
+        self.detail = 0.0
         self.contact_bone = _bone_numbers(self.rest, scene.holders(muscle))
         self.contact = ContactConstraint(reach=scene.length(REACH), nearest_only=self.as_printed)
         self.finishing_reach, self.depth = scene.length(FINISHING_REACH), scene.length(DEPTH)

@@ -119,7 +119,7 @@ class ToyMuscle:
         self.names = [bone.name for bone in scene.bones]
         self.rest = np.array(muscle.mesh.vertices, dtype=float)
         self.faces = np.array(muscle.mesh.faces)
-        self.contact_bone = np.full(len(self.rest), -1)
+        self.contact_bone, self.detail = np.full(len(self.rest), -1), 0.0
         for attachment in muscle.attachments:
             self.contact_bone[attachment.vertices] = self.names.index(attachment.bone)
         self.sweeps = sweeps

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.jit import compiled
 
 
 def inside_test(vertices: Floats, faces: Integers) -> Callable[[Floats], Booleans]:
@@ -18,3 +19,34 @@ def inside_test(vertices: Floats, faces: Integers) -> Callable[[Floats], Boolean
         return tree.winding_number(np.ascontiguousarray(points)) > 0.5
 
     return inside
+
+
+@compiled(error_model="numpy")
+def winding_loop(vertices, faces, points, out):
+    """Winding numbers (n,) of a few points by the sum over all triangles' solid angles, without a tree.
+
+    Van Oosterom & Strackee 1983, "The solid angle of a plane triangle".
+    """
+    a, b, c = np.empty(3), np.empty(3), np.empty(3)
+    for q in range(len(points)):
+        total = 0.0
+        for f in range(len(faces)):
+            aa, bb, cc, ab, bc, ca = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(3):
+                a[k] = vertices[faces[f, 0], k] - points[q, k]
+                b[k] = vertices[faces[f, 1], k] - points[q, k]
+                c[k] = vertices[faces[f, 2], k] - points[q, k]
+                aa += a[k] * a[k]
+                bb += b[k] * b[k]
+                cc += c[k] * c[k]
+                ab += a[k] * b[k]
+                bc += b[k] * c[k]
+                ca += c[k] * a[k]
+            x, y, z = np.sqrt(aa), np.sqrt(bb), np.sqrt(cc)
+            volume = (
+                a[0] * (b[1] * c[2] - b[2] * c[1])
+                + a[1] * (b[2] * c[0] - b[0] * c[2])
+                + a[2] * (b[0] * c[1] - b[1] * c[0])
+            )
+            total += np.arctan2(volume, x * y * z + ab * z + bc * x + ca * y)
+        out[q] = total / (2.0 * np.pi)

@@ -17,6 +17,9 @@ from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 
+# Neighbours meet a muscle at contact points so far apart, of the side of a lattice cell, which has three nodes on it.
+DETAIL = 0.3
+
 
 class RBFMuscle:
     """A muscle as the zero level set of an RBF field with moving centres.
@@ -62,6 +65,7 @@ class RBFMuscle:
         self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options)
         names = scene.holders(muscle)
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
+        self.detail = DETAIL * self.solid.side
         self.contact_bone = np.where(self.solid.owner < 0, -1, numbers[self.solid.owner])
         self.points = self.rest.centres.copy()
         # Contact points, and the centres and nodes that they belong to.

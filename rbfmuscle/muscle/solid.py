@@ -48,6 +48,9 @@ GHOST = 1e-3  # stiffness of second differences, relative to a cell: for nodes t
 # is drawn at the volume at rest in any case.
 BULK, MOST_PRESSURE = 50.0, 3.0
 MOST_TREND = 1.5  # greatest multiple of the last sub-step's correction that the next one starts with
+# Share of that where neighbours meet the muscle. They see its prediction: with all of it the surface between two
+# muscles goes on as it went, like a mass without damping, and oscillates.
+TREND_BESIDE_NEIGHBOURS = 0.5
 MOBILE = 0.02  # points that move by less than this fraction of the median for a unit force count as attached
 SETTLED = 2e-5  # of the size: an iteration that moves no node farther was the last one
 # The same where the bones stand still and only the activation changes, and how many times the iterations it may take.
@@ -349,7 +352,7 @@ class EmbeddedSolid:
         self.forces[:] = 0.0
         self.forces[near.which] = near.forces
         self.shown = self.contact.lifted(near)
-        self._note_trend()
+        self._note_trend(TREND_BESIDE_NEIGHBOURS if contacts.neighbours else 1.0)
 
     def _begin(self) -> None:
         """Forces and responses for the nodes that a solve starts from, with the points that are squeezed there."""
@@ -359,11 +362,11 @@ class EmbeddedSolid:
             self._invert()
         self._find_responses()
 
-    def _note_trend(self) -> None:
+    def _note_trend(self, share: float) -> None:
         if self.begun is not None:
             motion, start, pressure = self.begun
             if np.abs(motion).max() > SETTLED * self.scale:
-                self.trend = motion, self.y - start, self.pressure - pressure
+                self.trend = motion, share * (self.y - start), share * (self.pressure - pressure)
             self.begun = None
 
     def energy(self) -> float:

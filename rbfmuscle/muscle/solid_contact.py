@@ -112,12 +112,10 @@ class SolidContact:
         softness = np.ones(sources)
         for k, planes in enumerate(contacts.neighbours):
             softness[-1 - k] = planes.softness
-        index = np.arange(len(solid.points))
-        if not contacts.neighbours:
-            here = np.empty_like(solid.points)
-            carry_loop(solid.y, solid.columns, solid.shares, here)
-            index = np.unique(contacts.half_spaces(here, self.reach).index)
-            contacts = contacts.only(index)
+        here = np.empty_like(solid.points)
+        carry_loop(solid.y, solid.columns, solid.shares, here)
+        index = np.unique(contacts.half_spaces(here, self.reach).index)
+        contacts = contacts.only(index)
         return NearPoints(
             index, solid.columns[index], solid.shares[index], solid.forces[index], self._rounded(contacts),
             contacts, solid.y.copy(), self.reach, self.most[index], softness,

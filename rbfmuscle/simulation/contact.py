@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,11 +53,32 @@ class Planes:
         """Replace the planes."""
         self.index, self.gap, self.normal, self.anchor = index, gap, normal, anchor
 
-    def contacts(self, points: Floats, reach: float) -> tuple[Integers, Floats, Floats]:
-        """``(index, gap, normal)`` of the planes nearer than ``reach`` to the model's contact points now."""
+
+class _PlaneStack(NamedTuple):
+    """The planes of all kinds, one below the other; ``source`` as in `HalfSpaces`."""
+
+    index: Integers
+    gap: Floats
+    normal: Floats
+    anchor: Floats
+    source: Integers
+
+    def near(self, points: Floats, reach: float) -> tuple[Integers, Floats, Floats, Integers]:
+        """``(index, gap, normal, source)`` of the planes nearer than ``reach`` to the contact points now."""
         gap = self.gap + np.einsum("ij,ij->i", self.normal, points[self.index] - self.anchor)
         near = gap < reach
-        return self.index[near], gap[near], self.normal[near]
+        return self.index[near], gap[near], self.normal[near], self.source[near]
+
+    def only(self, index: Integers) -> _PlaneStack:
+        """Those at a sorted subset ``index`` of the contact points, which are numbered anew."""
+        kept = np.isin(self.index, index)
+        index, *others = (part[kept] for part in self._replace(index=np.searchsorted(index, self.index)))
+        return _PlaneStack(index, *others)
+
+
+NO_PLANES = _PlaneStack(
+    np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
+)
 
 
 class BoneContacts:
@@ -81,7 +102,8 @@ class BoneContacts:
         self.move(AtRest((name, np.eye(4)) for name in self.names))
         self.allowed: dict[int, Floats] = {}
         #: Planes of sliding neighbours, and those that hold points on their side of a bone.
-        self.neighbours: list[Any] = []
+        self.neighbours: list[Planes] = []
+        self._stack: _PlaneStack | None = None  # of a copy for a subset of the contact points
         self.cuts: list[Any] = []  # sliding pairs that clip the muscle's surface beside the bones
         self._known: tuple[Floats, ...] = (
             np.zeros((len(self.reached), 0, 3)),
@@ -107,6 +129,7 @@ class BoneContacts:
         if self.contact_bone is not None:
             other.contact_bone = self.contact_bone[index]
         other.allowed = {bone: depth[index] for bone, depth in self.allowed.items()}
+        other._stack = self._planes().only(index)
         return other
 
     def allow(self, bone_index: int, depth: Floats) -> None:
@@ -181,9 +204,8 @@ class BoneContacts:
             source[count:end] = b
             count = end
         parts = [(index[:count], gap[:count], normal[:count], source[:count])]
-        for k, neighbour in enumerate(self.neighbours):
-            found = neighbour.contacts(points, float(reach.max(initial=0.0)))
-            parts.append((*found, np.full(len(found[0]), -1 - k)))
+        if self.neighbours:
+            parts.append(self._planes().near(points, float(reach.max(initial=0.0))))
         return HalfSpaces(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts))))
 
     def near(self, points: Floats, reach: Floats) -> list[tuple[int, Integers]]:
@@ -212,6 +234,16 @@ class BoneContacts:
         if len(self.contact_bone) != count:
             raise ValueError(f"half-spaces need all {len(self.contact_bone)} contact points, got {count}")
         return self.contact_bone < 0
+
+    def _planes(self) -> _PlaneStack:
+        """The neighbours' planes."""
+        if self._stack is not None or not self.neighbours:
+            return self._stack or NO_PLANES
+        kinds = [
+            (p.index, p.gap, p.normal, p.anchor, np.full(len(p.index), -1 - k))
+            for k, p in enumerate(self.neighbours)
+        ]
+        return _PlaneStack(*map(np.concatenate, zip(*kinds)))
 
     def _stacked(self, poses):
         """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""

@@ -93,6 +93,7 @@ class MuscleModel(Protocol):
 
     name: str
     contact_bone: np.ndarray  # (n,) bone that a contact point is attached to, -1 where it is free
+    detail: float  # length over which it bends as a whole: neighbours meet it at points so far apart; 0 for all points
 
     def contact_points(self) -> np.ndarray:
         """Present contact points (n, 3); their number and order never change."""

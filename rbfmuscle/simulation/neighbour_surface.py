@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import touching_balls, vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
+from rbfmuscle.geometry.winding import winding_loop
 from rbfmuscle.jit import compiled
 
 if TYPE_CHECKING:
@@ -131,15 +132,13 @@ class NeighbourSurface:
             or np.any(other.reach_box[1] < self.box[0] - reach)
         )
 
-    def query(self, points: Floats, which: Booleans, reach: float) -> Found:
+    def query(self, points: Floats, reach: Floats | float) -> Found:
         """Distances of those points that are nearer than ``reach``.
 
         Parameters
         ----------
         points : (n, 3) ndarray
-        which : (n,) ndarray of bool
-            Points that are asked for.
-        reach : float
+        reach : float or (n,) ndarray
 
         Returns
         -------
@@ -152,23 +151,23 @@ class NeighbourSurface:
         nearest : (c,) ndarray of int
             Nearest vertex.
         """
-        bound = min(reach, self.reach) + self.edge
-        inside = which & ((points >= self.box[0] - bound) & (points <= self.box[1] + bound)).all(axis=1)
-        index = np.flatnonzero(inside)
-        away, nearest = self._tree.query(points[index], distance_upper_bound=bound)
-        index, nearest = index[away < bound], nearest[away < bound]
+        reach = np.broadcast_to(reach, len(points))
+        most = min(float(reach.max(initial=0.0)), self.reach) + self.edge
+        away, nearest = self._tree.query(points, distance_upper_bound=most)
+        index = np.flatnonzero(away < reach + self.edge)
+        nearest = nearest[index]
         count = len(index)
         distance, normal = np.empty(count), np.empty((count, 3))
         skin = Skin(self.vertices, self.normals, self.faces, self.start, self.ring)
         _distance_loop(points, index, nearest, skin, distance, normal)
         # Beyond a sharp rim the normals of its sides disagree: no point is deeper than the muscle is thick.
-        near = (distance < reach) & (distance >= -self.deepest[nearest])
+        near = (distance < reach[index]) & (distance >= -self.deepest[nearest])
         # A folded triangle at a rim may give a point far outside a large depth.
         deep = np.flatnonzero(near & (distance < -FOLDED * self.edge))
         if len(deep):
-            import igl
-
-            near[deep] = igl.winding_number(self.vertices, self.faces, points[index[deep]]) > 0.5
+            winding = np.empty(len(deep))
+            winding_loop(self.vertices, self.faces, points[index[deep]], winding)
+            near[deep] = winding > 0.5
         return index[near], distance[near], normal[near], nearest[near]
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.simulation.contact import Planes
 from rbfmuscle.simulation.neighbour_surface import Found, NeighbourSurface
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 # Distances [mm]. Points nearer than THRESHOLD (the default) at rest are linked. A linked point is free to STRIP beyond
 # its gap at rest, and is released RELEASE beyond that.
-THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 5.0
+THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 15.0
 # At rest points this share of a mean edge farther are linked too: a patch where two muscles touch may lie between them.
 BETWEEN = 0.5
 # Neighbours are looked for within this distance [mm] of points that are not linked.
 SEARCH = 3.0
 # Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
 CUT_FROM, CUT_DEPTH = 3.0, 6.0
-# How far planes between muscles yield to a force, relative to a bone's: those that keep them apart, and those that hold
-# them together. Of these one point in each cell of SPARSE mean edges has one, which yields less in proportion.
-PUSH_YIELDS, PULL_YIELDS, SPARSE = 10.0, 30.0, 2.0
+# How far planes between muscles yield to a pressure, relative to a bone's. One point in each cell of SPARSE mean edges
+# has a plane that holds muscles together, which yields less in proportion.
+YIELDS, SPARSE = 40.0, 2.0
 # How far a plane pushes out of a neighbour at most in one sub-step [mm].
 MOST = 1.0
 
@@ -57,45 +57,44 @@ class SlidingPair:
     ) -> None:
         self.own, self.other, self.limits = own, other, limits
         self.free = stepper.contacts.free(len(stepper.model.contact_points()))
-        #: Which points are linked, and how far each may be from the neighbour.
-        self.linked = self.free.copy()
-        self.touching: Integers = np.zeros(0, dtype=np.int64)
-        self.hold = np.full(len(self.free), limits.hold)
         #: Box in which points of this muscle are near the neighbour, and the pair seen from the neighbour.
         self.zone: Floats | None = None
         self.back: SlidingPair | None = None
-        index, distance, _, _ = self._near()
-        self.linked[:] = False
-        near = distance < limits.threshold + min(BETWEEN * own.edge, limits.threshold)
-        self.linked[index[near]] = True
-        self.hold[index[near]] = np.maximum(distance[near], 0.0) + limits.strip
-        near = distance < limits.threshold
-        #: Points that touch the neighbour at rest, and how far they are from it there.
-        self.touching, self.gap = index[near], distance[near]
-        apart = np.where(self.free, limits.reach, np.inf)
+        at = np.flatnonzero(self.free)
+        apart = np.full(len(at), limits.reach)
+        index, distance, _, _ = self._ask(at, limits.reach)
         apart[index] = distance
-        #: Points that may be held, the nearest of each cell.
-        self.sparse = _nearest_by_cell(self.own.points, apart, SPARSE * own.edge)
-        share = float(self.sparse.sum() / max(1, self.free.sum()))
-        self.push, self.pull = Planes(PUSH_YIELDS), Planes(PULL_YIELDS * share)
+        chosen = _nearest_by_cell(own.points[at], apart, stepper.model.detail)
+        #: Contact points that meet the neighbour, and which of them it holds.
+        self.at, apart = at[chosen], apart[chosen]
+        self.held = np.zeros(len(self.at), dtype=bool)
+        self.held[_nearest_by_cell(own.points[self.at], apart, SPARSE * own.edge)] = True
+        #: Which of them are linked, and how far each may be from the neighbour.
+        self.linked = apart < min(limits.threshold + min(BETWEEN * own.edge, limits.threshold), limits.reach)
+        self.hold = np.where(self.linked, np.maximum(apart, 0.0) + limits.strip, limits.hold)
+        #: Those that touch the neighbour at rest, and how far they are from it there.
+        self.touching = np.flatnonzero(apart < limits.threshold)
+        self.gap = apart[self.touching]
+        area = self.free.sum() / max(1, len(self.at))
+        self.push = Planes(YIELDS / area)
+        self.pull = Planes(YIELDS / area * self.held.sum() / max(1, len(self.at)))
 
     def update(self) -> None:
         """Recompute the planes from the extrapolated surfaces."""
-        limits = self.limits
-        points = self.own.points
+        limits, points = self.limits, self.own.points
         index, distance, normal, nearest = self._near()
-        far = np.ones(len(points), dtype=bool)
+        far = np.ones(len(self.at), dtype=bool)
         far[index] = distance > self.hold[index] + limits.release
         self.linked &= ~far
         self.linked[index[distance < limits.threshold]] = True
         share = np.where(self.other.fixed[nearest], 1.0, 0.5)
-        own = index, np.maximum(share * distance, -limits.most), normal
+        own = self.at[index], np.maximum(share * distance, -limits.most), normal
         # Planes that keep the muscle out: at its own points, and at attached points of the neighbour.
         at, gap, out = (np.concatenate(parts) for parts in zip(own, self._pushed()))
         self.push.set(at, gap, out, points[at])
-        held = self.linked[index] & self.sparse[index]
-        slack = share[held] * (self.hold[index[held]] - distance[held])
-        self.pull.set(index[held], slack, -normal[held], points[index[held]])
+        held = self.linked[index] & self.held[index]
+        at, slack = self.at[index[held]], share[held] * (self.hold[index[held]] - distance[held])
+        self.pull.set(at, slack, -normal[held], points[at])
 
     def _pushed(self) -> tuple[Integers, Floats, Floats]:
         """Planes (index, gap, normal) by which the muscle yields to attached points of the neighbour inside it.
@@ -105,7 +104,7 @@ class SlidingPair:
         if self.own.apart(self.other, self.limits.search):
             return _FAR[:3]
         _, distance, normal, nearest = self.own.query(
-            self.other.vertices, self.other.fixed, self.limits.search
+            self.other.vertices[self.other.fixed], self.limits.search
         )
         at = self.own.contact[nearest]
         deep = np.flatnonzero((distance < 0.0) & self.free[at])
@@ -126,13 +125,16 @@ class SlidingPair:
         opened : float
             Sum of the squares of how much their gaps have grown.
         """
-        limits, index, distance = self.limits, *self._near()[:2]
-        close = self.own.points[index[distance < limits.cut_from]]
-        self.zone = None
-        if len(close):
-            self.zone = np.array([close.min(axis=0) - limits.cut_depth, close.max(axis=0) + limits.cut_depth])
-        apart = np.full(len(self.free), limits.reach)
-        apart[index] = distance
+        limits, at = self.limits, np.flatnonzero(self.free)
+        close, distance, _, _ = self._ask(at, limits.cut_from)
+        self.zone, points = None, self.own.points[at[close]]
+        if len(points):
+            self.zone = np.array(
+                [points.min(axis=0) - limits.cut_depth, points.max(axis=0) + limits.cut_depth]
+            )
+        apart = np.full(len(self.at), limits.reach)
+        index, now, _, _ = self._near()
+        apart[index] = now
         opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
         return max(0.0, -float(distance.min(initial=0.0))), len(opened), float((opened**2).sum())
 
@@ -161,12 +163,10 @@ class SlidingPair:
             ours, own = self.own.field.value_and_gradient(points[both])
             theirs, normal = self.other.field.value_and_gradient(points[both])
         else:
-            near, theirs, normal, _ = self.other.query(points, inside, self.limits.cut_depth)
-            inside[:] = False
-            inside[near] = True
-            both, ours, own, _ = self.own.query(points, inside, self.limits.cut_depth)
-            match = np.searchsorted(near, both)
-            theirs, normal = theirs[match], normal[match]
+            both = np.flatnonzero(inside)
+            near, theirs, normal, _ = self.other.query(points[both], self.limits.cut_depth)
+            met, ours, own, _ = self.own.query(points[both[near]], self.limits.cut_depth)
+            both, theirs, normal = both[near[met]], theirs[met], normal[met]
         value[both], gradient[both] = 0.5 * (theirs - ours), 0.5 * (normal - own)
         return value, gradient
 
@@ -179,26 +179,24 @@ class SlidingPair:
         return found[np.all((found > low) & (found < high), axis=1)]
 
     def _near(self) -> Found:
-        """Points near the neighbour: linked ones up to their release distance, others within the search distance."""
-        limits = self.limits
-        if self.other.apart(self.own, limits.reach):
-            return _FAR
+        """Of the points ``at`` those near the neighbour: linked ones up to their release distance, others less far."""
         far = self.linked.copy()
         far[self.touching] = True
-        found = [
-            self.other.query(self.own.points, self.free & which, reach)
-            for which, reach in ((far, limits.reach), (~far, limits.search))
-        ]
-        index, distance, normal, nearest = (np.concatenate(parts) for parts in zip(*found))
-        return index, distance, normal, nearest
+        return self._ask(self.at, np.where(far, self.limits.reach, self.limits.search))
+
+    def _ask(self, at: Integers, reach: Floats | float) -> Found:
+        """Of some contact points those nearer to the neighbour than their reach."""
+        if self.other.apart(self.own, self.limits.reach):
+            return _FAR
+        return self.other.query(self.own.points[at], reach)
 
 
-def _nearest_by_cell(points: Floats, distance: Floats, size: float) -> Booleans:
-    """Which points (n, 3) are the nearest in their cell of a grid, of those whose distance is finite."""
-    order = np.argsort(distance, kind="stable")[: np.isfinite(distance).sum()]
-    chosen = np.zeros(len(points), dtype=bool)
-    chosen[order[np.unique(np.floor(points[order] / size), axis=0, return_index=True)[1]]] = True
-    return chosen
+def _nearest_by_cell(points: Floats, distance: Floats, size: float) -> Integers:
+    """Sorted indices of the points (n, 3) that are nearest in their cell of a grid; all points for size 0."""
+    if size == 0.0:
+        return np.arange(len(points))
+    order = np.argsort(distance, kind="stable")
+    return np.sort(order[np.unique(np.floor(points[order] / size), axis=0, return_index=True)[1]])
 
 
 class BoneLink:
@@ -209,7 +207,7 @@ class BoneLink:
         points = stepper.model.contact_points()
         distance, _ = stepper.contacts.distance_and_direction(points, bone_index)
         self.linked = stepper.contacts.free(len(points)) & (distance < limits.threshold)
-        self.pull = Planes(PULL_YIELDS)
+        self.pull = Planes(YIELDS)
 
     def update(self) -> None:
         """Planes from the predicted state."""
