@@ -18,7 +18,7 @@ from rbfmuscle.simulation.overlap import resolve_initial_overlap
 from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.sliding import Sliding
 from rbfmuscle.simulation.stepper import MuscleStepper, TimedDrawing
-from rbfmuscle.simulation.substeps import PoseCache, SubSteps
+from rbfmuscle.simulation.substeps import PoseCache
 
 Path = tuple[list[dict[str, float]], list[dict[str, float]]]
 
@@ -68,13 +68,10 @@ class FrameLoop:
             for model, contacts in zip(models, _obstacles(scene, models, fields))
         ]
         self.here: dict[str, float] = {}
-        self.activations, self._sub_steps = Activations(scene), SubSteps(scene, poses=self._poses)
+        self.activations = Activations(scene)
         for stepper in self.steppers:
-            muscle, contacts = scene.muscle(stepper.name), stepper.contacts
-            if muscle.contraction is None:
-                met = [contacts.names[b] for b in contacts.reached]
-                stepper.cut = SubSteps(scene, muscle, bones=met, poses=self._poses)
-                stepper.carrier = RigidTransport(muscle, scene) if scene.sliding is None else None
+            if scene.sliding is None and not stepper.contracts:
+                stepper.carrier = RigidTransport(scene.muscle(stepper.name), scene)
         self._next_index, self._wall, self._blas = 0, 0.0, ThreadpoolController()
         with self.working():
             each(resolve_initial_overlap, self.steppers)
@@ -136,13 +133,12 @@ class FrameLoop:
         paths: dict[str, Path] = {}
         for stepper in self.steppers:
             stepper.frame = self._next_index
-            if stepper.carrier is not None and stepper.cut is not None:
-                paths[stepper.name] = [here, *stepper.cut.split(here, self.here)], []
-        if len(paths) < len(self.steppers):
-            # The others share the sub-steps of the muscle that has the most.
-            stops = [here, *self._sub_steps.split(here, self.here)]
+            paths[stepper.name] = [here, *stepper.cut.split(here, self.here)], []
+        if any(stepper.carrier is None for stepper in self.steppers):
+            # Muscles that slide or contract share the sub-steps of the one that has the most.
+            stops = max((stops for stops, _ in paths.values()), key=len)
             shared = self.activations.refine(self._next_index, stops)
-            paths = {stepper.name: paths.get(stepper.name, shared) for stepper in self.steppers}
+            paths |= {stepper.name: shared for stepper in self.steppers if stepper.carrier is None}
         self._next_index += 1
         return paths
 

@@ -39,7 +39,7 @@ def plan_scene(scene: Scene) -> dict[str, Any]:
 def _count_substeps(muscle: Muscle, scene: Scene, bones: list[str], poses: PoseCache) -> int:
     """Sub-steps in which the motion requires a muscle to be solved."""
     always = scene.sliding is not None or muscle.contraction is not None
-    cut = SubSteps(scene, poses=poses) if always else SubSteps(scene, muscle, bones=bones, poses=poses)
+    cut = SubSteps(scene, muscle, bones=bones, poses=poses)
     carrier, count, here = RigidTransport(muscle, scene), 0, rest_coordinates(scene)
     carrier.solved = poses(here)
     for frame in scene.motion.frames:

@@ -149,7 +149,7 @@ class Sliding:
 def _stride(stepper, stops):
     """Number of sub-steps that a muscle takes at a time; one that contracts takes every one."""
     count = len(stops) - 1
-    if stepper.cut is None or count < 2:
+    if stepper.contracts or count < 2:
         return 1
     return max(1, count // max(1, len(stepper.cut.split(stops[0], stops[-1]))))
 

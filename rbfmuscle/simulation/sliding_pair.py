@@ -82,6 +82,11 @@ class SlidingPair:
     def update(self) -> None:
         """Recompute the planes from the extrapolated surfaces."""
         limits, points = self.limits, self.own.points
+        if self.other.apart(self.own, limits.reach):
+            self.linked[:] = False
+            for planes in (self.push, self.pull):
+                planes.set(*_FAR[:3], _FAR[2])
+            return
         index, distance, normal, nearest = self._near()
         far = np.ones(len(self.at), dtype=bool)
         far[index] = distance > self.hold[index] + limits.release

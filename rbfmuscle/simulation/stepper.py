@@ -72,8 +72,8 @@ class CarriedDrawing:
 class MuscleStepper:
     """Advances one model through sub-steps, against obstacles of its own.
 
-    ``cut`` gives sub-steps by the relative motion of the muscle's own bones, None for one that contracts; ``carrier``
-    moves the muscle rigidly where it need not be solved, None where it is always solved.
+    ``cut`` gives sub-steps by the relative motion of the bones that the muscle meets; ``carrier`` moves the muscle
+    rigidly where it need not be solved, None where it is always solved.
     """
 
     def __init__(
@@ -91,7 +91,9 @@ class MuscleStepper:
         self.times: dict[str, float] = {}
         self.events: dict[tuple[int, str, str], int] = {}
         self.frame, self.solves = 0, 0
-        self.cut: SubSteps | None = None
+        self.contracts = scene.muscle(self.name).contraction is not None
+        met = [contacts.names[b] for b in contacts.reached]
+        self.cut = SubSteps(scene, scene.muscle(self.name), bones=met, poses=self.poses)
         self.carrier: RigidTransport | None = None
         self._path: Any = None
         self._saved: Any = None

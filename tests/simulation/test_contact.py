@@ -9,7 +9,7 @@ from toy_scene import ToyMuscle, attach, box, ellipsoid, muscle, scene, sphere
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.simulation.broad_phase import boxes_apart
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import BoneContacts, Planes
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.overlap import resolve_initial_overlap
 from rbfmuscle.simulation.stepper import MuscleStepper
@@ -51,6 +51,22 @@ def test_half_spaces_are_all_pairs_nearer_than_reach(reach):
             assert gap == pytest.approx(expected[i, b][0], abs=1e-12)
             assert np.allclose(normal, expected[i, b][1])
         points = points + rng.normal(size=points.shape) * 0.4
+
+
+def test_planes_of_neighbours_are_those_of_a_subset_of_the_points_too():
+    contacts, _ = _pair(contact_bone=np.full(400, -1))
+    points, rng = _points(), np.random.default_rng(4)
+    contacts.neighbours = [Planes(), Planes(3.0)]
+    for planes in contacts.neighbours:
+        at = rng.permutation(400)[:60]
+        planes.set(at, rng.normal(size=60), rng.normal(size=(60, 3)), points[at] + 0.1)
+    every, index = contacts.half_spaces(points, 0.5), np.sort(rng.permutation(400)[:150])
+    found = contacts.only(index).half_spaces(points[index], 0.5)
+    rows = [
+        set(zip(i.tolist(), h.source.tolist(), h.gap.tolist()))
+        for i, h in ((every.index, every), (index[found.index], found))
+    ]
+    assert rows[1] == {row for row in rows[0] if row[0] in index} and {-1, -2} <= {row[1] for row in rows[1]}
 
 
 def test_nearest_is_the_smallest_over_bones_and_infinite_without():

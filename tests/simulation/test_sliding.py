@@ -28,10 +28,6 @@ def _model(mesh):
     )  # fmt: skip
 
 
-def _all(points):
-    return np.ones(len(points), dtype=bool)
-
-
 @pytest.mark.parametrize(
     ("scale", "subdivisions", "reach", "share"),
     [([10, 10, 10], 3, 3.0, 1.0), ([24, 9, 4], 2, 1.5, 0.95), ([10, 10, 2.5], 3, 4.0, 0.9)],
@@ -43,7 +39,7 @@ def test_distances_are_those_of_the_triangles(scale, subdivisions, reach, share)
     surface = NeighbourSurface(_model(mesh), reach=reach)
     rng = np.random.default_rng(7)
     points = np.tile(mesh.vertices, (3, 1)) * rng.uniform(0.85, 1.4, (3 * len(mesh.vertices), 1))
-    index, distance, normal, nearest = surface.query(points, _all(points), reach)
+    index, distance, normal, nearest = surface.query(points, reach)
     exact, _, foot, _ = igl.signed_distance(points, surface.vertices, surface.faces)
     assert set(np.flatnonzero(np.abs(exact) < 0.95 * reach)) <= set(index)
     exact, way = exact[index], (points - foot)[index] * np.sign(exact[index])[:, None]
@@ -62,12 +58,12 @@ def test_surface_follows_the_model_and_asks_only_what_it_is_asked():
     model = _model(toy.ellipsoid((10, 10, 10), subdivisions=3))
     surface = NeighbourSurface(model, reach=3.0)
     for points in (np.array([[100.0, 0, 0]]), np.zeros((0, 3)), np.zeros((1, 3))):
-        assert len(surface.query(points, _all(points), 3.0)[0]) == 0
+        assert len(surface.query(points, 3.0)[0]) == 0
     turn = rotation_about([1, 2, 3], 1.0, np.array([50.0, 0, 0]))
     model.vertices[:] = model.vertices @ turn[:3, :3].T + turn[:3, 3]
     surface.refresh()
     points = (np.array([[11.0, 0, 0], [0, 9, 0], [0, 0, 12]])) @ turn[:3, :3].T + turn[:3, 3]
-    index, distance, _, _ = surface.query(points, np.array([True, True, False]), 3.0)
+    index, distance, _, _ = surface.query(points, np.array([3.0, 3.0, 1.5]))
     assert index.tolist() == [0, 1]
     assert np.allclose(distance, [1, -1], atol=0.08)
 
