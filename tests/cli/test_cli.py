@@ -12,9 +12,7 @@ from blend_model import arm_files
 from command_line import call
 
 import rbfmuscle as rm
-from rbfmuscle import progress
 from rbfmuscle.cli.app import GROUPS
-from rbfmuscle.progress import Progress
 from rbfmuscle.scene.check import check_extents
 from rbfmuscle.validation import MeshError
 
@@ -206,14 +204,3 @@ def test_remedy_of_a_wrong_unit_makes_the_size_it_says(factor, remedy):
     text = str(caught.value)
     assert f"is {size:.4g} mm across" in text
     assert f"({remedy:g} times the present one would make it {size * remedy:.4g} mm)" in text
-
-
-def test_counts_are_shown_after_two_seconds_then_every_ten_and_at_the_end(monkeypatch, capsys):
-    clock = [100.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
-    with Progress("hip") as shown:
-        for done, seconds in enumerate((1.0, 2.5, 8.0, 12.4, 12.6, 13.0), 1):
-            clock[0] = 100.0 + seconds
-            shown(done, 6)
-    shown = capsys.readouterr().err.splitlines()
-    assert shown == ["hip: frame 2 of 6 (2 s)", "hip: frame 5 of 6 (13 s)", "hip: frame 6 of 6 (13 s)"]

@@ -36,8 +36,6 @@ MODELS = {
         },
     ),
 }  # fmt: skip
-# Where a motion comes from: a file has one of them, and another cannot stand beside it.
-SOURCES = {"waypoints", "file"}
 # The name of the model decides it, so it is no key of the scene's.
 IMPLIED = {"method", "tolerance"}
 
@@ -84,13 +82,6 @@ def test_every_documented_key_has_a_value_here(table, values):
     assert set(values) == set(fields)
     same = [k for k, v in values.items() if v == fields[k].get_default(call_default_factory=True)]
     assert same == []
-
-
-def test_every_key_of_the_motion_is_set_here_or_is_its_source():
-    here = {key.split(".")[1] for key, _, _ in OTHERS if key.startswith("motion.")}
-    assert here | SOURCES == set(options.MotionOptions.model_fields) and not here & SOURCES
-    ramp = {key.rsplit(".", 1)[-1] for key, _, _ in OTHERS if key.startswith("motion.ramp.")}
-    assert ramp == {field.alias or name for name, field in options.RampOptions.model_fields.items()}
 
 
 @pytest.mark.parametrize("table", TABLES)

@@ -62,11 +62,9 @@ def test_planes_of_neighbours_are_those_of_a_subset_of_the_points_too():
         planes.set(at, rng.normal(size=60), rng.normal(size=(60, 3)), points[at] + 0.1)
     every, index = contacts.half_spaces(points, 0.5), np.sort(rng.permutation(400)[:150])
     found = contacts.only(index).half_spaces(points[index], 0.5)
-    rows = [
-        set(zip(i.tolist(), h.source.tolist(), h.gap.tolist()))
-        for i, h in ((every.index, every), (index[found.index], found))
-    ]
-    assert rows[1] == {row for row in rows[0] if row[0] in index} and {-1, -2} <= {row[1] for row in rows[1]}
+    rows = {(index[i], source, gap) for i, source, gap in zip(found.index, found.source, found.gap)}
+    assert {-1, -2} <= {source for _, source, _ in rows}
+    assert rows == {row for row in zip(every.index, every.source, every.gap) if row[0] in index}
 
 
 def test_nearest_is_the_smallest_over_bones_and_infinite_without():

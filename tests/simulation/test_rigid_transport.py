@@ -11,6 +11,7 @@ from toy_scene import box_mesh, ellipsoid, held
 import rbfmuscle as rm
 from rbfmuscle.models import build_model, build_models
 from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.options import SlidingOptions
 from rbfmuscle.simulation.frame_loop import simulate_frames, solve_pose
 from rbfmuscle.simulation.plan import plan_scene
 from rbfmuscle.simulation.substeps import SubSteps
@@ -91,6 +92,9 @@ def test_sub_steps_are_those_of_a_muscles_own_bones():
     assert cuts["brachialis"] <= 3 and cuts["deltoid"] >= 20
     end = {"shoulder.flexion": 0.7}
     assert SubSteps(scene, scene.muscles[0]).split({}, end) == [end]
+    scene.sliding = SlidingOptions()  # shares the sub-steps, but no more than the one muscle needs
+    work = _run(scene, "pbd", surfaces=False)[-1].work
+    assert {name: work[name].substeps for name in cuts} == cuts
 
 
 def test_muscles_side_by_side_in_any_order_are_what_they_are_alone():
