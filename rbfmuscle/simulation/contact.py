@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,7 +54,8 @@ class Planes:
         self.index, self.gap, self.normal, self.anchor = index, gap, normal, anchor
 
 
-class _PlaneStack(NamedTuple):
+@dataclass(frozen=True)
+class _PlaneStack:
     """The planes of all kinds, one below the other; ``source`` as in `HalfSpaces`."""
 
     index: Integers
@@ -72,13 +73,13 @@ class _PlaneStack(NamedTuple):
     def only(self, index: Integers) -> _PlaneStack:
         """Those at a sorted subset ``index`` of the contact points, which are numbered anew."""
         kept = np.isin(self.index, index)
-        index, *others = (part[kept] for part in self._replace(index=np.searchsorted(index, self.index)))
-        return _PlaneStack(index, *others)
-
-
-NO_PLANES = _PlaneStack(
-    np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
-)
+        return _PlaneStack(
+            np.searchsorted(index, self.index[kept]),
+            self.gap[kept],
+            self.normal[kept],
+            self.anchor[kept],
+            self.source[kept],
+        )
 
 
 class BoneContacts:
@@ -237,13 +238,16 @@ class BoneContacts:
 
     def _planes(self) -> _PlaneStack:
         """The neighbours' planes."""
-        if self._stack is not None or not self.neighbours:
-            return self._stack or NO_PLANES
-        kinds = [
-            (p.index, p.gap, p.normal, p.anchor, np.full(len(p.index), -1 - k))
-            for k, p in enumerate(self.neighbours)
-        ]
-        return _PlaneStack(*map(np.concatenate, zip(*kinds)))
+        if self._stack is not None:
+            return self._stack
+        kinds = [Planes(), *self.neighbours]  # the first stands for no neighbour
+        return _PlaneStack(
+            np.concatenate([planes.index for planes in kinds]),
+            np.concatenate([planes.gap for planes in kinds]),
+            np.concatenate([planes.normal for planes in kinds]),
+            np.concatenate([planes.anchor for planes in kinds]),
+            -np.repeat(np.arange(len(kinds)), [len(planes.index) for planes in kinds]),
+        )
 
     def _stacked(self, poses):
         """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""
