@@ -350,35 +350,50 @@ def contact_loop(
     table[:] = 0.0
     push[:] = 0.0
     taken[:] = 0.0
-    is_chosen = force > 0.0
-    chosen = np.flatnonzero(is_chosen)
-    lacking = need.copy()
-    done, room = 0, len(chosen) + rounds * batch
+    is_chosen, total = np.zeros(count, np.bool_), 0
+    lacking = np.empty(count)
+    for c in range(count):
+        lacking[c] = need[c]
+        if force[c] > 0.0:
+            is_chosen[c] = True
+            total += 1
+    room = min(count, total + rounds * batch)
+    # Of the working set the contacts, their points, normals, needs, forces and the greatest of these.
+    chosen, points, ways = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 3))
+    wants, strength, limits = np.empty(room), np.empty(room), np.empty(room)
     rows, answers = np.empty((room, response.shape[0])), np.empty((room, len(push)))
     gram, own = np.empty((room, room)), np.empty(room)
+    done, total = 0, 0
+    for c in range(count):
+        if is_chosen[c]:
+            chosen[total] = c
+            total += 1
     for _ in range(rounds):
         added = _deepest(lacking, is_chosen, tolerance, batch)
-        if len(added) == 0 and len(chosen) == 0:
-            break
         for c in added:
             is_chosen[c] = True
-        chosen = np.concatenate((chosen, added))
-        points, ways = index[chosen], normal[chosen]
-        _rows_loop(done, points, ways, response, columns, shares, rows)
-        _answers_loop(done, points, columns, shares, inverse, answers)
-        _pairs_loop(done, points, ways, rows, answers, columns, shares, gram, own)
-        done, least = len(chosen), 0.0
+            chosen[total] = c
+            total += 1
+        if total == 0:
+            break
+        for k in range(done, total):
+            c = chosen[k]
+            points[k], wants[k], strength[k], limits[k] = index[c], need[c], force[c], most[c]
+            for a in range(3):
+                ways[k, a] = normal[c, a]
+        some = points[:total], ways[:total]
+        _rows_loop(done, *some, response, columns, shares, rows)
+        _answers_loop(done, points[:total], columns, shares, inverse, answers)
+        _pairs_loop(done, *some, rows, answers, columns, shares, gram, own)
+        done, least = total, 0.0
         for k in range(done):
             least = max(least, 1e-7 * abs(own[k]))
         for k in range(done):
             gram[k, k] = own[k] + least + yielding[chosen[k]]
-        strength = force[chosen]
-        solve_contact_forces(gram, need[chosen], strength, sweeps, 0.1 * tolerance, most[chosen])
-        for k in range(len(chosen)):
-            force[chosen[k]] = strength[k]
-        _push_loop(ways, strength, rows, answers, response, push, taken)
+        solve_contact_forces(gram, wants[:total], strength, sweeps, 0.1 * tolerance, limits)
+        _push_loop(ways, strength[:total], rows, answers, response, push, taken)
         if len(added) == 0:
             break
         _lacking_loop(index, normal, need, columns, shares, push, lacking)
-    for c in chosen:
-        table[index[c], source[c]] = force[c]
+    for k in range(total):
+        table[points[k], source[chosen[k]]] = strength[k]

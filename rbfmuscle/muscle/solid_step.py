@@ -62,10 +62,26 @@ def _mix_loop(state, image, steps, residuals, images, last_residual, last_image,
                 value += residuals[k, i] * residuals[m, i]
             gram[k, m], gram[m, k] = value, value
         gram[k, k] = gram[k, k] * (1.0 + 1e-8) + 1e-300
-    weight = np.linalg.solve(gram, right)
+    _solve_definite(gram, right)
     for k in range(count):
         for i in range(len(image)):
-            out[i] -= weight[k] * images[k, i]
+            out[i] -= right[k] * images[k, i]
+
+
+@compiled(error_model="numpy")
+def _solve_definite(matrix, right):
+    """Solve a small system with a positive definite matrix by elimination, both in place."""
+    count = len(right)
+    for k in range(count):
+        for row in range(k + 1, count):
+            share = matrix[row, k] / matrix[k, k]
+            for column in range(k, count):
+                matrix[row, column] -= share * matrix[k, column]
+            right[row] -= share * right[k]
+    for k in range(count - 1, -1, -1):
+        for column in range(k + 1, count):
+            right[k] -= matrix[k, column] * right[column]
+        right[k] /= matrix[k, k]
 
 
 @compiled(error_model="numpy")
