@@ -55,7 +55,9 @@ if MOVED:
 
 
 def find_data(name):
-    """A folder of real data; the test is skipped where it is absent."""
+    """A folder of real data; the test is skipped where it is absent, or would take hours without compiler."""
+    if os.environ.get("NUMBA_DISABLE_JIT"):
+        pytest.skip("real data takes hours without compiler")
     for place in (os.environ.get("RBFMUSCLE_DATA"), ROOT.parent / "shared" / "data"):
         if place and (Path(place) / name).is_dir():
             return Path(place) / name
