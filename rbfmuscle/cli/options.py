@@ -5,6 +5,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.validation import SceneError, UsageError
+
 SceneName = Annotated[Path, Parameter(help='Scene file (TOML), or "phantom" for the embedded hip.')]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Folder for the results.")]
 Model = Annotated[
@@ -26,3 +28,11 @@ Json = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON an
 Flag = Annotated[bool, Parameter(negative="")]
 Force = Annotated[bool, Parameter(negative="", help="Replace a scene file that exists.")]
 Texts = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
+
+
+def chosen_muscle(scene, name):
+    """The muscle that ``--muscle`` names; UsageError if there is none."""
+    try:
+        return scene.muscle(name)
+    except SceneError as error:
+        raise UsageError(f"--muscle: {error}") from None

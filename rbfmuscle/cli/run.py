@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rbfmuscle.cli.options import Frames, Json, Model, Output, SceneName, Settings
+from rbfmuscle.cli.options import Frames, Json, Model, Output, SceneName, Settings, chosen_muscle
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SolveError
 
@@ -57,7 +57,7 @@ def run(
 
         changes, loaded = parse_settings(settings), open_scene(scene)
         if muscle is not None:
-            loaded.muscles, loaded.sliding = [loaded.muscle(muscle)], None
+            loaded.muscles, loaded.sliding = [chosen_muscle(loaded, muscle)], None
         options: dict[str, Any] = {"model": model, "frames": frames, "fail_on": fail_on}
         try:
             info = stream_run(loaded, output, settings=changes, progress=advance, **options)

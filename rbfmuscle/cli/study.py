@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from rbfmuscle.cli.options import Frames, Model, Output, SceneName, Settings, Texts
+from rbfmuscle.cli.options import Frames, Model, Output, SceneName, Settings, Texts, chosen_muscle
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SolveError, UsageError, did_you_mean
 
@@ -136,7 +136,7 @@ def _meshes(source, muscle, units):
     if source != PHANTOM and Path(source).suffix.lower() != ".toml":
         return {Path(source).stem: read_mesh(source).mesh}, units
     scene = open_scene(source)
-    chosen = [scene.muscle(muscle)] if muscle else scene.muscles
+    chosen = [chosen_muscle(scene, muscle)] if muscle else scene.muscles
     return {each.name: each.mesh for each in chosen}, scene.units
 
 

@@ -66,7 +66,7 @@ class TestRun:
         info = json.loads((tmp_path / "o" / "run.json").read_text(encoding="utf-8"))
         assert code == 0 and list(info["muscles"]) == ["extensor"] and info["kernels"] == {}
         code, _, err = call(capsys, *command, "--muscle", "extenso")
-        assert code == 3 and "did you mean 'extensor'?" in one_line(err)
+        assert code == 2 and "did you mean 'extensor'?" in one_line(err)
 
     def test_limit_exceeded(self, folder, tmp_path, capsys):
         arguments = ("run", folder / "arm.toml", "-o", tmp_path / "o", "--frames", "0:1", "--fail-on")
