@@ -43,7 +43,8 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
     else:
         of_fields = [_describe_field(name, found, loaded.units) for name, found in errors.items()]
         print("\n".join([*_scene_lines(loaded), *of_fields, *map(str, findings), *drawn.values()]))
-        print("usable" if usable else "not usable", file=sys.stderr)
+        last = f"usable; next: rbfmuscle run {scene} -o results" if usable else "not usable"
+        print(last, file=sys.stderr)
     return 0 if usable else SceneError.exit_code
 
 
