@@ -176,7 +176,8 @@ class TestErrors:
 class TestOtherCommands:
     def test_check_tells_what_is_there(self, folder, capsys):
         code, out, err = call(capsys, "check", folder / "arm.toml")
-        assert code == 0 and "muscle biceps: model rbf" in out
+        volume = rm.Scene.load(folder / "arm.toml").muscle("biceps").mesh.volume / 1e3
+        assert code == 0 and "muscle biceps: model rbf" in out and f"{volume:.4g} cm3" in out
         assert err.splitlines()[-1].startswith("usable; next: rbfmuscle run ")
         assert json.loads(call(capsys, "check", folder / "arm.toml", "--json")[1])["scene"]["units"] == "mm"
         code, out, err = call(capsys, "check", folder / "none.toml", "--json")

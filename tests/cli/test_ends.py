@@ -91,8 +91,7 @@ class TestOutputs:
     def test_full_standard_output_is_one_line(self, tmp_path, words):
         scene = write_scene(tmp_path, end=2)
         with open("/dev/full", "w") as full:
-            command = [*PROGRAM, words[0], str(scene), *words[1:]]
-            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+            done = subprocess.run([*PROGRAM, *words, scene], stdout=full, stderr=subprocess.PIPE, text=True)
         # "usable" is the finding; lines that end in seconds tell what goes on, on a slow machine.
         busy = re.compile(r".* s\)|rbfmuscle: compiling loops .*|usable; .*")
         own = [line for line in done.stderr.splitlines() if not busy.fullmatch(line)]

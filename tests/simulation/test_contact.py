@@ -60,7 +60,7 @@ def test_planes_of_neighbours_are_those_of_a_subset_of_the_points_too():
     for planes in contacts.neighbours:
         at = rng.permutation(400)[:60]
         planes.set(at, rng.normal(size=60), rng.normal(size=(60, 3)), points[at] + 0.1)
-    every, index = contacts.half_spaces(points, 0.5), np.sort(rng.permutation(400)[:150])
+    every, index = contacts.half_spaces(points, 0.5), np.arange(0, 400, 3)
     found = contacts.only(index).half_spaces(points[index], 0.5)
     rows = {(index[i], source, gap) for i, source, gap in zip(found.index, found.source, found.gap)}
     assert {-1, -2} <= {source for _, source, _ in rows}
