@@ -1,11 +1,15 @@
 """Options that several commands take."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from rbfmuscle.validation import SceneError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.objects import Muscle
+    from rbfmuscle.scene.scene import Scene
 
 SceneName = Annotated[Path, Parameter(help='Scene file (TOML), or "phantom" for the embedded hip.')]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Folder for the results.")]
@@ -30,7 +34,7 @@ Force = Annotated[bool, Parameter(negative="", help="Replace a scene file that e
 Texts = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
 
 
-def chosen_muscle(scene, name):
+def chosen_muscle(scene: "Scene", name: str) -> "Muscle":
     """The muscle that ``--muscle`` names; UsageError if there is none."""
     try:
         return scene.muscle(name)
