@@ -52,10 +52,10 @@ def view(
 
         if not scene.is_dir() and str(scene) != PHANTOM:
             read_scene_file(scene)  # its errors are shown before a browser opens
-        served = open_server(port)
-        print(f"{served[1]}  (Ctrl-C ends)", flush=True)
+        server, address = open_server(port)
+        print(f"{address}  (Ctrl-C ends)", flush=True)
         if browser:
-            webbrowser.open(served[1])
+            webbrowser.open(address)
         opened = _open(scene)
         from rbfmuscle.viewer.page import Page
         from rbfmuscle.viewer.sources import LiveSource, SavedSource
@@ -63,7 +63,7 @@ def view(
         with stage("building"):
             source = SavedSource(opened) if isinstance(opened, dict) else LiveSource(opened, model)
             _check_stops(stops, source.controls)
-            Page(source, at=stops, colour=colour, served=served)
+            Page(source, at=stops, colour=colour, served=(server, address))
     threading.Event().wait()
 
 

@@ -70,7 +70,10 @@ def _mix_loop(state, image, steps, residuals, images, last_residual, last_image,
 
 @compiled(error_model="numpy")
 def _solve_definite(matrix, right):
-    """Solve a small system with a positive definite matrix by elimination, both in place."""
+    """Solve a small system with a positive definite matrix by elimination, both in place.
+
+    ``np.linalg.solve`` takes a second to compile.
+    """
     count = len(right)
     for k in range(count):
         for row in range(k + 1, count):

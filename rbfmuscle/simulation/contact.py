@@ -47,6 +47,10 @@ class Planes:
 
     def __init__(self, softness: float = 1.0) -> None:
         self.softness = softness
+        self.clear()
+
+    def clear(self) -> None:
+        """Remove the planes."""
         self.set(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
 
     def set(self, index: Integers, gap: Floats, normal: Floats, anchor: Floats) -> None:

@@ -84,8 +84,8 @@ class SlidingPair:
         limits, points = self.limits, self.own.points
         if self.other.apart(self.own, limits.reach):
             self.linked[:] = False
-            for planes in (self.push, self.pull):
-                planes.set(*_FAR[:3], _FAR[2])
+            self.push.clear()
+            self.pull.clear()
             return
         index, distance, normal, nearest = self._near()
         far = np.ones(len(self.at), dtype=bool)
@@ -191,7 +191,7 @@ class SlidingPair:
 
     def _ask(self, at: Integers, reach: Floats | float) -> Found:
         """Of some contact points those nearer to the neighbour than their reach."""
-        if self.other.apart(self.own, self.limits.reach):
+        if self.other.apart(self.own, float(np.max(reach, initial=0.0))):
             return _FAR
         return self.other.query(self.own.points[at], reach)
 

@@ -259,10 +259,13 @@ def _agree(faces):
 def _orient(state, place):
     """Make neighbouring faces agree, then turn what was mended, or the whole, outward; consistent cavities stay."""
     faces = np.ascontiguousarray(state.faces)
-    # Most meshes agree, and bfs_orient, which would leave these as they are, takes long.
-    oriented, part = (faces, np.zeros(len(faces), int)) if _agree(faces) else igl.bfs_orient(faces)
-    if oriented is not faces and not _agree(oriented):
-        raise MeshError(f"{place}: the surface has one side only (no consistent orientation); remesh it")
+    oriented, part = faces, np.zeros(len(faces), dtype=int)
+    if not _agree(
+        faces
+    ):  # most meshes agree, and bfs_orient, which would leave these as they are, takes long
+        oriented, part = igl.bfs_orient(faces)
+        if not _agree(oriented):
+            raise MeshError(f"{place}: the surface has one side only (no consistent orientation); remesh it")
     turned = (oriented != faces).any(axis=1)
     turned ^= (np.bincount(part, weights=turned) * 2 > np.bincount(part))[part]
     mended = np.bincount(part, weights=turned) > 0
