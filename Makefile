@@ -4,8 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
-# Beside a clone's folder Python takes that folder for the package, but where the package itself is on the path.
-INSTALL := $(BIN)/python -m pip install --quiet --quiet --config-settings editable_mode=compat
+# Beside a clone's folder Python takes that folder for the package, but where the package itself is on the path. Modules
+# are compiled when they are first imported: most never are.
+INSTALL := $(BIN)/python -m pip install --quiet --quiet --no-compile --config-settings editable_mode=compat
 
 .PHONY: demo test portability fuzz test-fast test-nojit coverage mutants references check bench figures docs release-check clean
 

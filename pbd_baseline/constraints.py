@@ -13,7 +13,7 @@ import numpy as np
 
 from pbd_baseline.topology import colour, spread
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.surfaces import volume_about, volume_cubic
+from rbfmuscle.geometry.surfaces import volume_cubic, volume_loop
 from rbfmuscle.jit import compiled
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no direction.
@@ -71,7 +71,7 @@ class VolumeConstraint:
 
     def volume(self, points: Floats) -> float:
         """Signed enclosed volume [unit^3]."""
-        return volume_about(points, self.faces, np.ascontiguousarray(points[0]))
+        return volume_loop(points, self.faces)
 
     def gradient(self, points: Floats) -> Floats:
         """Gradient (n, 3) of the volume."""
@@ -95,12 +95,12 @@ class VolumeConstraint:
         cannot meet it (no real root near zero), nothing moves and s is 0. ``clear_way(points, direction, s)``
         may take parts out of the direction, in place, and says whether it did.
         """
-        coefficients = volume_cubic(points, self.faces, direction, np.ascontiguousarray(points[0]))
+        coefficients = volume_cubic(points, self.faces, direction)
         # A slope below this is rounding: the direction shifts the surface along itself.
         least = 1e-13 * abs(self.rest) ** (2 / 3) * float(np.abs(direction).max(initial=0.0))
         s = _cubic_step(coefficients, self.rest, least)
         if clear_way is not None and clear_way(points, direction, s):
-            again = volume_cubic(points, self.faces, direction, np.ascontiguousarray(points[0]))
+            again = volume_cubic(points, self.faces, direction)
             s = _cubic_step(again, self.rest, least)
         points += s * direction
         return s

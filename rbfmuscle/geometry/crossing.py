@@ -3,7 +3,7 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.surfaces import opposite_half_edges
+from rbfmuscle.geometry.surfaces import opposite_half_edges, touching_faces
 from rbfmuscle.geometry.triangles import triangle_normal
 from rbfmuscle.jit import compiled
 
@@ -51,7 +51,7 @@ class FaceTree:
             _plain_loop(vertices, faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain)
         asked = np.ones(count, dtype=np.bool_)
         if among is not None:
-            asked = among[self.order] | ~plain[faces].all(axis=1)
+            asked = among[self.order] | touching_faces(faces, ~plain)
             if not asked.any():
                 return np.zeros(count, dtype=np.bool_)
         box, node = np.empty((self.leaves, 6, LEAF)), np.empty((2 * self.leaves, 6))

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
-from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
+from rbfmuscle.geometry.rotations import matrix_quaternion
 from rbfmuscle.jit import compiled
 
 
@@ -86,8 +86,8 @@ def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
     The motions' twists (logarithms in se(3)) are averaged with the point's weights and exponentiated, so a motion
     that all bones share moves every point rigidly, and a weight of one gives that bone's motion exactly.
     """
-    twists = _twists(motions)
-    out = np.empty((len(points), 3))
+    twists, out = np.empty((len(motions), 6)), np.empty((len(points), 3))
+    _logarithm_loop(motions, twists)
     _exponential_loop(np.asarray(points, dtype=np.float64), weights @ twists, out)
     return out
 
@@ -114,16 +114,22 @@ def _exponential_loop(points, twists, out):
         out[n, 2] = z + w + first * pz + second * (a * py - b * px + sz) + third * (a * sy - b * sx)
 
 
-def _twists(motions: Floats) -> Floats:
-    """Logarithms of rigid motions (b, 4, 4) as (omega, velocity), (b, 6)."""
-    omega = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
-    angle = np.linalg.norm(omega, axis=1)
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    third = np.where(
-        small, 1 / 12 + angle**2 / 720, 1 / safe**2 - (1 + np.cos(safe)) / (2 * safe * np.sin(safe))
-    )
-    shift = motions[:, :3, 3]
-    once = np.cross(omega, shift)
-    velocity = shift - 0.5 * once + third[:, None] * np.cross(omega, once)
-    return np.concatenate([omega, velocity], axis=1)
+@compiled(error_model="numpy")
+def _logarithm_loop(motions, twists):
+    """Twists (omega, velocity) of rigid motions (b, 4, 4)."""
+    for n in range(len(motions)):
+        w, a, b, c = matrix_quaternion(motions[n])
+        sine = np.sqrt(a * a + b * b + c * c)
+        half = np.arctan2(sine, abs(w))
+        share = np.copysign(2.0 * half / sine if sine > 1e-8 else 2.0, w)
+        third = 1.0 / 12.0 + half * half / 180.0
+        if half > 5e-5:
+            third = (0.25 - 0.25 * half * abs(w) / sine) / (half * half)
+        a, b, c = share * a, share * b, share * c
+        x, y, z = motions[n, 0, 3], motions[n, 1, 3], motions[n, 2, 3]
+        # omega x shift, and omega x that.
+        px, py, pz = b * z - c * y, c * x - a * z, a * y - b * x
+        twists[n, 0], twists[n, 1], twists[n, 2] = a, b, c
+        twists[n, 3] = x - 0.5 * px + third * (b * pz - c * py)
+        twists[n, 4] = y - 0.5 * py + third * (c * px - a * pz)
+        twists[n, 5] = z - 0.5 * pz + third * (a * py - b * px)

@@ -34,11 +34,27 @@ def smooth_displacement(rest: Floats, points: Floats, smooth: Callable[[Floats],
 
 def turned_quaternions(quaternions: Floats, rotation: Floats) -> Floats:
     """Unit quaternions (n, 4), each followed by a rotation (3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    w, x, y, z = matrix_quaternion(rotation)
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return np.ascontiguousarray(quaternions @ left.T)
+
+
+@compiled(error_model="numpy")
+def matrix_quaternion(m):
+    """Unit quaternion of a rotation matrix, as four numbers, from the greatest of them (Shepperd 1978)."""
+    trace, i = m[0, 0] + m[1, 1] + m[2, 2], 0
+    for k in range(1, 3):
+        if m[k, k] > m[i, i]:
+            i = k
+    j, k = (i + 1) % 3, (i + 2) % 3
+    q = np.empty(4)
+    if trace > m[i, i]:
+        q[0], q[1], q[2], q[3] = 1.0 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    else:
+        q[0], q[1 + i] = m[k, j] - m[j, k], 1.0 + 2.0 * m[i, i] - trace
+        q[1 + j], q[1 + k] = m[j, i] + m[i, j], m[k, i] + m[i, k]
+    length = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    return q[0] / length, q[1] / length, q[2] / length, q[3] / length
 
 
 @compiled(error_model="numpy", inline="always")

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.jit import compiled
 
 
@@ -34,6 +34,11 @@ def _vertex_normal_loop(vertices, faces, normals):
         length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2)
         for k in range(3):
             normals[v, k] /= max(length, 1e-300)
+
+
+def touching_faces(faces: Integers, marked: Booleans) -> Booleans:
+    """Mask (m,) of the triangles with a corner among the marked vertices (n,)."""
+    return marked[faces[:, 0]] | marked[faces[:, 1]] | marked[faces[:, 2]]
 
 
 def unique_edges(faces: Integers) -> Integers:
@@ -119,7 +124,7 @@ def barycentric_weights(points: Floats, corners: Floats) -> Floats:
 
 
 def mesh_volume(vertices: Floats, faces: Integers) -> float:
-    """Volume enclosed by a closed, outward mesh, about the mean vertex, so that a far origin costs no digits.
+    """Volume enclosed by a closed, outward mesh, about one of its vertices, so that a far origin costs no digits.
 
     Examples
     --------
@@ -128,8 +133,7 @@ def mesh_volume(vertices: Floats, faces: Integers) -> float:
     >>> round(mesh_volume(tetrahedron, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])), 6)
     0.166667
     """
-    vertices = np.asarray(vertices, dtype=np.float64)
-    return float(volume_about(vertices, np.asarray(faces), vertices.mean(axis=0)))
+    return float(volume_loop(np.asarray(vertices, dtype=np.float64), np.asarray(faces)))
 
 
 @compiled(error_model="numpy", inline="always")
@@ -149,9 +153,11 @@ def corner_from(vertices, v, origin):
 
 
 @compiled(error_model="numpy")
-def volume_about(vertices, faces, origin):
-    """Enclosed volume, measured from ``origin`` (3,)."""
-    total = 0.0
+def volume_loop(vertices, faces):
+    """Enclosed volume, measured from a corner of the first face; 0 without faces."""
+    if len(faces) == 0:
+        return 0.0
+    total, origin = 0.0, corner_from(vertices, faces[0, 0], (0.0, 0.0, 0.0))
     for f in range(len(faces)):
         p = corner_from(vertices, faces[f, 0], origin)
         q = corner_from(vertices, faces[f, 1], origin)
@@ -161,10 +167,11 @@ def volume_about(vertices, faces, origin):
 
 
 @compiled(error_model="numpy")
-def volume_cubic(vertices, faces, direction, origin):
+def volume_cubic(vertices, faces, direction):
     """Coefficients c of the volume V(x + s d) = c0 + c1 s + c2 s^2 + c3 s^3 along directions d (n, 3)."""
     c0, c1, c2, c3 = 0.0, 0.0, 0.0, 0.0
     still = (0.0, 0.0, 0.0)
+    origin = corner_from(vertices, faces[0, 0], still)
     for f in range(len(faces)):
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
         p = corner_from(vertices, i, origin)

@@ -6,6 +6,8 @@ exact distances at the nodes of a lattice: smoothed over about a cell (a kernel 
 its gradient turns steadily. Only blocks of the lattice that are asked for are ever filled.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
@@ -13,6 +15,9 @@ from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.jit import compiled
+from rbfmuscle.simulation.broad_phase import box_loop, boxes_apart, lower_bound, note_query
+from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
+from rbfmuscle.validation import check_points
 
 SIDE = 4  # cells along a block
 WIDE = SIDE + 3  # nodes along it, those of the splines that reach into it too
@@ -22,52 +27,75 @@ PROBES, STEPS_IN = 300, 12  # paths into a bone that tell how thick it is, and p
 LEAST_SLOPE = 0.3  # where the distance's slope is less, inside a thin bone, the exact one answers
 
 
-class RoundedField:
-    """The rounded distance to one bone, in place of its `BoneSDF` where a muscle settles.
+class RoundedBones:
+    """The rounded distances to some bones, in place of their exact fields where a muscle settles.
 
-    ``frame`` gives the axes and the origin of the lattice, which are then those of the muscle wherever the scene
-    lies; ``edge`` is that of a cell [scene unit].
+    ``frame`` gives the axes and the origin of their lattices, which are then those of the muscle wherever the scene
+    lies; ``edges`` (r,) are those of their cells [scene unit]. The blocks of bone b are those from ``start[b]`` on, by
+    their sorted ``keys``, each with its ``nodes``.
     """
 
-    def __init__(self, field: BoneField, frame: RestFrame, edge: float) -> None:
-        self.field, self.frame, self.edge = field, frame, float(edge)
-        self.bounds = field.bounds
+    def __init__(self, fields: Sequence[BoneField], frame: RestFrame, edges: Floats) -> None:
+        self.fields, self.frame, self.edges = list(fields), frame, edges
+        self.start: Integers = np.zeros(len(self.fields) + 1, dtype=np.int64)
         self.keys: Integers = np.zeros(0, dtype=np.int64)
         self.nodes: Floats = np.zeros((0, WIDE, WIDE, WIDE))
 
-    def distance_and_gradient(
-        self, points: Floats, pose: Floats, reach: Floats | float = np.inf
-    ) -> tuple[Floats, Floats]:
-        """Distance (n,) and its unit gradient (n, 3), as `BoneSDF.distance_and_gradient` gives them.
-
-        ``reach`` matters where the exact field answers, which is where the rounded distance is flat.
-        """
-        axes = np.ascontiguousarray(self.frame.axes @ pose[:3, :3].T)
-        origin = pose[:3, :3] @ self.frame.origin + pose[:3, 3]
-        row, distance = np.empty(len(points), np.int64), np.empty(len(points))
-        gradient = np.empty((len(points), 3))
-        if _rows_loop(points, axes, origin, self.edge, self.keys, row):
-            self._fill(np.unique(-1 - row[row < 0]))
-            _rows_loop(points, axes, origin, self.edge, self.keys, row)
-        if _spline_loop(points, axes, origin, self.edge, row, self.nodes, distance, gradient):
-            flat = np.flatnonzero(np.isnan(distance))
-            limit = reach if np.ndim(reach) == 0 else np.asarray(reach)[flat]
-            distance[flat], gradient[flat] = self.field.distance_and_gradient(
-                points[flat], pose=pose, reach=limit
-            )
-        return distance, gradient
-
-    def _fill(self, new: Integers) -> None:
-        """Find the distances of blocks of the lattice, by their keys (n,)."""
-        block = (new[:, None] >> SHIFTS & 2 * MOST - 1) - MOST
+    def fill(self, rows: Integers, keys: Integers) -> None:
+        """Find the distances of blocks (n,) that are lacking, given by bones' rows and blocks' keys."""
         grid = np.stack(np.meshgrid(*[np.arange(WIDE) - 1] * 3, indexing="ij"), -1).reshape(-1, 3)
-        nodes = block[:, None, :] * SIDE + grid
-        places = self.frame.origin + nodes.reshape(-1, 3) * self.edge @ self.frame.axes
-        found = self.field.distance(places) / self.edge
-        keys = np.concatenate([self.keys, new])
-        order = np.argsort(keys, kind="stable")
-        filled = np.concatenate([self.nodes, found.reshape(-1, WIDE, WIDE, WIDE)])
-        self.keys, self.nodes = keys[order], np.ascontiguousarray(filled[order])
+        owner = [np.repeat(np.arange(len(self.fields)), np.diff(self.start))]
+        key, nodes = [self.keys], [self.nodes]
+        for b in np.unique(rows):
+            new = np.unique(keys[rows == b])
+            block = (new[:, None] >> SHIFTS & 2 * MOST - 1) - MOST
+            place = (block[:, None, :] * SIDE + grid).reshape(-1, 3) * self.edges[b]
+            found = self.fields[b].distance(self.frame.origin + place @ self.frame.axes) / self.edges[b]
+            owner.append(np.full(len(new), b))
+            key.append(new)
+            nodes.append(found.reshape(-1, WIDE, WIDE, WIDE))
+        order = np.lexsort((np.concatenate(key), np.concatenate(owner)))
+        self.keys, self.nodes = np.concatenate(key)[order], np.concatenate(nodes)[order]
+        self.start = np.searchsorted(np.concatenate(owner)[order], np.arange(len(self.fields) + 1))
+
+
+class RoundedContacts:
+    """The obstacles of ``count`` contact points in one pose of the bones, which are rounded; ``exact`` as they are."""
+
+    def __init__(self, bones: RoundedBones, exact: BoneContacts, count: int) -> None:
+        self.bones, self.exact, rows = bones, exact, len(exact.reached)
+        turns, origin = exact.placed[:, :3, :3], bones.frame.origin
+        axes = np.ascontiguousarray(bones.frame.axes @ turns.transpose(0, 2, 1))
+        self._lattice = axes, turns @ origin + exact.placed[:, :3, 3], bones.edges
+        self._known = np.zeros((rows, count, 3)), np.full((rows, count), -np.inf)
+        self._free, self._allowed = exact.free(count), np.zeros((rows, count))
+        for row, b in enumerate(exact.reached):
+            self._allowed[row] = exact.allowed.get(b, 0.0)
+
+    def half_spaces(self, points: Floats, reach: Floats) -> HalfSpaces:
+        """As `BoneContacts.half_spaces`, of all the contact points (n, 3), nearer than ``reach`` (n,)."""
+        exact, bones, points, room = self.exact, self.bones, check_points(points), self._allowed.size
+        index, row = np.empty((2, room), dtype=np.int64)
+        gap, normal = np.empty(room), np.empty((room, 3))
+        while True:
+            count, lacking, flat = _contacts_loop(
+                points, self._free, reach, (exact.placed, exact.boxes, self._allowed), self._known, self._lattice,
+                (bones.start, bones.keys, bones.nodes), (index, gap, normal, row),
+            )  # fmt: skip
+            if not lacking:
+                break
+            bones.fill(row[:lacking], index[:lacking])
+        index, gap, normal, row = index[:count], gap[:count], normal[:count], row[:count]
+        if flat:
+            for k in np.unique(row[np.isnan(gap)]):
+                some = np.flatnonzero(np.isnan(gap) & (row == k))
+                at = index[some]
+                distance, normal[some] = exact.distance_and_direction(points[at], exact.reached[k], reach[at])
+                gap[some] = distance + self._allowed[k, at]
+            near = gap < reach[index]
+            index, gap, normal, row = index[near], gap[near], normal[near], row[near]
+        source = np.array(exact.reached, dtype=np.int64)[row]
+        return exact.with_planes(HalfSpaces(index, gap, normal, source), points, reach)
 
 
 def bone_thickness(field: BoneField, vertices: Floats, faces: Integers, most: float) -> float:
@@ -97,38 +125,56 @@ def _place(point, axis, origin, edge):
 
 
 @compiled(error_model="numpy")
-def _rows_loop(points, axes, origin, edge, keys, row):
-    """Row of the block that holds each point, -1 less its key where that is lacking; returns whether one is."""
-    lacking = False
-    for n in range(len(points)):
-        key = 0
-        for a in range(3):
-            block = np.int64(np.floor(_place(points[n], axes[a], origin, edge) / SIDE))
-            key += (block + MOST) << SHIFTS[a]
-        k = np.searchsorted(keys, key)
-        row[n] = k
-        if k == len(keys) or keys[k] != key:
-            row[n], lacking = -1 - key, True
-    return lacking
+def _contacts_loop(points, free, reach, obstacles, known, lattice, blocks, found):
+    """Fill the contacts ``found`` of all bones: how many, how many blocks are lacking, whether splines are flat.
 
-
-@compiled(error_model="numpy")
-def _spline_loop(points, axes, origin, edge, row, nodes, distance, gradient):
-    """Distances and gradients by the splines; NaN where these are flat, and returns whether they are anywhere."""
-    weight, lean = np.empty((3, 4)), np.empty((3, 4))
-    first, flat = np.empty(3, np.int64), False
-    for n in range(len(points)):
-        for k in range(3):
-            place = _place(points[n], axes[k], origin, edge)
-            cell = np.int64(np.floor(place))
-            bspline_weights(place - cell, weight[k], lean[k])
-            first[k] = cell - SIDE * np.int64(np.floor(place / SIDE))
-        value, x, y, z = bspline_sum(nodes[row[n]], first, weight, lean)
-        steep = np.sqrt(x * x + y * y + z * z)
-        if steep > LEAST_SLOPE:
-            distance[n] = value / steep * edge
-            for b in range(3):
-                gradient[n, b] = (x * axes[0, b] + y * axes[1, b] + z * axes[2, b]) / steep
-        else:
-            distance[n], flat = np.nan, True
-    return flat
+    The bones' rows and the keys of lacking blocks are put into ``found`` instead; the gap is NaN where a spline is
+    flat. ``known`` has the places of the last queries in bone coordinates and lower bounds of the distances there.
+    """
+    poses, boxes, allowed = obstacles
+    anchor, bound = known
+    axes, origin, edge = lattice
+    start, keys, nodes = blocks
+    index, gap, normal, row = found
+    box, weight, lean = np.empty((2, 3)), np.empty((3, 4)), np.empty((3, 4))
+    place, first = np.empty(3), np.empty(3, np.int64)
+    box_loop(points, free, box)
+    farthest, count, lacking, flat = -np.inf, 0, 0, False
+    for i in range(len(points)):
+        if free[i]:
+            farthest = max(farthest, reach[i])
+    for b in range(len(poses)):
+        if boxes_apart(box, poses[b], boxes[b]) > farthest:
+            continue
+        known_keys = keys[start[b] : start[b + 1]]
+        for i in range(len(points)):
+            if not free[i] or lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) > reach[i]:
+                continue
+            key = 0
+            for a in range(3):
+                place[a] = _place(points[i], axes[b, a], origin[b], edge[b])
+                key += (np.int64(np.floor(place[a] / SIDE)) + MOST) << SHIFTS[a]
+            k = np.searchsorted(known_keys, key)
+            if k == len(known_keys) or known_keys[k] != key:
+                row[lacking], index[lacking] = b, key
+                lacking += 1
+            if lacking > 0:
+                continue
+            for a in range(3):
+                cell = np.int64(np.floor(place[a]))
+                bspline_weights(place[a] - cell, weight[a], lean[a])
+                first[a] = cell - SIDE * np.int64(np.floor(place[a] / SIDE))
+            value, x, y, z = bspline_sum(nodes[start[b] + k], first, weight, lean)
+            steep, here = np.sqrt(x * x + y * y + z * z), np.nan
+            if steep > LEAST_SLOPE:
+                here = value / steep * edge[b]
+                note_query(points, i, poses[b], here, anchor[b], bound[b])
+                here += allowed[b, i]
+                for a in range(3):
+                    normal[count, a] = (x * axes[b, 0, a] + y * axes[b, 1, a] + z * axes[b, 2, a]) / steep
+            else:
+                flat = True
+            if not here >= reach[i]:
+                index[count], gap[count], row[count] = i, here, b
+                count += 1
+    return count, lacking, flat

@@ -25,16 +25,16 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.implicit.placement.lattice import Lattice
+from rbfmuscle.muscle.carrier import Carrier
 from rbfmuscle.muscle.inversion import STIFFNESS
 from rbfmuscle.muscle.solid_contact import NearPoints, SolidContact
-from rbfmuscle.muscle.solid_loops import Fibres, carry_loop, mobility_loop, normals_loop, respond_loop
+from rbfmuscle.muscle.solid_loops import Fibres, mobility_loop, normals_loop, respond_loop
 from rbfmuscle.muscle.solid_step import Anderson, global_loop, local_loop, pressure_loop
 from rbfmuscle.simulation.contact import BoneContacts
 
@@ -104,6 +104,8 @@ class EmbeddedSolid:
         self.scale, self.side = diameter(points), float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
         self.rest = frame.points(lattice.rest)
         self.columns, self.shares, self.slopes_at = self._embed(points)
+        self.carrier = Carrier(self.columns, self.shares)
+        self._free_carrier = Carrier(self.columns[free], self.shares[free])
         self.quad_columns = lattice.quadrature.indices
         self.slopes = np.ascontiguousarray(lattice.quadrature.slopes @ frame.axes / frame.size)
         self.weights = lattice.weights * frame.size**3
@@ -125,7 +127,7 @@ class EmbeddedSolid:
         self.history, self.still = [0.0], False
         self.trend: tuple[Floats, Floats, Floats] | None = None
         self.begun: tuple[Floats, Floats, Floats] | None = None
-        self._followed: tuple[Floats, Integers, Floats] | None = None
+        self._followed: tuple[Floats, Carrier] | None = None
 
     def _embed(self, points: Floats) -> tuple[Integers, Floats, Floats]:
         """Nodes (n, 27), shape functions (n, 27) and their slopes (n, 27, 3) at points of the muscle at rest."""
@@ -226,23 +228,18 @@ class EmbeddedSolid:
 
     def carry(self) -> Floats:
         """Contact points now, (n, 3)."""
-        out = np.empty_like(self.points)
-        carry_loop(self.shown, self.columns, self.shares, out)
-        return out
+        return self.carrier.carry(self.shown)
 
     def follow(self, points: Floats) -> Floats:
         """Present positions of points (n, 3) of the muscle at rest; the embedding of the last array is kept."""
         if self._followed is None or self._followed[0] is not points:
-            self._followed = points, *self._embed(points)[:2]
-        out = np.empty_like(points)
-        carry_loop(self.shown, *self._followed[1:], out)
-        return out
+            self._followed = points, Carrier(*self._embed(points)[:2])
+        return self._followed[1].carry(self.shown)
 
     def centres(self, before: Floats) -> Floats:
         """Centres (K, 3): the free ones where the nodes carry them, the held ones as in ``before``."""
-        out, free = before.copy(), np.empty((len(self.free), 3))
-        carry_loop(self.shown, self.columns[self.free], self.shares[self.free], free)
-        out[self.free] = free
+        out = before.copy()
+        out[self.free] = self._free_carrier.carry(self.shown)
         return out
 
     def turned_normals(self, normals: Floats) -> Floats:
@@ -395,12 +392,10 @@ class EmbeddedSolid:
     def _find_responses(self) -> None:
         """Motion of the nodes for a unit pressure of each region: the metric of this solve's corrections."""
         count = len(self.pressure)
-        response, gram = np.empty((count, 3, len(self.y))), np.empty((count, count))
-        respond_loop(self.start, self.touched, self.gradient, self.inverse, response, gram)
-        gram[np.diag_indices(count)] += 1e-9 * gram[np.diag_indices(count)] + self.rest_volumes / BULK
-        self.factor = np.linalg.cholesky(gram)
-        white = solve_triangular(self.factor, response.reshape(count, -1), lower=True, check_finite=False)
-        self.response = np.ascontiguousarray(white.reshape(response.shape))
+        self.response, self.factor = np.empty((count, 3, len(self.y))), np.zeros((count, count))
+        regions = self.start, self.touched, self.gradient
+        if not respond_loop(regions, self.inverse, self.rest_volumes / BULK, self.response, self.factor):
+            raise np.linalg.LinAlgError("the volumes of the solid's regions depend on each other")
 
     def _iterate(self, near: NearPoints) -> tuple[Floats, Floats, float]:
         """One global step with volumes and contacts: nodes (N, 3), pressures (M,), greatest motion of a node."""

@@ -2,7 +2,7 @@
 
 A surface of points on a bone of flat facets has many equilibria, because each point has to be lifted over each edge. A
 muscle on a bone has not. So the solid settles with contacts that yield a little, on bones whose facets are rounded
-(`RoundedField`): one shape for each pose. What is then left in a bone is lifted out of it in the metric of the energy,
+(`RoundedBones`): one shape for each pose. What is then left in a bone is lifted out of it in the metric of the energy,
 volumes kept. The next sub-step starts from the settled shape, not from the lifted one.
 """
 
@@ -14,7 +14,8 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.muscle.rounded_bones import RoundedField, bone_thickness
+from rbfmuscle.muscle.carrier import Carrier
+from rbfmuscle.muscle.rounded_bones import RoundedBones, RoundedContacts, bone_thickness
 from rbfmuscle.muscle.solid_loops import carry_loop, contact_loop
 from rbfmuscle.muscle.solid_step import ways_loop
 from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
@@ -44,6 +45,7 @@ class Solid(Protocol):
     owner: Integers
     columns: Integers
     shares: Floats
+    carrier: Carrier
     inverse: Floats
     response: Floats
     pressure: Floats
@@ -60,7 +62,7 @@ class NearPoints(NamedTuple):
     columns: Integers  # (m, w) their nodes
     shares: Floats  # (m, w) shape functions
     forces: Floats  # (m, sources), changed in place
-    contacts: BoneContacts  # obstacles with rounded bones
+    contacts: RoundedContacts  # obstacles with rounded bones
     exact: BoneContacts  # obstacles as they are
     y: Floats  # (N, 3) nodes when the points were chosen
     reach: float  # distance within which points were chosen [scene unit]
@@ -86,7 +88,7 @@ class SolidContact:
         self.tolerance, self.margin = TOLERANCE * solid.scale, REACH_MARGIN * solid.scale
         self.yielding, self.most = YIELDING * solid.scale / area, self._greatest_forces(area)
         self.edge = ROUNDING * float(np.sqrt(area))
-        self._round: dict[int, RoundedField] = {}
+        self._round: RoundedBones | None = None
         self._last_push = np.zeros_like(solid.rest)
 
     def _greatest_forces(self, area: float) -> Floats:
@@ -112,25 +114,21 @@ class SolidContact:
         softness = np.ones(sources)
         for k, planes in enumerate(contacts.neighbours):
             softness[-1 - k] = planes.softness
-        here = np.empty_like(solid.points)
-        carry_loop(solid.y, solid.columns, solid.shares, here)
-        index = np.unique(contacts.half_spaces(here, self.reach).index)
+        index = np.unique(contacts.half_spaces(solid.carrier.carry(solid.y), self.reach).index)
         contacts = contacts.only(index)
         return NearPoints(
-            index, solid.columns[index], solid.shares[index], solid.forces[index], self._rounded(contacts),
-            contacts, solid.y.copy(), self.reach, self.most[index], softness,
+            index, solid.columns[index], solid.shares[index], solid.forces[index],
+            RoundedContacts(self._rounded(contacts), contacts, len(index)), contacts, solid.y.copy(), self.reach,
+            self.most[index], softness,
         )  # fmt: skip
 
-    def _rounded(self, contacts: BoneContacts) -> BoneContacts:
-        """The same obstacles with rounded bones."""
-        other = contacts.frozen()
-        other.fields = list(contacts.fields)
-        for b in contacts.reached:
-            field = contacts.fields[b]
-            if b not in self._round or self._round[b].field is not field:
-                self._round[b] = RoundedField(field, self.solid.frame, self._edge(field, contacts.names[b]))
-            other.fields[b] = self._round[b]
-        return other
+    def _rounded(self, contacts: BoneContacts) -> RoundedBones:
+        """The bones in reach, rounded."""
+        fields, kept = [contacts.fields[b] for b in contacts.reached], self._round
+        if kept is None or any(field is not other for field, other in zip(fields, kept.fields, strict=True)):
+            edges = [self._edge(contacts.fields[b], contacts.names[b]) for b in contacts.reached]
+            kept = self._round = RoundedBones(fields, self.solid.frame, np.array(edges, dtype=np.float64))
+        return kept
 
     def _edge(self, field: BoneField, bone: str) -> float:
         """Cells over which a bone is rounded: no larger than it is thick, or a thin plate would vanish."""

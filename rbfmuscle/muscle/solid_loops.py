@@ -19,6 +19,21 @@ class Fibres(NamedTuple):
     content: np.ndarray  # (Q,)
 
 
+@compiled(error_model="numpy", fastmath={"contract"})
+def gradient_rows(y, columns, slopes):
+    """Rows of the deformation gradient Σ_k y_k ∇N_k at one point."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(len(columns)):
+        j, u, v, w = columns[k], slopes[k, 0], slopes[k, 1], slopes[k, 2]
+        x = y[j, 0]
+        xx, xy, xz = xx + x * u, xy + x * v, xz + x * w
+        x = y[j, 1]
+        yx, yy, yz = yx + x * u, yy + x * v, yz + x * w
+        x = y[j, 2]
+        zx, zy, zz = zx + x * u, zy + x * v, zz + x * w
+    return (xx, xy, xz), (yx, yy, yz), (zx, zy, zz)
+
+
 @compiled(error_model="numpy")
 def target_loop(y, columns, slopes, fibre, least, tension, q, t, f, target):
     """Deformation gradients F and their targets R (t aaᵀ + t^(-1/2) (I - aaᵀ)) at all points.
@@ -28,16 +43,7 @@ def target_loop(y, columns, slopes, fibre, least, tension, q, t, f, target):
     """
     fd = np.empty((3, 3))
     for i in range(len(columns)):
-        for a in range(3):
-            for b in range(3):
-                f[i, a, b] = 0.0
-        for k in range(columns.shape[1]):
-            j = columns[i, k]
-            for a in range(3):
-                v = y[j, a]
-                f[i, a, 0] += v * slopes[i, k, 0]
-                f[i, a, 1] += v * slopes[i, k, 1]
-                f[i, a, 2] += v * slopes[i, k, 2]
+        f[i, 0], f[i, 1], f[i, 2] = gradient_rows(y, columns[i], slopes[i])
         e = fibre[i]
         u = 1.0 / np.sqrt(t[i])
         for a in range(3):
@@ -141,8 +147,13 @@ def swell_loop(motion, start, node, gradient, out):
 
 
 @compiled(error_model="numpy")
-def respond_loop(start, node, gradient, inverse, response, gram):
-    """Motion of the nodes for a unit pressure of each region (M, N, 3), and the volumes that it adds (M, M)."""
+def respond_loop(regions, inverse, yielding, response, factor):
+    """Motion of the nodes for a unit of each whitened pressure (M, 3, N); returns whether there is one.
+
+    ``factor`` becomes the Cholesky factor (M, M) of the volumes that a unit pressure of each region adds to all, and
+    of what each yields.
+    """
+    start, node, gradient = regions
     count, nodes = len(start) - 1, len(inverse)
     response[:] = 0.0
     for r in range(count):
@@ -153,12 +164,30 @@ def respond_loop(start, node, gradient, inverse, response, gram):
                 for n in range(nodes):
                     response[r, a, n] += row[n] * g
     for r in range(count):
-        for o in range(count):
+        for o in range(r + 1):
             value = 0.0
             for s in range(start[o], start[o + 1]):
                 for a in range(3):
                     value += gradient[s, a] * response[r, a, node[s]]
-            gram[r, o] = value
+            factor[r, o] = value
+        factor[r, r] += 1e-9 * factor[r, r] + yielding[r]
+    for r in range(count):
+        for o in range(r + 1):
+            for k in range(o):
+                factor[r, o] -= factor[r, k] * factor[o, k]
+            if o < r:
+                factor[r, o] /= factor[o, o]
+        if not factor[r, r] > 0.0:
+            return False
+        factor[r, r] = np.sqrt(factor[r, r])
+    for r in range(count):
+        for a in range(3):
+            for o in range(r):
+                for n in range(nodes):
+                    response[r, a, n] -= factor[r, o] * response[o, a, n]
+            for n in range(nodes):
+                response[r, a, n] /= factor[r, r]
+    return True
 
 
 @compiled(error_model="numpy")

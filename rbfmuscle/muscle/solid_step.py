@@ -143,19 +143,23 @@ def ways_loop(y, step, push, columns, shares, margin, here, motion, reach):
 
     That is half as far again as they go in the step with the last push on top, and a margin.
     """
-    for s in range(len(columns)):
+    size = len(y)
+    ways = np.empty((size, 9))
+    for n in range(size):
         for a in range(3):
-            now, moved, pushed = 0.0, 0.0, 0.0
-            for k in range(columns.shape[1]):
-                j, share = columns[s, k], shares[s, k]
-                now += share * y[j, a]
-                moved += share * (step[j, a] - y[j, a])
-                pushed += share * push[j, a]
-            here[s, a], motion[s, a] = now, moved
-            if a == 0:
-                reach[s] = 0.0
-            reach[s] += (moved + pushed) ** 2
-        reach[s] = 1.5 * np.sqrt(reach[s]) + margin
+            ways[n, a], ways[n, 3 + a], ways[n, 6 + a] = y[n, a], step[n, a] - y[n, a], push[n, a]
+    total = np.empty(9)
+    for s in range(len(columns)):
+        total[:] = 0.0
+        for k in range(columns.shape[1]):
+            way, share = ways[columns[s, k]], shares[s, k]
+            for a in range(9):
+                total[a] += share * way[a]
+        square = 0.0
+        for a in range(3):
+            here[s, a], motion[s, a] = total[a], total[3 + a]
+            square += (total[3 + a] + total[6 + a]) ** 2
+        reach[s] = 1.5 * np.sqrt(square) + margin
 
 
 @compiled(error_model="numpy")

@@ -37,6 +37,16 @@ def closer_loop(distance, direction, smallest, gradient):
                 gradient[i, a] = direction[i, a]
 
 
+@compiled(error_model="numpy")
+def note_query(points, i, pose, distance, anchor, bound):
+    """Keep where point i was asked about, in bone coordinates, and a lower bound of its distance there."""
+    bound[i] = TRUSTED_SHARE * distance
+    for k in range(3):
+        anchor[i, k] = 0.0
+        for j in range(3):
+            anchor[i, k] += pose[j, k] * (points[i, j] - pose[j, 3])
+
+
 @compiled(error_model="numpy", nogil=False)
 def answer_loop(points, pose, box, near, distance, gradient, anchor, bound):
     """Normalise the gradients at the points ``near`` in place; store where they were queried, and bounds there.
@@ -45,13 +55,9 @@ def answer_loop(points, pose, box, near, distance, gradient, anchor, bound):
     """
     at = np.empty((len(near), 3))
     for n in range(len(near)):
-        i = near[n]
-        bound[i] = TRUSTED_SHARE * distance[n]
+        note_query(points, near[n], pose, distance[n], anchor, bound)
         for k in range(3):
-            at[n, k] = points[i, k]
-            anchor[i, k] = 0.0
-            for j in range(3):
-                anchor[i, k] += pose[j, k] * (points[i, j] - pose[j, 3])
+            at[n, k] = points[near[n], k]
     direction_loop(at, gradient, pose, box)
 
 
@@ -78,7 +84,7 @@ def take_contacts_loop(near, distance, direction, limits, found):
 
 
 @compiled(error_model="numpy")
-def _lower_bound(points, i, pose, bounds, anchor, bound):
+def lower_bound(points, i, pose, bounds, anchor, bound):
     """Lower bound of the distance of point i: from the bone's box, or an earlier bound less the motion since."""
     moved, outside = 0.0, 0.0
     for k in range(3):
@@ -93,7 +99,7 @@ def _lower_bound(points, i, pose, bounds, anchor, bound):
 
 
 @compiled(error_model="numpy")
-def _box_loop(points, chosen, box):
+def box_loop(points, chosen, box):
     """Fill ``box`` (2, 3) with the least and greatest coordinates of the chosen points."""
     box[0], box[1] = np.inf, -np.inf
     for i in range(len(points)):
@@ -121,7 +127,7 @@ def boxes_apart(box, pose, bounds):
 def apart_loop(points, poses, boxes, apart):
     """Lower bound of the distance between each bone's box and the box of the points."""
     box = np.empty((2, 3))
-    _box_loop(points, np.ones(len(points), np.bool_), box)
+    box_loop(points, np.ones(len(points), np.bool_), box)
     for b in range(len(poses)):
         apart[b] = boxes_apart(box, poses[b], boxes[b])
 
@@ -135,7 +141,7 @@ def near_loop(points, free, reach, bones, known, found, counts):
     poses, boxes = bones
     anchor, bound = known
     box = np.empty((2, 3))
-    _box_loop(points, free, box)
+    box_loop(points, free, box)
     for b in range(len(poses)):
         count, farthest, limit = 0, -np.inf, reach[b % len(reach)]
         for i in range(len(points)):
@@ -144,7 +150,7 @@ def near_loop(points, free, reach, bones, known, found, counts):
         if boxes_apart(box, poses[b], boxes[b]) > farthest:
             continue
         for i in range(len(points)):
-            if free[i] and _lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) <= limit[i]:
+            if free[i] and lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) <= limit[i]:
                 found[b, count] = i
                 count += 1
         counts[b] = count

@@ -91,7 +91,8 @@ class BoneContacts:
 
     ``fields`` has one entry for each bone of the scene, None where the muscle cannot reach it; muscles may share
     fields. ``contact_bone`` (n,) holds the bone that each contact point is attached to, -1 where it is free; attached
-    points take no contact.
+    points take no contact. ``reached`` lists the bones that have a field, ``boxes`` (r, 2, 3) has theirs at rest and
+    ``placed`` (r, 4, 4) their poses.
     """
 
     def __init__(self, names: list[str], fields: list[Any], *, contact_bone: ArrayLike | None = None) -> None:
@@ -120,7 +121,7 @@ class BoneContacts:
         missing = [self.names[b] for b in self.reached if self.names[b] not in poses]
         if missing:
             raise ValueError(f"poses lack the bone {missing[0]!r}")
-        self.poses, self._placed = poses, self._stacked(poses)
+        self.poses, self.placed = poses, self._stacked(poses)
 
     def frozen(self) -> BoneContacts:
         """A copy in the present poses, for queries from another thread while the bones move."""
@@ -134,7 +135,8 @@ class BoneContacts:
         if self.contact_bone is not None:
             other.contact_bone = self.contact_bone[index]
         other.allowed = {bone: depth[index] for bone, depth in self.allowed.items()}
-        other._stack = self._planes().only(index)
+        if self.neighbours:
+            other._stack = self._planes().only(index)
         return other
 
     def allow(self, bone_index: int, depth: Floats) -> None:
@@ -169,7 +171,7 @@ class BoneContacts:
         """
         points = check_points(points)
         apart = np.empty(len(self.reached))
-        apart_loop(points, self._placed, self.boxes, apart)
+        apart_loop(points, self.placed, self.boxes, apart)
         far = apart > np.max(limit, initial=0.0)
         smallest, gradient = np.full(len(points), apart[far].min(initial=np.inf)), np.zeros((len(points), 3))
         for b in np.array(self.reached, dtype=int)[~far].tolist():
@@ -208,10 +210,17 @@ class BoneContacts:
             end = count + take_contacts_loop(some, distance, direction, limits, found)
             source[count:end] = b
             count = end
-        parts = [(index[:count], gap[:count], normal[:count], source[:count])]
-        if self.neighbours:
-            parts.append(self._planes().near(points, float(reach.max(initial=0.0))))
-        return HalfSpaces(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts))))
+        return self.with_planes(
+            HalfSpaces(index[:count], gap[:count], normal[:count], source[:count]), points, reach
+        )
+
+    def with_planes(self, spaces: HalfSpaces, points: Floats, reach: Floats) -> HalfSpaces:
+        """Half-spaces of bones and, behind them, of the neighbours of contact points (n, 3) nearer than ``reach``."""
+        if not self.neighbours:
+            return spaces
+        bones = spaces.index, spaces.gap, spaces.normal, spaces.source
+        planes = self._planes().near(points, float(reach.max(initial=0.0)))
+        return HalfSpaces(*map(np.concatenate, zip(bones, planes)))
 
     def near(self, points: Floats, reach: Floats) -> list[tuple[int, Integers]]:
         """Bones in reach, each with the free contact points (n, 3) that may be nearer to it than their reach.
@@ -220,7 +229,7 @@ class BoneContacts:
         """
         found = np.empty((len(self.reached), len(points)), dtype=np.int64)
         counts = np.zeros(len(self.reached), dtype=np.int64)
-        bones = self._placed, self.boxes
+        bones = self.placed, self.boxes
         near_loop(points, self.free(len(points)), reach, bones, self._bounds(len(points)), found, counts)
         return [(b, near[:count]) for b, near, count in zip(self.reached, found, counts.tolist()) if count]
 

@@ -158,8 +158,9 @@ class MuscleStepper:
         try:
             with self.timed("solve"):
                 self.model.solve(self.contacts)
-            bad = ~np.isfinite(self.model.contact_points()).all(axis=1)
-            if bad.any():
+            points = self.model.contact_points()
+            if not np.isfinite(points).all():
+                bad = ~np.isfinite(points).all(axis=1)
                 raise NotFiniteError(f"{int(bad.sum())} of {len(bad)} positions are not finite")
         except (np.linalg.LinAlgError, FloatingPointError, NotFiniteError) as error:
             source = self.scene.muscle(self.name).source

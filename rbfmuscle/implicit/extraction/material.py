@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
-from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
+from rbfmuscle.geometry.surfaces import mesh_volume, touching_faces, vertex_normals
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import Obstacles
 from rbfmuscle.implicit.extraction.projection import CutBounds, Projector
@@ -144,7 +144,7 @@ class CarriedMaterial:
         spacing = max(self.edge, 0.52 * self.mesh.longest(vertices))
         if bounds is not None:
             near = bounds.below(vertices) < bounds.steepest * NEAR_BONE * spacing
-            faces = faces[near[faces].any(axis=1)]
+            faces = faces[touching_faces(faces, near)]
         if len(faces):
             self.pushed |= self.projector.push_off(faces, obstacles, spacing, PUSHED * self.edge)
 
@@ -173,7 +173,7 @@ class CarriedMaterial:
             moved, marked = True, np.zeros(len(self.carried), dtype=np.bool_)
             marked[faces[bad].ravel()] = True
             region = self.mesh.around(marked, 1 + max(turn, 0) // GROWTH)
-            among = np.asarray(region[faces].any(axis=1), dtype=np.bool_)
+            among = touching_faces(faces, region)
             if turn < 0:
                 self._return(np.flatnonzero(region))
             else:
@@ -186,7 +186,7 @@ class CarriedMaterial:
             return None
         faded = SURE * self.projector.slope * self.mesh.slope >= 1.0
         odd = self.sunk | self.pushed | self.left | faded
-        return np.asarray(odd[self.mesh.faces].any(axis=1), dtype=np.bool_)
+        return touching_faces(self.mesh.faces, odd)
 
     def _strayed(self, rows: Integers | slice) -> Booleans:
         """Mask of the vertices that are far from where the material takes them."""

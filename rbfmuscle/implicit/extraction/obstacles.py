@@ -56,17 +56,17 @@ def near_triangles(obstacles: Obstacles, vertices: Floats, faces: Integers, marg
         local = np.ascontiguousarray((vertices - pose[:3, 3]) @ pose[:3, :3])
         cells, room = (grid.points, grid.start, grid.low, grid.edge, grid.shape), PAIRS * len(faces)
         while True:
-            count, pairs = np.zeros(len(grid.points), dtype=np.int64), np.empty((room, 2), dtype=np.int64)
-            met = _near_loop(local, faces, margin, cells, count, pairs)
+            pairs = np.empty((2, room), dtype=np.int64)
+            met = _near_loop(local, faces, margin, cells, pairs)
             if met <= room:
                 break
             room = met
-        found = np.empty(met, dtype=np.int64)
-        _sort_loop(pairs[:met], np.cumsum(count) - count, found)
-        rows = np.flatnonzero(count)
-        points.append(grid.points[rows] @ pose[:3, :3].T + pose[:3, 3])
-        counts.append(count[rows])
-        near.append(found)
+        order = np.argsort(pairs[0, :met], kind="stable")
+        point = pairs[0, order]
+        begin = np.flatnonzero(np.diff(point, prepend=-1))
+        points.append(grid.points[point[begin]] @ pose[:3, :3].T + pose[:3, 3])
+        counts.append(np.diff(begin, append=met))
+        near.append(pairs[1, order])
     first = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
     return NearTriangles(np.concatenate(points), first, np.concatenate(near))
 
@@ -89,7 +89,7 @@ def push_off_points(
 
 
 @compiled(error_model="numpy")
-def _near_loop(vertices, faces, margin, cells, count, pairs):
+def _near_loop(vertices, faces, margin, cells, pairs):
     """Pairs of a point and a triangle near it; how many there are, also beyond the room for them."""
     points, start, low, edge, shape = cells
     least, most = np.empty(3), np.empty(3)
@@ -105,33 +105,27 @@ def _near_loop(vertices, faces, margin, cells, count, pairs):
         for a in range(3):
             begin[a] = np.int64(max(np.floor((least[a] - low[a]) / edge), 0.0))
             end[a] = min(np.int64(np.floor((most[a] - low[a]) / edge)), shape[a] - 1)
+        plane = _plane(vertices, faces, f)
+        square = _square(plane)
         for i in range(begin[0], end[0] + 1):
             for j in range(begin[1], end[1] + 1):
                 row = (i * shape[1] + j) * shape[2]
                 for p in range(start[row + begin[2]], start[row + end[2] + 1]):
                     x, y, z = points[p, 0], points[p, 1], points[p, 2]
-                    if not (
+                    height = _height(plane, x, y, z)
+                    if height * height > margin * margin * square:
+                        continue
+                    at_b, at_c = _areas(plane, x, y, z)
+                    if min(at_b, at_c, square - at_b - at_c) < -BESIDE * square:
+                        continue
+                    if (
                         (least[0] <= x) & (x <= most[0]) & (least[1] <= y) & (y <= most[1])
                         & (least[2] <= z) & (z <= most[2])
                     ):  # fmt: skip
-                        continue
-                    _, _, _, square, height, at_b, at_c = _shadow(vertices, faces, f, x, y, z)
-                    beside = min(at_b, at_c, square - at_b - at_c)
-                    if height * height <= margin * margin * square and beside >= -BESIDE * square:
-                        if met < len(pairs):
-                            pairs[met, 0], pairs[met, 1] = p, f
-                        count[p] += 1
+                        if met < pairs.shape[1]:
+                            pairs[0, met], pairs[1, met] = p, f
                         met += 1
     return met
-
-
-@compiled(error_model="numpy")
-def _sort_loop(pairs, place, found):
-    """Triangles of the pairs by point, whose first is at ``place``."""
-    for k in range(len(pairs)):
-        p = pairs[k, 0]
-        found[place[p]] = pairs[k, 1]
-        place[p] += 1
 
 
 @compiled(error_model="numpy")
@@ -141,19 +135,20 @@ def _push_loop(vertices, faces, near_points, spacing, tolerance, moved):
     pushed = False
     for p in range(len(points)):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        best, least, signed, found = -1, spacing, -spacing, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        best, least, signed = -1, spacing, -spacing
         for f in near[first[p] : first[p + 1]]:
-            shadow = _shadow(vertices, faces, f, x, y, z)
-            square, height, at_b, at_c = shadow[3], shadow[4], shadow[5], shadow[6]
+            plane = _plane(vertices, faces, f)
+            square, (at_b, at_c) = _square(plane), _areas(plane, x, y, z)
             if square == 0.0 or min(at_b, at_c, square - at_b - at_c) < -1e-9 * square:
                 continue  # beside it
-            depth = -height / np.sqrt(square)
+            depth = -_height(plane, x, y, z) / np.sqrt(square)
             if abs(depth) < least:
-                best, least, signed, found = f, abs(depth), depth, shadow
+                best, least, signed = f, abs(depth), depth
         if signed <= tolerance or signed > CHORD * spacing:
             continue
         pushed = True
-        nx, ny, nz, square, _, at_b, at_c = found
+        plane = _plane(vertices, faces, best)
+        square, (at_b, at_c), (nx, ny, nz) = _square(plane), _areas(plane, x, y, z), plane[3]
         weight = 1.0 - (at_b + at_c) / square, at_b / square, at_c / square
         # Half the tolerance is left, so that rounding does not ask for another round.
         way = (signed - 0.5 * tolerance) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2)
@@ -167,15 +162,35 @@ def _push_loop(vertices, faces, near_points, spacing, tolerance, moved):
     return pushed
 
 
-@compiled(error_model="numpy")
-def _shadow(vertices, faces, f, x, y, z):
-    """A triangle's normal, its square, and of a point height and shadow areas at B and C, times the normal's length."""
+@compiled(error_model="numpy", inline="always")
+def _plane(vertices, faces, f):
+    """Corner A of a triangle, its sides to B and C, and its normal, as long as twice its area."""
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
     ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
     ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
     vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    return (ax, ay, az), (ux, uy, uz), (vx, vy, vz), (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx)
+
+
+@compiled(error_model="numpy", inline="always")
+def _square(plane):
+    """Square of the normal's length."""
+    nx, ny, nz = plane[3]
+    return nx * nx + ny * ny + nz * nz
+
+
+@compiled(error_model="numpy", inline="always")
+def _height(plane, x, y, z):
+    """Height of a point above a triangle, times the normal's length."""
+    (ax, ay, az), (nx, ny, nz) = plane[0], plane[3]
+    return nx * (x - ax) + ny * (y - ay) + nz * (z - az)
+
+
+@compiled(error_model="numpy", inline="always")
+def _areas(plane, x, y, z):
+    """Areas at B and C of a point's foot on a triangle's plane, times twice the normal's length."""
+    (ax, ay, az), (ux, uy, uz), (vx, vy, vz), (nx, ny, nz) = plane
     px, py, pz = x - ax, y - ay, z - az
     at_b = nx * (py * vz - pz * vy) + ny * (pz * vx - px * vz) + nz * (px * vy - py * vx)
     at_c = nx * (uy * pz - uz * py) + ny * (uz * px - ux * pz) + nz * (ux * py - uy * px)
-    return nx, ny, nz, nx * nx + ny * ny + nz * nz, nx * px + ny * py + nz * pz, at_b, at_c
+    return at_b, at_c

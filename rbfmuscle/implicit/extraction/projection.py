@@ -126,7 +126,7 @@ class Projector:
 
     def volume_step(self, faces: Integers, target: float, steps: int = 1) -> float:
         """Change of level that brings the mesh to a volume, a cubic polynomial of the change, by Newton steps."""
-        c0, c1, c2, c3 = volume_cubic(self.vertices, faces, self._direction, self.vertices.mean(axis=0))
+        c0, c1, c2, c3 = volume_cubic(self.vertices, faces, self._direction)
         change = 0.0
         for _ in range(steps):
             lack = target - (c0 + change * (c1 + change * (c2 + change * c3)))
