@@ -3,6 +3,7 @@
 import os
 import re
 import zlib
+from functools import lru_cache
 from html import escape
 from pathlib import Path
 
@@ -35,20 +36,31 @@ def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
     points = np.ascontiguousarray(vertices)
     points = _rounded(points) if points.dtype != np.float32 else points
     corners = np.ascontiguousarray(faces, dtype="<i4")
-    ends = np.arange(3, 3 * len(corners) + 1, 3, dtype="<i4")
-    elements: list[str] = []
-    blocks: list[bytes] = []
-    for name, values, components in ("Points", points, 3), ("connectivity", corners, 1), ("offsets", ends, 1):
+    blocks = _packed(points.tobytes()), *_packed_faces(corners.tobytes())
+    elements, offset = [], 0
+    for name, kind, components, block in zip(
+        ("Points", "connectivity", "offsets"), (points.dtype.str[1:], "i4", "i4"), (3, 1, 1), blocks
+    ):
         elements.append(
-            f'<DataArray type="{_TYPES[values.dtype.str[1:]]}" Name="{name}" NumberOfComponents="{components}" '
-            f'format="appended" offset="{sum(len(block) for block in blocks)}"/>\n'
+            f'<DataArray type="{_TYPES[kind]}" Name="{name}" NumberOfComponents="{components}" '
+            f'format="appended" offset="{offset}"/>\n'
         )
-        raw = values.tobytes()
-        packed = zlib.compress(raw, 1)
-        # VTK's header with the sizes of one zlib block, then the block.
-        blocks += [np.array([1, len(raw), 0, len(packed)], dtype="<u4").tobytes(), packed]
+        offset += len(block)
     head = _HEAD.format(len(points), len(corners), *elements).encode("ascii")
     Path(path).write_bytes(b"".join([head, _BEFORE_DATA, *blocks, _AFTER_DATA]))
+
+
+@lru_cache(maxsize=128)
+def _packed_faces(corners: bytes) -> tuple[bytes, bytes]:
+    """Blocks of corners and of where each face ends, kept because a mesh has the same ones in every frame."""
+    ends = np.arange(3, len(corners) // 4 + 1, 3, dtype="<i4")
+    return _packed(corners), _packed(ends.tobytes())
+
+
+def _packed(raw: bytes) -> bytes:
+    """VTK's header with the sizes of one zlib block, then the block."""
+    packed = zlib.compress(raw, 1)
+    return np.array([1, len(raw), 0, len(packed)], dtype="<u4").tobytes() + packed
 
 
 def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
