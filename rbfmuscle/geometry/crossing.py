@@ -190,17 +190,19 @@ def _cross_loop(vertices, faces, leaves, asked, found):
     """The triangles of pairs of leaves: which of them touch by their boxes, then which of these cross."""
     pairs, box = leaves
     among, plain = asked
+    near = np.empty(LEAF, np.bool_)
     for k in range(len(pairs)):
         i, j = pairs[k, 0], pairs[k, 1]
         for m in range(LEAF):
-            for n in range(m + 1 if i == j else 0, LEAF):
-                # All six are compared: which of them tells cannot be foreseen, and a wrong guess costs more.
-                near = (
+            # All six are compared, and all boxes of the leaf: side by side, which is quicker than to choose.
+            for n in range(LEAF):
+                near[n] = (
                     (box[i, 0, m] <= box[j, 3, n]) & (box[j, 0, n] <= box[i, 3, m])
                     & (box[i, 1, m] <= box[j, 4, n]) & (box[j, 1, n] <= box[i, 4, m])
                     & (box[i, 2, m] <= box[j, 5, n]) & (box[j, 2, n] <= box[i, 5, m])
                 )  # fmt: skip
-                if not near:
+            for n in range(m + 1 if i == j else 0, LEAF):
+                if not near[n]:
                     continue
                 f, g = LEAF * i + m, LEAF * j + n
                 if not _meet(faces, f, g, plain) or (found[f] and found[g]) or not (among[f] or among[g]):
