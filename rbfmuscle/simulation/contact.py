@@ -137,6 +137,8 @@ class BoneContacts:
         other.allowed = {bone: depth[index] for bone, depth in self.allowed.items()}
         if self.neighbours:
             other._stack = self._planes().only(index)
+        if self._known[1].shape[1]:
+            other._known = tuple(part[:, index] for part in self._known)
         return other
 
     def allow(self, bone_index: int, depth: Floats) -> None:
