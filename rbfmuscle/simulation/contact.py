@@ -138,7 +138,7 @@ class BoneContacts:
         if self.neighbours:
             other._stack = self._planes().only(index)
         if self._known[1].shape[1]:
-            other._known = tuple(part[:, index] for part in self._known)
+            other._known = tuple(np.take(part, index, axis=1) for part in self._known)
         return other
 
     def allow(self, bone_index: int, depth: Floats) -> None:
