@@ -5,9 +5,10 @@
     python benchmarks/mutants.py table [--seed S]
 
 A fault changes one expression: a comparison, an operator, a sign, a constant, a truth value. It lies in a copy of the
-checkout, never in the checkout. Faults in compiled loops are tried without compiler, all others with it. What went
-unnoticed is listed; what changes nothing that could be told is named in ``.mutants/equivalent.json`` by its key, with
-the reason, and counted apart. The same command goes on where it ended.
+checkout, never in the checkout. It is tried on quick tests of different files first, and what these let pass on more,
+the reference runs first. Faults in compiled loops are tried without compiler, then with it, all others with it. What
+went unnoticed is listed; what changes nothing that could be told is named in ``.mutants/equivalent.json`` by its key,
+with the reason, and counted apart. The same command goes on where it ended.
 """
 
 import argparse
@@ -18,10 +19,13 @@ import hashlib
 import json
 import os
 import random
+import re
 import resource
 import shutil
+import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections import defaultdict
 from dataclasses import dataclass
@@ -31,20 +35,20 @@ from xml.etree import ElementTree
 ROOT = Path(__file__).resolve().parents[1]
 WORK = Path(os.environ.get("MUTANTS_FOLDER", ROOT / ".mutants"))
 PACKAGES = ("rbfmuscle", "pbd_baseline")
-# A fault is tried on so many tests at most, of so many seconds together as recorded; then on the processor's time.
-MOST, BUDGET, LIMIT = 20, 20.0, 180
+# A fault is tried on so many tests at most, of so many seconds together as recorded: quick ones, then others.
+STEPS = ((20, 20.0), (200, 150.0))
+# Seconds of the processor that compiling takes at most, beside three times those of the tests: more is an endless loop.
+LIMIT = 180
+PYTEST = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"]
+REFERENCES = "tests/contract/test_whole_runs.py"
+WORD = re.compile(r"\w+")
 LEFT_OUT = (".git", ".venv", ".mutants", "__pycache__", "*.egg-info", ".hypothesis", "demo_output", "images")
 COMPARE = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
 }  # fmt: skip
-ARITHMETIC = {
-    ast.Add: ast.Sub,
-    ast.Sub: ast.Add,
-    ast.Mult: ast.Div,
-    ast.Div: ast.Mult,
-    ast.FloorDiv: ast.Mult,
-}
+ARITHMETIC = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
+ARITHMETIC |= {ast.FloorDiv: ast.Mult}
 TOGETHER = {ast.And: ast.Or, ast.Or: ast.And}
 
 
@@ -63,8 +67,10 @@ class Fault:
         In its place.
     loop : bool
         Whether it lies in a compiled loop.
-    inside : bool
-        Whether it lies in a function: other lines run when the module is imported.
+    first, last : int
+        Lines of its statement; of a default value those of the function.
+    name : str
+        What holds it, where its line runs within no test: the compiled loop, or what is assigned at import.
     """
 
     path: str
@@ -73,7 +79,9 @@ class Fault:
     end: int
     text: str
     loop: bool
-    inside: bool
+    first: int
+    last: int
+    name: str
 
     def planted(self, source: bytes) -> bytes:
         """The file with the fault."""
@@ -106,6 +114,18 @@ def changed(node: ast.AST) -> ast.AST | None:
     return new
 
 
+def is_loop(node: ast.FunctionDef) -> bool:
+    """Whether a function is compiled."""
+    return any(word in ast.unparse(d) for d in node.decorator_list for word in ("compiled", "njit"))
+
+
+def assigned(node: ast.stmt) -> str:
+    """The name that a statement gives a value, empty of others."""
+    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+    names = [part.id for part in ast.walk(targets[0]) if isinstance(part, ast.Name)] if targets[0] else []
+    return names[0] if names else ""
+
+
 def faults_of(path: Path) -> list[Fault]:
     """All faults of a file, but in annotations, decorators, f-strings and what is for type checkers."""
     source = path.read_bytes()
@@ -114,33 +134,36 @@ def faults_of(path: Path) -> list[Fault]:
         starts.append(starts[-1] + len(line))
     found: list[Fault] = []
 
-    def walk(node, loop, inside):
+    def walk(node, at):
         for name, value in ast.iter_fields(node):
             if name in ("annotation", "returns", "decorator_list", "type_params"):
                 continue
             for child in value if isinstance(value, list) else [value]:
                 if isinstance(child, ast.AST):
-                    visit(child, loop, inside)
+                    visit(child, at)
 
-    def visit(node, loop, inside):
+    def visit(node, at):
         if isinstance(node, ast.JoinedStr) or (
             isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
         ):
             return
+        loop, inside, name, span = at
         if isinstance(node, ast.FunctionDef):
-            inside = True
-            loop = loop or any(
-                word in ast.unparse(d) for d in node.decorator_list for word in ("compiled", "njit")
-            )
+            loop = loop or is_loop(node)
+            inside, name = True, name if at[0] else node.name if loop else ""
+        if isinstance(node, ast.stmt):
+            body = hasattr(node, "body") and not isinstance(node, ast.FunctionDef)
+            span = node.lineno, node.lineno if body else node.end_lineno
+            name = name if inside else assigned(node)
         new = changed(node)
         if new is not None:
             start = starts[node.lineno - 1] + node.col_offset
             end = starts[node.end_lineno - 1] + node.end_col_offset
             relative = str(path.relative_to(ROOT))
-            found.append(Fault(relative, node.lineno, start, end, ast.unparse(new), loop, inside))
-        walk(node, loop, inside)
+            found.append(Fault(relative, node.lineno, start, end, ast.unparse(new), loop, *span, name))
+        walk(node, (loop, inside, name, span))
 
-    walk(ast.parse(source), False, False)
+    walk(ast.parse(source), (False, False, "", (1, 1)))
     return found
 
 
@@ -168,29 +191,19 @@ def record(tests: list[str]) -> None:
     """Run tests with compiler, and those of ``tests/nojit.txt`` without, and keep which lines each runs."""
     import coverage
 
-    listed = [
-        line
-        for line in (ROOT / "tests/nojit.txt").read_text(encoding="utf-8").splitlines()
-        if not line.startswith("#")
-    ]
+    text = (ROOT / "tests/nojit.txt").read_text(encoding="utf-8")
+    listed = [line for line in text.splitlines() if not line.startswith("#")]
     WORK.mkdir(exist_ok=True)
     for kind, files in (("plain", tests or listed), ("compiled", tests or ["tests"])):
         data, times = WORK / f"{kind}.coverage", WORK / f"{kind}.xml"
         more = {"COVERAGE_FILE": str(data)} | ({"NUMBA_DISABLE_JIT": "1"} if kind == "plain" else {})
-        command = [sys.executable, "-m", "pytest", "-q", "-n", os.environ.get("WORKERS", "auto"), *files]
-        options = [
-            "--cov",
-            "--cov-context=test",
-            "--cov-report=",
-            f"--junitxml={times}",
-            "-p",
-            "no:cacheprovider",
-        ]
-        subprocess.run([*command, *options], cwd=ROOT, env={**os.environ, **more}, check=False)
+        options = f"-q -n {os.environ.get('WORKERS', 'auto')} --cov --cov-context=test --cov-report=".split()
+        command = [*PYTEST, *options, f"--junitxml={times}", *files]
+        subprocess.run(command, cwd=ROOT, env={**os.environ, **more}, check=False)
         kept = coverage.CoverageData(str(data))
         kept.read()
         lines = {}
-        for file in kept.measured_files():
+        for file in [file for file in kept.measured_files() if file.endswith(".py")]:  # not templates
             contexts = kept.set_query_contexts(None) or kept.contexts_by_lineno(file)
             relative = os.path.relpath(file, ROOT)
             lines[relative] = {n: [c.rpartition("|")[0] for c in cs if c] for n, cs in contexts.items()}
@@ -206,57 +219,89 @@ class Reach:
 
     def __init__(self, kind: str) -> None:
         path = WORK / f"{kind}.json"
-        found = (
-            json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"lines": {}, "seconds": {}}
-        )
-        self.lines, self.seconds = found["lines"], found["seconds"]
+        found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        self.kind, self.lines, self.seconds = kind, found.get("lines", {}), found.get("seconds", {})
+        self.words: dict[tuple[str, str], set[str]] = {}
+        self.made: list[tuple[str, set[str]]] = []
+        for file, lines in self.lines.items():
+            text = (ROOT / file).read_text(encoding="utf-8")
+            split = dict(enumerate(text.splitlines(), 1))
+            self.words |= {(file, n): set(WORD.findall(split.get(int(n), ""))) for n in lines}
+            for node in ast.parse(text).body:
+                loop = isinstance(node, ast.FunctionDef) and is_loop(node)
+                name = node.name if loop else assigned(node)
+                if name:
+                    self.made.append((name, set(WORD.findall(ast.unparse(node)))))
 
-    def tests(self, fault: Fault) -> list[str]:
-        """Tests that run a fault's line, quick ones first; of what runs at import, tests that run its module."""
-        lines = self.lines.get(fault.path, {})
-        found = set(lines.get(str(fault.line), ())) if fault.inside else set()
-        found = found or {test for tests in lines.values() for test in tests}
-        chosen, spent = [], 0.0
+    def steps(self, fault: Fault) -> list[list[str]]:
+        """Tests that run a fault's line, those of each step: in turn of all files, the quick ones of each first."""
+        lines, span = self.lines.get(fault.path, {}), range(fault.first, fault.last + 1)
+        found = set(lines.get(str(fault.line), ())) or {t for n in span for t in lines.get(str(n), ())}
+        if fault.name and not (fault.loop and self.kind == "plain"):
+            found = self._naming(fault.name)
+        if not found and not fault.loop:
+            found = {test for tests in lines.values() for test in tests}
+        place = {}
+        files: dict[str, int] = defaultdict(int)
         for test in sorted(found, key=lambda t: (self._time(t), t)):
-            spent += self._time(test)
-            if len(chosen) == MOST or (chosen and spent > BUDGET):
-                break
-            chosen.append(test)
-        return chosen
+            file = test.partition("::")[0]
+            near = f"/{group_of(fault.path)}/" in file or Path(fault.path).stem in file
+            place[test] = files[file] // (3 if near else 1), self._time(test), test
+            files[file] += 1
+        ordered, steps = sorted(found, key=place.__getitem__), []
+        for most, budget in STEPS:
+            chosen, spent = [], 0.0
+            for test in ordered:
+                spent += self._time(test)
+                if len(chosen) == most or (chosen and spent > budget):
+                    break
+                chosen.append(test)
+            steps.append(chosen)
+            left = ordered[len(chosen) :]
+            references = [test for test in left if test.startswith(REFERENCES)][:2]
+            ordered = references + [test for test in left if test not in references]
+        return [step for step in steps if step]
+
+    def _naming(self, name):
+        """Tests that run a line with a name, or with that of a loop or constant that is made with it."""
+        names: set[str] = set()
+        more = {name}
+        while more:
+            names |= more
+            more = {made for made, words in self.made if words & names} - names
+        found = [self.lines[file][n] for (file, n), words in self.words.items() if words & names]
+        return {test for tests in found for test in tests}
+
+    def time(self, tests: list[str]) -> float:
+        """Seconds that tests took together."""
+        return sum(self._time(test) for test in tests)
 
     def _time(self, test):
         file, _, rest = test.partition("::")
         return self.seconds.get(f"{file.removesuffix('.py')}/{rest}".replace("::", "/"), 1.0)
 
 
-def passes(tree: Path, tests: list[str], kind: str) -> tuple[bool, str]:
+def passes(tree: Path, tests: list[str], kind: str, *, seconds: float) -> tuple[bool, str]:
     """Whether tests pass in a copy of the checkout, and the first that fails; too much time counts as failing."""
+    limit = int(LIMIT + 3.0 * seconds)
     paths = os.pathsep.join(str(tree / part) for part in ("", "benchmarks", "tests"))
     more = {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1", "OPENBLAS_NUM_THREADS": "1"}
+    more |= {"RBFMUSCLE_LOOPS": str(WORK / "loops"), "RBFMUSCLE_CACHE": str(tree / "cache")}
     more |= {"NUMBA_DISABLE_JIT": "1"} if kind == "plain" else {}
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-x",
-        "-q",
-        "-n",
-        "0",
-        "--tb=no",
-        "-rf",
-        "-p",
-        "no:cacheprovider",
-    ]
-    done = subprocess.run(
-        [*command, *tests], cwd=tree, env={**os.environ, **more}, capture_output=True, text=True, check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (LIMIT, LIMIT + 1)),
-    )  # fmt: skip
-    failed = [
-        line.removeprefix("FAILED ").partition(" - ")[0]
-        for line in done.stdout.splitlines()
-        if line.startswith("FAILED ")
-    ]
-    return done.returncode in (0, 5), failed[0] if failed else ""
+    with tempfile.TemporaryFile("w+") as out:
+        process = subprocess.Popen(
+            [*PYTEST, "-xq", "-n0", "--tb=no", "-rf", *tests], cwd=tree, env={**os.environ, **more}, stdout=out,
+            stderr=subprocess.DEVNULL, start_new_session=True,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1)),
+        )  # fmt: skip
+        try:
+            code = process.wait(3 * limit)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            code = process.wait()
+        out.seek(0)
+        failed = [line[7:].partition(" - ")[0].strip() for line in out if line.startswith("FAILED ")]
+    return code in (0, 5), failed[0] if failed else ""
 
 
 def run(count: int, seed: int, minutes: float) -> None:
@@ -277,21 +322,24 @@ def run(count: int, seed: int, minutes: float) -> None:
             print("time is over; the same command goes on from here")
             break
         outcome, by = "unreached", ""
-        for kind in ("plain",) if fault.loop else ("compiled", "plain"):
-            tests = [test for test in reach[kind].tests(fault) if sound.get((kind, test), True)]
-            while tests and outcome != "noticed":
-                path.write_bytes(fault.planted(source))
-                good, by = passes(tree, tests, kind)
-                path.write_bytes(source)
-                outcome = "unnoticed" if good else "noticed"
-                if outcome == "noticed" and by in tests:  # a test that fails anyway tells nothing
-                    sound.setdefault((kind, by), passes(tree, [by], kind)[0])
-                    if not sound[kind, by]:
-                        outcome, tests = "unreached", [test for test in tests if test != by]
-                        continue
+        for kind in ("plain", "compiled") if fault.loop else ("compiled", "plain"):
+            for step in reach[kind].steps(fault):
+                tests = [test for test in step if sound.get((kind, test), True)]
+                while tests and outcome != "noticed":
+                    path.write_bytes(fault.planted(source))
+                    seconds = reach[kind].time(tests)
+                    good, by = passes(tree, tests, kind, seconds=seconds)
+                    path.write_bytes(source)
+                    outcome = "unnoticed" if good else "noticed"
+                    if not good and by in tests:  # a test that fails anyway tells nothing
+                        sound.setdefault((kind, by), passes(tree, [by], kind, seconds=seconds)[0])
+                        if not sound[kind, by]:
+                            outcome, tests = "unreached", [test for test in tests if test != by]
+                            continue
+                    break
+            if outcome == "noticed" or (outcome == "unnoticed" and not fault.loop):
                 break
-            if outcome != "unreached":
-                break
+        shutil.rmtree(tree / "cache", ignore_errors=True)
         before = source[fault.start : fault.end].decode()
         row = {"key": key, "seed": seed, "outcome": outcome, "by": by, "path": fault.path, "line": fault.line}
         with (WORK / "results.jsonl").open("a") as file:
@@ -303,9 +351,8 @@ def run(count: int, seed: int, minutes: float) -> None:
 def results() -> list[dict]:
     """All results so far."""
     path = WORK / "results.jsonl"
-    return (
-        [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
-    )
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    return [json.loads(line) for line in text.splitlines()]
 
 
 def table(seed: int) -> str:
@@ -315,7 +362,7 @@ def table(seed: int) -> str:
     rows: dict[str, list[int]] = {}
     for row in results():
         if row["seed"] == seed:
-            kind = 2 if row["key"] in equivalent else 0 if row["outcome"] == "noticed" else 1
+            kind = 0 if row["outcome"] == "noticed" else 2 if row["key"] in equivalent else 1
             for name in (group_of(row["path"]), "all"):
                 rows.setdefault(name, [0, 0, 0])[kind] += 1
     lines = [
