@@ -24,6 +24,13 @@ class TestSimulate:
         with pytest.warns(SceneWarning, match="motion: times are not even"):
             simulate(scene)
 
+    def test_progress_is_called_after_each_frame_or_shown(self, capsys):
+        calls = []
+        simulate(arm_scene(), progress=lambda *given: calls.append(given))
+        assert calls == [(1, 3), (2, 3), (3, 3)] and capsys.readouterr().err == ""
+        simulate(arm_scene(), progress=True)
+        assert "arm: frame 3 of 3 (" in capsys.readouterr().err
+
     @pytest.mark.parametrize("report", [True, False])
     def test_report_is_written_where_it_is_asked_for(self, report, tmp_path):
         stream_run(arm_scene(end=10), tmp_path, settings={"output.report": report}, pictures=False)

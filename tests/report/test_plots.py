@@ -78,6 +78,11 @@ def test_tracks_are_the_series_of_the_run_and_times_leave_out_the_first_frame(ar
     (track,) = _tracks(saved, "volume_error", 100.0, axis, None)
     np.testing.assert_allclose(track.y, 100.0 * saved.series("biceps", "volume_error")[1], rtol=1e-12)
     np.testing.assert_allclose(track.x, angles, rtol=1e-12)
+    assert saved.moment_arm_coordinates() == saved.moment_arm_coordinates("biceps") == ["elbow.flexion"]
+    assert (
+        saved.moment_arm_coordinates("triceps") == []
+        and len(saved.series("biceps", "moment_arm", "x")[0]) == 0
+    )
     (track,) = _tracks(saved, "time_frame", 1000.0, axis, None)
     np.testing.assert_allclose(track.y, 1000.0 * saved.series("biceps", "time_frame")[1][1:], rtol=1e-12)
 

@@ -23,7 +23,11 @@ BOX = trimesh.creation.box((10, 10, 10))
 DEG = math.pi / 180
 Q = {"axes": {"q": (1, 0, 0)}}
 SPLINE = {"x": [-120, -60, 0, 10], "y": [3, 9, 5, 4]}
-SLOPELESS = [{"axis": [1, 0, 0], "coordinates": ["q"], "linear": [1.0]}]
+
+
+def turning(*more, **function):
+    """A custom joint that turns by one function of q and further coordinates."""
+    return {"type": "custom", "rotations": [{"axis": [1, 0, 0], "coordinates": ["q", *more], **function}]}
 
 
 def pair(units="mm", **row):
@@ -99,10 +103,15 @@ class TestKinds:
         [
             ({"type": "hinge", "axes": {"p": (1, 0, 0), "q": (0, 1, 0)}}, "a hinge joint has 1 coordinates, 2"),
             ({"type": "custom", "axes": {"q": (1, 0, 0)}}, "rotations and translations instead of axes"),
-            ({"type": "custom", "rotations": SLOPELESS}, "linear needs a slope"),
+            (turning(linear=[1.0]), "linear needs a slope"),
             ({**Q, "coordinates": {"q": {"range": [3, 1]}}}, "range must go upwards"),
             ({**Q, "coordinates": {"q": {"motion": "translation"}}}, "'q' is a rotation here, not a translation"),
             ({**Q, "coordinates": {"p": {}}}, "coordinate 'p' moves nothing"),
+            ({**Q, "coordinates": {"q": {"clamped": True}}}, "clamped needs a range"),
+            (turning(spline={"x": [0, 1, 1], "y": [0, 1, 2]}), "x must increase"),
+            (turning(piecewise={"x": [0, 1, 2], "y": [0, 1]}), "x has 3 values and y 2"),
+            (turning(polynomial=[1, 2], constant=3), "give one function, not constant and polynomial"),
+            (turning("p", polynomial=[1, 2]), "polynomial is of 1 coordinate, 2 are given"),
         ],
     )  # fmt: skip
     def test_wrong_tables_are_named(self, row, message):

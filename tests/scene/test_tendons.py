@@ -1,6 +1,7 @@
 """Tendons against known answers: straight, around a pulley, of kept length, the same by every path."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,11 +10,12 @@ from toy_scene import held
 
 import rbfmuscle as rm
 from rbfmuscle.geometry.tubes import line_length
+from rbfmuscle.output.appearance import LONGEST_TAPER, TAPER, tendon_mesh
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.tendons import STIFFNESS_RATIO, taut_line
+from rbfmuscle.scene.tendons import STIFFNESS_RATIO, TendonLine, taut_line
 
 END = "strap tendon 2 to limb"
 
@@ -159,6 +161,16 @@ def test_both_models_carry_the_end_and_measure_and_write_the_tendon(model, tmp_p
     assert set(saved.poses[0]) == {"trunk", "limb"}
     (file,) = export_run(tmp_path, "animated-glb")
     assert {"strap", "strap_tendon"} <= set(trimesh.load(file).geometry)
+
+
+@pytest.mark.parametrize(("length", "taper"), [(100.0, 4.0 * TAPER), (10.0, 10.0 * LONGEST_TAPER)])
+def test_a_drawn_tendon_tapers_smoothly_from_the_belly_to_its_own_radius(length, taper):
+    line = TendonLine(np.linspace([5.0, 0.0, 0.0], [5.0, 0.0, length], 101), (4.0, 1.0))
+    muscle = SimpleNamespace(tendons=[SimpleNamespace(name="one"), SimpleNamespace(name="absent")])
+    vertices, _ = tendon_mesh(muscle, {"one": line})
+    share = np.clip(vertices[:-2, 2] / taper, 0.0, 1.0)
+    radii = np.hypot(vertices[:-2, 0] - 5.0, vertices[:-2, 1])
+    np.testing.assert_allclose(radii, 4.0 - 3.0 * (3.0 * share**2 - 2.0 * share**3), rtol=1e-9)
 
 
 def test_a_notebook_shows_a_run_with_tendons_that_are_left_out_of_its_files_on_request(tmp_path):

@@ -1,0 +1,33 @@
+"""Progress of a command: lines for a log, at most one in ten seconds, and a bar on a terminal."""
+
+import sys
+from types import SimpleNamespace
+
+from rbfmuscle import progress
+from rbfmuscle.progress import Progress, stage
+
+
+def test_a_log_has_each_stage_the_last_count_and_others_ten_seconds_apart(monkeypatch, capsys):
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(progress, "time", clock)
+    with Progress("arm") as shown:
+        for done, clock.now in enumerate((1.9, 2.6, 3.0, 12.5, 12.7, 13.0), 1):
+            shown(done, 6)
+        with Progress("inner", "muscle") as inner:
+            inner(1, 1)
+        with stage("report"):
+            pass
+    with stage("nobody looks"):
+        pass
+    told = ["frame 2 of 6 (3 s)", "frame 5 of 6 (13 s)", "frame 6 of 6 (13 s)", "muscle 1 of 1 (13 s)"]
+    assert capsys.readouterr().err.splitlines() == [f"arm: {text}" for text in [*told, "report (13 s)"]]
+
+
+def test_a_terminal_has_a_bar(monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    with Progress("arm") as shown:
+        shown(2, 6)
+        (task,) = shown.bar.tasks
+        assert (task.description, task.completed, task.total) == ("arm: frame 2 of 6", 2, 6)
+        assert not shown.bar.finished and shown.bar.live.is_started
+    assert not shown.bar.live.is_started
