@@ -94,7 +94,7 @@ def _open_runs(folder):
 
     inside = sorted(path.parent for path in folder.glob("*/run.json"))
     if (folder / "run.json").exists() or not inside:
-        return {folder.name or "run": SavedRun(folder)}
+        return {folder.resolve().name: SavedRun(folder)}
     return {path.name: SavedRun(path) for path in inside}
 
 
