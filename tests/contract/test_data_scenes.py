@@ -3,7 +3,6 @@
 import pytest
 
 from rbfmuscle.models import check_models
-from rbfmuscle.run import simulate
 from rbfmuscle.scene.check import check_initial
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.plan import plan_scene
@@ -13,8 +12,6 @@ SCENES = {f"hip/{name}": (4, 3) for name in ("adduction", "apriori", "extension"
 SCENES |= {"hip/external_rotation": (4, 3), "hip/internal_rotation": (4, 3), "hip/gluteus": (1, 3)}
 SCENES |= {"leg/gait": (12, 15), "leg/hip_flexion": (8, 9), "leg/knee_flexion": (6, 10), "leg/leg": (38, 11)}
 SCENES |= {"leg/neighbours": (4, 7), "leg/quadriceps": (4, 6), "leg/slender": (4, 6), "leg/squat": (38, 21)}
-RBF = {"name": "rbf", "centres": 40, "samples": 150, "resolution": 16}
-COARSE = {"rbf": RBF, "pbd": {"name": "pbd", "iterations": 3}}
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +34,3 @@ def test_scene_loads_and_is_planned(data, name):
     assert plan["frames"] == len(scene.motion) > 1 and plan["substeps"] >= len(scene.motion) - 1
     assert [muscle["name"] for muscle in plan["muscles"]] == [muscle.name for muscle in scene.muscles]
     assert any(muscle["bones"] for muscle in plan["muscles"])
-
-
-@pytest.mark.parametrize("model", COARSE)
-@pytest.mark.parametrize("name", ["hip/flexion", "leg/knee_flexion"])
-def test_first_frames_are_solved_by_coarse_models(data, name, model):
-    scene = Scene.load(data / f"{name}.toml").with_options(frames="0:2:1", model=COARSE[model])
-    scene.muscles = scene.muscles[:2]
-    run = simulate(scene)
-    for muscle in scene.muscles:
-        assert max(abs(run.values(muscle.name, "volume_error"))) < 0.02

@@ -7,7 +7,6 @@ import sys
 import time
 
 import pytest
-from command_line import call
 
 from rbfmuscle.importers.opensim.xml import read_xml
 from rbfmuscle.validation import SceneError
@@ -73,10 +72,3 @@ def test_two_colons_in_a_name_and_what_is_not_ascii_are_read(tmp_path):
     path.write_text('<A::B name="é"><!-- x::y --><c> 1 </c></A::B>', encoding="utf-8")
     root = read_xml(path)
     assert root.tag == "A__B" and root.get("name") == "é" and root.word("c") == "1"
-
-
-def test_the_command_line_says_one_line_and_three(tmp_path, capsys):
-    path = tmp_path / "bad.osim"
-    path.write_text(LAUGHS + "]><x>&u;</x>")
-    code, _, err = call(capsys, "import", path, "-o", tmp_path / "o")
-    assert code == 3 and len(err.strip().splitlines()) == 1
