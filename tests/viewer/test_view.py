@@ -21,12 +21,14 @@ def image(path):
 
 
 def test_picture_is_of_the_frame_asked_for(run_folder, tmp_path, capsys, graphics):
-    code, out, err = call(capsys, "view", run_folder, "--at", "frame=2", "--screenshot", tmp_path / "a.png")
+    code, out, err = call(
+        capsys, "view", run_folder, "--at", "frame=2", "--screenshot", tmp_path / "x/y/a.png"
+    )
     assert code == 0, err
-    assert Path(out.strip()) == tmp_path / "a.png"
+    assert Path(out.strip()) == tmp_path / "x/y/a.png"
     for frame in (0, 2):
         render_run(run_folder, tmp_path / f"{frame}.png", frame=frame)
-    asked, first, third = (image(tmp_path / f"{name}.png") for name in ("a", "0", "2"))
+    asked, first, third = (image(tmp_path / f"{name}.png") for name in ("x/y/a", "0", "2"))
     np.testing.assert_array_equal(asked, third)
     assert (asked != first).any(axis=2).mean() > 0.01
 
