@@ -4,8 +4,6 @@ import numba
 import numpy as np
 import pytest
 import trimesh
-from peers.detectors import TreeDetector
-from peers.spline import SplineField
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.bones.errors import measure_field
@@ -181,17 +179,6 @@ def test_measured_errors_are_those_of_the_field():
     found = measure_field(Shifted(), count=5000)
     assert found["error_rms"] == pytest.approx(0.1, rel=0.01)
     assert found["sign_wrong"] > 0.01 and found["angle_median"] > 179.0
-
-
-@pytest.mark.parametrize("kind", [TreeDetector, SplineField])
-def test_other_fields_of_a_bone_agree(kind):
-    mesh = trimesh.creation.icosphere(4, 20.0)
-    pose = trimesh.transformations.rotation_matrix(0.7, [1.0, 2.0, 3.0], [30.0, -10.0, 5.0])
-    points = trimesh.transform_points(_near(mesh, 3.0, 3000), pose)
-    distance, gradient = kind.from_mesh(mesh).distance_and_gradient(points, pose)
-    wanted, direction = BoneSDF.from_mesh(mesh, cache=False).distance_and_gradient(points, pose)
-    assert np.abs(distance - wanted).max() < 0.05
-    assert np.einsum("ni,ni->n", gradient, direction).min() > 0.95
 
 
 def test_fields_of_a_run_name_each_bone():

@@ -73,13 +73,6 @@ def test_flat_and_peaked_kernels_on_a_muscle_are_right_or_say_so(muscle, kernel,
     assert field is None or np.isfinite(field(vertices)).all()
 
 
-@pytest.mark.parametrize("size", [1e-6, 1e6])
-def test_a_muscle_in_tiny_and_huge_units_is_the_same(muscle, size):
-    points, normals, vertices = muscle
-    plain, other = (RBFField.fit_hermite(points * s, normals)(vertices * s) / s for s in (1.0, size))
-    np.testing.assert_allclose(other, plain, atol=1e-8 * np.ptp(vertices))
-
-
 def test_a_muscle_with_two_centres_almost_in_one_place_is_right_or_says_so(muscle):
     points, normals, vertices = (part.copy() for part in muscle)
     reach = spacing(points).mean()
