@@ -68,13 +68,6 @@ class TestRun:
         code, _, err = call(capsys, *command, "--muscle", "extenso")
         assert code == 2 and "did you mean 'extensor'?" in one_line(err)
 
-    def test_limit_exceeded(self, folder, tmp_path, capsys):
-        arguments = ("run", folder / "arm.toml", "-o", tmp_path / "o", "--frames", "0:1", "--fail-on")
-        code, _, err = call(capsys, *arguments, "rest_error_rms=1e-9")
-        assert code == 6 and "rest_error_rms" in err
-        assert (tmp_path / "o" / "run.json").exists()
-        assert call(capsys, *arguments, "volume_error")[0] == 0
-
     def test_export_of_a_run(self, folder, tmp_path, capsys):
         call(capsys, "run", folder / "arm.toml", "-o", tmp_path / "o", "--frames", "0:1")
         code, out, _ = call(capsys, "export", tmp_path / "o", "--format", "stl", "obj", "--units", "m")

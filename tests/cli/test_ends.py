@@ -71,7 +71,7 @@ cli.main()
             assert "frames are kept in" in err
             kept = SavedRun(out)
             assert kept.info["status"] == "interrupted" and 2 <= len(kept.frames) < 60
-            assert export_run(out, ["stl"])
+            assert {row.frame for row in kept.metrics} == set(kept.frames) and export_run(out, ["stl"])
 
     def test_json_is_told_of_an_interrupt(self, tmp_path):
         code = (

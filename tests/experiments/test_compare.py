@@ -22,6 +22,9 @@ def test_what_does_not_count_is_a_tie():
     found = {name: {"all": {"rest_error_rms": e}} for name, e in (("a", 0.0), ("b", 0.01), ("c", 0.5))}
     assert best_models(found, "rest_error_rms", "mm") == ["a", "b"]
     assert best_models(found, "rest_error_rms", "m") == ["a"]
+    found = {name: {"all": {"distance_rms": 1.0, "slack": s}} for name, s in (("a", 1.0), ("b", 0.9))}
+    assert best_models(found, "distance_rms", "mm") == best_models({"a": found["a"]}, "slack", "mm") == []
+    assert best_models(found, "slack", "mm") == ["a"]  # which is perfect at 1
 
 
 def test_answer_says_what_the_first_keeps_at_which_price_and_who_comes_near():

@@ -18,6 +18,7 @@ from rbfmuscle.experiments.wanted_error import STEP, reach_error
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.report import kernel_page
 from rbfmuscle.report.kernel_page import answer, write_studies
 from rbfmuscle.validation import MeshError, UsageError
 
@@ -129,6 +130,20 @@ def test_files_hold_the_table(study, tmp_path):
     assert tomllib.loads(text)["muscle"]["model"]["kernel"] == study.recommended["kernel"]
 
 
+def test_plot_has_the_cost_in_milliseconds_and_a_colour_a_number_of_centres(monkeypatch):
+    rows = [row("cubic", 0.1, 2.0), row("linear", 0.4, 1.0), row("gaussian", 0.1, 1.0, unfit="9 sheets")]
+    rows[0]["evaluation_time"] = 0.003
+    rows = [one | {"centres": 80 + k, "front": k == 0} for k, one in enumerate(rows)]
+    study, drawn = kernel_study.KernelStudy(rows, units="mm", recommended=rows[0]), []
+    monkeypatch.setattr(kernel_page, "front_plot", lambda points, labels: drawn.append((points, labels)))
+    for studies in ({"one": study}, {"one": study, "two": study}):
+        kernel_page._plot(studies, "mm")
+    (cubic, linear), labels = drawn[0]
+    assert cubic == pytest.approx((5.0, 0.1, "cubic", "80 centres", True, True))
+    assert linear == (1.0, 0.4, "linear", "81 centres", False, False) and labels[1] == "RMS error [mm]"
+    assert [point.group for point in drawn[1][0]] == ["one", "one", "two", "two"]
+
+
 def test_wrong_requests_are_answered(ellipsoid):
     for wrong in ({"centres": [4]}, {"kernels": ["cubics"]}, {"placement": "even"}):
         with pytest.raises(UsageError):
@@ -142,11 +157,11 @@ def test_wrong_requests_are_answered(ellipsoid):
 
 def test_command_ranks_and_prints(tmp_path, capsys):
     words = ["phantom", "--muscle", "adductor_posterior", "--kernels", "cubic,quintic", "--centres", "60"]
-    code, out, _ = call(capsys, "kernels", *words, "--resolution", "40", "-o", tmp_path / "k")
+    code, out, _ = call(capsys, "kernels", *words, "--resolution", "40", "-o", tmp_path / "new/k")
     assert code == 0 and "use " in out.lower() and "[muscle.model]" in out
-    rows = json.loads((tmp_path / "k" / "kernels.json").read_text(encoding="utf-8"))["rows"]
+    rows = json.loads((tmp_path / "new/k/kernels.json").read_text(encoding="utf-8"))["rows"]
     assert {row["kernel"] for row in rows} == {"cubic", "quintic"}
-    assert (tmp_path / "k" / "kernels.html").exists()
+    assert (tmp_path / "new/k/kernels.html").exists()
 
 
 def test_rows_that_err_more_than_the_coarsest_kernel_are_unfit():
@@ -186,10 +201,11 @@ def test_a_number_four_per_cent_smaller_was_seen_to_fail(found):
 
 def test_command_with_an_error_says_what_to_paste(tmp_path, ellipsoid, capsys, monkeypatch):
     ellipsoid.export(tmp_path / "muscle.ply")
-    words = [tmp_path / "muscle.ply", "-o", tmp_path / "out", "--kernels", "cubic", "--placement", "greedy"]
+    words = [tmp_path / "muscle.ply", "-o", tmp_path / "new/out"]
+    words += ["--kernels", "cubic", "--placement", "greedy"]
     code, said, _ = call(capsys, "kernels", *words, "--error", "0.4", "--units", "mm")
     assert code == 0 and "reaches" in said and "mm RMS" in said
-    facts = json.loads((tmp_path / "out" / "error.json").read_text(encoding="utf-8"))["muscle"]
+    facts = json.loads((tmp_path / "new/out/error.json").read_text(encoding="utf-8"))["muscle"]
     assert facts["reached"] and facts["error"] <= 0.4
     table = tomllib.loads(facts["toml"])["muscle"]["model"]
     assert table["kernel"] == "cubic" and table["centres"] == facts["row"]["centres"]

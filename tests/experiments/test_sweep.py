@@ -24,6 +24,7 @@ from rbfmuscle.experiments.sweep_run import (
     sweep_rows,
     write_table,
 )
+from rbfmuscle.report import sweep_page
 from rbfmuscle.report.sweep_page import write_page
 from rbfmuscle.validation import UsageError
 
@@ -108,6 +109,27 @@ class TestFront:
         assert verdict["factor"] == pytest.approx(factor)
         assert verdict["near"] is near
         assert ("lies on the Pareto front" in verdict["text"]) is rows[2]["front"]
+
+
+def test_page_shows_milliseconds_roles_and_the_ends_of_the_front(monkeypatch):
+    rows = [row(1.0, 0.004, "default"), row(2.0, 0.002), row(0.5, 0.008), row(np.nan, 1.0, "reference")]
+    rows[1]["settings"], rows[2]["settings"] = {"model": "pbd", "model.sweeps": 3}, {"model.centres": 90}
+    rows[3]["settings"] = {"model.centres": 300}
+    verdicts, drawn = mark_front(rows), []
+    monkeypatch.setattr(sweep_page, "front_plot", lambda points, labels: drawn.extend(points))
+    sweep_page.front_picture(rows, "error_rms")
+    default, quick = (4.0, 1.0, "default", "s", True, True), (2.0, 2.0, "sweeps 3", "s pbd", False, True)
+    assert [tuple(point) for point in drawn] == [default, quick, (8.0, 0.5, "centres 90", "s", False, True)]
+    lights = sweep_page._lights(rows, verdicts, "error_rms")
+    wanted = {
+        "default": ("1 mm", "4 ms"),
+        "the quickest": ("2 mm", "2 ms"),
+        "the most accurate": ("0.5 mm", "8 ms"),
+    }
+    assert {light.title: tuple(cell.text for cell in light.cells) for light in lights} == wanted
+    assert not sweep_page.inside_grid(rows)  # as nothing else has 300 centres
+    rows[3]["settings"] = {"model.centres": 90}
+    assert sweep_page.inside_grid(rows)
 
 
 class TestRun:

@@ -77,19 +77,6 @@ class TestStream:
             assert timeless(tmp_path / "streamed" / name) == timeless(tmp_path / "saved" / name), name
         assert ",bones_overlap" in (tmp_path / "saved" / "events.csv").read_text(encoding="utf-8")
 
-    def test_interrupt_keeps_the_frames_so_far(self, tmp_path):
-        def stop(done, total):
-            if done == 2:
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            stream_run(arm_scene(), tmp_path, progress=stop)
-        saved = SavedRun(tmp_path)
-        assert saved.info["status"] == "interrupted"
-        assert saved.frames == [0, 1] and {r.frame for r in saved.metrics} == {0, 1}
-        assert len(saved.surface("biceps", 1)[0]) > 0
-        assert (tmp_path / "surfaces.pvd").read_text(encoding="utf-8").endswith("</VTKFile>\n")
-
     def test_failure_is_written_down(self, tmp_path, monkeypatch):
         use_blend_model(monkeypatch, fail_at=8)
         with pytest.raises(SolveError, match="planted"):
