@@ -105,6 +105,7 @@ class TestFront:
     )
     def test_default_is_judged_by_the_factor_to_the_front(self, error, time, factor, near):
         rows = [row(1.0, 1.0), row(5.0, 0.5), row(error, time, "default"), row(np.nan, 0.1, "reference")]
+        assert mark_front([row(0.0, 1.0, "default"), row(0.0, 0.5)])[0]["factor"] == 1.0
         (verdict,) = mark_front(rows)
         assert verdict["factor"] == pytest.approx(factor)
         assert verdict["near"] is near
@@ -116,6 +117,7 @@ def test_page_shows_milliseconds_roles_and_the_ends_of_the_front(monkeypatch):
     rows[1]["settings"], rows[2]["settings"] = {"model": "pbd", "model.sweeps": 3}, {"model.centres": 90}
     rows[3]["settings"] = {"model.centres": 300}
     verdicts, drawn = mark_front(rows), []
+    assert "(1 mm at 4 ms per frame)" in verdicts[0]["text"]
     monkeypatch.setattr(sweep_page, "front_plot", lambda points, labels: drawn.extend(points))
     sweep_page.front_picture(rows, "error_rms")
     default, quick = (4.0, 1.0, "default", "s", True, True), (2.0, 2.0, "sweeps 3", "s pbd", False, True)
