@@ -68,6 +68,7 @@ def test_run_that_is_loaded_is_the_run_that_was_saved(run, loaded, tmp_path):
         np.testing.assert_array_equal(other.poses["femur"], mine.poses["femur"])
         assert list(other.surfaces) == ["abductor"]
     found, wanted = (each["abductor"].surface().vertices for each in (loaded, run))
+    np.testing.assert_array_equal(wanted, run.frames[-1].surfaces["abductor"].vertices)
     np.testing.assert_allclose(found, wanted, rtol=1e-6)
     np.testing.assert_array_equal(loaded.values("abductor", "length"), run.values("abductor", "length"))
     loaded.save(tmp_path / "copy")

@@ -6,8 +6,10 @@ import json
 import numpy as np
 import pytest
 from command_line import call
+from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
+from rbfmuscle.cli.new import _beside, _write_surfaces
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.importers.labels import surfaces
 from rbfmuscle.importers.labels.read import LabelVolume, read_labels, read_names
@@ -181,9 +183,20 @@ def test_a_volume_larger_than_the_limit_is_refused_unread(tmp_path):
         read_labels(tmp_path / "huge.nii")
 
 
-def test_two_labels_of_one_name_are_two_meshes(tmp_path):
-    from rbfmuscle.cli.new import _write_surfaces
+def test_scene_of_a_segmentation_lies_beside_it_and_is_in_its_unit(tmp_path, capsys):
+    file, other = write_nifti(tmp_path / "a.nii.gz", np.ones((3, 3, 3), np.int16), np.eye(4)), tmp_path / "o"
+    given = ((file, None), (tmp_path, None), (file, other), (file, other / "x.toml"))
+    found = [_beside(*pair) for pair in given]
+    assert found == [tmp_path / "a_scene", tmp_path / "scene", other, other]
+    for words, said in (
+        ((file, "--units", "m"), "says its unit"),
+        ((ROOT, "--labels", file), "folder of meshes"),
+    ):
+        code, _, err = call(capsys, "new", *words)
+        assert code == 2 and said in err
 
+
+def test_two_labels_of_one_name_are_two_meshes(tmp_path):
     labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
     source = write_nifti(tmp_path / "a.nii", labels, np.eye(4))
     (tmp_path / "names.csv").write_text("1,Soleus\n2,soleus\n")

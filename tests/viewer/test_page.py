@@ -122,16 +122,6 @@ def test_play_goes_through_the_motion_and_stops(page, tab):
     assert degrees(page) == pytest.approx(2.0 * frame)
 
 
-def test_two_browsers_show_the_same(page, tab, chromium):
-    other = chromium.open(page.address + STEADY)
-    wait_for(lambda: other.slider(FLEXION), SLOW)
-    value = drag(other, 0.2)
-    assert -21 < value < -15
-    other.close()
-    tab.call("Page.bringToFront")  # only the tab in front takes input and draws
-    wait_for(lambda: tab.slider(FLEXION)[0] == value, SLOW)
-
-
 def test_colouring_shows_its_scale_and_changes_the_picture(page, tab):
     before = canvas(tab)
     page.panel.colour.value = "penetration"
