@@ -17,10 +17,12 @@ from blend_model import files_in
 from run_folders import timeless
 
 from rbfmuscle import recording
+from rbfmuscle.child import unexpected_end
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.sharing import crew
 from rbfmuscle.sharing.crew import WorkerPool, helpers_for
 from rbfmuscle.validation import MeshError, SceneWarning, SolveError
 
@@ -55,8 +57,8 @@ def small_scene(mixed=0, **settings):
     return scene.with_options({"output.report": False, **settings})
 
 
-def ended(crew):
-    return all(process.poll() is not None for process in crew._processes)
+def ended(pool):
+    return all(process.poll() is not None for process in pool._processes)
 
 
 def test_folder_is_that_of_one_process_to_the_last_byte(tmp_path, two_helpers, crews, monkeypatch):
@@ -128,7 +130,7 @@ def test_errors_of_a_helper_are_reported_as_they_are(raised, expected):
         process.stdin.write(pickle.dumps((None, [])))
         process.stdin.flush()
         kind, what = pickle.load(process.stdout)
-    assert kind == "failed"
+    assert kind == "failed" and process.returncode == 0
     assert type(what) is type(expected) and str(expected) in str(what)
 
 
@@ -136,7 +138,7 @@ def test_errors_of_a_helper_are_reported_as_they_are(raised, expected):
     ("muscles", "frames", "sliding", "cores", "wanted"),
     [
         (4, 1000, None, 4, 1), (38, 5, None, 4, 1), (38, 37, object(), 4, 1), (38, 37, None, 1, 1),
-        (38, 37, None, 4, 4), (12, 100, None, 4, 2), (38, 37, None, 2, 2),
+        (38, 37, None, 8, 4), (10, 40, None, 4, 2), (38, 37, None, 2, 2),
     ],
 )  # fmt: skip
 def test_helpers_are_as_many_as_bring_more_than_they_cost(muscles, frames, sliding, cores, wanted):
@@ -149,6 +151,7 @@ def test_a_message_that_is_cut_is_the_last_one():
     said = """
 from rbfmuscle.child import Outbox
 box = Outbox()
+print("heard", flush=True)
 try:
     box.put(("done", ["first", lambda: 0]))
 except Exception:
@@ -157,19 +160,32 @@ box.put(("failed", "next"))
 """
     done = subprocess.run([sys.executable, "-c", said], capture_output=True, check=False)
     assert done.returncode == 1 and b"pickle" in done.stderr and b"next" not in done.stdout
+    assert b"heard" in done.stderr and b"heard" not in done.stdout
+    assert "(exit code 0)" in str(unexpected_end(SimpleNamespace(wait=lambda: 0)))
+
+
+@pytest.mark.parametrize(("threads", "share"), [(8, 4), (1, 1)])
+def test_helpers_divide_the_threads(monkeypatch, threads, share):
+    asked, child = [], SimpleNamespace(stdin=io.BytesIO())
+    monkeypatch.setattr("numba.get_num_threads", lambda: threads)
+    monkeypatch.setattr(crew, "start_child", lambda module, count: asked.append(count) or child)
+    WorkerPool(small_scene(), 2)
+    assert asked == [share, share]
 
 
 def test_warnings_and_log_records_of_several_helpers_are_repeated_once(caplog):
     def helper(*messages):
         return SimpleNamespace(stdout=io.BytesIO(b"".join(pickle.dumps(message) for message in messages)))
 
-    crew = WorkerPool.__new__(WorkerPool)
-    crew.times, crew._repeated = {}, set()
+    pool = WorkerPool.__new__(WorkerPool)
+    pool.times, pool._repeated = {}, set()
     warning, line = SceneWarning("bones meet"), ("rbfmuscle.bones", logging.WARNING, "bone: is open")
-    one = helper(("warned", warning), ("logged", line), ("done", (1, {"simulate": 2.0})))
-    other = helper(("logged", line), ("warned", SceneWarning("bones meet")), ("done", (2, {"simulate": 1.0})))
+    one = helper(("warned", warning), ("logged", line), ("done", (1, {"simulate": 0.5})))
+    other = helper(
+        ("logged", line), ("warned", SceneWarning("bones meet")), ("done", (2, {"simulate": 0.25}))
+    )
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
-        assert [crew._next(one), crew._next(other)] == [1, 2] and crew.times == {"simulate": 2.0}
+        assert [pool._next(one), pool._next(other)] == [1, 2] and pool.times == {"simulate": 0.5}
     assert [str(w.message) for w in heard] == ["bones meet"]
     assert [record.getMessage() for record in caplog.records] == ["bone: is open"]
