@@ -305,56 +305,59 @@ def passes(tree: Path, tests: list[str], kind: str, *, seconds: float) -> tuple[
 
 
 def run(count: int, seed: int, minutes: float) -> None:
-    """Plant the sample one after the other until the time is over; what has a result is not run again."""
+    """Plant the sample until the time is over: all on quick tests, then what these let pass on others."""
     end, tree = time.monotonic() + 60.0 * minutes, WORK / f"tree{os.getpid()}"
     shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(*LEFT_OUT), symlinks=True)
     for part in (*PACKAGES, "tests", "benchmarks"):
         compileall.compile_dir(tree / part, quiet=2)
     reach, sound = {kind: Reach(kind) for kind in ("plain", "compiled")}, {}
-    done = {row["key"] for row in results()}
-    for fault in sample(count, seed):
+    done = {row["key"]: row for row in results()}
+    for step, fault in ((k, fault) for k in range(len(STEPS)) for fault in sample(count, seed)):
         path = tree / fault.path
         source = path.read_bytes()
         key = fault.key(source)
-        if key in done:
+        before = done.get(key, {"outcome": "unreached", "step": -1})
+        if before["outcome"] == "noticed" or before["step"] >= step:
             continue
         if time.monotonic() > end:
             print("time is over; the same command goes on from here")
             break
         if group_of(fault.path) not in COLD and (WORK / "cache").exists():
             shutil.copytree(WORK / "cache", tree / "cache", copy_function=os.link)
-        outcome, by = "unreached", ""
+        outcome, by = before["outcome"], ""
         for kind in ("plain", "compiled") if fault.loop else ("compiled", "plain"):
-            for step in reach[kind].steps(fault):
-                tests = [test for test in step if sound.get((kind, test), True)]
-                while tests and outcome != "noticed":
-                    path.write_bytes(fault.planted(source))
-                    seconds = reach[kind].time(tests)
-                    good, by = passes(tree, tests, kind, seconds=seconds)
-                    path.write_bytes(source)
-                    outcome = "unnoticed" if good else "noticed"
-                    if not good and by in tests:  # a test that fails anyway tells nothing
-                        sound.setdefault((kind, by), passes(tree, [by], kind, seconds=seconds)[0])
-                        if not sound[kind, by]:
-                            outcome, tests = "unreached", [test for test in tests if test != by]
-                            continue
-                    break
+            steps = reach[kind].steps(fault)[step : step + 1]
+            tests = [test for chosen in steps for test in chosen if sound.get((kind, test), True)]
+            while tests and outcome != "noticed":
+                path.write_bytes(fault.planted(source))
+                seconds = reach[kind].time(tests)
+                good, by = passes(tree, tests, kind, seconds=seconds)
+                path.write_bytes(source)
+                if not good and by in tests:  # a test that fails anyway tells nothing
+                    sound.setdefault((kind, by), passes(tree, [by], kind, seconds=seconds)[0])
+                    if not sound[kind, by]:
+                        tests.remove(by)
+                        continue
+                outcome = "unnoticed" if good else "noticed"
+                break
             if outcome == "noticed" or (outcome == "unnoticed" and not fault.loop):
                 break
         shutil.rmtree(tree / "cache", ignore_errors=True)
-        before = source[fault.start : fault.end].decode()
-        row = {"key": key, "seed": seed, "outcome": outcome, "by": by, "path": fault.path, "line": fault.line}
+        text = source[fault.start : fault.end].decode()
+        row = {"key": key, "seed": seed, "outcome": outcome, "step": step, "by": by, "path": fault.path}
+        row |= {"line": fault.line, "loop": fault.loop, "before": text, "after": fault.text}
+        done[key] = row
         with (WORK / "results.jsonl").open("a") as file:
-            file.write(json.dumps({**row, "loop": fault.loop, "before": before, "after": fault.text}) + "\n")
-        print(f"{outcome:9} {key} {fault.path}:{fault.line} {before!r} -> {fault.text!r}", flush=True)
+            file.write(json.dumps(row) + "\n")
+        print(f"{outcome:9} {key} {fault.path}:{fault.line} {text!r} -> {fault.text!r}", flush=True)
     shutil.rmtree(tree, ignore_errors=True)
 
 
 def results() -> list[dict]:
-    """All results so far."""
+    """The last result of each fault so far."""
     path = WORK / "results.jsonl"
     text = path.read_text(encoding="utf-8") if path.exists() else ""
-    return [json.loads(line) for line in text.splitlines()]
+    return list({row["key"]: row for row in map(json.loads, text.splitlines())}.values())
 
 
 def table(seed: int) -> str:
@@ -388,10 +391,9 @@ def main() -> None:
     given = parser.parse_args()
     if given.what == "record":
         record(given.tests)
-        return
-    if given.what == "run":
+    elif given.what == "run":
         run(given.count, given.seed, given.minutes)
-    print(table(given.seed))
+    print("recorded" if given.what == "record" else table(given.seed))
 
 
 if __name__ == "__main__":
