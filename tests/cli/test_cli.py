@@ -127,7 +127,7 @@ class TestErrors:
             ("check setting.toml", 3, "model: unknown key 'centers', did you mean 'centres'"),
             ("check number.toml", 3, "centres: input should be greater than or equal to 0, got -5"),
             ("check kernel.toml", 3, "unknown kernel 'cubik', did you mean 'cubic'"),
-            ("paths phantom -o o --samples 3", 2, "--samples 3 is too few"),
+            ("paths phantom -o o --samples 9", 2, "--samples 9 is too few"),
             ("check metres.toml", 4, "cannot be right; correct the scene's units, or set its scale (0.01"),
             ("check bare.toml", 3, "not valid TOML: Invalid value (at line 4, column 9)"),
             ("sweep arm.toml -o o --grid model.centers=60,70", 2, "did you mean 'centres'"),
@@ -141,6 +141,7 @@ class TestErrors:
             ("compare arm.toml -o o --set model=xpdb", 2, "did you mean 'xpbd'"),
             ("compare arm.toml -o o --models rbf,pbd --set pbd:model.sweeps=3", 2, "unknown key 'sweeps'"),
             ("kernels phantom -o o --centres 100,many", 2, "--centres must be whole numbers of 8 and more"),
+            ("kernels phantom -o o --centres 100,7", 2, "--centres must be whole numbers of 8 and more"),
             ("export nowhere --format stl", 2, "holds no run"),
             ("render nowhere -o a.png", 2, "holds no run"),
             ("new nowhere --units mm", 2, "is no folder"),
@@ -171,6 +172,12 @@ class TestOtherCommands:
         code, out, err = call(capsys, "check", folder / "arm.toml")
         volume = rm.Scene.load(folder / "arm.toml").muscle("biceps").mesh.volume / 1e3
         assert code == 0 and "muscle biceps: model rbf" in out and f"{volume:.4g} cm3" in out
+        assert "superior is (0, 0, 1), anterior (0, -1, 0)" in out and "field of" not in out
+        assert not (folder / "arm.png").exists()
+        text = (folder / "arm.toml").read_text(encoding="utf-8")
+        (folder / "bones.toml").write_text(text[: text.index("[[muscle]]")])
+        code, out, _ = call(capsys, "check", folder / "bones.toml")  # before there are muscles
+        assert code == 3 and "joint elbow" in out and "add a [[muscle]]" in out
         assert err.splitlines()[-1].startswith("usable; next: rbfmuscle run ")
         assert json.loads(call(capsys, "check", folder / "arm.toml", "--json")[1])["scene"]["units"] == "mm"
         code, out, err = call(capsys, "check", folder / "none.toml", "--json")

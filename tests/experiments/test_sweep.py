@@ -14,7 +14,7 @@ import pytest
 from blend_model import arm_files, arm_scene, use_blend_model
 
 from rbfmuscle.cli.app import run_command as command
-from rbfmuscle.cli.study import run_point
+from rbfmuscle.cli.study import _names, run_point
 from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep
 from rbfmuscle.experiments.sweep_run import (
     SweepFolder,
@@ -218,14 +218,13 @@ def test_a_cluster_that_loses_one_of_two_workers_gives_the_same_table(finished, 
     assert rows_of(points, tmp_path / "out") == rows_of(*finished)
 
 
-def test_no_scheduler_is_said(tmp_path, monkeypatch):
-    pytest.importorskip("distributed")
-    monkeypatch.setattr("rbfmuscle.experiments.sweep_run.CONNECT_WITHIN", 2)
-    with pytest.raises(UsageError, match="no Dask scheduler"):
-        sweep(tmp_path, cluster="tcp://127.0.0.1:1")
-
-
 class TestCommand:
+    def test_scenes_of_one_name_are_named_by_their_folders(self):
+        assert _names(["x/a.toml", "x/b.toml"]) == {"a": "x/a.toml", "b": "x/b.toml"}
+        assert _names(["x/a.toml", "y/a.toml"]) == {"x": "x/a.toml", "y": "y/a.toml"}
+        with pytest.raises(UsageError, match="different names"):
+            _names(2 * ["x/a.toml"])
+
     def test_failed_points_end_with_five_and_are_run_again(self, tmp_path, monkeypatch, capsys):
         scenes = [str(arm_files(tmp_path, name)) for name in ("arm.toml", "other.toml")]
         base = ["sweep", *scenes, "-o", str(tmp_path / "out"), "--jobs", "1"]
