@@ -221,6 +221,9 @@ class Reach:
         path = WORK / f"{kind}.json"
         found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         self.kind, self.lines, self.seconds = kind, found.get("lines", {}), found.get("seconds", {})
+        self.tests = {test for lines in self.lines.values() for found in lines.values() for test in found}
+        files = {test.partition("::")[0] for test in self.tests}
+        self.named = {file: set(WORD.findall((ROOT / file).read_text(encoding="utf-8"))) for file in files}
         self.words: dict[tuple[str, str], set[str]] = {}
         self.made: list[tuple[str, set[str]]] = []
         for file, lines in self.lines.items():
@@ -241,18 +244,17 @@ class Reach:
             found = self._naming(fault.name)
         if not found and not fault.loop:
             found = {test for tests in lines.values() for test in tests}
-        place = {}
-        files: dict[str, int] = defaultdict(int)
-        for test in sorted(found, key=lambda t: (self._time(t), t)):
+        place, files = {}, defaultdict(int)
+        for test in sorted(found, key=lambda t: (self.time(t), t)):
             file = test.partition("::")[0]
             near = f"/{group_of(fault.path)}/" in file or Path(fault.path).stem in file
-            place[test] = files[file] // (3 if near else 1), self._time(test), test
+            place[test] = files[file] // (3 if near else 1), self.time(test), test
             files[file] += 1
         ordered, steps = sorted(found, key=place.__getitem__), []
         for most, budget in STEPS:
             chosen, spent = [], 0.0
             for test in ordered:
-                spent += self._time(test)
+                spent += self.time(test)
                 if len(chosen) == most or (chosen and spent > budget):
                     break
                 chosen.append(test)
@@ -263,20 +265,18 @@ class Reach:
         return [step for step in steps if step]
 
     def _naming(self, name):
-        """Tests that run a line with a name, or with that of a loop or constant that is made with it."""
+        """Tests that say a name or run a line with it, or with that of a loop or constant that is made with it."""
         names: set[str] = set()
         more = {name}
         while more:
             names |= more
             more = {made for made, words in self.made if words & names} - names
         found = [self.lines[file][n] for (file, n), words in self.words.items() if words & names]
+        found.append([test for test in self.tests if self.named[test.partition("::")[0]] & names])
         return {test for tests in found for test in tests}
 
-    def time(self, tests: list[str]) -> float:
-        """Seconds that tests took together."""
-        return sum(self._time(test) for test in tests)
-
-    def _time(self, test):
+    def time(self, test: str) -> float:
+        """Seconds that a test took."""
         file, _, rest = test.partition("::")
         return self.seconds.get(f"{file.removesuffix('.py')}/{rest}".replace("::", "/"), 1.0)
 
@@ -330,7 +330,7 @@ def run(count: int, seed: int, minutes: float) -> None:
             tests = [test for chosen in steps for test in chosen if sound.get((kind, test), True)]
             while tests and outcome != "noticed":
                 path.write_bytes(fault.planted(source))
-                seconds = reach[kind].time(tests)
+                seconds = sum(map(reach[kind].time, tests))
                 good, by = passes(tree, tests, kind, seconds=seconds)
                 path.write_bytes(source)
                 if not good and by in tests:  # a test that fails anyway tells nothing
