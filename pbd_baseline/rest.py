@@ -17,7 +17,7 @@ from rbfmuscle.geometry.harmonic import surface_gradient
 from rbfmuscle.geometry.surfaces import edge_lengths, vertex_normals
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import MeshError, NotFiniteError, SceneError, check_finite
+from rbfmuscle.validation import MeshError, NotFiniteError, check_finite
 
 # Raise it when weights or room are computed in another way: entries of the cache are then not found.
 VERSION = 4
@@ -42,11 +42,8 @@ class RestState:
     def from_muscle(cls, muscle: Muscle, scene: Scene, options: PBDOptions) -> RestState:
         """Measure a muscle of a scene.
 
-        Raises MeshError if its mesh is not closed, or no smooth weights can be found on it, SceneError if nothing
-        holds it.
+        Raises MeshError if its mesh is not closed, or no smooth weights can be found on it.
         """
-        if not muscle.attachments:
-            raise SceneError(f"muscle {muscle.name!r} has no attachment, give attach a place on two bones")
         order, vertices, faces, bones, attached_bone = _renumbered(muscle)
         topology = Topology.from_mesh(vertices, faces)
         volume = VolumeConstraint(vertices, faces)
