@@ -95,7 +95,7 @@ class TestOutputs:
         busy = re.compile(r".* s\)|rbfmuscle: compiling loops .*|usable; .*")
         own = [line for line in done.stderr.splitlines() if not busy.fullmatch(line)]
         assert done.returncode == 2 and len(own) == 1
-        assert "standard output" in own[0] and "No space left" in own[0]
+        assert "cannot read or write standard output" in own[0] and ": No space left on device; " in own[0]
 
     def test_closed_standard_output_is_one_line(self, tmp_path):
         scene = write_scene(tmp_path, end=2)
