@@ -5,6 +5,7 @@ import pytest
 
 from rbfmuscle.muscle.solid_loops import (
     Fibres,
+    _deepest,
     carry_loop,
     contact_loop,
     mobility_loop,
@@ -68,6 +69,13 @@ def test_contact_forces_and_gaps_are_complementary(rng):
     solve_contact_forces(gram, need, force, 1000, 1e-12, np.full(6, np.inf))
     slack = gram @ force - need
     assert slack.min() > -1e-10 and force.min() >= 0.0 and abs(slack @ force) < 1e-10
+
+
+def test_the_deepest_contacts_come_first_and_of_equals_the_first(rng):
+    lacking, chosen = rng.integers(0, 6, 40) / 5.0, rng.random(40) < 0.3
+    order = [c for c in np.argsort(-lacking, kind="stable") if lacking[c] > 0.2 and not chosen[c]]
+    for most in (1, 8, 40):
+        assert _deepest(lacking, chosen, 0.2, most).tolist() == order[:most]
 
 
 @pytest.mark.parametrize("measured", [12, 9])

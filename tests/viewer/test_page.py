@@ -146,6 +146,8 @@ def test_hidden_muscles_and_cut_leave_less(page, tab):
     for name in ("extensor", "abductor"):
         page.panel.eyes[name].value = True
     page.panel.cut.value = "z"
+    heights = np.concatenate([vertices[:, 2] for vertices, _ in page.panel.source.muscles.values()])
+    assert page.panel.look().cut == (2, pytest.approx(0.5 * (heights.min() + heights.max())))
     wait_for(lambda: changed(hidden, canvas(tab)) > 0.01, SLOW)
     page.panel.cut.value = "none"
     wait_for(lambda: changed(before, canvas(tab)) < 0.002, SLOW)

@@ -54,7 +54,6 @@ def test_runs_are_named_as_their_folders(run_folder, tmp_path, monkeypatch):
         (["--at", "hip.flexion"], "COORDINATE=DEGREES"),
         (["--at", "hip.flexion=3"], "unknown coordinate 'hip.flexion'"),
         (["--at", "frame=7", "--screenshot", "x.png"], "was not written"),
-        (["--at", "hip.flexion=3", "--screenshot", "x.png"], "unknown coordinate 'hip.flexion'"),
     ],
 )
 def test_wrong_use_is_one_line(run_folder, capsys, arguments, says):
