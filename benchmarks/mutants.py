@@ -36,8 +36,7 @@ WORK = Path(os.environ.get("MUTANTS_FOLDER", ROOT / ".mutants"))
 PACKAGES = ("rbfmuscle", "pbd_baseline")
 # A fault is tried on so many tests at most, of so many seconds together as recorded: quick ones, then others.
 STEPS = ((20, 20.0), (60, 90.0))
-# Seconds of the processor that compiling takes at most, beside three times those of the tests: more is an endless loop.
-LIMIT = 180
+LIMIT = 180  # seconds of compiling at most, beside three times those of the tests: more is an endless loop
 PYTEST = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"]
 COLD = ("bones", "geometry", "implicit", "muscle")  # what they compute is cached, right or wrong
 REFERENCES = "tests/contract/test_whole_runs.py"
@@ -244,10 +243,12 @@ class Reach:
             found = self._naming(fault.name)
         if not found and not fault.loop:
             found = {test for tests in lines.values() for test in tests}
+        own = f"/test_{Path(fault.path).stem}.py"  # which may run it in processes of their own
+        found |= {test for test in self.tests if own in test}
         place, files = {}, defaultdict(int)
         for test in sorted(found, key=lambda t: (self.time(t), t)):
             file = test.partition("::")[0]
-            near = f"/{group_of(fault.path)}/" in file or Path(fault.path).stem in file
+            near = f"/{group_of(fault.path)}/" in file or own in file
             place[test] = files[file] // (3 if near else 1), self.time(test), test
             files[file] += 1
         ordered, steps = sorted(found, key=place.__getitem__), []
@@ -381,8 +382,7 @@ def table(seed: int) -> str:
 
 def main() -> None:
     """The command."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("what", choices=["record", "run", "table"])
     parser.add_argument("tests", nargs="*")
     parser.add_argument("--count", type=int, default=200)
