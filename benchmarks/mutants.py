@@ -189,8 +189,8 @@ def record(tests: list[str]) -> None:
     """Run tests with compiler, and those of ``tests/nojit.txt`` without, and keep which lines each runs."""
     import coverage
 
-    text = (ROOT / "tests/nojit.txt").read_text(encoding="utf-8").splitlines()
-    listed = [line for line in text if not line.startswith("#")]
+    text = (ROOT / "tests/nojit.txt").read_text(encoding="utf-8")
+    listed = re.findall(r"^[^#\n].*", text, re.MULTILINE)
     WORK.mkdir(exist_ok=True)
     for kind, files in (("plain", tests or listed), ("compiled", tests or ["tests"])):
         data, times = WORK / f"{kind}.coverage", WORK / f"{kind}.xml"
@@ -199,9 +199,8 @@ def record(tests: list[str]) -> None:
         options = f"-q -n {os.environ.get('WORKERS', 'auto')} --cov --cov-context=test --cov-report=".split()
         command = [*PYTEST, *options, f"--junitxml={times}", *files]
         subprocess.run(command, cwd=ROOT, env={**os.environ, **more}, check=False)
-        kept = coverage.CoverageData(str(data))
+        kept, lines = coverage.CoverageData(str(data)), {}
         kept.read()
-        lines = {}
         for file in [file for file in kept.measured_files() if file.endswith(".py")]:  # not templates
             contexts = kept.set_query_contexts(None) or kept.contexts_by_lineno(file)
             relative = os.path.relpath(file, ROOT)
@@ -243,15 +242,16 @@ class Reach:
             found = self._naming(fault.name)
         if not found and not fault.loop:
             found = {test for tests in lines.values() for test in tests}
-        own = f"/test_{Path(fault.path).stem}.py"  # which may run it in processes of their own
-        found |= {test for test in self.tests if own in test}
-        place, files = {}, defaultdict(int)
+        own = f"/test_{Path(fault.path).stem}/"  # which may run it in processes of their own
+        for place, rest in [key.split(own, 1) for key in self.seconds if own in key]:
+            found.add(f"{place}{own[:-1]}.py::{rest.replace('/', '::', int(rest.startswith('Test')))}")
+        order, files = {}, defaultdict(int)
         for test in sorted(found, key=lambda t: (self.time(t), t)):
             file = test.partition("::")[0]
-            near = f"/{group_of(fault.path)}/" in file or own in file
-            place[test] = files[file] // (3 if near else 1), self.time(test), test
+            near = f"/{group_of(fault.path)}/" in file or f"{own[:-1]}.py" in file
+            order[test] = files[file] // (3 if near else 1), self.time(test), test
             files[file] += 1
-        ordered, steps = sorted(found, key=place.__getitem__), []
+        ordered, steps = sorted(found, key=order.__getitem__), []
         for most, budget in STEPS:
             chosen, spent = [], 0.0
             for test in ordered:
