@@ -17,7 +17,7 @@ class ContactConstraint:
     longest of its ways out alone, as in the authors' papers, not by their sum.
     """
 
-    def __init__(self, *, reach: float, nearest_only: bool = False) -> None:
+    def __init__(self, *, reach: float, nearest_only: bool) -> None:
         self.reach, self.nearest_only = float(reach), nearest_only
         self.index, self.gap = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.normal = self.anchor = np.zeros((0, 3))

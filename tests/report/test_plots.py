@@ -35,7 +35,7 @@ def test_lines_lie_where_the_numbers_at_the_axes_say():
     np.testing.assert_allclose(drawn(svg, r'<g data-muscle="strap">.*?<path d="([^"]*)"'), [x, y], atol=1e-4)
     limit = drawn(svg, r'<path d="([^"]*)"[^>]*stroke-dasharray')[1]
     np.testing.assert_allclose(limit, 50.0, atol=1e-4)
-    assert "a &lt;title&gt;" in svg and "http" not in svg
+    assert "a &lt;title&gt;" in svg and "http" not in svg and ">angle</text>" in svg and ">mm</text>" in svg
     y[4] = np.nan  # where the line is broken
     svg = line_plot("a", [Track("strap", "#cc6677", x, y)], ("angle", "mm"))
     path = re.search(r'<g data-muscle="strap">.*?<path d="([^"]*)"', svg, re.S)[1]
