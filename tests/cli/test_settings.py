@@ -45,7 +45,6 @@ OTHERS = [
     ("muscle.biceps.model", "arap-volume", ["arap-volume", "rbf"]),
     ("muscle.brachialis.model.centres", 80, ["rbf", "rbf"]),
     ("motion.step", 3.0, ["rbf", "rbf"]),
-    ("motion.ramp.elbow.flexion.step", 1.0, ["rbf", "rbf"]),
 ]
 
 

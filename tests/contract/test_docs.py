@@ -45,8 +45,3 @@ def test_what_is_listed_is_there_and_named_once(name):
         assert (ROOT / path).exists(), line
         text = (ROOT / path).read_text(encoding="utf-8") if names else ""
         assert all(re.search(rf"^ *(def|class) {word}\b", text, flags=re.M) for word in names), line
-
-
-def test_quick_tests_are_of_every_package():
-    packages = {path.relative_to(ROOT / "tests").parts[0] for path in (ROOT / "tests").rglob("test_*.py")}
-    assert {line.split("/")[1] for line in listed("fast.txt")} == packages

@@ -27,10 +27,3 @@ def test_file_is_shown_and_names_command_commit_and_machine(path):
     assert facts["rows"] and (ROOT / script).exists() and (ROOT / figures.COMMANDS[path.stem][0]).exists()
     shown = "".join(page.read_text(encoding="utf-8") for page in figures.page_files())
     assert f"<!-- evidence: {path.stem} -->" in shown
-
-
-def test_scripts_that_pages_name_exist():
-    for page in figures.page_files():
-        text = page.read_text(encoding="utf-8")
-        for script in re.findall(r"\b((?:benchmarks|examples)/\w+(?:/\w+)?\.py)", text):
-            assert (ROOT / script).exists(), f"{page.name}: {script}"

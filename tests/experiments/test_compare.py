@@ -14,7 +14,7 @@ from rbfmuscle.experiments.comparison import MEASURES, best_models, describe
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.models import build_model
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.report.comparison_page import shown
+from rbfmuscle.report.comparison_page import _values, shown
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import UsageError
 
@@ -26,6 +26,8 @@ def test_what_does_not_count_is_a_tie():
     found = {name: {"all": {"distance_rms": 1.0, "slack": s}} for name, s in (("a", 1.0), ("b", 0.9))}
     assert best_models(found, "distance_rms", "mm") == best_models({"a": found["a"]}, "slack", "mm") == []
     assert best_models(found, "slack", "mm") == ["a"]  # which is perfect at 1
+    known = {"models": ["a"], "results": found}
+    assert (_values(known, "slack"), _values(known, "flicker")) == ([1.0], [])
     table = {"measures": {name: {"unit": "mm"} for name in MEASURES}}
     values = ("return_rms", 0.009), ("return_rms", 0.011), ("distance_rms", 0.4), ("distance_max", 0.4)
     assert [shown(table, *value) for value in values] == ["0 mm", "0.011 mm", "0.4 mm", "0.4 mm"]

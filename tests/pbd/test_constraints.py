@@ -1,6 +1,7 @@
 """Known answers of the mesh baseline: connections, colours, constraints, volume."""
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,9 +9,11 @@ import trimesh
 
 from pbd_baseline.bending import BendingConstraint
 from pbd_baseline.constraints import EdgeConstraint, VolumeConstraint
+from pbd_baseline.contact import ContactConstraint
 from pbd_baseline.topology import Topology, colour
 from pbd_baseline.weights import even_weights
 from rbfmuscle.geometry.harmonic import harmonic_weights
+from rbfmuscle.simulation.contact import HalfSpaces
 
 
 def ellipsoid(subdivisions=3, axes=(3.0, 2.0, 1.0)):
@@ -104,6 +107,16 @@ def test_volume_is_met_quadratically_and_by_restoring_in_one_step(rng):
     points = vertices * 0.9 + 0.01 * rng.normal(size=vertices.shape)
     constraint.restore(points, constraint.gradient(points))
     assert constraint.volume(points) == pytest.approx(constraint.rest, rel=1e-14)
+
+
+def test_a_vertex_in_two_bones_moves_by_both_ways_or_by_the_longest_alone():
+    spaces = HalfSpaces(np.zeros(2, int), np.array([-0.2, -0.5]), np.eye(3)[:2], np.arange(2))
+    contacts = SimpleNamespace(half_spaces=lambda *given: spaces)
+    for alone, wanted in ((False, [0.2, 0.5, 0.0]), (True, [0.0, 0.5, 0.0])):
+        constraint, points = ContactConstraint(reach=1.0, nearest_only=alone), np.zeros((1, 3))
+        assert constraint.find(contacts, points) == constraint.depth(points) == 0.5
+        constraint.project(points)
+        np.testing.assert_allclose(points, [wanted], atol=1e-15)
 
 
 def test_even_weights_stretch_less_than_harmonic_ones(body):
