@@ -79,9 +79,8 @@ def test_radial_functions_against_fifty_digits(name, k):
 @pytest.mark.parametrize("name", KERNELS)
 def test_limits_at_zero_are_exact(name):
     kernel = KERNELS[name]
-    tiny = 1e-9
     for k, function in enumerate([kernel.phi, kernel.first, kernel.second]):
-        limit, near = float(function(0.0)), float(literal_radial(name, tiny, k))
+        limit, near = float(function(0.0)), float(literal_radial(name, 1e-9, k))
         if np.isfinite(limit):
             # the next term of the expansion is of order s (log s), its factor at most 1e4
             assert abs(near - limit) <= 1e-3 * max(1, abs(limit)) or name == "skala_cervenka"
@@ -98,6 +97,7 @@ def test_epsilon_multiplies_the_distance(name):
     h = 1e-5
     slope = (kernel.phi(r + h, 0.5) - kernel.phi(r - h, 0.5)) / (2 * h)
     assert np.allclose(kernel.first(r, 0.5) * r, slope, rtol=1e-7, atol=1e-9)
+    assert kernel.compact == (LITERAL[name](mp.mpf(2)) == 0)
     if kernel.compact:
         assert kernel.phi(0.999 / 0.3, 0.3) >= 0
         assert kernel.phi([1 / 0.3, 5.0, 1e60], 0.3).tolist() == [0, 0, 0]
