@@ -145,14 +145,13 @@ def _facing(one, other, index):
 
 
 def holders(scene, models, surfaces):
-    """Bones that the vertices (n,) of each surface at rest go along with, as the model's nearest contact point does."""
-    names = np.array([*(bone.name for bone in scene.bones), ""])
-    return {
-        model.name: names[
-            np.asarray(model.contact_bone)[cKDTree(model.contact_points()).query(surfaces[model.name][0])[1]]
-        ]
-        for model in models
-    }
+    """What the vertices (n,) of each surface at rest go along with, as the model's nearest contact point does."""
+    found = {}
+    for model in models:
+        names = np.array([*scene.holders(scene.muscle(model.name)), ""])
+        nearest = cKDTree(model.contact_points()).query(surfaces[model.name][0])[1]
+        found[model.name] = names[np.asarray(model.contact_bone)[nearest]]
+    return found
 
 
 def _near(one, other, reach):
