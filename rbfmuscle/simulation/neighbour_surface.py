@@ -132,6 +132,12 @@ class NeighbourSurface:
             or np.any(other.reach_box[1] < self.box[0] - reach)
         )
 
+    def is_near(self, other: NeighbourSurface, reach: float) -> bool:
+        """Whether a contact point of the other muscle is nearer than ``reach`` to this surface."""
+        low, high, points = self.box[0] - reach, self.box[1] + reach, other.points
+        near = points[np.all((points > low) & (points < high), axis=1)]
+        return len(self.query(near, reach)[0]) > 0
+
     def query(self, points: Floats, reach: Floats | float) -> Found:
         """Distances of those points that are nearer than ``reach``.
 

@@ -45,18 +45,33 @@ class Sliding:
             for stepper in steppers
             if any(stepper.name in pair for pair in pairs)
         }
+        self.limits = limits
+        #: Pairs that have not come near each other yet.
+        self.apart = [
+            (one, other)
+            for one in steppers
+            for other in steppers
+            if one.name < other.name and frozenset((one.name, other.name)) in pairs
+        ]
+        self._link_near()
         for stepper in steppers:
-            for other in steppers:
-                if frozenset((stepper.name, other.name)) in pairs:
-                    self._link(stepper, other, limits)
             if scene.sliding.bones:
                 held = [BoneLink(stepper, b, limits) for b in stepper.contacts.reached]
                 self.bone_links[stepper.name] = held
                 stepper.contacts.neighbours += [link.pull for link in held]
 
-    def _link(self, stepper: MuscleStepper, other: MuscleStepper, limits: SlidingLimits) -> None:
+    def _link_near(self) -> None:
+        """Link the muscles that are near each other now; done at rest and after each frame."""
+        for pair in list(self.apart):
+            one, other = (self.surfaces[stepper.name] for stepper in pair)
+            if other.is_near(one, self.limits.search):
+                self.apart.remove(pair)
+                self._link(*pair)
+                self._link(*pair[::-1])
+
+    def _link(self, stepper: MuscleStepper, other: MuscleStepper) -> None:
         """Link a muscle to a neighbour."""
-        link = SlidingPair(stepper, self.surfaces[stepper.name], self.surfaces[other.name], limits)
+        link = SlidingPair(stepper, self.surfaces[stepper.name], self.surfaces[other.name], self.limits)
         self.links[stepper.name].append(link)
         stepper.contacts.neighbours += [link.push, link.pull]
         stepper.contacts.cuts.append(link)
@@ -79,6 +94,7 @@ class Sliding:
             if due:
                 self._step(due, {name: (stops[k], stops[stop]) for name, k in here.items()})
             here.update((stepper.name, stop) for stepper in due)
+        self._link_near()
 
     def _step(self, due: list[MuscleStepper], paths: Mapping[str, tuple[Coordinates, Coordinates]]) -> None:
         """One sub-step of some muscles, each from its own last coordinates."""
@@ -107,7 +123,8 @@ class Sliding:
                     self.surfaces[stepper.name].learn(*paths[stepper.name])
 
         each(predict, due)
-        each(wait, [stepper for stepper in self.steppers if stepper not in due])
+        seen = {link.other.model.name for stepper in due for link in self.links[stepper.name]}
+        each(wait, [stepper for stepper in self.steppers if stepper.name in seen and stepper not in due])
         for act in (find_planes, MuscleStepper.correct, learn):
             each(act, due)
 

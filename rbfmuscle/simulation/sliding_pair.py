@@ -23,8 +23,11 @@ THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 15.0
 BETWEEN = 0.5
 # Neighbours are looked for within this distance [mm] of points that are not linked.
 SEARCH = 3.0
-# Distance [mm] between the surfaces as solved below which they are cut, and how deep an overlap may be.
-CUT_FROM, CUT_DEPTH = 3.0, 6.0
+# Surfaces are cut in cells of CUT_DEPTH [mm] around points that are nearer than CUT_FROM to the neighbour, as solved.
+CUT_FROM, CUT_DEPTH = 2.0, 3.0
+# Steps between cells of a grid along its axes, and from a cell to itself and those around it.
+ALONG = np.array([1, 1 << 20, 1 << 40])
+AROUND = np.stack(np.meshgrid(*3 * [[-1, 0, 1]]), axis=-1).reshape(-1, 3) @ ALONG
 # How far planes between muscles yield to a pressure, relative to a bone's. One point in each cell of SPARSE mean edges
 # has a plane that holds muscles together, which yields less in proportion.
 YIELDS, SPARSE = 40.0, 2.0
@@ -57,8 +60,8 @@ class SlidingPair:
     ) -> None:
         self.own, self.other, self.limits = own, other, limits
         self.free = stepper.contacts.free(len(stepper.model.contact_points()))
-        #: Box in which points of this muscle are near the neighbour, and the pair seen from the neighbour.
-        self.zone: Floats | None = None
+        #: Sorted cells of space where this muscle is near the neighbour, and the pair seen from the neighbour.
+        self.zone = np.zeros(0, dtype=np.int64)
         self.back: SlidingPair | None = None
         at = np.flatnonzero(self.free)
         apart = np.full(len(at), limits.reach)
@@ -132,25 +135,21 @@ class SlidingPair:
         """
         limits, at = self.limits, np.flatnonzero(self.free)
         close, distance, _, _ = self._ask(at, limits.cut_from)
-        self.zone, points = None, self.own.points[at[close]]
-        if len(points):
-            self.zone = np.array(
-                [points.min(axis=0) - limits.cut_depth, points.max(axis=0) + limits.cut_depth]
-            )
+        met = _cells(self.own.points[at[close]], limits.cut_depth)
+        self.zone = np.unique(met[:, None] + AROUND)
         apart = np.full(len(self.at), limits.reach)
         index, now, _, _ = self._near()
         apart[index] = now
         opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
         return max(0.0, -float(distance.min(initial=0.0))), len(opened), float((opened**2).sum())
 
-    def meeting(self) -> Floats | None:
-        """Box (2, 3) in which the two meet, as seen from either; None where they do not."""
-        zones = [pair.zone for pair in (self, self.back) if pair is not None and pair.zone is not None]
-        if not zones:
-            return None
-        return np.array(
-            [np.min([zone[0] for zone in zones], axis=0), np.max([zone[1] for zone in zones], axis=0)]
-        )
+    def _met(self, points: Floats) -> Integers:
+        """Indices of the points (n, 3) where the two meet, as seen from either."""
+        cell, inside = _cells(points, self.limits.cut_depth), np.zeros(len(points), dtype=np.bool_)
+        for pair in (self, self.back):
+            if pair is not None and len(pair.zone):
+                inside |= pair.zone[np.searchsorted(pair.zone[:-1], cell)] == cell
+        return np.flatnonzero(inside)
 
     def cut(self, points: Floats) -> tuple[Floats, Floats]:
         """The surface midway between two overlapping muscles.
@@ -159,16 +158,11 @@ class SlidingPair:
         (n, 3). Where both have a field, both surfaces are clipped where their fields are equal.
         """
         value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
-        zone = self.meeting()
-        if zone is None:
-            return value, gradient
-        inside = np.all((points > zone[0]) & (points < zone[1]), axis=1)
+        both = self._met(points)
         if self.own.field is not None and self.other.field is not None:
-            both = np.flatnonzero(inside)
             ours, own = self.own.field.value_and_gradient(points[both])
             theirs, normal = self.other.field.value_and_gradient(points[both])
         else:
-            both = np.flatnonzero(inside)
             near, theirs, normal, _ = self.other.query(points[both], self.limits.cut_depth)
             met, ours, own, _ = self.own.query(points[both[near]], self.limits.cut_depth)
             both, theirs, normal = both[near[met]], theirs[met], normal[met]
@@ -177,11 +171,8 @@ class SlidingPair:
 
     def points(self) -> Floats:
         """Points (k, 3) of the neighbour where the two meet, which must stay outside the surface."""
-        zone = self.meeting()
-        if zone is None:
-            return np.zeros((0, 3))
-        found, (low, high) = self.other.vertices, zone
-        return found[np.all((found > low) & (found < high), axis=1)]
+        found = self.other.vertices
+        return found[self._met(found)]
 
     def _near(self) -> Found:
         """Of the points ``at`` those near the neighbour: linked ones up to their release distance, others less far."""
@@ -202,6 +193,11 @@ def _nearest_by_cell(points: Floats, distance: Floats, size: float) -> Integers:
         return np.arange(len(points))
     order = np.argsort(distance, kind="stable")
     return np.sort(order[np.unique(np.floor(points[order] / size), axis=0, return_index=True)[1]])
+
+
+def _cells(points: Floats, size: float) -> Integers:
+    """Number (n,) of the cell of a grid that each point (n, 3) lies in."""
+    return np.floor(points / size).astype(np.int64) @ ALONG
 
 
 class BoneLink:

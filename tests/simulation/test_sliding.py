@@ -194,9 +194,8 @@ def test_cut_is_midway_between_overlapping_muscles():
     inside = upper.x[igl.signed_distance(upper.x, lower.x, lower.faces)[0] < 0]
     assert len(inside) > 10
     assert np.isin(inside.view("f8,f8,f8"), np.ascontiguousarray(met).view("f8,f8,f8")).all()
-    low, high = steppers[0].contacts.cuts[0].meeting()
-    assert np.all((met > low) & (met < high))
-    assert high[2] < upper.x[:, 2].max() + 6.5
+    assert np.abs(igl.signed_distance(met, lower.x, lower.faces)[0]).max() < 12.0
+    assert len(met) < len(upper.x)
 
 
 def test_points_near_a_bone_may_be_held_there(monkeypatch):
