@@ -7,6 +7,7 @@ import trimesh
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.models import build_models
+from rbfmuscle.muscle.rounded_bones import RoundedBones, RoundedContacts
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.contact import BoneContacts
@@ -18,8 +19,6 @@ RADIUS, EDGE = 20.0, 2.0
 @pytest.fixture(scope="module")
 def ball():
     """A ball of flat facets, rounded over a cell, at a pose."""
-    from rbfmuscle.muscle.rounded_bones import RoundedBones, RoundedContacts
-
     mesh = trimesh.creation.icosphere(2, RADIUS)
     field = BoneSDF.from_mesh(mesh, cache=False)
     pose = rotation_about([1, 2, 3], 0.7, np.array([5.0, -2.0, 1.0]))
