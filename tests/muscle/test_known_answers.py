@@ -27,6 +27,11 @@ class TestStretchedBar:
         assert abs(found["radius"]) < radius
         assert abs(found["path"]) < path
 
+    def test_rbf_comes_nearer_with_more_nodes(self):
+        models = ({**FINE_RBF, "nodes": nodes} for nodes in (60, 600))
+        coarse, fine = (abs(study.stretched(1.3, model, 2.0)["radius_ends"]) for model in models)
+        assert fine < 0.6 * coarse
+
 
 class TestBentBar:
     def test_path_arc_and_radius(self):

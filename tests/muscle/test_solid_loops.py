@@ -159,8 +159,7 @@ def test_responses_are_those_of_the_inverse_and_their_gram_is_symmetric(rng, cel
         # Pressing and swelling are transposes.
         swell_loop(motion, cells.start, cells.node, gradient, swollen)
         assert np.vdot(force, motion) == pytest.approx(swollen[r])
-    # Regions whose volumes are one have no factor.
-    twice = np.array([0, 4, 8]), np.tile(cells.node[:4], 2), np.tile(gradient[:4], (2, 1))
+    twice = np.array([0, 4, 8]), np.tile(cells.node[:4], 2), np.tile(gradient[:4], (2, 1))  # no factor
     assert not respond_loop(twice, inverse, np.array([0.0, -1e-3]), white, factor)
 
 
