@@ -43,7 +43,9 @@ def target_loop(y, columns, slopes, fibre, least, tension, q, t, f, target):
     """
     fd = np.empty((3, 3))
     for i in range(len(columns)):
-        f[i, 0], f[i, 1], f[i, 2] = gradient_rows(y, columns[i], slopes[i])
+        first, second, third = gradient_rows(y, columns[i], slopes[i])
+        for b in range(3):
+            f[i, 0, b], f[i, 1, b], f[i, 2, b] = first[b], second[b], third[b]
         e = fibre[i]
         u = 1.0 / np.sqrt(t[i])
         for a in range(3):
