@@ -8,6 +8,7 @@ tibial plafond above it, each with its own radius (Singh et al. 1992; Siegler et
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull
 
 from rbfmuscle.importers.guess.parts import Part
@@ -231,9 +232,6 @@ def fit_coaxial(
         return np.concatenate([root * (row - radius) for root, row, radius in zip(roots, rows, x[4:])])
 
     start = np.r_[np.zeros(4), radii / size]
-    # Half a second to import, and most runs fit nothing.
-    from scipy.optimize import least_squares
-
     x = least_squares(residual, start, loss="soft_l1", f_scale=soft / size, max_nfev=200).x
     parts = np.split(residual(x) * size, np.cumsum([len(root) for root in roots])[:-1])
     misfit = float(np.sqrt(sum(np.mean(part**2) for part in parts)))
