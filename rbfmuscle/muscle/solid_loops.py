@@ -173,15 +173,8 @@ def respond_loop(regions, inverse, yielding, response, factor):
                     value += gradient[s, a] * response[r, a, node[s]]
             factor[r, o] = value
         factor[r, r] += 1e-9 * factor[r, r] + yielding[r]
-    for r in range(count):
-        for o in range(r + 1):
-            for k in range(o):
-                factor[r, o] -= factor[r, k] * factor[o, k]
-            if o < r:
-                factor[r, o] /= factor[o, o]
-        if not factor[r, r] > 0.0:
-            return False
-        factor[r, r] = np.sqrt(factor[r, r])
+    if not _factor_small(factor):
+        return False
     for r in range(count):
         for a in range(3):
             for o in range(r):
@@ -189,6 +182,21 @@ def respond_loop(regions, inverse, yielding, response, factor):
                     response[r, a, n] -= factor[r, o] * response[o, a, n]
             for n in range(nodes):
                 response[r, a, n] /= factor[r, r]
+    return True
+
+
+@compiled(error_model="numpy")
+def _factor_small(matrix):
+    """Turn the lower triangle of a small matrix into its Cholesky factor; returns whether it is positive definite."""
+    for r in range(len(matrix)):
+        for o in range(r + 1):
+            for k in range(o):
+                matrix[r, o] -= matrix[r, k] * matrix[o, k]
+            if o < r:
+                matrix[r, o] /= matrix[o, o]
+        if not matrix[r, r] > 0.0:
+            return False
+        matrix[r, r] = np.sqrt(matrix[r, r])
     return True
 
 
