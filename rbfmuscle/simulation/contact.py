@@ -252,16 +252,16 @@ class BoneContacts:
         return self.contact_bone < 0
 
     def _planes(self) -> _PlaneStack:
-        """The neighbours' planes."""
+        """The neighbours' planes; there is a neighbour."""
         if self._stack is not None:
             return self._stack
-        kinds = [Planes(), *self.neighbours]  # the first stands for no neighbour
+        kinds = self.neighbours
         return _PlaneStack(
             np.concatenate([planes.index for planes in kinds]),
             np.concatenate([planes.gap for planes in kinds]),
             np.concatenate([planes.normal for planes in kinds]),
             np.concatenate([planes.anchor for planes in kinds]),
-            -np.repeat(np.arange(len(kinds)), [len(planes.index) for planes in kinds]),
+            -1 - np.repeat(np.arange(len(kinds)), [len(planes.index) for planes in kinds]),
         )
 
     def _stacked(self, poses):

@@ -260,9 +260,8 @@ def _orient(state, place):
     """Make neighbouring faces agree, then turn what was mended, or the whole, outward; consistent cavities stay."""
     faces = np.ascontiguousarray(state.faces)
     oriented, part = faces, np.zeros(len(faces), dtype=int)
-    if not _agree(
-        faces
-    ):  # most meshes agree, and bfs_orient, which would leave these as they are, takes long
+    # Most meshes agree, and bfs_orient, which would leave these as they are, takes long.
+    if not _agree(faces):
         oriented, part = igl.bfs_orient(faces)
         if not _agree(oriented):
             raise MeshError(f"{place}: the surface has one side only (no consistent orientation); remesh it")
