@@ -93,7 +93,7 @@ def outcome(kernel, points, normals, shape, judge, bound):
         warnings.simplefilter("always", NumericalWarning)
         try:
             apart = spacing(np.unique(np.asarray(points, dtype=float), axis=0)).mean()
-            field = FieldFit(get_kernel(kernel), shape / apart, "all").fit(points, normals)
+            field = FieldFit(get_kernel(kernel), shape / apart).fit(points, normals)
             error = judge(field)
         except (ValueError, np.linalg.LinAlgError) as failed:
             return "refused", None, str(failed)

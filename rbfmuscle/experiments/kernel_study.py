@@ -17,7 +17,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.surfaces import face_normals, mesh_volume, vertex_areas
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
-from rbfmuscle.implicit.field import FieldFit, RBFField, wanted_derivatives
+from rbfmuscle.implicit.field import FieldFit, RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface, spread_points
@@ -90,8 +90,7 @@ class Measured(NamedTuple):
 def measure_row(judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel, placement: str) -> Measured:
     """One row of the table, its times left open, and its surface; ``sample`` holds greedy centres."""
     placement = placement if kernel.hermite else "greedy"
-    derivatives = wanted_derivatives(len(sample.points), fitted=placement == FITTED)
-    fit = FieldFit(kernel, 1.0, derivatives, BOUND if kernel.has_epsilon else np.inf)
+    fit = FieldFit(kernel, 1.0, BOUND if kernel.has_epsilon else np.inf)
     row = {
         "kernel": kernel.name, "centres": len(sample.points), "placement": placement, "epsilon": 0.0, "shape": None,
         "condition": None, "bound": 0.0, "rms": None, "hausdorff": None, "normal_error": None, "volume_error": None,

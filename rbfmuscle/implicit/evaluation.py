@@ -15,31 +15,41 @@ from rbfmuscle.jit import compiled
 
 # Points of a block, and pairs of points and centres below which a thread does not pay.
 _BLOCK, _SERIAL = 256, 200_000
+# Points that are sorted into fits at a time.
+_CHUNK = 4096
+# Beyond this share of the radius of every ball, all grow until the point lies there in the nearest.
+RIM = 0.95
+# How close to a centre its closeness levels off, in radii of the fit's ball.
+NEAR = 0.15
 
 
 class Terms(NamedTuple):
-    """A field as the loops read it, in the scaled coordinates (points - origin) / scale.
+    """A field of P local fits of n centres each, as the loops read it.
 
-    ``centres`` (3, K); ``a`` (K,) and ``b`` (3, K) are the weights of the values and of the derivatives, of which the
-    latter count where ``hermite``; ``coefficients`` (q,) and ``powers`` (q, 3) are the polynomial's.
+    In the coordinates of a fit, (points - origin) / scale with ``origin`` (P, 3) and ``scale`` (P,): ``centres``
+    (P, 3, n); ``a`` (P, n) and ``b`` (P, 3, n) are the weights of the values and of the derivatives, which count where
+    ``hermite``; ``epsilon`` (P,); ``coefficients`` (P, q) and ``powers`` (q, 3) are the polynomial's. A fit counts in a
+    ball, in the caller's coordinates, with ``middle`` (P, 3) and ``radius`` (P,); a single fit counts everywhere.
     """
 
     origin: np.ndarray
-    scale: float
+    scale: np.ndarray
     centres: np.ndarray
     a: np.ndarray
     b: np.ndarray
     hermite: bool
-    epsilon: float
+    epsilon: np.ndarray
     coefficients: np.ndarray
     powers: np.ndarray
+    middle: np.ndarray
+    radius: np.ndarray
 
 
 def evaluate(points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool) -> tuple[Floats, Floats]:
     """A field's values (n,) at points (n, 3), and its gradients (n, 3) by these, which are empty where not wanted."""
     count = len(points)
     value, gradient = np.empty(count), np.empty((count if with_gradient else 0, 3))
-    cubic, form = kernel.plain_cube and terms.epsilon == 1.0, kernel.form
+    cubic, form = kernel.plain_cube and bool((terms.epsilon == 1.0).all()), kernel.form
 
     def work(start: int, stop: int) -> None:
         if cubic:
@@ -47,7 +57,7 @@ def evaluate(points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool) 
         else:
             _evaluate_loop(points, terms, form, start, stop, value, gradient)
 
-    in_chunks(count, work, least=max(_BLOCK, _SERIAL // terms.centres.shape[1]))
+    in_chunks(count, work, least=max(_BLOCK, _SERIAL // terms.centres.shape[2]))
     return value, gradient
 
 
@@ -58,64 +68,164 @@ def evaluate(points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool) 
 @compiled(error_model="numpy")
 def _evaluate_cubic_loop(points, terms, start, stop, value, gradient):
     """Value and, where there is room for it, gradient of the cubic kernel with epsilon 1 at points[start:stop]."""
-    wanted, centres, a, b = len(gradient) > 0, terms.centres, terms.a, terms.b
-    for low in range(start, stop, _BLOCK):
-        n = min(_BLOCK, stop - low)
-        p, acc, g = _fill_block(points, terms, low, n)
-        for j in range(centres.shape[1]):
-            at, slope = (centres[0, j], centres[1, j], centres[2, j]), (b[0, j], b[1, j], b[2, j])
-            if wanted:
-                _cubic_gradient_loop(p, at, a[j], slope, acc, g)
-            else:
-                _cubic_value_loop(p, at, a[j], slope, acc)
-        _polynomial_loop(terms, wanted, p, acc, g)
-        _give_block_loop(terms.scale, low, n, acc, g, value, gradient)
+    wanted, rows = len(gradient) > 0, np.empty(_BLOCK, np.int64)
+    for low in range(start, stop, _CHUNK):
+        x = points[low : min(low + _CHUNK, stop)]
+        shares, growth, total = _shares_loop(x, terms)
+        for fit in range(len(shares)):
+            first = 0
+            while first < len(x):
+                first, p, acc, g = _fill_block(x, terms, fit, shares, first, rows)
+                _cubic_block_loop(terms, fit, wanted, p, acc, g)
+                _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total)
+        _give_loop(low, total, value, gradient)
 
 
 @compiled(error_model="numpy")
 def _evaluate_loop(points, terms, form, start, stop, value, gradient):
     """Value and, where there is room for it, gradient of any kernel at points[start:stop]."""
-    wanted = len(gradient) > 0
-    for low in range(start, stop, _BLOCK):
-        n = min(_BLOCK, stop - low)
-        p, acc, g = _fill_block(points, terms, low, n)
-        _general_block_loop(terms, form, wanted, p, acc, g)
-        _polynomial_loop(terms, wanted, p, acc, g)
-        _give_block_loop(terms.scale, low, n, acc, g, value, gradient)
+    wanted, rows = len(gradient) > 0, np.empty(_BLOCK, np.int64)
+    for low in range(start, stop, _CHUNK):
+        x = points[low : min(low + _CHUNK, stop)]
+        shares, growth, total = _shares_loop(x, terms)
+        for fit in range(len(shares)):
+            first = 0
+            while first < len(x):
+                first, p, acc, g = _fill_block(x, terms, fit, shares, first, rows)
+                _general_block_loop(terms, fit, form, wanted, p, acc, g)
+                _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total)
+        _give_loop(low, total, value, gradient)
 
 
 @compiled(error_model="numpy")
-def _fill_block(points, terms, low, n):
-    """Scaled points (3, m) of a block, its end repeats the last point; zeros (m,) and (3, m) to add to."""
-    size = (n + 7) // 8 * 8
+def _shares_loop(x, terms):
+    """Where points (n, 3) lie in the balls of the fits, and zeros (8, n) for sums over these.
+
+    Squared distances (P, n) from the middles over the squared radii, 0 for a single fit. For points beyond `RIM` of all
+    balls these grow until the nearest is met there: by what the squares are multiplied then, and the derivatives of its
+    logarithm, halved, are (4, n).
+    """
+    fits, n = len(terms.middle), len(x)
+    shares, growth = np.zeros((fits, n)), np.zeros((4, n))
+    growth[0] = 1.0
+    if fits > 1:
+        for k in range(fits):
+            (a, b, c), scale = terms.middle[k], 1.0 / terms.radius[k] ** 2
+            for i in range(n):
+                shares[k, i] = scale * ((x[i, 0] - a) ** 2 + (x[i, 1] - b) ** 2 + (x[i, 2] - c) ** 2)
+        for i in range(n):
+            nearest = 0
+            for k in range(fits):
+                nearest = k if shares[k, i] < shares[nearest, i] else nearest
+            least = shares[nearest, i]
+            if least > RIM * RIM:
+                growth[0, i] = RIM * RIM / least
+                for k in range(fits):
+                    shares[k, i] *= growth[0, i]
+                for c in range(3):
+                    growth[1 + c, i] = (terms.middle[nearest, c] - x[i, c]) / (
+                        least * terms.radius[nearest] ** 2
+                    )
+    return shares, growth, np.zeros((8, n))
+
+
+@compiled(error_model="numpy")
+def _fill_block(x, terms, fit, shares, first, rows):
+    """The next points that lie in a fit's ball, from the first on: where to go on, and these in the fit's coordinates.
+
+    Their numbers are put into ``rows`` (`_BLOCK`,), -1 after the last; the points are (3, m), the last repeated, and
+    zeros (m,) and (3, m) to add to.
+    """
+    count = 0
+    while first < len(x) and count < _BLOCK:
+        if shares[fit, first] < 1.0:
+            rows[count] = first
+            count += 1
+        first += 1
+    size = (count + 7) // 8 * 8
     p = np.empty((3, size))
     for i in range(size):
+        row = rows[min(i, count - 1)]
         for c in range(3):
-            p[c, i] = (points[low + min(i, n - 1), c] - terms.origin[c]) / terms.scale
-    return p, np.zeros(size), np.zeros((3, size))
+            p[c, i] = (x[row, c] - terms.origin[fit, c]) / terms.scale[fit]
+    if count < _BLOCK:
+        rows[count] = -1
+    return first, p, np.zeros(size), np.zeros((3, size))
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def _closeness_loop(p, centres, soft, gradient):
+    """Sum over a fit's centres of 1 / (distance^2 + soft^2)^4 at points (3, m), and its gradient: (4, m)."""
+    out = np.zeros((4, p.shape[1]))
+    for j in range(centres.shape[1]):
+        cx, cy, cz = centres[0, j], centres[1, j], centres[2, j]
+        for i in range(p.shape[1]):
+            dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+            q = 1.0 / (dx * dx + dy * dy + dz * dz + soft * soft)
+            v = (q * q) * (q * q)
+            out[0, i] += v
+            if gradient:
+                w = -8.0 * v * q
+                out[1, i] += w * dx
+                out[2, i] += w * dy
+                out[3, i] += w * dz
+    return out
 
 
 @compiled(error_model="numpy")
-def _give_block_loop(scale, low, n, acc, g, value, gradient):
-    for i in range(n):
-        value[low + i] = acc[i]
-    if len(gradient) > 0:
-        for i in range(n):
+def _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total):
+    """Add a fit's weight w, w f, and the gradients of both, to their sums (8, n).
+
+    w is (1 - t)^4 (4 t + 1) at t of the ball's radius, times how close the fit's own centres are: a sheet of another
+    part of the muscle may have come into the ball, of which the fit knows nothing.
+    """
+    size, radius, single = terms.scale[fit], terms.radius[fit], len(terms.middle) == 1
+    near = (
+        np.zeros((4, p.shape[1]))
+        if single
+        else _closeness_loop(p, terms.centres[fit], NEAR * radius / size, wanted)
+    )
+    for n in range(len(acc)):
+        i = rows[n]
+        if i < 0:
+            break
+        t = np.sqrt(shares[fit, i])
+        ball, close = (1.0 - t) ** 4 * (4.0 * t + 1.0), 1.0 if single else near[0, n] / size**8
+        steep = 0.0 if single else -20.0 * (1.0 - t) ** 3 / radius**2
+        total[0, i] += ball * close
+        total[1, i] += ball * close * acc[n]
+        for c in range(3):
+            away = (
+                growth[0, i] * (x[i, c] - terms.middle[fit, c])
+                + shares[fit, i] * radius**2 * growth[1 + c, i]
+            )
+            slope = steep * away * close + ball * near[1 + c, n] / size**9
+            total[2 + c, i] += slope
+            total[5 + c, i] += ball * close * g[c, n] / size + slope * acc[n]
+
+
+@compiled(error_model="numpy")
+def _give_loop(low, total, value, gradient):
+    """f = sum w f / sum w, and its gradient."""
+    for i in range(total.shape[1]):
+        value[low + i] = total[1, i] / total[0, i]
+        if len(gradient) > 0:
             for c in range(3):
-                gradient[low + i, c] = g[c, i] / scale
+                gradient[low + i, c] = (total[5 + c, i] - value[low + i] * total[2 + c, i]) / total[0, i]
 
 
 @compiled(error_model="numpy")
-def _general_block_loop(terms, form, gradient, p, acc, g):
+def _general_block_loop(terms, fit, form, gradient, p, acc, g):
     """Any kernel: radial functions into scratch blocks, then their sums."""
     d, u = np.empty_like(p), np.empty_like(acc)
     work, radial = np.empty((3, u.size)), np.empty((3, u.size))
-    hermite, centres, weight, slope = terms.hermite, terms.centres, terms.a, terms.b
+    hermite, epsilon = terms.hermite, terms.epsilon[fit]
+    centres, weight, slope = terms.centres[fit], terms.a[fit], terms.b[fit]
     wanted = (2 << (int(gradient) + int(hermite))) - 1
-    e2, ball = terms.epsilon * terms.epsilon, _ball(p)
+    e2, ball = epsilon * epsilon, _ball(p)
     for j in range(centres.shape[1]):
         at = centres[0, j], centres[1, j], centres[2, j]
-        if form.compact and _out_of_reach(ball, at, terms.epsilon):
+        if form.compact and _out_of_reach(ball, at, epsilon):
             continue
         a, b = weight[j], (slope[0, j], slope[1, j], slope[2, j])
         _offsets_loop(p, at, e2, d, u)
@@ -123,6 +233,7 @@ def _general_block_loop(terms, form, gradient, p, acc, g):
         _add_value_loop(a, b, e2, hermite, radial, d, acc)
         if gradient:
             _add_gradient_loop(a, b, e2, hermite, radial, d, g)
+    _polynomial_loop(terms.coefficients[fit], terms.powers, gradient, p, acc, g)
 
 
 @compiled(error_model="numpy")
@@ -160,9 +271,8 @@ def _monomial_loop(p, i, j, k, factor, term, out):
 
 
 @compiled(error_model="numpy")
-def _polynomial_loop(terms, gradient, p, acc, g):
-    """Adds a field's polynomial to acc, its gradient to g."""
-    coefficients, powers = terms.coefficients, terms.powers
+def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
+    """Adds a fit's polynomial to acc, its gradient to g."""
     term = np.empty_like(acc)
     for q in range(len(coefficients)):
         c, i, j, k = coefficients[q], powers[q, 0], powers[q, 1], powers[q, 2]
@@ -173,6 +283,19 @@ def _polynomial_loop(terms, gradient, p, acc, g):
             _monomial_loop(p, i, j - 1, k, c * j, term, g[1])
         if gradient and k > 0:
             _monomial_loop(p, i, j, k - 1, c * k, term, g[2])
+
+
+@compiled(error_model="numpy")
+def _cubic_block_loop(terms, fit, wanted, p, acc, g):
+    """The cubic kernel with epsilon 1."""
+    centres, a, b = terms.centres[fit], terms.a[fit], terms.b[fit]
+    for j in range(centres.shape[1]):
+        at, slope = (centres[0, j], centres[1, j], centres[2, j]), (b[0, j], b[1, j], b[2, j])
+        if wanted:
+            _cubic_gradient_loop(p, at, a[j], slope, acc, g)
+        else:
+            _cubic_value_loop(p, at, a[j], slope, acc)
+    _polynomial_loop(terms.coefficients[fit], terms.powers, wanted, p, acc, g)
 
 
 @compiled(error_model="numpy", fastmath={"contract"})

@@ -1,6 +1,9 @@
 """RBFField: a scalar field f, negative inside, whose zero set is the surface; how those of muscles are fitted.
 
-f(x) = sum_j a_j phi(|x - c_j|) - B_j . grad phi(x - c_j) + p(x), with B = 0 for a fit to values.
+f(x) = sum_j a_j phi(|x - c_j|) - B_j . grad phi(x - c_j) + p(x), with B = 0 for a fit to values. The field of a muscle
+is a blend of such fits, each to a few centres that are near each other at rest: sum_p w_p f_p / sum_p w_p with weights
+that fall from the middle of a fit to zero at its farthest centre (a partition of unity; Wendland 2002, "Fast evaluation
+of radial basis functions: methods based on partition of unity"). Its time grows as the number of centres does.
 """
 
 import warnings
@@ -11,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import touching_balls
 from rbfmuscle.implicit.evaluation import Terms, evaluate
-from rbfmuscle.implicit.fit.assembly import Basis, hermite_system
+from rbfmuscle.implicit.fit.assembly import Basis
 from rbfmuscle.implicit.fit.fitting import solve
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.validation import (
@@ -29,8 +32,8 @@ from rbfmuscle.validation import (
 if TYPE_CHECKING:
     import trimesh
 
-# With more centres than these a fit to normal derivatives alone errs less for the same time.
-MOST_WITH_ALL_DERIVATIVES = 200
+# Centres of each local fit of a muscle's field, and how many of these count as covered by it.
+PART, COVERED = 28, 20
 # Part of the touching ball's radius that a step off the surface may use.
 SAFETY = 0.5
 
@@ -44,12 +47,10 @@ class RBFField:
         In the coordinates of the caller.
     kernel, epsilon : Kernel, float
         Its shape parameter [1/length] multiplies r.
-    weights : (K,) or (K, 4) ndarray
-        a_j, or for a Hermite fit a_j and B_j, for scaled coordinates (x - ``origin``) / ``scale``.
-    coefficients : (q,) ndarray
-        Of the monomials ``powers`` in scaled coordinates.
+    terms : Terms
+        Weights and polynomials of the local fits.
     condition : float
-        Estimate for the matrix that was factored.
+        Estimate for the worst matrix that was factored.
 
     Examples
     --------
@@ -63,22 +64,22 @@ class RBFField:
     """
 
     def __init__(
-        self, centres: Floats, epsilon: float, basis: Basis, right: Floats, smoothing: float, condition: float
+        self, basis: Basis, right: Floats, epsilon: float, smoothing: float, condition: float
     ) -> None:
         if not (np.isfinite(smoothing) and smoothing >= 0.0):
             raise UsageError(f"smoothing must be a number of at least 0, got {smoothing}")
         if not condition >= 1.0:
             raise UsageError(f"condition must be at least 1, got {condition}")
-        found = solve(basis, right, smoothing=smoothing, condition=condition)
-        weights, self.coefficients, self.condition = found
-        self.centres, self.kernel, self.epsilon = centres, basis.kernel, epsilon
-        self.weights, self.powers = basis.centre_weights(weights), basis.powers
-        self.origin, self.scale = basis.origin, basis.scale
-        rows = np.ascontiguousarray(self.weights.reshape(len(centres), -1).T)
-        self._terms = Terms(
-            self.origin, self.scale, np.ascontiguousarray(basis.points.T),
-            rows[0], rows[1:] if len(rows) > 1 else np.zeros((3, len(centres))), len(rows) > 1,
-            basis.epsilon, self.coefficients, self.powers,
+        weights, coefficients, self.condition = solve(basis, right, smoothing=smoothing, condition=condition)
+        self.centres, self.kernel, self.epsilon = basis.centres, basis.kernel, epsilon
+        fits, count = basis.parts.shape
+        rows = weights.reshape(fits, -1, count)
+        middle = basis.centres[basis.parts[:, 0]]
+        away = basis.centres[basis.parts] - middle[:, None]
+        self.terms = Terms(
+            basis.origin, basis.scale, basis.points, rows[:, 0].copy(),
+            rows[:, 1:].copy() if basis.hermite else np.zeros((fits, 3, count)), basis.hermite, basis.epsilon,
+            coefficients, basis.powers, middle, np.sqrt(np.einsum("pnc,pnc->pn", away, away).max(axis=1)),
         )  # fmt: skip
 
     @classmethod
@@ -91,6 +92,7 @@ class RBFField:
         epsilon: float = 1.0,
         smoothing: float = 0.0,
         condition: float = np.inf,
+        parts: Integers | None = None,
     ) -> "RBFField":
         """Interpolate values at points.
 
@@ -106,6 +108,8 @@ class RBFField:
             Added to the diagonal, in coordinates scaled to order one; 0 interpolates.
         condition : float
             Bound, at least 1 [1]: a ridge keeps it (see `solve`).
+        parts : (P, n) array_like of int, optional
+            Points of each local fit, its middle first; by default there is one, to all.
 
         Raises
         ------
@@ -115,8 +119,8 @@ class RBFField:
         points = check_points(points)
         values = check_values(values, len(points))
         kernel, epsilon = get_kernel(kernel), check_positive(epsilon, name="epsilon")
-        basis = Basis(points, kernel, epsilon)
-        return cls(points, epsilon, basis, values, smoothing, condition)
+        basis = Basis(points, kernel, epsilon, parts=parts)
+        return cls(basis, values[basis.parts], epsilon, smoothing, condition)
 
     @classmethod
     def fit_hermite(
@@ -127,8 +131,8 @@ class RBFField:
         kernel: Kernel | str = "cubic",
         epsilon: float = 1.0,
         smoothing: float = 0.0,
-        derivatives: str = "all",
         condition: float = np.inf,
+        parts: Integers | None = None,
     ) -> "RBFField":
         """Fit f = 0 and grad f = normal at every point (Hermite RBF, Macedo 2011).
 
@@ -138,16 +142,13 @@ class RBFField:
             Points of the surface [scene unit].
         normals : (K, 3) array_like
             Gradients wanted there, outward; unit vectors make f a distance near the surface.
-        kernel, epsilon, smoothing, condition
+        kernel, epsilon, smoothing, condition, parts
             As in `fit`; the kernel must be C2.
-        derivatives : {"all", "normal"}
-            "normal" asks only for the derivative along the normal: 2K unknowns in place of 4K, a quarter of the time
-            for nearly the same surface (see ``docs/field.md``).
 
         Raises
         ------
         UsageError, numpy.linalg.LinAlgError
-            For a kernel that is not smooth enough, a normal of length zero, or a condition below 1; as in `fit`.
+            For a kernel that is not smooth enough, or a condition below 1; as in `fit`.
         """
         points = check_points(points)
         normals = check_vectors(normals, len(points))
@@ -156,17 +157,17 @@ class RBFField:
             raise UsageError(
                 f"kernel '{kernel.name}' is C{kernel.smoothness}: use fit, as fit_hermite needs C2"
             )
-        if derivatives not in ("all", "normal"):
-            raise UsageError(f"derivatives must be 'all' or 'normal', got {derivatives!r}")
-        basis, right = hermite_system(points, normals, kernel, epsilon, derivatives)
-        fitted = cls(points, epsilon, basis, right, smoothing, condition)
+        basis = Basis(points, kernel, epsilon, hermite=True, parts=parts)
+        right = np.zeros((len(basis.parts), 4, basis.parts.shape[1]))
+        right[:, 1:] = np.swapaxes(normals[basis.parts], 1, 2) * basis.scale[:, None, None]
+        fitted = cls(basis, right.reshape(len(right), -1), epsilon, smoothing, condition)
         if kernel.has_epsilon:
             _warn_if_narrow(fitted, points, normals)
         return fitted
 
     def __call__(self, points: ArrayLike) -> Floats:
         """Field value at (n, 3) points: (n,), negative inside."""
-        return evaluate(check_points(points), self._terms, self.kernel, False)[0]
+        return evaluate(check_points(points), self.terms, self.kernel, False)[0]
 
     def gradient(self, points: Floats) -> Floats:
         """Gradient at (n, 3) points: (n, 3)."""
@@ -174,7 +175,7 @@ class RBFField:
 
     def value_and_gradient(self, points: Floats) -> tuple[Floats, Floats]:
         """Value (n,) and gradient (n, 3) at (n, 3) points, for little more than the value alone."""
-        return evaluate(check_points(points), self._terms, self.kernel, True)
+        return evaluate(check_points(points), self.terms, self.kernel, True)
 
     def surface(self, resolution: int = 64) -> "trimesh.Trimesh":
         """Zero set as a closed outward ``trimesh.Trimesh``; resolution in cells along the longest side."""
@@ -205,33 +206,48 @@ def _warn_if_narrow(fitted: RBFField, points: Floats, normals: Floats) -> None:
 class FieldFit:
     """How the field through a muscle's centres is fitted.
 
-    ``epsilon`` is the kernel's shape parameter [1 / length], ``derivatives`` ("all" or "normal") what the fit meets at
-    a centre, ``condition`` the bound that a ridge keeps.
+    ``epsilon`` is the kernel's shape parameter [1 / length], ``condition`` the bound that a ridge keeps.
     """
 
     kernel: Kernel
     epsilon: float
-    derivatives: str
     condition: float = np.inf
 
-    def fit(self, centres: Floats, normals: Floats) -> RBFField:
-        """The field through centres (K, 3) with unit normals (K, 3).
+    def fit(self, centres: Floats, normals: Floats, parts: Integers | None = None) -> RBFField:
+        """The field through centres (K, 3) with unit normals (K, 3), of local fits to ``parts`` (P, n) of them.
 
-        A Hermite fit where the kernel is C2. Else a fit to values on the surface and off it: three centres for each
-        point, and normals only as good as finite differences.
+        The parts are `overlapping_parts` of the centres, or of where these are at rest. Hermite fits where the kernel
+        is C2. Else fits to values on the surface and off it: three centres for each point, and normals only as good as
+        finite differences.
         """
+        parts = overlapping_parts(centres) if parts is None else parts
         how: dict[str, Any] = {"kernel": self.kernel, "epsilon": self.epsilon, "condition": self.condition}
         if self.kernel.hermite:
-            return RBFField.fit_hermite(centres, normals, derivatives=self.derivatives, **how)
-        fitted = RBFField.fit(*off_surface_points(centres, normals), **how)
+            return RBFField.fit_hermite(centres, normals, parts=parts, **how)
+        three = np.hstack([parts + k * len(centres) for k in range(3)])
+        fitted = RBFField.fit(*off_surface_points(centres, normals), parts=three, **how)
         if self.kernel.has_epsilon:
             _warn_if_narrow(fitted, centres, normals)
         return fitted
 
 
-def wanted_derivatives(count: int, *, fitted: bool) -> str:
-    """What a fit to so many centres meets: all derivatives of few ones and of those fitted to the whole surface."""
-    return "all" if fitted or count <= MOST_WITH_ALL_DERIVATIVES else "normal"
+def overlapping_parts(points: Floats) -> Integers:
+    """Parts (P, n) of points (K, 3): `PART` nearest to one of them, which comes first, or all where there are few.
+
+    Every point is among the first `COVERED` of a part: the middle of the next is always the point without one that is
+    farthest from the middles so far.
+    """
+    if len(points) <= PART:
+        return np.arange(len(points))[None]
+    near = cKDTree(points).query(points, PART)[1]
+    away = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    middles: list[int] = []
+    while (away >= 0.0).any():
+        middles.append(int(np.argmax(away)))
+        distance = np.linalg.norm(points - points[middles[-1]], axis=1)
+        away = distance if len(middles) == 1 else np.minimum(away, distance)
+        away[near[middles, :COVERED]] = -1.0
+    return np.asarray(near[middles])
 
 
 def off_surface_points(points: Floats, normals: Floats) -> tuple[Floats, Floats]:

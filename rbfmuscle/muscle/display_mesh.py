@@ -51,7 +51,7 @@ class DisplayMesh:
     def _on_level(self, rest: RestState, points: np.ndarray) -> np.ndarray:
         """The vertices on the level set at rest, where they stay as part of the material."""
         try:
-            field = rest.fit.fit(rest.centres, rest.normals)
+            field = rest.field(rest.centres, rest.normals)
 
             def onto(mesh: MaterialMesh, vertices: Floats) -> Floats:
                 return project_to_level_set(mesh, vertices, field, volume=rest.mesh_volume).vertices

@@ -245,7 +245,7 @@ class RBFDrawing:
     def _fit(self) -> RBFField:
         if self._fitted is None:
             started = time.perf_counter()
-            self._fitted = self._drawer.rest.fit.fit(self._now.centres, self._now.normals)
+            self._fitted = self._drawer.rest.field(self._now.centres, self._now.normals)
             self._time_fit = time.perf_counter() - started
         return self._fitted
 

@@ -134,7 +134,7 @@ class RBFMuscle:
 
     def field(self) -> RBFField:
         """The RBF field through the present centres."""
-        return self.rest.fit.fit(self.points, self.normals())
+        return self.rest.field(self.points, self.normals())
 
     def drawing(self, contacts: BoneContacts) -> RBFDrawing:
         """The muscle as it is now, for its surface."""

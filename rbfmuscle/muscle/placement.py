@@ -13,7 +13,7 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.surface import extract_surface
-from rbfmuscle.implicit.field import FieldFit, wanted_derivatives
+from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface
@@ -148,7 +148,6 @@ def _choose_fit(
     fit = FieldFit(
         kernel,
         options.epsilon or 1.0,
-        wanted_derivatives(len(centres.points), fitted=options.placement == FITTED),
         options.condition or (BOUND if kernel.has_epsilon else np.inf),
     )
     if not kernel.hermite:

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.implicit.field import FieldFit
+from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import choose_centres, place_points
 from rbfmuscle.scene.objects import Muscle
@@ -29,6 +29,7 @@ class RestState:
     samples: np.ndarray  # (S, 3)
     sample_faces: np.ndarray  # (m, 3) closed outward triangulation of the samples
     fit: FieldFit  # how the field through the centres is fitted
+    parts: np.ndarray  # (P, n) centres of its local fits
     bones: list[str]  # bones, and ends of tendons, that hold the muscle, in the order of the scene
     attached_bone: np.ndarray  # (K + S,) position in ``bones`` of what holds a contact point, -1 where free
     free: np.ndarray  # centres that move
@@ -52,10 +53,14 @@ class RestState:
         attached_bone = np.concatenate([held_by.centres, held_by.samples])
         return cls(
             points, frame.directions(centres.normals), frame.points(samples.points), samples.control_faces, fit,
-            held_by.bones, attached_bone, free, held, float(muscle.mesh.volume),
+            overlapping_parts(centres.points), held_by.bones, attached_bone, free, held, float(muscle.mesh.volume),
             # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
             frame.directions(_principal_axes(samples.points)),
         )  # fmt: skip
+
+    def field(self, centres: Floats, normals: Floats) -> RBFField:
+        """The field through the centres (K, 3) where they are now, with their unit normals (K, 3)."""
+        return self.fit.fit(centres, normals, self.parts)
 
     def contact_points(self) -> np.ndarray:
         """Centres, then samples, (K + S, 3)."""

@@ -12,7 +12,7 @@ from rbfmuscle.implicit.placement.refinement import fit_sample
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
 from rbfmuscle.implicit.selection import spacing
 
-CUBIC = FieldFit(get_kernel("cubic"), 1.0, "all")
+CUBIC = FieldFit(get_kernel("cubic"), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def bean():
 )
 def test_fitted_centres_err_less_at_points_they_have_not_seen(bean, kernel, epsilon, condition):
     vertices, faces, plain = bean
-    fit = FieldFit(get_kernel(kernel), epsilon, "all", condition)
+    fit = FieldFit(get_kernel(kernel), epsilon, condition)
     fitted = fit_sample(plain, vertices, faces, fit=fit)
     unseen = spread_points(vertices, faces, 3000, seed=7)[0]
 

@@ -18,7 +18,7 @@ from rbfmuscle.validation import NumericalWarning, UsageError
 
 
 def fit_of(kernel, condition=BOUND):
-    return FieldFit(get_kernel(kernel), 1.0, "all", condition)
+    return FieldFit(get_kernel(kernel), 1.0, condition)
 
 
 @pytest.fixture(scope="module")

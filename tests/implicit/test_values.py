@@ -38,8 +38,10 @@ def test_values_and_slopes_are_those_of_the_literal_sum(kernel, dipoles):
     weights[1:] *= dipoles
     coefficients, powers = np.array([0.3, -1.2, 0.7]), np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]])
     points = origin + scale * rng.uniform(-1, 1, (11, 3))
-    parts = origin, scale, centres, weights[0], weights[1:], dipoles
-    terms = Terms(*parts, epsilon, coefficients, powers)
+    parts = origin, np.array(scale), centres, weights[0], weights[1:]
+    shape = np.array(epsilon), coefficients
+    whole = [part[None] for part in (*parts, *shape, np.zeros(3), np.array(1.0))]
+    terms = Terms(*whole[:5], dipoles, *whole[5:7], powers, *whole[7:])
 
     def found(at, with_gradient=True):
         return evaluate(at, terms, kernel, with_gradient)

@@ -1,7 +1,7 @@
-"""Systems of RBF fits: the coordinates that they are scaled to, their matrices and right sides.
+"""Systems of RBF fits: the coordinates that they are scaled to, their matrices and polynomials.
 
-Unknowns of a Hermite fit are grouped: all values, then all x-, y- and z-derivatives (or all normal derivatives), so
-that every column of every block is one contiguous run. Only the lower triangle (Fortran order) is filled.
+Unknowns of a Hermite fit are grouped: all values, then all x-, y- and z-derivatives, so that every row of every block
+is one contiguous run.
 """
 
 import numpy as np
@@ -13,9 +13,6 @@ from rbfmuscle.implicit.kernels.table import Kernel
 from rbfmuscle.jit import compiled
 from rbfmuscle.validation import UsageError
 
-_KINDS = ("value", "gradient", "normal")
-_VALUE, _GRADIENT, _NORMAL = range(3)
-
 
 def exponents(degree: int) -> Integers:
     """Exponents (q, 3) of the monomials of total degree up to ``degree``; (0, 3) for degree -1."""
@@ -24,163 +21,132 @@ def exponents(degree: int) -> Integers:
     return np.array(every, dtype=np.int64).reshape(-1, 3)
 
 
-def monomials(points: Floats, powers: Integers) -> Floats:
-    """Monomials at points: (q, n)."""
-    out = np.ones((len(powers), len(points)))
-    for row, power in zip(out, powers):
-        for axis in range(3):
-            if power[axis]:
-                row *= points[:, axis] ** power[axis]
-    return out
+class Basis:
+    """Centres, kernel and polynomials of P fits of n centres each, every one in coordinates scaled to order one.
 
+    Of the caller's ``centres`` (K, 3), of which ``parts`` (P, n) says which each fit has, and epsilon [1 / length]:
+    ``points`` (P, 3, n) are (x - ``origin``) / ``scale``, in the unit ball, and ``epsilon`` (P,) goes with them. The
+    unknowns of a fit, ``size`` of them, are values at its centres, for a ``hermite`` one also all derivatives.
+    ``polynomials`` (P, q, size) are the monomials of ``powers`` (q, 3) and their derivatives. LinAlgError for fewer
+    values than polynomial terms.
+    """
 
-def monomial_gradients(points: Floats, powers: Integers) -> Floats:
-    """Derivatives of the monomials at points: (3, q, n)."""
-    out = np.zeros((3, len(powers), len(points)))
-    for axis in range(3):
-        lower = powers.copy()
-        lower[:, axis] -= 1
-        some = lower[:, axis] >= 0
-        out[axis, some] = powers[some, axis, None] * monomials(points, lower[some])
-    return out
+    def __init__(
+        self, centres: Floats, kernel: Kernel, epsilon: float, *, hermite: bool = False, parts: Integers | None = None
+    ) -> None:  # fmt: skip
+        if not len(centres):
+            raise UsageError("a fit needs at least one point, got none")
+        self.centres, self.parts = centres, np.arange(len(centres))[None] if parts is None else parts
+        points, (fits, count) = centres[self.parts], self.parts.shape
+        self.origin = 0.5 * (points.min(axis=1) + points.max(axis=1))
+        away = points - self.origin[:, None]
+        self.scale = np.sqrt(np.einsum("pnc,pnc->pn", away, away).max(axis=1))
+        self.scale[self.scale == 0.0] = 1.0
+        self.points = np.ascontiguousarray(np.swapaxes(away / self.scale[:, None, None], 1, 2))
+        self.kernel, self.hermite = kernel, hermite
+        self.epsilon = epsilon * self.scale if kernel.has_epsilon else np.ones(fits)
+        self.powers = exponents(kernel.degree)
+        if not hermite and len(self.powers) > count:
+            raise np.linalg.LinAlgError(
+                f"degree {kernel.degree} of kernel '{kernel.name}' has {len(self.powers)} polynomial terms, more than "
+                f"the {count} points; degree too high: use a kernel of lower order or add points"
+            )
+        self.size = 4 * count if hermite else count
+        self.polynomials = np.empty((fits, len(self.powers), self.size))
+        _polynomials_loop(self.points, self.powers, self.polynomials)
+
+    def scaled(self) -> Floats:
+        """All centres (K, 3) in the unit ball."""
+        away = self.centres - 0.5 * (self.centres.min(axis=0) + self.centres.max(axis=0))
+        return np.asarray(away / (np.sqrt((away**2).sum(axis=1).max()) or 1.0))
+
+    def matrices(self, start: int, stop: int) -> Floats:
+        """A of the fits from start to stop: (stop - start, size, size)."""
+        out = np.empty((stop - start, self.size, self.size))
+        if self.hermite and self.kernel.plain_cube:
+            _cubic_matrices_loop(self.points, self.epsilon, start, out)
+        else:
+            _matrices_loop(self.points, self.epsilon, self.kernel.form, self.hermite, start, out)
+        return out
+
+    def full_matrix(self) -> Floats:
+        """The augmented matrix [A P^T; P 0] of the first fit: (size + q, size + q)."""
+        size, q = self.size, len(self.powers)
+        full = np.zeros((size + q, size + q))
+        full[:size, :size] = self.matrices(0, 1)[0]
+        full[size:, :size], full[:size, size:] = self.polynomials[0], self.polynomials[0].T
+        return full
 
 
 @compiled(error_model="numpy")
-def _matrix_loop(x, normals, epsilon, form, kind, out):
-    """Lower triangle of the matrix of a basis of some kind; out[column, row] is its transpose, x is (3, n)."""
-    n, e2 = x.shape[1], epsilon * epsilon
+def _polynomials_loop(points, powers, out):
+    """Monomials at points (P, 3, n), and where there is room for them their derivatives."""
+    n = points.shape[2]
+    for p in range(len(points)):
+        for q in range(len(powers)):
+            for c in range(-1, out.shape[2] // n - 1):
+                _monomial_loop(points[p], powers[q], c, out[p, q, (c + 1) * n : (c + 2) * n])
+
+
+@compiled(error_model="numpy")
+def _monomial_loop(x, powers, axis, out):
+    """A monomial at points (3, n), or its derivative along an axis that is not negative."""
+    out[:] = powers[axis] if axis >= 0 else 1.0
+    for c in range(3):
+        for _ in range(powers[c] - int(c == axis)):
+            for i in range(len(out)):
+                out[i] *= x[c, i]
+
+
+@compiled(error_model="numpy")
+def _matrices_loop(points, epsilon, form, hermite, start, out):
+    """Matrices of fits from start on, of points (P, 3, n), for any kernel."""
+    n = points.shape[2]
     d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((3, n))
-    for j in range(n):
-        _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), e2, d, u)
-        _radial_loop(form, 1 if kind == _VALUE else 7, u, work, radial)
-        for i in range(j, n):
-            out[j, i] = radial[0, i]
-        if kind == _GRADIENT:
-            _gradient_columns_loop(j, e2, d, radial, out)
-        elif kind == _NORMAL:
-            _normal_columns_loop(j, e2, d, normals, radial, out)
+    for p in range(len(out)):
+        x, e2 = points[start + p], epsilon[start + p] ** 2
+        for j in range(n):
+            _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), e2, d, u)
+            _radial_loop(form, 7 if hermite else 1, u, work, radial)
+            for i in range(n):
+                out[p, j, i] = radial[0, i]
+            if hermite:
+                _derivatives_loop(j, e2, d, radial, out[p])
 
 
 @compiled(error_model="numpy")
-def _cubic_hermite_matrix_loop(x, epsilon, out):
-    """As `_matrix_loop` with gradients for the kernel s^3, which muscles use and which should not wait for others."""
-    n = x.shape[1]
+def _cubic_matrices_loop(points, epsilon, start, out):
+    """As `_matrices_loop` for the kernel s^3, which muscles use and which should not wait for others."""
+    n = points.shape[2]
     d, u, radial = np.empty((3, n)), np.empty(n), np.empty((3, n))
-    for j in range(n):
-        _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), epsilon * epsilon, d, u)
-        for i in range(n):
-            s = np.sqrt(u[i])
-            radial[1, i] = 3.0 * s
-            radial[2, i] = 3.0 / s if s > 0.0 else 0.0
-            out[j, i] = u[i] * s
-        _gradient_columns_loop(j, epsilon * epsilon, d, radial, out)
+    for p in range(len(out)):
+        x, e2 = points[start + p], epsilon[start + p] ** 2
+        for j in range(n):
+            _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), e2, d, u)
+            for i in range(n):
+                s = np.sqrt(u[i])
+                radial[1, i] = 3.0 * s
+                radial[2, i] = 3.0 / s if s > 0.0 else 0.0
+                out[p, j, i] = u[i] * s
+            _derivatives_loop(j, e2, d, radial, out[p])
 
 
 @compiled(error_model="numpy")
-def _gradient_columns_loop(j, e2, d, radial, out):
-    """Derivatives in the four columns of centre j, from the offsets of all centres and the radial functions there.
+def _derivatives_loop(j, e2, d, radial, out):
+    """Derivatives in the four rows of centre j, from the offsets of all centres and the radial functions there.
 
-    Blocks: (d/dx_c, value) first * d_c; (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).
+    Blocks: (value, d/dx_c) first * d_c, as the other way round by the sign of d;
+    (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).
     """
     n = d.shape[1]
     for c in range(3):
         for i in range(n):
             out[j, (c + 1) * n + i] = e2 * radial[1, i] * d[c, i]
+            out[(c + 1) * n + j, i] = -e2 * radial[1, i] * d[c, i]
     for e in range(3):
-        column = (e + 1) * n + j
-        for i in range(j, n):
-            out[column, (e + 1) * n + i] = -e2 * (radial[1, i] + e2 * radial[2, i] * d[e, i] * d[e, i])
-        for c in range(e + 1, 3):
+        row = (e + 1) * n + j
+        for c in range(3):
             for i in range(n):
-                out[column, (c + 1) * n + i] = -e2 * e2 * radial[2, i] * d[c, i] * d[e, i]
-
-
-@compiled(error_model="numpy")
-def _normal_columns_loop(j, e2, d, normals, radial, out):
-    """As `_gradient_columns_loop`, with the derivative along the unit normals (3, n) alone.
-
-    Blocks: (normal i, value j) first (d . n_i); (normal i, normal j) -(first n_i . n_j + second (d . n_i)(d . n_j)).
-    """
-    n, (nx, ny, nz) = d.shape[1], (normals[0, j], normals[1, j], normals[2, j])
-    for i in range(n):
-        at_i = d[0, i] * normals[0, i] + d[1, i] * normals[1, i] + d[2, i] * normals[2, i]
-        at_j = d[0, i] * nx + d[1, i] * ny + d[2, i] * nz
-        both = nx * normals[0, i] + ny * normals[1, i] + nz * normals[2, i]
-        out[j, n + i] = e2 * radial[1, i] * at_i
-        out[n + j, n + i] = -e2 * (radial[1, i] * both + e2 * radial[2, i] * at_i * at_j)
-
-
-class Basis:
-    """Centres, kernel and polynomial part of one fit, in coordinates scaled to order one.
-
-    Of points (K, 3) and epsilon [1 / length] as the caller has them: ``points`` are (x - ``origin``) / ``scale``, in
-    the unit ball, and ``epsilon`` goes with them. ``kind`` is "value", "gradient" (values and all derivatives) or
-    "normal" (values and derivatives along unit ``normals`` (K, 3)). LinAlgError for fewer values than polynomial terms.
-    """
-
-    def __init__(
-        self, points: Floats, kernel: Kernel, epsilon: float, *, kind: str = "value", normals: Floats | None = None
-    ) -> None:  # fmt: skip
-        if not len(points):
-            raise UsageError("a fit needs at least one point, got none")
-        self.origin = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        self.scale = float(np.sqrt(((points - self.origin) ** 2).sum(axis=1).max())) or 1.0
-        self.points, self.kernel, self.kind = (points - self.origin) / self.scale, kernel, kind
-        self.epsilon = epsilon * self.scale if kernel.has_epsilon else 1.0
-        self.normals = np.zeros((0, 3)) if normals is None else normals
-        self.powers = exponents(kernel.degree)
-        if kind == "value" and len(self.powers) > len(points):
-            raise np.linalg.LinAlgError(
-                f"degree {kernel.degree} of kernel '{kernel.name}' has {len(self.powers)} polynomial terms, more than "
-                f"the {len(points)} points; degree too high: use a kernel of lower order or add points"
-            )
-        blocks = [monomials(self.points, self.powers)]
-        if kind == "gradient":
-            blocks += [*monomial_gradients(self.points, self.powers)]
-        elif kind == "normal":
-            blocks += [np.einsum("cqn,nc->qn", monomial_gradients(self.points, self.powers), self.normals)]
-        self.polynomials = np.ascontiguousarray(np.hstack(blocks))
-        self.size = self.polynomials.shape[1]
-
-    def matrix(self) -> Floats:
-        """A, lower triangle valid, Fortran order: (size, size)."""
-        out, x = np.empty((self.size, self.size)), np.ascontiguousarray(self.points.T)
-        if self.kind == "gradient" and self.kernel.plain_cube:
-            _cubic_hermite_matrix_loop(x, self.epsilon, out)
-        else:
-            normals, kind = np.ascontiguousarray(self.normals.T), _KINDS.index(self.kind)
-            _matrix_loop(x, normals, self.epsilon, self.kernel.form, kind, out)
-        return out.T
-
-    def full_matrix(self) -> Floats:
-        """The augmented matrix [A P^T; P 0], both triangles: (size + q, size + q)."""
-        size, q = self.size, len(self.powers)
-        full = np.zeros((size + q, size + q))
-        lower = np.tril(self.matrix())
-        full[:size, :size] = lower + np.tril(lower, -1).T
-        full[size:, :size], full[:size, size:] = self.polynomials, self.polynomials.T
-        return full
-
-    def centre_weights(self, weights: Floats) -> Floats:
-        """Weights (K,), or of a Hermite fit rows (a, B) for each centre (K, 4), from the solution of a system."""
-        if self.kind == "value":
-            return weights
-        if self.kind == "gradient":
-            return weights.reshape(4, -1).T.copy()
-        value, along = weights.reshape(2, -1)
-        return np.column_stack([value, along[:, None] * self.normals])
-
-
-def hermite_system(
-    points: Floats, normals: Floats, kernel: Kernel, epsilon: float, derivatives: str
-) -> tuple[Basis, Floats]:
-    """Basis and right side of a Hermite fit (arguments as in `RBFField.fit_hermite`)."""
-    zeros = np.zeros(len(points))
-    if derivatives == "all":
-        basis = Basis(points, kernel, epsilon, kind="gradient")
-        return basis, np.concatenate([zeros, normals.T.ravel()]) * basis.scale
-    lengths = np.linalg.norm(normals, axis=1)
-    if not lengths.all():
-        raise UsageError(f"normals must not be zero, row {int(np.argmin(lengths))} is")
-    basis = Basis(points, kernel, epsilon, kind="normal", normals=normals / lengths[:, None])
-    return basis, np.concatenate([zeros, lengths]) * basis.scale
+                out[row, (c + 1) * n + i] = -e2 * e2 * radial[2, i] * d[c, i] * d[e, i]
+        for i in range(n):
+            out[row, (e + 1) * n + i] -= e2 * radial[1, i]

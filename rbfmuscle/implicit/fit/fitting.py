@@ -8,23 +8,21 @@ P w = 0. With Q an orthonormal basis of the rows of P (P^T = Q R) the augmented 
 
 has w = M^-1 (I - Q Q^T) y with M = (I - Q Q^T) A (I - Q Q^T) + gamma Q Q^T, definite for any gamma > 0, and
 R b = Q^T (y - A w). The condition of M is that of A on those weights, as gamma is the mean of the other eigenvalues;
-adding a multiple of P^T P to A instead costs two digits at 2,000 centres.
+adding a multiple of P^T P to A instead costs two digits at 2,000 centres. Where polynomials are dependent on the
+centres of a fit, as the second degree is on those of a flat part, the rows of P that add nothing are left out.
 """
 
-import ctypes
 import math
 import warnings
-from collections.abc import Callable
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
-from scipy.linalg import blas
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.implicit.fit.assembly import Basis
+from rbfmuscle.jit import compiled
 from rbfmuscle.validation import NumericalWarning
 
 DOUBTFUL = 1e13
@@ -32,161 +30,207 @@ DOUBTFUL = 1e13
 KEPT = 1e12
 """Condition that this ridge keeps: with a greater one Cholesky may still fail."""
 _DEPENDENT = 1e-9
+# Fits that are solved at a time: their matrices stay in the second-level cache.
+_CHUNK = 7
+
+
+class Fits(NamedTuple):
+    """Solutions of P fits.
+
+    ``weights`` (P, size), ``coefficients`` (P, q) of the polynomials, and for each fit the ``condition`` and the
+    ``ridge`` (P,) on the diagonal, in units of the unknowns.
+    """
+
+    weights: np.ndarray
+    coefficients: np.ndarray
+    condition: np.ndarray
+    ridge: np.ndarray
 
 
 def solve(
     basis: Basis, right: Floats, *, smoothing: float = 0.0, condition: float = math.inf
 ) -> tuple[Floats, Floats, float]:
-    """Weights (size,), polynomial coefficients (q,) and an estimate of the condition, for a right side (size,).
+    """Weights (P, size) and polynomial coefficients (P, q) for right sides (P, size), and the worst fit's condition.
 
     ``smoothing`` is added to the diagonal (scaled coordinates). ``condition`` is a bound [1]: a ridge of the largest
     eigenvalue over it, with derivatives in units of the centres' spacing, keeps it; the conditions of the fit are then
     met to about one part in so many.
 
-    The estimate is that of the matrix on the weights that annihilate polynomials, 2-norm, by power iteration (a lower
-    bound, usually within 10). With a bound, of the matrix with its ridge in units of the spacing. Without one, where it
-    is beyond `DOUBTFUL` that number, and a ridge keeps it at `KEPT`, with a NumericalWarning. LinAlgError if the system
+    The condition is an estimate for the matrix on the weights that annihilate polynomials, 2-norm, from below and
+    usually within 10. With a bound, of the matrix with its ridge in units of the spacing. Without one, where it is
+    beyond `DOUBTFUL` that number, and a ridge keeps it at `KEPT`, with a NumericalWarning. LinAlgError if the system
     is singular (the message names the likely cause), or the bound is more than floating-point numbers hold.
     """
-    bound = condition
-    if math.isinf(bound):
-        factor = _factorise(_smoothed(basis, smoothing), basis.polynomials)
-        solution = None if factor is None else factor.solve(right)
-        if solution is not None and solution[2] < DOUBTFUL:
-            return solution
-        _raise_if_singular(basis)
-        bound = KEPT
-    factor, scale = _factorise_bounded(basis, bound, smoothing)
-    weights, coefficients, found = factor.solve(scale * right)
-    if math.isinf(condition):
-        _warn(basis)
-        return scale * weights, coefficients, DOUBTFUL
-    return scale * weights, coefficients, min(found, condition)
+    if math.isfinite(condition):
+        found = _solve_bounded(basis, right, smoothing, condition)
+        return found.weights, found.coefficients, min(float(found.condition.max()), condition)
+    first = _solve_all(basis, right, smoothing, math.inf)
+    if first is not None and first.condition.max() < DOUBTFUL:
+        return first.weights, first.coefficients, float(first.condition.max())
+    _raise_if_singular(basis)
+    found = _solve_bounded(basis, right, smoothing, KEPT)
+    _warn(basis)
+    return found.weights, found.coefficients, DOUBTFUL
 
 
 def bounding_ridge(basis: Basis, condition: float) -> Floats:
-    """What `solve` adds to the diagonal (size,) for this bound of the condition."""
-    factor, scale = _factorise_bounded(basis, condition, 0.0)
-    return np.asarray(factor.norm / condition / scale**2)
+    """What `solve` adds to the diagonal (size,) of a single fit for this bound of the condition."""
+    found = _solve_bounded(basis, np.zeros((1, basis.size)), 0.0, condition)
+    return np.asarray(found.ridge[0] / _units(basis, condition) ** 2)
 
 
-def _factorise_bounded(basis: Basis, condition: float, smoothing: float) -> "tuple[Factor, Floats]":
-    """Factor with a ridge, and the units (size,) of its unknowns."""
-    # about the spacing of so many centres in the unit ball; a factor of three either way changes little
-    count, unit = len(basis.points), 1.0 / math.sqrt(len(basis.points))
-    matrix = _smoothed(basis, smoothing)
-    with np.errstate(all="ignore"):  # the upper triangle, which is never read, holds anything
-        matrix[count:, :count] *= unit
-        matrix[count:, count:] *= unit**2
-    scale = np.ones(basis.size)
-    scale[count:] = unit
-    factor = _factorise(matrix, np.ascontiguousarray(basis.polynomials * scale), condition)
-    if factor is None:
+def _solve_bounded(basis: Basis, right: Floats, smoothing: float, bound: float) -> Fits:
+    """`_solve_all`, or the LinAlgError that says why not."""
+    found = _solve_all(basis, right, smoothing, bound)
+    if found is None:
         _raise_if_singular(basis)
-        message = f"no Cholesky factor with a condition of {condition:g}; lower the bound or raise epsilon"
+        message = f"no Cholesky factor with a condition of {bound:g}; lower the bound or raise epsilon"
         raise np.linalg.LinAlgError(message)
-    return factor, scale
+    return found
 
 
-class Factor(NamedTuple):
-    """A factored matrix; letters as in the head of this file.
+def _solve_all(basis: Basis, right: Floats, smoothing: float, bound: float) -> Fits | None:
+    """Solve with a ridge for this bound of the condition, infinity for none.
 
-    ``lower`` is the Cholesky factor of M (size, size), its upper triangle anything; ``directions`` Q (size, q),
-    ``triangle`` R (q, q), ``products`` A Q (size, q), ``norm`` an estimate of the largest eigenvalue of A.
+    None where a matrix is not definite in floating-point numbers, or the polynomials of a single fit are dependent.
     """
-
-    lower: Floats
-    directions: Floats
-    triangle: Floats
-    products: Floats
-    norm: float
-
-    def solve(self, right: Floats) -> tuple[Floats, Floats, float]:
-        """Weights (size,), coefficients (q,) and condition |A| |M^-1| for the right side (size,)."""
-        # one by one: dpotrs takes three times as long for the two columns there are
-        solution, weakest = (
-            blas.dtrsv(self.lower, blas.dtrsv(self.lower, column, lower=1), lower=1, trans=1)
-            for column in (self._project(right), _probe(np.diagonal(self.lower)))
-        )
-        condition = max(1.0, self.norm * math.sqrt(weakest @ weakest))
-        weights = self._project(solution)
-        if not self.directions.shape[1]:
-            return weights, np.zeros(0), condition
-        short = self.directions.T @ right - self.products.T @ weights
-        return weights, blas.dtrsv(self.triangle, short), condition
-
-    def _project(self, vector: Floats) -> Floats:
-        """Its part that annihilates polynomials."""
-        if not self.directions.shape[1]:
-            return vector.copy()
-        return vector - self.directions @ (self.directions.T @ vector)
-
-
-def _smoothed(basis: Basis, smoothing: float) -> Floats:
-    """The matrix of a basis with the smoothing on its diagonal."""
-    matrix = basis.matrix()
-    if smoothing:
-        matrix.ravel(order="K")[:: basis.size + 1] += smoothing
-    return matrix
-
-
-def _factorise(matrix: Floats, polynomials: Floats, condition: float = math.inf) -> "Factor | None":
-    """Factor of A (size, size), lower triangle valid, Fortran order, overwritten; polynomials (q, size).
-
-    The largest eigenvalue, ``norm``, over the bound of the condition is added to the diagonal. None where the matrix is
-    not definite in floating-point numbers, or the polynomials are dependent.
-    """
-    q, size = polynomials.shape
-    start = np.ones(size)
-    start[1::2] -= 1e-3
-    norm = _largest_eigenvalue(matrix, start, 2)
-    directions, triangle, products = np.empty((size, 0)), np.empty((0, 0)), np.empty((size, 0))
-    if q:
-        directions, triangle = linalg.qr(polynomials.T, mode="economic", check_finite=False)
-        if size < q or np.abs(np.diagonal(triangle)).min() < _DEPENDENT * math.sqrt(size):
-            return None
-        directions = np.asfortranarray(directions)
-        # column by column: dsymm takes twice as long for so few
-        products = np.array([blas.dsymv(1.0, matrix, column, lower=1) for column in directions.T]).T
-        # through SciPy's BLAS, as NumPy's has threads of its own, which then wait on the same cores
-        inner = blas.dgemm(1.0, directions, products, trans_a=1)
-        gamma = (np.trace(matrix) - np.trace(inner)) / (size - q) if size > q else 0.0
-        gamma = gamma if gamma > 0 else norm or 1.0
-        half = blas.dgemm(-0.5, directions, inner + gamma * np.eye(q), beta=1.0, c=products)
-        matrix = blas.dsyr2k(-1.0, directions, half, beta=1.0, c=matrix, lower=1, overwrite_c=1)
-    if math.isfinite(condition):  # a constant vector is all but a polynomial, which M has no share of
-        norm = _largest_eigenvalue(matrix, _probe(np.ones(size)), 6)
-        matrix.ravel(order="K")[:: size + 1] += norm / condition
-    if factor_cholesky(matrix):
+    fits, q, size = basis.polynomials.shape
+    units = _units(basis, bound)
+    directions, inverse, complete = _orthonormal(basis.polynomials * units)
+    if fits == 1 and not complete:
         return None
-    return Factor(matrix, directions, triangle, products, norm)
+    found = Fits(np.empty((fits, size)), np.empty((fits, q)), *np.empty((2, fits)))
+
+    def work(start: int, stop: int) -> None:
+        for low in range(start, stop, _CHUNK):
+            some = slice(low, min(low + _CHUNK, stop))
+            a = basis.matrices(some.start, some.stop)
+            if smoothing:
+                a[:, np.arange(size), np.arange(size)] += smoothing
+            if math.isfinite(bound):
+                a *= units[:, None] * units
+            solved = _solve_some(a, directions[some], inverse[some], units * right[some], bound)
+            for part, values in zip(found, (solved[0] * units, *solved[1:])):
+                part[some] = values
+
+    try:
+        in_chunks(fits, work, least=_CHUNK)
+    except np.linalg.LinAlgError:
+        return None
+    return found
 
 
-def _largest_eigenvalue(matrix: Floats, vector: Floats, steps: int) -> float:
-    """Largest eigenvalue of a symmetric matrix by power iteration from a vector (size,), a lower bound."""
-    norm = 0.0
+def _units(basis: Basis, bound: float) -> Floats:
+    """Units (size,) of the unknowns: with a bound, derivatives count in that of the spacing of the centres."""
+    units, count = np.ones(basis.size), basis.points.shape[2]
+    if math.isfinite(bound):
+        # About the spacing of so many centres in the unit ball; a factor of three changes little.
+        units[count:] = 1.0 / math.sqrt(count)
+    return units
+
+
+def _orthonormal(polynomials: Floats) -> tuple[Floats, Floats, bool]:
+    """Q (P, size, q) and the inverse of R (P, q, q) for polynomials (P, q, size), and whether none are dependent.
+
+    The columns of Q for those that are dependent on others are zero.
+    """
+    fits, q, size = polynomials.shape
+    if not q:
+        return np.zeros((fits, size, 0)), np.zeros((fits, 0, 0)), True
+    tolerance = _DEPENDENT * math.sqrt(size)
+    if size >= q:
+        directions, triangle = np.linalg.qr(np.swapaxes(polynomials, 1, 2))
+        if np.abs(np.diagonal(triangle, axis1=1, axis2=2)).min() >= tolerance:
+            return directions, np.linalg.inv(triangle), True
+    directions, values, turned = np.linalg.svd(np.swapaxes(polynomials, 1, 2), full_matrices=False)
+    kept = values >= tolerance
+    inverse = np.swapaxes(turned, 1, 2) * (kept / np.maximum(values, tolerance))[:, None]
+    return directions * kept[:, None], inverse, False
+
+
+def _solve_some(
+    a: Floats, directions: Floats, inverse: Floats, right: Floats, bound: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """The parts of `Fits` for matrices (m, size, size), which are overwritten; letters as in the head of this file."""
+    size, q = directions.shape[1:]
+    turned, products = np.swapaxes(directions, 1, 2), a @ directions
+    if q:
+        # The constants are all but the strongest direction.
+        norm = np.sqrt(np.einsum("mnq,mnq->mq", products, products).max(axis=1))
+        inner = turned @ products
+        gamma = _trace(a) - _trace(inner)
+        gamma = np.where(gamma > 0.0, gamma / max(size - q, 1), np.where(norm > 0.0, norm, 1.0))
+        half = products - 0.5 * directions @ (inner + gamma[:, None, None] * np.eye(q))
+        both = np.concatenate([half, directions], axis=2)
+        a -= np.concatenate([directions, half], axis=2) @ np.swapaxes(both, 1, 2)
+    else:
+        norm = _largest(a, _probe(np.ones((len(a), size))), 2)
+    ridge = np.zeros(len(a))
+    if math.isfinite(bound):  # a constant vector is all but a polynomial, which M has no share of
+        norm = _largest(a, _probe(np.ones((len(a), size))), 6)
+        ridge = norm / bound
+        a[:, np.arange(size), np.arange(size)] += ridge[:, None]
+    lower = np.linalg.cholesky(a)
+
+    def annihilating(vectors: Floats) -> Floats:
+        return np.asarray(vectors - (directions @ (turned @ vectors[:, :, None]))[:, :, 0])
+
+    solved = np.stack([annihilating(right), _probe(np.diagonal(lower, axis1=1, axis2=2))], axis=1)
+    _substitute_loop(lower, solved)
+    weights = annihilating(solved[:, 0])
+    short = turned @ right[:, :, None] - np.swapaxes(products, 1, 2) @ weights[:, :, None]
+    condition = np.maximum(1.0, norm * np.linalg.norm(solved[:, 1], axis=1))
+    return weights, (inverse @ short)[:, :, 0], condition, ridge
+
+
+def _trace(matrices: Floats) -> Floats:
+    return np.asarray(np.trace(matrices, axis1=1, axis2=2))
+
+
+def _largest(matrices: Floats, vectors: Floats, steps: int) -> Floats:
+    """Largest eigenvalues (m,) of symmetric matrices by power iteration from vectors (m, size), lower bounds."""
     for _ in range(steps):
-        vector = blas.dsymv(1.0, matrix, vector / math.sqrt(vector @ vector), lower=1)
-        norm = math.sqrt(vector @ vector)
-        if norm == 0.0:  # one centre of a kernel that is 0 there
-            break
-    return norm
+        size = np.linalg.norm(vectors, axis=1, keepdims=True)
+        vectors = (matrices @ (vectors / np.where(size > 0.0, size, 1.0))[:, :, None])[:, :, 0]
+    return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
 def _probe(pivots: Floats) -> Floats:
-    """Vector (size,) of random signs and the smallest pivot's unit vector: it holds some of the weakest eigenvector."""
-    size = len(pivots)
+    """Vectors (m, size) of random signs and the smallest pivot's unit vector: some of the weakest direction each."""
+    count, size = pivots.shape
     signs = np.where((np.arange(size) * 0x9E3779B1) >> 7 & 1, 1.0, -1.0) / math.sqrt(2 * size)
-    weakest = int(np.argmin(pivots))
-    signs[weakest] += math.copysign(math.sqrt(0.5), signs[weakest])
-    return signs
+    found, weakest = np.tile(signs, (count, 1)), np.argmin(pivots, axis=1)
+    found[np.arange(count), weakest] += np.copysign(math.sqrt(0.5), signs[weakest])
+    return found
+
+
+@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+def _substitute_loop(lower, both):
+    """Solve L L^T x = b in place for two right sides (m, 2, size)."""
+    for p in range(len(lower)):
+        x, y = both[p, 0], both[p, 1]
+        for j in range(len(x)):
+            row, sx, sy = lower[p, j], 0.0, 0.0
+            for i in range(j):
+                sx += row[i] * x[i]
+                sy += row[i] * y[i]
+            x[j] = (x[j] - sx) / row[j]
+            y[j] = (y[j] - sy) / row[j]
+        for j in range(len(x) - 1, -1, -1):
+            row = lower[p, j]
+            x[j] /= row[j]
+            y[j] /= row[j]
+            xj, yj = x[j], y[j]
+            for i in range(j):
+                x[i] -= row[i] * xj
+                y[i] -= row[i] * yj
 
 
 def _warn(basis: Basis) -> None:
     remedy = "spread the centres or add smoothing"
     if basis.kernel.has_epsilon:
-        remedy = f"raise epsilon (it is {basis.epsilon:.2g} in units of the extent), {remedy}"
-    first, second, apart = _nearest_pair(basis.points)
+        remedy = f"raise epsilon (it is {basis.epsilon.max():.2g} in units of the extent), {remedy}"
+    first, second, apart = _nearest_pair(basis.scaled())
     pair = f"; centres {first} and {second} are only {apart:.1e} of the extent apart"
     warnings.warn(
         f"fit with kernel '{basis.kernel.name}' has a condition beyond {DOUBTFUL:g}: a ridge keeps it at {KEPT:g} and "
@@ -207,14 +251,15 @@ def _nearest_pair(points: Floats) -> tuple[int, int, float]:
 
 def _raise_if_singular(basis: Basis) -> None:
     """Raise LinAlgError if centres coincide or the polynomials are dependent on them."""
-    points, q = basis.points, len(basis.powers)
+    points, q = basis.scaled(), len(basis.powers)
     first, second, apart = _nearest_pair(points)
     if apart < 1e-15:
         same = np.flatnonzero((np.abs(points - points[first]) < 1e-15).all(axis=1))
         first, second = (same[0], same[1]) if len(same) > 1 else (first, second)
         pair = f"centres {first} and {second} coincide"
         raise np.linalg.LinAlgError(f"singular fit: {pair}; remove duplicates (or use smoothing)")
-    if q and np.linalg.matrix_rank(basis.polynomials, tol=_DEPENDENT * math.sqrt(basis.size)) < q:
+    tolerance = _DEPENDENT * math.sqrt(basis.size)
+    if q and len(basis.parts) == 1 and np.linalg.matrix_rank(basis.polynomials[0], tol=tolerance) < q:
         degree = int(basis.powers.sum(axis=1).max())
         flat = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         shape = "special (they lie on one surface of that degree)"
@@ -226,21 +271,3 @@ def _raise_if_singular(basis: Basis) -> None:
             f"singular fit: the {len(points)} centres are {shape}, so a polynomial of degree {degree} "
             f"({q} terms) is not determined; degree too high: lower it or use a kernel of lower order"
         )
-
-
-@cache
-def _dpotrf() -> Callable[..., None]:
-    from numba.extending import get_cython_function_address
-
-    address = get_cython_function_address("scipy.linalg.cython_lapack", "dpotrf")
-    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 5)(address)
-
-
-def factor_cholesky(matrix: Floats) -> int:
-    """Put the Cholesky factor in the lower triangle of a Fortran-ordered matrix; 0, or the first minor that fails."""
-    if matrix.dtype != np.float64 or not matrix.flags.f_contiguous or matrix.ndim != 2:
-        raise ValueError("LAPACK needs a two-dimensional float64 array in Fortran order")
-    lower, size, failed = ctypes.c_char(b"L"), ctypes.c_int(len(matrix)), ctypes.c_int(0)
-    order = ctypes.byref(size)
-    _dpotrf()(ctypes.byref(lower), order, matrix.ctypes.data, order, ctypes.byref(failed))
-    return failed.value

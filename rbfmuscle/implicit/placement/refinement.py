@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.field import FieldFit
-from rbfmuscle.implicit.fit.assembly import Basis, hermite_system, monomials
+from rbfmuscle.implicit.fit.assembly import Basis
 from rbfmuscle.implicit.fit.fitting import bounding_ridge
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, spread_points
 from rbfmuscle.implicit.selection import spacing, surface_error
@@ -38,15 +38,12 @@ def fit_sample(
     """Centres moved along their normals, and normals turned, so that the field is small on the whole mesh.
 
     ``sample`` is one of the mesh (vertices (n, 3), faces (m, 3)) with unit normals, ``fit`` that of the field that will
-    be fitted to it, to all derivatives; ``seed`` is that of points of the mesh. The least-squares problem is that of
+    be fitted to it; ``seed`` is that of points of the mesh. The least-squares problem is that of
     the given centres; what their moves leave is met by further rounds of it. Returns the sample of the round, the given
-    one included, whose field misses the mesh least. UsageError for a kernel that is not smooth enough for a Hermite
-    fit, or a fit to normal derivatives alone.
+    one included, whose field misses the mesh least. UsageError for a kernel that is not smooth enough.
     """
-    if not fit.kernel.hermite or fit.derivatives != "all":
-        raise UsageError(
-            f"kernel '{fit.kernel.name}' has no Hermite fit to all derivatives: take greedy centres"
-        )
+    if not fit.kernel.hermite:
+        raise UsageError(f"kernel '{fit.kernel.name}' has no Hermite fit: take greedy centres")
     where, _ = spread_points(np.asarray(vertices), np.asarray(faces), SAMPLES, seed=seed)
     points, normals = sample.points, sample.normals
     reach = float(spacing(points).mean())
@@ -76,8 +73,8 @@ class _Problem(NamedTuple):
 def _problem(points: Floats, normals: Floats, samples: Floats, fit: FieldFit, reach: float) -> _Problem:
     """The problem of some centres."""
     count = len(points)
-    basis, _ = hermite_system(points, normals, fit.kernel, fit.epsilon, "all")
-    scaled = (samples - basis.origin) / basis.scale
+    basis = Basis(points, fit.kernel, fit.epsilon, hermite=True)
+    scaled, scale = (samples - basis.origin) / basis.scale, float(basis.scale[0])
     full = basis.full_matrix()
     if math.isfinite(fit.condition):
         full[np.diag_indices(basis.size)] += bounding_ridge(basis, fit.condition)
@@ -89,9 +86,9 @@ def _problem(points: Floats, normals: Floats, samples: Floats, fit: FieldFit, re
         cardinal[:, low : low + _CHUNK] = found[: basis.size]
     matrix = cardinal @ cardinal.T
     weight = np.full(basis.size, STIFFNESS)
-    weight[count:] *= reach / basis.scale  # derivatives are by scaled coordinates
+    weight[count:] *= reach / scale  # derivatives are by scaled coordinates
     matrix[np.diag_indices(basis.size)] += weight**2 * len(samples) / count
-    return _Problem(cardinal, linalg.cho_factor(matrix, overwrite_a=True, check_finite=False), basis.scale)
+    return _Problem(cardinal, linalg.cho_factor(matrix, overwrite_a=True, check_finite=False), scale)
 
 
 def _step(points: Floats, normals: Floats, value: Floats, problem: _Problem) -> tuple[Floats, Floats]:
@@ -106,8 +103,8 @@ def _step(points: Floats, normals: Floats, value: Floats, problem: _Problem) -> 
 
 def _rows(basis: Basis, at: Floats) -> Floats:
     """Rows (n, size + q) of the field at scaled points: for the weights a, B and the polynomial."""
-    offset = at[:, None, :] - basis.points[None]
-    r, kernel = cdist(at, basis.points), basis.kernel
-    first = kernel.first(r, basis.epsilon)
-    parts = [kernel.phi(r, basis.epsilon), *(-first * offset[:, :, k] for k in range(3))]
-    return np.hstack([*parts, monomials(at, basis.powers).T])
+    kernel, points, epsilon = basis.kernel, basis.points[0].T, float(basis.epsilon[0])
+    offset, r = at[:, None, :] - points, cdist(at, points)
+    first = kernel.first(r, epsilon)
+    parts = [kernel.phi(r, epsilon), *(-first * offset[:, :, k] for k in range(3))]
+    return np.hstack([*parts, np.prod(at[:, None] ** basis.powers, axis=2)])
