@@ -73,7 +73,7 @@ def _evaluate_cubic_loop(points, terms, start, stop, value, gradient):
         x = points[low : min(low + _CHUNK, stop)]
         shares, growth, total = _shares_loop(x, terms)
         for fit in range(len(shares)):
-            first = 0
+            first = np.int64(0)  # of the type that `_fill_block` returns, which is then compiled once
             while first < len(x):
                 first, p, acc, g = _fill_block(x, terms, fit, shares, first, rows)
                 _cubic_block_loop(terms, fit, wanted, p, acc, g)
@@ -89,7 +89,7 @@ def _evaluate_loop(points, terms, form, start, stop, value, gradient):
         x = points[low : min(low + _CHUNK, stop)]
         shares, growth, total = _shares_loop(x, terms)
         for fit in range(len(shares)):
-            first = 0
+            first = np.int64(0)  # of the type that `_fill_block` returns, which is then compiled once
             while first < len(x):
                 first, p, acc, g = _fill_block(x, terms, fit, shares, first, rows)
                 _general_block_loop(terms, fit, form, wanted, p, acc, g)
@@ -176,7 +176,7 @@ def _closeness_loop(p, centres, soft, gradient):
 def _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total):
     """Add a fit's weight w, w f, and the gradients of both, to their sums (8, n).
 
-    w is (1 - t)^4 (4 t + 1) at t of the ball's radius, times how close the fit's own centres are: a sheet of another
+    w is (1 - t^2)^2 at t of the ball's radius, times how close the fit's own centres are: a sheet of another
     part of the muscle may have come into the ball, of which the fit knows nothing.
     """
     size, radius, single = terms.scale[fit], terms.radius[fit], len(terms.middle) == 1
@@ -189,16 +189,13 @@ def _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total):
         i = rows[n]
         if i < 0:
             break
-        t = np.sqrt(shares[fit, i])
-        ball, close = (1.0 - t) ** 4 * (4.0 * t + 1.0), 1.0 if single else near[0, n] / size**8
-        steep = 0.0 if single else -20.0 * (1.0 - t) ** 3 / radius**2
+        share = shares[fit, i]
+        ball, close = (1.0 - share) ** 2, 1.0 if single else near[0, n] / size**8
+        steep = 0.0 if single else -4.0 * (1.0 - share) / radius**2
         total[0, i] += ball * close
         total[1, i] += ball * close * acc[n]
         for c in range(3):
-            away = (
-                growth[0, i] * (x[i, c] - terms.middle[fit, c])
-                + shares[fit, i] * radius**2 * growth[1 + c, i]
-            )
+            away = growth[0, i] * (x[i, c] - terms.middle[fit, c]) + share * radius**2 * growth[1 + c, i]
             slope = steep * away * close + ball * near[1 + c, n] / size**9
             total[2 + c, i] += slope
             total[5 + c, i] += ball * close * g[c, n] / size + slope * acc[n]
