@@ -49,7 +49,7 @@ def digest(value):
     if isinstance(value, Mapping):
         return {str(key): digest(one) for key, one in value.items()}
     if isinstance(value, str | Path):
-        return len(re.findall(r"\w+", str(value)))
+        return len(re.findall(r"\w+", re.sub(r"\S*/", "", str(value))))  # without folders
     if value is None or isinstance(value, bool | int | float | np.number | np.bool_):
         return None if value is None or not math.isfinite(value) else float(value)
     if isinstance(value, list | tuple | set | frozenset):

@@ -84,7 +84,7 @@ def _tunnelling(model, **options):
 SCENES = {
     "contact_rbf": lambda: _contact(RBF),
     "contact_rbf_marching": lambda: _contact({**RBF, "surface": "marching"}),
-    "contact_rbf_fibres": lambda: _contact({**RBF, "nodes": 120, "fibre_ratio": 4.0}),
+    "contact_rbf_fibres": lambda: _contact({**RBF, "nodes": 120, "fibre_ratio": 4.0, "resolution": 0}),
     "contact_pbd": lambda: _bent("pbd"),
     "contact_pbd_serendipity": lambda: _bent("pbd"),
     "contact_pbd_voxel": lambda: _bent("pbd"),

@@ -101,14 +101,15 @@ def test_files_of_a_run_hold_what_is_kept(name, limb, tmp_path, monkeypatch, clo
     if name == "blend":
         use_blend_model(monkeypatch)
     rm.simulate(arm_scene(end=60) if name == "blend" else limb).save(folder)
-    write_report(folder)
+    info, facts = SavedRun(folder).info, {}
+    if name == "blend":  # the other's volume is the same in all frames: rounding decides where it is worst
+        write_report(folder)
+        facts = {key: info[key] for key in ("muscles", "frames", "times", "frame_time", "limits", "verdict")}
     export_run(folder, ["obj", "pvd", "stl", "ply"], units="cm", frames=slice(1, 3))
-    export_run(folder, ["glb", "animated-glb"])
-    info = SavedRun(folder).info
-    facts = [info[key] for key in ("muscles", "frames", "times", "frame_time", "limits", "verdict")]
+    export_run(folder, ["glb", "animated-glb"], frames=slice(1, 3))
     draw_scene(limb, folder / "scene.png")
     render_run(folder, folder / "side.png", frame=2)
     render_run(folder, folder / "plane.png", frame=3, views=["motion", "top"])
     # Without the lines of text above and below.
-    facts += [np.asarray(Image.open(file))[22:200] for file in sorted(folder.glob("*.png"))]
+    facts["plots"] = [np.asarray(Image.open(file))[22:200] for file in sorted(folder.glob("*.png"))]
     check_kept(f"run_{name}", [facts, file_facts(folder)])
