@@ -69,9 +69,9 @@ mutants: $(DEV)
 	test -f .mutants/compiled.json || $(BIN)/python benchmarks/mutants.py record
 	$(BIN)/python benchmarks/mutants.py run --minutes $(MINUTES) --seed $(SEED)
 
-# Results of small whole runs that tests compare with, written anew; what differs is reviewed as part of the change.
+# Results that tests compare with, written anew; what differs is reviewed as part of the change.
 references: $(DEV)
-	PYTHONPATH=tests:benchmarks $(BIN)/python -m whole_runs
+	RBFMUSCLE_WRITE_REFERENCES=1 $(PYTEST) -q -k what_is_kept
 	git --no-pager diff --stat -- tests/data/references
 
 check: $(DEV)

@@ -6,9 +6,9 @@
 
 A fault changes one expression: a comparison, an operator, a sign, a constant, a truth value. It lies in a copy of the
 checkout, never in the checkout. It is tried on quick tests of different files first, and what these let pass on more,
-the reference runs first. Faults in compiled loops are tried without compiler, then with it, all others with it. What
-went unnoticed is listed; what changes nothing that could be told is named in ``.mutants/equivalent.json`` by its key,
-with the reason, and counted apart. The same command goes on where it ended.
+each time first on some that compare with kept numbers. Faults in compiled loops are tried without compiler, then with
+it, all others with it. What went unnoticed is listed; what changes nothing that could be told is named in
+``.mutants/equivalent.json`` by its key, with the reason, and counted apart. The same command goes on where it ended.
 """
 
 import argparse
@@ -26,7 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -39,7 +39,7 @@ STEPS = ((20, 20.0), (60, 90.0))
 LIMIT = 180  # seconds of compiling at most, beside three times those of the tests: more is an endless loop
 PYTEST = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"]
 COLD = ("bones", "geometry", "implicit", "muscle")  # what they compute is cached, right or wrong
-REFERENCES = "tests/contract/test_whole_runs.py"
+KEPT, FIRST = "what_is_kept", 4  # tests that compare many numbers, and how many of them come first
 WORD = re.compile(r"\w+")
 LEFT_OUT = (".git", ".venv", ".mutants", "__pycache__", "*.egg-info", ".hypothesis", "demo_output", "images")
 COMPARE = {
@@ -55,21 +55,10 @@ TOGETHER = {ast.And: ast.Or, ast.Or: ast.And}
 class Fault:
     """One expression of a file and what stands in its place.
 
-    Attributes
-    ----------
-    path : str
-        Relative to the checkout.
-    line : int
-    start, end : int
-        Of the expression in the file [byte].
-    text : str
-        In its place.
-    loop : bool
-        Whether it lies in a compiled loop.
-    first, last : int
-        Lines of its statement; of a default value those of the function.
-    name : str
-        What holds it, where its line runs within no test: the compiled loop, or what is assigned at import.
+    ``path`` is relative to the checkout; the expression goes from byte ``start`` to ``end``, ``text`` is in its place;
+    ``loop`` says whether it is in a compiled loop. ``first`` and ``last`` are the lines of its statement, of a default
+    value those of the function. ``name`` is of what holds it, where its line runs within no test: the compiled loop, or
+    what is assigned at import.
     """
 
     path: str
@@ -205,10 +194,11 @@ def record(tests: list[str]) -> None:
             contexts = kept.set_query_contexts(None) or kept.contexts_by_lineno(file)
             relative = os.path.relpath(file, ROOT)
             lines[relative] = {n: [c.rpartition("|")[0] for c in cs if c] for n, cs in contexts.items()}
-        seconds = {
-            f"{case.get('classname', '').replace('.', '/')}/{case.get('name')}": float(case.get("time", 0.0))
-            for case in ElementTree.parse(times).iter("testcase")
-        }
+        seconds = {}
+        for case in ElementTree.parse(times).iter("testcase"):
+            file, _, group = case.get("classname", "").replace(".", "/").partition("/Test")
+            parts = [f"{file}.py", *[f"Test{group}"][: bool(group)], case.get("name", "")]
+            seconds["::".join(parts)] = float(case.get("time", 0.0))
         (WORK / f"{kind}.json").write_text(json.dumps({"lines": lines, "seconds": seconds}))
 
 
@@ -219,7 +209,8 @@ class Reach:
         path = WORK / f"{kind}.json"
         found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         self.kind, self.lines, self.seconds = kind, found.get("lines", {}), found.get("seconds", {})
-        self.tests = {test for lines in self.lines.values() for found in lines.values() for test in found}
+        self.run = Counter(t for lines in self.lines.values() for found in lines.values() for t in found)
+        self.tests = set(self.seconds)
         files = {test.partition("::")[0] for test in self.tests}
         self.named = {file: set(WORD.findall((ROOT / file).read_text(encoding="utf-8"))) for file in files}
         self.words: dict[tuple[str, str], set[str]] = {}
@@ -242,16 +233,17 @@ class Reach:
             found = self._naming(fault.name)
         if not found and not fault.loop:
             found = {test for tests in lines.values() for test in tests}
-        own = f"/test_{Path(fault.path).stem}/"  # which may run it in processes of their own
-        for place, rest in [key.split(own, 1) for key in self.seconds if own in key]:
-            found.add(f"{place}{own[:-1]}.py::{rest.replace('/', '::', int(rest.startswith('Test')))}")
+        own, folder = f"/test_{Path(fault.path).stem}.py", f"/{group_of(fault.path)}/"
+        # Tests with processes of their own run lines that are not recorded as theirs.
+        apart = {t for t in self.tests if folder in t and "subprocess" in self.named[t.partition("::")[0]]}
+        found |= apart | {test for test in self.tests if own in test}
         order, files = {}, defaultdict(int)
         for test in sorted(found, key=lambda t: (self.time(t), t)):
             file = test.partition("::")[0]
-            near = f"/{group_of(fault.path)}/" in file or f"{own[:-1]}.py" in file
+            near = folder in file or own in file
             order[test] = files[file] // (3 if near else 1), self.time(test), test
             files[file] += 1
-        ordered, steps = sorted(found, key=order.__getitem__), []
+        ordered, steps = self._kept_first(sorted(found, key=order.__getitem__)), []
         for most, budget in STEPS:
             chosen, spent = [], 0.0
             for test in ordered:
@@ -260,10 +252,12 @@ class Reach:
                     break
                 chosen.append(test)
             steps.append(chosen)
-            left = ordered[len(chosen) :]
-            references = [test for test in left if test.startswith(REFERENCES)][:2]
-            ordered = references + [test for test in left if test not in references]
+            ordered = self._kept_first(ordered[len(chosen) :])
         return [step for step in steps if step]
+
+    def _kept_first(self, tests):
+        kept = sorted((test for test in tests if KEPT in test), key=self.run.__getitem__)[:FIRST]
+        return kept + [test for test in tests if test not in kept]
 
     def _naming(self, name):
         """Tests that say a name or run a line with it, or with that of a loop or constant that is made with it."""
@@ -278,8 +272,7 @@ class Reach:
 
     def time(self, test: str) -> float:
         """Seconds that a test took."""
-        file, _, rest = test.partition("::")
-        return self.seconds.get(f"{file.removesuffix('.py')}/{rest}".replace("::", "/"), 1.0)
+        return float(self.seconds.get(test, 1.0))
 
 
 def passes(tree: Path, tests: list[str], kind: str, *, seconds: float) -> tuple[bool, str]:
@@ -300,6 +293,8 @@ def passes(tree: Path, tests: list[str], kind: str, *, seconds: float) -> tuple[
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             code = process.wait()
+        if code == 4:
+            raise SystemExit("a test that was recorded is not here any more: record again")
         out.seek(0)
         failed = [line[7:].partition(" - ")[0].strip() for line in out if line.startswith("FAILED ")]
     return code in (0, 5), failed[0] if failed else ""
@@ -390,10 +385,10 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0)
     given = parser.parse_args()
     if given.what == "record":
-        record(given.tests)
-    elif given.what == "run":
+        return record(given.tests)
+    if given.what == "run":
         run(given.count, given.seed, given.minutes)
-    print("recorded" if given.what == "record" else table(given.seed))
+    return print(table(given.seed))
 
 
 if __name__ == "__main__":

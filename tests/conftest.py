@@ -1,5 +1,6 @@
 """What several test files share."""
 
+import itertools
 import os
 import re
 import subprocess
@@ -97,6 +98,14 @@ def arm_run(tmp_path_factory):
         made = simulate(arm_scene(end=60))
     made.save(folder)
     return made, folder
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Each reading of the time is a 64th of a second after the one before, so that what is timed is the same anew."""
+    ticks = itertools.count()
+    for name in ("time.perf_counter", "time.process_time", "rbfmuscle.cli.check.perf_counter"):
+        monkeypatch.setattr(name, lambda: next(ticks) / 64.0)
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from blend_model import arm_files, arm_scene, use_blend_model
+from kept import check_kept, file_facts
 
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.study import _names, run_point
@@ -24,7 +25,6 @@ from rbfmuscle.experiments.sweep_run import (
     sweep_rows,
     write_table,
 )
-from rbfmuscle.report import sweep_page
 from rbfmuscle.report.sweep_page import write_page
 from rbfmuscle.validation import UsageError
 
@@ -113,28 +113,6 @@ class TestFront:
         assert ("lies on the Pareto front" in verdict["text"]) is rows[2]["front"]
 
 
-def test_page_shows_milliseconds_roles_and_the_ends_of_the_front(monkeypatch):
-    rows = [row(1.0, 0.004, "default"), row(2.0, 0.002), row(0.5, 0.008), row(np.nan, 1.0, "reference")]
-    rows[1]["settings"], rows[2]["settings"] = {"model": "pbd", "model.sweeps": 3}, {"model.centres": 90}
-    rows[3]["settings"] = {"model.centres": 300}
-    verdicts, drawn = mark_front(rows), []
-    assert "(1 mm at 4 ms per frame)" in verdicts[0]["text"]
-    monkeypatch.setattr(sweep_page, "front_plot", lambda points, labels: drawn.extend(points))
-    sweep_page.front_picture(rows, "error_rms")
-    default, quick = (4.0, 1.0, "default", "s", True, True), (2.0, 2.0, "sweeps 3", "s pbd", False, True)
-    assert [tuple(point) for point in drawn] == [default, quick, (8.0, 0.5, "centres 90", "s", False, True)]
-    lights = sweep_page._lights(rows, verdicts, "error_rms")
-    wanted = {
-        "default": ("1 mm", "4 ms"),
-        "the quickest": ("2 mm", "2 ms"),
-        "the most accurate": ("0.5 mm", "8 ms"),
-    }
-    assert {light.title: tuple(cell.text for cell in light.cells) for light in lights} == wanted
-    assert not sweep_page.inside_grid(rows)  # as nothing else has 300 centres
-    rows[3]["settings"] = {"model.centres": 90}
-    assert sweep_page.inside_grid(rows)
-
-
 class TestRun:
     def test_error_falls_with_refinement_and_the_reference_has_none(self, finished):
         points, folder = finished
@@ -148,6 +126,15 @@ class TestRun:
         assert 0 < fine["error_rms"] < coarse["error_rms"] < 1
         (reference,) = [r for r in rows.values() if r["role"] == "reference"]
         assert np.isnan(reference["error_rms"]) and not reference["front"]
+
+    def test_page_holds_what_is_kept(self, finished, tmp_path):
+        table = write_table(*finished, {"arm": "mm"})
+        for k, row in enumerate(table["rows"]):
+            row |= {"time_frame": 0.004 * (k % 3 + 1), "front": False}
+        table["verdicts"] = mark_front(table["rows"])
+        write_page(table, tmp_path)
+        # The page has three digits.
+        check_kept("sweep_page", file_facts(tmp_path), tolerance=1e-2)
 
     def test_what_is_done_is_not_done_twice(self, finished):
         before = {path: path.stat().st_mtime_ns for path in (finished[1] / "points").iterdir()}

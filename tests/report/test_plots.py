@@ -1,17 +1,13 @@
 """Plots: each line holds the values of the quantity that its title names, in the unit of its axis."""
 
-import math
 import re
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.writer import Neighbours
-from rbfmuscle.report.plots import Point, Track, front_plot, line_plot, motion_axis
-from rbfmuscle.report.report import _tracks
+from rbfmuscle.report.plots import Point, Track, front_plot, line_plot
 
 
 def ticks(svg, anchor):
@@ -68,23 +64,6 @@ def test_plots_do_not_depend_on_the_users_settings_and_take_any_name():
     with matplotlib.rc_context({"axes.facecolor": "black", "text.color": "white", "font.size": 30}):
         assert line_plot(r"$\frac$", tracks, ("angle", "mm")) == plain
     assert r">$\frac$</text>" in plain
-
-
-def test_tracks_are_the_series_of_the_run_and_times_leave_out_the_first_frame(arm_run):
-    saved = SavedRun(arm_run[1])
-    axis, label = motion_axis(saved)
-    assert label == "elbow.flexion [degree]" and axis[6] == pytest.approx(60)
-    angles = [math.degrees(math.radians(row["coordinates"]["elbow.flexion"])) for row in saved.info["frames"]]
-    (track,) = _tracks(saved, "volume_error", 100.0, axis, None)
-    np.testing.assert_allclose(track.y, 100.0 * saved.series("biceps", "volume_error")[1], rtol=1e-12)
-    np.testing.assert_allclose(track.x, angles, rtol=1e-12)
-    assert saved.moment_arm_coordinates() == saved.moment_arm_coordinates("biceps") == ["elbow.flexion"]
-    assert (
-        saved.moment_arm_coordinates("triceps") == []
-        and len(saved.series("biceps", "moment_arm", "x")[0]) == 0
-    )
-    (track,) = _tracks(saved, "time_frame", 1000.0, axis, None)
-    np.testing.assert_allclose(track.y, 1000.0 * saved.series("biceps", "time_frame")[1][1:], rtol=1e-12)
 
 
 def test_the_worst_of_neighbours_over_the_frames_is_kept():

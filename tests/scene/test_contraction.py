@@ -9,7 +9,6 @@ from rbfmuscle.scene.activation.contraction import (
     SETTLING,
     STEP,
     Activations,
-    activation_curve,
     resolve_contraction,
 )
 from rbfmuscle.validation import SceneError
@@ -30,16 +29,6 @@ def test_fibres_of_a_mesh_are_slack_pull_or_yield_by_the_law():
         assert fibres.lower[belly] == pytest.approx(low) and fibres.upper[belly] == pytest.approx(high)
         assert (fibres.active[belly] == activation).all() and (fibres.active[~belly] == 0.0).all()
         assert (fibres.lower[~belly] == 1.0).all() and fibres.upper[~belly] == pytest.approx(1.0 + strain)
-
-
-@pytest.mark.parametrize(
-    ("given", "values"), [(0.4, [0.4] * 5), ([0.2], [0.2] * 5), ([0, 1, 0], [0, 0.5, 1, 0.5, 0])]
-)
-def test_activation_along_the_motion_and_in_chosen_frames(given, values):
-    made = scene(activation=given)
-    assert activation_curve(made.muscle(MUSCLE), made.motion) == pytest.approx(values)
-    chosen = made.with_options(frames="2:5:2")
-    assert activation_curve(chosen.muscle(MUSCLE), chosen.motion) == pytest.approx(values[2:5:2])
 
 
 def test_sub_steps_follow_activation_and_settle_where_bones_stand_still():

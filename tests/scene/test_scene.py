@@ -55,25 +55,6 @@ def built():
 
 
 class TestLoading:
-    def test_everything_arrives(self, folder):
-        scene = load(folder)
-        assert (scene.name, scene.units) == ("arm", "mm")
-        assert [bone.name for bone in scene.bones] == ["upper", "lower"]
-        assert scene.joints[0].rotations[0].direction == pytest.approx([0, -1, 0])
-        muscle = scene.muscle("biceps")
-        assert (muscle.model, muscle.options) == ("rbf", {"centres": 60})
-        assert [a.bone for a in muscle.attachments] == ["upper", "lower"]
-        assert scene.contact.initial == "keep" and scene.contact.substep_angle == 2
-        assert scene.detect.tunnelling.action == "report" and scene.sliding is None
-        assert [f["elbow.flexion"] for f in scene.motion.frames] == pytest.approx(np.radians([0, 10, 20]))
-
-    def test_sphere_attachment_and_inline_vertices(self, folder):
-        sphere = "sphere = { centre = [60, 0, 20], radius = 12 }"
-        scene = load(folder, ('vertices = "lower.txt"', sphere))
-        points = scene.muscles[0].mesh.vertices[scene.muscles[0].attachments[1].vertices]
-        assert np.linalg.norm(points - [60, 0, 20], axis=1).max() <= 12
-        assert load(folder, ('"lower.txt"', "[1, 2]")).muscles[0].attachments[1].vertices.tolist() == [1, 2]
-
     def test_units_and_scale_give_the_same_shape(self, folder):
         scaled = [(f'"{n}.ply"', f'"{n}.ply"\nscale = 0.001') for n in ("upper", "lower", "biceps")]
         metres = load(folder, ('units = "mm"', 'units = "m"'), ("near = 4", "near = 0.004"), *scaled)
@@ -94,9 +75,6 @@ class TestMistakes:
             ('child = "lower"', 'child = "lowr"', r"joint 'elbow': .*'lowr', did you mean 'lower'"),
             ('{ bone = "upper"', '{ bone = "uper"', r"attach 1: .*'uper', did you mean 'upper'"),
             ("elbow.flexion", "elbo.flexion", r"'elbo.flexion', did you mean 'elbow"),
-            ("step = 10", "step = 0", r"\[motion\] ramp elbow.flexion step: .*greater than 0, got 0"),
-            ('units = "mm"', 'units = "inch"', r"\[scene\] units: .*'m', 'cm' or 'mm', got 'inch'"),
-            ('units = "mm"', "", r"\[scene\] units: field required"),
             ("[0, -2, 0]", "[0, 0, 0]", r"'elbow' axes flexion: must not be the zero vector"),
             ("near = 4", f"near = 4, {BALL}", r"one of vertices, near and sphere, got near and"),
             ("near = 4", "near = 0.001", r"reaches no vertex .*, the nearest is .* away"),
@@ -106,12 +84,8 @@ class TestMistakes:
             ('name = "biceps"', 'name = "../x"', r"muscle name '../x' may hold letters"),
             ("[scene]", "[scene", r"not valid TOML.*line 1"),
             ('"report"', '"reprot"', r"\[detect\] tunnelling action: .*'reprot'"),
-            ('name = "lower"\n', "", r"\[\[bone\]\] 2 name: field required"),
             ("[defaults]", '[defaults]\nattach = [ { bone = "arm", x = 1 } ]', r"\[defaults\] attach 1: unknown"),
             ("near = 4", BALL.replace(" }", ", x = 1 }"), r"\[\[muscle\]\] 'biceps' attach 1 sphere: unknown"),
-            ('"lower.txt"', "3.5", r"\[\[muscle\]\] 'biceps' attach 2 vertices: "),
-            ("{ from = 0, to = 20, step = 10 }", "3", r"ramp elbow.flexion: input should be a table, got 3"),
-            ("[contact]", "[output]\nsurfaces = 3\n[contact]", r"\[output\] surfaces: .* a valid boolean, got 3"),
         ],
     )  # fmt: skip
     def test_one_line_names_file_place_and_remedy(self, folder, old, new, message):

@@ -14,26 +14,6 @@ from rbfmuscle.simulation.substeps import SubSteps
 from rbfmuscle.validation import SceneError, SolveError
 
 
-def test_frames_carry_what_they_promise():
-    made, fields = hinged_scene([0, 10, 20], tunnelling=TunnellingOptions())
-    model = ToyMuscle(made.muscles[0], made)
-    frames = list(simulate_frames(made, [model], fields=fields))
-    assert [frame.index for frame in frames] == [0, 1, 2]
-    assert frames[2].coordinates == {"hinge.bend": np.radians(20)}
-    last = frames[-1]
-    for shown in (last.surfaces["strap"].vertices, last.carried["strap"][0]):
-        assert np.array_equal(shown, model.x)
-    assert np.allclose(last.poses["trunk"], np.eye(4))
-    times = last.times["strap"]
-    assert set(times) == {"time_predict", "time_solve", "time_tunnelling", "time_surface", "time_frame"}
-    assert 0.0 < times["time_frame"] == pytest.approx(sum(v for k, v in times.items() if k != "time_frame"))
-    assert sum(f.wall for f in frames) >= sum(f.times["strap"].get("time_solve", 0.0) for f in frames)
-    made.detect = model.drawing = None  # without surfaces and tables nothing is extracted or looked for
-    *_, last = simulate_frames(made, [model], fields=fields, surfaces=False)
-    assert last.surfaces == {}
-    assert not {"time_surface", "time_sliding", "time_tunnelling"} & set(last.times["strap"])
-
-
 def test_sub_steps_bound_turn_and_travel():
     made, _ = hinged_scene([0, 45])
     before, after = made.motion.frames

@@ -1,13 +1,8 @@
 """A muscle whose bones move as one is carried, not solved; what is solved comes out as it ever did."""
 
-import itertools
-import json
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import trimesh
-from command_line import call
 from toy_scene import box_mesh, ellipsoid, held
 
 import rbfmuscle as rm
@@ -121,22 +116,6 @@ def test_plan_counts_what_a_run_then_does():
         assert done[-1].state == "skipped"
         np.testing.assert_array_equal(*(frame.surfaces[muscle].vertices for frame in frames[-2:]))
     assert 0 < planned["brachialis"]["substeps"] < planned["deltoid"]["substeps"]
-
-
-def test_command_prints_the_plan_and_extrapolates_the_time(capsys, monkeypatch):
-    made = json.loads(call(capsys, "plan", "phantom", "--json")[1])
-    assert {field["bone"] for field in made["fields"]} == {"pelvis", "femur"}
-    assert "centres" in made["muscles"][0]["points"] and "time" not in made
-    # Three frames in 20 s, of which the last two take 2 and 4.
-    run = SimpleNamespace(frames=[SimpleNamespace(wall=wall) for wall in (9.0, 2.0, 4.0)])
-    monkeypatch.setattr("rbfmuscle.run.simulate", lambda *given, **named: run)
-    monkeypatch.setattr("rbfmuscle.cli.check.perf_counter", itertools.cycle((100.0, 120.0)).__next__)
-    total = 14.0 + 3.0 * (made["frames"] - 1)
-    found = json.loads(call(capsys, "plan", "phantom", "--json", "--time")[1])["time"]
-    assert found == {"build": 14.0, "frame": 3.0, "total": total}
-    said = call(capsys, "plan", "phantom", "--time")[1].splitlines()
-    assert said[0] == f"{made['frames']} frames in {made['substeps']} sub-steps"
-    assert f"expected time: {total:.3g} s " in said[-1] and "14 s, 3e+03 ms per frame" in said[-1]
 
 
 POSE = {"hip.flexion": np.radians(24.0), "hip.adduction": np.radians(-10.0)}

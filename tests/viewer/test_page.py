@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 
 import rbfmuscle as rm
+from rbfmuscle.output.saved import SavedRun
 
 pytest.importorskip("viser")
 from browser import Browser, wait_for
+from kept import check_kept, text_facts
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from rbfmuscle.viewer.page import Page
-from rbfmuscle.viewer.sources import LiveSource
+from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 FRAME, FLEXION = 0, 1  # sliders in their order
 STEADY = "?fixedDpr=1"  # otherwise the page lowers its resolution where drawing is slow
@@ -122,37 +124,6 @@ def test_play_goes_through_the_motion_and_stops(page, tab):
     assert degrees(page) == pytest.approx(2.0 * frame)
 
 
-def test_colouring_shows_its_scale_and_changes_the_picture(page, tab):
-    before = canvas(tab)
-    page.panel.colour.value = "penetration"
-    wait_for(lambda: "Depth in a bone [mm]" in tab.text(), SLOW)
-    wait_for(lambda: changed(before, canvas(tab)) > 0.01, SLOW)
-    coloured = canvas(tab)
-    page.panel.colour.value = "stretch"  # none, which is light grey
-    wait_for(lambda: changed(coloured, canvas(tab)) > 0.01, SLOW)
-    coloured = canvas(tab)
-    assert (coloured.max(axis=2) < 60).mean() < 1e-3
-    wait_for(lambda: len(page.sides[0]._painted) == 1, SLOW)  # what it replaced is gone
-    page.panel.colour.value = "group"
-    wait_for(lambda: changed(coloured, canvas(tab)) > 0.01, SLOW)
-
-
-def test_hidden_muscles_and_cut_leave_less(page, tab):
-    before = canvas(tab)
-    for name in ("extensor", "abductor"):
-        page.panel.eyes[name].value = False
-    wait_for(lambda: changed(before, canvas(tab)) > 0.01, SLOW)
-    hidden = canvas(tab)
-    for name in ("extensor", "abductor"):
-        page.panel.eyes[name].value = True
-    page.panel.cut.value = "z"
-    heights = np.concatenate([vertices[:, 2] for vertices, _ in page.panel.source.muscles.values()])
-    assert page.panel.look().cut == (2, pytest.approx(0.5 * (heights.min() + heights.max())))
-    wait_for(lambda: changed(hidden, canvas(tab)) > 0.01, SLOW)
-    page.panel.cut.value = "none"
-    wait_for(lambda: changed(before, canvas(tab)) < 0.002, SLOW)
-
-
 def test_second_model_follows_the_same_slider(page, tab):
     before = canvas(tab)
     page.panel.models[1].value = "xpbd"
@@ -233,6 +204,31 @@ def test_websocket_opens_for_the_own_page_alone(page, origin, path, opens):
 def test_server_listens_on_one_address(page):
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", urlsplit(page.address).port), timeout=5)
+
+
+def test_page_of_a_run_draws_what_is_kept(run_folder):
+    page, found = Page(SavedSource({"run": SavedRun(run_folder)}), at={"frame": 1.0}), {}
+    page._closed = True  # ends its thread, so that nothing is drawn but what is asked for
+    page._wake.set()
+    page._thread.join()
+    panel, side, camera = page.panel, page.sides[0], page.server.initial_camera
+    panel.eyes["abductor"].value = False
+    values = (
+        ("colour", "stretch"),
+        ("colour", "penetration"),
+        ("cut", "x"),
+        ("place", 0.3),
+        ("play", True),
+        ("play", False),
+    )
+    for name, value in (("quantity", "volume error [%]"), *values):
+        getattr(panel, name).value = value
+        more = page._turn(), panel.frame.value, camera.position, camera.look_at, camera.fov
+        nodes = {key: (n.vertices, n.faces, n.position, n.wxyz, n.visible) for key, n in side._nodes.items()}
+        text = text_facts(panel._numbers.content.rpartition("<br>")[0])
+        found[f"{name} {value}"] = nodes, side.numbers, more, text, panel._history
+    page.close()
+    check_kept("page", found, tolerance=1e-6)
 
 
 def test_notebook_shows_a_scene_and_a_run():

@@ -1,6 +1,5 @@
 """What a viewer shows of scenes and saved runs, without a browser."""
 
-import matplotlib
 import numpy as np
 import pytest
 import toy_scene
@@ -8,11 +7,10 @@ import trimesh
 
 import rbfmuscle as rm
 from rbfmuscle.metrics.mesh_distance import BoneProbe
-from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession
-from rbfmuscle.viewer.side import COLOURINGS, legend, shades, vertex_values
-from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource
+from rbfmuscle.viewer.side import vertex_values
+from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture
 
 
 @pytest.fixture
@@ -83,30 +81,6 @@ def test_stretch_of_a_ball_that_grew_and_its_depth_in_a_box():
     bone.apply_translation((0.0, 0.0, 58.0))  # its lower face cuts the ball 2 below the top
     values = vertex_values("penetration", "ball", rest, rest, [BoneProbe("bone", bone)], None)
     np.testing.assert_allclose(values, np.maximum(vertices[:, 2] - 8.0, 0.0), atol=1e-9)
-
-
-def test_scale_of_a_colouring_is_in_the_scenes_unit():
-    depth, stretch = COLOURINGS["penetration"], COLOURINGS["stretch"]
-    for colouring, unit, ends in ((depth, " [m]", (0, 0.001, 0.002)), (stretch, "", (-0.5, 0, 0.5))):
-        text = legend(colouring, "m", 0.001)
-        assert f"{colouring.title}{unit}<" in text and "".join(f"<span>{x:g}</span>" for x in ends) in text
-    found = shades(depth, np.array([0.0, 0.002, np.nan]), 0.001)
-    inferno = matplotlib.colormaps["inferno"]
-    np.testing.assert_allclose(found, [inferno(0.0)[:3], inferno(1.0)[:3], [179 / 255] * 3])
-
-
-def test_saved_run_is_scrubbed(run_folder):
-    source = SavedSource({"run": SavedRun(run_folder)})
-    assert source.motion == [{"frame": 0.0}, {"frame": 1.0}, {"frame": 2.0}]
-    figure = source.figure("run")
-    first = figure.advance() if figure.pending else None
-    assert not figure.pending
-    figure.set("frame", 0.9)
-    assert figure.pending
-    last = figure.advance()
-    assert not np.allclose(first.surfaces["extensor"][0], last.surfaces["extensor"][0])
-    assert "frame 1" in last.text and set(last.depth) == set(last.surfaces)
-    assert np.abs(vertex_values("stretch", "extensor", last, first, [], None)).max() > 0.01
 
 
 def test_controls_of_the_phantom_have_joint_unit_and_limits():

@@ -4,6 +4,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from kept import check_kept
 
 from rbfmuscle.paths import (
     FittedPath,
@@ -37,6 +38,11 @@ def test_fit_holds_at_poses_that_it_has_not_seen():
     length, arms = smooth(held)
     assert np.sqrt(np.mean((path.length(held) - length) ** 2)) < 1e-3
     assert np.sqrt(np.mean((path.arms(held) - arms) ** 2)) < 1e-2
+
+
+def test_fit_is_what_is_kept():
+    # The equations have a condition of 1e4.
+    check_kept("path", fit_path("m", ("a.x", "b.y"), *made()), tolerance=1e-7)
 
 
 def test_file_is_in_metres_with_terms_in_the_order_of_opensim(tmp_path):

@@ -96,20 +96,6 @@ class TestSmall:
         (note,) = [note for note in read_osim(small).notes if "closes a loop" in note]
         assert "joint 'strut' (ground to shank)" in note
 
-    def test_scene_stands_in_the_default_pose(self, small):
-        scene = import_osim(small).scene
-        assert [bone.name for bone in scene.bones] == ["thigh", "shank"] and scene.links == ["ground", "cap"]
-        knee = scene.joints[1]
-        assert knee.name == "knee" and knee.coordinates["knee_angle"].rest == -0.5
-        shank = scene.bone("shank").mesh
-        place = read_osim(small).transforms()["shank"]
-        wedge = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]) @ place[:3, :3].T + place[:3, 3]
-        assert np.asarray(shank.vertices).min(axis=0) == pytest.approx(wedge.min(axis=0))
-        assert all(np.array_equal(pose, np.eye(4)) for pose in bone_poses(scene, {}).values())
-        mesh = scene.bone("thigh").mesh  # mirrored and scaled
-        assert mesh.volume == pytest.approx(2 * 0.1**3 / 6)
-        assert mesh.bounds[0][2] == pytest.approx(-0.2)
-
 
 def test_ground_may_be_the_child(small):
     text = small.read_text(encoding="utf-8").replace(

@@ -1,0 +1,115 @@
+"""Scenes, imports, pages, files and pictures of small inputs hold what they held, with times of a counting clock."""
+
+from itertools import pairwise
+from shutil import copy
+
+import numpy as np
+import pytest
+from blend_model import arm_scene, use_blend_model
+from conftest import ROOT
+from fuzz.meshes import base_scene, damaged_shape, write_base
+from fuzz.scenes import to_toml
+from kept import check_kept, file_facts
+from PIL import Image
+from whole_runs import SCENES
+
+import rbfmuscle as rm
+from rbfmuscle.importers.guess.guess import guess_scene, write_scene
+from rbfmuscle.importers.opensim import scene as opensim
+from rbfmuscle.output.export import export_run
+from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.report.render import draw_scene, render_run
+from rbfmuscle.report.report import write_report
+from rbfmuscle.scene.activation.contraction import Activations, resolve_contraction
+from rbfmuscle.scene.meshes.read import prepare_mesh
+from rbfmuscle.scene.motion import bone_poses, step_angle
+from rbfmuscle.simulation.plan import plan_scene
+from rbfmuscle.validation import MeshError
+
+
+def scene_facts(scene):
+    """A scene as run.json has it, its findings, plan, attachments, and what changes along its motion."""
+    told, frames, activations = scene.resolved(), scene.motion.frames, Activations(scene)
+    for table in (told, *told["bones"], *told["muscles"]):
+        table.pop("sha256" if "sha256" in table else "file")
+    yield told, plan_scene(scene), scene.body, [(f.level, f.place) for f in scene.check()]
+    yield (
+        [bone_poses(scene, frame) for frame in frames],
+        [step_angle(scene, *pair) for pair in pairwise(frames)],
+    )
+    yield [bone_poses(scene, frame).tendons for frame in frames]
+    yield [held.vertices for muscle in scene.muscles for held in muscle.attachments]
+    yield [resolve_contraction(muscle) for muscle in scene.muscles if muscle.contraction is not None]
+    yield [activations.at(k) for k in range(len(frames))], activations.refine(1, frames[:2])
+
+
+@pytest.fixture
+def limb(tmp_path):
+    """A scene of joints of several kinds, with a coupling, a tendon and activation."""
+    write_base(tmp_path)
+    return rm.Scene.load(copy(ROOT / "tests" / "data" / "limb.toml", tmp_path))
+
+
+@pytest.mark.parametrize("name", ["limb", "contact_pbd", "sliding_xpbd", "tunnelling_arap_volume"])
+def test_scene_is_what_is_kept(name, limb):
+    check_kept(f"scene_{name}", list(scene_facts(limb if name == "limb" else SCENES[name]())))
+
+
+def test_scene_with_a_file_of_motion_is_what_is_kept(tmp_path):
+    write_base(tmp_path)
+    (tmp_path / "scene.toml").write_text(
+        to_toml(base_scene() | {"motion": {"file": "flex.mot"}}), encoding="utf-8"
+    )
+    check_kept("scene_file", list(scene_facts(rm.Scene.load(tmp_path / "scene.toml"))))
+
+
+def test_mended_mesh_is_what_is_kept():
+    found = {}
+    for kind in (*range(8), *range(10, 14)):
+        mesh = damaged_shape(np.random.default_rng(kind), kind)
+        try:
+            read = prepare_mesh(mesh.vertices, mesh.faces, place="x", name="y", may_be_open=True)
+            found[kind] = read.mesh, read.notes, read.closed
+        except MeshError as error:
+            found[kind] = str(error)
+    check_kept("meshes", found)
+
+
+def test_imported_model_is_what_is_kept(tmp_path):
+    for name in ("small.osim", "wedge.obj"):
+        copy(ROOT / "tests" / "data" / name, tmp_path)
+    found = opensim.import_osim(tmp_path / "small.osim")
+    opensim.write_scene(found, tmp_path / "scene")
+    facts = list(scene_facts(rm.Scene.load(tmp_path / "scene" / "scene.toml", skeleton=True)))
+    moved = [found.model.transforms(dict.fromkeys(found.model.coordinates(), 0.1 * k)) for k in range(-2, 3)]
+    check_kept("osim", [facts, found.places, found.notes, moved])
+
+
+def test_guessed_scene_is_what_is_kept(tmp_path):
+    scene = rm.phantom_scene(spacing=4.0)
+    for item in scene.bones + scene.muscles:
+        item.mesh.export(tmp_path / f"{item.name}.ply")
+    made = write_scene(guess_scene(tmp_path, "mm", tmp_path), tmp_path / "scene.toml")
+    # Meshes in single precision.
+    check_kept("guess", [list(scene_facts(made)), file_facts(tmp_path)], tolerance=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:limb and hand")
+@pytest.mark.parametrize("name", ["blend", "limb"])
+def test_files_of_a_run_hold_what_is_kept(name, limb, tmp_path, monkeypatch, clock):
+    folder = tmp_path / "run"
+    if name == "blend":
+        use_blend_model(monkeypatch)
+    rm.simulate(arm_scene(end=60) if name == "blend" else limb).save(folder)
+    info, facts = SavedRun(folder).info, {}
+    if name == "blend":  # the other's volume is the same in all frames: rounding decides where it is worst
+        write_report(folder)
+        facts = {key: info[key] for key in ("muscles", "frames", "times", "frame_time", "limits", "verdict")}
+    export_run(folder, ["obj", "pvd", "stl", "ply"], units="cm", frames=slice(1, 3))
+    export_run(folder, ["glb", "animated-glb"], frames=slice(1, 3))
+    draw_scene(limb, folder / "scene.png")
+    render_run(folder, folder / "side.png", frame=2)
+    render_run(folder, folder / "plane.png", frame=3, views=["motion", "top"])
+    # Without the lines of text above and below.
+    facts["plots"] = [np.asarray(Image.open(file))[22:200] for file in sorted(folder.glob("*.png"))]
+    check_kept(f"run_{name}", [facts, file_facts(folder)])
