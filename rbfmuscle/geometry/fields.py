@@ -47,19 +47,3 @@ class BoneField(Protocol):
         self, points: np.ndarray, pose: np.ndarray | None = None, reach: np.ndarray | float = np.inf
     ) -> tuple[np.ndarray, np.ndarray]:
         """The same with gradients (n, 3) in the axes of the points."""
-
-
-class LevelField:
-    """A field less a level: its zero set is the field's set of that level."""
-
-    def __init__(self, field: Field, level: float) -> None:
-        self.field, self.level = field, level
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Values (n,) at points (n, 3)."""
-        return self.field(points) - self.level
-
-    def value_and_gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values (n,) and gradients (n, 3) at points (n, 3)."""
-        value, gradient = self.field.value_and_gradient(points)
-        return value - self.level, gradient

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypedDict
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.fields import ClipDistance, LevelField
+from rbfmuscle.geometry.fields import ClipDistance
 from rbfmuscle.implicit.extraction.material import FittedMesh, project_to_level_set
 from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
 from rbfmuscle.implicit.extraction.obstacles import Obstacles, PointGrid
@@ -19,7 +19,7 @@ from rbfmuscle.muscle.rest import RestState
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame import ModelSurface
+from rbfmuscle.simulation.frame import Mesh, ModelSurface
 from rbfmuscle.validation import SolveError
 
 # Cells along the longest side where marching cubes is asked for and no resolution.
@@ -43,18 +43,12 @@ class Configuration(NamedTuple):
     carried: np.ndarray | None  # (n, 3) vertices of the shown mesh where the material takes them
 
 
-class _Neighbours(NamedTuple):
-    """Whether points of sliding neighbours push faces off, and whether neighbours cut the surface at all."""
-
-    points: bool
-    cut: bool
-
-
 class _Surroundings(TypedDict):
-    """Cut and obstacles, as `project_to_level_set` takes them."""
+    """Bones and neighbours, as `project_to_level_set` takes them."""
 
     cut: ClipDistance | None
     obstacles: Obstacles
+    excess: Callable[[Floats], Floats] | None
 
 
 class SurfaceBuilder:
@@ -81,7 +75,7 @@ class SurfaceBuilder:
             result: ExtractedSurface = self._march(fit, now, contacts)
             left = 0.0
         else:
-            result, notes = self._of_material(fit, now.carried, contacts)
+            result = self._of_material(fit, now.carried, contacts)
             left = result.left / len(now.carried)
             if left == 1.0:
                 bone, cause = self._cause(now, contacts)
@@ -91,41 +85,21 @@ class SurfaceBuilder:
 
     def _of_material(
         self, fit: Callable[[], RBFField], carried: np.ndarray, contacts: BoneContacts
-    ) -> tuple[FittedMesh, list[tuple[str, int, str]]]:
-        """The material's mesh on the level set, or where the material is if there is no fit; notes for events."""
-        mesh = self.shown.mesh
-        volume, notes = self.rest.mesh_volume, []
-        for neighbours in self._neighbours_met(contacts):
-            where = self._surroundings(mesh, carried, contacts, neighbours)
-            try:
-                result = project_to_level_set(mesh, carried, fit(), volume=volume, level=self.level, **where)
-            except (ValueError, np.linalg.LinAlgError):
-                continue
-            self.level = result.level
-            if result.crossing:
-                result = self._sounder(result, mesh, carried, volume, where)
-            break
-        else:
-            result = self._carry(mesh, carried, volume, where)
-        if contacts.cuts and not neighbours.cut:
-            notes.append(("", len(carried), "neighbours_let_in"))
-        return result, notes
-
-    def _neighbours_met(self, contacts: BoneContacts) -> list[_Neighbours]:
-        """What sliding neighbours do to the surface, the first that leaves one: on all sides they may leave nothing."""
-        less = [_Neighbours(points=False, cut=True), _Neighbours(points=False, cut=False)]
-        if not contacts.cuts:
-            return less[1:]
-        return [_Neighbours(points=True, cut=True), *less] if len(contacts.neighbour_points()) else less
-
-    def _surroundings(
-        self, mesh: MaterialMesh, carried: Floats, contacts: BoneContacts, neighbours: _Neighbours
-    ) -> _Surroundings:
+    ) -> FittedMesh:
+        """The material's mesh on the level set, or where the material is if there is no fit."""
+        mesh, volume = self.shown.mesh, self.rest.mesh_volume
         reach = REACH * mesh.edge(carried)
-        return {
-            "cut": _BoneCut(contacts, reach, neighbours=neighbours.cut) if contacts.names else None,
-            "obstacles": self._obstacles(contacts, neighbours=neighbours.points),
+        where: _Surroundings = {
+            "cut": _BoneCut(contacts, reach) if contacts.names else None,
+            "obstacles": self._obstacles(contacts),
+            "excess": contacts.excess if contacts.beside else None,
         }
+        try:
+            result = project_to_level_set(mesh, carried, fit(), volume=volume, level=self.level, **where)
+        except (ValueError, np.linalg.LinAlgError):
+            return self._carry(mesh, carried, volume, where)
+        self.level = result.level
+        return self._sounder(result, mesh, carried, volume, where) if result.crossing else result
 
     def _sounder(
         self, fitted: FittedMesh, mesh: MaterialMesh, carried: Floats, volume: float, where: _Surroundings
@@ -183,12 +157,9 @@ class SurfaceBuilder:
         """Axes that turn with the scene: what is sorted by them then falls out alike."""
         return self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
 
-    def _obstacles(self, contacts: BoneContacts, *, neighbours: bool = True) -> Obstacles:
-        """Points that faces have to leave outside: those of bones, and of sliding neighbours where they meet."""
-        found = [(self._bones[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
-        points = contacts.neighbour_points() if neighbours else np.zeros((0, 3))
-        # A neighbour thinner than the surface's edges would stick through its faces: their corners alone are cut.
-        return [*found, (PointGrid(points), np.eye(4))] if len(points) else found
+    def _obstacles(self, contacts: BoneContacts) -> Obstacles:
+        """Points of bones, which faces have to leave outside."""
+        return [(self._bones[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
 
     def _cause(self, now: Configuration, contacts: BoneContacts) -> tuple[str, str]:
         """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or sheets that met."""
@@ -225,9 +196,10 @@ class RBFDrawing:
         self._fitted: RBFField | None = None
         self._time_fit = 0.0
 
-    def field(self) -> LevelField:
-        """The field that the surface is drawn by, less the level that the frame before came to."""
-        return LevelField(self._fit(), self._drawer.level)
+    def carried(self) -> Mesh | None:
+        """The shown mesh where the material takes it; None where marching cubes show the surface."""
+        shown = self._drawer.shown
+        return None if shown is None or self._now.carried is None else (self._now.carried, shown.mesh.faces)
 
     def surface(self) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lay in the way."""
@@ -253,13 +225,13 @@ class RBFDrawing:
 class _BoneCut:
     """What the bones cut away: their smallest distance, a lower bound where it is beyond ``reach``."""
 
-    def __init__(self, contacts: BoneContacts, reach: float, *, neighbours: bool = True) -> None:
-        self.contacts, self.reach, self.neighbours = contacts, reach, neighbours
-        # Distances to bones change as fast as one walks; half the difference of two muscles' fields is no distance.
-        self.steepest = np.inf if contacts.cuts and neighbours else 1.0
+    steepest = 1.0
+
+    def __init__(self, contacts: BoneContacts, reach: float) -> None:
+        self.contacts, self.reach = contacts, reach
 
     def __call__(self, points: Floats) -> Floats:
-        return self.contacts.nearest(points, self.reach, neighbours=self.neighbours)[0]
+        return self.contacts.nearest(points, self.reach)[0]
 
     def value_and_gradient_below(self, points: Floats, limit: Floats) -> tuple[Floats, Floats]:
-        return self.contacts.nearest(points, limit, neighbours=self.neighbours)
+        return self.contacts.nearest(points, limit)

@@ -110,7 +110,7 @@ class BoneContacts:
         #: Planes of sliding neighbours, and those that hold points on their side of a bone.
         self.neighbours: list[Planes] = []
         self._stack: _PlaneStack | None = None  # of a copy for a subset of the contact points
-        self.cuts: list[Any] = []  # sliding pairs that clip the muscle's surface beside the bones
+        self.beside: list[Any] = []  # sliding pairs, for the muscle's surface
         self._known: tuple[Floats, ...] = (
             np.zeros((len(self.reached), 0, 3)),
             np.zeros((len(self.reached), 0)),
@@ -126,7 +126,7 @@ class BoneContacts:
     def frozen(self) -> BoneContacts:
         """A copy in the present poses, for queries from another thread while the bones move."""
         other = copy.copy(self)
-        other.cuts, other._known = list(self.cuts), tuple(part[:, :0] for part in self._known)
+        other.beside, other._known = list(self.beside), tuple(part[:, :0] for part in self._known)
         return other
 
     def only(self, index: Integers) -> BoneContacts:
@@ -162,14 +162,11 @@ class BoneContacts:
         direction_loop(points, gradient, pose, self.boxes[self._row[bone_index]])
         return distance, gradient
 
-    def nearest(
-        self, points: ArrayLike, limit: Floats | float = np.inf, *, neighbours: bool = True
-    ) -> tuple[Floats, Floats]:
-        """Smallest distance (n,) over bones and neighbours, and its gradient (n, 3) in world axes, for clipping.
+    def nearest(self, points: ArrayLike, limit: Floats | float = np.inf) -> tuple[Floats, Floats]:
+        """Smallest distance (n,) over bones, and its gradient (n, 3) in world axes, for clipping.
 
         [scene unit], negative inside a bone, infinity where none is in reach. Beyond ``limit``, a number or (n,), it
-        is only a lower bound above the limit, without a gradient. Against a sliding neighbour it is half the
-        difference of the two muscles' distances, so that both are cut alike.
+        is only a lower bound above the limit, without a gradient.
         """
         points = check_points(points)
         apart = np.empty(len(self.reached))
@@ -180,13 +177,11 @@ class BoneContacts:
             # No farther than what was found: elsewhere a lower bound will do.
             found = self.distance_and_direction(points, b, np.minimum(smallest, limit))
             closer_loop(*found, smallest, gradient)
-        for neighbour in self.cuts if neighbours else ():
-            closer_loop(*neighbour.cut(points), smallest, gradient)
         return smallest, gradient
 
-    def neighbour_points(self) -> Floats:
-        """Points (k, 3) of sliding neighbours where these meet the muscle [scene unit]."""
-        return np.concatenate([np.zeros((0, 3)), *(neighbour.points() for neighbour in self.cuts)])
+    def excess(self, points: Floats) -> Floats:
+        """How far (n,) points (n, 3) of the surface are to move inwards for sliding neighbours [scene unit]."""
+        return np.max([np.zeros(len(points)), *(pair.excess(points) for pair in self.beside)], axis=0)
 
     def depths(self, points: Floats) -> dict[int, Floats]:
         """Depth (n,) of each free contact point in each bone, by the bone's index [scene unit]; 0 outside."""

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
-from rbfmuscle.geometry.fields import Field
 from rbfmuscle.simulation.contact import BoneContacts
+
+Mesh: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,6 @@ class Event:
     (crossed by the bone's field, by its triangles less than 0.1 mm deep), ``"unresolved"`` (crossed all the same),
     ``"carried_stretched"``, ``"carried_held_end"`` or ``"carried_sheets"`` (no level set could be shown, so the surface
     is where the material is: it is stretched too far, an end is held inside the bone named, or sheets have met),
-    ``"neighbours_let_in"`` (sliding neighbours on all sides left no surface, so it was fitted without them),
     ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,
     ``"bones_overlap"`` (the motion drives two bones into each other) or ``"joint_opens"`` (those of a joint apart).
     """
@@ -67,8 +67,8 @@ class Frame:
 class Drawing(Protocol):
     """A copy of a model's state, from which its surface is computed, maybe while the model continues."""
 
-    def field(self) -> Field | None:
-        """The field whose zero level set is shown; None for a model without one."""
+    def carried(self) -> Mesh | None:
+        """Vertices and faces of the shown mesh, where the material takes them; None where that is the material's."""
 
     def surface(self) -> ModelSurface:
         """The surface, closed and outward; called once."""
@@ -76,12 +76,12 @@ class Drawing(Protocol):
 
 @dataclass(frozen=True)
 class FinishedDrawing:
-    """The drawing of a model whose surface is known, without a field."""
+    """The drawing of a model whose surface is known."""
 
     finished: ModelSurface
 
-    def field(self) -> None:
-        """None: there is no field."""
+    def carried(self) -> None:
+        """None: the surface is the material's."""
 
     def surface(self) -> ModelSurface:
         """The surface."""

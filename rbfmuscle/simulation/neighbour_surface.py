@@ -15,8 +15,7 @@ from rbfmuscle.geometry.winding import winding_loop
 from rbfmuscle.jit import compiled
 
 if TYPE_CHECKING:
-    from rbfmuscle.geometry.fields import Field
-    from rbfmuscle.simulation.frame import MuscleModel
+    from rbfmuscle.simulation.frame import Mesh, MuscleModel
 
 # Index, distance, outward normal and nearest vertex of the points that are near a surface.
 Found = tuple[Integers, Floats, Floats, Integers]
@@ -41,13 +40,104 @@ class Skin(NamedTuple):
     ring: np.ndarray
 
 
-class NeighbourSurface:
-    """Signed distance to a model's material mesh, for points near it.
+class MovingSurface:
+    """Signed distance to a mesh whose vertices move, for points near it.
 
     The nearest point of the surface lies in one of the triangles around the nearest vertex, up to the square of an edge
     over the radius of curvature.
     Directions are interpolated vertex normals, or, around a rim, the direction to the point. The sign is that of the
     triangles that meet at the nearest point.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+        At rest.
+    faces : (m, 3) ndarray
+    reach : float
+        Greatest distance that will be asked for [scene unit].
+
+    Attributes
+    ----------
+    vertices : (n, 3) ndarray
+    deepest : (n,) ndarray
+        How deep a point whose nearest vertex is this one may be.
+    box : (2, 3) ndarray
+        About the surface.
+    """
+
+    def __init__(self, vertices: Floats, faces: Integers, reach: float) -> None:
+        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
+        corner = self.faces.ravel()
+        order = np.argsort(corner, kind="stable")
+        self.ring = order // 3
+        self.start = np.searchsorted(corner[order], np.arange(len(vertices) + 1))
+        sides = vertices[self.faces] - vertices[np.roll(self.faces, 1, axis=1)]
+        self.edge = float(np.linalg.norm(sides, axis=2).mean())
+        self.reach = float(reach)
+        rest, balls = np.ascontiguousarray(vertices, dtype=np.float64), np.empty((2, len(vertices)))
+        touching_balls(rest, vertex_normals(rest, self.faces), balls, np.empty(len(rest)))
+        self.deepest = DEEPER * np.minimum(balls[1], self.reach) + self.edge
+        self.move(rest)
+
+    def move(self, vertices: Floats) -> None:
+        """Take the present vertices (n, 3)."""
+        self.vertices = vertices
+        self.normals = vertex_normals(vertices, self.faces)
+        self.box = np.array([vertices.min(axis=0), vertices.max(axis=0)])
+        self._tree: cKDTree | None = None
+
+    def nearest(self, points: Floats, reach: float) -> Integers:
+        """Nearest vertex (n,) of points (n, 3); as many as there are vertices where none is within ``reach``."""
+        if self._tree is None:
+            self._tree = cKDTree(self.vertices, balanced_tree=False, compact_nodes=False)
+        found: Integers = self._tree.query(points, distance_upper_bound=reach)[1]
+        return found
+
+    def query(self, points: Floats, reach: Floats | float, start: Integers | None = None) -> Found:
+        """Distances of those points that are nearer than ``reach``.
+
+        Parameters
+        ----------
+        points : (n, 3) ndarray
+        reach : float or (n,) ndarray
+        start : (n,) ndarray of int, optional
+            Vertices that were `nearest` not long ago, from which the nearest now is found over edges.
+
+        Returns
+        -------
+        index : (c,) ndarray of int
+            Which points.
+        distance : (c,) ndarray
+            Negative inside.
+        normal : (c, 3) ndarray
+            Unit, outward.
+        nearest : (c,) ndarray of int
+            Nearest vertex.
+        """
+        reach = np.broadcast_to(reach, len(points))
+        if start is None:
+            start = self.nearest(points, min(float(reach.max(initial=0.0)), self.reach) + self.edge)
+        skin = Skin(self.vertices, self.normals, self.faces, self.start, self.ring)
+        index = np.flatnonzero(start < len(self.vertices))
+        nearest, away = start[index], np.empty(len(index))
+        _walk_loop(points, index, skin, nearest, away)
+        near = away < reach[index] + self.edge
+        index, nearest = index[near], nearest[near]
+        distance, normal = np.empty(len(index)), np.empty((len(index), 3))
+        _distance_loop(points, index, nearest, skin, distance, normal)
+        # Beyond a sharp rim the normals of its sides disagree: no point is deeper than the muscle is thick.
+        near = (distance < reach[index]) & (distance >= -self.deepest[nearest])
+        # A folded triangle at a rim may give a point far outside a large depth.
+        deep = np.flatnonzero(near & (distance < -FOLDED * self.edge))
+        if len(deep):
+            winding = np.empty(len(deep))
+            winding_loop(self.vertices, self.faces, points[index[deep]], winding)
+            near[deep] = winding > 0.5
+        return index[near], distance[near], normal[near], nearest[near]
+
+
+class NeighbourSurface(MovingSurface):
+    """Signed distance to a model's material mesh, and to the mesh that shows it.
 
     Parameters
     ----------
@@ -60,40 +150,35 @@ class NeighbourSurface:
     ----------
     points : (c, 3) ndarray
         The model's contact points.
-    vertices : (n, 3) ndarray
     fixed : (n,) ndarray of bool
         Vertices that a bone holds.
     contact : (n,) ndarray of int
         Contact point that a vertex is, or is nearest to.
-    deepest : (n,) ndarray
-        How deep a point whose nearest vertex is this one may be.
-    box, reach_box : (2, 3) ndarray
-        About the surface, and about the model's contact points.
-    field : Field or None
-        The field whose zero set is shown, for models that have one.
+    reach_box : (2, 3) ndarray
+        About the model's contact points.
+    shown : MovingSurface
+        The mesh that is shown, where the material takes it.
     """
 
     def __init__(self, model: MuscleModel, reach: float) -> None:
         self.model = model
-        self.field: Field | None = None
-        vertices, faces = model.material_mesh()
-        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
-        corner = self.faces.ravel()
-        order = np.argsort(corner, kind="stable")
-        self.ring = order // 3
-        self.start = np.searchsorted(corner[order], np.arange(len(vertices) + 1))
-        sides = vertices[self.faces] - vertices[np.roll(self.faces, 1, axis=1)]
-        self.edge = float(np.linalg.norm(sides, axis=2).mean())
-        self.reach = float(reach)
-        rest, balls = np.ascontiguousarray(vertices, dtype=np.float64), np.empty((2, len(vertices)))
-        touching_balls(rest, vertex_normals(rest, self.faces), balls, np.empty(len(rest)))
-        self.deepest = DEEPER * np.minimum(balls[1], self.reach) + self.edge
-        self.contact = cKDTree(model.contact_points()).query(vertices)[1]
+        super().__init__(*model.material_mesh(), reach)
+        self.shown: MovingSurface = self
+        self.contact = cKDTree(model.contact_points()).query(self.vertices)[1]
         self.fixed = np.asarray(model.contact_bone)[self.contact] >= 0
         #: Change of the coordinates in the last sub-step, and how far the solve moved points and vertices in it.
         self._change: dict[str, float] = {}
         self._correction: list[Floats] = []
         self.refresh()
+
+    def show(self, mesh: Mesh | None) -> None:
+        """Take the vertices and faces of the mesh that is shown; None where that is the material's."""
+        if mesh is None:
+            self.shown = self
+        elif self.shown is self:
+            self.shown = MovingSurface(*mesh, self.reach)
+        else:
+            self.shown.move(mesh[0])
 
     def refresh(self, *path: Mapping[str, float]) -> None:
         """Update from the model's present state.
@@ -103,12 +188,10 @@ class NeighbourSurface:
         self._predicted = self._present()
         share = self._share(_change(*path)) if path and self._correction else 0.0
         ahead = [here + share * moved for here, moved in zip(self._predicted, self._correction)]
-        self.points, self.vertices = map(np.ascontiguousarray, ahead if share else self._predicted)
-        self.normals = vertex_normals(self.vertices, self.faces)
-        self.box = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        self.points, vertices = map(np.ascontiguousarray, ahead if share else self._predicted)
+        self.move(vertices)
         #: Box of the contact points.
         self.reach_box = np.array([self.points.min(axis=0), self.points.max(axis=0)])
-        self._tree = cKDTree(self.vertices, balanced_tree=False, compact_nodes=False)
 
     def learn(self, *path: Mapping[str, float]) -> None:
         """Record how far the solve moved the model from its prediction, for a path from coordinates to others."""
@@ -134,52 +217,34 @@ class NeighbourSurface:
 
     def is_near(self, other: NeighbourSurface, reach: float) -> bool:
         """Whether a contact point of the other muscle is nearer than ``reach`` to this surface."""
+        if self.apart(other, reach):
+            return False
         low, high, points = self.box[0] - reach, self.box[1] + reach, other.points
         near = points[np.all((points > low) & (points < high), axis=1)]
         return len(self.query(near, reach)[0]) > 0
-
-    def query(self, points: Floats, reach: Floats | float) -> Found:
-        """Distances of those points that are nearer than ``reach``.
-
-        Parameters
-        ----------
-        points : (n, 3) ndarray
-        reach : float or (n,) ndarray
-
-        Returns
-        -------
-        index : (c,) ndarray of int
-            Which points.
-        distance : (c,) ndarray
-            Negative inside.
-        normal : (c, 3) ndarray
-            Unit, outward.
-        nearest : (c,) ndarray of int
-            Nearest vertex.
-        """
-        reach = np.broadcast_to(reach, len(points))
-        most = min(float(reach.max(initial=0.0)), self.reach) + self.edge
-        away, nearest = self._tree.query(points, distance_upper_bound=most)
-        index = np.flatnonzero(away < reach + self.edge)
-        nearest = nearest[index]
-        count = len(index)
-        distance, normal = np.empty(count), np.empty((count, 3))
-        skin = Skin(self.vertices, self.normals, self.faces, self.start, self.ring)
-        _distance_loop(points, index, nearest, skin, distance, normal)
-        # Beyond a sharp rim the normals of its sides disagree: no point is deeper than the muscle is thick.
-        near = (distance < reach[index]) & (distance >= -self.deepest[nearest])
-        # A folded triangle at a rim may give a point far outside a large depth.
-        deep = np.flatnonzero(near & (distance < -FOLDED * self.edge))
-        if len(deep):
-            winding = np.empty(len(deep))
-            winding_loop(self.vertices, self.faces, points[index[deep]], winding)
-            near[deep] = winding > 0.5
-        return index[near], distance[near], normal[near], nearest[near]
 
 
 def _change(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
     """Change of each coordinate."""
     return {name: value - before.get(name, 0.0) for name, value in after.items()}
+
+
+@compiled
+def _walk_loop(points, index, skin, nearest, away):
+    """From vertices over edges to the nearest ones, and how far away these are."""
+    vertices, _, faces, start, ring = skin
+    for q in range(len(index)):
+        here, least, last = nearest[q], np.inf, -1
+        while here != last:
+            last = here
+            for r in range(start[last], start[last + 1]):
+                for corner in range(3):
+                    v, square = faces[ring[r], corner], 0.0
+                    for k in range(3):
+                        square += (vertices[v, k] - points[index[q], k]) ** 2
+                    if square < least:
+                        least, here = square, v
+        nearest[q], away[q] = here, np.sqrt(least)
 
 
 @compiled

@@ -39,9 +39,8 @@ class Sliding:
         self.links: dict[str, list[SlidingPair]] = {stepper.name: [] for stepper in steppers}
         self.bone_links: dict[str, list[BoneLink]] = {stepper.name: [] for stepper in steppers}
         pairs = sliding_pairs(scene, [stepper.name for stepper in steppers], limits.reach)
-        reach = max(limits.reach, limits.cut_depth)
         self.surfaces = {
-            stepper.name: NeighbourSurface(stepper.model, reach)
+            stepper.name: NeighbourSurface(stepper.model, limits.reach)
             for stepper in steppers
             if any(stepper.name in pair for pair in pairs)
         }
@@ -74,10 +73,7 @@ class Sliding:
         link = SlidingPair(stepper, self.surfaces[stepper.name], self.surfaces[other.name], self.limits)
         self.links[stepper.name].append(link)
         stepper.contacts.neighbours += [link.push, link.pull]
-        stepper.contacts.cuts.append(link)
-        link.back = next((back for back in self.links[other.name] if back.other is link.own), None)
-        if link.back is not None:
-            link.back.back = link
+        stepper.contacts.beside.append(link)
 
     def go(self, stops: Sequence[Coordinates], activations: Sequence[Mapping[str, float]]) -> None:
         """Solve all muscles at the coordinates of the sub-steps; the first of them are the present ones.
@@ -85,6 +81,8 @@ class Sliding:
         The muscle with the most sub-steps divides the frame. Another muscle takes several of these at a time, as many
         as its own bones allow; in between its neighbours see its prediction.
         """
+        for link in (link for links in self.links.values() for link in links):
+            link.begin_frame()
         strides = {stepper.name: _stride(stepper, stops) for stepper in self.steppers}
         last, here = len(stops) - 1, dict.fromkeys(strides, 0)
         for stop in range(1, last + 1):
@@ -148,19 +146,14 @@ class Sliding:
             if any(touching) or any(overlap)
         }
         drawings = [stepper.drawing() for stepper in self.steppers]
-        each(self._show, drawings)
+        for drawing in drawings:
+            if self.links[drawing.stepper.name]:
+                self.surfaces[drawing.stepper.name].show(drawing.drawing.carried())
         return drawings
 
     def _measure(self, stepper):
         with stepper.timed("sliding"):
             return [link.measure() for link in self.links[stepper.name]]
-
-    def _show(self, drawing):
-        """Use the field that a muscle will be shown by, before its surface is drawn."""
-        stepper = drawing.stepper
-        if self.links[stepper.name]:
-            with stepper.timed("surface"):
-                self.surfaces[stepper.name].field = drawing.drawing.field()
 
 
 def _stride(stepper, stops):

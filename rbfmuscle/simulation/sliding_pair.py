@@ -23,15 +23,14 @@ THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 15.0
 BETWEEN = 0.5
 # Neighbours are looked for within this distance [mm] of points that are not linked.
 SEARCH = 3.0
-# Surfaces are cut in cells of CUT_DEPTH [mm] around points that are nearer than CUT_FROM to the neighbour, as solved.
-CUT_FROM, CUT_DEPTH = 2.0, 3.0
-# Steps between cells of a grid along its axes, and from a cell to itself and those around it.
-ALONG = np.array([1, 1 << 20, 1 << 40])
-AROUND = np.stack(np.meshgrid(*3 * [[-1, 0, 1]]), axis=-1).reshape(-1, 3) @ ALONG
+# Drawn surfaces are moved CLEAR [mm] apart where they overlap by less than DEEP, neither by more than MOST.
+CLEAR, DEEP = 0.2, 6.0
+# What comes near in a frame is within this many mean edges more at its start.
+AHEAD = 3.0
 # How far planes between muscles yield to a pressure, relative to a bone's. One point in each cell of SPARSE mean edges
 # has a plane that holds muscles together, which yields less in proportion.
 YIELDS, SPARSE = 40.0, 2.0
-# How far a plane pushes out of a neighbour at most in one sub-step [mm].
+# How far a plane pushes out of a neighbour at most in one sub-step, and a neighbour a drawn surface [mm].
 MOST = 1.0
 
 
@@ -59,13 +58,13 @@ class SlidingPair:
         limits: SlidingLimits,
     ) -> None:
         self.own, self.other, self.limits = own, other, limits
+        self.begin_frame()
         self.free = stepper.contacts.free(len(stepper.model.contact_points()))
-        #: Sorted cells of space where this muscle is near the neighbour, and the pair seen from the neighbour.
-        self.zone = np.zeros(0, dtype=np.int64)
-        self.back: SlidingPair | None = None
         at = np.flatnonzero(self.free)
         apart = np.full(len(at), limits.reach)
-        index, distance, _, _ = self._ask(at, limits.reach)
+        index, distance, _, _ = (
+            _FAR if other.apart(own, limits.reach) else other.query(own.points[at], limits.reach)
+        )
         apart[index] = distance
         chosen = _nearest_by_cell(own.points[at], apart, stepper.model.detail)
         #: Contact points that meet the neighbour, and which of them it holds.
@@ -81,6 +80,11 @@ class SlidingPair:
         area = self.free.sum() / max(1, len(self.at))
         self.push = Planes(YIELDS / area)
         self.pull = Planes(YIELDS / area * self.held.sum() / max(1, len(self.at)))
+
+    def begin_frame(self) -> None:
+        """Look for nearest vertices anew, of the neighbour to contact points and of the muscle to the neighbour's."""
+        self._from: Integers | None = None
+        self._fixed_from: Integers | None = None
 
     def update(self) -> None:
         """Recompute the planes from the extrapolated surfaces."""
@@ -111,9 +115,10 @@ class SlidingPair:
         """
         if self.own.apart(self.other, self.limits.search):
             return _FAR[:3]
-        _, distance, normal, nearest = self.own.query(
-            self.other.vertices[self.other.fixed], self.limits.search
-        )
+        held, reach = self.other.vertices[self.other.fixed], self.limits.search
+        if self._fixed_from is None:
+            self._fixed_from = self.own.nearest(held, reach + AHEAD * self.own.edge)
+        _, distance, normal, nearest = self.own.query(held, reach, self._fixed_from)
         at = self.own.contact[nearest]
         deep = np.flatnonzero((distance < 0.0) & self.free[at])
         # The deepest of each point alone.
@@ -133,58 +138,32 @@ class SlidingPair:
         opened : float
             Sum of the squares of how much their gaps have grown.
         """
-        limits, at = self.limits, np.flatnonzero(self.free)
-        close, distance, _, _ = self._ask(at, limits.cut_from)
-        met = _cells(self.own.points[at[close]], limits.cut_depth)
-        self.zone = np.unique(met[:, None] + AROUND)
-        apart = np.full(len(self.at), limits.reach)
+        apart = np.full(len(self.at), self.limits.reach)
         index, now, _, _ = self._near()
         apart[index] = now
         opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
-        return max(0.0, -float(distance.min(initial=0.0))), len(opened), float((opened**2).sum())
+        return max(0.0, -float(now.min(initial=0.0))), len(opened), float((opened**2).sum())
 
-    def _met(self, points: Floats) -> Integers:
-        """Indices of the points (n, 3) where the two meet, as seen from either."""
-        cell, inside = _cells(points, self.limits.cut_depth), np.zeros(len(points), dtype=np.bool_)
-        for pair in (self, self.back):
-            if pair is not None and len(pair.zone):
-                inside |= pair.zone[np.searchsorted(pair.zone[:-1], cell)] == cell
-        return np.flatnonzero(inside)
-
-    def cut(self, points: Floats) -> tuple[Floats, Floats]:
-        """The surface midway between two overlapping muscles.
-
-        Half the difference (n,) of both muscles' distances near where they meet, infinity elsewhere; its gradient
-        (n, 3). Where both have a field, both surfaces are clipped where their fields are equal.
-        """
-        value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
-        both = self._met(points)
-        if self.own.field is not None and self.other.field is not None:
-            ours, own = self.own.field.value_and_gradient(points[both])
-            theirs, normal = self.other.field.value_and_gradient(points[both])
-        else:
-            near, theirs, normal, _ = self.other.query(points[both], self.limits.cut_depth)
-            met, ours, own, _ = self.own.query(points[both[near]], self.limits.cut_depth)
-            both, theirs, normal = both[near[met]], theirs[met], normal[met]
-        value[both], gradient[both] = 0.5 * (theirs - ours), 0.5 * (normal - own)
-        return value, gradient
-
-    def points(self) -> Floats:
-        """Points (k, 3) of the neighbour where the two meet, which must stay outside the surface."""
-        found = self.other.vertices
-        return found[self._met(found)]
+    def excess(self, points: Floats) -> Floats:
+        """How far (n,) points (n, 3) of the drawn muscle are to move inwards: half of the way out of the neighbour."""
+        limits, found, shown = self.limits, np.zeros(len(points)), self.other.shown
+        low, high = shown.box[0] - limits.clear, shown.box[1] + limits.clear
+        near = np.flatnonzero(np.all((points > low) & (points < high), axis=1))
+        index, distance, _, _ = shown.query(points[near], limits.deep)
+        found[near[index]] = np.clip(0.5 * (limits.clear - distance), 0.0, limits.most)
+        return found
 
     def _near(self) -> Found:
         """Of the points ``at`` those near the neighbour: linked ones up to their release distance, others less far."""
         far = self.linked.copy()
         far[self.touching] = True
-        return self._ask(self.at, np.where(far, self.limits.reach, self.limits.search))
-
-    def _ask(self, at: Integers, reach: Floats | float) -> Found:
-        """Of some contact points those nearer to the neighbour than their reach."""
-        if self.other.apart(self.own, float(np.max(reach, initial=0.0))):
+        reach, points = np.where(far, self.limits.reach, self.limits.search), self.own.points[self.at]
+        most = float(np.max(reach, initial=0.0))
+        if self.other.apart(self.own, most):
             return _FAR
-        return self.other.query(self.own.points[at], reach)
+        if self._from is None:
+            self._from = self.other.nearest(points, most + AHEAD * self.other.edge)
+        return self.other.query(points, reach, self._from)
 
 
 def _nearest_by_cell(points: Floats, distance: Floats, size: float) -> Integers:
@@ -193,11 +172,6 @@ def _nearest_by_cell(points: Floats, distance: Floats, size: float) -> Integers:
         return np.arange(len(points))
     order = np.argsort(distance, kind="stable")
     return np.sort(order[np.unique(np.floor(points[order] / size), axis=0, return_index=True)[1]])
-
-
-def _cells(points: Floats, size: float) -> Integers:
-    """Number (n,) of the cell of a grid that each point (n, 3) lies in."""
-    return np.floor(points / size).astype(np.int64) @ ALONG
 
 
 class BoneLink:
@@ -231,5 +205,5 @@ class SlidingLimits:
         self.release = scene.length(RELEASE)
         self.search = max(scene.length(SEARCH), self.threshold)
         self.reach = max(self.search, self.hold + self.release)
-        self.cut_from, self.cut_depth = scene.length(CUT_FROM), scene.length(CUT_DEPTH)
+        self.clear, self.deep = scene.length(CLEAR), scene.length(DEEP)
         self.most = scene.length(MOST)

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.fields import Field
 from rbfmuscle.scene.motion import interpolate, shown_value, step_angle, unit_sign
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
@@ -58,7 +57,7 @@ class CarriedDrawing:
     before: TimedDrawing
     motion: Floats
 
-    def field(self) -> Field | None:
+    def carried(self) -> None:
         """None: muscles that move rigidly do not slide."""
 
     def surface(self) -> ModelSurface:

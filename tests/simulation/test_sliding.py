@@ -168,34 +168,35 @@ def test_sliding_along_the_neighbour_is_free():
     assert np.sqrt((moved**2).mean()) < 1.0
 
 
-def test_cut_is_midway_between_overlapping_muscles():
-    made, fields = toy.neighbour_scene([{}], sliding=SlidingOptions(), gap=-2.0)
+def test_drawn_surfaces_yield_by_half_of_their_overlap():
+    made, fields = toy.neighbour_scene([{}], sliding=SlidingOptions(), gap=-0.6)
     steppers = []
     for part in [toy.ToyMuscle(m, made) for m in made.muscles]:
         contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=part.contact_bone)
         steppers.append(MuscleStepper(part, contacts, made))
-    sliding = Sliding(made, steppers)
-    sliding.drawings()
-    for surface in sliding.surfaces.values():
-        surface.field = None
-    points = np.array([[0, 0, 2.5], [0, 0, 3.0], [0, 0, 3.5], [1, 1, 3.0], [0, 0, -4.5], [0, 30, 0]])
-    lower, upper = (stepper.contacts.nearest(points)[0] for stepper in steppers)
-    assert np.allclose(lower[:3], [0.5, 0.0, -0.5], atol=0.1)
-    assert np.allclose(lower[:4], -upper[:4], atol=1e-12)
-    assert lower[4] > 4.0
-    step = 1e-5
-    value, gradient = steppers[0].contacts.cuts[0].cut(points[:4])
-    ahead = steppers[0].contacts.cuts[0].cut(points[:4] + [0, 0, step])[0]
-    # Normals are interpolated, distances are to flat triangles.
-    assert np.allclose((ahead - value) / step, gradient[:, 2], atol=0.1)
-    # What a coarse surface has to leave outside: all of the neighbour that lies in it, and nothing far from there.
-    met = steppers[0].contacts.neighbour_points()
-    upper, lower = (stepper.model for stepper in steppers[::-1])
-    inside = upper.x[igl.signed_distance(upper.x, lower.x, lower.faces)[0] < 0]
-    assert len(inside) > 10
-    assert np.isin(inside.view("f8,f8,f8"), np.ascontiguousarray(met).view("f8,f8,f8")).all()
-    left = upper.x[~np.isin(upper.x.view("f8,f8,f8"), np.ascontiguousarray(met).view("f8,f8,f8")).ravel()]
-    assert len(left) and igl.signed_distance(left, lower.x, lower.faces)[0].min() > links.CUT_FROM
+    Sliding(made, steppers).drawings()
+    for stepper, other in (steppers, steppers[::-1]):
+        points = stepper.model.x
+        found = stepper.contacts.frozen().excess(points)
+        depth = -igl.signed_distance(points, other.model.x, other.model.faces)[0]
+        assert np.allclose(found, np.maximum(0.5 * (links.CLEAR + depth), 0.0), atol=0.02)
+        assert found.max() > 0.3 and (found == 0.0).any()
+        assert np.all(stepper.contacts.excess(points - 100.0) == 0.0)
+
+
+def test_nearest_vertices_are_found_from_where_they_were():
+    model = _model(toy.ellipsoid((10, 6, 4), subdivisions=3))
+    surface, rng = NeighbourSurface(model, reach=3.0), np.random.default_rng(5)
+    points = surface.vertices * rng.uniform(0.9, 1.2, (len(surface.vertices), 1))
+    start = surface.nearest(points, 3.0)
+    turn = rotation_about([1, 2, 3], 0.2, np.zeros(3))
+    model.vertices[:] = model.vertices @ turn[:3, :3].T
+    surface.refresh()
+    found, wanted = surface.query(points, 2.0, start), surface.query(points, 2.0)
+    np.testing.assert_array_equal(found[0], wanted[0])
+    # A way over edges may end beside the nearest vertex.
+    assert (found[3] == wanted[3]).mean() > 0.99
+    assert np.abs(found[1] - wanted[1]).max() < 0.2
 
 
 def test_points_near_a_bone_may_be_held_there(monkeypatch):

@@ -4,6 +4,7 @@ Vertices go onto the zero set of max(f - s, -d) by Newton steps, the level s fol
 mesh, and what a fold of the field or the edge of a bone has turned inside out is smoothed.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,19 +70,22 @@ def project_to_level_set(
     level: float = 0.0,
     cut: ClipDistance | None = None,
     obstacles: Obstacles | None = None,
+    excess: Callable[[Floats], Floats] | None = None,
 ) -> FittedMesh:
     """Bring a triangulation onto the zero set of max(field - level, -cut) that has a volume.
 
     ``vertices`` (n, 3) are where the material carries them [scene unit]; field, cut, volume, level and obstacles are
     those of `rbfmuscle.implicit.extraction.surface.extract_surface`. Without a field the triangulation stays where the
-    material is, blown up to the volume out of the bones, and all vertices are ``left``. ValueError on NaN in field or
-    cut, and where nothing has the volume.
+    material is, blown up to the volume out of the bones, and all vertices are ``left``. ``excess`` says how far (n,)
+    vertices (n, 3) then move inwards. ValueError on NaN in field or cut, and where nothing has the volume.
     """
     fitting = CarriedMaterial(mesh, vertices, field, cut, float(level))
     if field is None:
         fitting.inflate(volume)
     else:
         fitting.reach(volume)
+    if excess is not None:
+        fitting.give_room(excess)
     return fitting.finish(volume, obstacles or [])
 
 
@@ -90,8 +94,8 @@ class CarriedMaterial:
 
     Its vertices (n, 3) there [scene unit] are kept as ``carried``; ``projector`` holds the vertices where they are now,
     ``edge`` is the mean length of an edge [scene unit]. Masks (n,) say what the material takes deep into a bone
-    (``sunk``), what it leaves outside all bones (``outside``), what a bone's vertex pushed off (``pushed``), and what
-    was kept from a level set that is too far away (``left``).
+    (``sunk``), what it leaves outside all bones (``outside``), what a bone's vertex pushed off (``pushed``), what makes
+    room for a neighbour (``moved``), and what was kept from a level set that is too far away (``left``).
     """
 
     def __init__(
@@ -100,7 +104,7 @@ class CarriedMaterial:
         self.mesh, self.carried, self.level = mesh, np.ascontiguousarray(vertices, dtype=np.float64), level
         self.field, self.cut = field, cut
         self.edge = mesh.edge(self.carried)
-        self.sunk, self.pushed, self.left = np.zeros((3, len(vertices)), dtype=np.bool_)
+        self.sunk, self.pushed, self.moved, self.left = np.zeros((4, len(vertices)), dtype=np.bool_)
         self.outside = np.ones(len(vertices), dtype=np.bool_)
         self.reach_of: Floats | None = None
         self._start(cut)
@@ -148,6 +152,17 @@ class CarriedMaterial:
         if len(faces):
             self.pushed |= self.projector.push_off(faces, obstacles, spacing, PUSHED * self.edge)
 
+    def give_room(self, excess: Callable[[Floats], Floats]) -> None:
+        """Move vertices inwards by their excess (n,), where they stay."""
+        vertices, inwards = self.projector.vertices, excess(self.projector.vertices)
+        rows = np.flatnonzero(inwards > 0.0)
+        normals = vertex_normals(vertices, self.mesh.faces)[rows]
+        size = np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)
+        vertices[rows] -= (inwards[rows] / size)[:, None] * normals
+        self.moved[rows] = True
+        self.projector.hold(rows)
+        self.projector.lift(rows)
+
     def gather(self) -> None:
         """Close the surface over what is deep in a bone: a sheet that is folded over it would cross itself."""
         lost = self.sunk | self._strayed(slice(None))
@@ -185,7 +200,7 @@ class CarriedMaterial:
         if self.field is None or self.mesh.slope is None:
             return None
         faded = SURE * self.projector.slope * self.mesh.slope >= 1.0
-        odd = self.sunk | self.pushed | self.left | faded
+        odd = self.sunk | self.pushed | self.moved | self.left | faded
         return touching_faces(self.mesh.faces, odd)
 
     def _strayed(self, rows: Integers | slice) -> Booleans:
