@@ -1,6 +1,5 @@
 """Progress of a command: lines for a log, at most one in ten seconds, and a bar on a terminal."""
 
-import sys
 from types import SimpleNamespace
 
 from rbfmuscle import progress
@@ -21,13 +20,3 @@ def test_a_log_has_each_stage_the_last_count_and_others_ten_seconds_apart(monkey
         pass
     told = ["frame 2 of 6 (2 s)", "frame 5 of 6 (13 s)", "frame 6 of 6 (13 s)", "muscle 1 of 1 (13 s)"]
     assert capsys.readouterr().err.splitlines() == [f"arm: {text}" for text in [*told, "report (13 s)"]]
-
-
-def test_a_terminal_has_a_bar(monkeypatch):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with Progress("arm") as shown:
-        shown(2, 6)
-        (task,) = shown.bar.tasks
-        assert (task.description, task.completed, task.total) == ("arm: frame 2 of 6", 2, 6)
-        assert not shown.bar.finished and shown.bar.live.is_started
-    assert not shown.bar.live.is_started

@@ -58,15 +58,6 @@ def test_numbers_are_those_of_the_surface(study, ellipsoid):
         assert np.abs(radius - 1.0).max() * 12.0 <= row["hausdorff"] + 0.2
 
 
-def test_front_holds_what_nothing_beats(study):
-    good = [row for row in study.rows if not row["unfit"]]
-    assert good[0]["front"] and all(row["condition"] <= 1e10 for row in good if row["epsilon"])
-    for row in good:
-        better = [other for other in good if other["rms"] < row["rms"]]
-        least = min((other["fit_time"] + other["evaluation_time"] for other in better), default=np.inf)
-        assert not row["front"] or row["fit_time"] + row["evaluation_time"] < least
-
-
 def test_lines_to_paste_give_the_row(study):
     row = next(row for row in study.rows if row["kernel"] == "matern_52")
     table = tomllib.loads(row_toml(row))["muscle"]["model"]

@@ -26,8 +26,7 @@ def fibonacci(count):
 def ellipsoid(count):
     """Points and outward unit normals of an ellipsoid with half-axes AXES."""
     unit = fibonacci(count)
-    normals = unit / AXES
-    return unit * AXES + 100.0, normals / np.linalg.norm(normals, axis=1)[:, None]
+    return unit * AXES + 100.0, unit / AXES / np.linalg.norm(unit / AXES, axis=1)[:, None]
 
 
 @pytest.mark.filterwarnings("ignore::rbfmuscle.validation.NumericalWarning")
@@ -156,9 +155,6 @@ def test_values_are_those_of_scipy(kernel, epsilon):
     assert np.abs(field(where) - expected).max() < 1e-8
 
 
-# The blend of local fits.
-
-
 def bent(points, normals):
     """A strip along z bent to half a ring about an axis along y, and its normals turned with it."""
     angle, radius = points[:, 2] * np.pi / np.ptp(points[:, 2]), np.ptp(points[:, 2]) / np.pi
@@ -169,19 +165,16 @@ def bent(points, normals):
 
 
 def strip(count):
-    unit = fibonacci(count)
-    normals = unit / [4.0, 15.0, 80.0]
-    return unit * [4.0, 15.0, 80.0], normals / np.linalg.norm(normals, axis=1)[:, None]
+    unit, axes = fibonacci(count), np.array([4.0, 15.0, 80.0])
+    return unit * axes, unit / axes / np.linalg.norm(unit / axes, axis=1)[:, None]
 
 
 def test_every_centre_is_well_inside_some_part():
     points, _ = strip(300)
     parts = overlapping_parts(points)
-    assert parts.shape[1] == PART and len(parts) < 300 / 5
-    assert set(parts[:, :COVERED].ravel()) == set(range(300))
+    assert len(parts) < 300 / 5 and set(parts[:, :COVERED].ravel()) == set(range(300))
     near = np.sort(np.linalg.norm(points[:, None] - points[parts[:, 0]], axis=2), axis=0)[:PART].T
-    found = np.linalg.norm(points[parts] - points[parts[:, :1]], axis=2)
-    np.testing.assert_allclose(found, near)
+    np.testing.assert_allclose(np.linalg.norm(points[parts] - points[parts[:, :1]], axis=2), near)
     assert overlapping_parts(points[:PART]).shape == (1, PART)
 
 
@@ -191,20 +184,15 @@ def test_a_blended_field_is_nearly_that_of_one_fit_and_its_slope_is_its_derivati
     points, normals = strip(300)
     fit = FieldFit(KERNELS[kernel], 1 / 20, 1e10 if KERNELS[kernel].has_epsilon else np.inf)
     parts, (others, _) = overlapping_parts(points), strip(777)
-    for centres, turned, where in (
-        (points, normals, others),
-        (*bent(points, normals), bent(others, others)[0]),
-    ):
+    straight, arc = (points, normals, others), (*bent(points, normals), bent(others, others)[0])
+    for centres, turned, where in (straight, arc):
         field, whole = fit.fit(centres, turned, parts), fit.fit(centres, turned, np.arange(300)[None])
         # Centres are 10 apart: bent, a part that does not have one counts there a little.
         assert np.abs(field(centres)).max() < max(1e-2, 1.5 * np.abs(whole(centres)).max())
         assert np.sqrt((field(where) ** 2).mean()) < 1.5 * np.sqrt((whole(where) ** 2).mean()) + 0.02
         assert field.condition < 20 * whole.condition
-        # also far outside, where the balls of all parts grow
         at = np.concatenate([where[::20] * 1.05, np.random.default_rng(5).uniform(-150, 150, (60, 3))])
-        value, gradient = field.value_and_gradient(at)
-        np.testing.assert_allclose(field(at), value, rtol=1e-9, atol=1e-9)
-        step = 1e-4 * np.eye(3)
-        ahead = np.array([(field(at + way) - field(at - way)) / 2e-4 for way in step]).T
+        value, gradient = field.value_and_gradient(at)  # also far outside, where the balls of all parts grow
+        ahead = np.array([(field(at + 1e-4 * way) - field(at - 1e-4 * way)) / 2e-4 for way in np.eye(3)]).T
         off = np.abs(ahead - gradient) / (1e-3 * np.abs(value)[:, None] + np.abs(ahead) + 1.0)
         assert np.median(off) < 1e-6 and np.percentile(off, 95) < 1e-4

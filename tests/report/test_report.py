@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from rbfmuscle.metrics.summary import shown_number
-from rbfmuscle.output.appearance import MUSCLE_COLOURS, mixed_colour, muscle_colours, muscle_groups, rgb
+from rbfmuscle.output.appearance import muscle_groups
 from rbfmuscle.report import render
 from rbfmuscle.report.page import Cell, Page, Section, Table, limit_state
 from rbfmuscle.report.report import write_report
@@ -61,16 +61,6 @@ def test_muscles_are_grouped_by_the_joints_that_they_cross():
     for bones, group in groups.items():
         muscle = {"name": "one", "attach": [{"bone": bone} for bone in bones.split()]}
         assert muscle_groups({"scene": {"joints": joints, "muscles": [muscle]}}) == {"one": group}
-
-
-def test_muscles_of_a_group_share_a_hue_and_none_the_colour():
-    names = [f"{group}{k}" for group in "abcd" for k in range(3)]
-    found = muscle_colours(names, {name: name[0] for name in names})
-    assert len(set(found.values())) == 12 and [found[f"{g}0"] for g in "abcd"] == list(MUSCLE_COLOURS[:4])
-    light = {name: rgb(colour).sum() for name, colour in found.items()}
-    assert all(light[f"{g}1"] > light[f"{g}0"] > light[f"{g}2"] for g in "abcd")
-    assert mixed_colour("#000000", 0.5) == mixed_colour("#ffffff", -0.5) == "#808080"
-    assert muscle_colours(["a", "b"], {"a": "x", "b": "x"}) == dict(zip("ab", MUSCLE_COLOURS))
 
 
 @pytest.mark.parametrize(

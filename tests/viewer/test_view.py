@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from command_line import call
 
-from rbfmuscle.cli.look import _open_runs
 from rbfmuscle.report.render import render_run
 
 
@@ -39,13 +38,6 @@ def test_picture_of_a_scene_is_of_the_pose_asked_for(tmp_path, capsys, graphics)
         code, _, err = call(capsys, *common, tmp_path / f"{name}.png", "--at", f"hip.flexion={degrees}")
         assert code == 0, err
     assert (image(tmp_path / "rest.png") != image(tmp_path / "bent.png")).any(axis=2).mean() > 0.01
-
-
-def test_runs_are_named_as_their_folders(run_folder, tmp_path, monkeypatch):
-    (tmp_path / "pbd").symlink_to(run_folder)
-    monkeypatch.chdir(run_folder)
-    for place, names in ((run_folder, [run_folder.name]), (Path(), [run_folder.name]), (tmp_path, ["pbd"])):
-        assert list(_open_runs(place)) == names
 
 
 @pytest.mark.parametrize(
