@@ -17,6 +17,7 @@ import warnings
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import lapack
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
@@ -170,7 +171,7 @@ def _solve_some(
         norm = _largest(a, _probe(np.ones((len(a), size))), 6)
         ridge = norm / bound
         a[:, np.arange(size), np.arange(size)] += ridge[:, None]
-    lower = np.linalg.cholesky(a)
+    lower = _cholesky(a)
 
     def annihilating(vectors: Floats) -> Floats:
         return np.asarray(vectors - (directions @ (turned @ vectors[:, :, None]))[:, :, 0])
@@ -181,6 +182,16 @@ def _solve_some(
     short = turned @ right[:, :, None] - np.swapaxes(products, 1, 2) @ weights[:, :, None]
     condition = np.maximum(1.0, norm * np.linalg.norm(solved[:, 1], axis=1))
     return weights, (inverse @ short)[:, :, 0], condition, ridge
+
+
+def _cholesky(a: Floats) -> Floats:
+    """Lower factors of matrices (m, size, size), upper triangles anything; a single one is factored in its place."""
+    if len(a) > 1:
+        return np.asarray(np.linalg.cholesky(a))
+    _, failed = lapack.dpotrf(a[0].T, lower=0, overwrite_a=1, clean=0)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not definite")
+    return a
 
 
 def _trace(matrices: Floats) -> Floats:
