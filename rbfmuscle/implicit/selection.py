@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.extraction.surface import find_sheets
-from rbfmuscle.implicit.field import FieldFit, RBFField
+from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
 from rbfmuscle.validation import NumericalWarning, UsageError, check_points, check_vectors
 
 SPAN = (0.02, 20.0)
@@ -113,12 +113,13 @@ def choose_epsilon(
 def _search(points: Floats, normals: Floats, fit: FieldFit, held_out: Floats, reach: float) -> list[Trial]:
     """Scan and narrow; the trials that have a fit, in the order of their worth."""
     trials: dict[float, Trial] = {}
+    parts = overlapping_parts(points)
 
     def error(epsilon: float) -> float:
         if epsilon not in trials:
             trials[epsilon] = Trial(epsilon, math.inf, math.inf, None)
             with contextlib.suppress(np.linalg.LinAlgError):
-                field = replace(fit, epsilon=epsilon).fit(points, normals)
+                field = replace(fit, epsilon=epsilon).fit(points, normals, parts)
                 missed = surface_error(field, held_out, reach)
                 trials[epsilon] = Trial(epsilon, missed, field.condition, field)
         return trials[epsilon].error

@@ -225,8 +225,6 @@ class RBFDrawing:
 class _BoneCut:
     """What the bones cut away: their smallest distance, a lower bound where it is beyond ``reach``."""
 
-    steepest = 1.0
-
     def __init__(self, contacts: BoneContacts, reach: float) -> None:
         self.contacts, self.reach = contacts, reach
 

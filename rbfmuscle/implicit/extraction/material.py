@@ -125,9 +125,7 @@ class CarriedMaterial:
         distance, outward = cut.value_and_gradient_below(self.carried, limit)
         near, self.outside = distance < limit, distance >= 0.0
         self.projector = Projector(self.field, cut if near.any() else None, vertices, self.edge, near)
-        if np.isfinite(cut.steepest):
-            bounds = np.minimum(distance, FAR * self.edge)
-            self.projector.bounds = CutBounds(self.carried, bounds, cut.steepest)
+        self.projector.bounds = CutBounds(self.carried, np.minimum(distance, FAR * self.edge))
         if near.any():  # of what sinks into a bone, what looks away from it keeps off the rest
             normals = vertex_normals(self.carried, self.mesh.faces)
             away = near & (np.einsum("nd,nd->n", normals, outward) > 0.0)
@@ -147,7 +145,7 @@ class CarriedMaterial:
         # So large that no corner is farther than 1.3 of it from its triangle's middle.
         spacing = max(self.edge, 0.52 * self.mesh.longest(vertices))
         if bounds is not None:
-            near = bounds.below(vertices) < bounds.steepest * NEAR_BONE * spacing
+            near = bounds.below(vertices) < NEAR_BONE * spacing
             faces = faces[touching_faces(faces, near)]
         if len(faces):
             self.pushed |= self.projector.push_off(faces, obstacles, spacing, PUSHED * self.edge)

@@ -15,13 +15,13 @@ OUT = 1e-5
 class CutBounds:
     """Values (n,) of a cut, or lower bounds, at places (n, 3) where vertices were: bounds where those are now."""
 
-    def __init__(self, places: Floats, values: Floats, steepest: float) -> None:
-        self.places, self.values, self.steepest = places.copy(), values.copy(), steepest
+    def __init__(self, places: Floats, values: Floats) -> None:
+        self.places, self.values = places.copy(), values.copy()
 
     def below(self, vertices: Floats, rows: Integers | slice = slice(None)) -> Floats:
         """Lower bounds (k,) at vertices (k, 3), those numbered ``rows``."""
         away = vertices - self.places[rows]
-        found: Floats = self.values[rows] - self.steepest * np.sqrt(np.einsum("nd,nd->n", away, away))
+        found: Floats = self.values[rows] - np.sqrt(np.einsum("nd,nd->n", away, away))
         return found
 
 
