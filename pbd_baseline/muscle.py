@@ -103,6 +103,9 @@ class PBDMuscle:
         if self.fibres is not None:
             self.fibres.activate(activation)
 
+    def make_room(self, contacts: BoneContacts) -> None:
+        """Nothing: `solve` does not yield to neighbours."""
+
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the vertices marked in a bool mask (n,) by a (4, 4) transform; held ones stay."""
         which = which & (self.rest.attached_bone < 0)

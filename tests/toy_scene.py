@@ -159,6 +159,9 @@ class ToyMuscle:
             near = contacts.half_spaces(self.x, self.reach)
             self.x = press(self.target, self.x, self.inverse, near.index, near.gap, near.normal)
 
+    def make_room(self, contacts):
+        pass
+
     def turn(self, which, transform):
         self.x[which] = self.x[which] @ transform[:3, :3].T + transform[:3, 3]
 

@@ -103,6 +103,11 @@ class RBFMuscle:
         self.solid.settle(contacts)
         self.points = self.solid.centres(self.points)
 
+    def make_room(self, contacts: BoneContacts) -> None:
+        """Move what is shown out of the planes of neighbours."""
+        self.solid.make_room(contacts)
+        self.points = self.solid.centres(self.points)
+
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         if self.law is not None:

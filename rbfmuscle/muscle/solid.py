@@ -48,11 +48,9 @@ GHOST = 1e-3  # stiffness of second differences, relative to a cell: for nodes t
 # is drawn at the volume at rest in any case.
 BULK, MOST_PRESSURE = 50.0, 3.0
 MOST_TREND = 1.5  # greatest multiple of the last sub-step's correction that the next one starts with
-# Share of that where neighbours meet the muscle. They see its prediction: with all of it the surface between two
-# muscles goes on as it went, like a mass without damping, and oscillates.
-TREND_BESIDE_NEIGHBOURS = 0.5
 MOBILE = 0.02  # points that move by less than this fraction of the median for a unit force count as attached
 SETTLED = 2e-5  # of the size: an iteration that moves no node farther was the last one
+SETTLED_BESIDE = 1e-4  # the same beside neighbours, whose planes are not known better
 # The same where the bones stand still and only the activation changes, and how many times the iterations it may take.
 SETTLED_STILL, ROUNDS_STILL = 1e-7, 10
 LONGEST = 0.2  # of the size: a longer step is shortened to it
@@ -254,7 +252,8 @@ class EmbeddedSolid:
         """Predict the nodes.
 
         They take a weighted mean of the motions of the bones (b, 4, 4); held points follow the ``poses`` (4, 4) from
-        rest, a list by bone. Where the motion goes on as before, so does the last correction.
+        rest, a list by bone. Where the motion goes on as before, so does the last correction, of which neighbours
+        see nothing: they would answer to what the muscle did with the motion alone.
         """
         self.y = blended_motion(self.y, self.motion_weights, motions)
         anchor, own = np.empty_like(self.anchor), self.owner[self.held]
@@ -265,13 +264,13 @@ class EmbeddedSolid:
         self.still = bool(np.abs(step).max() <= SETTLED_STILL * self.scale)
         self._take_anchor(anchor)
         self.begun = step, self.y, self.pressure.copy()
+        self.shown = self.y
         if self.trend is not None:
             last, correction, pressed = self.trend
             share = float(step @ last) / max(float(last @ last), 1e-30)
             share = float(np.clip(share, -MOST_TREND, MOST_TREND))
             self.y = self.y + share * correction
             self.pressure = self.pressure + share * pressed
-        self.shown = self.y
 
     def turn(self, which: Integers, transform: Floats) -> None:
         """Move the nodes by a rigid transform as far as they carry free contact points of the mask ``which``."""
@@ -315,7 +314,9 @@ class EmbeddedSolid:
         self.history, self._pull = [], self.spring @ self.anchor
         self._begin()
         near = self.contact.near(contacts, None)
-        rounds, settled = (ROUNDS_STILL, SETTLED_STILL) if self.still else (1, SETTLED)
+        rounds, settled = 1, SETTLED_BESIDE if contacts.neighbours else SETTLED
+        if self.still:
+            rounds, settled = ROUNDS_STILL, SETTLED_STILL
         size = self.y.size
         mixer, least = Anderson(MEMORY, size + len(self.pressure), size), np.inf
         while True:
@@ -348,8 +349,12 @@ class EmbeddedSolid:
         self.y, self.pressure = new, pressure
         self.forces[:] = 0.0
         self.forces[near.which] = near.forces
-        self.shown = self.contact.lifted(near)
-        self._note_trend(TREND_BESIDE_NEIGHBOURS if contacts.neighbours else 1.0)
+        self.shown = self.contact.lifted(near, self.y)
+        self._note_trend()
+
+    def make_room(self, contacts: BoneContacts) -> None:
+        """Show the settled nodes moved out of neighbours as well, by their planes."""
+        self.shown = self.contact.parted(contacts)
 
     def _begin(self) -> None:
         """Forces and responses for the nodes that a solve starts from, with the points that are squeezed there."""
@@ -359,11 +364,11 @@ class EmbeddedSolid:
             self._invert()
         self._find_responses()
 
-    def _note_trend(self, share: float) -> None:
+    def _note_trend(self) -> None:
         if self.begun is not None:
             motion, start, pressure = self.begun
             if np.abs(motion).max() > SETTLED * self.scale:
-                self.trend = motion, share * (self.y - start), share * (self.pressure - pressure)
+                self.trend = motion, self.y - start, self.pressure - pressure
             self.begun = None
 
     def energy(self) -> float:

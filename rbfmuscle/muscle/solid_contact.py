@@ -21,6 +21,7 @@ from rbfmuscle.muscle.solid_step import ways_loop
 from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
 
 TOLERANCE = 2e-5  # violation of a contact that is left, of the muscle's size
+SHOWN_YIELDING = 0.1  # of what the planes of neighbours yield while a muscle settles, in what is shown of it
 REACH_MARGIN = 0.003  # of the muscle's size
 NEAR = 0.03  # contact points nearer to an obstacle than this take part in a solve, of the muscle's size
 BATCH, ROUNDS, SWEEPS = 24, 10, 400  # contacts that join the working set in one round, rounds, sweeps in each
@@ -63,7 +64,7 @@ class NearPoints(NamedTuple):
     shares: Floats  # (m, w) shape functions
     forces: Floats  # (m, sources), changed in place
     contacts: RoundedContacts  # obstacles with rounded bones
-    exact: BoneContacts  # obstacles as they are
+    exact: BoneContacts  # bones as they are, and planes that do not yield
     y: Floats  # (N, 3) nodes when the points were chosen
     reach: float  # distance within which points were chosen [scene unit]
     most: Floats  # (m,) greatest force on each, over 2 μ
@@ -118,7 +119,7 @@ class SolidContact:
         contacts = contacts.only(index)
         return NearPoints(
             index, solid.columns[index], solid.shares[index], solid.forces[index],
-            RoundedContacts(self._rounded(contacts), contacts, len(index)), contacts, solid.y.copy(), self.reach,
+            RoundedContacts(self._rounded(contacts), contacts, len(index)), contacts.unyielding(), solid.y.copy(), self.reach,
             self.most[index], softness,
         )  # fmt: skip
 
@@ -151,21 +152,25 @@ class SolidContact:
         self._last_push = push
         return push, taken
 
-    def lifted(self, near: NearPoints) -> Floats:
-        """The settled nodes (N, 3), moved so far that no contact point is left in an obstacle."""
-        y = self.solid.y
+    def parted(self, contacts: BoneContacts) -> Floats:
+        """The settled nodes (N, 3), moved by the planes of neighbours and then out of bones."""
+        near, y = self.near(contacts, None), self.solid.y
+        spaces = near.contacts.exact.half_spaces(near.carry(y), self.margin)
+        return self.lifted(near, y + self._push_out(near, spaces, SHOWN_YIELDING * self.yielding))
+
+    def lifted(self, near: NearPoints, y: Floats) -> Floats:
+        """Nodes (N, 3), moved so far that no contact point is left in an obstacle that does not yield."""
         for _ in range(LIFTS):
-            here = near.carry(y)
-            spaces = near.exact.half_spaces(here, self.margin)
+            spaces = near.exact.half_spaces(near.carry(y), self.margin)
             if spaces.gap.min(initial=0.0) > -self.tolerance:
                 break
-            y = (
-                y
-                + self._touch(near, spaces, np.zeros_like(here), np.zeros_like(near.forces), 0.0, near.most)[
-                    0
-                ]
-            )
+            y = y + self._push_out(near, spaces, 0.0)
         return y
+
+    def _push_out(self, near: NearPoints, spaces: HalfSpaces, yielding: float) -> Floats:
+        """Motion (N, 3) of nodes at rest that brings them out of obstacles."""
+        still, none = np.zeros((len(near.which), 3)), np.zeros_like(near.forces)
+        return self._touch(near, spaces, still, none, yielding, near.most)[0]
 
     def _touch(
         self,

@@ -7,7 +7,7 @@ surfaces of neighbouring muscles. Nothing here depends on how a muscle is repres
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -76,13 +76,13 @@ class _PlaneStack:
 
     def only(self, index: Integers) -> _PlaneStack:
         """Those at a sorted subset ``index`` of the contact points, which are numbered anew."""
-        kept = np.isin(self.index, index)
+        found = self.where(np.isin(self.index, index))
+        return replace(found, index=np.searchsorted(index, found.index))
+
+    def where(self, kept: Booleans) -> _PlaneStack:
+        """Those of a mask."""
         return _PlaneStack(
-            np.searchsorted(index, self.index[kept]),
-            self.gap[kept],
-            self.normal[kept],
-            self.anchor[kept],
-            self.source[kept],
+            self.index[kept], self.gap[kept], self.normal[kept], self.anchor[kept], self.source[kept]
         )
 
 
@@ -139,6 +139,15 @@ class BoneContacts:
             other._stack = self._planes().only(index)
         if self._known[1].shape[1]:
             other._known = tuple(np.take(part, index, axis=1) for part in self._known)
+        return other
+
+    def unyielding(self) -> BoneContacts:
+        """The same obstacles without the planes that yield more than a bone."""
+        if not self.neighbours:
+            return self
+        other, stack = copy.copy(self), self._planes()
+        soft = np.array([planes.softness > 1.0 for planes in self.neighbours])
+        other._stack = stack.where(~soft[-1 - stack.source])
         return other
 
     def allow(self, bone_index: int, depth: Floats) -> None:

@@ -104,6 +104,9 @@ class MuscleModel(Protocol):
     def solve(self, contacts: BoneContacts) -> None:
         """Solve for equilibrium under the model's constraints and these contacts."""
 
+    def make_room(self, contacts: BoneContacts) -> None:
+        """Move what is shown out of neighbours, by planes from where these are now, where `solve` yields to them."""
+
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""
 

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 
 # Index, distance, outward normal and nearest vertex of the points that are near a surface.
 Found = tuple[Integers, Floats, Floats, Integers]
-# Fraction of a muscle's last correction that is expected again. With all of it neighbours that pull and push each other
-# oscillate without damping; with none each reacts to a prediction that lies a millimetre or two from the equilibrium.
-MOMENTUM = 0.5
+# Share of a muscle's last corrections that is expected again, and that of the earlier ones in their mean. Where each
+# sub-step expects all of the last correction alone, neighbours that push each other oscillate; where it expects nothing,
+# they answer to a surface that lies a millimetre or two from the equilibrium, and may pass each other.
+MOMENTUM, MEMORY = 0.75, 0.5
 # Greatest thickness of a muscle, relative to rest.
 DEEPER = 1.5
 # Least cosine between the surface normal and the direction to a point for which the normal is used.
@@ -166,7 +167,7 @@ class NeighbourSurface(MovingSurface):
         self.shown: MovingSurface = self
         self.contact = cKDTree(model.contact_points()).query(self.vertices)[1]
         self.fixed = np.asarray(model.contact_bone)[self.contact] >= 0
-        #: Change of the coordinates in the last sub-step, and how far the solve moved points and vertices in it.
+        #: Change of the coordinates in the last sub-step, and a mean of how far solves moved points and vertices.
         self._change: dict[str, float] = {}
         self._correction: list[Floats] = []
         self.refresh()
@@ -183,10 +184,10 @@ class NeighbourSurface(MovingSurface):
     def refresh(self, *path: Mapping[str, float]) -> None:
         """Update from the model's present state.
 
-        For a path from coordinates to others the prediction is extrapolated by the last correction.
+        For a path from coordinates to others the prediction is extrapolated by the last corrections.
         """
         self._predicted = self._present()
-        share = self._share(_change(*path)) if path and self._correction else 0.0
+        share = MOMENTUM * self._share(_change(*path)) if path and self._correction else 0.0
         ahead = [here + share * moved for here, moved in zip(self._predicted, self._correction)]
         self.points, vertices = map(np.ascontiguousarray, ahead if share else self._predicted)
         self.move(vertices)
@@ -195,18 +196,22 @@ class NeighbourSurface(MovingSurface):
 
     def learn(self, *path: Mapping[str, float]) -> None:
         """Record how far the solve moved the model from its prediction, for a path from coordinates to others."""
-        self._change = _change(*path)
-        self._correction = [solved - predicted for solved, predicted in zip(self._present(), self._predicted)]
+        change = _change(*path)
+        found = [solved - predicted for solved, predicted in zip(self._present(), self._predicted)]
+        if self._correction:
+            old = MEMORY * self._share(change)
+            found = [(1.0 - MEMORY) * new + old * before for new, before in zip(found, self._correction)]
+        self._change, self._correction = change, found
 
     def _present(self) -> list[Floats]:
         """Contact points and vertices now."""
         return [np.array(self.model.contact_points()), np.array(self.model.material_mesh()[0])]
 
     def _share(self, change: dict[str, float]) -> float:
-        """Fraction of the last correction to apply: `MOMENTUM` for the same change of coordinates, 0 across or back."""
+        """Share of the last correction in another change of coordinates: 1 for the same, 0 across or back."""
         square = sum(value**2 for value in self._change.values())
         along = sum(value * self._change.get(name, 0.0) for name, value in change.items())
-        return MOMENTUM * min(max(along / square, 0.0), 1.0) if square else 0.0
+        return min(max(along / square, 0.0), 1.0) if square else 0.0
 
     def apart(self, other: NeighbourSurface, reach: float) -> bool:
         """Whether no point of the other muscle can be nearer than ``reach`` to this surface, by their boxes."""
