@@ -119,8 +119,8 @@ class SolidContact:
         contacts = contacts.only(index)
         return NearPoints(
             index, solid.columns[index], solid.shares[index], solid.forces[index],
-            RoundedContacts(self._rounded(contacts), contacts, len(index)), contacts.unyielding(), solid.y.copy(), self.reach,
-            self.most[index], softness,
+            RoundedContacts(self._rounded(contacts), contacts, len(index)), contacts.unyielding(), solid.y.copy(),
+            self.reach, self.most[index], softness,
         )  # fmt: skip
 
     def _rounded(self, contacts: BoneContacts) -> RoundedBones:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import touching_balls, vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
 from rbfmuscle.geometry.winding import winding_loop
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 # Index, distance, outward normal and nearest vertex of the points that are near a surface.
 Found = tuple[Integers, Floats, Floats, Integers]
-# Share of a muscle's last corrections that is expected again, and that of the earlier ones in their mean. Where each
-# sub-step expects all of the last correction alone, neighbours that push each other oscillate; where it expects nothing,
-# they answer to a surface that lies a millimetre or two from the equilibrium, and may pass each other.
+# Share of a muscle's last corrections that is expected again, and that of the earlier ones in their mean. With all of
+# the last one alone neighbours that push each other oscillate; with none they answer to a surface that lies a
+# millimetre or two from the equilibrium, and may pass each other.
 MOMENTUM, MEMORY = 0.75, 0.5
 # Greatest thickness of a muscle, relative to rest.
 DEEPER = 1.5
@@ -89,10 +89,19 @@ class MovingSurface:
 
     def nearest(self, points: Floats, reach: float) -> Integers:
         """Nearest vertex (n,) of points (n, 3); as many as there are vertices where none is within ``reach``."""
-        if self._tree is None:
-            self._tree = cKDTree(self.vertices, balanced_tree=False, compact_nodes=False)
-        found: Integers = self._tree.query(points, distance_upper_bound=reach)[1]
+        found, near = np.full(len(points), len(self.vertices)), np.flatnonzero(self.boxed(points, reach))
+        if len(near):
+            if self._tree is None:
+                self._tree = cKDTree(self.vertices, balanced_tree=False, compact_nodes=False)
+            found[near] = self._tree.query(points[near], distance_upper_bound=reach)[1]
         return found
+
+    def boxed(self, points: Floats, reach: float) -> Booleans:
+        """Whether points (n, 3) are within ``reach`` of the box about the surface."""
+        (low, high), near = (self.box[0] - reach, self.box[1] + reach), np.ones(len(points), dtype=np.bool_)
+        for a in range(3):
+            near &= (points[:, a] > low[a]) & (points[:, a] < high[a])
+        return near
 
     def query(self, points: Floats, reach: Floats | float, start: Integers | None = None) -> Found:
         """Distances of those points that are nearer than ``reach``.
@@ -224,9 +233,7 @@ class NeighbourSurface(MovingSurface):
         """Whether a contact point of the other muscle is nearer than ``reach`` to this surface."""
         if self.apart(other, reach):
             return False
-        low, high, points = self.box[0] - reach, self.box[1] + reach, other.points
-        near = points[np.all((points > low) & (points < high), axis=1)]
-        return len(self.query(near, reach)[0]) > 0
+        return len(self.query(other.points, reach)[0]) > 0
 
 
 def _change(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:

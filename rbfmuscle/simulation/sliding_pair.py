@@ -76,6 +76,8 @@ class SlidingPair:
         self.hold = np.where(self.linked, np.maximum(apart, 0.0) + limits.strip, limits.hold)
         #: Those that touch the neighbour at rest, and how far they are from it there.
         self.touching = np.flatnonzero(apart < limits.threshold)
+        #: Least distance of its points from the neighbour, when last measured.
+        self.least = np.inf
         self.gap = apart[self.touching]
         area = self.free.sum() / max(1, len(self.at))
         self.push = Planes(YIELDS / area)
@@ -141,14 +143,16 @@ class SlidingPair:
         apart = np.full(len(self.at), self.limits.reach)
         index, now, _, _ = self._near()
         apart[index] = now
+        self.least = float(now.min(initial=np.inf))
         opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
-        return max(0.0, -float(now.min(initial=0.0))), len(opened), float((opened**2).sum())
+        return max(0.0, -self.least), len(opened), float((opened**2).sum())
 
     def excess(self, points: Floats) -> Floats:
         """How far (n,) points (n, 3) of the drawn muscle are to move inwards: half of the way out of the neighbour."""
         limits, found, shown = self.limits, np.zeros(len(points)), self.other.shown
-        low, high = shown.box[0] - limits.clear, shown.box[1] + limits.clear
-        near = np.flatnonzero(np.all((points > low) & (points < high), axis=1))
+        if self.least > limits.clear + self.own.edge:
+            return found
+        near = np.flatnonzero(shown.boxed(points, limits.clear))
         index, distance, _, _ = shown.query(points[near], limits.deep)
         found[near[index]] = np.clip(0.5 * (limits.clear - distance), 0.0, limits.most)
         return found
