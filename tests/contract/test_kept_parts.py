@@ -103,6 +103,9 @@ def _surfaces():
     for crumpled in (vertices + 0.1 * noise, vertices + 0.4 * noise):
         yield crossing.crossing_faces(crumpled, faces), crossing.crossing_faces(crumpled, few)
         yield crossing.FaceTree(vertices, faces).crossing(crumpled, np.arange(len(faces)) % 9 == 0)
+        turns, plain = np.zeros(162, dtype=np.int64), np.ones(162, dtype=bool)
+        crossing._plain_loop(crumpled, faces, np.zeros((162, 3)), turns, plain)
+        yield turns, plain
     weights = harmonic.harmonic_weights(vertices, faces, [[0], [7, 8, 9], [50], [100, 101]])
     yield weights, harmonic.surface_gradient(vertices, faces, noise[:, 0])
     poses = np.stack([turned(angle, shift=3.0 * noise[k]) for k, angle in enumerate((0.0, 1e-7, 0.5, 3.1))])
