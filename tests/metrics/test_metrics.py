@@ -112,18 +112,6 @@ class TestPenetration:
         assert depth == pytest.approx(2.0, abs=1e-9)
         assert bone_depth(MeshDistance(*arrays(block)), [], {}) == 0.0
 
-    def test_equals_a_literal_search(self, blob):
-        bone = trimesh.creation.icosphere(subdivisions=4, radius=6.0)
-        pose = turned(0.4, (1, 2, 3))
-        pose[:3, 3] = [9, 4, 3]
-        moved = bone.copy().apply_transform(pose)
-        probes = [BoneProbe("bone", bone)]
-        v, f = arrays(blob)
-        expected = max(0, -igl.signed_distance(np.array(moved.vertices), v, f)[0].min())
-        assert bone_depth(MeshDistance(v, f), probes, {"bone": pose}) == pytest.approx(expected, rel=1e-9)
-        expected = np.maximum(0, -igl.signed_distance(v, *arrays(moved))[0])
-        np.testing.assert_allclose(surface_depth(v, probes, {"bone": pose}), expected, atol=1e-9)
-
 
 class TestMeshMeasures:
     def test_form_is_looked_for_again_where_it_can_have_changed(self):
