@@ -182,4 +182,5 @@ def test_live_pictures_are_what_is_kept(limb):
             figure.set(name, control.low + share * (control.high - control.low))
         pictures.append(figure.advance(coarse=coarse))
     facts = source.controls, source.motion, source.body, source.millimetre, figure.pending, figure.near
-    check_kept("live", [facts, pictures])
+    coarse = LiveSource(rm.phantom_scene(end=0.0, spacing=2.5), "pbd").rest.surfaces
+    check_kept("live", [facts, pictures, coarse])
