@@ -336,5 +336,7 @@ def test_header_counts_and_bones_against_it_are_named(leg):
     found = find_orientation(bones, HEADER)
     assert (found.anterior == [0, 1, 0]).all()
     assert any("anterior by the bones" in doubt for doubt in found.doubts)
+    shank = find_orientation([bone for bone in bones if bone.kind in ("tibia", "foot")])  # no femur shows it
+    assert shank.superior @ [0, 0, 1] > 0.95 and shank.anterior @ [0, -1, 0] > 0.95
     bones[1].side = "l"
     assert any("is it mirrored" in doubt for doubt in find_orientation(bones).doubts)
