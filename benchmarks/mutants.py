@@ -35,11 +35,11 @@ ROOT = Path(__file__).resolve().parents[1]
 WORK = Path(os.environ.get("MUTANTS_FOLDER", ROOT / ".mutants"))
 PACKAGES = ("rbfmuscle", "pbd_baseline")
 # A fault is tried on so many tests at most, of so many seconds together as recorded: quick ones, then others.
-STEPS = ((20, 20.0), (60, 90.0))
+STEPS = ((30, 25.0), (60, 90.0))
 LIMIT = 180  # seconds of compiling at most, beside three times those of the tests: more is an endless loop
 PYTEST = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"]
 COLD = ("bones", "geometry", "implicit", "muscle")  # what they compute is cached, right or wrong
-KEPT, FIRST = "what_is_kept", 4  # tests that compare many numbers, and how many of them come first
+KEPT, FIRST = "what_is_kept", 6  # tests that compare many numbers, and how many of them come first
 WORD = re.compile(r"\w+")
 LEFT_OUT = (".git", ".venv", ".mutants", "__pycache__", "*.egg-info", ".hypothesis", "demo_output", "images")
 COMPARE = {
@@ -226,7 +226,7 @@ class Reach:
                     self.made.append((name, set(WORD.findall(ast.unparse(node)))))
 
     def steps(self, fault: Fault) -> list[list[str]]:
-        """Tests that run a fault's line, those of each step: in turn of all files, the quick ones of each first."""
+        """Tests that run a fault's line, by step: of its own file, then in turn of all, quick ones of each first."""
         lines, span = self.lines.get(fault.path, {}), range(fault.first, fault.last + 1)
         found = set(lines.get(str(fault.line), ())) or {t for n in span for t in lines.get(str(n), ())}
         if fault.name and not (fault.loop and self.kind == "plain"):
@@ -237,12 +237,15 @@ class Reach:
         # Tests with processes of their own run lines that are not recorded as theirs.
         apart = {t for t in self.tests if folder in t and "subprocess" in self.named[t.partition("::")[0]]}
         found |= apart | {test for test in self.tests if own in test}
-        order, files = {}, defaultdict(int)
+        order, seen = {}, defaultdict(int)
         for test in sorted(found, key=lambda t: (self.time(t), t)):
-            file = test.partition("::")[0]
-            near = folder in file or own in file
-            order[test] = files[file] // (3 if near else 1), self.time(test), test
-            files[file] += 1
+            file, case = test.partition("::")[0], test.partition("[")[0]
+            turn = -1 if own in file else seen[file] // (6 if folder in file else 1)
+            # One case of each test that has several comes first, of quick ones of the own file eight.
+            again = seen[case] // (8 if own in file and self.time(test) < 0.1 else 1)
+            order[test] = 3 * again + turn, self.time(test), test
+            seen[file] += seen[case] == 0
+            seen[case] += 1
         ordered, steps = self._kept_first(sorted(found, key=order.__getitem__)), []
         for most, budget in STEPS:
             chosen, spent = [], 0.0

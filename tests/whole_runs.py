@@ -11,6 +11,7 @@ from spindle_scene import CENTRE, build_scene
 from toy_scene import held
 
 import rbfmuscle as rm
+from rbfmuscle.scene.objects import Attachment
 from rbfmuscle.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
 
 RBF = {"name": "rbf", "centres": 80, "samples": 300, "resolution": 20}
@@ -37,6 +38,11 @@ def _bent(model):
     """A spindle is bent over a ball by 30 degrees to either side and pressed on it."""
     scene = build_scene().with_options({}, model=model)
     scene.muscles[0].mesh.apply_translation([0.7, -4.0, 0.3])
+    if model == "xpbd":  # held by a third bone, too
+        x, _, z = scene.muscles[0].mesh.vertices.T
+        scene.muscles[0].attachments.append(
+            Attachment("ball", np.flatnonzero((x > 5.0) & (abs(z - 25.0) < 4.0)))
+        )
     for name, bone in (("bend", "upper"), ("other", "lower")):
         scene.add_joint(name, "ball", bone, CENTRE.tolist(), {"flexion": (1, 0, 0)})
     stops = [{}, {"bend.flexion": 30.0, "other.flexion": -30.0}]

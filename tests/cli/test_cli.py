@@ -89,15 +89,15 @@ class TestRun:
         [
             (("run",), "rbfmuscle.run.Recording"),
             (("compare",), "rbfmuscle.compare._measure"),
-            (("kernels",), "rbfmuscle.experiments.kernel_study.study_kernels"),
+            (("kernels", "--centres", "8"), "rbfmuscle.experiments.kernel_study.study_kernels"),
             (("kernels", "--error", "1"), "rbfmuscle.experiments.wanted_error.reach_error"),
-            (("paths",), "rbfmuscle.paths.sample_muscles"),
+            (("paths", "--samples", "10"), "rbfmuscle.paths.sample_muscles"),
         ],
     )
     def test_unwritable_output_is_told_before_any_work(self, tmp_path, capsys, monkeypatch, words, work):
         monkeypatch.setattr(work, lambda *given, **named: pytest.fail("work was begun"))
         (tmp_path / "file").write_text("in the way")
-        code, _, err = call(capsys, *words, "phantom", "-o", tmp_path / "file" / "out")
+        code, _, err = call(capsys, words[0], "phantom", *words[1:], "-o", tmp_path / "file" / "out")
         assert code == 2 and "cannot write to" in one_line(err)
 
 

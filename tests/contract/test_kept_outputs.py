@@ -1,7 +1,9 @@
 """Scenes, imports, pages, files and pictures of small inputs hold what they held, with times of a counting clock."""
 
+import inspect
 from itertools import pairwise
 from shutil import copy
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -9,22 +11,35 @@ from blend_model import arm_scene, use_blend_model
 from conftest import ROOT
 from fuzz.meshes import base_scene, damaged_shape, write_base
 from fuzz.scenes import to_toml
-from kept import check_kept, file_facts
+from kept import check_kept, file_facts, text_facts
 from PIL import Image
+from trimesh.transformations import rotation_matrix as turned
 from whole_runs import SCENES
 
 import rbfmuscle as rm
+from pbd_baseline.options import PBDOptions
+from rbfmuscle.cli.app import GROUPS
+from rbfmuscle.experiments.comparison import MEASURES
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.opensim import scene as opensim
+from rbfmuscle.metrics.summary import LIMITS
+from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.output import appearance
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.report.plots import Point, Track, front_plot, line_plot
 from rbfmuscle.report.render import draw_scene, render_run
 from rbfmuscle.report.report import write_report
 from rbfmuscle.scene.activation.contraction import Activations, resolve_contraction
 from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.scene.motion import bone_poses, step_angle
+from rbfmuscle.scene.options import Table
 from rbfmuscle.simulation.plan import plan_scene
 from rbfmuscle.validation import MeshError
+from rbfmuscle.viewer.side import COLOURINGS, legend, shades
+from rbfmuscle.viewer.sources import LiveSource
+
+BOUNDS = ("gt", "ge", "lt", "le", "min_length", "max_length")
 
 
 def scene_facts(scene):
@@ -75,14 +90,16 @@ def test_mended_mesh_is_what_is_kept():
     check_kept("meshes", found)
 
 
-def test_imported_model_is_what_is_kept(tmp_path):
-    for name in ("small.osim", "wedge.obj"):
-        copy(ROOT / "tests" / "data" / name, tmp_path)
-    found = opensim.import_osim(tmp_path / "small.osim")
+@pytest.mark.parametrize(("file", "name"), [("small", "osim"), ("muscles", "osim_muscles")])
+def test_imported_model_is_what_is_kept(tmp_path, file, name):
+    for part in (f"{file}.osim", "wedge.obj"):
+        copy(ROOT / "tests" / "data" / part, tmp_path)
+    found = opensim.import_osim(tmp_path / f"{file}.osim")
     opensim.write_scene(found, tmp_path / "scene")
     facts = list(scene_facts(rm.Scene.load(tmp_path / "scene" / "scene.toml", skeleton=True)))
     moved = [found.model.transforms(dict.fromkeys(found.model.coordinates(), 0.1 * k)) for k in range(-2, 3)]
-    check_kept("osim", [facts, found.places, found.notes, moved])
+    muscles = [[found.model.muscles, [m.mesh for m in found.scene.muscles]]] if file == "muscles" else []
+    check_kept(name, [facts, found.places, found.notes, moved, *muscles])
 
 
 def test_guessed_scene_is_what_is_kept(tmp_path):
@@ -113,3 +130,57 @@ def test_files_of_a_run_hold_what_is_kept(name, limb, tmp_path, monkeypatch, clo
     # Without the lines of text above and below.
     facts["plots"] = [np.asarray(Image.open(file))[22:200] for file in sorted(folder.glob("*.png"))]
     check_kept(f"run_{name}", [facts, file_facts(folder)])
+
+
+def numbers(values):
+    """All numbers among values and tuples of them; not a number for what is none."""
+    flat = [one for value in values for one in (value if isinstance(value, tuple) else [value])]
+    return [one if isinstance(one, int | float) else np.nan for one in flat]
+
+
+def defaults_of(call):
+    """Defaults of a function, or of a class and its methods, and whether its options take several words."""
+    calls = [call, *(one for _, one in inspect.getmembers(call, inspect.isfunction))]
+    given = [each.default for one in calls for each in inspect.signature(one).parameters.values()]
+    hints = get_type_hints(call, include_extras=True).values() if "cli" in call.__module__ else ()
+    parts = [part for kind in hints for part in getattr(kind, "__metadata__", ())]
+    return numbers([*given, *(getattr(part, "consume_multiple", None) for part in parts)])
+
+
+def test_defaults_and_bounds_are_what_is_kept():
+    calls = [getattr(rm, name) for name in rm._HOME if name not in rm._ERRORS] + [*sum(GROUPS.values(), ())]
+    found, kinds = {call.__name__: defaults_of(call) for call in calls}, [Table, PBDOptions, RBFOptions]
+    for kind in kinds:
+        kinds += [new for new in kind.__subclasses__() if new not in kinds]
+        fields = kind.model_fields.values()
+        bounds = [getattr(part, key, None) for field in fields for part in field.metadata for key in BOUNDS]
+        found[kind.__name__] = numbers([*bounds, *(field.default for field in fields)])
+    check_kept("defaults", [found, numbers(MEASURES.values()), numbers(LIMITS.values())])
+
+
+def test_looks_are_what_is_kept():
+    body, shares = np.roll(np.eye(3), 1, axis=0), np.linspace(0.0, 2.0, 201)
+    names = {f"muscle {k}": str(k % 7) for k in range(30)}
+    colours = map(appearance.rgb, appearance.muscle_colours(list(names), names).values())
+    views = [appearance.view_axes(view, body) for view in appearance.VIEWS.values()]
+    turns = [[{"a": np.eye(4)}, {"a": turned(angle, axis)}] for angle in (0.03, 0.1) for axis in body]
+    seen = [appearance.motion_direction(poses, body) for poses in turns]
+    scales = [one for one in COLOURINGS.values() if one is not None]
+    shown = [(shades(one, 3.0 * shares, 0.3), text_facts(legend(one, "cm", 0.1))) for one in scales]
+    lines, axes = [Track(name, "#cc6677", shares, shares**2) for name in names], ("x", "y")
+    plots = [line_plot("a", lines[:2], axes, limits=[2.0], zero=zero, legend=zero) for zero in (True, False)]
+    dots = [Point(1 + k % 7, 1 + k % 5, f"p{k}", str(k % 2), k == 4, k < 3) for k in range(9)]
+    plots = list(map(text_facts, [*plots, front_plot(dots, axes)]))
+    check_kept("looks", [list(colours), appearance.linear_rgb(shares), views, seen, shown, plots])
+
+
+def test_live_pictures_are_what_is_kept(limb):
+    source = LiveSource(limb)
+    figure, pictures = source.figure(source.choices[0]), [source.rest]
+    for share, coarse in ((0.3, False), (0.6, True), (0.6, True), (0.6, False)):
+        for name, control in source.controls.items():
+            figure.set(name, control.low + share * (control.high - control.low))
+        pictures.append(figure.advance(coarse=coarse))
+    facts = source.controls, source.motion, source.body, source.millimetre, figure.pending, figure.near
+    coarse = LiveSource(rm.phantom_scene(end=0.0, spacing=2.5), "pbd").rest.surfaces
+    check_kept("live", [facts, pictures, coarse])

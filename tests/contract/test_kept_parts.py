@@ -9,7 +9,10 @@ from kept import check_kept
 
 from rbfmuscle.bones.errors import measure_field
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry import surfaces
+from rbfmuscle.geometry import bsplines, coarse, crossing, harmonic, rotations, surfaces, triangles, tubes
+from rbfmuscle.geometry.exact_distance import faces_across
+from rbfmuscle.geometry.rest_frame import BoneFrame, moved_box
+from rbfmuscle.geometry.winding import winding_loop
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField, off_surface_points
 from rbfmuscle.implicit.kernels.table import get_kernel
@@ -94,13 +97,57 @@ def _fields():
         yield {"about": len(found.vertices), "volume": found.volume, "level": found.level}
 
 
+def _surfaces():
+    rng, (vertices, faces) = np.random.default_rng(5), ball((3.0, 2.0, 1.2), 2, bumps=0.1)
+    noise, few = rng.normal(size=vertices.shape), faces[:200]
+    for crumpled in (vertices + 0.1 * noise, vertices + 0.4 * noise):
+        yield crossing.crossing_faces(crumpled, faces), crossing.crossing_faces(crumpled, few)
+        yield crossing.FaceTree(vertices, faces).crossing(crumpled, np.arange(len(faces)) % 9 == 0)
+        turns, plain = np.zeros(162, dtype=np.int64), np.ones(162, dtype=bool)
+        crossing._plain_loop(crumpled, faces, np.zeros((162, 3)), turns, plain)
+        yield turns, plain
+    weights = harmonic.harmonic_weights(vertices, faces, [[0], [7, 8, 9], [50], [100, 101]])
+    yield weights, harmonic.surface_gradient(vertices, faces, noise[:, 0])
+    poses = np.stack([turned(angle, shift=3.0 * noise[k]) for k, angle in enumerate((0.0, 1e-7, 0.5, 3.1))])
+    for share in (weights, *np.eye(4)[:, None].repeat(len(vertices), 1)):
+        yield harmonic.blended_motion(vertices, share, poses)
+    turns = np.array([rotations.matrix_quaternion(turned(angle)) for angle in np.linspace(-6.0, 6.0, 25)])
+    for sizes in ((3.0, 1.0, 0.5), (1.0, 0.2, -0.1), (1.0, 1e-4, 0.0)):
+        yield turns.copy()
+        for q, m in zip(turns, map(np.linalg.svd, noise.reshape(-1, 3, 3))):
+            rotations.rotation_loop(m[0] * sizes @ m[2], q)
+    yield [rotations.rotate(q, x) for q, x in zip(turns, noise)], rotations.rigid_fit(vertices, noise)
+    yield rotations.turned_quaternions(turns, poses[2, :3, :3])
+    moved = vertices @ poses[2, :3, :3] + noise
+    yield rotations.smooth_displacement(vertices, moved, lambda beside: beside.sort(0))
+    yield triangles.pseudonormals(vertices, few, faces_across(few))
+    near, steps, away, winding = np.empty((162, 3)), np.empty((2, 162)), np.empty(162), np.empty(162)
+    for x, out in zip(3.0 * noise, near):
+        triangles.nearest_weights(x, *np.diag([1.0, 2.0, 0.6]), out)
+    surfaces.touching_balls(vertices, surfaces.vertex_normals(vertices, faces), steps, away)
+    winding_loop(vertices, faces[:300], noise, winding)
+    yield near, steps, away, winding, surfaces.volume_cubic(vertices, faces, noise)
+    yield surfaces.barycentric_weights(noise, vertices[faces[:162]]), surfaces.vertex_areas(vertices, faces)
+    line, places = np.cumsum(np.abs(noise[:9]), axis=0), np.linspace(-1.0, 9.0, 20)
+    yield tubes.tube_mesh(line, np.linspace(1.0, 2.0, 9)), tubes.points_along(line, places)
+    pinched = np.where(faces == 9, 0, faces)
+    yield coarse.clustered(vertices, faces, 150), surfaces.split_pinched_vertices(vertices, pinched)
+    frame = BoneFrame(vertices + 0.1 * noise)
+    yield frame.axes, frame.local, frame.box([[-1, -2, 0], [1, 1, 2]]), frame.placed(poses[2])
+    yield moved_box(np.sort(noise[:2], axis=0), poses)
+    weight, slope = np.empty((2, 3, 4))
+    for t, *one in zip((0.1, 0.5, 0.8), weight, slope):
+        bsplines.bspline_weights(t, *one)
+    yield weight, slope, bsplines.bspline_sum(noise[:144].reshape(6, 8, 9), (1, 2, 3), weight, slope)
+
+
 def _lattice():
-    lattice, points = Lattice(*ball((3.0, 2.0, 1.2), bumps=0.1), 60), ball((3.7, 2.4, 1.5))[0]
+    lattice, points = Lattice(*ball((3.0, 2.0, 1.2), bumps=0.1), 60), ball((5.0, 3.0, 2.0))[0]
     yield {key: value for key, value in vars(lattice).items() if isinstance(value, np.ndarray)}
     yield lattice.embed(points), lattice.regions(5), lattice.second_differences()
 
 
-PARTS = {"bones": _bones, "fields": _fields, "lattice": _lattice}
+PARTS = {"bones": _bones, "fields": _fields, "surfaces": _surfaces, "lattice": _lattice}
 
 
 @pytest.mark.parametrize("name", PARTS)

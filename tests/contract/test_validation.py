@@ -5,6 +5,7 @@ import pytest
 
 from pbd_baseline.options import PBDOptions
 from rbfmuscle import validation
+from rbfmuscle.cli.app import one_line
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene.options import Table
 from rbfmuscle.validation import (
@@ -16,6 +17,8 @@ from rbfmuscle.validation import (
     check_vectors,
     did_you_mean,
     is_file,
+    shown,
+    shown_path,
 )
 
 CODES = {
@@ -84,6 +87,16 @@ def test_nearest_name_or_all_names():
     for count, more in ((40, ""), (41, " and 1 more"), (43, " and 3 more")):
         names = [f"n{k:02d}" for k in range(count)]
         assert did_you_mean("zzz", names) == "known: " + ", ".join(names[:40]) + more
+
+
+def test_messages_show_values_whole_up_to_a_length():
+    assert shown("x" * 80) == "x" * 80 and shown("x" * 81) == f"{65 * 'x'} ... {10 * 'x'}"
+    assert shown_path("x" * 400) == "x" * 400 and len(shown_path("x" * 401)) == 400 and shown(2.5) == "2.5"
+    assert one_line("a\n b") == "a b" and (len(one_line("x" * 1000)), len(one_line("x" * 1001))) == (
+        1000,
+        995,
+    )
+    assert shown(10**5000) == "a int too long to show"
 
 
 def test_only_regular_files_are_files(tmp_path):

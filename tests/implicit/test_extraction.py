@@ -144,23 +144,3 @@ def test_spurious_sheets_are_counted_and_left_out():
 def test_what_gives_no_surface_is_refused(word, field, options):
     with pytest.raises(ValueError, match=word):
         extract_surface(field, points=on_sphere(), **{"resolution": 12, **options})
-
-
-def test_mesh_moves_rigidly_with_the_grid_axes():
-    rotation = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])[:3, :3]
-    offset = np.array([1e4, -2e3, 5e2])
-    # Turned by little, so that no point lies on the border of two cells.
-    turn = trimesh.transformations.rotation_matrix(0.1, [3, 1, 2])[:3, :3]
-    ellipsoid = trimesh.creation.icosphere(3).vertices @ turn * [40.0, 20.0, 10.0]
-
-    def field(x):
-        return np.linalg.norm(x / [40.0, 20.0, 10.0], axis=1) - 1
-
-    def turned(x):
-        return field((x - offset) @ rotation)
-
-    rest = extract_surface(field, points=ellipsoid, volume=30000.0)
-    points = ellipsoid @ rotation.T + offset
-    moved = extract_surface(turned, points=points, volume=30000.0, axes=rotation.T)
-    np.testing.assert_array_equal(moved.faces, rest.faces)
-    np.testing.assert_allclose(moved.vertices, rest.vertices @ rotation.T + offset, atol=1e-7)

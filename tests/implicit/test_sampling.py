@@ -61,14 +61,6 @@ def test_sphere_is_covered_evenly_with_radial_normals():
     assert (radial * sample.normals).sum(axis=1).min() > np.cos(np.radians(2))
 
 
-def test_same_seed_same_points_and_another_seed_others():
-    mesh = SHAPES["ellipsoid"]()
-    first, again, other = (sample_surface(mesh.vertices, mesh.faces, 50, seed=s) for s in (1, 1, 2))
-    np.testing.assert_array_equal(first.points, again.points)
-    np.testing.assert_array_equal(first.control_faces, again.control_faces)
-    assert np.abs(first.points - other.points).max() > 0.1
-
-
 def test_scrambled_clusters_still_contract_to_a_manifold():
     mesh = trimesh.creation.torus(20.0, 6.0, major_sections=40, minor_sections=20)
     labels = np.random.default_rng(3).integers(0, 40, len(mesh.vertices))

@@ -50,6 +50,7 @@ def test_names_as_they_are_published(name, tissue, known, side):
 def test_misspelt_names_are_named_and_known_words_are_never_taken_for_others():
     assert "'illiacus' read as 'iliacus'" in name_facts("Illiacus").spelling
     assert not name_facts("obturator_externus").spelling
+    assert name_facts("femor").bone == "femur" and not name_facts("tals").bone  # four letters are too few
     assert name_facts("abductor_hallucis").muscle.name == "abductor hallucis"
 
 
@@ -190,11 +191,14 @@ def test_joints_of_the_leg_however_it_lies(leg, how):
     assert joints["ankle"].rest == pytest.approx(-32.0, abs=3.0)
 
 
-def test_a_condyle_larger_than_anatomy_has_is_refused_and_named(leg):
-    bones, _ = _leg_bones(leg, np.diag([2.5, 2.5, 2.5, 1.0]))
-    find_orientation(bones)
-    fit = fit_condyles(bones[1], bones[1].frame, 1.0)
-    assert fit.wrong and f"anatomy has {CONDYLE[0]:g} to {CONDYLE[1]:g}" in fit.wrong
+@pytest.mark.parametrize("millimetre", [1.0, 1e-3])
+def test_a_condyle_larger_than_anatomy_has_is_refused_and_named(leg, millimetre):
+    for scale in (1.0, 2.5):
+        bones, _ = _leg_bones(leg, np.diag([*3 * [scale * millimetre], 1.0]))
+        find_orientation(bones)
+        fit = fit_condyles(bones[1], bones[1].frame, millimetre)
+        said = f"radius {fit.radii[0] / millimetre:.3g} mm, anatomy has {CONDYLE[0]:g} to {CONDYLE[1]:g}"
+        assert fit.wrong == ("" if scale == 1.0 else f"a condyle of {said}")
 
 
 def test_patella_follows_the_table_that_was_computed_for_the_leg(leg):
@@ -324,7 +328,7 @@ def test_meshes_in_metres_make_a_scene_that_runs_and_an_unused_bone_is_in_the_ve
     assert code == 0 and f"verdict: {verdict}" in printed and len(SavedRun(out).frames) == 5
     assert "the bones, bones left out (sacrum) 1 at frame 0 (limit 0)" in verdict
     code, _, err = call(capsys, *run, "--set", "output.surfaces=false", "--fail-on", "bones_left_out")
-    assert code == 6 and "bones_left_out = 1 > 0" in err
+    assert code == 6 and "bones_left_out = 1 > 0" in err and not SavedRun(out).has_surfaces()
 
 
 def test_header_counts_and_bones_against_it_are_named(leg):
@@ -332,5 +336,7 @@ def test_header_counts_and_bones_against_it_are_named(leg):
     found = find_orientation(bones, HEADER)
     assert (found.anterior == [0, 1, 0]).all()
     assert any("anterior by the bones" in doubt for doubt in found.doubts)
+    shank = find_orientation([bone for bone in bones if bone.kind in ("tibia", "foot")])  # no femur shows it
+    assert shank.superior @ [0, 0, 1] > 0.95 and shank.anterior @ [0, -1, 0] > 0.95
     bones[1].side = "l"
     assert any("is it mirrored" in doubt for doubt in find_orientation(bones).doubts)

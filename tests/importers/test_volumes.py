@@ -200,5 +200,6 @@ def test_two_labels_of_one_name_are_two_meshes(tmp_path):
     labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
     source = write_nifti(tmp_path / "a.nii", labels, np.eye(4))
     (tmp_path / "names.csv").write_text("1,Soleus\n2,soleus\n")
-    folder = _write_surfaces(source, tmp_path / "names.csv", tmp_path / "out")
-    assert sorted(path.name for path in folder.iterdir()) == ["Soleus.ply", "soleus_2.ply"]
+    for _ in range(2):  # into a folder that is not there, and over what is
+        folder = _write_surfaces(source, tmp_path / "names.csv", tmp_path / "new" / "out")
+        assert sorted(path.name for path in folder.iterdir()) == ["Soleus.ply", "soleus_2.ply"]

@@ -19,6 +19,7 @@ from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.material import project_to_level_set
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.models import build_model
+from rbfmuscle.muscle.display_mesh import display_vertices
 from rbfmuscle.muscle.drawing import Configuration
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
@@ -232,3 +233,10 @@ def test_what_folds_does_not_flicker():
     run = rm.simulate(scene, frames="52:61")
     assert run.values("abductor", "flicker").max() < 0.6
     assert run.values("abductor", "self_crossings").max() == 0
+
+
+def test_shown_mesh_has_three_edges_through_its_thickness():
+    muscle = SimpleNamespace(mesh=trimesh.creation.cylinder(5.0, 250.0, sections=64))  # mean thickness 5
+    for resolution, edge in ((0, 5.0 / 3.0), (100, 2.5)):
+        wanted = 1.15 * muscle.mesh.area / edge**2
+        assert display_vertices(muscle, resolution) == pytest.approx(wanted, rel=0.06)

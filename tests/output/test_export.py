@@ -51,12 +51,6 @@ class TestVtp:
             read_vtp(tmp_path / "none.vtp")
 
 
-def read(path):
-    """Vertices and faces of a file, by readers that are not ours."""
-    data = pyvista.read(path)
-    return np.asarray(data.points, dtype=float), data.regular_faces
-
-
 class TestSaved:
     def test_paraview_collection_has_every_frame_and_muscle(self, arm_run):
         reader = pyvista.get_reader(arm_run[1] / "surfaces.pvd")
@@ -89,16 +83,6 @@ class TestSaved:
 
 
 class TestExport:
-    @pytest.mark.parametrize("name", ["pvd", "vtp", "ply", "obj"])
-    def test_vertices_and_faces_come_back_in_their_order(self, arm_run, tmp_path, name):
-        made, folder = arm_run
-        written = [p for p in export_run(folder, name, output=tmp_path) if p.stem.startswith("biceps_")]
-        assert len(written) == len(made.frames)
-        for path, frame in zip(sorted(written), made.frames):
-            vertices, faces = read(path)
-            np.testing.assert_allclose(vertices, frame.surfaces["biceps"].vertices, rtol=1e-6, atol=1e-5)
-            np.testing.assert_array_equal(faces, frame.surfaces["biceps"].faces)
-
     @pytest.mark.parametrize(("name", "units"), [("fbx", "m"), ("ply", "inch"), ("glb", "mm")])
     def test_wrong_words(self, arm_run, tmp_path, name, units):
         with pytest.raises(UsageError):

@@ -59,15 +59,6 @@ def test_large_steps_stay_finite_and_keep_the_volume(method, step):
         assert rig.volume_error() < 1e-3
 
 
-@pytest.mark.parametrize("method", [m for m in METHODS if m != "pbd-paper"])  # which keeps its velocity
-def test_there_and_back_is_near_the_rest(method):
-    rig = Rig(method=method)
-    rest = rig.model.material_mesh()[0].copy()
-    back = rig.go(*range(2, 42, 2), *range(38, -2, -2), *[0] * 100)
-    # a relaxation, so it comes nearer with every solve; the slowest is at 0.34 mm of a muscle of 90 mm here
-    assert np.sqrt(((back - rest) ** 2).sum(axis=1).mean()) < 0.5
-
-
 def test_xpbd_does_not_depend_on_the_number_of_iterations():
     stops = range(2, 42, 2)
     ten = Rig(method="xpbd", iterations=10).go(*stops)

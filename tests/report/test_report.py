@@ -27,8 +27,8 @@ def colours_of(image):
 def test_preview_shows_bone_and_muscle_move(folder):
     write_report(folder)
     with Image.open(folder / "preview.webp") as preview:
-        assert preview.n_frames == 7
         first = colours_of(preview)
+        assert (preview.n_frames, preview.info["duration"]) == (7, 4000 // 7)  # milliseconds of each
         preview.seek(6)
         last = colours_of(preview)
     for pixels in (first, last):

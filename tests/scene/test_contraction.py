@@ -5,12 +5,7 @@ import pytest
 from contraction_scenes import MUSCLE, spindle_scene
 
 from rbfmuscle.models import build_model
-from rbfmuscle.scene.activation.contraction import (
-    SETTLING,
-    STEP,
-    Activations,
-    resolve_contraction,
-)
+from rbfmuscle.scene.activation.contraction import SETTLING, STEP, Activations, resolve_contraction
 from rbfmuscle.validation import SceneError
 
 

@@ -21,6 +21,7 @@ from kept import check_kept, text_facts
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from rbfmuscle.output.appearance import VIEWS
 from rbfmuscle.viewer.page import Page
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
@@ -207,7 +208,9 @@ def test_server_listens_on_one_address(page):
 
 
 def test_page_of_a_run_draws_what_is_kept(run_folder):
-    page, found = Page(SavedSource({"run": SavedRun(run_folder)}), at={"frame": 1.0}), {}
+    source, found = SavedSource({"run": SavedRun(run_folder)}), {}
+    source.muscles |= {"extensor": (1.1 * source.muscles["extensor"][0], source.muscles["extensor"][1])}
+    page = Page(source, at={"frame": 1.0})
     page._closed = True  # ends its thread, so that nothing is drawn but what is asked for
     page._wake.set()
     page._thread.join()
@@ -227,6 +230,11 @@ def test_page_of_a_run_draws_what_is_kept(run_folder):
         nodes = {key: (n.vertices, n.faces, n.position, n.wxyz, n.visible) for key, n in side._nodes.items()}
         text = text_facts(panel._numbers.content.rpartition("<br>")[0])
         found[f"{name} {value}"] = nodes, side.numbers, more, text, panel._history
+    panel.models[1].value = "run"
+    for name, view in VIEWS.items():
+        page._turn()
+        page._aim(view, camera)
+        found[name] = np.array(page.sides[1].frame.position), camera.position, camera.look_at, camera.up
     page.close()
     check_kept("page", found, tolerance=1e-6)
 

@@ -30,6 +30,8 @@ def test_picture_is_of_the_frame_asked_for(run_folder, tmp_path, capsys, graphic
     asked, first, third = (image(tmp_path / f"{name}.png") for name in ("x/y/a", "0", "2"))
     np.testing.assert_array_equal(asked, third)
     assert (asked != first).any(axis=2).mean() > 0.01
+    assert call(capsys, "view", run_folder, "--screenshot", tmp_path / "plain.png")[0] == 0
+    np.testing.assert_array_equal(image(tmp_path / "plain.png"), first)
 
 
 def test_picture_of_a_scene_is_of_the_pose_asked_for(tmp_path, capsys, graphics):

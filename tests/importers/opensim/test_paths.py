@@ -4,7 +4,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from kept import check_kept
+from kept import check_kept, file_facts
 
 from rbfmuscle.paths import (
     FittedPath,
@@ -103,7 +103,7 @@ def scene():
 RANGES = {"hip.flexion": (0.0, 0.4), "hip.adduction": (-0.1, 0.1), "hip.internal_rotation": (-0.1, 0.1)}
 
 
-def test_muscle_is_sampled_over_what_moves_it_and_fitted(scene, tmp_path):
+def test_sampled_muscle_and_its_fit_are_what_is_kept(scene, tmp_path):
     (found,) = sample_muscles(scene, RANGES, samples=15)
     assert found.coordinates == tuple(RANGES)
     assert found.values.shape == (15, 3) == found.arms.shape and np.ptp(found.lengths) > 0
@@ -111,7 +111,8 @@ def test_muscle_is_sampled_over_what_moves_it_and_fitted(scene, tmp_path):
     assert (found.values >= low).all() and (found.values <= high).all()
     assert (np.ptp(found.values, axis=0) > 0.8 * (high - low)).all()
     lines = report_fits(scene, [found], tmp_path)
-    assert "3 poses held out" in lines[0] and (tmp_path / "errors.csv").is_file()
+    assert "3 poses held out" in lines[0]
+    check_kept("paths", [found, file_facts(tmp_path)], tolerance=1e-5)
     assert ElementTree.parse(tmp_path / "paths.xml").getroot().find(".//order").text in "1234567"
 
 
