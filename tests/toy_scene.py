@@ -8,7 +8,7 @@ from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.tables import JointTable
 from rbfmuscle.scene.objects import Attachment, Motion, Muscle, SceneData
 from rbfmuscle.scene.options import ContactOptions, DetectOptions
-from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
+from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface, MuscleModel
 
 
 class Formula:
@@ -108,7 +108,7 @@ def press(target, now, inverse, index, gap, normal):
     return x
 
 
-class ToyMuscle:
+class ToyMuscle(MuscleModel):
     """Vertices on springs to t, where the bones' blended motion would take them; attached ones go with their bones.
 
     Energy (x - t)' K (x - t) / 2 with K a graph Laplacian plus a share of the identity.
@@ -158,9 +158,6 @@ class ToyMuscle:
         for _ in range(self.sweeps):
             near = contacts.half_spaces(self.x, self.reach)
             self.x = press(self.target, self.x, self.inverse, near.index, near.gap, near.normal)
-
-    def make_room(self, contacts):
-        pass
 
     def turn(self, which, transform):
         self.x[which] = self.x[which] @ transform[:3, :3].T + transform[:3, 3]
