@@ -168,7 +168,7 @@ class SolidContact:
         return y
 
     def _push_out(self, near: NearPoints, spaces: HalfSpaces, yielding: float) -> Floats:
-        """Motion (N, 3) of nodes at rest that brings them out of obstacles."""
+        """Motion (N, 3) of nodes that stand still, out of obstacles."""
         still, none = np.zeros((len(near.which), 3)), np.zeros_like(near.forces)
         return self._touch(near, spaces, still, none, yielding, near.most)[0]
 

@@ -108,6 +108,13 @@ class Sliding:
             self.refresh(stepper, before, after)
             stepper.model.restore(state)
 
+        def find_planes(stepper: MuscleStepper) -> None:
+            with stepper.timed("sliding"):
+                for link in self.links[stepper.name]:
+                    link.update()
+                for bone_link in self.bone_links[stepper.name]:
+                    bone_link.update()
+
         def learn(stepper: MuscleStepper) -> None:
             if stepper.name in self.surfaces:
                 with stepper.timed("sliding"):
@@ -116,15 +123,8 @@ class Sliding:
         each(predict, due)
         seen = {link.other.model.name for stepper in due for link in self.links[stepper.name]}
         each(wait, [stepper for stepper in self.steppers if stepper.name in seen and stepper not in due])
-        for act in (self._find_planes, MuscleStepper.correct, learn):
+        for act in (find_planes, MuscleStepper.correct, learn):
             each(act, due)
-
-    def _find_planes(self, stepper: MuscleStepper) -> None:
-        with stepper.timed("sliding"):
-            for link in self.links[stepper.name]:
-                link.update()
-            for bone_link in self.bone_links[stepper.name]:
-                bone_link.update()
 
     def refresh(self, stepper: MuscleStepper, *path: Coordinates) -> None:
         """Update a muscle's surface from its present state, extrapolated for a path from coordinates to others."""
@@ -136,8 +136,7 @@ class Sliding:
         """Drawings of all muscles in their present state; updates ``pairs``."""
         each(self.refresh, self.steppers)
         solved = [stepper for stepper in self.steppers if stepper.solves and self.links[stepper.name]]
-        each(self._find_planes, solved)
-        each(lambda stepper: stepper.model.make_room(stepper.contacts), solved)
+        each(self._make_room, solved)
         each(self.refresh, solved)
         met: dict[tuple[str, str], list[tuple[float, int, float]]] = {}
         for stepper, found in zip(self.steppers, each(self._measure, self.steppers)):
@@ -154,6 +153,12 @@ class Sliding:
             if self.links[drawing.stepper.name]:
                 self.surfaces[drawing.stepper.name].show(drawing.drawing.carried())
         return drawings
+
+    def _make_room(self, stepper):
+        with stepper.timed("sliding"):
+            for link in self.links[stepper.name]:
+                link.update(relink=False)
+            stepper.model.make_room(stepper.contacts)
 
     def _measure(self, stepper):
         with stepper.timed("sliding"):

@@ -88,19 +88,20 @@ class SlidingPair:
         self._from: Integers | None = None
         self._fixed_from: Integers | None = None
 
-    def update(self) -> None:
-        """Recompute the planes from the extrapolated surfaces."""
+    def update(self, *, relink: bool = True) -> None:
+        """Recompute the planes from the surfaces as last refreshed, and, with ``relink``, which points are linked."""
         limits, points = self.limits, self.own.points
         if self.other.apart(self.own, limits.reach):
-            self.linked[:] = False
+            self.linked &= not relink
             self.push.clear()
             self.pull.clear()
             return
         index, distance, normal, nearest = self._near()
-        far = np.ones(len(self.at), dtype=bool)
-        far[index] = distance > self.hold[index] + limits.release
-        self.linked &= ~far
-        self.linked[index[distance < limits.threshold]] = True
+        if relink:
+            far = np.ones(len(self.at), dtype=bool)
+            far[index] = distance > self.hold[index] + limits.release
+            self.linked &= ~far
+            self.linked[index[distance < limits.threshold]] = True
         share = np.where(self.other.fixed[nearest], 1.0, 0.5)
         own = self.at[index], np.maximum(share * distance, -limits.most), normal
         # Planes that keep the muscle out: at its own points, and at attached points of the neighbour.
