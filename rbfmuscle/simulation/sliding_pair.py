@@ -23,15 +23,14 @@ THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 15.0
 BETWEEN = 0.5
 # Neighbours are looked for within this distance [mm] of points that are not linked.
 SEARCH = 3.0
-# Drawn surfaces are moved CLEAR [mm] apart where they overlap by less than DEEP, neither by more than MOST.
-CLEAR, DEEP = 0.2, 6.0
+# Drawn surfaces are moved CLEAR [mm] apart where they overlap by less than DEEP, neither by more than DRAWN.
+CLEAR, DEEP, DRAWN = 0.2, 6.0, 1.0
 # What comes near in a frame is within this many mean edges more at its start.
 AHEAD = 3.0
 # How far planes between muscles yield to a pressure, relative to a bone's. One point in each cell of SPARSE mean edges
 # has a plane that holds muscles together, which yields less in proportion.
 YIELDS, SPARSE = 40.0, 2.0
-# How far a plane pushes out of a neighbour at most in one sub-step, and a neighbour a drawn surface [mm].
-MOST = 1.0
+MOST = 3.0  # how far a plane pushes out of a neighbour at most in one sub-step [mm]
 
 
 # The result for muscles far from each other.
@@ -155,7 +154,7 @@ class SlidingPair:
             return found
         near = np.flatnonzero(shown.boxed(points, limits.clear))
         index, distance, _, _ = shown.query(points[near], limits.deep)
-        found[near[index]] = np.clip(0.5 * (limits.clear - distance), 0.0, limits.most)
+        found[near[index]] = np.clip(0.5 * (limits.clear - distance), 0.0, limits.drawn)
         return found
 
     def _near(self) -> Found:
@@ -211,4 +210,4 @@ class SlidingLimits:
         self.search = max(scene.length(SEARCH), self.threshold)
         self.reach = max(self.search, self.hold + self.release)
         self.clear, self.deep = scene.length(CLEAR), scene.length(DEEP)
-        self.most = scene.length(MOST)
+        self.drawn, self.most = scene.length(DRAWN), scene.length(MOST)
