@@ -104,7 +104,7 @@ class PBDMuscle:
             self.fibres.activate(activation)
 
     def make_room(self, contacts: BoneContacts) -> None:
-        """Nothing: `solve` does not yield to neighbours."""
+        """Nothing: `solve` moves vertices out of neighbours all the way."""
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the vertices marked in a bool mask (n,) by a (4, 4) transform; held ones stay."""

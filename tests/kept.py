@@ -98,9 +98,7 @@ def _glb_facts(content):
     """Numbers of a glTF file: of its tree, and its arrays."""
     start = 20 + int.from_bytes(content[12:16], "little")
     tree, kinds = json.loads(content[20:start]), {5125: "<u4", 5126: "<f4"}
-    views = [
-        (kinds[one["componentType"]], tree["bufferViews"][one["bufferView"]]) for one in tree["accessors"]
-    ]
+    views = [(kinds[a["componentType"]], tree["bufferViews"][a["bufferView"]]) for a in tree["accessors"]]
     places = [(kind, start + 8 + view["byteOffset"], view["byteLength"]) for kind, view in views]
     numbers = np.array([float(text) for text in NUMBER.findall(content[20:start].decode())])
     return numbers, [np.frombuffer(content[at : at + size], kind) for kind, at, size in places]

@@ -40,9 +40,8 @@ def _bent(model):
     scene.muscles[0].mesh.apply_translation([0.7, -4.0, 0.3])
     if model == "xpbd":  # held by a third bone, too
         x, _, z = scene.muscles[0].mesh.vertices.T
-        scene.muscles[0].attachments.append(
-            Attachment("ball", np.flatnonzero((x > 5.0) & (abs(z - 25.0) < 4.0)))
-        )
+        held_by_ball = np.flatnonzero((x > 5.0) & (abs(z - 25.0) < 4.0))
+        scene.muscles[0].attachments.append(Attachment("ball", held_by_ball))
     for name, bone in (("bend", "upper"), ("other", "lower")):
         scene.add_joint(name, "ball", bone, CENTRE.tolist(), {"flexion": (1, 0, 0)})
     stops = [{}, {"bend.flexion": 30.0, "other.flexion": -30.0}]

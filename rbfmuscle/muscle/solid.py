@@ -252,8 +252,8 @@ class EmbeddedSolid:
         """Predict the nodes.
 
         They take a weighted mean of the motions of the bones (b, 4, 4); held points follow the ``poses`` (4, 4) from
-        rest, a list by bone. Where the motion goes on as before, so does the last correction, of which neighbours
-        see nothing: they would answer to what the muscle did with the motion alone.
+        rest, a list by bone. Where the motion goes on as before, so does the last correction. What is shown
+        has no part in that: neighbours add a mean of several corrections (`NeighbourSurface`).
         """
         self.y = blended_motion(self.y, self.motion_weights, motions)
         anchor, own = np.empty_like(self.anchor), self.owner[self.held]

@@ -21,13 +21,13 @@ from rbfmuscle.muscle.solid_step import ways_loop
 from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
 
 TOLERANCE = 2e-5  # violation of a contact that is left, of the muscle's size
-SHOWN_YIELDING = 0.1  # of what the planes of neighbours yield while a muscle settles, in what is shown of it
 REACH_MARGIN = 0.003  # of the muscle's size
 NEAR = 0.03  # contact points nearer to an obstacle than this take part in a solve, of the muscle's size
 BATCH, ROUNDS, SWEEPS = 24, 10, 400  # contacts that join the working set in one round, rounds, sweeps in each
 # How far a contact yields under a pressure of 2 μ, of the muscle's size, and the greatest pressure that it takes, over
 # 2 μ. With 5 the gluteus maximus is pressed 6.6 mm into the femur in 90 degrees of flexion.
 YIELDING, MOST_CONTACT_PRESSURE = 1e-4, 40.0
+SHOWN_YIELDING = 0.1  # share of YIELDING by which obstacles yield where room is made in what is shown
 # Edge of the cells that a bone is rounded over, relative to the spacing of the samples. With 0.7 to 1.0 one pose of the
 # phantom's extensor has shapes 0.6 to 1.6 mm RMS apart, from 1.5 to 2 at most 0.06.
 ROUNDING = 1.7
@@ -64,7 +64,7 @@ class NearPoints(NamedTuple):
     shares: Floats  # (m, w) shape functions
     forces: Floats  # (m, sources), changed in place
     contacts: RoundedContacts  # obstacles with rounded bones
-    exact: BoneContacts  # bones as they are, and planes that do not yield
+    hard: BoneContacts  # bones as they are, and planes that do not yield
     y: Floats  # (N, 3) nodes when the points were chosen
     reach: float  # distance within which points were chosen [scene unit]
     most: Floats  # (m,) greatest force on each, over 2 μ
@@ -161,7 +161,7 @@ class SolidContact:
     def lifted(self, near: NearPoints, y: Floats) -> Floats:
         """Nodes (N, 3), moved so far that no contact point is left in an obstacle that does not yield."""
         for _ in range(LIFTS):
-            spaces = near.exact.half_spaces(near.carry(y), self.margin)
+            spaces = near.hard.half_spaces(near.carry(y), self.margin)
             if spaces.gap.min(initial=0.0) > -self.tolerance:
                 break
             y = y + self._push_out(near, spaces, 0.0)

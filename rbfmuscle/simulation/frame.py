@@ -105,7 +105,7 @@ class MuscleModel(Protocol):
         """Solve for equilibrium under the model's constraints and these contacts."""
 
     def make_room(self, contacts: BoneContacts) -> None:
-        """Move what is shown out of neighbours, by planes from where these are now, where `solve` yields to them."""
+        """Move what is shown out of neighbours, by planes at where these are now; nothing where `solve` does that."""
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""

@@ -82,11 +82,8 @@ def _fields():
         yield fit_sample(sample, vertices, faces, fit=fit)
         if name != "cubic":
             yield choose_epsilon(*places, fit, held_out=held_out[0], distance=distance)
-    for more in (
-        {"smoothing": 1e-3},
-        {"parts": np.arange(40).reshape(2, 20)},
-        {"kernel": "quintic", "condition": 1e6},
-    ):
+    two = np.arange(40).reshape(2, 20)
+    for more in ({"smoothing": 1e-3}, {"parts": two}, {"kernel": "quintic", "condition": 1e6}):
         yield RBFField.fit_hermite(*places, **more).value_and_gradient(points)
     for more in ({}, {"kernel": "linear", "smoothing": 1e-2}):
         yield RBFField.fit(vertices[::9], distance(1.1 * vertices[::9]), **more)(points)

@@ -7,14 +7,7 @@ from blend_model import arm_scene, use_blend_model
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
 from rbfmuscle.metrics.rows import joint_gaps
-from rbfmuscle.metrics.summary import (
-    LIMITS,
-    Summary,
-    default_limit,
-    describe_verdict,
-    exceeded,
-    parse_limits,
-)
+from rbfmuscle.metrics.summary import LIMITS, Summary, default_limit, describe_verdict, exceeded, parse_limits
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import simulate, stream_run
 from rbfmuscle.validation import LimitExceededError, UsageError

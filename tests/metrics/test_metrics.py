@@ -67,6 +67,13 @@ class TestColumns:
 
 
 class TestMeshDistance:
+    @pytest.mark.parametrize("spread", [1e-6, 0.1, 3.0])
+    def test_equals_libigl(self, blob, spread):
+        noise = np.random.default_rng(3).normal(scale=spread, size=blob.vertices.shape)
+        points = np.array(blob.vertices) + noise
+        expected = igl.signed_distance(points, *arrays(blob))[0]  # near zero both round a squared distance
+        np.testing.assert_allclose(MeshDistance(*arrays(blob)).signed(points), expected, atol=1e-9)
+
     def test_triangles_near_from_the_frame_before_change_no_distance(self, blob):
         vertices, faces = arrays(blob)
         points = vertices + np.random.default_rng(5).normal(scale=0.3, size=vertices.shape)

@@ -138,16 +138,12 @@ def test_surface_makes_room_for_neighbours_and_keeps_its_volume(side):
     """On one side of the muscle vertices yield by a millimetre; where all have to, the volume comes first."""
     scene = phantom_scene()
     scene.muscles = [scene.muscle("adductor_posterior")]
-    middle = scene.muscles[0].mesh.vertices[:, 0].mean()
-    shown = []
-    for excess in (
-        lambda p: np.zeros(len(p)),
-        lambda p: 1.0 * (side * p[:, 0] > side * middle),
-        lambda p: np.ones(len(p)),
-    ):
+    middle, shown = scene.muscles[0].mesh.vertices[:, 0].mean(), []
+    for least in (np.inf, side * middle, -np.inf):
         model = build_model(scene.muscles[0], scene, "rbf")
         loop = FrameLoop(scene, [model])
-        loop.steppers[0].contacts.beside.append(SimpleNamespace(excess=excess))
+        yields = SimpleNamespace(excess=lambda p, least=least: 1.0 * (side * p[:, 0] > least))
+        loop.steppers[0].contacts.beside.append(yields)
         surface = loop.advance(scene.motion.frames[0]).surfaces[model.name]
         shown.append(trimesh.Trimesh(surface.vertices, surface.faces, process=False))
     volumes = [mesh.volume for mesh in shown]

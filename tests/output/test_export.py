@@ -83,6 +83,15 @@ class TestSaved:
 
 
 class TestExport:
+    @pytest.mark.parametrize("name", ["pvd", "vtp", "ply", "obj"])
+    def test_vertices_and_faces_come_back_in_their_order(self, arm_run, tmp_path, name):
+        made, folder = arm_run
+        written = [p for p in export_run(folder, name, output=tmp_path) if p.stem.startswith("biceps_")]
+        for path, frame in zip(sorted(written), made.frames, strict=True):
+            data, surface = pyvista.read(path), frame.surfaces["biceps"]  # by readers that are not ours
+            np.testing.assert_allclose(data.points, surface.vertices, rtol=1e-6, atol=1e-5)
+            np.testing.assert_array_equal(data.regular_faces, surface.faces)
+
     @pytest.mark.parametrize(("name", "units"), [("fbx", "m"), ("ply", "inch"), ("glb", "mm")])
     def test_wrong_words(self, arm_run, tmp_path, name, units):
         with pytest.raises(UsageError):
