@@ -91,30 +91,22 @@ def main() -> None:
     parser.add_argument("--muscles", nargs="*")
     parser.add_argument("--model")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--first", action="store_true", help="the first motion alone")
-    parser.add_argument("--own", action="store_true", help="the scene's own motion, whatever its joints")
     parser.add_argument("--seeds", nargs="*", type=int, help="random walks of these seeds, and nothing else")
     arguments = parser.parse_args()
     scene = phantom_scene() if arguments.scene == "phantom" else rm.Scene.load(Path(arguments.scene))
-    settings = parse_settings(arguments.set)
-    scene = scene.with_options(settings)
+    scene = scene.with_options(parse_settings(arguments.set))
     if arguments.muscles:
         scene.muscles = [scene.muscle(name) for name in arguments.muscles]
     motions = {name: {"ramp": ramp(ends)} for name, ends in RAMPS.items()}
     motions[f"random walk of {WALK} stops"] = {"waypoints": walk(WALK), "step": FARTHEST}
-    if arguments.own:
-        motions = {"its own motion": None}
-    elif arguments.seeds:
+    if arguments.seeds:
         motions = {
             f"random walk of {WALK} stops, seed {seed}": {"waypoints": walk(WALK, seed), "step": FARTHEST}
             for seed in arguments.seeds
         }
-    if arguments.first:
-        motions = dict(list(motions.items())[:1])
     for title, motion in motions.items():
         moved = scene.copy()
-        if motion:
-            moved.set_motion(**motion)
+        moved.set_motion(**motion)
         rows, spent = measure(moved, arguments.model)
         show(title, len(moved.motion), rows, spent)
 

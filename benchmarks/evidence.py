@@ -5,7 +5,6 @@ import json
 import os
 import platform
 import subprocess
-from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -21,31 +20,10 @@ def data_folder(name):
 
 def machine():
     """What the figures hold for."""
-    model = platform.processor()
     info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [
-            line.split(":", 1)[1].strip()
-            for line in info.read_text(encoding="utf-8").splitlines()
-            if "model name" in line
-        ]
-        model = names[0] if names else model
-    versions = {name: version(name) for name in ("numpy", "numba", "rbfmuscle", "scipy")}
-    import numba
-
-    return {
-        "cpu": model, "cores": os.cpu_count(), "usable_cores": len(os.sched_getaffinity(0)),
-        "threads": numba.get_num_threads(), "system": platform.platform(), "python": platform.python_version(),
-        "versions": versions,
-    }  # fmt: skip
-
-
-def version(name):
-    """Installed version of a distribution, or None."""
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
 
 
 def commit():
@@ -62,7 +40,7 @@ def provenance(command):
     return {
         "command": f"python {' '.join(words)}",
         "commit": commit(),
-        "machine": machine()["cpu"],
+        "machine": machine(),
         "date": datetime.date.today().isoformat(),
     }
 

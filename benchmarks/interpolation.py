@@ -5,13 +5,12 @@ hold, milliseconds do not.
 """
 
 import argparse
-import json
 import time
 import warnings
 from pathlib import Path
 
 import numpy as np
-from evidence import machine
+from evidence import machine, write_evidence
 from scipy.interpolate import RBFInterpolator
 
 from rbfmuscle.implicit.field import RBFField
@@ -94,12 +93,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path)
     chosen = parser.parse_args()
-    about = machine()
-    print(f"{about['cpu']}, {about['usable_cores']} of {about['cores']} cores, {about['threads']} threads")
+    print(machine())
     warnings.simplefilter("ignore", NumericalWarning)
     rows = [*fits(), *evaluations()]
     if chosen.output:
-        chosen.output.write_text(json.dumps({"machine": about, "rows": rows}, indent=1), encoding="utf-8")
+        write_evidence(chosen.output, ["benchmarks/interpolation.py"], rows)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Where a muscle's surface is at fault: in bones by held or free vertices, bone vertices in it, crossings of itself.
 
     NUMBA_NUM_THREADS=1 python benchmarks/mesh_faults.py SCENE [--model pbd] [--muscles A,B] [--set KEY=VALUE ...]
-                                                         [--frames A:B:S] [--each]
+                                                         [--frames A:B:S]
 
 Greatest depth over all frames, triangles that cross others (most in a frame, frames with any), greatest volume error,
 distance from the input mesh in the first frame, frames in which the surface is no sphere, and processor time of the
@@ -23,14 +23,8 @@ from rbfmuscle.scene.settings import parse_settings
 from rbfmuscle.simulation.frame_loop import simulate_frames
 
 COLUMNS = (
-    "held in bone",
-    "free in bone",
-    "bone in muscle",
-    "crossing",
-    "frames",
-    "volume error",
-    "rest error",
-)
+    "held in bone", "free in bone", "bone in muscle", "crossing", "frames", "volume error", "rest error"
+)  # fmt: skip
 
 
 class Faults:
@@ -66,7 +60,7 @@ class Faults:
         rows = np.array(self.rows, dtype=float)
         most = rows.max(axis=0)
         most[4] = rows[:, 4].sum()
-        return most[:7], int(rows[:, 7].sum()), rows
+        return most[:7], int(rows[:, 7].sum())
 
 
 def main():
@@ -78,7 +72,6 @@ def main():
     parser.add_argument("--muscles", default="")
     parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--frames")
-    parser.add_argument("--each", action="store_true", help="print every frame with a crossing")
     given = parser.parse_args()
     scene = Scene.load(given.scene)
     if given.muscles:
@@ -96,17 +89,17 @@ def main():
             key = event.muscle, event.bone, event.action
             events[key] = max(events.get(key, 0), event.count)
         start = time.process_time()
-    report(faults, spent, given.each)
+    report(faults, spent)
     for key, count in events.items():
         if key[2] not in ("rotated", "halved", "held_back"):
             print("event", *key, count)
 
 
-def report(faults, spent, each):
+def report(faults, spent):
     print(f"{'':28s}" + "".join(f"{name:>16s}" for name in COLUMNS))
     whole, spheres = [], 0
     for name, found in faults.items():
-        most, odd, rows = found.worst()
+        most, odd = found.worst()
         spheres += odd
         whole.append(most)
         print(
@@ -114,8 +107,6 @@ def report(faults, spent, each):
             + "".join(f"{value:16.3g}" for value in most)
             + (f"  no sphere in {odd}" if odd else "")
         )
-        if each:
-            print("   ", {k: int(n) for k, n in enumerate(rows[:, 3]) if n})
     whole = np.array(whole)
     worst = [*whole[:, :4].max(axis=0), whole[:, 4].sum(), *whole[:, 5:].max(axis=0)]
     print(f"{'all':28s}" + "".join(f"{value:16.3g}" for value in worst))

@@ -10,7 +10,6 @@ through the third coordinate, a seeded random walk that ends there, both at once
 
 import argparse
 import itertools
-import json
 import time
 
 import numpy as np
@@ -20,6 +19,7 @@ from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.settings import parse_settings
 from rbfmuscle.simulation.frame_loop import simulate_frames
 
 STEP = 2.0  # degrees
@@ -85,15 +85,6 @@ def spread(found):
     return worst[0], greatest, worst[2]
 
 
-def read_number(text):
-    """``key=value`` with a number, or a word where it is none."""
-    key, value = text.split("=", 1)
-    try:
-        return key, json.loads(value)
-    except json.JSONDecodeError:
-        return key, value
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", help="a scene file, or 'phantom'")
@@ -104,8 +95,8 @@ def main():
     given = parser.parse_args()
     scene = phantom_scene() if given.scene == "phantom" else Scene.load(given.scene)
     scene.muscles = [scene.muscle(given.muscle)]
-    settings = dict(read_number(item) for item in given.settings)
-    found, seconds = ends(scene, dict(read_number(item) for item in given.pose), given.others, settings)
+    settings = parse_settings(given.settings)
+    found, seconds = ends(scene, parse_settings(given.pose), given.others, settings)
     rms, greatest, pair = spread(found)
     print(f"{given.muscle} {settings}: {rms:.3f} mm RMS ({pair}), {greatest:.2f} greatest, {seconds:.1f} s")
     names = list(found)

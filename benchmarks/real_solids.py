@@ -12,13 +12,12 @@ import argparse
 import contextlib
 import hashlib
 import itertools
-import json
 import os
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from evidence import commit, machine
+from evidence import write_evidence
 from peers.finite_element import TetSolid, follow, nearest_bone
 from scipy.spatial import cKDTree
 
@@ -246,14 +245,9 @@ def main():
         for name in given.names:
             solve(name, given.edges or CASES[name][2], given.output or reference_file(name), given.coarser)
         return
-    found = {
-        "command": f"python benchmarks/real_solids.py compare {' '.join(given.names)}",
-        "commit": commit(),
-        "machine": machine()["cpu"],
-        "rows": compare(given.names, given.models.split(",")),
-    }
+    rows = compare(given.names, given.models.split(","))
     if given.output:
-        given.output.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        write_evidence(given.output, ["benchmarks/real_solids.py", "compare", *given.names], rows)
 
 
 if __name__ == "__main__":
