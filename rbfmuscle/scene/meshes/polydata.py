@@ -16,7 +16,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError
 
 PATIENCE = 120.0  # Time after which a file that is not read is refused [s].
-MEMORY = 8 << 30  # Address space of the process that reads [bytes]: a small file may unpack to anything.
+MEMORY = 2 << 30  # Address space of the process that reads [bytes]: a small file may unpack to anything.
 _LOCK = threading.Lock()
 
 
