@@ -236,7 +236,10 @@ class Reach:
         own, folder = f"/test_{Path(fault.path).stem}.py", f"/{group_of(fault.path)}/"
         # Tests with processes of their own run lines that are not recorded as theirs.
         apart = {t for t in self.tests if folder in t and "subprocess" in self.named[t.partition("::")[0]]}
-        found |= apart | {test for test in self.tests if own in test}
+        # So do fixtures of a whole file, which count to its first test.
+        files = {test.partition("::")[0] for test in found}
+        kept = {test for test in self.tests if KEPT in test and test.partition("::")[0] in files}
+        found |= apart | kept | {test for test in self.tests if own in test}
         order, seen = {}, defaultdict(int)
         for test in sorted(found, key=lambda t: (self.time(t), t)):
             file, case = test.partition("::")[0], test.partition("[")[0]

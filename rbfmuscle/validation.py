@@ -91,10 +91,7 @@ def shown_path(path: str | os.PathLike[str]) -> str:
 
 def is_file(path: str | os.PathLike[str]) -> bool:
     """Whether a path is a regular file: no folder, pipe or device, and a name that the system takes."""
-    try:
-        return os.path.isfile(path)
-    except (OSError, ValueError):
-        return False
+    return os.path.isfile(path)
 
 
 def read_text(path: Path, *, place: str) -> str:

@@ -81,6 +81,15 @@ def test_projection_follows_the_gradient(body, rng, family, number):
     np.testing.assert_allclose((moved - points)[members], expected, atol=1e-7)
 
 
+def test_an_edge_without_stiffness_is_hard_beyond_its_limits():
+    ends = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    for length, kept in ((1.0, 1.6), (1.8, 1.8), (3.0, 2.4)):
+        points = ends * 0.5 * length
+        edge = EdgeConstraint(ends, np.array([[0, 1]]), stiffness=0.0, limits=(0.8, 1.2))
+        edge.project(points, np.array([1.0, 3.0]))
+        assert points[:, 0] == pytest.approx([0.25 * (length - kept), 0.25 * (length - kept) + kept])
+
+
 def test_volume_gradient_agrees_with_differences_and_sums_to_nothing(body, rng):
     vertices, faces, _ = body
     constraint = VolumeConstraint(vertices, faces)
