@@ -4,7 +4,7 @@
     python docs/figures.py --measure [NAME]  # measure first: minutes to an hour, on a quiet machine
 
 In a page a table stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``, a figure within a line between
-``<!-- value: NAME.KEY -->`` and ``<!-- end -->``. ``tests/contract/test_evidence.py`` fails where a page says
+``<!-- value: NAME.KEY -->`` and ``<!-- end -->``. ``tests/contract/test_docs.py`` fails where a page says
 something else than its file.
 """
 

@@ -53,8 +53,3 @@ def test_reference_documents_every_parameter(name):
     listed = {word.strip() for line in section.splitlines() if not line.startswith(" ")
               for word in line.split(" : ")[0].split(",")}  # fmt: skip
     assert set(inspect.signature(value).parameters) <= listed
-
-
-def test_topics_hold_every_public_name():
-    known = {name for names in TOPICS.values() for name in names}
-    assert known <= set(rbfmuscle.__all__)

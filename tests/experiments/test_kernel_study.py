@@ -56,7 +56,7 @@ def test_numbers_are_those_of_the_surface(study, ellipsoid):
         # The implicit form x^2/a^2 + ... = 1 is met where the row says so.
         radius = np.sqrt(((vertices / [40.0, 18.0, 12.0]) ** 2).sum(axis=1))
         assert np.abs(radius - 1.0).max() * 12.0 <= row["hausdorff"] + 0.2
-        if row["epsilon"]:  # the shape parameter in spacings, which are about the root of the area of each centre
+        if row["epsilon"]:  # the shape parameter is per spacing, about the root of the area of each centre
             spacing = row["shape"] / row["epsilon"]
             assert 0.5 < spacing / np.sqrt(ellipsoid.area / row["centres"]) < 1.5
 

@@ -83,9 +83,9 @@ def test_surfaces_of_labels_are_what_is_kept():
     affine[:3] = np.column_stack([OBLIQUE * [0.8, 0.8, 1.5], [5.0, 7.0, -3.0]])
     volume, found = LabelVolume(labels, affine, {1: "left"}, "x.nii"), []
     for label in (1, 2):
-        surface = label_surface(volume, label, pieces=True)
-        mesh, count = surface.mesh, {"about": len(surface.mesh.vertices)}
-        found += [surface.name, surface.volume, surface.notes, count, mesh.area, mesh.moment_inertia, mesh.centroid]
+        part = label_surface(volume, label, pieces=True)
+        found += [part.name, part.volume, part.notes, {"about": len(part.mesh.vertices)}]
+        found += [part.mesh.area, part.mesh.moment_inertia, part.mesh.centroid]
     check_kept("labels", found, tolerance=1e-3)
 
 
