@@ -2,7 +2,8 @@
 
     python benchmarks/one_frame.py [SCENE]
 
-Ten frames of the RBF model are traced on one thread, with metrics and files. Nested functions count with the outer one.
+Ten frames of the RBF model are traced on one thread, with metrics and files. Nested functions count with the outer one,
+those that only share work among threads are left out.
 """
 
 import os
@@ -18,6 +19,7 @@ import rbfmuscle as rm
 from rbfmuscle.run import stream_run
 
 OURS = str(Path(rm.__file__).parent) + os.sep
+THREADS = OURS + "geometry/threads.py"
 FIRST, LAST, LEAST = 4, 14, 0.1  # frames that are traced; what takes less than a tenth of them is not drawn
 parts, stack = defaultdict(lambda: defaultdict(float)), []  # seconds of each function by its caller
 
@@ -25,11 +27,12 @@ parts, stack = defaultdict(lambda: defaultdict(float)), []  # seconds of each fu
 def trace(frame, event, _argument):
     """Note the time of a call of one of our functions."""
     code = frame.f_code
-    if not code.co_filename.startswith(OURS) or code.co_name.startswith("<"):
+    file = code.co_filename
+    if not file.startswith(OURS) or file == THREADS or code.co_name.startswith("<"):
         return
     if event == "call":
         name = code.co_qualname.partition(".<locals>")[0]
-        stack.append(((code.co_filename[len(OURS) :], name), time.perf_counter()))
+        stack.append(((file[len(OURS) :], name), time.perf_counter()))
     elif event == "return" and stack:
         (function, start), above = stack.pop(), [name for name, _ in stack]
         if function not in above:
