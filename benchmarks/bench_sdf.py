@@ -1,4 +1,4 @@
-"""Bone distance fields beside libigl's exact distances and the baselines, in one run.
+"""Bone distance fields beside libigl's and trimesh's exact distances and the baselines, in one run.
 
     NUMBA_NUM_THREADS=2 OMP_NUM_THREADS=2 python benchmarks/bench_sdf.py [--data FOLDER] [--bones femur pelvis]
 
@@ -24,8 +24,8 @@ from rbfmuscle.bones.mesh import points_near
 from rbfmuscle.bones.sdf import BoneSDF
 
 PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-# Points for accuracy, for speed, and for the slower exact tool.
-ACCURACY, SPEED, SLOW = 200_000, 1_000_000, 40_000
+# Points for accuracy, for speed, and for the slow exact tools.
+ACCURACY, SPEED, SLOW = 200_000, 1_000_000, 2_000
 # Bytes of a coefficient or node value of the dense fields.
 FLOAT = 8
 
@@ -117,17 +117,19 @@ def bone_table(name, mesh):
     row("voxels 64^3", voxels, build, vertices, faces, SPEED // 10)
     build, tree = least(lambda: TreeDetector.from_mesh((vertices, faces)))
     row("exact tree", tree, build, vertices, faces, SPEED // 10)
-    exact_tools(vertices, faces)
+    exact_tools(mesh, vertices, faces)
 
 
-def exact_tools(vertices, faces):
-    """Time of the exact distances of libigl."""
-    points = points_near(vertices, faces, SLOW, 1.0, seed=2)
+def exact_tools(mesh, vertices, faces):
+    """Time of the exact distances of libigl and trimesh, which asks for rtree."""
+    points = points_near(vertices, faces, 20 * SLOW, 1.0, seed=2)
     spent, _ = least(lambda: igl.signed_distance(points, vertices, faces, PSEUDONORMAL), 2)
     threads = os.environ.get("OMP_NUM_THREADS", "all")
     print(
         f"libigl pseudonormals, tree included, {threads} threads: {1e9 * spent / len(points):.0f} ns a value"
     )
+    spent, _ = least(lambda: trimesh.proximity.signed_distance(mesh, points[:SLOW]), 1)
+    print(f"trimesh: {1e9 * spent / SLOW:.0f} ns a value")
 
 
 def build_stages(mesh):
