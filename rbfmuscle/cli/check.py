@@ -16,7 +16,7 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
     Parameters
     ----------
     picture
-        Draw held patches, tendons and joint axes to a PNG beside the scene file.
+        Draw attachments, tendons and joint axes to a PNG beside the scene file.
     fields
         Measure the bones' distance fields against exact distances.
     """

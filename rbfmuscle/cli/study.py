@@ -34,8 +34,8 @@ def compare(
     Parameters
     ----------
     models
-        Models, separated by commas, for instance rbf,pbd; distances are measured to the first. All but pbd-paper
-        by default; this takes long. A mesh model with "-converged" after its name sweeps until no vertex moves.
+        Models, separated by commas, for instance rbf,pbd; distances are measured to the first. By default rbf, the
+        mesh models but pbd-paper, and pbd-converged, which takes long: it sweeps until no vertex moves.
     pictures
         Draw pictures and the animation.
     """
