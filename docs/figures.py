@@ -60,7 +60,10 @@ def headline_table(facts):
     steps, back = (lambda r, key=key: bound(r[key], 2) for key in ("steps_apart", "there_and_back"))
     shown = [
         ("volume error, relative", lambda r: volume(r["volume_error"])),
-        ("depth of the surface inside a bone; PBD: of attached vertices (mm)", lambda r: bound(r["penetration_max"], 2)),
+        (
+            "depth of the surface inside a bone; PBD: of attached vertices (mm)",
+            lambda r: bound(r["penetration_max"], 2),
+        ),
         ("depth of a bone's vertices inside a muscle (mm)", lambda r: bound(r["bone_penetration_max"], 2)),
         ("distance from the input mesh at rest, RMS (mm)", lambda r: bound(r["rest_error_rms"], 2)),
         ("flicker in steps of 2 degrees (mm); a mesh model has none", flicker),
