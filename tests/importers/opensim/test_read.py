@@ -83,7 +83,7 @@ class TestSmall:
         got = model.transforms({"hip_angle": 0.3, "knee_angle": -1.0, "slide": 5.0})
         thigh = rotation_about((0, 0, 1), 0.3, np.zeros(3))
         assert got["thigh"] == pytest.approx(thigh, abs=1e-15)
-        knee = frame_at((0, -0.4, 0)) @ frame_at((0.03, 0, 0)) @ rotation_about((0, 0, 1), -1.0, np.zeros(3))
+        knee = frame_at((0.03, -0.424, 0)) @ rotation_about((0, 0, 1), -1.0, np.zeros(3))
         assert got["shank"] == pytest.approx(thigh @ knee, abs=1e-15)
         assert got["cap"] == pytest.approx(thigh @ frame_at((-0.08, 0, 0)), abs=1e-15)
 
