@@ -75,7 +75,7 @@ def compare_models(
     >>> sorted(table["models"])
     ['pbd', 'xpbd']
     """
-    variants = _variants(configure_scene(open_scene(scene), frames=frames), list(models), settings or {})
+    variants = _variants(open_scene(scene), list(models), settings or {}, frames)
     folder = Path(directory)
     check_writable(folder)
     first = next(iter(variants.values()))
@@ -101,7 +101,7 @@ def compare_models(
     return table
 
 
-def _variants(scene, models, settings):
+def _variants(scene, models, settings, frames):
     """The scene for each model; every name and setting is checked before anything is run."""
     if len(models) < 2 or len(set(models)) < len(models):
         raise UsageError(f"give two or more different models, got {', '.join(models) or 'none'}")
@@ -111,6 +111,8 @@ def _variants(scene, models, settings):
         model = key.rpartition(":")[0]
         if model and model not in models:
             raise UsageError(f"{key}: model {model!r} is not compared; models: {', '.join(models)}")
+        if model and key.removeprefix(f"{model}:").startswith("motion."):
+            raise UsageError(f"{key}: all models have the same motion; leave out {model}:")
     variants = {}
     for name in models:
         mine = {k.rpartition(":")[2]: v for k, v in settings.items() if k.rpartition(":")[0] in ("", name)}
@@ -118,29 +120,29 @@ def _variants(scene, models, settings):
         whole = {key: value for key, value in mine.items() if chooses_model(key)}
         own = {key: value for key, value in mine.items() if not chooses_model(key)}
         variant = configure_scene(scene, whole).with_options(model=name)
-        variants[name] = configure_scene(variant, own).validate()
+        variants[name] = configure_scene(variant, own, frames=frames).validate()
         variants[name].output = OutputOptions(report=False)
     return variants
 
 
 def _measure(name, scene, folder, progress):
     """One model: compile its loops, run, then there and back by coarser steps."""
-    _surfaces(scene, scene.motion.frames[:2])
+    last = len(scene.motion) - 1
+    _surfaces(scene, [*range(min(last, 1) + 1)])
     report = None if progress is None else (lambda done, total: progress(name, done, total))
     stream_run(scene, folder, pictures=False, progress=report)
     with stage(f"{name}: there and back by coarser steps"):
-        frames = scene.motion.frames
-        coarse = frames[:-1:COARSER]
-        build, shown = _surfaces(scene, [*coarse, frames[-1], *coarse[::-1]])
+        coarse = [*range(0, last, COARSER)]
+        build, shown = _surfaces(scene, [*coarse, last, *coarse[::-1]])
     again = {"build": build} | ({"turn": shown[len(coarse)], "end": shown[-1]} if coarse else {})
     with stage(f"{name}: measuring"):
         return measure_run(SavedRun(folder), again)
 
 
-def _surfaces(scene, frames):
-    """Time to build the models, and the surfaces of all muscles in each of some frames."""
-    changed = scene.copy()
-    changed.motion = Motion(frames)
+def _surfaces(scene, chosen):
+    """Time to build the models, and the surfaces of all muscles in frames of these numbers, in this order."""
+    changed, motion = scene.copy(), scene.motion
+    changed.motion = Motion([motion.frames[k] for k in chosen], progress=motion.progress[chosen])
     start = time.perf_counter()
     models = build_models(changed)
     build = time.perf_counter() - start

@@ -55,7 +55,10 @@ def parse_ranges(scene: Scene, texts: list[str]) -> Ranges:
         except ValueError:
             form = "COORDINATE=LOW:HIGH, for instance hip.flexion=0:60"
             raise UsageError(f"--range {text!r} is not {form}") from None
-        full = full_name(name, known, place="--range")
+        try:
+            full = full_name(name, known, place="--range")
+        except SceneError as error:
+            raise UsageError(str(error)) from None
         if not -np.inf < low < high < np.inf:
             raise UsageError(f"--range {text!r}: the range must go upwards between two numbers")
         found[full] = (inner_value(scene, full, low), inner_value(scene, full, high))
@@ -101,7 +104,9 @@ def _measured(scene, poses):
         for model, state in zip(models, rest):
             model.restore(state)
         try:
-            yield _row(FrameLoop(scene, models, fields=fields, surfaces=False), lines, pose)
+            loop = FrameLoop(scene, models, fields=fields, surfaces=False)
+            loop.activations.target = loop.activations.at(0)  # the same in all solves
+            yield _row(loop, lines, pose)
         except SolveError:
             yield np.full((len(models), 1 + len(pose)), np.nan)
 
@@ -158,7 +163,7 @@ def _groups(scene):
     free = [name for name, fact in facts.items() if name not in followers and not fact.locked]
     groups = {}
     for muscle in scene.muscles:
-        bones = sorted({attachment.bone for attachment in muscle.attachments})
+        bones = sorted({bone for attachment in muscle.attachments for bone in attachment.bones})
         needed = tuple(name for name in free if _moves(scene, bones, name))
         if not 1 <= len(needed) <= MOST_COORDINATES:
             raise SceneError(
@@ -182,10 +187,13 @@ def _moves(scene, bones, name):
 def _range(scene, name, given):
     """The range of a coordinate: as given, its own, or what the motion covers."""
     moved = [frame[name] for frame in scene.motion.frames if name in frame]
-    own = all_coordinates(scene.joints)[name].range
-    for ends in (given.get(name), own, (min(moved, default=0.0), max(moved, default=0.0))):
+    fact = all_coordinates(scene.joints)[name]
+    for ends in (given.get(name), fact.range, (min(moved, default=0.0), max(moved, default=0.0))):
         if ends is not None and ends[0] < ends[1]:
-            return ends
+            low, high = (fact.honoured(end) for end in ends)
+            if low == high:
+                raise UsageError(f"--range {name}: the coordinate is clamped to a range beyond it")
+            return low, high
     raise UsageError(f"coordinate {name!r} has no range; give --range {name}=LOW:HIGH")
 
 
@@ -215,7 +223,7 @@ def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[s
 
 def _fit(found):
     """The path of a muscle, and its errors at poses that the fit has not seen."""
-    solved = np.isfinite(found.lengths)
+    solved = np.isfinite(found.lengths) & np.isfinite(found.arms).all(axis=1)
     held = np.arange(len(solved)) % HELD_OUT == HELD_OUT - 1
     use, out, failed = solved & ~held, solved & held, int((~solved).sum())
     if use.sum() < 2 * (len(found.coordinates) + 1) or not out.any():

@@ -70,7 +70,7 @@ class Recording:
         frames: slice | str | None = None,
         fields: Mapping[str, BoneField] | None = None,
     ) -> None:
-        self.started, self._start = datetime.now(UTC), time.perf_counter()
+        self.started, self._start, self._end = datetime.now(UTC), time.perf_counter(), 0.0
         scene = configure_scene(scene, settings, model=model, frames=frames)
         self.scene = orient_scene(scene.validate())
         if fields is not None and set(fields) != {bone.name for bone in scene.bones}:
@@ -128,6 +128,7 @@ class Recording:
             # What ended the run says more than a disk that then refuses the rest.
             with suppress(*((SolveError,) if self.status == "failed" else ())):
                 sink.close(rows)
+                self._end = time.perf_counter()
                 sink.write_info(self.info())
 
     def finish(
@@ -162,7 +163,7 @@ class Recording:
 
     def info(self, status: str | None = None) -> dict:
         """What ``run.json`` holds by now."""
-        self.times["wall"] = time.perf_counter() - self._start
+        self.times["wall"] = (self._end or time.perf_counter()) - self._start
         here, shared = self.times, self.share.times
         table = self.summary.table()
         limits = {name: default_limit(name, self.scene) for name in LIMITS}

@@ -263,10 +263,11 @@ class Run:
 
         ``pictures`` are those of the report and the preview. UsageError if the folder cannot be written to.
         """
-        if self._recording is None:
-            shutil.copytree(self.saved.directory, directory, dirs_exist_ok=True)
-        else:
+        check_writable(directory)
+        if self._recording is not None:
             self._recording.finish(self._write(directory), {}, pictures=pictures)
+        elif Path(directory).resolve() != self.saved.directory.resolve():
+            shutil.copytree(self.saved.directory, directory, dirs_exist_ok=True)
 
     def export(
         self, directory: str | Path, formats: str | Sequence[str], *, units: str | None = None

@@ -303,7 +303,7 @@ def paths(
         raise UsageError(f"--samples {samples} is too few to fit anything, give 10 or more")
     loaded = configure_scene(open_scene(scene), parse_settings(settings), model=model)
     if muscles is not None:
-        loaded.muscles = [loaded.muscle(name.strip()) for name in muscles.split(",")]
+        loaded.muscles = [chosen_muscle(loaded, name.strip()) for name in dict.fromkeys(muscles.split(","))]
     given = parse_ranges(loaded, ranges or [])
     check_writable(output)
     with Progress(loaded.name, "pose") as progress:

@@ -71,7 +71,7 @@ def measure_run(saved: SavedRun, extra: dict[str, Any]) -> dict[str, Any]:
     found = {}
     for muscle in saved.muscles:
         facts = saved.info["muscles"].get(muscle, {})
-        values = {q: facts[q]["worst"] for q in _FROM_METRICS if q in facts}
+        values = {q: facts[q]["worst"] for q in _FROM_METRICS if "worst" in facts.get(q, {})}
         times = saved.series(muscle, "time_frame")[1][1:]  # the first loads and compiles
         if len(times):
             values["time_frame"] = float(np.median(times))

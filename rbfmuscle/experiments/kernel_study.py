@@ -53,6 +53,8 @@ class ReferenceSurface:
         radius = 2.0 * self.volume / vertex_areas(vertices, faces).sum()
         self.axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
         self.axes[2] *= np.sign(np.linalg.det(self.axes))
+        if resolution and resolution < 4:
+            raise UsageError(f"resolution must be at least 4 cells, got {resolution}")
         self.resolution = resolution or int(np.clip(CELLS * np.ptp(vertices @ self.axes[0]) / radius, *RANGE))
         self.distance = MeshDistance(vertices, faces)
         self.points, which = spread_points(vertices, faces, JUDGES)

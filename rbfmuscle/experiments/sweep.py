@@ -55,7 +55,9 @@ def parse_grid(texts: Sequence[str]) -> Grid:
             parts = tomllib.loads(f"value = [{values}]")["value"]
         except tomllib.TOMLDecodeError:
             parts = [parse_value(part.strip(), place=key) for part in values.split(",") if part.strip()]
-        grid[key] = list(dict.fromkeys(parts))
+        if key in (*FINER_UP, *FINER_DOWN) and not all(isinstance(part, int | float) for part in parts):
+            raise UsageError(f"{key}: {values} are not all numbers")
+        grid[key] = [part for k, part in enumerate(parts) if part not in parts[:k]]
     return grid
 
 

@@ -67,9 +67,9 @@ class SweepFolder:
         return self.references / f"{key}.npz"
 
     def is_done(self, point: SweepPoint) -> bool:
-        """Whether a point need not be run again."""
-        kept = point.role != "reference" or self.surfaces(point.key).exists()
-        return kept and self.read(point.key).get("status") == "done"
+        """Whether a point need not be run again: it is done, and was measured against the same reference."""
+        kept, found = point.role != "reference" or self.surfaces(point.key).exists(), self.read(point.key)
+        return kept and (found.get("status"), found.get("reference")) == ("done", point.reference)
 
 
 def run_sweep(
@@ -162,7 +162,8 @@ def measure_point(
 ) -> None:
     """Run one point, measure it and keep the result; an error becomes the result of a failed point."""
     start = time.perf_counter()
-    result: dict[str, Any] = {"key": point.key, "settings": point.settings, "status": "done", "error": ""}
+    result: dict[str, Any] = {"key": point.key, "reference": point.reference, "settings": point.settings}
+    result |= {"status": "done", "error": ""}
     try:
         with threads_limited(threads):
             run = runner(scene, point.settings, frames)
@@ -199,7 +200,10 @@ def _values(run):
 
 
 def _pose(frame):
-    return " ".join(f"{name}={angle:.9f}" for name, angle in sorted(frame.coordinates.items())) or "rest"
+    return (
+        " ".join(f"{name}={round(angle, 9) + 0.0:.9f}" for name, angle in sorted(frame.coordinates.items()))
+        or "rest"
+    )
 
 
 def _errors(shown, path):
@@ -273,7 +277,8 @@ def mark_front(rows: list[dict[str, Any]], quantity: str = "error_rms") -> list[
         usable = [row for row in mine if row["status"] == "done"]
         for k in pareto_front([r[quantity] for r in usable], [r["time_frame"] for r in usable]):
             usable[k]["front"] = True
-        verdicts += [_judge(row, usable, quantity) for row in usable if row["role"] == "default"]
+        default = [row for row in usable if row["role"] == "default" and math.isfinite(row[quantity])]
+        verdicts += [_judge(row, usable, quantity) for row in default]
     return verdicts
 
 

@@ -159,6 +159,8 @@ class _SavedSurfaces(Mapping[str, ModelSurface]):
         self._saved, self._frame = saved, frame
 
     def __getitem__(self, muscle: str) -> ModelSurface:
+        if muscle not in [*self]:
+            raise KeyError(muscle)
         return ModelSurface(*self._saved.surface(muscle, self._frame))
 
     def __iter__(self) -> Iterator[str]:
@@ -252,6 +254,8 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
         bones.append(MovingPart(name, look.BONE_COLOUR, [vertices * factor], [faces], poses))
     times = saved.info["scene"].get("motion", {}).get("times")
     name = str(saved.info["scene"].get("name") or saved.directory.name)
+    if times is not None and np.any(np.diff([times[k] for k in frames]) <= 0.0):
+        times = None  # no animation: they stand still, or go backwards
     at = np.array([k / FRAMES_A_SECOND if times is None else times[k] for k in frames], dtype=float)
     captions = [saved.caption(frame) for frame in frames]
     direction = look.motion_direction([saved.poses[frame] for frame in frames], saved.body)

@@ -73,7 +73,7 @@ def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
         return points.astype(float), corners.astype(int)
     except FileNotFoundError:
         raise MeshError(f"{path} is missing") from None
-    except (KeyError, ValueError, IndexError, zlib.error):
+    except (KeyError, ValueError, IndexError, StopIteration, zlib.error):
         raise MeshError(f"{path} is damaged or was not written by a run; run the scene again") from None
 
 

@@ -145,7 +145,8 @@ class RunWriter:
         """Take the meshes of all frames after ``last`` away."""
         for folder in ("surfaces", "bones"):
             for file in (self.directory / folder).glob("*_[0-9][0-9][0-9][0-9]*.*"):
-                if int(file.stem.rpartition("_")[2]) > last:
+                number = file.stem.rpartition("_")[2]
+                if number.isdigit() and int(number) > last:
                     file.unlink(missing_ok=True)
 
     def _clear(self):
@@ -264,9 +265,11 @@ def machine() -> dict[str, Any]:
 
 def input_hashes(scene: Scene) -> dict[str, Any]:
     """SHA-256 of the scene file and of the meshes and motion that it names; files that are gone are left out."""
-    motion = scene.motion.options.file
-    if motion is not None:
-        motion = (Path(scene.path).parent if scene.path else Path()) / motion
-    sources = [scene.path, motion, *(b.source for b in scene.bones), *(m.source for m in scene.muscles)]
+    sources = [
+        scene.path,
+        scene.motion.options.file,
+        *(b.source for b in scene.bones),
+        *(m.source for m in scene.muscles),
+    ]
     paths = [Path(source) for source in dict.fromkeys(str(source) for source in sources if source)]
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.is_file()}

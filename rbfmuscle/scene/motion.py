@@ -53,11 +53,12 @@ def slice_motion(motion: Motion, frames: slice) -> Motion:
 
 
 def rest_coordinates(scene: SceneData) -> dict[str, float]:
-    """Return the coordinates whose rest value is not zero, by full name [radian or scene unit]."""
-    facts = all_coordinates(scene.joints)
+    """Return the coordinates that follow no other and whose rest value is not zero [radian or scene unit]."""
+    facts, followers = all_coordinates(scene.joints), {coupling.coordinate for coupling in scene.couplings}
     if not any(coordinate.rest for coordinate in facts.values()):
         return {}
-    return {name: value for name, value in resolve({}, facts, scene.couplings).items() if value}
+    rest = resolve({}, facts, scene.couplings)
+    return {name: value for name, value in rest.items() if value and name not in followers}
 
 
 def completed(scene: SceneData, coordinates: Mapping[str, float]) -> dict[str, float]:
@@ -259,6 +260,8 @@ def _read_storage(path: Path) -> tuple[dict[str, str], list[str], Floats]:
         if len(row) != len(labels):
             words = f"row {number} has {len(row)} values, the header names {len(labels)}"
             raise SceneError(f"[motion]: {path} {words}")
+    if not rows:
+        raise SceneError(f"[motion]: {path} has no rows under its labels")
     try:
         values = np.array(rows, dtype=float)
     except ValueError as error:

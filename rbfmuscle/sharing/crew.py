@@ -28,10 +28,11 @@ MOST_HELPERS = 4
 def helpers_for(scene: Scene, threads: int) -> int:
     """How many processes should share the muscles of a run that may use ``threads``; fewer than two: one's own alone.
 
-    Muscles that slide on each other see each other at every sub-step, and stay together.
+    Muscles that slide on each other see each other at every sub-step, those that contract share all sub-steps: they
+    stay together.
     """
-    count = len(scene.muscles)
-    if scene.sliding is not None or count * len(scene.motion.frames) < LEAST_WORK:
+    count, contracts = len(scene.muscles), any(m.contraction is not None for m in scene.muscles)
+    if scene.sliding is not None or contracts or count * len(scene.motion.frames) < LEAST_WORK:
         return 0
     return min(threads, count // LEAST_MUSCLES, MOST_HELPERS)
 
@@ -116,7 +117,7 @@ def _joined(parts, order):
         return {name: found.pop(name) for name in order if name in found} | found
 
     first, frames = parts[0].frame, [part.frame for part in parts]
-    by_muscle = ("surfaces", "carried", "times", "work", "tendons")
+    by_muscle = ("surfaces", "carried", "times", "work", "tendons", "poses")
     frame = replace(
         first,
         events=[event for f in frames for event in f.events],

@@ -179,7 +179,7 @@ def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset
     for name in sorted({name for pair in named or [] for name in pair}):
         if name not in names:
             raise SceneError(f"[sliding] pairs: unknown muscle {name!r}, known: {', '.join(names)}")
-    wanted = [frozenset(pair) for pair in named] if named else None
+    wanted = [frozenset(pair) for pair in named] if named is not None else None
     muscles = [muscle for muscle in scene.muscles if muscle.name in names]
     poses = sampled_poses(scene)
 
@@ -196,4 +196,4 @@ def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset
     pairs = [
         (i, k, frozenset((muscles[i].name, muscles[k].name))) for i in range(len(muscles)) for k in range(i)
     ]
-    return {pair for i, k, pair in pairs if (not wanted or pair in wanted) and meet(i, k)}
+    return {pair for i, k, pair in pairs if (wanted is None or pair in wanted) and meet(i, k)}

@@ -8,7 +8,7 @@ import numba
 import pytest
 from conftest import ROOT
 
-needs_compiler = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
+pytestmark = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
 SOURCES = {
     "__init__": "",
     "constants": "SHIFT = 0.5\n",
@@ -75,7 +75,6 @@ def files(place):
     return {path: path.stat().st_mtime_ns for path in (place / "cache").glob("*/*")}
 
 
-@needs_compiler
 def test_second_process_and_a_copy_of_the_sources_compile_nothing(place):
     assert run(place) == ([102.5, 1.0], SAID)
     kept = files(place)
@@ -86,7 +85,6 @@ def test_second_process_and_a_copy_of_the_sources_compile_nothing(place):
     assert files(place) == kept
 
 
-@needs_compiler
 @pytest.mark.parametrize(
     ("name", "old", "new", "expected"),
     [
@@ -104,7 +102,6 @@ def test_edit_of_what_a_loop_uses_reaches_it(place, name, old, new, expected):
     assert run(place)[0] == expected
 
 
-@needs_compiler
 @pytest.mark.parametrize("damage", [b"no such thing", None])
 def test_damaged_file_is_compiled_again(place, damage):
     run(place)
@@ -114,7 +111,6 @@ def test_damaged_file_is_compiled_again(place, damage):
     assert run(place) == ([102.5, 1.0], "")
 
 
-@needs_compiler
 def test_folder_that_cannot_be_written_costs_one_line(place):
     (place / "file").write_text("not a folder")
     values, err = run(place, cache="file/cache")
@@ -123,14 +119,12 @@ def test_folder_that_cannot_be_written_costs_one_line(place):
     assert f"cannot keep compiled loops in {place / 'file' / 'cache'} (" in err
 
 
-@needs_compiler
 def test_processes_that_compile_at_once_are_right(place):
     both = [start(place), start(place)]
     assert [finish(process)[0] for process in both] == 2 * [[102.5, 1.0]]
     assert run(place) == ([102.5, 1.0], "")
 
 
-@needs_compiler
 def test_folders_that_are_unused_are_removed(place):
     run(place)
     used = {path.parent for path in files(place)}

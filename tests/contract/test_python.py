@@ -71,6 +71,8 @@ def test_run_that_is_loaded_is_the_run_that_was_saved(run, loaded, tmp_path):
     np.testing.assert_array_equal(wanted, run.frames[-1].surfaces["abductor"].vertices)
     np.testing.assert_allclose(found, wanted, rtol=1e-6)
     np.testing.assert_array_equal(loaded.values("abductor", "length"), run.values("abductor", "length"))
+    assert "nope" not in loaded.frames[0].surfaces and loaded.save(loaded.saved.directory) is None
+    assert run.info["times"]["wall"] == run.info["times"]["wall"]
     loaded.save(tmp_path / "copy")
     assert len(rm.Run.load(tmp_path / "copy")) == 3
     with pytest.raises(rm.UsageError, match="holds no run"):

@@ -94,6 +94,7 @@ class TestFailure:
             (["rbf", "rbf"], {}, "two or more"),
             (["rbf", "pbd"], {"xpbd:model.sweeps": 2}, "not compared"),
             (["rbf", "rbf-converged"], {}, "unknown model"),
+            (["rbf", "pbd"], {"pbd:motion.step": 1}, "same motion"),
         ):
             with pytest.raises(UsageError, match=words):
                 compare_models(arm_scene(), tmp_path, models, settings=settings)

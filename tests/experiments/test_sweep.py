@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -64,7 +65,14 @@ class TestGrid:
     def test_values_are_read_as_toml_or_text(self):
         texts = ["model.centres=100,200", "contact.substep_angle=0.5,2", "model.kernel=cubic,wendland_c2"]
         assert list(parse_grid(texts).values()) == [[100, 200], [0.5, 2], ["cubic", "wendland_c2"]]
-        for wrong in (["centres"], ["=1,2"], ["a="], ["model.centres=1", "model.centres=2"]):
+        assert parse_grid(["a=[1,2],[3],[1,2]"]) == {"a": [[1, 2], [3]]}
+        for wrong in (
+            ["centres"],
+            ["=1,2"],
+            ["a="],
+            ["model.centres=1", "model.centres=2"],
+            ["motion.step=1,a"],
+        ):
             with pytest.raises(UsageError):
                 parse_grid(wrong)
 
@@ -142,6 +150,9 @@ class TestRun:
         before = {path: path.stat().st_mtime_ns for path in (finished[1] / "points").iterdir()}
         assert sweep(finished[1])[1] == 0 and len(before) == POINTS
         assert {path: path.stat().st_mtime_ns for path in before} == before
+        # Against another reference all but that one are measured again.
+        other = [replace(point, reference="other") for point in finished[0]]
+        assert not any(SweepFolder(finished[1]).is_done(point) for point in other)
 
     def test_processes_give_the_same_table(self, finished, tmp_path):
         points, count = sweep(tmp_path, jobs=2)

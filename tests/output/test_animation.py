@@ -5,6 +5,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +50,8 @@ def changing(folder, tmp_path):
     return copy, np.array(ball.vertices), np.array(ball.faces)
 
 
+@pytest.mark.skipif(find_spec("pxr") is None, reason="usd-core is not installed")
 class TestUsd:
-    @pytest.fixture(autouse=True)
-    def _needs_usd(self):
-        pytest.importorskip("pxr.UsdGeom")
-
     def read(self, path):
         from pxr import Usd
 

@@ -1,6 +1,7 @@
 """Files against readers that are not ours: pyvista and trimesh."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import trimesh
 
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.output.export import export_run
+from rbfmuscle.output.export import _file_name, export_run
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.vtp import read_vtp, write_vtp
 from rbfmuscle.output.writer import write_json
@@ -96,6 +97,9 @@ class TestExport:
     def test_wrong_words(self, arm_run, tmp_path, name, units):
         with pytest.raises(UsageError):
             export_run(arm_run[1], name, output=tmp_path, units=units)
+
+    def test_no_name_leads_out_of_the_folder(self):
+        assert _file_name(SimpleNamespace(name="../a b/c")) == "_a b_c"
 
 
 def test_json_has_no_nan_and_is_replaced_whole(tmp_path):

@@ -71,7 +71,7 @@ class TestOpenSimFile:
         frames = chain().set_motion(file="walk.mot", folder=tmp_path).motion.frames
         assert frames == [{"two.bend": 0.5, "one.turn": 1.0}]
 
-    @pytest.mark.parametrize("rows", ["0 1\n", "0 x 1\n", "0 nan 1\n", ""])
+    @pytest.mark.parametrize("rows", ["0 1\n", "0 x 1\n", "0 nan 1\n", "", "\n"])
     def test_bad_rows(self, tmp_path, rows):
         self.write(tmp_path, rows)
         with pytest.raises(SceneError, match=r"walk\.mot"):

@@ -135,16 +135,18 @@ def test_errors_of_a_helper_are_reported_as_they_are(raised, expected):
 
 
 @pytest.mark.parametrize(
-    ("muscles", "frames", "sliding", "cores", "wanted"),
+    ("muscles", "frames", "together", "cores", "wanted"),
     [
         (4, 1000, None, 4, 1), (38, 5, None, 4, 1), (38, 37, object(), 4, 1), (38, 37, None, 1, 1),
         (38, 37, None, 8, 4), (10, 40, None, 4, 2), (38, 37, None, 2, 2),
     ],
 )  # fmt: skip
-def test_helpers_are_as_many_as_bring_more_than_they_cost(muscles, frames, sliding, cores, wanted):
+def test_helpers_are_as_many_as_bring_more_than_they_cost(muscles, frames, together, cores, wanted):
     motion = SimpleNamespace(frames=range(frames))
-    scene = SimpleNamespace(muscles=range(muscles), motion=motion, sliding=sliding)
-    assert max(helpers_for(scene, cores), 1) == wanted
+    for sliding, contraction in ((together, None), (None, together)):
+        part = [SimpleNamespace(contraction=contraction)]
+        scene = SimpleNamespace(muscles=muscles * part, motion=motion, sliding=sliding)
+        assert max(helpers_for(scene, cores), 1) == wanted
 
 
 def test_a_message_that_is_cut_is_the_last_one():

@@ -152,7 +152,12 @@ def _joint(node, ends, holder, model):
         for sort, group in axes.items()
         for axis in group
     ]
-    coordinates = {inner.name: _coordinate(inner, motion_of(inner.name, slopes), model) for inner in found}
+    used = {name for _, names, _ in slopes for name in names}
+    model.notes += [
+        f"coordinate {name!r} moves nothing: it is left out" for name in names if name not in used
+    ]
+    kept = [inner for inner in found if inner.name in used]
+    coordinates = {inner.name: _coordinate(inner, motion_of(inner.name, slopes), model) for inner in kept}
     return ModelJoint(
         node.name, parent, child, np.zeros(3), coordinates, axes["rotation"], axes["translation"], kind,
         parent_frame=first, child_frame=second,

@@ -127,9 +127,9 @@ def test_a_pose_is_sampled_from_rest_whatever_was_sampled_before(scene):
 
 def test_poses_that_fail_are_left_out_and_too_many_are_refused(tmp_path, scene):
     values, lengths, arms = made(20)
-    lengths[3] = np.nan
+    lengths[3] = arms[4] = np.nan
     found = Samples("m", ("hip.flexion", "hip.adduction"), values, lengths, arms)
-    assert "1 poses could not be solved" in report_fits(scene, [found], tmp_path)[0]
+    assert "2 poses could not be solved" in report_fits(scene, [found], tmp_path)[0]
     lengths[:15] = np.nan
     with pytest.raises(SolveError, match="15 of 20 poses failed"):
         report_fits(scene, [found], tmp_path)
@@ -137,6 +137,6 @@ def test_poses_that_fail_are_left_out_and_too_many_are_refused(tmp_path, scene):
 
 def test_ranges_are_checked(scene):
     assert parse_ranges(scene, ["flexion=0:90"])["hip.flexion"] == pytest.approx((0.0, np.pi / 2))
-    for text in ("flexion", "flexion=1", "flexion=9:1", "flexion=a:b", "flexion=0:inf"):
+    for text in ("flexion", "flexion=1", "flexion=9:1", "flexion=a:b", "flexion=0:inf", "foo=0:1"):
         with pytest.raises(UsageError, match="--range"):
             parse_ranges(scene, [text])
