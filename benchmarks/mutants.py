@@ -237,9 +237,9 @@ class Reach:
         # Tests with processes of their own run lines that are not recorded as theirs.
         apart = {t for t in self.tests if folder in t and "subprocess" in self.named[t.partition("::")[0]]}
         # So do fixtures of a whole file, which count to its first test.
-        files = {test.partition("::")[0] for test in found}
+        files, direct = {test.partition("::")[0] for test in found}, found
         kept = {test for test in self.tests if KEPT in test and test.partition("::")[0] in files}
-        found |= apart | kept | {test for test in self.tests if own in test}
+        found = found | apart | kept | {test for test in self.tests if own in test}
         order, seen = {}, defaultdict(int)
         for test in sorted(found, key=lambda t: (self.time(t), t)):
             file, case = test.partition("::")[0], test.partition("[")[0]
@@ -249,7 +249,7 @@ class Reach:
             order[test] = 3 * again + turn, self.time(test), test
             seen[file] += seen[case] == 0
             seen[case] += 1
-        ordered, steps = self._kept_first(sorted(found, key=order.__getitem__)), []
+        ordered, steps = self._kept_first(sorted(found, key=order.__getitem__), direct), []
         for most, budget in STEPS:
             chosen, spent = [], 0.0
             for test in ordered:
@@ -258,11 +258,11 @@ class Reach:
                     break
                 chosen.append(test)
             steps.append(chosen)
-            ordered = self._kept_first(ordered[len(chosen) :])
+            ordered = self._kept_first(ordered[len(chosen) :], direct)
         return [step for step in steps if step]
 
-    def _kept_first(self, tests):
-        kept = sorted((test for test in tests if KEPT in test), key=self.run.__getitem__)[:FIRST]
+    def _kept_first(self, tests, direct):
+        kept = sorted((t for t in tests if KEPT in t), key=lambda t: (t not in direct, self.run[t]))[:FIRST]
         return kept + [test for test in tests if test not in kept]
 
     def _naming(self, name):
