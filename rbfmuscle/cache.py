@@ -47,7 +47,7 @@ def content_key(vertices: Floats, faces: Integers, options: tuple[Any, ...]) -> 
 def load_arrays(key: str) -> dict[str, Array] | None:
     """Arrays of an entry by name, or None where there is none; a damaged entry is removed."""
     path = cache_path() / (key + SUFFIX)
-    if not path.exists():
+    if not os.path.exists(path):
         return None
     try:
         # One thread at a time: Python 3.11 counts the depth of what it parses, as NumPy's headers, for all together.

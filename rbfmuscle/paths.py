@@ -79,7 +79,9 @@ def sample_muscles(
     groups, found, done = _groups(scene), [], 0
     ranges = {name: _range(scene, name, given) for names in groups for name in names}
     for name in [name for name in given if name not in ranges]:
-        raise UsageError(f"--range {name}: none of the muscles depends on it, or it is locked or follows others")
+        raise UsageError(
+            f"--range {name}: none of the muscles depends on it, or it is locked or follows others"
+        )
     for names, muscles in groups.items():
         part = scene.copy()
         part.muscles = muscles

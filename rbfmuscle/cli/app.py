@@ -54,10 +54,12 @@ def run_command(arguments: list[str]) -> int:
         _drop_output()
         return 0
     except OSError as error:
-        _drop_output()
         what = error.filename or "standard output or a file of the command"
         reason = error.strerror or one_line(error)
         message = f"cannot read or write {what}: {reason}; free or choose another place"
+        if error.filename:
+            return _fail(message, UsageError.exit_code, "--json" in arguments)
+        _drop_output()
         return _fail(message, UsageError.exit_code)
     return code
 

@@ -1,5 +1,6 @@
 """``rbfmuscle view``, ``render`` and ``export``: a scene or a run in the browser, in pictures and other formats."""
 
+import math
 import threading
 import webbrowser
 from pathlib import Path
@@ -70,7 +71,10 @@ def view(
 def _parse_stop(text):
     name, _, value = text.partition("=")
     try:
-        return name, float(value)
+        number = float(value)
+        if not math.isfinite(number):
+            raise ValueError
+        return name, number
     except ValueError:
         raise UsageError(f"--at {text!r} is not COORDINATE=DEGREES, for instance hip.flexion=60") from None
 

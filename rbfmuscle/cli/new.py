@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from rbfmuscle.cli.options import Force, Output
-from rbfmuscle.validation import UsageError
+from rbfmuscle.validation import MeshError, UsageError
 
 
 def new(
@@ -133,6 +133,8 @@ def _write_surfaces(source, labels, folder):
     volume = read_labels(source, names=labels)
     meshes = folder / "meshes"
     meshes.mkdir(parents=True, exist_ok=True)
+    for old in meshes.glob("*.ply"):  # of an earlier volume
+        old.unlink()
     values, files = volume.values(), set()
     with Progress("surfaces", "label") as progress:
         for done, label in enumerate(values, start=1):
@@ -140,7 +142,11 @@ def _write_surfaces(source, labels, folder):
             if tissue == "other":
                 print(f"{volume.name(label)}: neither bone nor muscle, left out")
                 continue
-            surface = label_surface(volume, int(label), pieces=tissue == "bone")
+            try:
+                surface = label_surface(volume, int(label), pieces=tissue == "bone")
+            except MeshError as error:
+                print(f"{error}; left out")
+                continue
             file = re.sub(r"[^A-Za-z0-9_-]+", "_", surface.name)
             if file.lower() in files:  # two labels of one name are two parts
                 file = f"{file}_{int(label)}"

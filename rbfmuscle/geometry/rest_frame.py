@@ -46,7 +46,7 @@ class RestFrame:
         second = across[np.argmax(span > 0.3 * span.max())]
         second = second / np.linalg.norm(second)
         self.axes = np.array([first, second, np.cross(first, second)])
-        self.local = np.round(offset @ self.axes.T / self.size, 8)
+        self.local = np.round(offset @ self.axes.T / self.size, 8) + 0.0  # no zero has a sign
 
     def points(self, local: Floats) -> Floats:
         """World positions of local points."""
@@ -90,7 +90,7 @@ class BoneFrame:
         # Found in rounded numbers, so that equal moments give the same axes for every pose of the scene.
         turn = _principal_axes(frame.local)
         self.origin, self.size, self.axes = frame.origin, frame.size, turn @ frame.axes
-        self.local = np.round(frame.local @ turn.T, 8)
+        self.local = np.round(frame.local @ turn.T, 8) + 0.0
         self._placed = lru_cache(maxsize=16)(self._place)
 
     def box(self, bounds: ArrayLike) -> Floats:

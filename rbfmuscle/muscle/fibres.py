@@ -27,7 +27,11 @@ def fibre_directions(
         distance, index = cKDTree(middles).query(points, k=np.arange(1, near + 1))
         unit = pieces / np.linalg.norm(pieces, axis=1, keepdims=True)
         floor = 1e-9 * np.ptp(points, axis=0).max()
-        along = (unit[index] / np.maximum(distance, floor)[:, :, None]).sum(axis=1)
+        unit = unit[index]
+        unit *= np.where(np.einsum("nkd,nd->nk", unit, unit[:, 0]) < 0.0, -1.0, 1.0)[
+            :, :, None
+        ]  # a fibre has no sense
+        along = (unit / np.maximum(distance, floor)[:, :, None]).sum(axis=1)
     length = np.linalg.norm(along, axis=1)
     weak = length < 1e-9 * max(length.max(), 1e-300)
     along = np.where(weak[:, None], fallback, along)

@@ -36,7 +36,7 @@ FALL, TRIALS, MOST_CENTRES = 1.2, 5, 4.0
 # What is aimed at, in what is wanted: the shown mesh adds its own.
 AIM = 0.97
 # Parts of the names under which samples and numbers of centres are cached: raise one when the way to find them changes.
-SAMPLING, SEARCH = 4, 1
+SAMPLING, SEARCH = 4, 2
 SEED = 0
 
 
@@ -71,7 +71,7 @@ def choose_centres(muscle: Muscle, scene: Scene, options: RBFOptions, *, known_o
         return Chosen(options.centres, np.nan, "as given")
     usual, wanted = default_centres(muscle.mesh.area, scene), wanted_error(muscle, scene, options)
     frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
-    fit = (options.kernel, options.epsilon, options.condition, options.placement, SEED)
+    fit = (options.kernel, round(options.epsilon * frame.size, 9), options.condition, options.placement, SEED)
     key = content_key(frame.local, faces, ("centres", SEARCH, usual, round(wanted / frame.size, 9), *fit))
     found = load_arrays(key)
     if found is None and known_only:

@@ -126,7 +126,7 @@ class SolidContact:
     def _rounded(self, contacts: BoneContacts) -> RoundedBones:
         """The bones in reach, rounded."""
         fields, kept = [contacts.fields[b] for b in contacts.reached], self._round
-        if kept is None or any(field is not other for field, other in zip(fields, kept.fields, strict=True)):
+        if kept is None or [*map(id, fields)] != [*map(id, kept.fields)]:
             edges = [self._edge(contacts.fields[b], contacts.names[b]) for b in contacts.reached]
             kept = self._round = RoundedBones(fields, self.solid.frame, np.array(edges, dtype=np.float64))
         return kept

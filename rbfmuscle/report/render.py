@@ -171,6 +171,8 @@ def render_run(
         raise UsageError(f"{output}: the suffix must be .png, .gif or .webp")
     if not saved.has_surfaces():
         raise UsageError(f"{directory} has no surfaces to draw")
+    if not 0.0 < seconds <= 3600.0:
+        raise UsageError(f"an animation of {seconds:g} seconds; give up to 3600")
     frame = saved.frames[-1] if frame is None else frame
     if frame not in saved.frames:
         ends = f"{saved.frames[0]} to {saved.frames[-1]}"
@@ -230,6 +232,7 @@ def save_images(images: Sequence[Image.Image], path: Path, seconds: float) -> No
         pauses = [max(20, int(1000 * seconds / len(sheets)))] * (len(sheets) - 1) + [900]
         kind |= {"save_all": True, "append_images": sheets[1:], "duration": pauses, "loop": 0}
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         sheets[0].save(path, **kind)
     except OSError as error:
         raise SolveError(f"cannot write {path}: {error.strerror}") from None

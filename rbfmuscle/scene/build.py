@@ -204,5 +204,7 @@ def check_new_name(items: Sequence[Bone | Joint | Muscle], name: str, what: str)
     if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
         allowed = "letters, digits, '_' and '-' only (it becomes a file name)"
         raise SceneError(f"{what} name {shown(repr(name))} may hold {allowed}")
+    if name == "all":
+        raise SceneError(f"{what} name 'all' stands for the whole scene in tables, choose another")
     if any(item.name == name for item in items):
         raise SceneError(f"{what} {name!r} is given twice")

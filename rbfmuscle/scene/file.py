@@ -20,6 +20,7 @@ from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.motion import make_motion, unit_sign
 from rbfmuscle.scene.objects import Muscle, SceneData
 from rbfmuscle.scene.options import (
+    Axis,
     ContactOptions,
     DetectOptions,
     FileName,
@@ -28,7 +29,6 @@ from rbfmuscle.scene.options import (
     Positive,
     SlidingOptions,
     Table,
-    Vector,
     check_plain,
 )
 from rbfmuscle.validation import MeshError, SceneError, is_file, shown, shown_path
@@ -45,8 +45,8 @@ class SceneTable(Table):
     name: str | None = None
     units: Literal["m", "cm", "mm"]
     left_out: list[str] = Field(default=[])
-    superior: Vector | None = None
-    anterior: Vector | None = None
+    superior: Axis | None = None
+    anterior: Axis | None = None
 
 
 class BoneTable(Table):
@@ -152,6 +152,11 @@ def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
 
 def _fill(scene: SceneData, tables: SceneFile) -> None:
     about = tables.scene
+    up, front = about.superior, about.anterior
+    if (up is None) != (front is None) or np.linalg.norm(
+        np.cross(up or [1, 0, 0], front or [0, 1, 0])
+    ) < 1e-9:
+        raise SceneError("[scene]: give superior and anterior, of different directions, or neither")
     scene.left_out, scene.superior, scene.anterior = about.left_out, about.superior, about.anterior
     for bone in tables.bone:
         add_bone(scene, bone.name, bone.mesh, scale=bone.scale)

@@ -146,6 +146,6 @@ def open_scene(scene: Scene | str | Path, *, skeleton: bool = False) -> Scene:
     """
     if isinstance(scene, Scene):
         return scene
-    if str(scene) == PHANTOM and not Path(scene).exists():
+    if str(scene) == PHANTOM and not Path(scene).is_file():
         return phantom_scene()
     return Scene.load(scene, skeleton=skeleton)

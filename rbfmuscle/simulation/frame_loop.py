@@ -210,6 +210,8 @@ def solve_pose(
     finally:
         for model, state in zip(models, rest):
             model.restore(state)
+            if scene.muscle(model.name).contraction is not None:
+                model.activate(0.0)
 
 
 def _obstacles(scene, models, fields):

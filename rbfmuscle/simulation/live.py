@@ -9,6 +9,7 @@ import numpy as np
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.scene.motion import SHIFT_LEVER
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
@@ -35,6 +36,10 @@ class LiveSession:
         self.rest = {name: facts[name].rest for name in self.limits}
         self.here, self.target = dict(self.rest), dict(self.rest)
         self.activation = {m.name: 0.0 for m in scene.muscles if m.contraction is not None}
+        #: A shift counts as the turn that moves a place at this lever as far.
+        self._lever = {
+            n: scene.length(SHIFT_LEVER) if facts[n].motion == "translation" else 1.0 for n in self.rest
+        }
         self._loop: FrameLoop | None = None
 
     def use(self, models: list[MuscleModel]) -> None:
@@ -67,9 +72,9 @@ class LiveSession:
         return self.within(1e-9, 1e-9)
 
     def within(self, stride: float, step: float) -> bool:
-        """Whether no coordinate is farther than ``stride`` from its target, and no activation than ``step``."""
+        """Whether no coordinate is farther than ``stride`` [radian] from its target, no activation than ``step``."""
         active = self._loop.activations.here if self._loop else dict.fromkeys(self.activation, 0.0)
-        near = all(abs(value - self.here[name]) <= stride for name, value in self.target.items())
+        near = self._farthest() <= stride
         return near and all(abs(value - active[name]) <= step for name, value in self.activation.items())
 
     def advance(self, stride: float = math.inf, *, surfaces: bool = True) -> Frame:
@@ -86,12 +91,16 @@ class LiveSession:
         for name, wanted in self.activation.items():
             now = active.here[name]
             active.target[name] = now + min(max(wanted - now, -reach), reach)
-        farthest = max((abs(self.target[k] - self.here[k]) for k in self.target), default=0.0)
+        farthest = self._farthest()
         share = stride / farthest if farthest > stride else 1.0
         step = {k: self.here[k] + share * (self.target[k] - self.here[k]) for k in self.target}
         frame = self._loop.advance(dict(self.target) if share == 1.0 else step)
         self.here = dict(frame.coordinates)
         return frame
+
+    def _farthest(self) -> float:
+        """How far coordinates are from their targets, at most [radian]."""
+        return max((abs(self.target[k] - self.here[k]) / self._lever[k] for k in self.target), default=0.0)
 
 
 def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:

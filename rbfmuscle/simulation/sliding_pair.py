@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.simulation.contact import Planes
 from rbfmuscle.simulation.neighbour_surface import Found, NeighbourSurface
 
@@ -65,11 +66,14 @@ class SlidingPair:
             _FAR if other.apart(own, limits.reach) else other.query(own.points[at], limits.reach)
         )
         apart[index] = distance
-        chosen = _nearest_by_cell(own.points[at], apart, stepper.model.detail)
+        # In the muscle's own frame, so that it does not depend on where the scene lies.
+        frame = RestFrame(own.points)
+        places = frame.size * frame.local
+        chosen = _nearest_by_cell(places[at], apart, stepper.model.detail)
         #: Contact points that meet the neighbour, and which of them it holds.
         self.at, apart = at[chosen], apart[chosen]
         self.held = np.zeros(len(self.at), dtype=bool)
-        self.held[_nearest_by_cell(own.points[self.at], apart, SPARSE * own.edge)] = True
+        self.held[_nearest_by_cell(places[self.at], apart, SPARSE * own.edge)] = True
         #: Which of them are linked, and how far each may be from the neighbour.
         self.linked = apart < min(limits.threshold + min(BETWEEN * own.edge, limits.threshold), limits.reach)
         self.hold = np.where(self.linked, np.maximum(apart, 0.0) + limits.strip, limits.hold)
@@ -171,10 +175,13 @@ class SlidingPair:
 
 
 def _nearest_by_cell(points: Floats, distance: Floats, size: float) -> Integers:
-    """Sorted indices of the points (n, 3) that are nearest in their cell of a grid; all points for size 0."""
+    """Sorted indices of the points (n, 3) that are nearest in their cell of a grid; all points for size 0.
+
+    Of points that are equally near, but for rounding, the first.
+    """
     if size == 0.0:
         return np.arange(len(points))
-    order = np.argsort(distance, kind="stable")
+    order = np.argsort(np.round(distance / size, 8), kind="stable")
     return np.sort(order[np.unique(np.floor(points[order] / size), axis=0, return_index=True)[1]])
 
 

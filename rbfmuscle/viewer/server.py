@@ -7,7 +7,7 @@ import secrets
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from rbfmuscle.validation import MissingPartError
+from rbfmuscle.validation import MissingPartError, UsageError
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -68,6 +68,8 @@ def open_server(port: int = 0) -> "tuple[ViserServer, str]":
         import viser
     except ImportError:
         raise MissingPartError(f"the viewer needs viser, which is not installed; run: {INSTALL}") from None
+    if not 0 <= port <= 65535:
+        raise UsageError(f"--port {port}: ports go from 0 to 65535")
     gate = Gate(secrets.token_urlsafe(16))
     with _every_request_through(gate), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=LOOPBACK, port=port, label="rbfmuscle", verbose=False)

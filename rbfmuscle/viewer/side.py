@@ -139,8 +139,9 @@ class Side:
         for name, (vertices, faces) in self._bones.items():
             pose = self.picture.poses[name]
             _, kept = self._part((vertices @ pose[:3, :3].T + pose[:3, 3], faces), look.cut)
-            self._show(name, self._part((vertices, kept), None), BONE_COLOUR, visible=name not in look.hidden)
-            node = self._nodes[name]
+            part, place = self._part((vertices, kept), None), f"bones/{name}"  # a muscle may have its name
+            self._show(place, part, BONE_COLOUR, visible=name not in look.hidden)
+            node = self._nodes[place]
             node.position = pose[:3, 3] * (0.001 / self.source.millimetre)
             node.wxyz = SO3.from_matrix(pose[:3, :3]).wxyz
         painted, colouring = [], COLOURINGS[look.colour]

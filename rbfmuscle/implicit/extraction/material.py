@@ -197,7 +197,7 @@ class CarriedMaterial:
         """Mask of the triangles that may cross others without a fold at a corner; None where it can be any."""
         if self.field is None or self.mesh.slope is None:
             return None
-        faded = SURE * self.projector.slope * self.mesh.slope >= 1.0
+        faded = SURE * self.projector.slope * self.mesh.slope >= 1.0 - 1e-9  # the slope was cut to be 1
         odd = self.sunk | self.pushed | self.moved | self.left | faded
         return touching_faces(self.mesh.faces, odd)
 

@@ -130,7 +130,7 @@ def _take(joint: JointGuess, fit: Fit | None, method: str, name: str, direction:
         return
     radii = " and ".join(f"{radius:.4g}" for radius in fit.radii)
     joint.reason = f"{method}, radii {radii}, misfit {fit.misfit:.2g}"
-    joint.centre, joint.axes = fit.centre, {coordinate: fit.axis * np.sign(fit.axis @ direction)}
+    joint.centre, joint.axes = fit.centre, {coordinate: fit.axis * np.copysign(1.0, fit.axis @ direction)}
     joint.confidence = max(1.0 - 0.5 * fit.misfit / (MISFIT * min(fit.radii)), 0.1)
     joint.confidence -= 0.2 * (len(fit.radii) < 2)  # one surface alone shows the direction less well
     if fit.wrong:

@@ -90,10 +90,10 @@ def femur_frame(femur: Part, below: list[Part], above: list[Part]) -> Frame:
     share = (points @ up - (points @ up).min()) / np.ptp(points @ up)
     shaft, end, top = (share > 0.3) & (share < 0.7), share < 0.1, share > 1.0 - END
     middle, axes = main_axes(points[shaft], areas[shaft])
-    up = axes[:, 2] * np.sign(axes[:, 2] @ up)
+    up = axes[:, 2] * np.copysign(1.0, axes[:, 2] @ up)
     behind, axes = main_axes(across(points[end] - middle, up), areas[end])
     anterior = unit(np.cross(up, axes[:, 2]))
-    frame = Frame(up, anterior * -np.sign(anterior @ behind))
+    frame = Frame(up, anterior * -np.copysign(1.0, anterior @ behind))
     head = np.average(points[top], axis=0, weights=areas[top]) - middle
     frame.side = "r" if head @ frame.right < 0 else "l"
     return frame

@@ -135,13 +135,17 @@ def _read_nrrd(path):
 
     _check_size(tuple(int(size) for size in nrrd.read_header(str(path))["sizes"]), 8, path)
     data, header = nrrd.read(str(path))
-    directions = np.asarray(header.get("space directions", np.eye(3)), dtype=np.float64)
+    across = np.diag(np.asarray(header.get("spacings", np.ones(3)), dtype=np.float64))
+    directions = np.asarray(header.get("space directions", across), dtype=np.float64)
     if directions.shape != (3, 3):
         raise MeshError(f"{path}: its directions are not those of three axes; export one label map in 3-D")
     affine = np.eye(4)
     affine[:3, :3], affine[:3, 3] = directions.T, header.get("space origin", np.zeros(3))
-    if str(header.get("space", "lps")).lower() in ("left-posterior-superior", "lps"):
-        affine[:2] *= -1.0
+    space = str(header.get("space", "lps")).lower()
+    ends = "".join(word[0] for word in space.split("-")) if "-" in space else space
+    if len(ends) < 3 or any(end not in pair for end, pair in zip(ends, ("lr", "pa", "si"))):
+        raise MeshError(f"{path}: its space is {space!r}; export it as left-posterior-superior")
+    affine[:3] *= [[-1.0] if end in "lpi" else [1.0] for end in ends[:3]]
     names = {}
     for key, value in header.items():
         segment = re.fullmatch(r"Segment(\d+)_Name", str(key))
@@ -222,7 +226,7 @@ def _json_names(table):
     if isinstance(table, list):
         rows = [row for row in table if isinstance(row, dict) and isinstance(row.get("value"), int)]
         parts = {row["value"]: (row.get("anatomy") or row.get("structure"), row.get("side")) for row in rows}
-        return {number: " ".join(filter(None, words)) for number, words in parts.items()}
+        return {number: " ".join(str(word) for word in words if word) for number, words in parts.items()}
     pairs = table.items() if isinstance(table, dict) else ()
     names = {int(key): str(value) for key, value in pairs if str(key).isdigit()}
     return names | {value: str(key) for key, value in pairs if isinstance(value, int) and not key.isdigit()}

@@ -138,7 +138,9 @@ def _read_trimesh(content, kind):
     with warnings.catch_warnings():
         # Older NumPy warns of text that is no number and goes on.
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
-        mesh = trimesh.load(io.BytesIO(content), file_type=kind, process=False, force="mesh")
+        # Vertices are not split where textures meet.
+        options = {"fix_texture": False, "skip_materials": True} if kind == "ply" else {}
+        mesh = trimesh.load(io.BytesIO(content), file_type=kind, process=False, force="mesh", **options)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(getattr(mesh, "faces", ()), np.int64)
     if kind == "stl":  # each triangle has its own vertices: merged in order of first use
         # Bytes sort faster than rows; 0.0 is -0.0.
@@ -152,7 +154,7 @@ def _read_trimesh(content, kind):
 def _read_obj(content):
     """Vertices and triangles of an OBJ file; numbers of textures and normals do not split vertices."""
     vertices, faces = [], []
-    for line in content.splitlines():
+    for line in content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines():
         key, *words = line.partition(b"#")[0].split() or [b""]
         if key == b"v":
             x, y, z = map(float, words[:3])
@@ -178,6 +180,9 @@ def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Fl
             points = check_points(line, name=f"polyline {number}")
         except (ValueError, TypeError) as error:
             raise SceneError(f"{place}: {error}") from None
+        points = points[
+            np.append(True, np.diff(points, axis=0).any(axis=1))[: len(points)]
+        ]  # none twice in a row
         if len(points) < 2:
             words = f"polyline {number} has {len(points)} points, a fibre needs two or more"
             raise SceneError(f"{place}: {words}")
