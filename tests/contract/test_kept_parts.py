@@ -21,6 +21,7 @@ from rbfmuscle.implicit.placement.refinement import fit_sample
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
 from rbfmuscle.implicit.selection import choose_epsilon, spacing
 from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.muscle.fibres import fibre_directions
 
 
 def ball(radii=(1.0, 1.0, 1.0), subdivisions=3, bumps=0.0):
@@ -142,6 +143,8 @@ def _lattice():
     lattice, points = Lattice(*ball((3.0, 2.0, 1.2), bumps=0.1), 60), ball((5.0, 3.0, 2.0))[0]
     yield {key: value for key, value in vars(lattice).items() if isinstance(value, np.ndarray)}
     yield lattice.embed(points), lattice.regions(5), lattice.second_differences()
+    lines = [np.cumsum(points[k : k + 9], axis=0)[:: 1 - 2 * (k % 2)] for k in (0, 33, 70, 111)]
+    yield fibre_directions(points, points, lines, fallback=points[0])
 
 
 PARTS = {"bones": _bones, "fields": _fields, "surfaces": _surfaces, "lattice": _lattice}

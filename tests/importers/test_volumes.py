@@ -99,10 +99,13 @@ def test_directions_and_units_are_honoured(tmp_path, turn):
     metres = affine.copy()
     metres[:3] *= 1e-3
     files.append(write_nifti(tmp_path / "b.nii", labels, metres, unit="meter"))
-    lps = np.diag([-1.0, -1.0, 1.0]) @ affine[:3]
-    header = {"space": "left-posterior-superior", "space directions": lps[:, :3].T, "space origin": lps[:, 3]}
-    nrrd.write(str(tmp_path / "c.nrrd"), labels, header)
-    for file in [*files, tmp_path / "c.nrrd"]:
+    spaces = {"left-posterior-superior": [-1, -1, 1], "left-anterior-superior": [-1, 1, 1], "RAS": [1, 1, 1]}
+    for space, signs in spaces.items():
+        there = np.diag(signs) @ affine[:3]
+        header = {"space": space, "space directions": there[:, :3].T, "space origin": there[:, 3]}
+        files.append(tmp_path / f"{space}.nrrd")
+        nrrd.write(str(files[-1]), labels, header)
+    for file in files:
         volume = read_labels(file)
         meshes = [label_surface(volume, label).mesh for label in (1, 2)]
         assert all(mesh.volume > 0 for mesh in meshes)

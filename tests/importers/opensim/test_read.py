@@ -85,7 +85,7 @@ class TestSmall:
         assert got["thigh"] == pytest.approx(thigh, abs=1e-15)
         knee = frame_at((0.03, -0.424, 0)) @ rotation_about((0, 0, 1), -1.0, np.zeros(3))
         assert got["shank"] == pytest.approx(thigh @ knee, abs=1e-15)
-        assert got["cap"] == pytest.approx(thigh @ frame_at((-0.08, 0, 0)), abs=1e-15)
+        assert got["cap"] == pytest.approx(thigh @ frame_at((-0.16, 0, 0)), abs=1e-15)
 
     def test_joint_that_closes_a_loop_is_left_out_and_named(self, small):
         joint = """<PinJoint name="strut"><socket_parent_frame>/ground</socket_parent_frame>

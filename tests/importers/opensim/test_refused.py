@@ -96,12 +96,6 @@ def test_coupler_that_is_switched_off_couples_nothing(small, switch):
     assert not read_osim(changed(small, (FUNCTION, switch + FUNCTION))).couplings
 
 
-def test_scale_of_a_coupler_multiplies_its_function(small):
-    one = read_osim(small).couplings[0]
-    three = read_osim(changed(small, (FUNCTION, f"<scale_factor>3</scale_factor>{FUNCTION}"))).couplings[0]
-    assert three.function(0.7) == pytest.approx(3.0 * one.function(0.7))
-
-
 @pytest.mark.parametrize(
     ("before", "start", "end", "name"),
     [
