@@ -135,11 +135,13 @@ class Recording:
         self, writer: RunWriter, limits: Mapping[str, float], *, pictures: bool = True
     ) -> dict[str, Any]:
         """Write report and pictures of a run that is in a folder, then hold it to limits; what ``run.json`` holds."""
+        start = time.perf_counter()
         with timed(self.times, "report"), stage("drawing pictures"):
             if self.scene.output.report:
                 from rbfmuscle.report.report import write_report
 
                 write_report(writer.directory, pictures=pictures)
+        self._end += time.perf_counter() - start
         info = self.info()
         writer.write_info(info)
         require_limits(self.summary.table(), limits)

@@ -28,9 +28,8 @@ def fibre_directions(
         unit = pieces / np.linalg.norm(pieces, axis=1, keepdims=True)
         floor = 1e-9 * np.ptp(points, axis=0).max()
         unit = unit[index]
-        unit *= np.where(np.einsum("nkd,nd->nk", unit, unit[:, 0]) < 0.0, -1.0, 1.0)[
-            :, :, None
-        ]  # a fibre has no sense
+        against = np.einsum("nkd,nd->nk", unit, unit[:, 0]) < 0.0  # a fibre has no sense
+        unit = np.where(against[:, :, None], -unit, unit)
         along = (unit / np.maximum(distance, floor)[:, :, None]).sum(axis=1)
     length = np.linalg.norm(along, axis=1)
     weak = length < 1e-9 * max(length.max(), 1e-300)

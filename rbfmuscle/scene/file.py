@@ -153,9 +153,7 @@ def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
 def _fill(scene: SceneData, tables: SceneFile) -> None:
     about = tables.scene
     up, front = about.superior, about.anterior
-    if (up is None) != (front is None) or np.linalg.norm(
-        np.cross(up or [1, 0, 0], front or [0, 1, 0])
-    ) < 1e-9:
+    if (up is None) != (front is None) or (up and front and np.abs(np.cross(up, front)).max() < 1e-9):
         raise SceneError("[scene]: give superior and anterior, of different directions, or neither")
     scene.left_out, scene.superior, scene.anterior = about.left_out, about.superior, about.anterior
     for bone in tables.bone:

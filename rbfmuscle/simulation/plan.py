@@ -29,11 +29,9 @@ def plan_scene(scene: Scene) -> dict[str, Any]:
     for name, box in bone_regions(regions).items():
         mesh = scene.bone(name).mesh
         own = np.asarray(mesh.bounds, dtype=float)
-        reached, wide = (
-            np.diff(np.clip(box, own[0], own[1]), axis=0)[0],
-            own[1] > own[0],
-        )  # a bone may be flat
-        share = float(np.prod(reached[wide] / (own[1] - own[0])[wide]))
+        reached, extent = np.diff(np.clip(box, own[0], own[1]), axis=0)[0], own[1] - own[0]
+        wide = extent > 0.0  # a bone may be flat
+        share = float(np.prod(reached[wide] / extent[wide]))
         fields.append({"bone": name, "triangles": len(mesh.faces), "share": share})
     most = max((muscle["substeps"] for muscle in muscles), default=0)
     return {"frames": len(scene.motion), "substeps": most, "muscles": muscles, "fields": fields}

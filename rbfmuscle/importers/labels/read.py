@@ -142,7 +142,7 @@ def _read_nrrd(path):
     affine = np.eye(4)
     affine[:3, :3], affine[:3, 3] = directions.T, header.get("space origin", np.zeros(3))
     space = str(header.get("space", "lps")).lower()
-    ends = "".join(word[0] for word in space.split("-")) if "-" in space else space
+    ends = "".join(word[:1] for word in space.split("-")) if "-" in space else space
     if len(ends) < 3 or any(end not in pair for end, pair in zip(ends, ("lr", "pa", "si"))):
         raise MeshError(f"{path}: its space is {space!r}; export it as left-posterior-superior")
     affine[:3] *= [[-1.0] if end in "lpi" else [1.0] for end in ends[:3]]

@@ -180,9 +180,8 @@ def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Fl
             points = check_points(line, name=f"polyline {number}")
         except (ValueError, TypeError) as error:
             raise SceneError(f"{place}: {error}") from None
-        points = points[
-            np.append(True, np.diff(points, axis=0).any(axis=1))[: len(points)]
-        ]  # none twice in a row
+        kept = np.append(True, np.diff(points, axis=0).any(axis=1))[: len(points)]
+        points = points[kept]  # none twice in a row
         if len(points) < 2:
             words = f"polyline {number} has {len(points)} points, a fibre needs two or more"
             raise SceneError(f"{place}: {words}")
