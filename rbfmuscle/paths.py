@@ -196,7 +196,7 @@ def _range(scene, name, given):
         if ends is not None and ends[0] < ends[1]:
             low, high = (fact.honoured(end) for end in ends)
             if low == high:
-                raise UsageError(f"--range {name}: the coordinate is clamped to a range beyond it")
+                raise UsageError(f"--range {name}: it lies outside the range that clamps the coordinate")
             return low, high
     raise UsageError(f"coordinate {name!r} has no range; give --range {name}=LOW:HIGH")
 

@@ -89,14 +89,9 @@ def shown_path(path: str | os.PathLike[str]) -> str:
     return shown(str(path), longest=400)
 
 
-def is_file(path: str | os.PathLike[str]) -> bool:
-    """Whether a path is a regular file: no folder, pipe or device, and a name that the system takes."""
-    return os.path.isfile(path)
-
-
 def read_text(path: Path, *, place: str) -> str:
     """Return the text of a file that a scene names, or raise SceneError that begins with ``place``."""
-    if not is_file(path):
+    if not os.path.isfile(path):
         raise SceneError(f"{place}{shown_path(path)}: cannot read it: no such file")
     try:
         return path.read_text(encoding="utf-8", errors="replace")

@@ -45,7 +45,7 @@ def new(
     output = _scene_file(output, folder)
     _check_target(output, force)
     if volume:
-        folder = _write_surfaces(source, labels, folder)
+        folder = _write_surfaces(source, labels, folder, force)
     guess = guess_scene(folder, "mm" if volume else units, output.parent, header=HEADER if volume else None)
     scene = write_scene(guess, output)
     print(f"{output} written; check the lines marked GUESS")
@@ -123,18 +123,21 @@ def _beside(source, output):
     return source / "scene" if source.is_dir() else source.parent / f"{name}_scene"
 
 
-def _write_surfaces(source, labels, folder):
-    """Surfaces of all labels as PLY beside the scene; their folder."""
+def _write_surfaces(source, labels, folder, force):
+    """Surfaces of all labels as PLY beside the scene, with ``force`` in place of those there; their folder."""
     from rbfmuscle.importers.guess.names import name_facts
     from rbfmuscle.importers.labels.read import read_labels
     from rbfmuscle.importers.labels.surfaces import label_surface
     from rbfmuscle.progress import Progress
 
-    volume = read_labels(source, names=labels)
     meshes = folder / "meshes"
+    before = [*meshes.glob("*.ply")]
+    if before and not force:
+        raise UsageError(f"{meshes} holds meshes; give another folder, or --force to replace them")
+    volume = read_labels(source, names=labels)
     meshes.mkdir(parents=True, exist_ok=True)
-    for old in meshes.glob("*.ply"):  # of an earlier volume
-        old.unlink()
+    for path in before:
+        path.unlink()
     values, files = volume.values(), set()
     with Progress("surfaces", "label") as progress:
         for done, label in enumerate(values, start=1):

@@ -200,10 +200,8 @@ def _values(run):
 
 
 def _pose(frame):
-    return (
-        " ".join(f"{name}={round(angle, 9) + 0.0:.9f}" for name, angle in sorted(frame.coordinates.items()))
-        or "rest"
-    )
+    values = sorted(frame.coordinates.items())
+    return " ".join(f"{name}={round(value, 9) + 0.0:.9f}" for name, value in values) or "rest"
 
 
 def _errors(shown, path):

@@ -73,7 +73,7 @@ def _evaluate_loop(points, terms, form, start, stop, value, gradient):
             first = np.int64(0)  # of the type that `_fill_block` returns, which is then compiled once
             while first < len(x):
                 first, p, acc, g = _fill_block(x, terms, fit, shares, first, rows)
-                if p.shape[1] == 0:
+                if p.shape[1] == 0:  # no point in this fit
                     continue
                 if form is None:
                     _cubic_block_loop(terms, fit, wanted, p, acc, g)

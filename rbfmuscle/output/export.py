@@ -86,17 +86,17 @@ def _export(run: MovingRun, folder: Path, name: str, frames: list[int]) -> list[
     if name in MESHES:
         return _export_meshes(run, folder, name, frames)
     if name == "usd":
-        path = folder / f"{_file_name(run)}.usdc"
+        path = folder / f"{_file_name(run.name)}.usdc"
         write_usd(path, run)
     else:
-        path = folder / (f"frame_{frames[0]:04d}.glb" if name == "glb" else f"{_file_name(run)}.glb")
+        path = folder / (f"frame_{frames[0]:04d}.glb" if name == "glb" else f"{_file_name(run.name)}.glb")
         path.write_bytes(animated_glb(run))
     return [path]
 
 
-def _file_name(run: MovingRun) -> str:
+def _file_name(name: str) -> str:
     """The name of a run as that of a file, without what leads to other folders."""
-    return re.sub(r"[^\w .-]+", "_", run.name).strip(". ") or "run"
+    return re.sub(r"[^\w .-]+", "_", name).strip(". ") or "run"
 
 
 def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -> list[Path]:

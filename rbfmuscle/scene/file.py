@@ -31,7 +31,7 @@ from rbfmuscle.scene.options import (
     Table,
     check_plain,
 )
-from rbfmuscle.validation import MeshError, SceneError, is_file, shown, shown_path
+from rbfmuscle.validation import MeshError, SceneError, shown, shown_path
 
 S = TypeVar("S", bound=SceneData)
 # A scene file is a page or two; long lists of vertices belong into files of their own.
@@ -103,7 +103,7 @@ def read_scene_file(path: Path) -> SceneFile:
 def _read_toml(path):
     if path.is_dir():
         raise SceneError(f"{path}: is a folder, give a scene file (.toml)")
-    if not is_file(path):
+    if not os.path.isfile(path):
         raise SceneError(f"{shown_path(path)}: no such scene file")
     size = os.path.getsize(path)
     if size > LARGEST_FILE:

@@ -16,7 +16,6 @@ from rbfmuscle.validation import (
     check_values,
     check_vectors,
     did_you_mean,
-    is_file,
     shown,
     shown_path,
 )
@@ -92,12 +91,6 @@ def test_messages_show_values_whole_up_to_a_length():
     assert shown_path("x" * 400) == "x" * 400 and len(shown_path("x" * 401)) == 400 and shown(2.5) == "2.5"
     assert one_line("a\n b") == "a b" and [len(one_line(n * "x")) for n in (1000, 1001)] == [1000, 995]
     assert shown(10**5000) == "a int too long to show"
-
-
-def test_only_regular_files_are_files(tmp_path):
-    (tmp_path / "a").write_text("")
-    assert is_file(tmp_path / "a")
-    assert not any(map(is_file, (tmp_path, tmp_path / "b", "a\0b", "/dev/null")))
 
 
 def test_every_default_of_an_option_is_a_value_that_may_be_given():

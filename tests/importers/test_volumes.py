@@ -15,7 +15,7 @@ from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.importers.labels import surfaces
 from rbfmuscle.importers.labels.read import LabelVolume, read_labels, read_names
 from rbfmuscle.importers.labels.surfaces import label_surface
-from rbfmuscle.validation import MeshError
+from rbfmuscle.validation import MeshError, UsageError
 
 nibabel = pytest.importorskip("nibabel")
 nrrd = pytest.importorskip("nrrd")
@@ -216,6 +216,10 @@ def test_two_labels_of_one_name_are_two_meshes(tmp_path):
     labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
     source = write_nifti(tmp_path / "a.nii", labels, np.eye(4))
     (tmp_path / "names.csv").write_text("1,Soleus\n2,soleus\n")
-    for _ in range(2):  # into a folder that is not there, and over what is
-        folder = _write_surfaces(source, tmp_path / "names.csv", tmp_path / "new" / "out")
+    given = source, tmp_path / "names.csv", tmp_path / "new" / "out"
+    for force in (False, True):  # into a folder that is not there, and over what is
+        folder = _write_surfaces(*given, force)
         assert sorted(path.name for path in folder.iterdir()) == ["Soleus.ply", "soleus_2.ply"]
+        (folder / "earlier.ply").touch()
+    with pytest.raises(UsageError, match="--force"):
+        _write_surfaces(*given, False)

@@ -1,7 +1,6 @@
 """Files against readers that are not ours: pyvista and trimesh."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -99,7 +98,7 @@ class TestExport:
             export_run(arm_run[1], name, output=tmp_path, units=units)
 
     def test_no_name_leads_out_of_the_folder(self):
-        assert _file_name(SimpleNamespace(name="../a b/c")) == "_a b_c"
+        assert _file_name("../a b/c") == "_a b_c"
 
 
 def test_json_has_no_nan_and_is_replaced_whole(tmp_path):

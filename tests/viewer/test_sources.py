@@ -83,6 +83,13 @@ def test_stretch_of_a_ball_that_grew_and_its_depth_in_a_box():
     np.testing.assert_allclose(values, np.maximum(vertices[:, 2] - 8.0, 0.0), atol=1e-9)
 
 
+def test_controls_of_the_phantom_have_joint_unit_and_limits():
+    source = LiveSource(rm.phantom_scene(end=60.0, spacing=6.0), "pbd")
+    assert source.controls["hip.flexion"] == ("hip", "flexion [°]", -30.0, 60.0, 0.0)
+    assert source.choices[0] == "pbd" and len(set(source.choices)) == len(source.choices)
+    assert source.motion[-1]["hip.flexion"] == pytest.approx(60.0)
+
+
 def test_activation_of_a_muscle_is_set_and_coloured():
     scene = rm.phantom_scene(end=4.0, step=2.0, spacing=6.0)
     scene.muscles = [scene.muscle("extensor")]

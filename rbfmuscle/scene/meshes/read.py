@@ -23,7 +23,6 @@ from rbfmuscle.validation import (
     check_points,
     check_positive,
     did_you_mean,
-    is_file,
     read_text,
     shown,
     shown_path,
@@ -103,7 +102,7 @@ def read_arrays(path: Path) -> tuple[Floats, Integers]:
     if suffix not in MESH_SUFFIXES:
         words = f"{shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
         raise MeshError(f"{shown_path(path)}: {words}")
-    if not is_file(path):
+    if not os.path.isfile(path):
         raise MeshError(f"{shown_path(path)}: no such mesh file{_neighbours(path)}")
     try:
         content = path.read_bytes()
