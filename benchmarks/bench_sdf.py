@@ -1,9 +1,11 @@
 """Bone distance fields beside libigl's and trimesh's exact distances and the baselines, in one run.
 
-    NUMBA_NUM_THREADS=2 OMP_NUM_THREADS=2 python benchmarks/bench_sdf.py [--data FOLDER] [--bones femur pelvis]
+    NUMBA_NUM_THREADS=2 OMP_NUM_THREADS=2 python benchmarks/bench_sdf.py [--data FOLDER] [--bones
+    femur pelvis]
 
-FOLDER holds hip/. Builds use all threads numba is given, queries one. Times are the least of several; errors are
-against libigl's pseudonormal distance at random points within 1 mm of the surface, directions within 2 mm.
+FOLDER holds hip/. Builds use all threads numba is given, queries one. Times are the least of
+several; errors are against libigl's pseudonormal distance at random points within 1 mm of the
+surface, directions within 2 mm.
 """
 
 import argparse
@@ -25,13 +27,16 @@ from rbfmuscle.bones.sdf import BoneSDF
 
 PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
 # Points for accuracy, for speed, and for the slow exact tools.
-ACCURACY, SPEED, SLOW = 200_000, 1_000_000, 2_000
+ACCURACY = 200_000
+SPEED = 1_000_000
+SLOW = 2_000
 # Bytes of a coefficient or node value of the dense fields.
 FLOAT = 8
 
 
 def least(function, repeats=3):
-    """Least time of a call [s], and its result; the first call, which may compile, is not counted."""
+    """Least time of a call [s], and its result; the first call, which may compile, is not
+    counted."""
     result = function()
     times = []
     for _ in range(repeats):
@@ -95,14 +100,16 @@ def bone_table(name, mesh):
     """All fields and detectors on one bone."""
     vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
     print(
-        f"\n{name}: {len(vertices)} vertices, {len(faces)} faces, {numba.get_num_threads()} threads to build"
+        f"\n{name}: {len(vertices)} vertices, {len(faces)} faces, {numba.get_num_threads()} "
+        "threads to build"
     )
     print(
         f"{'':22s} {'build':>7s} {'memory':>7s} {'value':>7s} {'+grad':>7s} {'sorted':>7s} "
         f"{'RMS':>9s} {'worst':>8s} {'sign':>9s} {'angle':>8s} {'99 %':>7s}"
     )
     print(
-        f"{'':22s} {'s':>7s} {'MB':>7s} {'ns':>7s} {'ns':>7s} {'ns':>7s} {'mm':>9s} {'mm':>8s} {'% wrong':>9s}"
+        f"{'':22s} {'s':>7s} {'MB':>7s} {'ns':>7s} {'ns':>7s} {'ns':>7s} {'mm':>9s} {'mm':>8s} "
+        f"{'% wrong':>9s}"
     )
     build, field = least(lambda: BoneSDF.from_mesh((vertices, faces), cache=False))
     row("BoneSDF", field, build, vertices, faces)
@@ -126,7 +133,8 @@ def exact_tools(mesh, vertices, faces):
     spent, _ = least(lambda: igl.signed_distance(points, vertices, faces, PSEUDONORMAL), 2)
     threads = os.environ.get("OMP_NUM_THREADS", "all")
     print(
-        f"libigl pseudonormals, tree included, {threads} threads: {1e9 * spent / len(points):.0f} ns a value"
+        f"libigl pseudonormals, tree included, {threads} threads: {1e9 * spent / len(points):.0f} "
+        "ns a value"
     )
     spent, _ = least(lambda: trimesh.proximity.signed_distance(mesh, points[:SLOW]), 1)
     print(f"trimesh: {1e9 * spent / SLOW:.0f} ns a value")
@@ -150,7 +158,8 @@ def build_stages(mesh):
     points = points[np.linalg.norm(points - place, axis=1) > 2.0 * radius]
     right = np.mean(field.distance(points) * judge(points, vertices, faces)[0] >= 0.0)
     print(
-        f"1 % of the faces removed: built in {spent:.3f} s, sign right for {100 * right:.4f} % away from the hole"
+        f"1 % of the faces removed: built in {spent:.3f} s, sign right for {100 * right:.4f} % "
+        "away from the hole"
     )
 
 

@@ -1,8 +1,10 @@
-"""Shapes in motions of several coordinates together: handles, flicker, crossings, points that stay beyond bones.
+"""Shapes in motions of several coordinates together: handles, flicker, crossings, points that stay
+beyond bones.
 
-python benchmarks/combined_motions.py phantom            # the embedded hip
-python benchmarks/combined_motions.py path/to/flexion.toml --muscles gluteus_maximus --set model.surface=marching
-python benchmarks/combined_motions.py path/to/flexion.toml --seeds 7 8 9 10 11 --model pbd
+python benchmarks/combined_motions.py phantom            # the embedded hip python
+benchmarks/combined_motions.py path/to/flexion.toml --muscles gluteus_maximus --set
+model.surface=marching python benchmarks/combined_motions.py path/to/flexion.toml --seeds 7 8 9 10
+11 --model pbd
 """
 
 import argparse
@@ -17,17 +19,31 @@ from rbfmuscle.scene.settings import parse_settings
 
 # Degrees from rest to the end of each coordinate, all together, or angles of stops on a way.
 RAMPS = {
-    "flexion, abduction, internal rotation": {"flexion": 90, "adduction": -25, "internal_rotation": 20},
-    "flexion, adduction, external rotation": {"flexion": 60, "adduction": 12, "internal_rotation": -25},
+    "flexion, abduction, internal rotation": {
+        "flexion": 90,
+        "adduction": -25,
+        "internal_rotation": 20,
+    },
+    "flexion, adduction, external rotation": {
+        "flexion": 60,
+        "adduction": 12,
+        "internal_rotation": -25,
+    },
 }
 STEP = 1.5
 # A walk of stops up to so many degrees apart, within these bounds.
-WALK, FARTHEST, SEED = 40, 20.0, 7
+WALK = 40
+FARTHEST = 20.0
+SEED = 7
 # What is shown of each muscle, its greatest over the frames, and the flicker that is wanted [mm].
 WORST = (
-    "self_crossings", "flicker", "unfitted_fraction", "penetration_max", "bone_penetration_max",
+    "self_crossings",
+    "flicker",
+    "unfitted_fraction",
+    "penetration_max",
+    "bone_penetration_max",
     "volume_error",
-)  # fmt: skip
+)
 FLICKER = 0.5
 BOUNDS = {"flexion": (-15, 80), "adduction": (-30, 12), "internal_rotation": (-25, 25)}
 
@@ -38,8 +54,11 @@ def ramp(ends: dict) -> dict:
 
 
 def walk(stops: int, seed: int = SEED) -> list[dict]:
-    """Stops of a random walk, each up to `FARTHEST` degrees from the one before in each coordinate."""
-    rng, here, path = np.random.default_rng(seed), dict.fromkeys(BOUNDS, 0.0), [{}]
+    """Stops of a random walk, each up to `FARTHEST` degrees from the one before in each
+    coordinate."""
+    rng = np.random.default_rng(seed)
+    here = dict.fromkeys(BOUNDS, 0.0)
+    path = [{}]
     for _ in range(stops):
         for name, (low, high) in BOUNDS.items():
             here[name] = float(np.clip(here[name] + rng.uniform(-FARTHEST, FARTHEST), low, high))
@@ -48,7 +67,9 @@ def walk(stops: int, seed: int = SEED) -> list[dict]:
 
 
 def measure(scene: rm.Scene, model: str | None) -> tuple[list[tuple], float]:
-    """Run a scene; for each muscle its worst figures over the frames, and the processor time of a frame [s]."""
+    """Run a scene; for each muscle its worst figures over the frames, and the processor time of a
+    frame [s].
+    """
     started = time.process_time()
     run = rm.simulate(scene, model=model)
     spent = (time.process_time() - started) / len(run.frames)
@@ -59,9 +80,20 @@ def measure(scene: rm.Scene, model: str | None) -> tuple[list[tuple], float]:
             for action in ("unresolved", "grazed", "held_back")
         }
         euler = run.values(name, "euler")
-        worst = {q: abs(run.values(name, q)).max(initial=0.0) for q in WORST if q in run.summary[name]}
+        worst = {
+            q: abs(run.values(name, q)).max(initial=0.0) for q in WORST if q in run.summary[name]
+        }
         flicker = run.values(name, "flicker")
-        rows.append((name, int((euler != 2).sum()), len(euler), int((flicker > FLICKER).sum()), worst, count))
+        rows.append(
+            (
+                name,
+                int((euler != 2).sum()),
+                len(euler),
+                int((flicker > FLICKER).sum()),
+                worst,
+                count,
+            )
+        )
     return rows, spent
 
 
@@ -69,7 +101,8 @@ def show(title: str, frames: int, rows: list[tuple], spent: float) -> None:
     """Print the table of a motion."""
     print(f"\n{title}: {frames} frames, {spent:.2f} s of processor time each, measures included")
     print(
-        "| muscle | frames with handles | crossing | flicker max (frames over 0.5) | unfitted | surface in bones "
+        "| muscle | frames with handles | crossing | flicker max (frames over 0.5) | unfitted | "
+        "surface in bones "
         "| bones in muscle | volume | unresolved | grazed | held back |"
     )
     print("|---" * 11 + "|")
@@ -79,7 +112,8 @@ def show(title: str, frames: int, rows: list[tuple], spent: float) -> None:
             f"| {worst.get('flicker', 0.0):.2f} ({over}) "
             f"| {worst.get('unfitted_fraction', 0.0):.3f} "
             f"| {worst['penetration_max']:.3f} | {worst['bone_penetration_max']:.3f} "
-            f"| {worst['volume_error']:.0e} | {events['unresolved']} | {events['grazed']} | {events['held_back']} |",
+            f"| {worst['volume_error']:.0e} | {events['unresolved']} | {events['grazed']} | "
+            f"{events['held_back']} |",
             flush=True,
         )
 
@@ -91,9 +125,13 @@ def main() -> None:
     parser.add_argument("--muscles", nargs="*")
     parser.add_argument("--model")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--seeds", nargs="*", type=int, help="random walks of these seeds, and nothing else")
+    parser.add_argument(
+        "--seeds", nargs="*", type=int, help="random walks of these seeds, and nothing else"
+    )
     arguments = parser.parse_args()
-    scene = phantom_scene() if arguments.scene == "phantom" else rm.Scene.load(Path(arguments.scene))
+    scene = (
+        phantom_scene() if arguments.scene == "phantom" else rm.Scene.load(Path(arguments.scene))
+    )
     scene = scene.with_options(parse_settings(arguments.set))
     if arguments.muscles:
         scene.muscles = [scene.muscle(name) for name in arguments.muscles]
@@ -101,7 +139,10 @@ def main() -> None:
     motions[f"random walk of {WALK} stops"] = {"waypoints": walk(WALK), "step": FARTHEST}
     if arguments.seeds:
         motions = {
-            f"random walk of {WALK} stops, seed {seed}": {"waypoints": walk(WALK, seed), "step": FARTHEST}
+            f"random walk of {WALK} stops, seed {seed}": {
+                "waypoints": walk(WALK, seed),
+                "step": FARTHEST,
+            }
             for seed in arguments.seeds
         }
     for title, motion in motions.items():

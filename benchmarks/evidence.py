@@ -1,4 +1,6 @@
-"""Files of evidence: what the tables of the pages are made of, each with command, commit, machine and date."""
+"""Files of evidence: what the tables of the pages are made of, each with command, commit, machine
+and date.
+"""
 
 import datetime
 import json
@@ -15,7 +17,9 @@ def data_folder(name):
     for place in (os.environ.get("RBFMUSCLE_DATA"), ROOT.parent / "shared" / "data"):
         if place and (Path(place) / name).is_dir():
             return Path(place) / name
-    raise SystemExit(f"data/{name} is not here; set RBFMUSCLE_DATA to the folder that holds {name}/")
+    raise SystemExit(
+        f"data/{name} is not here; set RBFMUSCLE_DATA to the folder that holds {name}/"
+    )
 
 
 def machine():
@@ -30,12 +34,16 @@ def commit():
     """The commit that was measured, with a plus where files were changed since."""
     run = {"cwd": ROOT, "capture_output": True, "text": True, "check": True}
     number = subprocess.run(["git", "rev-parse", "--short", "HEAD"], **run).stdout.strip()
-    changed = subprocess.run(["git", "status", "--porcelain", "--untracked-files=no"], **run).stdout.strip()
+    changed = subprocess.run(
+        ["git", "status", "--porcelain", "--untracked-files=no"], **run
+    ).stdout.strip()
     return number + ("+" if changed else "")
 
 
 def provenance(command):
-    """Where figures come from that are measured now; files in the command are named without their folders."""
+    """Where figures come from that are measured now; files in the command are named without their
+    folders.
+    """
     words = (Path(word).name if word.endswith(".toml") else word for word in command)
     return {
         "command": f"python {' '.join(words)}",

@@ -1,7 +1,9 @@
-"""Every kernel at the extremes: right within a bound, or a warning or an error that names cause and remedy.
+"""Every kernel at the extremes: right within a bound, or a warning or an error that names cause and
+remedy.
 
-``python benchmarks/extremes.py [--kernels a,b]`` fits an ellipsoid (half axes 3, 2 and 1) under every extreme and says
-how many kernels are right, warned of, refused, or wrong without a word ("silent": the one outcome that must not occur).
+``python benchmarks/extremes.py [--kernels a,b]`` fits an ellipsoid (half axes 3, 2 and 1) under
+every extreme and says how many kernels are right, warned of, refused, or wrong without a word
+("silent": the one outcome that must not occur).
 """
 
 import argparse
@@ -16,7 +18,8 @@ from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.validation import NumericalWarning
 
 HALF = np.array([3.0, 2.0, 1.0])
-# Shape parameters, in units of 1 / (mean distance to the nearest centre); numbers of centres and their bounds.
+# Shape parameters, in units of 1 / (mean distance to the nearest centre); numbers of centres and
+# their bounds.
 SHAPES = (1e-3, 1e-2, 0.1, 1.0, 10.0, 1e3)
 COUNTS = {4: 1.0, 10: 1.0, 50: 0.5, 1000: 0.05}
 OUTCOMES = ("right", "warned", "refused", "silent")
@@ -33,7 +36,9 @@ def spiral(count):
 
 
 def judge_at(size=1.0, shift=0.0):
-    """What measures a field's surface at unseen points of a scaled and shifted ellipsoid, in shortest half axes."""
+    """What measures a field's surface at unseen points of a scaled and shifted ellipsoid, in
+    shortest half axes.
+    """
     unseen, true = spiral(997)
 
     def judge(field):
@@ -67,7 +72,14 @@ def cases():
     for noise in (0.01, 0.1):
         noisy = normals + noise * rng.normal(size=normals.shape)
         yield f"{100 * noise:g} % noise on normals", points, noisy, 0.1, judge_at(), 0.1
-    yield "single precision", points.astype(np.float32), normals.astype(np.float32), 0.1, judge_at(), 0.1
+    yield (
+        "single precision",
+        points.astype(np.float32),
+        normals.astype(np.float32),
+        0.1,
+        judge_at(),
+        0.1,
+    )
     near = points.copy()
     near[10] = near[20] + [1e-12, 0.0, 0.0]
     yield "two centres 1e-12 apart", near, normals, 0.1, judge_at(), 0.1
@@ -78,10 +90,20 @@ def cases():
     middle = 0.5 * (side[:-1] + side[1:]) + [0.0, 0.0, 0.05]
     two_sides = np.repeat([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], len(side), axis=0)
     plate = np.vstack([side, side + [0.0, 0.0, 0.1]])
-    yield "thin plate, 0.1 of 50", plate, two_sides, 0.1, sides_of(middle, middle + [0, 0, 0.2], True), 0.2
+    yield (
+        "thin plate, 0.1 of 50",
+        plate,
+        two_sides,
+        0.1,
+        sides_of(middle, middle + [0, 0, 0.2], True),
+        0.2,
+    )
     up = np.tile([0.0, 0.0, 1.0], (25, 1))
     grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), [0.0]), axis=-1).reshape(-1, 3)
-    for name, flat in (("coplanar", grid), ("collinear", np.arange(25.0)[:, None] * [1.0, 0.0, 0.0])):
+    for name, flat in (
+        ("coplanar", grid),
+        ("collinear", np.arange(25.0)[:, None] * [1.0, 0.0, 0.0]),
+    ):
         between = 0.5 * (flat[:-1] + flat[1:])
         judge = sides_of(between - [0.0, 0.0, 0.2], between + [0.0, 0.0, 0.2], False)
         yield f"{name} centres", flat, up, 0.1, judge, 0.1

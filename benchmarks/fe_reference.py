@@ -1,10 +1,12 @@
 """The finite-element reference: the phantom's extensor, nearly incompressible, wrapped by flexion.
 
-    python benchmarks/fe_reference.py solve [FILE] [--cells 40 12 8]     the reference, a small .npz file
-    python benchmarks/fe_reference.py compare [FILE]                        distance of every model to it
+    python benchmarks/fe_reference.py solve [FILE] [--cells 40 12 8]     the reference, a small .npz
+    file python benchmarks/fe_reference.py compare [FILE]                        distance of every
+    model to it
 
-``solve`` needs the extra ``fem`` (scikit-fem). The mesh is a regular grid of bricks in a cube, mapped onto the
-tube; what is kept are the places of the phantom's surface vertices, which go along with the bricks.
+``solve`` needs the extra ``fem`` (scikit-fem). The mesh is a regular grid of bricks in a cube,
+mapped onto the tube; what is kept are the places of the phantom's surface vertices, which go along
+with the bricks.
 """
 
 import argparse
@@ -40,7 +42,8 @@ DATA = Path(__file__).resolve().parents[1] / "tests" / "data" / "fe_reference.np
 def solid_points(tube, cube):
     """Points of the tube's solid, for points of the cube [-1, 1]^3 (along, across, thick).
 
-    The square becomes a disc (elliptical grid mapping), disc and length the solid rho^2 + |z|^fullness <= 1.
+    The square becomes a disc (elliptical grid mapping), disc and length the solid rho^2 +
+    |z|^fullness <= 1.
     """
     t, x, y = cube.T
     p, q = x * np.sqrt(1 - y**2 / 2), y * np.sqrt(1 - x**2 / 2)
@@ -66,7 +69,9 @@ def _place(tube, z, p, q):
 
 
 def cube_points(tube, vertices, u):
-    """Inverse of `solid_points` for the vertices of the tube's surface mesh at fractions u of its axis."""
+    """Inverse of `solid_points` for the vertices of the tube's surface mesh at fractions u of its
+    axis.
+    """
     power = tube.fullness
     z = 2 * u - 1
     centre, wide, thin = tube.sections(u)
@@ -111,7 +116,9 @@ class Course:
         first, last = ATTACHED_ENDS[MUSCLE]
         along = np.clip((u - first) / (last - first), 0, 1)
         along = along**2 * (3 - 2 * along)
-        self.share = np.stack([1 - along, along], axis=1)  # of the pelvis's and of the femur's motion
+        self.share = np.stack(
+            [1 - along, along], axis=1
+        )  # of the pelvis's and of the femur's motion
         self.solid.set_obstacles(self._distance, self.owner >= 0)
         self.poses = bone_poses(self.scene, {})
 
@@ -135,7 +142,9 @@ class Course:
         return nearest_bone(self.fields, self.poses, points)
 
     def advance(self, displacement, before, angle):
-        """Solve at an angle [degree]: nodes start where their share of the bone's motion takes them."""
+        """Solve at an angle [degree]: nodes start where their share of the bone's motion takes
+        them.
+        """
         self.poses = bone_poses(self.scene, {COORDINATE: np.radians(angle)})
         old = bone_poses(self.scene, {COORDINATE: np.radians(before)})
         place = self.solid.rest + displacement
@@ -184,18 +193,28 @@ def solve(path, cells, ratio=1.0):
     start = time.perf_counter()
     course = Course(cells, ratio)
     print(f"{len(course.solid.rest)} nodes, {(course.owner >= 0).sum()} of them attached")
-    angles, places, depths, volumes = [], [], [], []
+    angles = []
+    places = []
+    depths = []
+    volumes = []
     for angle, displacement, depth, volume in course.run():
-        print(f"at {angle:g} degrees: {depth:.3f} mm deep, volume {100 * volume:+.3f} %", flush=True)
+        print(
+            f"at {angle:g} degrees: {depth:.3f} mm deep, volume {100 * volume:+.3f} %", flush=True
+        )
         angles.append(angle)
         places.append(np.round(carried(course, displacement), 3).astype(np.float32))
         depths.append(depth)
         volumes.append(volume)
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
-        path, angles=angles, vertices=np.array(places), depth=depths, volume_error=volumes, cells=cells,
+        path,
+        angles=angles,
+        vertices=np.array(places),
+        depth=depths,
+        volume_error=volumes,
+        cells=cells,
         fibre_ratio=ratio,
-    )  # fmt: skip
+    )
     print(f"{path}: {path.stat().st_size} bytes, {time.perf_counter() - start:.0f} s")
 
 
@@ -244,7 +263,9 @@ def compare(path):
     own = "".join(f"      -       - {100 * (v / volumes[0] - 1):+6.2f} %  " for v in volumes)
     print(f"{'finite elements':18}{own}")
     for model in COMPARED:
-        cells = "".join(f"{r:7.2f} {w:7.2f} {100 * v:+6.2f} %  " for _, r, w, v in distances(model, kept))
+        cells = "".join(
+            f"{r:7.2f} {w:7.2f} {100 * v:+6.2f} %  " for _, r, w, v in distances(model, kept)
+        )
         print(f"{model:18}{cells}", flush=True)
 
 

@@ -2,8 +2,8 @@
 
     python benchmarks/frame_rate.py SCENE.toml [...] [--set KEY=VALUE ...] [--repeat N]
 
-The median time from frame to frame without the first, which loads and compiles. Then the median of each stage
-of each muscle [ms].
+The median time from frame to frame without the first, which loads and compiles. Then the median of
+each stage of each muscle [ms].
 """
 
 import argparse
@@ -33,12 +33,16 @@ def measure(path, settings, repeat):
         wall, frames = frames_of(scene)
         walls.append(wall)
     low, middle, high = np.percentile(walls, [0, 50, 100])
-    print(f"{path.stem}: {middle:.1f} ms ({low:.1f} to {high:.1f}), {1e3 / middle:.0f} frames per second")
+    print(
+        f"{path.stem}: {middle:.1f} ms ({low:.1f} to {high:.1f}), {1e3 / middle:.0f} frames "
+        "per second"
+    )
     for muscle in scene.muscles:
         times = [frame.times[muscle.name] for frame in frames]
         stages = {key: 1e3 * np.median([t.get(key, 0.0) for t in times]) for key in times[0]}
         print(
-            f"  {muscle.name}: " + ", ".join(f"{k.removeprefix('time_')} {v:.1f}" for k, v in stages.items())
+            f"  {muscle.name}: "
+            + ", ".join(f"{k.removeprefix('time_')} {v:.1f}" for k, v in stages.items())
         )
 
 

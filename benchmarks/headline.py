@@ -2,9 +2,9 @@
 
     python benchmarks/headline.py SCENE.toml [-o docs/evidence/headline.json]
 
-The scene's ramp by 2 degrees with all metrics in every frame; its end reached in steps of 2, 5, 10 and 30 degrees; the
-motion and its reverse. Values are the worst of all muscles and frames. Times are processor times of one thread for all
-muscles, with surfaces and without metrics.
+The scene's ramp by 2 degrees with all metrics in every frame; its end reached in steps of 2, 5, 10
+and 30 degrees; the motion and its reverse. Values are the worst of all muscles and frames. Times
+are processor times of one thread for all muscles, with surfaces and without metrics.
 """
 
 import argparse
@@ -25,9 +25,16 @@ ROOT = Path(__file__).resolve().parent.parent
 MODELS = ("rbf", "pbd")  # pbd-converged takes half an hour
 STEPS = (2.0, 5.0, 10.0, 30.0)
 WORST = (
-    "volume_error", "penetration_max", "bone_penetration_max", "solver_penetration_max", "rest_error_rms",
-    "rest_error_max", "flicker", "slack", "self_crossings",
-)  # fmt: skip
+    "volume_error",
+    "penetration_max",
+    "bone_penetration_max",
+    "solver_penetration_max",
+    "rest_error_rms",
+    "rest_error_max",
+    "flicker",
+    "slack",
+    "self_crossings",
+)
 
 
 def worst(run, quantity):
@@ -77,7 +84,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, metavar="SCENE.toml")
     parser.add_argument("--models", default=",".join(MODELS))
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "evidence" / "headline.json")
+    parser.add_argument(
+        "-o", "--output", type=Path, default=ROOT / "docs" / "evidence" / "headline.json"
+    )
     given = parser.parse_args()
     rows = {model: measure(given.scene, model) for model in given.models.split(",")}
     write_evidence(given.output, ["benchmarks/headline.py", str(given.scene)], rows)

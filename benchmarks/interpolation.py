@@ -1,7 +1,7 @@
 """Fits and evaluation of the fields, as ratios: ``make bench``.
 
-Both sides of a row work in one process, in turns, and the least of several rounds counts: on a shared machine ratios
-hold, milliseconds do not.
+Both sides of a row work in one process, in turns, and the least of several rounds counts: on a
+shared machine ratios hold, milliseconds do not.
 """
 
 import argparse
@@ -17,8 +17,16 @@ from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.validation import NumericalWarning
 
-SHARED = {"linear": 1.0, "cubic": 1.0, "quintic": 1.0, "thin_plate_spline": 1.0, "multiquadric": 4.0,
-          "inverse_multiquadric": 4.0, "inverse_quadratic": 4.0, "gaussian": 6.0}  # fmt: skip
+SHARED = {
+    "linear": 1.0,
+    "cubic": 1.0,
+    "quintic": 1.0,
+    "thin_plate_spline": 1.0,
+    "multiquadric": 4.0,
+    "inverse_multiquadric": 4.0,
+    "inverse_quadratic": 4.0,
+    "gaussian": 6.0,
+}
 COUNTS = (500, 1000, 2000)
 ROUNDS = 5
 
@@ -38,12 +46,13 @@ def least_times(*works):
 def compare(work, ours, theirs, *, apart=False):
     """Time ``ours`` against SciPy's ``theirs``, print the line and return it.
 
-    ``apart`` times all rounds of one, then of the other: BLAS threads of a peer go on waiting on the cores for
-    some 20 ms after their work, which would be counted to ours.
+    ``apart`` times all rounds of one, then of the other: BLAS threads of a peer go on waiting on
+    the cores for some 20 ms after their work, which would be counted to ours.
     """
     mine, yours = (least_times(ours) + least_times(theirs)) if apart else least_times(ours, theirs)
     print(
-        f"{work:40}{1e3 * mine:9.2f} ms, SciPy {1e3 * yours:9.2f} ms, ratio {yours / mine:6.2f}", flush=True
+        f"{work:40}{1e3 * mine:9.2f} ms, SciPy {1e3 * yours:9.2f} ms, ratio {yours / mine:6.2f}",
+        flush=True,
     )
     return {"work": work, "ours": mine, "theirs": yours, "ratio": yours / mine}
 

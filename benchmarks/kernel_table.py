@@ -1,8 +1,9 @@
 """Choices of `rbfmuscle kernels` against a brute force of 40 shape parameters.
 
-``python benchmarks/kernel_table.py DATA [--kernels a,b] [--centres 150,300] [--placements greedy,fitted]``: DATA holds
-``hip``. Prints for each case the RMS error both ways of the choice over the best of the scan, by the same judge, the
-condition and the processor time of the row; then the share of cases within 5 %. One thread.
+``python benchmarks/kernel_table.py DATA [--kernels a,b] [--centres 150,300] [--placements
+greedy,fitted]``: DATA holds ``hip``. Prints for each case the RMS error both ways of the choice
+over the best of the scan, by the same judge, the condition and the processor time of the row; then
+the share of cases within 5 %. One thread.
 """
 
 import argparse
@@ -44,7 +45,9 @@ def error(judge, sample, fit):
         field = fit.fit(sample.points, sample.normals)
         if not find_sheets(field, sample.points, judge.distance.unsigned).sound():
             return np.inf
-        found = extract_surface(field, points=sample.points, resolution=judge.resolution, axes=judge.axes)
+        found = extract_surface(
+            field, points=sample.points, resolution=judge.resolution, axes=judge.axes
+        )
     except (ValueError, np.linalg.LinAlgError):
         return np.inf
     if abs(found.volume / judge.volume - 1.0) > VOLUME_BOUND:
@@ -53,8 +56,12 @@ def error(judge, sample, fit):
 
 
 def best_of_scan(judge, found, own):
-    """Least error of the scan; fits that miss by more than the best did both ways, to first order, are passed over."""
-    sample, best, h = found.sample, own, float(spacing(found.sample.points).mean())
+    """Least error of the scan; fits that miss by more than the best did both ways, to first order,
+    are passed over.
+    """
+    sample = found.sample
+    best = own
+    h = float(spacing(found.sample.points).mean())
     for epsilon in np.geomspace(*SPAN, SCANNED) / h:
         fit = replace(found.fit, epsilon=float(epsilon))
         try:
@@ -93,10 +100,17 @@ def main():
                         if row["unfit"]
                         else f"{own:.3g}, ratio {own / best:.3f}"
                     )
-                    print(f"{name} {count} {placement} {kernel.name}: {said}, {row['condition'] or np.nan:.1e}, "
-                          f"{spent:.1f} s", flush=True)  # fmt: skip
-    print(f"{np.mean(np.array(ratios) <= LIMIT):.1%} of {len(ratios)} within 5 %; of {len(unfit)} unfit "
-          f"{np.isfinite(unfit).sum()} where the scan has a fit one")  # fmt: skip
+                    print(
+                        f"{name} {count} {placement} {kernel.name}: {said}, "
+                        f"{row['condition'] or np.nan:.1e}, "
+                        f"{spent:.1f} s",
+                        flush=True,
+                    )
+    print(
+        f"{np.mean(np.array(ratios) <= LIMIT):.1%} of {len(ratios)} within 5 %; of "
+        f"{len(unfit)} unfit "
+        f"{np.isfinite(unfit).sum()} where the scan has a fit one"
+    )
 
 
 if __name__ == "__main__":

@@ -2,10 +2,11 @@
 
     python benchmarks/known_answers.py [PART ...]
 
-Parts are ``stretched``, ``bent``, ``wrapped`` (against closed forms), ``solid`` (what held ends do; needs the extra
-``fem``), ``centres``, ``meshes``, ``iterations``, ``substeps`` (converged runs on the phantom). Without
-any, all tables are printed: some ten minutes on one thread. Errors are in per cent; the order is the slope of the
-error's logarithm over that of the spacing (1 / sqrt(centres), or the mesh's edge).
+Parts are ``stretched``, ``bent``, ``wrapped`` (against closed forms), ``solid`` (what held ends do;
+needs the extra ``fem``), ``centres``, ``meshes``, ``iterations``, ``substeps`` (converged runs on
+the phantom). Without any, all tables are printed: some ten minutes on one thread. Errors are in per
+cent; the order is the slope of the error's logarithm over that of the spacing (1 / sqrt(centres),
+or the mesh's edge).
 """
 
 import argparse
@@ -93,7 +94,9 @@ def bent(model, spacing):
 
 def wrapped(over, model, spacing):
     """Errors of a strip over a cylinder or a sphere."""
-    played = play(wrapped_strip(TURNS[over], over=over, spacing=spacing, model=model), surfaces=False)
+    played = play(
+        wrapped_strip(TURNS[over], over=over, spacing=spacing, model=model), surfaces=False
+    )
     angle = math.radians(TURNS[over])
     added, lifted = wrapped_path(angle, bar=STRIPS[over])
     places = played.carried[0]
@@ -112,8 +115,14 @@ def mesh_levels(name, spacings, options=None):
 
 
 def settled(sweeps, spacing):
-    """Options of PBD with stiff fibres and as many sweeps as let the shape settle, more on finer meshes."""
-    return lambda h: {"fibre_exponent": 0.0, "slack": 1.0, "iterations": round(sweeps * (spacing / h) ** 2)}
+    """Options of PBD with stiff fibres and as many sweeps as let the shape settle, more on finer
+    meshes.
+    """
+    return lambda h: {
+        "fibre_exponent": 0.0,
+        "slack": 1.0,
+        "iterations": round(sweeps * (spacing / h) ** 2),
+    }
 
 
 def table(title, levels, measure, keys):
@@ -142,18 +151,23 @@ def stretched_tables():
             ("arap-volume", mesh_levels("arap-volume", meshes)),
         ):
             table(
-                f"stretch {stretch:g}, {name}", levels,
+                f"stretch {stretch:g}, {name}",
+                levels,
                 lambda model, spacing: stretched(stretch, model, spacing),  # noqa: B023
                 ("radius", "radius_ends", "waviness", "path", "volume"),
-            )  # fmt: skip
+            )
 
 
 def solid_table():
-    """What the held ends do to a solid: an incompressible bar of bricks, pulled with its end faces held."""
+    """What the held ends do to a solid: an incompressible bar of bricks, pulled with its end faces
+    held.
+    """
     from peers.finite_element import HexSolid, brick_grid
 
     print("\n### solid of bricks, stretch 1.3\n\n| bricks | radius_ends | volume |\n|---|---|---|")
-    goal, steps, half = STRETCHES[-1], 10, 0.5 * ROUND_BAR.length
+    goal = STRETCHES[-1]
+    steps = 10
+    half = 0.5 * ROUND_BAR.length
     for cells in ((40, 4, 4), (60, 6, 6)):
         cube, bricks = brick_grid(cells)
         disc = cube[:, 1:] * np.sqrt(1.0 - cube[:, :0:-1] ** 2 / 2)  # of the square
@@ -169,7 +183,10 @@ def solid_table():
         radius = np.linalg.norm((solid.rest + u)[rim, 1:], axis=1).mean()
         error = radius * math.sqrt(goal) / ROUND_BAR.thickness - 1.0
         volume = solid.volume(u) / solid.volume(np.zeros_like(u)) - 1.0
-        print(f"| {' × '.join(map(str, cells))} | {100 * error:+.2f} | {100 * volume:+.2f} |", flush=True)
+        print(
+            f"| {' × '.join(map(str, cells))} | {100 * error:+.2f} | {100 * volume:+.2f} |",
+            flush=True,
+        )
 
 
 def bent_tables():
@@ -183,7 +200,10 @@ def bent_tables():
     table("bent, arap-volume by default", mesh_levels("arap-volume", meshes), bent, keys)
     stiff = {"slack": 1.0, "iterations": 100}
     table(
-        "bent, arap-volume settled", mesh_levels("arap-volume", (*meshes, 1.5), lambda h: stiff), bent, keys
+        "bent, arap-volume settled",
+        mesh_levels("arap-volume", (*meshes, 1.5), lambda h: stiff),
+        bent,
+        keys,
     )
 
 
@@ -205,7 +225,8 @@ def wrapped_tables():
         table(f"{title}, arap-volume by default", mesh_levels("arap-volume", meshes), measure, keys)
 
 
-# --- converged runs on the phantom ----------------------------------------------------------------------------
+# --- converged runs on the phantom
+# ----------------------------------------------------------------------------
 
 MUSCLE = "extensor"
 FLEXIONS = (30.0, 60.0)
@@ -213,12 +234,16 @@ SIDE = math.sqrt(2.0)
 
 
 def flexed(model, *, spacing=3.0, substep=2.0):
-    """The phantom's extensor alone at each of ``FLEXIONS``: list of (surface, carried vertices, elongation)."""
+    """The phantom's extensor alone at each of ``FLEXIONS``: list of (surface, carried vertices,
+    elongation).
+    """
     scene = phantom_scene(end=max(FLEXIONS), step=30.0, spacing=spacing, model=model)
     scene.muscles = [scene.muscle(MUSCLE)]
     scene = scene.with_options({"contact.substep_angle": substep})
     built = build_model(scene.muscles[0], scene)
-    rest, found, lengths = built.material_mesh(), [], []
+    rest = built.material_mesh()
+    found = []
+    lengths = []
     for frame in simulate_frames(scene, [built]):
         mesh = frame.carried[MUSCLE]
         lengths.append(path_length(centreline(scene.muscles[0], scene, rest, mesh, frame.poses)))
@@ -238,10 +263,12 @@ def apart(one, other, *, same_mesh):
 def converged(title, runs, *, same_mesh):
     """Print distances to the finest and to the next run, and the orders that follow.
 
-    ``runs`` holds (label, size, result of `flexed`) from coarse to fine. Where the results converge with an order p,
-    the differences of neighbours do so too.
+    ``runs`` holds (label, size, result of `flexed`) from coarse to fine. Where the results converge
+    with an order p, the differences of neighbours do so too.
     """
-    head = " | ".join(f"{angle:g}°: to the finest, worst | to the next | elongation" for angle in FLEXIONS)
+    head = " | ".join(
+        f"{angle:g}°: to the finest, worst | to the next | elongation" for angle in FLEXIONS
+    )
     print(f"\n### {title}\n\n| level | {head} |\n|---|{'---|---|---|' * len(FLEXIONS)}")
     steps = np.full((len(runs), len(FLEXIONS)), np.nan)
     for k, (label, _, result) in enumerate(runs):
@@ -254,10 +281,13 @@ def converged(title, runs, *, same_mesh):
         print(f"| {label} | {' | '.join(cells)} |", flush=True)
     sizes = [size for _, size, _ in runs]
     for j, angle in enumerate(FLEXIONS):
-        order = observed_order(sizes[-4:-1], steps[-4:-1, j])  # the coarsest are often beyond all order
+        order = observed_order(
+            sizes[-4:-1], steps[-4:-1, j]
+        )  # the coarsest are often beyond all order
         exponent, limit = richardson(sizes, [result[j][2] for _, _, result in runs])
         print(
-            f"{angle:g}°: surface of order {order:.1f}; elongation of order {exponent:.1f}, limit {limit:.3f} mm"
+            f"{angle:g}°: surface of order {order:.1f}; elongation of order {exponent:.1f}, limit "
+            f"{limit:.3f} mm"
         )
 
 
@@ -315,7 +345,9 @@ PARTS = {
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("parts", nargs="*", metavar="PART", choices=[*PARTS, []], help=", ".join(PARTS))
+    parser.add_argument(
+        "parts", nargs="*", metavar="PART", choices=[*PARTS, []], help=", ".join(PARTS)
+    )
     for part in parser.parse_args().parts or PARTS:
         PARTS[part]()
 

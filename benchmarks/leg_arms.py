@@ -1,11 +1,13 @@
-"""Moment arms of the leg's muscles at hip, knee and ankle, beside OpenSim's gait2392 and published measurements.
+"""Moment arms of the leg's muscles at hip, knee and ankle, beside OpenSim's gait2392 and published
+measurements.
 
     python benchmarks/leg_arms.py [--models rbf,pbd] [--joints hip,knee,ankle]
 
-One joint moves at a time through the squat's range, in the scene with tendons of ``leg_tendons.py``. The arm is minus
-the change of length from bone to bone with the joint's angle, in mm; positive where the muscle flexes hip or knee, or
-dorsiflexes the ankle. "Geodesic" is the same of the shortest path over the bones between the belly's ends, with the
-tendons: where it departs from gait2392, attachments or joints differ and not the muscle's shape. gait2392's arms
+One joint moves at a time through the squat's range, in the scene with tendons of
+``leg_tendons.py``. The arm is minus the change of length from bone to bone with the joint's angle,
+in mm; positive where the muscle flexes hip or knee, or dorsiflexes the ankle. "Geodesic" is the
+same of the shortest path over the bones between the belly's ends, with the tendons: where it
+departs from gait2392, attachments or joints differ and not the muscle's shape. gait2392's arms
 (mean over a muscle's paths) are those of `reference/anatomy`, beside the data.
 """
 
@@ -31,14 +33,19 @@ JOINTS = {
 # Clinical angle = coordinate + this (data/leg/README.md).
 OFFSET = {"hip": -3.7, "knee": -0.5, "ankle": -32.0}
 MUSCLES = {
-    "hip": "gluteus_maximus iliacus psoas_major rectus_femoris sartorius tensor_fasciae_latae adductor_longus "
+    "hip": "gluteus_maximus iliacus psoas_major rectus_femoris sartorius tensor_fasciae_latae "
+    "adductor_longus "
     "adductor_magnus semimembranosus semitendinosus biceps_femoris_long_head",
-    "knee": "rectus_femoris vastus_lateralis vastus_medialis semimembranosus semitendinosus biceps_femoris_long_head "
+    "knee": "rectus_femoris vastus_lateralis vastus_medialis semimembranosus semitendinosus "
+    "biceps_femoris_long_head "
     "biceps_femoris_short_head gracilis sartorius gastrocnemius_medial gastrocnemius_lateral",
-    "ankle": "soleus gastrocnemius_medial gastrocnemius_lateral tibialis_anterior extensor_digitorum_longus "
+    "ankle": "soleus gastrocnemius_medial gastrocnemius_lateral tibialis_anterior "
+    "extensor_digitorum_longus "
     "extensor_hallucis_longus tibialis_posterior flexor_hallucis_longus peroneus_longus",
 }
-AGREES = 10.0  # mm, on average: a geodesic nearer to gait2392 than this has its attachments and joints
+AGREES = (
+    10.0  # mm, on average: a geodesic nearer to gait2392 than this has its attachments and joints
+)
 # Least and greatest published arm [mm] over about the same range.
 PUBLISHED = {
     ("hip", "gluteus_maximus"): (-68, -31, "Németh and Ohlsen 1985; Dostal et al. 1986"),
@@ -48,18 +55,32 @@ PUBLISHED = {
     ("knee", "vastus_medialis"): (-50, -20, "Wilson and Sheehan 2009, patellar tendon"),
     ("knee", "semimembranosus"): (20, 40, "Spoor and van Leeuwen 1992, as in Tözeren 2000"),
     ("knee", "semitendinosus"): (40, 55, "Spoor and van Leeuwen 1992, as in Tözeren 2000"),
-    ("knee", "biceps_femoris_long_head"): (20, 20, "Spoor and van Leeuwen 1992, as in Tözeren 2000"),
+    ("knee", "biceps_femoris_long_head"): (
+        20,
+        20,
+        "Spoor and van Leeuwen 1992, as in Tözeren 2000",
+    ),
     ("knee", "gastrocnemius_medial"): (12, 20, "Spoor et al. 1990, as in Tözeren 2000"),
     ("knee", "gastrocnemius_lateral"): (12, 20, "Spoor et al. 1990, as in Tözeren 2000"),
     ("ankle", "soleus"): (-57, -35, "Achilles tendon, 17 studies in Manal et al. 2013"),
-    ("ankle", "gastrocnemius_medial"): (-57, -35, "Achilles tendon, 17 studies in Manal et al. 2013"),
-    ("ankle", "gastrocnemius_lateral"): (-57, -35, "Achilles tendon, 17 studies in Manal et al. 2013"),
+    ("ankle", "gastrocnemius_medial"): (
+        -57,
+        -35,
+        "Achilles tendon, 17 studies in Manal et al. 2013",
+    ),
+    ("ankle", "gastrocnemius_lateral"): (
+        -57,
+        -35,
+        "Achilles tendon, 17 studies in Manal et al. 2013",
+    ),
     ("ankle", "tibialis_anterior"): (29, 45, "Maganaris 2000"),
 }
 
 
 def joint_scene(file, joint):
-    """The scene with one joint moving through the squat's range, and the muscles of the table that cross it."""
+    """The scene with one joint moving through the squat's range, and the muscles of the table that
+    cross it.
+    """
     scene = Scene.load(file)
     coordinate, step = JOINTS[joint]
     last = scene.motion.frames[-1][coordinate]
@@ -70,7 +91,9 @@ def joint_scene(file, joint):
 
 
 def our_arms(scene, joint, model):
-    """Arms of each muscle between neighbouring frames, by length and by geodesic: name to ((n,), (n,)) [mm]."""
+    """Arms of each muscle between neighbouring frames, by length and by geodesic: name to ((n,),
+    (n,)) [mm].
+    """
     run = simulate(scene, model=model)
     angles = np.array([frame.coordinates[JOINTS[joint][0]] for frame in run.frames])
     found = {}
@@ -78,7 +101,9 @@ def our_arms(scene, joint, model):
         lengths, slack = run.values(muscle.name, "length"), run.values(muscle.name, "slack")
         tendons = sum(end.length for end in muscle.tendons)
         shortest = tendons + (lengths - tendons) / slack
-        found[muscle.name] = tuple(-np.diff(values) / np.diff(angles) for values in (lengths, shortest))
+        found[muscle.name] = tuple(
+            -np.diff(values) / np.diff(angles) for values in (lengths, shortest)
+        )
     return np.degrees(angles[1:] + angles[:-1]) / 2 + OFFSET[joint], found
 
 
@@ -89,11 +114,19 @@ def span(values):
 def verdict(ours, theirs):
     """Whether arms agree with gait2392's in sign and within a factor of two, by their means."""
     ratio = np.mean(ours) / np.mean(theirs)
-    return "wrong sign" if ratio < 0 else "beyond a factor of two" if not 0.5 <= ratio <= 2 else "within"
+    return (
+        "wrong sign"
+        if ratio < 0
+        else "beyond a factor of two"
+        if not 0.5 <= ratio <= 2
+        else "within"
+    )
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--models", default="rbf")
     parser.add_argument("--joints", default="hip,knee,ankle")
     arguments = parser.parse_args()
@@ -127,11 +160,15 @@ def main():
                 if at:
                     inside = (angles >= min(at) - 5) & (angles <= max(at) + 5)
                     compared = np.interp(angles[inside], at, means)
-                    mean, of_geodesic = (np.mean(np.abs(a[inside] - compared)) for a in (arms, geodesic))
+                    mean, of_geodesic = (
+                        np.mean(np.abs(a[inside] - compared)) for a in (arms, geodesic)
+                    )
                     same = of_geodesic <= AGREES
                     differences += [mean] if same else []
                     result = (
-                        verdict(arms[inside], compared) if same else f"geodesic differs by {of_geodesic:.0f}"
+                        verdict(arms[inside], compared)
+                        if same
+                        else f"geodesic differs by {of_geodesic:.0f}"
                     )
                     row += [span(compared), published, f"{mean:.0f}", result]
                 else:
@@ -139,7 +176,8 @@ def main():
                 print(f"| {' | '.join(row)} |", flush=True)
     if differences:
         print(
-            f"mean difference of the {len(differences)} whose geodesic agrees: {np.mean(differences):.1f} mm"
+            f"mean difference of the {len(differences)} whose geodesic agrees: "
+            f"{np.mean(differences):.1f} mm"
         )
 
 

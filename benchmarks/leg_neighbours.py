@@ -2,14 +2,15 @@
 
     python benchmarks/leg_neighbours.py [--frames 0:37:6] [--model rbf] [--muscles A,B] [--without]
 
-Runs a scene of ``data/leg`` with tendons (``leg_tendons.py``) and ``[sliding]`` through its whole motion and measures
-the shown surfaces of the chosen frames by exact distances, which the solver does not use: how deep a vertex of one
-muscle lies in another, and for vertices nearer than the threshold at rest how much farther they are now (RMS by pair).
-Both are listed by pair, the worst first, and as 95th percentiles over pairs and frames. What two bones hold on both
-sides is counted apart: where a vertex and what it meets of the other muscle both go along with bones, these decide how
-far they come apart or into each other. Beside the gap stands the RMS over the vertices that the neighbour still faces,
-without what slid past its rim (the way to the neighbour is more than 60 degrees off the vertex's own normal).
-``--without`` measures the same run without sliding.
+Runs a scene of ``data/leg`` with tendons (``leg_tendons.py``) and ``[sliding]`` through its whole
+motion and measures the shown surfaces of the chosen frames by exact distances, which the solver
+does not use: how deep a vertex of one muscle lies in another, and for vertices nearer than the
+threshold at rest how much farther they are now (RMS by pair). Both are listed by pair, the worst
+first, and as 95th percentiles over pairs and frames. What two bones hold on both sides is counted
+apart: where a vertex and what it meets of the other muscle both go along with bones, these decide
+how far they come apart or into each other. Beside the gap stands the RMS over the vertices that the
+neighbour still faces, without what slid past its rim (the way to the neighbour is more than 60
+degrees off the vertex's own normal). ``--without`` measures the same run without sliding.
 """
 
 import argparse
@@ -32,7 +33,8 @@ from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame_loop import FrameLoop
 
 THRESHOLD = 2.0  # mm: nearer at rest is touching, as `[sliding]` has it
-FACING = 0.5  # cosine between a vertex's normal and the way to its neighbour, from which on it faces that
+# cosine between a vertex's normal and the way to its neighbour, from which on it faces that
+FACING = 0.5
 TOLD = 12  # pairs listed of these
 
 
@@ -44,11 +46,15 @@ class Bench:
             scene = Scene.load(convert(data_folder("leg") / arguments.scene, Path(folder)))
         asked = {key: float(value) for key, value in (pair.split("=") for pair in arguments.set)}
         self.scenes = {
-            True: scene.with_options({"sliding.threshold": THRESHOLD, **asked}, model=arguments.model),
+            True: scene.with_options(
+                {"sliding.threshold": THRESHOLD, **asked}, model=arguments.model
+            ),
             False: scene.with_options({}, model=arguments.model),
         }
         self.scenes[False].sliding = None
-        named = arguments.muscles.split(",") if arguments.muscles else [m.name for m in scene.muscles]
+        named = (
+            arguments.muscles.split(",") if arguments.muscles else [m.name for m in scene.muscles]
+        )
         for one in self.scenes.values():
             one.muscles = [muscle for muscle in one.muscles if muscle.name in named]
         self.models = build_models(self.scenes[True])
@@ -99,8 +105,8 @@ class Touching:
         return self.held[one][index] & self.held[other][nearest]
 
     def opened(self, surfaces):
-        """RMS of how much farther these are, by pair of sorted names, and the same of those held on both sides; of the
-        first those that the neighbour faces.
+        """RMS of how much farther these are, by pair of sorted names, and the same of those held on
+        both sides; of the first those that the neighbour faces.
         """
         found = {}, {}, {}
         for (one, other), (index, rest, both) in self.found.items():
@@ -114,7 +120,9 @@ class Touching:
         return tuple(_rms_by_pair(squares) for squares in found)
 
     def overlaps(self, surfaces):
-        """Deepest vertex of one in the other, by pair of sorted names, and the deepest held on both sides."""
+        """Deepest vertex of one in the other, by pair of sorted names, and the deepest held on both
+        sides.
+        """
         free, held = {}, {}
         for one, other in itertools.permutations(surfaces, 2):
             near = _near(surfaces[one], surfaces[other], 0.0)
@@ -130,22 +138,28 @@ class Touching:
 
 def _rms_by_pair(squares):
     joined = {pair: np.concatenate(parts) for pair, parts in squares.items()}
-    return {pair: float(np.sqrt(part.mean())) if len(part) else 0.0 for pair, part in joined.items()}
+    return {
+        pair: float(np.sqrt(part.mean())) if len(part) else 0.0 for pair, part in joined.items()
+    }
 
 
 def _facing(one, other, index):
-    """Which vertices of one surface have the other before them, no farther off than 60 degrees, or touch it."""
+    """Which vertices of one surface have the other before them, no farther off than 60 degrees, or
+    touch it.
+    """
     points = one[0][index]
     distance, closest, _, _ = ExactDistance(*other).nearest(points)
-    normals = vertex_normals(np.ascontiguousarray(one[0]), np.ascontiguousarray(one[1], dtype=np.int64))[
-        index
-    ]
+    normals = vertex_normals(
+        np.ascontiguousarray(one[0]), np.ascontiguousarray(one[1], dtype=np.int64)
+    )[index]
     along = np.einsum("ij,ij->i", normals, closest - points)
     return along >= FACING * np.abs(distance) * np.linalg.norm(normals, axis=1) - 0.5
 
 
 def holders(scene, models, surfaces):
-    """What the vertices (n,) of each surface at rest go along with, as the model's nearest contact point does."""
+    """What the vertices (n,) of each surface at rest go along with, as the model's nearest contact
+    point does.
+    """
     found = {}
     for model in models:
         names = np.array([*scene.holders(scene.muscle(model.name)), ""])
@@ -160,12 +174,18 @@ def _near(one, other, reach):
 
 
 def _surfaces(frame):
-    return {name: (surface.vertices, np.asarray(surface.faces)) for name, surface in frame.surfaces.items()}
+    return {
+        name: (surface.vertices, np.asarray(surface.faces))
+        for name, surface in frame.surfaces.items()
+    }
 
 
 def pairs(bench, arguments):
     wanted = {0, *chosen(arguments.frames, len(bench.path))}
-    worst, touching, every, spent = {}, None, ([], []), 0.0
+    worst = {}
+    touching = None
+    every = ([], [])
+    spent = 0.0
     loop = bench.loop(sliding=not arguments.without)
     for k, coordinates in enumerate(bench.path[: max(wanted) + 1]):
         begin = time.process_time()
@@ -174,7 +194,9 @@ def pairs(bench, arguments):
         if frame is None:
             continue
         surfaces = _surfaces(frame)
-        touching = touching or Touching(surfaces, holders(bench.scenes[True], bench.models, surfaces))
+        touching = touching or Touching(
+            surfaces, holders(bench.scenes[True], bench.models, surfaces)
+        )
         opened = touching.opened(surfaces)
         # Overlap, gap; the same of what is held on both sides; the gap of what is faced.
         found = [one for pair in zip(touching.overlaps(surfaces), opened) for one in pair]
@@ -191,11 +213,15 @@ def pairs(bench, arguments):
     deep, wide = (np.percentile(values, 95) for values in every)
     print(f"95th percentile over pairs and frames: overlap {deep:.3f}, opened {wide:.3f}")
     print(f"{len(touching.found) // 2} pairs touch at rest, {len(worst)} pairs meet")
-    for name, places in (("muscle against muscle", (0, 1)), ("held by bones on both sides", (2, 3))):
+    for name, places in (
+        ("muscle against muscle", (0, 1)),
+        ("held by bones on both sides", (2, 3)),
+    ):
         _tell_pairs(name, {pair: [row[k] for k in places] for pair, row in worst.items()})
     wide = np.array([row[4][0] for row in worst.values()])
     print(
-        f"opened, faced by the neighbour: {(wide > 1.0).sum()} of {len(wide)} pairs beyond 1 mm RMS, "
+        f"opened, faced by the neighbour: {(wide > 1.0).sum()} of {len(wide)} pairs beyond 1 "
+        "mm RMS, "
         f"worst {wide.max():.3f}"
     )
     for pair, row in sorted(worst.items(), key=lambda item: -item[1][4][0])[:TOLD]:
@@ -210,9 +236,12 @@ def _tell_pairs(name, worst):
         if deep > 0.1 or wide > 0.3:
             print(f"{' and '.join(pair):60} {deep:7.3f} {at:2d} {wide:7.3f} {there:2d}")
     deep, wide = (np.array([row[k][0] for row in worst.values()]) for k in range(2))
-    print(f"overlap: {(deep > 0.3).sum()} of {len(deep)} pairs beyond 0.3 mm, worst {deep.max():.3f}")
     print(
-        f"opened: {(wide > 1.0).sum()} of {len(wide)} pairs beyond 1 mm RMS, worst {wide.max():.3f}",
+        f"overlap: {(deep > 0.3).sum()} of {len(deep)} pairs beyond 0.3 mm, worst {deep.max():.3f}"
+    )
+    print(
+        f"opened: {(wide > 1.0).sum()} of {len(wide)} pairs beyond 1 mm RMS, worst "
+        f"{wide.max():.3f}",
         flush=True,
     )
 
@@ -228,12 +257,16 @@ def _tell_frame(k, frame, values):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--scene", default="squat.toml")
     parser.add_argument("--model", default=None)
     parser.add_argument("--muscles", default="", help="some of them, by comma")
     parser.add_argument("--frames", default="0:1000:6", help="A:B:S")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the scene")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="of the scene"
+    )
     parser.add_argument("--without", action="store_true", help="measure a run without sliding")
     arguments = parser.parse_args()
     pairs(Bench(arguments), arguments)

@@ -1,10 +1,12 @@
-"""The scenes of data/leg with tendons in place of the carriers, and the patella on its table, in a work folder.
+"""The scenes of data/leg with tendons in place of the carriers, and the patella on its table, in a
+work folder.
 
     python benchmarks/leg_tendons.py OUT [SCENE ...]
 
-A belly that a carrier holds is joined to its bone by a tendon; so are ends of the vasti and the semimembranosus that
-stop short of theirs. Insertions and via points were read off the bones of data/leg (Visible Human Female; CC BY 4.0
-and zlib, see its README) at the sites that its `scene.json` names.
+A belly that a carrier holds is joined to its bone by a tendon; so are ends of the vasti and the
+semimembranosus that stop short of theirs. Insertions and via points were read off the bones of
+data/leg (Visible Human Female; CC BY 4.0 and zlib, see its README) at the sites that its
+`scene.json` names.
 """
 
 import argparse
@@ -108,8 +110,8 @@ TENDONS = {
 }
 
 
-# Attached vertices nearer than this to the muscle's other end are left free [mm]. Over the lesser sciatic notch lies a
-# bursa, and fibres of 16 mm would be stretched by 13 mm in the squat.
+# Attached vertices nearer than this to the muscle's other end are left free [mm]. Over the lesser
+# sciatic notch lies a bursa, and fibres of 16 mm would be stretched by 13 mm in the squat.
 FREE_NECK = {"obturator_internus pelvis": 40.0}
 
 
@@ -130,10 +132,14 @@ def convert(source: Path, out: Path) -> Path:
     if "file" in data["motion"]:
         data["motion"]["file"] = str(source.parent / data["motion"]["file"])
     ramp = data["motion"].get("ramp", {})
-    for name in [name for name in ramp if name.endswith(("_slide", "_turn")) or name == "patella_angle"]:
+    for name in [
+        name for name in ramp if name.endswith(("_slide", "_turn")) or name == "patella_angle"
+    ]:
         del ramp[name]
     if any(joint["child"] == "patella" for joint in data["joint"]):
-        data["joint"] = [joint for joint in data["joint"] if joint["child"] != "patella"] + [_patella(facts)]
+        data["joint"] = [joint for joint in data["joint"] if joint["child"] != "patella"] + [
+            _patella(facts)
+        ]
         row = {"coordinate": "patella.flexion", "of": ["knee.knee_angle"], "linear": [1, 0]}
         data.setdefault("coupling", []).append(row)
     for muscle in data["muscle"]:
@@ -148,7 +154,10 @@ def convert(source: Path, out: Path) -> Path:
 def _attachment(muscle: str, entry: dict, bones: set[str], folder: Path) -> dict:
     file = Path(entry["vertices"])
     bone = file.stem.removeprefix(f"{muscle}_")
-    found = {"bone": entry["bone"] if entry["bone"] in bones else bone, "vertices": str(folder / file)}
+    found = {
+        "bone": entry["bone"] if entry["bone"] in bones else bone,
+        "vertices": str(folder / file),
+    }
     tendon = dict(TENDONS.get(f"{muscle} {bone}", {}))
     if tendon and tendon.get("bone", bone) in bones:
         found["bone"] = tendon.pop("bone", bone)
@@ -160,7 +169,9 @@ def _without_neck(muscle: dict, entry: dict) -> list[int]:
     """Attached vertices that are not too near to the muscle's other end."""
     vertices = trimesh.load(muscle["mesh"], process=False).vertices
     own = np.loadtxt(entry["vertices"], dtype=int)
-    (other,) = [np.loadtxt(end["vertices"], dtype=int) for end in muscle["attach"] if end is not entry]
+    (other,) = [
+        np.loadtxt(end["vertices"], dtype=int) for end in muscle["attach"] if end is not entry
+    ]
     away = cKDTree(vertices[other]).query(vertices[own])[0]
     return own[away > FREE_NECK[f"{muscle['name']} {entry['bone']}"]].tolist()
 
@@ -173,17 +184,24 @@ def _patella(facts: dict) -> dict:
     axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
     def rows(values):
-        functions = [{"x": list(angles), "y": [round(float(v), 4) for v in column]} for column in values]
+        functions = [
+            {"x": list(angles), "y": [round(float(v), 4) for v in column]} for column in values
+        ]
         return [
             {"axis": axis, "coordinates": ["flexion"], "spline": function}
             for axis, function in zip(axes, functions)
         ]
 
     return {
-        "name": "patella", "parent": "femur", "child": "patella", "type": "custom",
-        "centre": table["point_mm"], "rotations": rows(turns), "translations": rows(rest[3:]),
+        "name": "patella",
+        "parent": "femur",
+        "child": "patella",
+        "type": "custom",
+        "centre": table["point_mm"],
+        "rotations": rows(turns),
+        "translations": rows(rest[3:]),
         "coordinates": {"flexion": {"motion": "rotation"}},
-    }  # fmt: skip
+    }
 
 
 def _toml(data: dict) -> str:

@@ -1,12 +1,14 @@
-"""Where a muscle's surface is at fault: in bones by held or free vertices, bone vertices in it, crossings of itself.
+"""Where a muscle's surface is at fault: in bones by held or free vertices, bone vertices in it,
+crossings of itself.
 
-    NUMBA_NUM_THREADS=1 python benchmarks/mesh_faults.py SCENE [--model pbd] [--muscles A,B] [--set KEY=VALUE ...]
+    NUMBA_NUM_THREADS=1 python benchmarks/mesh_faults.py SCENE [--model pbd] [--muscles A,B] [--set
+    KEY=VALUE ...]
                                                          [--frames A:B:S]
 
-Greatest depth over all frames, triangles that cross others (most in a frame, frames with any), greatest volume error,
-distance from the input mesh in the first frame, frames in which the surface is no sphere, and processor time of the
-frames without measures, files and pictures. A surface that is not the muscle's own mesh has no held vertices; all its
-depth then stands under "free".
+Greatest depth over all frames, triangles that cross others (most in a frame, frames with any),
+greatest volume error, distance from the input mesh in the first frame, frames in which the surface
+is no sphere, and processor time of the frames without measures, files and pictures. A surface that
+is not the muscle's own mesh has no held vertices; all its depth then stands under "free".
 """
 
 import argparse
@@ -23,8 +25,14 @@ from rbfmuscle.scene.settings import parse_settings
 from rbfmuscle.simulation.frame_loop import simulate_frames
 
 COLUMNS = (
-    "held in bone", "free in bone", "bone in muscle", "crossing", "frames", "volume error", "rest error"
-)  # fmt: skip
+    "held in bone",
+    "free in bone",
+    "bone in muscle",
+    "crossing",
+    "frames",
+    "volume error",
+    "rest error",
+)
 
 
 class Faults:
@@ -47,13 +55,22 @@ class Faults:
         volume = mesh_volume(vertices, faces)
         away = 0.0
         if not self.rows:
-            rest = MeshDistance(np.asarray(self.muscle.mesh.vertices), np.asarray(self.muscle.mesh.faces))
+            rest = MeshDistance(
+                np.asarray(self.muscle.mesh.vertices), np.asarray(self.muscle.mesh.faces)
+            )
             away = float(np.sqrt(np.mean(rest.unsigned(vertices) ** 2)))
-        self.rows.append((
-            depth[held].max(initial=0.0), depth[~held].max(initial=0.0),
-            bone_depth(MeshDistance(vertices, faces), probes, frame.poses), form["self_crossings"],
-            form["self_crossings"] > 0, abs(volume / self.muscle.mesh.volume - 1.0), away, form["euler"] != 2,
-        ))  # fmt: skip
+        self.rows.append(
+            (
+                depth[held].max(initial=0.0),
+                depth[~held].max(initial=0.0),
+                bone_depth(MeshDistance(vertices, faces), probes, frame.poses),
+                form["self_crossings"],
+                form["self_crossings"] > 0,
+                abs(volume / self.muscle.mesh.volume - 1.0),
+                away,
+                form["euler"] != 2,
+            )
+        )
 
     def worst(self):
         """One row of `COLUMNS`, and the frames that are no sphere."""
@@ -75,12 +92,18 @@ def main():
     given = parser.parse_args()
     scene = Scene.load(given.scene)
     if given.muscles:
-        scene.muscles[:] = [muscle for muscle in scene.muscles if muscle.name in given.muscles.split(",")]
-    scene = configure_scene(scene, parse_settings(given.set), model=given.model, frames=given.frames)
+        scene.muscles[:] = [
+            muscle for muscle in scene.muscles if muscle.name in given.muscles.split(",")
+        ]
+    scene = configure_scene(
+        scene, parse_settings(given.set), model=given.model, frames=given.frames
+    )
     faults = {muscle.name: Faults(muscle) for muscle in scene.muscles}
     probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
     models = [build_model(muscle, scene, muscle.model) for muscle in scene.muscles]
-    spent, start, events = 0.0, time.process_time(), {}
+    spent = 0.0
+    start = time.process_time()
+    events = {}
     for frame in simulate_frames(scene, models):
         spent += time.process_time() - start
         for found in faults.values():

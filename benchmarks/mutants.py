@@ -1,14 +1,16 @@
 """Planted faults: a seeded sample over all packages, each against the tests that reach its line.
 
-    python benchmarks/mutants.py record [TESTS...]              which tests run which lines, with and without compiler
-    python benchmarks/mutants.py run [--count N] [--seed S] [--minutes M]
+    python benchmarks/mutants.py record [TESTS...]              which tests run which lines, with
+    and without compiler python benchmarks/mutants.py run [--count N] [--seed S] [--minutes M]
     python benchmarks/mutants.py table [--seed S]
 
-A fault changes one expression: a comparison, an operator, a sign, a constant, a truth value. It lies in a copy of the
-checkout, never in the checkout. It is tried on quick tests of different files first, and what these let pass on more,
-each time first on some that compare with kept numbers. Faults in compiled loops are tried without compiler, then with
-it, all others with it. What went unnoticed is listed; what changes nothing that could be told is named in
-``.mutants/equivalent.json`` by its key, with the reason, and counted apart. The same command goes on where it ended.
+A fault changes one expression: a comparison, an operator, a sign, a constant, a truth value. It
+lies in a copy of the checkout, never in the checkout. It is tried on quick tests of different files
+first, and what these let pass on more, each time first on some that compare with kept numbers.
+Faults in compiled loops are tried without compiler, then with it, all others with it. What went
+unnoticed is listed; what changes nothing that could be told is named in
+``.mutants/equivalent.json`` by its key, with the reason, and counted apart. The same command goes
+on where it ended.
 """
 
 import argparse
@@ -34,18 +36,37 @@ from xml.etree import ElementTree
 ROOT = Path(__file__).resolve().parents[1]
 WORK = Path(os.environ.get("MUTANTS_FOLDER", ROOT / ".mutants"))
 PACKAGES = ("rbfmuscle", "pbd_baseline")
-# A fault is tried on so many tests at most, of so many seconds together as recorded: quick ones, then others.
+# A fault is tried on so many tests at most, of so many seconds together as recorded: quick ones,
+# then others.
 STEPS = ((30, 25.0), (60, 90.0))
-LIMIT = 180  # seconds of compiling at most, beside three times those of the tests: more is an endless loop
+# seconds of compiling at most, beside three times those of the tests: more is an endless loop
+LIMIT = 180
 PYTEST = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"]
 COLD = ("bones", "geometry", "implicit", "muscle")  # what they compute is cached, right or wrong
 KEPT, FIRST = "what_is_kept", 6  # tests that compare many numbers, and how many of them come first
 WORD = re.compile(r"\w+")
-LEFT_OUT = (".git", ".venv", ".mutants", "__pycache__", "*.egg-info", ".hypothesis", "demo_output", "images")
+LEFT_OUT = (
+    ".git",
+    ".venv",
+    ".mutants",
+    "__pycache__",
+    "*.egg-info",
+    ".hypothesis",
+    "demo_output",
+    "images",
+)
 COMPARE = {
-    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
-    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
-}  # fmt: skip
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+}
 ARITHMETIC = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
 ARITHMETIC |= {ast.FloorDiv: ast.Mult}
 TOGETHER = {ast.And: ast.Or, ast.Or: ast.And}
@@ -55,10 +76,10 @@ TOGETHER = {ast.And: ast.Or, ast.Or: ast.And}
 class Fault:
     """One expression of a file and what stands in its place.
 
-    ``path`` is relative to the checkout; the expression goes from byte ``start`` to ``end``, ``text`` is in its place;
-    ``loop`` says whether it is in a compiled loop. ``first`` and ``last`` are the lines of its statement, of a default
-    value those of the function. ``name`` is of what holds it, where its line runs within no test: the compiled loop, or
-    what is assigned at import.
+    ``path`` is relative to the checkout; the expression goes from byte ``start`` to ``end``,
+    ``text`` is in its place; ``loop`` says whether it is in a compiled loop. ``first`` and ``last``
+    are the lines of its statement, of a default value those of the function. ``name`` is of what
+    holds it, where its line runs within no test: the compiled loop, or what is assigned at import.
     """
 
     path: str
@@ -110,12 +131,18 @@ def is_loop(node: ast.FunctionDef) -> bool:
 def assigned(node: ast.stmt) -> str:
     """The name that a statement gives a value, empty of others."""
     targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
-    names = [part.id for part in ast.walk(targets[0]) if isinstance(part, ast.Name)] if targets[0] else []
+    names = (
+        [part.id for part in ast.walk(targets[0]) if isinstance(part, ast.Name)]
+        if targets[0]
+        else []
+    )
     return names[0] if names else ""
 
 
 def faults_of(path: Path) -> list[Fault]:
-    """All faults of a file, but in annotations, decorators, f-strings and what is for type checkers."""
+    """All faults of a file, but in annotations, decorators, f-strings and what is for type
+    checkers.
+    """
     source = path.read_bytes()
     starts = [0]
     for line in source.splitlines(keepends=True):
@@ -148,7 +175,9 @@ def faults_of(path: Path) -> list[Fault]:
             start = starts[node.lineno - 1] + node.col_offset
             end = starts[node.end_lineno - 1] + node.end_col_offset
             relative = str(path.relative_to(ROOT))
-            found.append(Fault(relative, node.lineno, start, end, ast.unparse(new), loop, *span, name))
+            found.append(
+                Fault(relative, node.lineno, start, end, ast.unparse(new), loop, *span, name)
+            )
         walk(node, (loop, inside, name, span))
 
     walk(ast.parse(source), (False, False, "", (1, 1)))
@@ -162,7 +191,9 @@ def group_of(path: str) -> str:
 
 
 def sample(count: int, seed: int) -> list[Fault]:
-    """A seeded sample in which each package has its turn; a change of the source changes little of it."""
+    """A seeded sample in which each package has its turn; a change of the source changes little of
+    it.
+    """
     groups = defaultdict(list)
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
@@ -170,12 +201,16 @@ def sample(count: int, seed: int) -> list[Fault]:
                 groups[group_of(fault.path)].append(fault)
     for faults in groups.values():
         faults.sort(key=lambda fault: hashlib.sha256(f"{seed} {fault}".encode()).digest())
-    turns = (groups[name][k] for k in range(count) for name in sorted(groups) if k < len(groups[name]))
+    turns = (
+        groups[name][k] for k in range(count) for name in sorted(groups) if k < len(groups[name])
+    )
     return [fault for fault, _ in zip(turns, range(count))]
 
 
 def record(tests: list[str]) -> None:
-    """Run tests with compiler, and those of ``tests/nojit.txt`` without, and keep which lines each runs."""
+    """Run tests with compiler, and those of ``tests/nojit.txt`` without, and keep which lines each
+    runs.
+    """
     import coverage
 
     text = (ROOT / "tests/nojit.txt").read_text(encoding="utf-8")
@@ -185,15 +220,20 @@ def record(tests: list[str]) -> None:
         data, times = WORK / f"{kind}.coverage", WORK / f"{kind}.xml"
         more = {"COVERAGE_FILE": str(data), "RBFMUSCLE_CACHE": str(WORK / "cache")}
         more |= {"NUMBA_DISABLE_JIT": "1"} if kind == "plain" else {}
-        options = f"-q -n {os.environ.get('WORKERS', 'auto')} --cov --cov-context=test --cov-report=".split()
+        workers = os.environ.get("WORKERS", "auto")
+        options = f"-q -n {workers} --cov --cov-context=test --cov-report=".split()
         command = [*PYTEST, *options, f"--junitxml={times}", *files]
         subprocess.run(command, cwd=ROOT, env={**os.environ, **more}, check=False)
         kept, lines = coverage.CoverageData(str(data)), {}
         kept.read()
-        for file in [file for file in kept.measured_files() if file.endswith(".py")]:  # not templates
+        for file in [
+            file for file in kept.measured_files() if file.endswith(".py")
+        ]:  # not templates
             contexts = kept.set_query_contexts(None) or kept.contexts_by_lineno(file)
             relative = os.path.relpath(file, ROOT)
-            lines[relative] = {n: [c.rpartition("|")[0] for c in cs if c] for n, cs in contexts.items()}
+            lines[relative] = {
+                n: [c.rpartition("|")[0] for c in cs if c] for n, cs in contexts.items()
+            }
         seconds = {}
         for case in ElementTree.parse(times).iter("testcase"):
             file, _, group = case.get("classname", "").replace(".", "/").partition("/Test")
@@ -208,11 +248,17 @@ class Reach:
     def __init__(self, kind: str) -> None:
         path = WORK / f"{kind}.json"
         found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        self.kind, self.lines, self.seconds = kind, found.get("lines", {}), found.get("seconds", {})
-        self.run = Counter(t for lines in self.lines.values() for found in lines.values() for t in found)
+        self.kind = kind
+        self.lines = found.get("lines", {})
+        self.seconds = found.get("seconds", {})
+        self.run = Counter(
+            t for lines in self.lines.values() for found in lines.values() for t in found
+        )
         self.tests = set(self.seconds)
         files = {test.partition("::")[0] for test in self.tests}
-        self.named = {file: set(WORD.findall((ROOT / file).read_text(encoding="utf-8"))) for file in files}
+        self.named = {
+            file: set(WORD.findall((ROOT / file).read_text(encoding="utf-8"))) for file in files
+        }
         self.words: dict[tuple[str, str], set[str]] = {}
         self.made: list[tuple[str, set[str]]] = []
         for file, lines in self.lines.items():
@@ -226,16 +272,24 @@ class Reach:
                     self.made.append((name, set(WORD.findall(ast.unparse(node)))))
 
     def steps(self, fault: Fault) -> list[list[str]]:
-        """Tests that run a fault's line, by step: of its own file, then in turn of all, quick ones of each first."""
+        """Tests that run a fault's line, by step: of its own file, then in turn of all, quick ones
+        of each first.
+        """
         lines, span = self.lines.get(fault.path, {}), range(fault.first, fault.last + 1)
-        found = set(lines.get(str(fault.line), ())) or {t for n in span for t in lines.get(str(n), ())}
+        found = set(lines.get(str(fault.line), ())) or {
+            t for n in span for t in lines.get(str(n), ())
+        }
         if fault.name and not (fault.loop and self.kind == "plain"):
             found = self._naming(fault.name)
         if not found and not fault.loop:
             found = {test for tests in lines.values() for test in tests}
         own, folder = f"/test_{Path(fault.path).stem}.py", f"/{group_of(fault.path)}/"
         # Tests with processes of their own run lines that are not recorded as theirs.
-        apart = {t for t in self.tests if folder in t and "subprocess" in self.named[t.partition("::")[0]]}
+        apart = {
+            t
+            for t in self.tests
+            if folder in t and "subprocess" in self.named[t.partition("::")[0]]
+        }
         # So do fixtures of a whole file, which count to its first test.
         files, direct = {test.partition("::")[0] for test in found}, found
         kept = {test for test in self.tests if KEPT in test and test.partition("::")[0] in files}
@@ -244,7 +298,8 @@ class Reach:
         for test in sorted(found, key=lambda t: (self.time(t), t)):
             file, case = test.partition("::")[0], test.partition("[")[0]
             turn = -1 if own in file else seen[file] // (6 if folder in file else 1)
-            # One case of each test that has several comes first, of quick ones of the own file eight.
+            # One case of each test that has several comes first, of quick ones of the own file
+            # eight.
             again = seen[case] // (8 if own in file and self.time(test) < 0.1 else 1)
             order[test] = 3 * again + turn, self.time(test), test
             seen[file] += seen[case] == 0
@@ -262,11 +317,15 @@ class Reach:
         return [step for step in steps if step]
 
     def _kept_first(self, tests, direct):
-        kept = sorted((t for t in tests if KEPT in t), key=lambda t: (t not in direct, self.run[t]))[:FIRST]
+        kept = sorted(
+            (t for t in tests if KEPT in t), key=lambda t: (t not in direct, self.run[t])
+        )[:FIRST]
         return kept + [test for test in tests if test not in kept]
 
     def _naming(self, name):
-        """Tests that say a name or run a line with it, or with that of a loop or constant that is made with it."""
+        """Tests that say a name or run a line with it, or with that of a loop or constant that is
+        made with it.
+        """
         names: set[str] = set()
         more = {name}
         while more:
@@ -282,7 +341,9 @@ class Reach:
 
 
 def passes(tree: Path, tests: list[str], kind: str, *, seconds: float) -> tuple[bool, str]:
-    """Whether tests pass in a copy of the checkout, and the first that fails; too much time counts as failing."""
+    """Whether tests pass in a copy of the checkout, and the first that fails; too much time counts
+    as failing.
+    """
     limit = int(LIMIT + 3.0 * seconds)
     paths = os.pathsep.join(str(tree / part) for part in ("", "benchmarks", "tests"))
     more = {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -290,10 +351,14 @@ def passes(tree: Path, tests: list[str], kind: str, *, seconds: float) -> tuple[
     more |= {"NUMBA_DISABLE_JIT": "1"} if kind == "plain" else {}
     with tempfile.TemporaryFile("w+") as out:
         process = subprocess.Popen(
-            [*PYTEST, "-xq", "-n0", "--tb=no", "-rf", *tests], cwd=tree, env={**os.environ, **more}, stdout=out,
-            stderr=subprocess.DEVNULL, start_new_session=True,
+            [*PYTEST, "-xq", "-n0", "--tb=no", "-rf", *tests],
+            cwd=tree,
+            env={**os.environ, **more},
+            stdout=out,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1)),
-        )  # fmt: skip
+        )
         try:
             code = process.wait(3 * limit)
         except subprocess.TimeoutExpired:
@@ -302,12 +367,16 @@ def passes(tree: Path, tests: list[str], kind: str, *, seconds: float) -> tuple[
         if code == 4:
             raise SystemExit("a test that was recorded is not here any more: record again")
         out.seek(0)
-        failed = [line[7:].partition(" - ")[0].strip() for line in out if line.startswith("FAILED ")]
+        failed = [
+            line[7:].partition(" - ")[0].strip() for line in out if line.startswith("FAILED ")
+        ]
     return code in (0, 5), failed[0] if failed else ""
 
 
 def run(count: int, seed: int, minutes: float) -> None:
-    """Plant the sample until the time is over: all on quick tests, then what these let pass on others."""
+    """Plant the sample until the time is over: all on quick tests, then what these let pass on
+    others.
+    """
     end, tree = time.monotonic() + 60.0 * minutes, WORK / f"tree{os.getpid()}"
     shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(*LEFT_OUT), symlinks=True)
     for part in (*PACKAGES, "tests", "benchmarks"):
@@ -346,7 +415,14 @@ def run(count: int, seed: int, minutes: float) -> None:
                 break
         shutil.rmtree(tree / "cache", ignore_errors=True)
         text = source[fault.start : fault.end].decode()
-        row = {"key": key, "seed": seed, "outcome": outcome, "step": step, "by": by, "path": fault.path}
+        row = {
+            "key": key,
+            "seed": seed,
+            "outcome": outcome,
+            "step": step,
+            "by": by,
+            "path": fault.path,
+        }
         row |= {"line": fault.line, "loop": fault.loop, "before": text, "after": fault.text}
         done[key] = row
         with (WORK / "results.jsonl").open("a") as file:

@@ -1,9 +1,10 @@
-"""The functions of one frame, from ``simulate`` to its files: counted, and drawn with their shares of its time.
+"""The functions of one frame, from ``simulate`` to its files: counted, and drawn with their shares
+of its time.
 
     python benchmarks/one_frame.py [SCENE]
 
-Ten frames of the RBF model are traced on one thread, with metrics and files. Nested functions count with the outer one,
-those that only share work among threads are left out.
+Ten frames of the RBF model are traced on one thread, with metrics and files. Nested functions count
+with the outer one, those that only share work among threads are left out.
 """
 
 import os
@@ -20,7 +21,10 @@ from rbfmuscle.run import stream_run
 
 OURS = str(Path(rm.__file__).parent) + os.sep
 THREADS = OURS + "geometry/threads.py"
-FIRST, LAST, LEAST = 4, 14, 0.1  # frames that are traced; what takes less than a tenth of them is not drawn
+# frames that are traced; what takes less than a tenth of them is not drawn
+FIRST = 4
+LAST = 14
+LEAST = 0.1
 parts, stack = defaultdict(lambda: defaultdict(float)), []  # seconds of each function by its caller
 
 
@@ -40,7 +44,8 @@ def trace(frame, event, _argument):
 
 
 def draw(caller, whole, depth=0):
-    """Print the functions that one calls above all, and what these call; how many, in which files."""
+    """Print the functions that one calls above all, and what these call; how many, in which
+    files."""
     drawn = []
     for function, found in parts.items():
         share = sum(found.values()) / whole

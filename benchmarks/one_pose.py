@@ -3,9 +3,10 @@
     python benchmarks/one_pose.py SCENE --muscle NAME [--pose hip.flexion=60 hip.adduction=-25]
                                   [--set nodes=300 ...]
 
-The ways to a pose of two coordinates, by default in sub-steps of 2 degrees: both at once, either one first, a detour
-through the third coordinate, a seeded random walk that ends there, both at once in sub-steps of half a degree and of
-10 degrees. Distances are between material points of the carried surface, RMS and greatest over all pairs [mm].
+The ways to a pose of two coordinates, by default in sub-steps of 2 degrees: both at once, either
+one first, a detour through the third coordinate, a seeded random walk that ends there, both at once
+in sub-steps of half a degree and of 10 degrees. Distances are between material points of the
+carried surface, RMS and greatest over all pairs [mm].
 """
 
 import argparse
@@ -27,13 +28,16 @@ WALK, SEED = 5, 0
 
 
 def ways(pose, others, step=STEP):
-    """Named lists of waypoints (dicts of degrees) from rest to a pose, and the sub-step of each [degree]."""
+    """Named lists of waypoints (dicts of degrees) from rest to a pose, and the sub-step of each
+    [degree].
+    """
     rest = dict.fromkeys([*pose, *others], 0.0)
     end = {**rest, **pose}
     first, second = list(pose)[:2]
     rng = np.random.default_rng(SEED)
     walk = [
-        {**rest, **{key: value * rng.uniform(0.2, 1.0) for key, value in pose.items()}} for _ in range(WALK)
+        {**rest, **{key: value * rng.uniform(0.2, 1.0) for key, value in pose.items()}}
+        for _ in range(WALK)
     ]
     found = {
         "both": ([rest, end], step),
@@ -50,16 +54,22 @@ def ways(pose, others, step=STEP):
 
 
 def frames(waypoints, step):
-    """Frames [radian] along waypoints, no coordinate by more than ``step`` degrees from one to the next."""
+    """Frames [radian] along waypoints, no coordinate by more than ``step`` degrees from one to the
+    next.
+    """
     out = [waypoints[0]]
     for here, there in itertools.pairwise(waypoints):
         count = max(1, int(np.ceil(max(abs(there[k] - here[k]) for k in there) / step - 1e-9)))
-        out += [{k: here[k] + (there[k] - here[k]) * n / count for k in there} for n in range(1, count + 1)]
+        out += [
+            {k: here[k] + (there[k] - here[k]) * n / count for k in there}
+            for n in range(1, count + 1)
+        ]
     return [{k: float(np.radians(v)) for k, v in frame.items()} for frame in out]
 
 
 def ends(scene, pose, others, settings):
-    """Carried vertices (n, 3) at the end of each way, by name, and the processor time of all [s]."""
+    """Carried vertices (n, 3) at the end of each way, by name, and the processor time of all
+    [s]."""
     found, start = {}, time.process_time()
     for name, (waypoints, step) in ways(pose, others).items():
         part = scene.with_options({"contact.substep_angle": step})
@@ -98,7 +108,10 @@ def main():
     settings = parse_settings(given.settings)
     found, seconds = ends(scene, parse_settings(given.pose), given.others, settings)
     rms, greatest, pair = spread(found)
-    print(f"{given.muscle} {settings}: {rms:.3f} mm RMS ({pair}), {greatest:.2f} greatest, {seconds:.1f} s")
+    print(
+        f"{given.muscle} {settings}: {rms:.3f} mm RMS ({pair}), {greatest:.2f} greatest, "
+        f"{seconds:.1f} s"
+    )
     names = list(found)
     for a in names:
         row = [float(np.sqrt(((found[a] - found[b]) ** 2).sum(axis=1).mean())) for b in names]

@@ -1,10 +1,11 @@
-"""The tests as other machines would run them: other BLAS kernels, features, threads, versions, and last digits.
+"""The tests as other machines would run them: other BLAS kernels, features, threads, versions, and
+last digits.
 
     python benchmarks/portability.py [--only NAME ...] [--folder DIR] [TESTS ...]
 
-Each configuration runs in one process; bone fields are not taken from the cache. ``oldest`` and ``newest`` have an
-environment of their own each (``.ci/oldest.txt``, ``.ci/newest.txt``), kept in the folder. Exit code 1 where a test
-fails.
+Each configuration runs in one process; bone fields are not taken from the cache. ``oldest`` and
+``newest`` have an environment of their own each (``.ci/oldest.txt``, ``.ci/newest.txt``), kept in
+the folder. Exit code 1 where a test fails.
 """
 
 import argparse
@@ -30,7 +31,8 @@ CONFIGURATIONS = {
 }
 # Enough of NumPy and SciPy to meet an instruction that a processor has not.
 TRIAL = (
-    "import numpy as np, scipy.linalg as s; a = np.eye(300) + np.random.rand(300, 300); s.cho_factor(a @ a.T)"
+    "import numpy as np, scipy.linalg as s; a = np.eye(300) + np.random.rand(300, 300); "
+    "s.cho_factor(a @ a.T)"
 )
 
 
@@ -48,14 +50,28 @@ def interpreter(name: str, folder: Path) -> Path:
 
 
 def run_tests(name: str, tests: list[str], folder: Path) -> tuple[str, int]:
-    """What pytest counted in a configuration, and how many failed; all it printed is in the folder."""
+    """What pytest counted in a configuration, and how many failed; all it printed is in the
+    folder."""
     python, log = interpreter(name, folder), folder / f"{name}.log"
     with tempfile.TemporaryDirectory() as cache, log.open("w") as printed:
         environment = {**os.environ, **CONFIGURATIONS[name], "RBFMUSCLE_CACHE": cache}
-        trial = subprocess.run([python, "-c", TRIAL], env=environment, capture_output=True, check=False)
+        trial = subprocess.run(
+            [python, "-c", TRIAL], env=environment, capture_output=True, check=False
+        )
         if trial.returncode:
             return "not run: this processor has not the instructions", 0
-        command = [python, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=short", *tests]
+        command = [
+            python,
+            "-m",
+            "pytest",
+            "-q",
+            "-n",
+            "0",
+            "-p",
+            "no:cacheprovider",
+            "--tb=short",
+            *tests,
+        ]
         done = subprocess.run(command, cwd=ROOT, env=environment, stdout=printed, check=False)
     lines = log.read_text(encoding="utf-8").splitlines() or ["nothing"]
     for line in lines:

@@ -1,11 +1,14 @@
-"""Finite elements on real muscles: a gluteus maximus and a quadriceps as nearly incompressible solids, and the models.
+"""Finite elements on real muscles: a gluteus maximus and a quadriceps as nearly incompressible
+solids, and the models.
 
-    python benchmarks/real_solids.py solve NAME [--edges 18 14] [--coarser FILE] [-o FILE]   the reference, a small .npz
-    python benchmarks/real_solids.py compare NAME ... [--models rbf,pbd,arap-volume] [-o FILE.json]
+    python benchmarks/real_solids.py solve NAME [--edges 18 14] [--coarser FILE] [-o FILE]   the
+    reference, a small .npz python benchmarks/real_solids.py compare NAME ... [--models
+    rbf,pbd,arap-volume] [-o FILE.json]
 
-Names are those of ``CASES``. ``solve`` needs scikit-fem (the extra ``fem``) and pytetwild (fTetWild, MPL-2.0), which
-makes the tetrahedra; the real data are looked for beside the project or in RBFMUSCLE_DATA. Kept are the displacements
-of the input mesh's vertices, which go along with the tetrahedra, in hundredths of a unit; the data are not.
+Names are those of ``CASES``. ``solve`` needs scikit-fem (the extra ``fem``) and pytetwild
+(fTetWild, MPL-2.0), which makes the tetrahedra; the real data are looked for beside the project or
+in RBFMUSCLE_DATA. Kept are the displacements of the input mesh's vertices, which go along with the
+tetrahedra, in hundredths of a unit; the data are not.
 """
 
 import argparse
@@ -29,7 +32,8 @@ from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.validation import MissingPartError, SolveError
 
 ROOT = Path(__file__).resolve().parents[1]
-# Scene, muscle and edges of the tetrahedra [mm], each level; frames 15 and 30 are 30 and 60 degrees.
+# Scene, muscle and edges of the tetrahedra [mm], each level; frames 15 and 30 are 30 and 60
+# degrees.
 CASES = {
     "gluteus_maximus": ("hip/flexion.toml", "gluteus_maximus", (18.0, 14.0)),
     "vastus_lateralis": ("leg/quadriceps.toml", "vastus_lateralis", (12.0, 8.5)),
@@ -68,15 +72,21 @@ def tetrahedra(mesh, edge):
         import pytetwild
     except ImportError as error:
         raise MissingPartError(
-            "pytetwild is not installed, which makes tetrahedra: pip install -e '.[fem]' in rbfmuscle's folder"
+            "pytetwild is not installed, which makes tetrahedra: pip install -e '.[fem]' in "
+            "rbfmuscle's folder"
         ) from error
     size = float(np.linalg.norm(mesh.extents))
     # The mesher leaves a file of its own where it runs.
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         points, cells = pytetwild.tetrahedralize(
-            np.asarray(mesh.vertices), np.asarray(mesh.faces), edge_length_fac=edge / size,
-            epsilon=ENVELOPE / size, coarsen=True, num_threads=1, quiet=True,
-        )  # fmt: skip
+            np.asarray(mesh.vertices),
+            np.asarray(mesh.faces),
+            edge_length_fac=edge / size,
+            epsilon=ENVELOPE / size,
+            coarsen=True,
+            num_threads=1,
+            quiet=True,
+        )
     cells = np.asarray(cells, dtype=int)
     sides = points[cells[:, 1:]] - points[cells[:, :1]]
     flipped = np.linalg.det(sides) < 0.0
@@ -97,7 +107,9 @@ class Course:
         self.solid.set_obstacles(self._distance, self.owner >= 0)
 
     def _attach(self):
-        """Place of the holding bone in ``names``, -1 where free: that of the nearest vertex of the mesh."""
+        """Place of the holding bone in ``names``, -1 where free: that of the nearest vertex of the
+        mesh.
+        """
         held = np.full(len(self.muscle.mesh.vertices), -1)
         for index, attachment in enumerate(self.muscle.attachments):
             held[attachment.vertices] = index
@@ -115,7 +127,9 @@ class Course:
         return interpolate(frames[first], frames[first + 1], place - first)
 
     def advance(self, displacement, place, settled):
-        """Solve at a place, from a displacement at another one, until no step saves a larger share of the energy."""
+        """Solve at a place, from a displacement at another one, until no step saves a larger share
+        of the energy.
+        """
         self.poses = bone_poses(self.scene, self.coordinates(place))
         rest, wanted = self.solid.rest, displacement.copy()
         for index, name in enumerate(self.names):
@@ -151,7 +165,8 @@ def solve(name, edges, path, coarser=None):
         course = Course(scene, edge)
         cells, nodes = len(course.solid.nodes), len(course.solid.rest)
         print(
-            f"{name}, edges of {edge:g}: {cells} cells, {nodes} nodes, {(course.owner >= 0).sum()} held",
+            f"{name}, edges of {edge:g}: {cells} cells, {nodes} nodes, "
+            f"{(course.owner >= 0).sum()} held",
             flush=True,
         )
         columns, shares = course.solid.at(np.asarray(mesh.vertices))
@@ -164,7 +179,9 @@ def solve(name, edges, path, coarser=None):
 
 
 def keep(path, mesh, levels):
-    """Write the finest of the levels, coarse to fine: (edge, cells, [(displacements, depth, volume error)])."""
+    """Write the finest of the levels, coarse to fine: (edge, cells, [(displacements, depth, volume
+    error)]).
+    """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     apart = [
         [
@@ -174,14 +191,22 @@ def keep(path, mesh, levels):
         for coarse, fine in itertools.pairwise(levels)
     ]
     for (coarse, *_), row in zip(levels, apart):
-        print(f"edges of {coarse:g} to the next: " + ", ".join(f"{r:.2f} ({w:.1f})" for r, w in row))
+        print(
+            f"edges of {coarse:g} to the next: " + ", ".join(f"{r:.2f} ({w:.1f})" for r, w in row)
+        )
     finest = levels[-1][2]
     kept = np.round(np.array([u for u, _, _ in finest]) / UNIT)
     np.savez_compressed(
-        path, frames=FRAMES, moved=kept.astype(np.int16), depth=[d for _, d, _ in finest],
-        volume_error=[v for _, _, v in finest], edges=[e for e, *_ in levels], cells=[n for _, n, _ in levels],
-        apart=np.array(apart), mesh=digest(vertices),
-    )  # fmt: skip
+        path,
+        frames=FRAMES,
+        moved=kept.astype(np.int16),
+        depth=[d for _, d, _ in finest],
+        volume_error=[v for _, _, v in finest],
+        edges=[e for e, *_ in levels],
+        cells=[n for _, n, _ in levels],
+        apart=np.array(apart),
+        mesh=digest(vertices),
+    )
     print(f"{path}: {path.stat().st_size} bytes", flush=True)
 
 
@@ -195,12 +220,15 @@ def reference(name, scene):
     vertices = np.asarray(scene.muscles[0].mesh.vertices)
     with np.load(reference_file(name)) as kept:
         if str(kept["mesh"]) != digest(vertices):
-            raise SolveError(f"{reference_file(name)} is of another mesh than {scene.muscles[0].name}'s")
+            raise SolveError(
+                f"{reference_file(name)} is of another mesh than {scene.muscles[0].name}'s"
+            )
         return vertices + UNIT * kept["moved"]
 
 
 def distances(name, model, settings=None):
-    """Distance of a model's surfaces to the solid, ``[(rms, worst)]`` for each of ``FRAMES`` [mm]."""
+    """Distance of a model's surfaces to the solid, ``[(rms, worst)]`` for each of ``FRAMES``
+    [mm]."""
     scene = case_scene(name)
     places, faces = reference(name, scene), np.asarray(scene.muscles[0].mesh.faces)
     run = simulate(scene, model=model, settings=settings or {})
@@ -222,13 +250,17 @@ def rows_of(models):
 
 
 def compare(names, models):
-    """Print and return the distance of every model to every reference: by row and muscle, RMS and greatest a frame."""
+    """Print and return the distance of every model to every reference: by row and muscle, RMS and
+    greatest a frame.
+    """
     found = {}
     for name in names:
         for title, model, settings in rows_of(models):
             rows = distances(name, model, settings)
             found.setdefault(title, {})[name] = rows
-            print(f"{name}, {title}: " + ", ".join(f"{r:.2f} ({w:.1f})" for r, w in rows), flush=True)
+            print(
+                f"{name}, {title}: " + ", ".join(f"{r:.2f} ({w:.1f})" for r, w in rows), flush=True
+            )
     return found
 
 
@@ -237,13 +269,20 @@ def main():
     parser.add_argument("action", choices=("solve", "compare"))
     parser.add_argument("names", nargs="+", choices=sorted(CASES), metavar="NAME")
     parser.add_argument("--edges", nargs="+", type=float)
-    parser.add_argument("--coarser", type=Path, help="file of a coarser level that was solved before")
+    parser.add_argument(
+        "--coarser", type=Path, help="file of a coarser level that was solved before"
+    )
     parser.add_argument("--models", default=",".join(MODELS))
     parser.add_argument("-o", "--output", type=Path)
     given = parser.parse_args()
     if given.action == "solve":
         for name in given.names:
-            solve(name, given.edges or CASES[name][2], given.output or reference_file(name), given.coarser)
+            solve(
+                name,
+                given.edges or CASES[name][2],
+                given.output or reference_file(name),
+                given.coarser,
+            )
         return
     rows = compare(given.names, given.models.split(","))
     if given.output:

@@ -1,4 +1,5 @@
-"""Sphinx settings: every page of this folder, the gallery from ``examples/``, the reference of the public names.
+"""Sphinx settings: every page of this folder, the gallery from ``examples/``, the reference of the
+public names.
 
 No page asks a server for anything, neither when built nor when read.
 """

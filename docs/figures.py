@@ -3,9 +3,9 @@
     python docs/figures.py                   # write them anew into README.md and docs/*.md
     python docs/figures.py --measure [NAME]  # measure first: minutes to an hour, on a quiet machine
 
-In a page a table stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``, a figure within a line between
-``<!-- value: NAME.KEY -->`` and ``<!-- end -->``. ``tests/contract/test_docs.py`` fails where a page says
-something else than its file.
+In a page a table stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``, a figure within a
+line between ``<!-- value: NAME.KEY -->`` and ``<!-- end -->``. ``tests/contract/test_docs.py``
+fails where a page says something else than its file.
 """
 
 import argparse
@@ -24,12 +24,21 @@ _VALUE = re.compile(r"<!-- value: ([\w]+)\.([\w]+) -->.*?<!-- end -->", re.S)
 # Name: what measures it. DATA stands for the folder of the real hip.
 COMMANDS = {
     "headline": ["benchmarks/headline.py", "DATA/hip/flexion.toml", "-o", "OUT"],
-    "real_solids": ["benchmarks/real_solids.py", "compare", "gluteus_maximus", "rectus_femoris", "-o", "OUT"],
+    "real_solids": [
+        "benchmarks/real_solids.py",
+        "compare",
+        "gluteus_maximus",
+        "rectus_femoris",
+        "-o",
+        "OUT",
+    ],
 }
 
 
 def bound(value, digits):
-    """A length as a table says it: rounded, or the bound that it keeps (``{"below": b}`` where that is all we know)."""
+    """A length as a table says it: rounded, or the bound that it keeps (``{"below": b}`` where that
+    is all we know).
+    """
     least = 10.0**-digits
     if isinstance(value, dict):
         return f"< {value['below']:g}"
@@ -64,7 +73,10 @@ def headline_table(facts):
             "depth of the surface inside a bone; PBD: of attached vertices (mm)",
             lambda r: bound(r["penetration_max"], 2),
         ),
-        ("depth of a bone's vertices inside a muscle (mm)", lambda r: bound(r["bone_penetration_max"], 2)),
+        (
+            "depth of a bone's vertices inside a muscle (mm)",
+            lambda r: bound(r["bone_penetration_max"], 2),
+        ),
         ("distance from the input mesh at rest, RMS (mm)", lambda r: bound(r["rest_error_rms"], 2)),
         ("flicker in steps of 2 degrees (mm); a mesh model has none", flicker),
         ("length of the centreline / shortest path over the bones", lambda r: f"{r['slack']:.2f}"),
@@ -77,7 +89,9 @@ def headline_table(facts):
         f"| worst of four muscles | {' | '.join(LABELS[name] for name in rows)} |",
         "|---" * (len(rows) + 1) + "|",
     ]
-    lines += [f"| {what} | {' | '.join(text(row) for row in rows.values())} |" for what, text in shown]
+    lines += [
+        f"| {what} | {' | '.join(text(row) for row in rows.values())} |" for what, text in shown
+    ]
     return lines
 
 
@@ -130,7 +144,10 @@ def written(text):
         return f"<!-- evidence: {match[1]} -->\n{body}\n<!-- end -->"
 
     def value(match):
-        return f"<!-- value: {match[1]}.{match[2]} -->{VALUES[match[1], match[2]](facts_of(match[1]))}<!-- end -->"
+        return (
+            f"<!-- value: {match[1]}.{match[2]} "
+            f"-->{VALUES[match[1], match[2]](facts_of(match[1]))}<!-- end -->"
+        )
 
     return _VALUE.sub(value, _TABLE.sub(table, text))
 
@@ -146,7 +163,10 @@ def measure(names):
     data = next((str(p) for p in places if p and (Path(p) / "hip").is_dir()), None)
     for name in names:
         if data is None:
-            sys.exit(f"{name}: the real hip is not here (set RBFMUSCLE_DATA to the folder that holds hip/)")
+            sys.exit(
+                f"{name}: the real hip is not here (set RBFMUSCLE_DATA to the folder that "
+                "holds hip/)"
+            )
         command = [part.replace("DATA", data) for part in COMMANDS[name]]
         command[command.index("OUT")] = str(EVIDENCE / f"{name}.json")
         subprocess.run([sys.executable, *command], cwd=ROOT, check=True)

@@ -1,4 +1,6 @@
-"""Pages made before Sphinx runs: the gallery from ``examples/``, the reference from the public names."""
+"""Pages made before Sphinx runs: the gallery from ``examples/``, the reference from the public
+names.
+"""
 
 import ast
 import json
@@ -28,10 +30,17 @@ TOPICS = {
     "Fields and kernels": ("RBFField", "study_kernels", "reach_error"),
     "Muscles and bones": ("RBFMuscle", "BoneSDF"),
     "Errors and warnings": (
-        "RBFMuscleError", "UsageError", "SceneError", "MeshError", "SolveError", "LimitExceededError",
-        "MissingPartError", "NumericalWarning", "SceneWarning",
+        "RBFMuscleError",
+        "UsageError",
+        "SceneError",
+        "MeshError",
+        "SolveError",
+        "LimitExceededError",
+        "MissingPartError",
+        "NumericalWarning",
+        "SceneWarning",
     ),
-}  # fmt: skip
+}
 _TIMEOUT = 600
 _LONGEST = 60  # lines of an example's output that are shown
 
@@ -57,19 +66,25 @@ def write_gallery(root):
         list(pool.map(lambda name: _write_page(root, folder, name), EXAMPLES))
     listed = "\n".join(EXAMPLES)
     (folder / "index.md").write_text(
-        "# Gallery\n\nEach page is a script or a notebook of `examples/`, run when these pages were built; "
-        f"each ends with a check of its own result.\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n",
+        "# Gallery\n\nEach page is a script or a notebook of `examples/`, run when these pages "
+        "were built; "
+        f"each ends with a check of its own result.\n\n```{{toctree}}\n:maxdepth: "
+        f"1\n\n{listed}\n```\n",
         encoding="utf-8",
     )
 
 
 def find_example(root, name):
     """Path of an example: a script, or a notebook."""
-    return next(path for path in (root / "examples").glob(f"{name}.*") if path.suffix in (".py", ".ipynb"))
+    return next(
+        path for path in (root / "examples").glob(f"{name}.*") if path.suffix in (".py", ".ipynb")
+    )
 
 
 def read_example(path):
-    """Text of an example, which begins with its title, and its code; of a notebook all cells of either kind."""
+    """Text of an example, which begins with its title, and its code; of a notebook all cells of
+    either kind.
+    """
     source = path.read_text(encoding="utf-8")
     if path.suffix == ".py":
         return ast.get_docstring(ast.parse(source)), source.split('"""\n', 1)[1].strip()
@@ -84,9 +99,14 @@ def read_example(path):
 def run_example(path, pictures):
     """Run an example's code in its folder, with where its files go; the finished process."""
     return subprocess.run(
-        [sys.executable, "-c", read_example(path)[1], str(pictures)], cwd=path.parent, capture_output=True,
-        text=True, timeout=_TIMEOUT, env=os.environ | {"PYTHONUNBUFFERED": "1"}, check=False,
-    )  # fmt: skip
+        [sys.executable, "-c", read_example(path)[1], str(pictures)],
+        cwd=path.parent,
+        capture_output=True,
+        text=True,
+        timeout=_TIMEOUT,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        check=False,
+    )
 
 
 def _write_page(root, folder, name):
@@ -100,9 +120,12 @@ def _write_page(root, folder, name):
         raise RuntimeError(f"examples/{example.name} failed:\n{done.stderr[-2000:]}")
     text, code = read_example(example)
     shown = "\n\n".join(
-        f"![{path.stem.replace('_', ' ')}]({name}/{path.name})" for path in sorted(pictures.glob("*.png"))
+        f"![{path.stem.replace('_', ' ')}]({name}/{path.name})"
+        for path in sorted(pictures.glob("*.png"))
     )
-    output = done.stdout.replace(str(pictures), name).replace(str(root), ".").splitlines()[:_LONGEST]
+    output = (
+        done.stdout.replace(str(pictures), name).replace(str(root), ".").splitlines()[:_LONGEST]
+    )
     parts = [
         text,
         shown,
@@ -145,7 +168,8 @@ def write_reference(root, package):
 
 
 def write_scene_reference(root):
-    """Write ``docs/gallery/scene_reference.md``: every table and key of a scene file, from the schema itself.
+    """Write ``docs/gallery/scene_reference.md``: every table and key of a scene file, from the
+    schema itself.
 
     Parameters
     ----------
@@ -156,11 +180,14 @@ def write_scene_reference(root):
     from rbfmuscle.scene.file import SceneFile
 
     schema = SceneFile.model_json_schema()
-    models = [(options.__name__, options.model_json_schema()) for options in (RBFOptions, PBDOptions)]
+    models = [
+        (options.__name__, options.model_json_schema()) for options in (RBFOptions, PBDOptions)
+    ]
     lines = [
         "# Scene file: every key",
         "",
-        "Made from the schema that checks a scene. What the keys mean is under [scene files](../scene_file.md).",
+        "Made from the schema that checks a scene. What the keys mean is under [scene "
+        "files](../scene_file.md).",
         "",
     ]
     for name, table in [("SceneFile", schema), *schema["$defs"].items(), *models]:
@@ -170,13 +197,26 @@ def write_scene_reference(root):
             for key, field in table["properties"].items()
         ]
         lines += _table(name, table.get("description", ""), rows)
-    (root / "docs" / "gallery" / "scene_reference.md").write_text("\n".join(lines), encoding="utf-8")
+    (root / "docs" / "gallery" / "scene_reference.md").write_text(
+        "\n".join(lines), encoding="utf-8"
+    )
 
 
 def _table(name, meaning, rows):
     text = " ".join(meaning.replace("``", "`").split())
-    body = [f"| `{key}` | {allowed.replace('|', 'or')} | {default} |" for key, allowed, default in rows]
-    return [f"## {name}", "", text, "", "| key | what is allowed | default |", "|---|---|---|", *body, ""]
+    body = [
+        f"| `{key}` | {allowed.replace('|', 'or')} | {default} |" for key, allowed, default in rows
+    ]
+    return [
+        f"## {name}",
+        "",
+        text,
+        "",
+        "| key | what is allowed | default |",
+        "|---|---|---|",
+        *body,
+        "",
+    ]
 
 
 def _allowed(field):

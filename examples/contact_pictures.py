@@ -1,4 +1,5 @@
-"""Pictures of the contact page: tunnelled and corrected, overlapping and resolved, apart and sliding.
+"""Pictures of the contact page: tunnelled and corrected, overlapping and resolved, apart and
+sliding.
 
     python examples/contact_pictures.py docs/images
 
@@ -35,7 +36,10 @@ def picture(name, panels, *, view, zoom=1.0):
         plotter.set_background("white")
         for vertices, faces, colour, opacity in meshes:
             plotter.add_mesh(
-                pyvista.make_tri_mesh(vertices, faces), color=colour, opacity=opacity, smooth_shading=True
+                pyvista.make_tri_mesh(vertices, faces),
+                color=colour,
+                opacity=opacity,
+                smooth_shading=True,
             )
         plotter.add_text(title, font_size=9, color="black")
         focus = meshes[0][0].mean(axis=0)
@@ -47,23 +51,37 @@ def picture(name, panels, *, view, zoom=1.0):
 
 
 def slices(name, panels, *, height):
-    """Side by side: each panel a title and meshes as (vertices, faces, colour, ...), cut at a height."""
+    """Side by side: each panel a title and meshes as (vertices, faces, colour, ...), cut at a
+    height.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.6 * len(panels), 4.2), layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    for axes, (title, meshes) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+    for axes, (title, meshes) in zip(
+        figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True
+    ):
         for vertices, faces, colour, *_ in meshes:
-            cut = trimesh.Trimesh(vertices, faces, process=False).section([0.0, 0.0, 1.0], [0.0, 0.0, height])
+            cut = trimesh.Trimesh(vertices, faces, process=False).section(
+                [0.0, 0.0, 1.0], [0.0, 0.0, height]
+            )
             for line in [] if cut is None else cut.discrete:
                 axes.fill(line[:, 0], line[:, 1], color=colour, alpha=0.45, lw=0)
                 axes.plot(line[:, 0], line[:, 1], color=colour, lw=1.3)
         low, high = meshes[0][0].min(axis=0), meshes[0][0].max(axis=0)
-        axes.set(title=title, aspect="equal", xlabel="x [mm]", ylabel="y [mm]",
-                 xlim=(low[0] - 15, high[0] + 15), ylim=(low[1] - 15, high[1] + 15))  # fmt: skip
+        axes.set(
+            title=title,
+            aspect="equal",
+            xlabel="x [mm]",
+            ylabel="y [mm]",
+            xlim=(low[0] - 15, high[0] + 15),
+            ylim=(low[1] - 15, high[1] + 15),
+        )
     canvas.draw()
-    Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).save(out / f"contact_{name}.webp", quality=85)
+    Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).save(
+        out / f"contact_{name}.webp", quality=85
+    )
 
 
 def bones(scene, coordinates):
@@ -79,11 +97,13 @@ def depth(vertices, meshes):
     """Deepest of the vertices in any of the meshes."""
     found = [
         -igl.signed_distance(
-            np.ascontiguousarray(vertices), np.ascontiguousarray(v), np.ascontiguousarray(f),
+            np.ascontiguousarray(vertices),
+            np.ascontiguousarray(v),
+            np.ascontiguousarray(f),
             sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
         )[0].min()
         for v, f, *_ in meshes
-    ]  # fmt: skip
+    ]
     return max(0.0, *map(float, found))
 
 
@@ -97,7 +117,9 @@ for action, title in (("report", "tunnelled"), ("substep", "corrected")):
     scene.detect = DetectOptions(tunnelling=TunnellingOptions(action=action))
     model = build_model(muscle, scene, "pbd")
     names = [bone.name for bone in scene.bones]
-    stepper = MuscleStepper(model, BoneContacts(names, fields, contact_bone=model.contact_bone), scene)
+    stepper = MuscleStepper(
+        model, BoneContacts(names, fields, contact_bone=model.contact_bone), scene
+    )
     stepper.step(rest, turned)
     remaining[action] = {event.action for event in stepper.collect()[1]}
     panels.append((title, [(*model.material_mesh(), "#a63d38", 0.75), *bones(scene, turned)]))
@@ -133,13 +155,19 @@ for initial, title in (("keep", "overlapping"), ("resolve", "resolved")):
     volume = surface.volume / thick.volume - 1.0
     text = f"{title}: {deep[initial]:.1f} mm deep, volume {100 * volume:+.3f} %"
     panels.append(
-        (text, [(surface.vertices, surface.faces, "#a63d38", 0.6), *bones(scene, {"hip.flexion": 0.0})])
+        (
+            text,
+            [
+                (surface.vertices, surface.faces, "#a63d38", 0.6),
+                *bones(scene, {"hip.flexion": 0.0}),
+            ],
+        )
     )
 # At the height of the deepest overlap.
 inside = igl.fast_winding_number(
     *(np.ascontiguousarray(a) for a in bones(scene, {"hip.flexion": 0.0})[0][:2]),
     np.ascontiguousarray(thick.vertices[free]),
-)  # fmt: skip
+)
 slices("overlap", panels, height=float(np.median(thick.vertices[free][inside > 0.5, 2])))
 
 # Apart and sliding: two neighbours in internal rotation.

@@ -1,7 +1,7 @@
 """# Exporting
 
-A saved run becomes meshes for other programs: a PVD time series for ParaView, PLY, STL or OBJ a frame, one
-animated GLB; in metres where that is wanted.
+A saved run becomes meshes for other programs: a PVD time series for ParaView, PLY, STL or OBJ a
+frame, one animated GLB; in metres where that is wanted.
 """
 
 import numpy as np

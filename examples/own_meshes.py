@@ -1,7 +1,8 @@
 """# Your own meshes
 
-From a folder of STL files to a run: `rbfmuscle new` guesses a scene file, `check` looks at it, `run` runs it. The
-files here are written from the embedded hip first, so that this page needs no data; take your own in their place.
+From a folder of STL files to a run: `rbfmuscle new` guesses a scene file, `check` looks at it,
+`run` runs it. The files here are written from the embedded hip first, so that this page needs no
+data; take your own in their place.
 """
 
 import sys
@@ -14,7 +15,8 @@ from rbfmuscle.cli import main
 
 out = folder("own_meshes")
 
-# Bones and muscles, one file each. Names such as "femur" or "gluteus" tell bones from muscles; others go by size.
+# Bones and muscles, one file each. Names such as "femur" or "gluteus" tell bones from muscles;
+# others go by size.
 meshes = out / "meshes"
 meshes.mkdir(exist_ok=True)
 phantom = rm.phantom_scene()
@@ -40,14 +42,17 @@ text = (meshes / "scene.toml").read_text(encoding="utf-8")
 print("\n".join(line for line in text.splitlines() if "GUESS" in line))
 
 # The guessed axes are those of the files. Flexion of this hip is a turn about -x.
-(meshes / "scene.toml").write_text(text.replace("rotation_x = [1, 0, 0]", "rotation_x = [-1, 0, 0]"))
+(meshes / "scene.toml").write_text(
+    text.replace("rotation_x = [1, 0, 0]", "rotation_x = [-1, 0, 0]")
+)
 
 command("check", meshes / "scene.toml")
 scene = rm.Scene.load(meshes / "scene.toml")
 run = rm.simulate(scene, frames="0:16:5")
 draw(run, out / "guessed.png")
 
-# The check of this page: the ball joint was found where the phantom has it, and the muscles keep their volume.
+# The check of this page: the ball joint was found where the phantom has it, and the muscles keep
+# their volume.
 distance = float((scene.joints[0].centre ** 2).sum() ** 0.5)
 print(f"guessed joint centre: {distance:.2f} mm from the true one")
 assert distance < 3.0

@@ -1,14 +1,18 @@
-"""The paper's experiments with the mesh models: where do first penetration and first tunnelling come?
+"""The paper's experiments with the mesh models: where do first penetration and first tunnelling
+come?
 
-Cervenka, Havlicek, Kohout and Váša (GRAPP 2023) flex, turn and adduct the hip, and extend it by steps of 2,
-4, 5 and 10 degrees to 80. Here each model does so with and without sub-steps of 2 degrees; nothing is
-corrected afterwards, so that what the model itself can do shows. `pbd-paper` is plain PBD as printed:
-vertices keep their velocity, all edges are alike, the response is to one bone.
+Cervenka, Havlicek, Kohout and Váša (GRAPP 2023) flex, turn and adduct the hip, and extend it by
+steps of 2, 4, 5 and 10 degrees to 80. Here each model does so with and without sub-steps of 2
+degrees; nothing is corrected afterwards, so that what the model itself can do shows. `pbd-paper` is
+plain PBD as printed: vertices keep their velocity, all edges are alike, the response is to one
+bone.
 
-    python examples/paper_experiments.py                      two motions, two models (half a minute)
-    python examples/paper_experiments.py --all [-o FILE.md]   every motion, every model (ten minutes)
+    python examples/paper_experiments.py                      two motions, two models (half a
+    minute) python examples/paper_experiments.py --all [-o FILE.md]   every motion, every model (ten
+    minutes)
 
-It needs the hip (RBFMUSCLE_DATA, the folder that holds hip/); without it the embedded phantom is taken.
+It needs the hip (RBFMUSCLE_DATA, the folder that holds hip/); without it the embedded phantom is
+taken.
 """
 
 import argparse
@@ -43,12 +47,21 @@ MOTIONS = {
     "extension by 10": ("hip.flexion", -80, 10),
 }
 QUICK_MOTIONS, QUICK_MODELS = ("flexion by 2", "extension by 4"), ("pbd-paper", "pbd")
-# Depth [mm] from which a vertex counts as inside; the fields of the hip are good to a hundredth of this.
+# Depth [mm] from which a vertex counts as inside; the fields of the hip are good to a hundredth of
+# this.
 INSIDE = 0.5
 HEADINGS = (
-    "motion", "model", "sub-steps", "penetration from", "deepest vertex, mm", "deepest bone vertex, mm",
-    "tunnelling from", "volume error", "edge ratio 1 % to 99 %", "ms a frame",
-)  # fmt: skip
+    "motion",
+    "model",
+    "sub-steps",
+    "penetration from",
+    "deepest vertex, mm",
+    "deepest bone vertex, mm",
+    "tunnelling from",
+    "volume error",
+    "edge ratio 1 % to 99 %",
+    "ms a frame",
+)
 
 
 def hip_scene(muscle):
@@ -143,7 +156,8 @@ class Record:
         if self.frames > 1:
             self.depth = max(self.depth, depth)
         self.bone_depth = max(
-            self.bone_depth, bone_depth(MeshDistance(*self.model.material_mesh()), self.probes, poses)
+            self.bone_depth,
+            bone_depth(MeshDistance(*self.model.material_mesh()), self.probes, poses),
         )
         self.volume = max(self.volume, abs(self.model.volume() / self.model.rest.volume.rest - 1.0))
         low, high = np.quantile(self.edge_lengths(points) / self.lengths, [0.01, 0.99])
@@ -152,12 +166,18 @@ class Record:
     def cells(self):
         """The figures as text."""
         first = [
-            "never" if a is None else f"{np.degrees(a):.0f}°" for a in (self.penetration, self.tunnelling)
+            "never" if a is None else f"{np.degrees(a):.0f}°"
+            for a in (self.penetration, self.tunnelling)
         ]
         return (
-            first[0], f"{self.depth:.2f}", f"{self.bone_depth:.2f}", first[1], f"{self.volume:.0e}",
-            f"{self.ratio[0]:.2f} to {self.ratio[1]:.2f}", f"{1e3 * self.seconds / self.frames:.0f}",
-        )  # fmt: skip
+            first[0],
+            f"{self.depth:.2f}",
+            f"{self.bone_depth:.2f}",
+            first[1],
+            f"{self.volume:.0e}",
+            f"{self.ratio[0]:.2f} to {self.ratio[1]:.2f}",
+            f"{1e3 * self.seconds / self.frames:.0f}",
+        )
 
 
 def run_all(scene, motions, models):

@@ -1,7 +1,7 @@
 """# RBF against PBD
 
-The same scene, the same contacts, the same metrics: an implicit surface of some 150 centres against a mesh of
-thousands of vertices.
+The same scene, the same contacts, the same metrics: an implicit surface of some 150 centres against
+a mesh of thousands of vertices.
 """
 
 import numpy as np
@@ -14,8 +14,17 @@ scene = rm.phantom_scene()
 runs = {model: rm.simulate(scene, model=model, frames="0:46:5") for model in ("rbf", "pbd")}
 
 print(f"{'':24}{'rbf':>12}{'pbd':>12}")
-for quantity in ("volume_error", "penetration_max", "bone_penetration_max", "edge_strain_rms", "time_frame"):
-    values = [max(np.abs(run.values(m.name, quantity)).max() for m in scene.muscles) for run in runs.values()]
+for quantity in (
+    "volume_error",
+    "penetration_max",
+    "bone_penetration_max",
+    "edge_strain_rms",
+    "time_frame",
+):
+    values = [
+        max(np.abs(run.values(m.name, quantity)).max() for m in scene.muscles)
+        for run in runs.values()
+    ]
     print(f"{quantity:24}" + "".join(f"{value:12.3g}" for value in values))
 
 for model, run in runs.items():
@@ -40,8 +49,8 @@ def worst(model, quantity):
     return max(np.abs(runs[model].values(muscle.name, quantity)).max() for muscle in scene.muscles)
 
 
-# The check of this page: both keep their volume; the RBF surface, cut by the bones, stays out of them to a hundredth
-# of a millimetre, the mesh to half of one.
+# The check of this page: both keep their volume; the RBF surface, cut by the bones, stays out of
+# them to a hundredth of a millimetre, the mesh to half of one.
 assert worst("rbf", "volume_error") < 1e-3
 assert worst("pbd", "volume_error") < 1e-3
 assert worst("rbf", "penetration_max") < 0.01

@@ -1,7 +1,7 @@
 """# Neighbours that slide
 
-Two adductors lie on each other. Without `[sliding]` each knows the bones alone: in internal rotation they grow into one
-another. With it, they keep their distance and slide.
+Two adductors lie on each other. Without `[sliding]` each knows the bones alone: in internal
+rotation they grow into one another. With it, they keep their distance and slide.
 """
 
 import numpy as np
@@ -42,6 +42,7 @@ def lines(axes):
 
 plot(out / "gap.png", lines)
 
-# The check of this page: without sliding they overlap, with it by less than a tenth of a millimetre.
+# The check of this page: without sliding they overlap, with it by less than a tenth of a
+# millimetre.
 assert gaps["without"].min() < -1.0
 assert gaps["with"].min() > -0.1

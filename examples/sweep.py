@@ -1,7 +1,7 @@
 """# A sweep: error against time
 
-How many centres, how fine a grid? A sweep runs every combination, measures each against the finest, and marks the
-Pareto front. Points that are in the folder already are not run again.
+How many centres, how fine a grid? A sweep runs every combination, measures each against the finest,
+and marks the Pareto front. Points that are in the folder already are not run again.
 """
 
 import json
@@ -26,7 +26,8 @@ for path in found:
     if path.suffix == ".png":
         shutil.copy(path, out / path.name)
 
-# The check of this page: all points are measured (six, and the default), and there is a verdict on the default.
+# The check of this page: all points are measured (six, and the default), and there is a verdict on
+# the default.
 table = json.loads((out / "sweep" / "sweep.json").read_text(encoding="utf-8"))
 assert len(table["rows"]) == 7
 assert all(row["status"] == "done" for row in table["rows"])

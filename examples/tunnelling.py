@@ -1,8 +1,9 @@
 """# Tunnelling
 
-A point that is on one side of a bone in one frame and on the other in the next has tunnelled: a distance field, asked
-at the end alone, pushes it out on the wrong side. `[detect]` looks at the way in between. A run never takes steps so
-large; here one muscle is taken through 40 degrees of adduction in a single step, as a slow machine might.
+A point that is on one side of a bone in one frame and on the other in the next has tunnelled: a
+distance field, asked at the end alone, pushes it out on the wrong side. `[detect]` looks at the way
+in between. A run never takes steps so large; here one muscle is taken through 40 degrees of
+adduction in a single step, as a slow machine might.
 """
 
 import math
@@ -55,7 +56,8 @@ def scatter(axes):
 
 plot(out / "points.png", scatter, size=(6.0, 4.5))
 
-# The check of this page: points go through where nothing is done; none stays beyond where they are brought back.
+# The check of this page: points go through where nothing is done; none stays beyond where they are
+# brought back.
 assert events["report"]["reported"] > 20
 assert "unresolved" not in events["substep"]
 assert {"rotated", "halved"} & set(events["substep"])

@@ -1,8 +1,10 @@
-"""As-rigid-as-possible energy on a surface mesh: local rotations, the global solve, the PBD constraint.
+"""As-rigid-as-possible energy on a surface mesh: local rotations, the global solve, the PBD
+constraint.
 
-E(x) = 1/4 sum over edges of w_ij (|e_ij - R_i E_ij|^2 + |e_ij - R_j E_ij|^2), with e = x_i - x_j, E the same
-at rest, each R_i the rotation that makes E least (Sorkine and Alexa 2007). With the rotations optimal the
-gradient of E is its partial derivative with R frozen: grad_i E = sum_j w_ij (e_ij - (R_i + R_j) E_ij / 2).
+E(x) = 1/4 sum over edges of w_ij (|e_ij - R_i E_ij|^2 + |e_ij - R_j E_ij|^2), with e = x_i - x_j, E
+the same at rest, each R_i the rotation that makes E least (Sorkine and Alexa 2007). With the
+rotations optimal the gradient of E is its partial derivative with R frozen: grad_i E = sum_j w_ij
+(e_ij - (R_i + R_j) E_ij / 2).
 """
 
 import numpy as np
@@ -20,12 +22,16 @@ LEAST_WEIGHT = 1e-9
 
 
 class ARAP:
-    """ARAP energy of a mesh, with the rotation (w, x, y, z) of each vertex in ``quaternions`` (n, 4).
+    """ARAP energy of a mesh, with the rotation (w, x, y, z) of each vertex in ``quaternions`` (n,
+    4).
 
-    The ``laplacian`` (n, n) has cotangent weights, clamped from below, times the edges' factor ``stiffer``.
+    The ``laplacian`` (n, n) has cotangent weights, clamped from below, times the edges' factor
+    ``stiffer``.
     """
 
-    def __init__(self, vertices: Floats, topology: Topology, *, stiffer: Floats | float = 1.0) -> None:
+    def __init__(
+        self, vertices: Floats, topology: Topology, *, stiffer: Floats | float = 1.0
+    ) -> None:
         self.topology = topology
         self.laplacian = cotangent_laplacian(vertices, topology.faces)
         i, j = topology.edges.T
@@ -50,10 +56,11 @@ class ARAP:
 
 
 class ARAPConstraint:
-    """The ARAP energy as PBD constraints, a vector one an edge: the paper's section 6.2, first option.
+    """The ARAP energy as PBD constraints, a vector one an edge: the paper's section 6.2, first
+    option.
 
-    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component, compliance 1 / w_ij: at
-    convergence the gradient of the sum is that of the ARAP energy.
+    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component,
+    compliance 1 / w_ij: at convergence the gradient of the sum is that of the ARAP energy.
     """
 
     def __init__(self, arap: ARAP) -> None:
@@ -74,9 +81,15 @@ class ARAPConstraint:
     def project(self, points: Floats, inverse_mass: Floats, *, time: float = 1.0) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place, with the arap's rotations."""
         _constraint_loop(
-            points, inverse_mass, self.edges, self.rest, self.arap.quaternions, self.compliance, time,
+            points,
+            inverse_mass,
+            self.edges,
+            self.rest,
+            self.arap.quaternions,
+            self.compliance,
+            time,
             self.multiplier,
-        )  # fmt: skip
+        )
 
 
 @compiled
@@ -101,8 +114,9 @@ def _rotation_loop(points, rings, rest, weights, quaternions):
 def _turn_towards(moment, q):
     """One Newton step of maximising tr(R^T A) over rotations R; return its squared angle.
 
-    With B = R^T A and S its symmetric part, the step solves (tr(S) 1 - S) omega = axial(B). One-rings are
-    nearly flat, so A has rank two and a polar decomposition is not defined; this maximum is.
+    With B = R^T A and S its symmetric part, the step solves (tr(S) 1 - S) omega = axial(B).
+    One-rings are nearly flat, so A has rank two and a polar decomposition is not defined; this
+    maximum is.
     """
     r = quaternion_matrix(q)
     b = np.empty((3, 3))
@@ -110,12 +124,18 @@ def _turn_towards(moment, q):
         for n in range(3):
             b[m, n] = r[0][m] * moment[0, n] + r[1][m] * moment[1, n] + r[2][m] * moment[2, n]
     trace = b[0, 0] + b[1, 1] + b[2, 2]
-    vx, vy, vz = b[2, 1] - b[1, 2], b[0, 2] - b[2, 0], b[1, 0] - b[0, 1]
+    vx = b[2, 1] - b[1, 2]
+    vy = b[0, 2] - b[2, 0]
+    vz = b[1, 0] - b[0, 1]
     size = abs(trace) + abs(vx) + abs(vy) + abs(vz)
     if size <= 0.0:
         return 0.0
-    xx, yy, zz = trace - b[0, 0], trace - b[1, 1], trace - b[2, 2]
-    xy, xz, yz = -0.5 * (b[0, 1] + b[1, 0]), -0.5 * (b[0, 2] + b[2, 0]), -0.5 * (b[1, 2] + b[2, 1])
+    xx = trace - b[0, 0]
+    yy = trace - b[1, 1]
+    zz = trace - b[2, 2]
+    xy = -0.5 * (b[0, 1] + b[1, 0])
+    xz = -0.5 * (b[0, 2] + b[2, 0])
+    yz = -0.5 * (b[1, 2] + b[2, 1])
     first, second = xx * yy - xy * xy, yy * zz - yz * yz
     third, fourth = xy * yz - xz * yy, xy * xz - xx * yz
     det = zz * first + xz * third + yz * fourth
@@ -124,10 +144,14 @@ def _turn_towards(moment, q):
         oy = ((xz * yz - xy * zz) * vx + (xx * zz - xz * xz) * vy + fourth * vz) / det
         oz = (third * vx + fourth * vy + first * vz) / det
     else:
-        ox, oy, oz = vx / size, vy / size, vz / size
+        ox = vx / size
+        oy = vy / size
+        oz = vz / size
     square = ox * ox + oy * oy + oz * oz
     if square > 1.0:
-        ox, oy, oz = ox / np.sqrt(square), oy / np.sqrt(square), oz / np.sqrt(square)
+        ox = ox / np.sqrt(square)
+        oy = oy / np.sqrt(square)
+        oz = oz / np.sqrt(square)
     _turn_quaternion(q, 0.5 * ox, 0.5 * oy, 0.5 * oz)
     return square
 
@@ -135,7 +159,10 @@ def _turn_towards(moment, q):
 @compiled
 def _turn_quaternion(q, x, y, z):
     """q <- q (1, x, y, z), normalised: right to third order, and the fixed point is unchanged."""
-    a, b, c, d = q[0], q[1], q[2], q[3]
+    a = q[0]
+    b = q[1]
+    c = q[2]
+    d = q[3]
     q[0] = a - b * x - c * y - d * z
     q[1] = b + a * x + c * z - d * y
     q[2] = c + a * y + d * x - b * z

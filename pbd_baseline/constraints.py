@@ -1,9 +1,9 @@
 """Edge and volume constraints: one class a family, one loop each, for PBD and XPBD alike.
 
-Every projection is ``dlambda = (-C - a lambda) / (sum_i w_i |grad_i C|^2 + a)``,
-``dx_i = k w_i grad_i C dlambda`` with the compliance a over the time of the step (Macklin 2016); ``a = 0``
-is the hard constraint of PBD, and k in [0, 1] its stiffness (Müller 2007). w is the inverse mass, 0 where a
-vertex is held.
+Every projection is ``dlambda = (-C - a lambda) / (sum_i w_i |grad_i C|^2 + a)``, ``dx_i = k w_i
+grad_i C dlambda`` with the compliance a over the time of the step (Macklin 2016); ``a = 0`` is the
+hard constraint of PBD, and k in [0, 1] its stiffness (Müller 2007). w is the inverse mass, 0 where
+a vertex is held.
 """
 
 from collections.abc import Callable
@@ -16,16 +16,17 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import volume_cubic, volume_loop
 from rbfmuscle.jit import compiled
 
-# A gradient shorter than this share of its natural size belongs to a collapsed element: it has no direction.
+# A gradient shorter than this share of its natural size belongs to a collapsed element: it has no
+# direction.
 TINY = 1e-12
 
 
 class EdgeConstraint:
     """Keeps edge lengths: C = |x_i - x_j| - l, grad_i C = (x_i - x_j) / |x_i - x_j| = -grad_j C.
 
-    ``edges`` (e, 2) has each once. One PBD projection removes the share ``stiffness`` of an error; ``compliance`` is
-    that of XPBD times inverse time, 0 is hard. Beyond the ratios ``limits`` of length to rest length an edge is hard
-    whatever its stiffness.
+    ``edges`` (e, 2) has each once. One PBD projection removes the share ``stiffness`` of an error;
+    ``compliance`` is that of XPBD times inverse time, 0 is hard. Beyond the ratios ``limits`` of
+    length to rest length an edge is hard whatever its stiffness.
     """
 
     def __init__(
@@ -48,7 +49,9 @@ class EdgeConstraint:
 
     def values(self, points: Floats) -> Floats:
         """C of each edge, in the order of ``self.edges``."""
-        return np.linalg.norm(points[self.edges[:, 0]] - points[self.edges[:, 1]], axis=1) - self.rest
+        return (
+            np.linalg.norm(points[self.edges[:, 0]] - points[self.edges[:, 1]], axis=1) - self.rest
+        )
 
     def reset(self) -> None:
         """Forget the multipliers, as each time step does."""
@@ -57,13 +60,21 @@ class EdgeConstraint:
     def project(self, points: Floats, inverse_mass: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""
         _edge_loop(
-            points, inverse_mass, self.edges, self.rest, self.limits, self.stiffness, self.compliance,
+            points,
+            inverse_mass,
+            self.edges,
+            self.rest,
+            self.limits,
+            self.stiffness,
+            self.compliance,
             self.multiplier,
-        )  # fmt: skip
+        )
 
 
 class VolumeConstraint:
-    """Keeps the enclosed volume: C = V(x) - V_0, V = (1/6) sum a . (b x c), grad_a V = (1/6) sum b x c."""
+    """Keeps the enclosed volume: C = V(x) - V_0, V = (1/6) sum a . (b x c), grad_a V = (1/6) sum b
+    x c.
+    """
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         self.faces = np.ascontiguousarray(faces)
@@ -80,7 +91,9 @@ class VolumeConstraint:
         return out
 
     def project(self, points: Floats, inverse_mass: Floats) -> None:
-        """One PBD projection along the plain gradient, in place: the rough step of the paper's figure 8."""
+        """One PBD projection along the plain gradient, in place: the rough step of the paper's
+        figure 8.
+        """
         step = self.gradient(points) * inverse_mass[:, None]
         slope = (step * step).sum()
         if slope > 0.0:
@@ -89,11 +102,13 @@ class VolumeConstraint:
     def restore(
         self, points: Floats, direction: Floats, *, clear_way: Callable[..., Any] | None = None
     ) -> float:
-        """Move points along a direction (n, 3) until the volume is the rest volume; return the factor s.
+        """Move points along a direction (n, 3) until the volume is the rest volume; return the
+        factor s.
 
-        V(x + s d) is a cubic in s, computed exactly, so the volume is met to rounding. Where the direction
-        cannot meet it (no real root near zero), nothing moves and s is 0. ``clear_way(points, direction, s)``
-        may take parts out of the direction, in place, and says whether it did.
+        V(x + s d) is a cubic in s, computed exactly, so the volume is met to rounding. Where the
+        direction cannot meet it (no real root near zero), nothing moves and s is 0.
+        ``clear_way(points, direction, s)`` may take parts out of the direction, in place, and says
+        whether it did.
         """
         coefficients = volume_cubic(points, self.faces, direction)
         # A slope below this is rounding: the direction shifts the surface along itself.
@@ -107,7 +122,9 @@ class VolumeConstraint:
 
 
 def _cubic_step(coefficients, wanted, least):
-    """Root of c0 + c1 s + c2 s^2 + c3 s^3 = wanted that continues s = 0, by safeguarded Newton steps."""
+    """Root of c0 + c1 s + c2 s^2 + c3 s^3 = wanted that continues s = 0, by safeguarded Newton
+    steps.
+    """
     c0, c1, c2, c3 = coefficients
     error = c0 - wanted
     if abs(c1) <= least or error == 0.0:
@@ -130,7 +147,9 @@ def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance,
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
         wi, wj = inverse_mass[i], inverse_mass[j]
-        dx, dy, dz = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+        dx = points[i, 0] - points[j, 0]
+        dy = points[i, 1] - points[j, 1]
+        dz = points[i, 2] - points[j, 2]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
         total = wi + wj + compliance[c]
         if length <= TINY * rest[c] or wi + wj <= 0.0:
@@ -154,12 +173,22 @@ def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance,
 
 @compiled
 def _volume_gradient_loop(points, faces, out):
-    """Add a third of the area vector of each face at its vertices, on a closed mesh the same as b x c / 6."""
+    """Add a third of the area vector of each face at its vertices, on a closed mesh the same as b x
+    c / 6.
+    """
     for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-        vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
-        nx, ny, nz = (uy * vz - uz * vy) / 6.0, (uz * vx - ux * vz) / 6.0, (ux * vy - uy * vx) / 6.0
+        a = faces[f, 0]
+        b = faces[f, 1]
+        c = faces[f, 2]
+        ux = points[b, 0] - points[a, 0]
+        uy = points[b, 1] - points[a, 1]
+        uz = points[b, 2] - points[a, 2]
+        vx = points[c, 0] - points[a, 0]
+        vy = points[c, 1] - points[a, 1]
+        vz = points[c, 2] - points[a, 2]
+        nx = (uy * vz - uz * vy) / 6.0
+        ny = (uz * vx - ux * vz) / 6.0
+        nz = (ux * vy - uy * vx) / 6.0
         for v in (a, b, c):
             out[v, 0] += nx
             out[v, 1] += ny

@@ -11,10 +11,11 @@ TOUCHING = 1e-9
 
 
 class ContactConstraint:
-    """Keeps vertices out of bones: C = gap + n . (x - x_0) >= 0, linearised where the contacts were asked.
+    """Keeps vertices out of bones: C = gap + n . (x - x_0) >= 0, linearised where the contacts were
+    asked.
 
-    They are looked for within ``reach`` [scene unit]. With ``nearest_only`` a vertex in several bones moves by the
-    longest of its ways out alone, as in the authors' papers, not by their sum.
+    They are looked for within ``reach`` [scene unit]. With ``nearest_only`` a vertex in several
+    bones moves by the longest of its ways out alone, as in the authors' papers, not by their sum.
     """
 
     def __init__(self, *, reach: float, nearest_only: bool) -> None:
@@ -45,7 +46,9 @@ class ContactConstraint:
         np.add.at(points, self.index, depth[:, None] * self.normal)
 
     def clear_way(self, points: Floats, direction: Floats, step: float) -> bool:
-        """Take out of ``step * direction``, in place, what would lead into a half-space; say if anything."""
+        """Take out of ``step * direction``, in place, what would lead into a half-space; say if
+        anything.
+        """
         if len(self.index) == 0 or step == 0.0:
             return False
         return _clear_loop(points, self.index, self.gap, self.normal, self.anchor, direction, step)
@@ -57,7 +60,9 @@ class ContactConstraint:
 
 @compiled
 def _clear_loop(points, index, gap, normal, anchor, direction, step):
-    """Take out of a direction what leads into half-spaces within twice a step along it; whether anything did."""
+    """Take out of a direction what leads into half-spaces within twice a step along it; whether
+    anything did.
+    """
     cleared = False
     for c in range(len(index)):
         i = index[c]

@@ -1,4 +1,6 @@
-"""Rest lengths of edges along and across the fibres: slack fibres of a passive muscle, active ones, tendon."""
+"""Rest lengths of edges along and across the fibres: slack fibres of a passive muscle, active ones,
+tendon.
+"""
 
 import numpy as np
 
@@ -8,24 +10,28 @@ from rbfmuscle.jit import compiled
 from rbfmuscle.scene.activation.contraction import resolve_contraction
 from rbfmuscle.scene.objects import Muscle
 
-# Weight of tendon edges in the ARAP energy. Beside a belly that shortens by a fifth tendon keeps its length within
-# 0.6 %; at 100 it takes up so little in an iteration that a belly between fixed bones ends 8 % too long.
+# Weight of tendon edges in the ARAP energy. Beside a belly that shortens by a fifth tendon keeps
+# its length within 0.6 %; at 100 it takes up so little in an iteration that a belly between fixed
+# bones ends 8 % too long.
 TENDON_WEIGHT = 20.0
 
 
 class MeshFibres:
-    """Fibres of a mesh muscle: a frame along the fibre at each edge, and what the edge should be in it.
+    """Fibres of a mesh muscle: a frame along the fibre at each edge, and what the edge should be in
+    it.
 
-    An edge with the rest vector E, the fibre direction a and the target stretches t along and s across (means of its
-    two vertices) is wanted as T E, T = t aaᵀ + s (1 - aaᵀ). With λ the stretch against the scan and a the activation,
+    An edge with the rest vector E, the fibre direction a and the target stretches t along and s
+    across (means of its two vertices) is wanted as T E, T = t aaᵀ + s (1 - aaᵀ). With λ the stretch
+    against the scan and a the activation,
 
         t = min(max(λ, lower), upper),    s = (t + a (λ - t))^(-1/2).
 
-    A passive fibre is slack, where nothing pulls, between its stretch in the scan, 1, and 1 / stretch_at_rest (or
-    1 / slack, where the scene does not say). Activation moves both ends of this band in proportion towards the stretch
-    at which a fully active fibre has no tension. An active fibre pulls along itself alone: with the girth of t it would
-    push outwards too, and the widest place of a belly would take all the shortening. Tendon keeps its length, but may
-    stretch by its strain at full activation.
+    A passive fibre is slack, where nothing pulls, between its stretch in the scan, 1, and 1 /
+    stretch_at_rest (or 1 / slack, where the scene does not say). Activation moves both ends of this
+    band in proportion towards the stretch at which a fully active fibre has no tension. An active
+    fibre pulls along itself alone: with the girth of t it would push outwards too, and the widest
+    place of a belly would take all the shortening. Tendon keeps its length, but may stretch by its
+    strain at full activation.
     """
 
     def __init__(self, muscle: Muscle, rest: RestState, *, slack: float) -> None:
@@ -46,7 +52,8 @@ class MeshFibres:
         self.along = along[:, None] * axis
         square = np.einsum("ij,ij->i", self.vectors, self.vectors)
         self.lengths = np.sqrt(square)
-        # Weight of an edge in the stretch along the fibre: the fourth power of the cosine between them.
+        # Weight of an edge in the stretch along the fibre: the fourth power of the cosine between
+        # them.
         self.weights = (along**2 / np.maximum(square, 1e-300)) ** 2
         self.stretch = np.ones(count)
         self.activate(0.0)
@@ -65,7 +72,11 @@ class MeshFibres:
     @property
     def passive(self) -> bool:
         """Whether the fibres are those of a muscle that does not contract."""
-        return self.activation == 0.0 and self.given.stretch_at_rest == 1.0 and not self.at_tendon.any()
+        return (
+            self.activation == 0.0
+            and self.given.stretch_at_rest == 1.0
+            and not self.at_tendon.any()
+        )
 
     def targets(self, points: Floats) -> Floats:
         """Wanted vectors of the edges (e, 3) in the rest frame, for the present points (n, 3)."""
@@ -80,7 +91,9 @@ class MeshFibres:
 
 @compiled(error_model="numpy")
 def _stretch_loop(points, edges, lengths, weights, stretch):
-    """Stretch along the fibre at each vertex: mean ratio of its edges, by how much they lie along the fibre."""
+    """Stretch along the fibre at each vertex: mean ratio of its edges, by how much they lie along
+    the fibre.
+    """
     total = np.full(len(stretch), 1e-9)
     stretch[:] = 1e-9
     for c in range(len(edges)):

@@ -11,7 +11,8 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.harmonic import cotangent_laplacian
 from rbfmuscle.geometry.surfaces import vertex_areas
 
-# Distance over which the thickness is smoothed, and falls to 0 at held vertices, as a share of the diagonal.
+# Distance over which the thickness is smoothed, and falls to 0 at held vertices, as a share of the
+# diagonal.
 SMOOTHING = 0.04
 # Nearest pieces of the polylines whose directions are averaged.
 NEAREST = 6
@@ -22,8 +23,8 @@ def fibre_directions(
 ) -> np.ndarray:
     """Unit direction (n, 3) of the fibres at each point, zero where there is none.
 
-    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the last bone's
-    weight.
+    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the
+    last bone's weight.
     """
     if not fibres:
         return _normalised(along)
@@ -33,25 +34,34 @@ def fibre_directions(
     distance, index = cKDTree(middles).query(points, k=count)
     distance, index = distance.reshape(-1, count), index.reshape(-1, count)
     nearest = tangents[index[:, :1]]
-    signs = np.sign(np.einsum("nkd,nkd->nk", tangents[index], np.broadcast_to(nearest, (*index.shape, 3))))
+    signs = np.sign(
+        np.einsum("nkd,nkd->nk", tangents[index], np.broadcast_to(nearest, (*index.shape, 3)))
+    )
     share = signs / np.maximum(distance, 1e-9 * np.ptp(points, axis=0).max()) ** 2
     return _normalised(np.einsum("nk,nkd->nd", share, tangents[index]))
 
 
-def edge_stiffness(vertices: Floats, edges: Integers, directions: Floats, exponent: float) -> Floats:
-    """k = (1 - |cos(edge, fibre)|)^a, (e,): edges along the fibres are soft (Cervenka and Kohout, a = 0.5)."""
+def edge_stiffness(
+    vertices: Floats, edges: Integers, directions: Floats, exponent: float
+) -> Floats:
+    """k = (1 - |cos(edge, fibre)|)^a, (e,): edges along the fibres are soft (Cervenka and Kohout, a
+    = 0.5).
+    """
     if exponent == 0.0:
         return np.ones(len(edges))
     along = _normalised(vertices[edges[:, 1]] - vertices[edges[:, 0]])
     fibre = directions[edges[:, 0]]
     other = directions[edges[:, 1]]
-    fibre = _normalised(fibre + np.where(np.einsum("ij,ij->i", fibre, other) < 0, -1, 1)[:, None] * other)
+    fibre = _normalised(
+        fibre + np.where(np.einsum("ij,ij->i", fibre, other) < 0, -1, 1)[:, None] * other
+    )
     aligned = np.abs(np.einsum("ij,ij->i", along, fibre))
     return np.clip(1.0 - aligned, 0.0, 1.0) ** exponent
 
 
 def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Booleans) -> Floats:
-    """How far the surface moves at each vertex when the muscle swells: its local half thickness (n,).
+    """How far the surface moves at each vertex when the muscle swells: its local half thickness
+    (n,).
 
     Smooth, [unit of the vertices], 0 at held vertices.
     """
@@ -68,7 +78,9 @@ def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Bool
 
 
 def _inner_balls(vertices, normals, rounds=12):
-    """Radius of the largest inner ball that touches the surface at each vertex (shrinking balls, Ma 2012)."""
+    """Radius of the largest inner ball that touches the surface at each vertex (shrinking balls, Ma
+    2012).
+    """
     tree = cKDTree(vertices)
     radius = np.full(len(vertices), 0.5 * float(np.ptp(vertices, axis=0).max()))
     for _ in range(rounds):

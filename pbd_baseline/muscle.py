@@ -1,4 +1,6 @@
-"""PBDMuscle: a muscle as a triangle mesh held together by constraints, the baseline of the RBF muscle."""
+"""PBDMuscle: a muscle as a triangle mesh held together by constraints, the baseline of the RBF
+muscle.
+"""
 
 import math
 from collections.abc import Mapping
@@ -35,10 +37,11 @@ STEP_ANGLE = math.radians(2.0)
 
 
 class PBDMuscle:
-    """A mesh muscle of any of the paper's kinds; implements ``rbfmuscle.simulation.frame.MuscleModel``.
+    """A mesh muscle of any of the paper's kinds; implements
+    ``rbfmuscle.simulation.frame.MuscleModel``.
 
-    Raises SceneError on a muscle that nothing holds, MeshError if its mesh is not a closed, consistently oriented
-    surface.
+    Raises SceneError on a muscle that nothing holds, MeshError if its mesh is not a closed,
+    consistently oriented surface.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene, options: PBDOptions | None = None) -> None:
@@ -49,8 +52,12 @@ class PBDMuscle:
         self.as_printed = method.as_printed
         slack = 1.0 if self.as_printed else self.options.slack
         contracts = muscle.contraction is not None
-        self.fibres = MeshFibres(muscle, self.rest, slack=slack) if contracts or slack > 1.0 else None
-        stiffer = np.where(self.fibres.tendon, TENDON_WEIGHT, 1.0) if contracts and self.fibres else 1.0
+        self.fibres = (
+            MeshFibres(muscle, self.rest, slack=slack) if contracts or slack > 1.0 else None
+        )
+        stiffer = (
+            np.where(self.fibres.tendon, TENDON_WEIGHT, 1.0) if contracts and self.fibres else 1.0
+        )
         self.shape = method.shape(self.rest, self.options, stiffer)
         self.sweeps = self.options.iterations or method.sweeps
         self.most_sweeps, self.swept = self.sweeps, 0
@@ -83,10 +90,14 @@ class PBDMuscle:
             self.points[:] = blended_motion(self.points, self.rest.weights, motions)
         for b, bone in enumerate(self.rest.bones):
             held = self.rest.attached_bone == b
-            self.points[held] = self.rest.vertices[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
+            self.points[held] = (
+                self.rest.vertices[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
+            )
 
     def solve(self, contacts: BoneContacts) -> None:
-        """Sweep the shape, contacts inside the iteration and last, the volume on what is not in contact."""
+        """Sweep the shape, contacts inside the iteration and last, the volume on what is not in
+        contact.
+        """
         for k in range(self.most_sweeps):
             fresh = k % FRESH == 0
             if fresh:
@@ -119,7 +130,13 @@ class PBDMuscle:
 
     def snapshot(self) -> Any:
         """Everything that :meth:`restore` needs."""
-        return self.points.copy(), self.before.copy(), self.shape.snapshot(), self.time, self.penetration
+        return (
+            self.points.copy(),
+            self.before.copy(),
+            self.shape.snapshot(),
+            self.time,
+            self.penetration,
+        )
 
     def restore(self, state: Any) -> None:
         """Go back to a snapshot."""
@@ -153,10 +170,14 @@ class PBDMuscle:
         self.contact.project(self.points)
         if self.shape.volume_in_sweeps or self.still > 0.0:
             self.shape.restore_volume(self.points, self.contact)
-        return np.sqrt(((self.points - before) ** 2).sum(axis=1).max()) if self.still > 0.0 else np.inf
+        return (
+            np.sqrt(((self.points - before) ** 2).sum(axis=1).max()) if self.still > 0.0 else np.inf
+        )
 
     def _finish(self, contacts):
-        """Contact and volume in turn, half-spaces found again, until both hold where the bones are now known to be."""
+        """Contact and volume in turn, half-spaces found again, until both hold where the bones are
+        now known to be.
+        """
         for _ in range(FINISHING_ROUNDS):
             self.penetration = self.contact.find(contacts, self.points, reach=self.finishing_reach)
             self.contact.project(self.points)

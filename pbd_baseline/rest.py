@@ -19,7 +19,8 @@ from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, NotFiniteError, check_finite
 
-# Raise it when weights or room are computed in another way: entries of the cache are then not found.
+# Raise it when weights or room are computed in another way: entries of the cache are then not
+# found.
 VERSION = 4
 
 
@@ -52,14 +53,25 @@ class RestState:
             weights, room = _weights_and_room(vertices, faces, attached_bone, len(bones))
         except (RuntimeError, np.linalg.LinAlgError, NotFiniteError) as error:
             raise MeshError(
-                f"muscle {muscle.name!r}{f' ({muscle.source})' if muscle.source else ''}: the motions of its bones "
-                f"cannot be spread over its mesh ({error}); remesh it, and attach each part of it to a bone"
+                f"muscle {muscle.name!r}{f' ({muscle.source})' if muscle.source else ''}: the "
+                "motions of its bones "
+                f"cannot be spread over its mesh ({error}); remesh it, and attach each part of it "
+                "to a bone"
             ) from error
         along = surface_gradient(vertices, faces, weights[:, -1])
         fibres = fibre_directions(vertices, along, muscle.fibres)
         return cls(
-            order, vertices, topology, bones, weights, attached_bone, inverse_mass, fibres, room, volume
-        )  # fmt: skip
+            order,
+            vertices,
+            topology,
+            bones,
+            weights,
+            attached_bone,
+            inverse_mass,
+            fibres,
+            room,
+            volume,
+        )
 
     def edge(self) -> float:
         """Median length of the edges [scene unit]."""
@@ -71,7 +83,9 @@ class RestState:
 
 
 def _renumbered(muscle):
-    """Order of the vertices, vertices and faces in it, bones that hold the muscle, and who holds each vertex."""
+    """Order of the vertices, vertices and faces in it, bones that hold the muscle, and who holds
+    each vertex.
+    """
     order = cache_order(np.asarray(muscle.mesh.faces), len(muscle.mesh.vertices))
     place = np.argsort(order, kind="stable")
     vertices = np.ascontiguousarray(muscle.mesh.vertices, dtype=np.float64)[order]
@@ -91,7 +105,9 @@ def _weights_and_room(vertices, faces, attached_bone, bones):
         groups = [np.flatnonzero(attached_bone == b) for b in range(bones)]
         known = {
             "weights": even_weights(vertices, faces, groups),
-            "room": swelling_room(vertices, faces, vertex_normals(vertices, faces), attached_bone >= 0),
+            "room": swelling_room(
+                vertices, faces, vertex_normals(vertices, faces), attached_bone >= 0
+            ),
         }
         for name, values in known.items():
             check_finite(values, name=name)

@@ -34,7 +34,9 @@ class Shape:
     volume_in_sweeps = True
 
     def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
-        self.volume, self.room, self.inverse_mass = rest.volume, rest.room, rest.inverse_mass
+        self.volume = rest.volume
+        self.room = rest.room
+        self.inverse_mass = rest.inverse_mass
 
     def sweep(self, points: np.ndarray, time: float) -> None:
         """One iteration of the given time, in place."""
@@ -59,7 +61,9 @@ class Shape:
         """Go back to a snapshot."""
 
     def _swelling(self, points: np.ndarray) -> np.ndarray:
-        """Direction (n, 3) in which the muscle swells: along the normals, as far as there is room."""
+        """Direction (n, 3) in which the muscle swells: along the normals, as far as there is
+        room.
+        """
         direction = self.volume.gradient(points)
         _scale_loop(direction, self.room)
         return direction
@@ -76,7 +80,9 @@ class PBDShape(Shape):
 
     def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
-        stiffness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
+        stiffness = edge_stiffness(
+            rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent
+        )
         stiffness = stiffness * np.minimum(1.0, self.soft_length / rest.relative_lengths())
         self.edges = EdgeConstraint(
             rest.vertices, rest.topology.edges, stiffness=stiffness, limits=self.limits
@@ -87,7 +93,9 @@ class PBDShape(Shape):
         )
 
     def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
-        """Take rest lengths and stiffnesses from the fibres: an active fibre is as stiff along as across."""
+        """Take rest lengths and stiffnesses from the fibres: an active fibre is as stiff along as
+        across.
+        """
         self.edges.rest = np.linalg.norm(fibres.targets(points), axis=1)[self.edges.order]
         share = np.where(fibres.tendon, 1.0, fibres.activation)[self.edges.order]
         self.edges.stiffness = self.passive + share * (1.0 - self.passive)
@@ -99,21 +107,27 @@ class PBDShape(Shape):
 
 
 class PaperShape(PBDShape):
-    """PBD as Cervenka et al. print it (GRAPP 2023): stiffness does not fall with an edge's length, limits are wide."""
+    """PBD as Cervenka et al. print it (GRAPP 2023): stiffness does not fall with an edge's length,
+    limits are wide.
+    """
 
     soft_length = np.inf
     limits = 0.01, 100.0
 
 
 class XPBDShape(Shape):
-    """The same constraints with compliances, one iteration in each of many small steps (Macklin 2019).
+    """The same constraints with compliances, one iteration in each of many small steps (Macklin
+    2019).
 
-    A muscle without inertia relaxes by c dx/dt = -grad E, so the compliance is divided by the time, not by its square.
+    A muscle without inertia relaxes by c dx/dt = -grad E, so the compliance is divided by the time,
+    not by its square.
     """
 
     def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
-        softness = edge_stiffness(rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent)
+        softness = edge_stiffness(
+            rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent
+        )
         self.edges = EdgeConstraint(rest.vertices, rest.topology.edges, limits=LIMITS)
         self.bending = BendingConstraint(rest.vertices, rest.topology.edges, rest.topology.wings)
         across = options.edge_compliance * rest.relative_lengths()
@@ -123,7 +137,9 @@ class XPBDShape(Shape):
         self.bending_compliance = options.bending_compliance / np.mean(self.edges.rest) ** 2
 
     def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
-        """Take rest lengths and compliances from the fibres: an active fibre is as stiff along as across."""
+        """Take rest lengths and compliances from the fibres: an active fibre is as stiff along as
+        across.
+        """
         self.edges.rest = np.linalg.norm(fibres.targets(points), axis=1)[self.edges.order]
         share = np.where(fibres.tendon, 1.0, fibres.activation)[self.edges.order]
         mixed = 1.0 / ((1.0 - share) / self.passive + share / self.stiffest)
@@ -141,7 +157,9 @@ class XPBDShape(Shape):
 
 
 class RotatingShape(Shape):
-    """A shape whose neighbourhoods have rotations (`ARAP`), which it remembers from sweep to sweep."""
+    """A shape whose neighbourhoods have rotations (`ARAP`), which it remembers from sweep to
+    sweep.
+    """
 
     def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
@@ -182,9 +200,10 @@ class ARAPShape(RotatingShape):
 class GlobalARAPShape(RotatingShape):
     """Local rotations and one prefactored global solve: the ARAP of the paper's second option.
 
-    The global step makes E(x) + |x - z|^2 / (2 l^2) least in the surface's own measure, z where contact and
-    volume have left the vertices: without it (l infinite) every step forgets the contacts, and a stretched
-    muscle is pulled through the bone that it wraps. A free fixed point is the same for any l.
+    The global step makes E(x) + |x - z|^2 / (2 l^2) least in the surface's own measure, z where
+    contact and volume have left the vertices: without it (l infinite) every step forgets the
+    contacts, and a stretched muscle is pulled through the bone that it wraps. A free fixed point is
+    the same for any l.
     """
 
     def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
@@ -219,7 +238,9 @@ class GlobalARAPShape(RotatingShape):
 
 
 class InterleavedARAPShape(GlobalARAPShape):
-    """The same with the rough volume step of the paper's figure 8: each of the two undoes what the other did."""
+    """The same with the rough volume step of the paper's figure 8: each of the two undoes what the
+    other did.
+    """
 
     def restore_volume(self, points: np.ndarray, contact: ContactConstraint) -> None:
         """One projection along the plain gradient, in place, whatever lies in the way."""

@@ -1,4 +1,6 @@
-"""Connections of a closed triangle mesh: edges, wings, one-rings, and the colouring of constraints."""
+"""Connections of a closed triangle mesh: edges, wings, one-rings, and the colouring of
+constraints.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +21,20 @@ class Topology:
 
     faces: np.ndarray  # (m, 3)
     edges: np.ndarray  # (e, 2) each undirected edge once, the smaller vertex first
-    # (e, 2) vertices opposite to an edge: in the face that runs along it, then in the one against it
+    # (e, 2) vertices opposite to an edge: in the face that runs along it, then in the one against
+    # it
     wings: np.ndarray
     ring_start: np.ndarray  # (n + 1,)
-    ring: np.ndarray  # (2 e,) sorted neighbours of vertex i: ring[ring_start[i] : ring_start[i + 1]]
+    ring: (
+        np.ndarray
+    )  # (2 e,) sorted neighbours of vertex i: ring[ring_start[i] : ring_start[i + 1]]
     ring_edge: np.ndarray  # (2 e,) edge that leads to each neighbour
 
     @classmethod
     def from_mesh(cls, vertices: Floats, faces: Integers) -> Topology:
-        """Connect a mesh; MeshError if it is not closed and consistently oriented, or a vertex has no face."""
+        """Connect a mesh; MeshError if it is not closed and consistently oriented, or a vertex has
+        no face.
+        """
         vertices, faces = check_mesh(vertices, faces)
         edges, wings = _edges_and_wings(faces)
         ring_start, ring, ring_edge = _one_rings(edges, len(vertices))
@@ -58,7 +65,9 @@ def _edges_and_wings(faces):
     forward, backward = forward[first], backward[second]
     closed = len(forward) == len(backward) and np.array_equal(forward, backward)
     if not closed or (len(forward) > 1 and (np.diff(forward, axis=0) == 0).all(axis=1).any()):
-        raise MeshError("the muscle is not a closed, consistently oriented 2-manifold; repair it first")
+        raise MeshError(
+            "the muscle is not a closed, consistently oriented 2-manifold; repair it first"
+        )
     wings = np.column_stack([opposite[along][first], opposite[~along][second]])
     return np.ascontiguousarray(forward), np.ascontiguousarray(wings)
 
@@ -73,11 +82,13 @@ def _one_rings(edges, count):
 
 
 def colour(members: Integers, count: int) -> tuple[Integers, Integers]:
-    """Order constraints, given by their vertices (c, k), so that those of one colour share no vertex.
+    """Order constraints, given by their vertices (c, k), so that those of one colour share no
+    vertex.
 
-    Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints of one colour may
-    be projected in any order, or at once, with the same result to the last bit. Returns the order (c,), by colour and
-    then by the first vertex for the sake of the cache, and where each colour starts, (colours + 1,).
+    Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints
+    of one colour may be projected in any order, or at once, with the same result to the last bit.
+    Returns the order (c,), by colour and then by the first vertex for the sake of the cache, and
+    where each colour starts, (colours + 1,).
     """
     members = np.ascontiguousarray(members, dtype=np.int64)
     if len(members) == 0:
@@ -92,7 +103,9 @@ def colour(members: Integers, count: int) -> tuple[Integers, Integers]:
 
 
 def spread(value: Floats | float, order: Integers) -> Floats:
-    """A constraint's parameter, one number or one a constraint, as an array in the order of the colours."""
+    """A constraint's parameter, one number or one a constraint, as an array in the order of the
+    colours.
+    """
     value = np.asarray(value, dtype=np.float64)
     return np.ascontiguousarray(value[order]) if value.ndim else np.full(len(order), float(value))
 
@@ -117,10 +130,13 @@ def _colour_loop(members, taken, colours):
 
 
 def cache_order(faces: Integers, count: int) -> Integers:
-    """Order (count,) of vertices that puts neighbours near each other in memory (reverse Cuthill and McKee 1969)."""
+    """Order (count,) of vertices that puts neighbours near each other in memory (reverse Cuthill
+    and McKee 1969).
+    """
     ends = np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]])
     degree = np.bincount(ends.ravel(), minlength=count)
-    # SciPy's own reverse_cuthill_mckee begins at a vertex that depends on the processor, by an unstable sort.
+    # SciPy's own reverse_cuthill_mckee begins at a vertex that depends on the processor, by an
+    # unstable sort.
     by_degree = np.argsort(degree, kind="stable")
     rows, columns = np.argsort(by_degree, kind="stable")[ends].T
     graph = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))

@@ -1,6 +1,8 @@
-"""Weights between the bones' motions that stretch the surface evenly: they minimise the integral of |grad w|^4.
+"""Weights between the bones' motions that stretch the surface evenly: they minimise the integral of
+|grad w|^4.
 
-Harmonic weights (p = 2) are singular at the rim of a small patch that is held, and stretch edges there fivefold.
+Harmonic weights (p = 2) are singular at the rim of a small patch that is held, and stretch edges
+there fivefold.
 """
 
 import numpy as np
@@ -20,7 +22,9 @@ FLATTEST = 1e-6
 
 
 def even_weights(vertices: Floats, faces: Integers, groups: list[Integers]) -> Floats:
-    """Weights (n, groups) in [0, 1] that sum to one, 1 on a group's own vertices, by re-weighted Laplace solves."""
+    """Weights (n, groups) in [0, 1] that sum to one, 1 on a group's own vertices, by re-weighted
+    Laplace solves.
+    """
     weights = harmonic_weights(vertices, faces, groups)
     held = np.zeros(len(vertices), dtype=bool)
     for group in groups:
@@ -37,7 +41,8 @@ def even_weights(vertices: Floats, faces: Integers, groups: list[Integers]) -> F
             first, second, (cotangents * conductance[:, None]).T.ravel(), len(vertices)
         )[free]
         solved = splu(laplacian[:, free].tocsc()).solve(-(laplacian[:, fixed] @ weights[fixed]))
-        # a full step oscillates for p > 3; this one is Newton's where the direction of the gradient stays
+        # a full step oscillates for p > 3; this one is Newton's where the direction of the gradient
+        # stays
         weights[free] += (solved - weights[free]) / (POWER - 1.0)
     weights = np.clip(weights, 0.0, 1.0)
     return weights / weights.sum(axis=1, keepdims=True)
@@ -60,7 +65,9 @@ def _face_operators(vertices, faces):
     shape = (len(faces), len(vertices))
     columns = faces.T.ravel()
     matrices = [
-        sparse.csr_matrix((np.concatenate([slope[:, d] for slope in slopes]), (rows, columns)), shape=shape)
+        sparse.csr_matrix(
+            (np.concatenate([slope[:, d] for slope in slopes]), (rows, columns)), shape=shape
+        )
         for d in range(3)
     ]
     return cotangents, matrices

@@ -37,9 +37,16 @@ if TYPE_CHECKING:
 __version__ = "1.0.0"
 
 _ERRORS = (
-    "LimitExceededError", "MeshError", "MissingPartError", "NumericalWarning", "RBFMuscleError", "SceneError",
-    "SceneWarning", "SolveError", "UsageError",
-)  # fmt: skip
+    "LimitExceededError",
+    "MeshError",
+    "MissingPartError",
+    "NumericalWarning",
+    "RBFMuscleError",
+    "SceneError",
+    "SceneWarning",
+    "SolveError",
+    "UsageError",
+)
 _HOME = {
     "BoneSDF": "rbfmuscle.bones.sdf",
     "RBFField": "rbfmuscle.implicit.field",

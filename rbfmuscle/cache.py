@@ -1,7 +1,8 @@
-"""Arrays that take long to compute, kept on disk by the content of mesh and options: distance fields, samples.
+"""Arrays that take long to compute, kept on disk by the content of mesh and options: distance
+fields, samples.
 
-An entry is a NumPy archive (`numpy.load` reads it). It is written to a temporary file and moved to its place, so that
-several processes may build the same field and none reads half of it.
+An entry is a NumPy archive (`numpy.load` reads it). It is written to a temporary file and moved to
+its place, so that several processes may build the same field and none reads half of it.
 """
 
 import contextlib
@@ -24,7 +25,15 @@ VERSION = 12  # part of every name: raise it when the arrays or the way they are
 SUFFIX = ".sdf.npz"
 _READING = Lock()
 # What reading a damaged, foreign or half-removed archive may raise.
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, IndexError, NotImplementedError, zipfile.BadZipFile)
+_DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    EOFError,
+    IndexError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+)
 
 
 def cache_path() -> Path:
@@ -32,7 +41,11 @@ def cache_path() -> Path:
     import platformdirs
 
     place = os.environ.get("RBFMUSCLE_CACHE")
-    return Path(place) if place else Path(platformdirs.user_cache_dir("rbfmuscle", appauthor=False)) / "sdf"
+    return (
+        Path(place)
+        if place
+        else Path(platformdirs.user_cache_dir("rbfmuscle", appauthor=False)) / "sdf"
+    )
 
 
 def content_key(vertices: Floats, faces: Integers, options: tuple[Any, ...]) -> str:
@@ -50,7 +63,8 @@ def load_arrays(key: str) -> dict[str, Array] | None:
     if not os.path.exists(path):
         return None
     try:
-        # One thread at a time: Python 3.11 counts the depth of what it parses, as NumPy's headers, for all together.
+        # One thread at a time: Python 3.11 counts the depth of what it parses, as NumPy's headers,
+        # for all together.
         with _READING, path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             if archive.zip.testzip() is not None:
                 raise ValueError("a checksum is wrong")
@@ -66,9 +80,14 @@ def load_arrays(key: str) -> dict[str, Array] | None:
 
 
 def store_arrays(key: str, arrays: dict[str, Any]) -> None:
-    """Keep arrays under a name; a cache that cannot be written is reported in the log and does no harm."""
+    """Keep arrays under a name; a cache that cannot be written is reported in the log and does no
+    harm.
+    """
     folder = cache_path()
-    entry: dict[str, Any] = {"key": np.array(key), **{k: np.asarray(a, order="C") for k, a in arrays.items()}}
+    entry: dict[str, Any] = {
+        "key": np.array(key),
+        **{k: np.asarray(a, order="C") for k, a in arrays.items()},
+    }
     try:
         folder.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=key, suffix=SUFFIX + ".part", dir=folder)

@@ -1,6 +1,7 @@
 """Child processes: start them, send them messages, receive theirs.
 
-They are started by command and not by `multiprocessing`, so that a script needs no guard of its main part.
+They are started by command and not by `multiprocessing`, so that a script needs no guard of its
+main part.
 """
 
 import contextlib
@@ -18,7 +19,8 @@ from rbfmuscle.validation import SolveError
 
 
 def start_child(module: str, threads: int) -> subprocess.Popen[bytes]:
-    """Start a process that runs a module of ours, with pipes, and with ``threads`` threads for loops and BLAS.
+    """Start a process that runs a module of ours, with pipes, and with ``threads`` threads for
+    loops and BLAS.
 
     Modules in the present folder are not imported.
     """
@@ -52,7 +54,8 @@ def unexpected_end(process: subprocess.Popen[bytes]) -> SolveError:
     code = process.wait()
     how = f" by signal {-code}" if code < 0 else f" (exit code {code})"
     return SolveError(
-        f"a helper process was ended{how}; memory may have run out: with NUMBA_NUM_THREADS=1 set, one process does "
+        f"a helper process was ended{how}; memory may have run out: with NUMBA_NUM_THREADS=1 set, "
+        "one process does "
         "it all"
     )
 

@@ -115,8 +115,13 @@ def _variants(scene, models, settings, frames):
             raise UsageError(f"{key}: all models have the same motion; leave out {model}:")
     variants = {}
     for name in models:
-        mine = {k.rpartition(":")[2]: v for k, v in settings.items() if k.rpartition(":")[0] in ("", name)}
-        # As in the scene file, a model given for all is the model whose settings these are; each then takes its turn.
+        mine = {
+            k.rpartition(":")[2]: v
+            for k, v in settings.items()
+            if k.rpartition(":")[0] in ("", name)
+        }
+        # As in the scene file, a model given for all is the model whose settings these are; each
+        # then takes its turn.
         whole = {key: value for key, value in mine.items() if chooses_model(key)}
         own = {key: value for key, value in mine.items() if not chooses_model(key)}
         variant = configure_scene(scene, whole).with_options(model=name)
@@ -140,11 +145,15 @@ def _measure(name, scene, folder, progress):
 
 
 def _surfaces(scene, chosen):
-    """Time to build the models, and the surfaces of all muscles in frames of these numbers, in this order."""
+    """Time to build the models, and the surfaces of all muscles in frames of these numbers, in this
+    order.
+    """
     changed, motion = scene.copy(), scene.motion
     changed.motion = Motion([motion.frames[k] for k in chosen], progress=motion.progress[chosen])
     start = time.perf_counter()
     models = build_models(changed)
     build = time.perf_counter() - start
     shown = [frame.surfaces for frame in simulate_frames(changed, models)]
-    return build, [{name: (s.vertices, s.faces) for name, s in surfaces.items()} for surfaces in shown]
+    return build, [
+        {name: (s.vertices, s.faces) for name, s in surfaces.items()} for surfaces in shown
+    ]

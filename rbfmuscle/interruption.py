@@ -1,6 +1,7 @@
 """Handling of SIGINT and SIGTERM: end at once, or first finish what is being written.
 
-Imports only light parts of the standard library, because it is installed before anything else is loaded.
+Imports only light parts of the standard library, because it is installed before anything else is
+loaded.
 """
 
 import atexit
@@ -26,27 +27,34 @@ class _State:
 
 
 def install(*, as_json: bool = False, watch: bool = False) -> None:
-    """Let SIGINT and SIGTERM end the process with 130, with the error as JSON on standard output where ``as_json``.
+    """Let SIGINT and SIGTERM end the process with 130, with the error as JSON on standard output
+    where ``as_json``.
 
-    With ``watch`` a thread listens too: Python's own handlers wait until compiled code of the main thread returns.
+    With ``watch`` a thread listens too: Python's own handlers wait until compiled code of the main
+    thread returns.
     """
-    _State.asked, _State.kept, _State.as_json = False, None, as_json
+    _State.asked = False
+    _State.kept = None
+    _State.as_json = as_json
     _answer_by(_handle)
     if watch:
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         threading.Thread(target=_listen, args=(reader,), daemon=True).start()
-        # The first of all that is registered is the last that is called: signals are ignored while Python exits.
+        # The first of all that is registered is the last that is called: signals are ignored while
+        # Python exits.
         atexit.register(_answer_by, signal.SIG_IGN)
 
 
 @contextlib.contextmanager
 def keeping(kept: Callable[[], str]) -> Iterator[None]:
-    """While inside, and where ``kept()`` returns text, an interrupt raises KeyboardInterrupt with it.
+    """While inside, and where ``kept()`` returns text, an interrupt raises KeyboardInterrupt with
+    it.
 
-    Output can then be finished; where it returns none, the process ends at once, as at a second interrupt. Compiled
-    code and callbacks may lose the exception: :func:`check` raises it again, and so does leaving.
+    Output can then be finished; where it returns none, the process ends at once, as at a second
+    interrupt. Compiled code and callbacks may lose the exception: :func:`check` raises it again,
+    and so does leaving.
     """
     before = _State.kept
     _State.kept = kept

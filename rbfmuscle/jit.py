@@ -1,7 +1,8 @@
 """Declaration of compiled loops, and the cache of their code.
 
-Each module that declares loops has a folder named by a digest of its source and of the sources that it imports.
-Numba's own cache misses edits of functions that are inlined from other files, and is unsafe for concurrent processes.
+Each module that declares loops has a folder named by a digest of its source and of the sources that
+it imports. Numba's own cache misses edits of functions that are inlined from other files, and is
+unsafe for concurrent processes.
 """
 
 import contextlib
@@ -27,16 +28,19 @@ _IMPORT = re.compile(r"^(?:from\s+([\w.]+)\s+)?import\s+(\([^)]*\)|.*)", re.MULT
 
 
 def compiled(function: Callable | None = None, **options: object) -> Callable:
-    """Declare a loop: compiled or loaded at its first call; the function itself where ``NUMBA_DISABLE_JIT`` is set.
+    """Declare a loop: compiled or loaded at its first call; the function itself where
+    ``NUMBA_DISABLE_JIT`` is set.
 
-    It takes arrays, numbers and NamedTuples of these; options are those of ``numba.njit``. ``nogil=False`` suits short
-    loops that are called often, because releasing the interpreter's lock takes longer than they do.
+    It takes arrays, numbers and NamedTuples of these; options are those of ``numba.njit``.
+    ``nogil=False`` suits short loops that are called often, because releasing the interpreter's
+    lock takes longer than they do.
     """
     if function is None:
         return lambda inner: compiled(inner, **options)
     if numba.config.DISABLE_JIT:
         return function
-    # No loop is an argument of another: the wrapper for that, an eighth of the time of compiling, is left out.
+    # No loop is an argument of another: the wrapper for that, an eighth of the time of compiling,
+    # is left out.
     loop = numba.njit(**{"nogil": True, "no_cfunc_wrapper": True, **options})(function)
     loop._compiler.compile = _no_collection()(loop._compiler.compile)
     loop._cache = _LoopCache(function)
@@ -44,7 +48,9 @@ def compiled(function: Callable | None = None, **options: object) -> Callable:
 
 
 def loops_path() -> Path:
-    """Folder of compiled loops: ``RBFMUSCLE_LOOPS``, or in the user's cache folder of the platform."""
+    """Folder of compiled loops: ``RBFMUSCLE_LOOPS``, or in the user's cache folder of the
+    platform.
+    """
     place = os.environ.get("RBFMUSCLE_LOOPS")
     return Path(place or platformdirs.user_cache_path("rbfmuscle", appauthor=False) / "loops")
 
@@ -61,8 +67,16 @@ class _LoopCache(FunctionCache):
     def _path(self, signature, codegen):
         code = self._py_func.__code__
         types = [_spelled(kind) for kind in getattr(signature, "args", signature)]
-        facts = (types, codegen.magic_tuple(), code.co_firstlineno, code.co_code, numba.config.BOUNDSCHECK)
-        name = f"{self._py_func.__qualname__}-{_digest(repr(facts).encode())}".replace("<locals>", "local")
+        facts = (
+            types,
+            codegen.magic_tuple(),
+            code.co_firstlineno,
+            code.co_code,
+            numba.config.BOUNDSCHECK,
+        )
+        name = f"{self._py_func.__qualname__}-{_digest(repr(facts).encode())}".replace(
+            "<locals>", "local"
+        )
         return loops_path() / self._cache_path / name
 
     def _load_overload(self, sig, target_context):
@@ -86,7 +100,8 @@ class _LoopCache(FunctionCache):
             part.replace(path)  # whole or absent, whoever else writes it
         except OSError as error:
             _say(
-                f"cannot keep compiled loops in {loops_path()} ({error.strerror}); every process compiles them"
+                f"cannot keep compiled loops in {loops_path()} ({error.strerror}); every process "
+                "compiles them"
             )
 
 
@@ -103,8 +118,12 @@ def _digest(content: bytes) -> str:
 
 @cache
 def _sources_digest(name: str) -> str | None:
-    """Digest of a module, of what it imports of its package and of this one; None where a source cannot be read."""
-    ours, sources, left = {name.partition(".")[0], "rbfmuscle"}, {}, [name]
+    """Digest of a module, of what it imports of its package and of this one; None where a source
+    cannot be read.
+    """
+    ours = {name.partition(".")[0], "rbfmuscle"}
+    sources = {}
+    left = [name]
     while left:
         one = left.pop()
         if one not in sources and one in sys.modules and one.partition(".")[0] in ours:
@@ -116,7 +135,9 @@ def _sources_digest(name: str) -> str | None:
 
 @cache
 def _source(name: str) -> tuple[str, list[str]]:
-    """Digest of a module's file, empty where there is none, and names imported at its top that may be modules."""
+    """Digest of a module's file, empty where there is none, and names imported at its top that may
+    be modules.
+    """
     try:
         content = Path(sys.modules[name].__file__ or "").read_bytes()
     except (OSError, AttributeError):

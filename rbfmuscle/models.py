@@ -23,7 +23,8 @@ class _Home(NamedTuple):
 
 
 _PBD = "pbd_baseline", "PBDMuscle", "PBDOptions"
-# Sweeps of the converged mesh models go on until none moves a vertex by more than this share of the muscle's size.
+# Sweeps of the converged mesh models go on until none moves a vertex by more than this share of the
+# muscle's size.
 CONVERGED, _SUFFIX = 5e-6, "-converged"
 _METHODS = ("pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 _HOME = {"rbf": _Home("rbfmuscle.muscle", "RBFMuscle", "RBFOptions", {})}
@@ -40,19 +41,26 @@ _SWEEPS = {"pbd": 3}  # where the settings name none
 
 
 def model_title(muscle: Muscle) -> str:
-    """What the model of a muscle is called in tables and pictures, with its sweeps where they are known."""
+    """What the model of a muscle is called in tables and pictures, with its sweeps where they are
+    known.
+    """
     base = muscle.model.removesuffix(_SUFFIX)
-    title, sweeps = _TITLES.get(base, base), muscle.options.get("iterations", 0) or _SWEEPS.get(base, 0)
+    title, sweeps = (
+        _TITLES.get(base, base),
+        muscle.options.get("iterations", 0) or _SWEEPS.get(base, 0),
+    )
     if base != muscle.model:
         return f"{title}, converged"
     return f"{title}, {sweeps} sweeps" if sweeps and base != "rbf" else title
 
 
 def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> MuscleModel:
-    """Return the model of one muscle of a scene, of a name in ``MODEL_NAMES``, the scene's own choice where not given.
+    """Return the model of one muscle of a scene, of a name in ``MODEL_NAMES``, the scene's own
+    choice where not given.
 
-    The options of the scene's model table are for the class of models that it names, and are left out for another.
-    UsageError on an unknown name, with the nearest right one; SceneError if a setting is unknown or impossible.
+    The options of the scene's model table are for the class of models that it names, and are left
+    out for another. UsageError on an unknown name, with the nearest right one; SceneError if a
+    setting is unknown or impossible.
     """
     name = muscle.model if name is None else name
     home = _HOME[check_model_name(name)]
@@ -76,7 +84,9 @@ def kernel_names(scene: Scene) -> dict[str, str]:
 
 
 def build_models(scene: Scene, names: Collection[str] | None = None) -> list[MuscleModel]:
-    """Return the models of a scene's muscles, all or those named, in the scene's order, built side by side."""
+    """Return the models of a scene's muscles, all or those named, in the scene's order, built side
+    by side.
+    """
     from threadpoolctl import threadpool_limits
 
     muscles = [muscle for muscle in scene.muscles if names is None or muscle.name in names]
@@ -91,15 +101,18 @@ def configure_scene(
     model: str | dict | None = None,
     frames: slice | str | None = None,
 ) -> Scene:
-    """Return a scene with other settings, checked to the last key of every muscle's model; nothing is built.
+    """Return a scene with other settings, checked to the last key of every muscle's model; nothing
+    is built.
 
-    Arguments are those of `Scene.with_options`. SceneError if the scene itself names an unknown model, or an unknown or
-    impossible setting of one; UsageError if the settings do.
+    Arguments are those of `Scene.with_options`. SceneError if the scene itself names an unknown
+    model, or an unknown or impossible setting of one; UsageError if the settings do.
     """
     check_models(scene)
     for key in settings or ():
         schemas = (_part(home, "options", home.options) for home in _HOME.values())
-        if key.partition(".")[0] not in HEADS and any(key in schema.model_fields for schema in schemas):
+        if key.partition(".")[0] not in HEADS and any(
+            key in schema.model_fields for schema in schemas
+        ):
             raise UsageError(f"{key}: unknown setting, did you mean 'model.{key}'?")
     changed = scene.with_options(settings, model=model, frames=frames)
     for muscle in changed.muscles:

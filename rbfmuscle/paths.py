@@ -1,4 +1,6 @@
-"""Paths of muscles for OpenSim: sample muscles over their coordinates, fit polynomials, and say how well they hold."""
+"""Paths of muscles for OpenSim: sample muscles over their coordinates, fit polynomials, and say how
+well they hold.
+"""
 
 import csv
 import itertools
@@ -68,15 +70,19 @@ def parse_ranges(scene: Scene, texts: list[str]) -> Ranges:
 def sample_muscles(
     scene: Scene, given: Ranges, *, samples: int, progress: Callable[[int, int], None] | None = None
 ) -> list[Samples]:
-    """Return lengths and moment arms of every muscle at quasi-random poses of the coordinates that it depends on.
+    """Return lengths and moment arms of every muscle at quasi-random poses of the coordinates that
+    it depends on.
 
-    Each of the ``samples`` poses is reached from rest in a straight line and the muscle settles there. A moment arm is
-    minus the central difference of the length over `STEP` to both sides, the muscle settling there too. Ranges that are
-    ``given`` stand for the coordinates' own; ``progress`` is called with the poses that are done, and of how many.
+    Each of the ``samples`` poses is reached from rest in a straight line and the muscle settles
+    there. A moment arm is minus the central difference of the length over `STEP` to both sides, the
+    muscle settling there too. Ranges that are ``given`` stand for the coordinates' own;
+    ``progress`` is called with the poses that are done, and of how many.
     """
     scene = scene.validate().copy()
     scene.sliding = None
-    groups, found, done = _groups(scene), [], 0
+    groups = _groups(scene)
+    found = []
+    done = 0
     ranges = {name: _range(scene, name, given) for names in groups for name in names}
     for name in [name for name in given if name not in ranges]:
         raise UsageError(
@@ -98,11 +104,15 @@ def sample_muscles(
 
 
 def _measured(scene, poses):
-    """For each pose a row for each muscle: its length, then its moment arm about each coordinate of the poses."""
+    """For each pose a row for each muscle: its length, then its moment arm about each coordinate of
+    the poses.
+    """
     scene.motion = Motion(poses[:40])  # what bones a muscle may meet is sought along it
     models = build_models(scene)
     rest = [model.snapshot() for model in models]
-    lines = {m.name: Centreline(scene.muscle(m.name), scene.joints, *m.material_mesh()) for m in models}
+    lines = {
+        m.name: Centreline(scene.muscle(m.name), scene.joints, *m.material_mesh()) for m in models
+    }
     fields = build_fields(scene, find_contact_pairs(scene))
     for pose in poses:
         for model, state in zip(models, rest):
@@ -129,7 +139,9 @@ def _row(loop, lines, pose):
 
 
 def _settled(loop, lines, pose):
-    """Lengths (n,) of the muscles when they have come to rest at a pose, or have had `MOST_SOLVES`."""
+    """Lengths (n,) of the muscles when they have come to rest at a pose, or have had
+    `MOST_SOLVES`.
+    """
     loop.skip(pose)
     with loop.working():
         each(lambda stepper: _settle(stepper, loop.here), loop.steppers)
@@ -163,7 +175,10 @@ def _poses(ranges, samples):
 
 def _groups(scene):
     """Muscles by the coordinates that they depend on; those of a group are sampled together."""
-    facts, followers = all_coordinates(scene.joints), {coupling.coordinate for coupling in scene.couplings}
+    facts, followers = (
+        all_coordinates(scene.joints),
+        {coupling.coordinate for coupling in scene.couplings},
+    )
     free = [name for name, fact in facts.items() if name not in followers and not fact.locked]
     groups = {}
     for muscle in scene.muscles:
@@ -171,7 +186,8 @@ def _groups(scene):
         needed = tuple(name for name in free if _moves(scene, bones, name))
         if not 1 <= len(needed) <= MOST_COORDINATES:
             raise SceneError(
-                f"muscle {muscle.name!r} depends on {len(needed)} coordinates ({', '.join(needed)}); OpenSim takes "
+                f"muscle {muscle.name!r} depends on {len(needed)} coordinates "
+                f"({', '.join(needed)}); OpenSim takes "
                 f"1 to {MOST_COORDINATES}: lock some in the scene"
             )
         groups.setdefault(needed, []).append(muscle)
@@ -196,20 +212,28 @@ def _range(scene, name, given):
         if ends is not None and ends[0] < ends[1]:
             low, high = (fact.honoured(end) for end in ends)
             if low == high:
-                raise UsageError(f"--range {name}: it lies outside the range that clamps the coordinate")
+                raise UsageError(
+                    f"--range {name}: it lies outside the range that clamps the coordinate"
+                )
             return low, high
     raise UsageError(f"coordinate {name!r} has no range; give --range {name}=LOW:HIGH")
 
 
 def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[str]:
-    """Fit every muscle, write the files, and return lines that say how well the fits hold where they were not made."""
-    fitted, lines, errors, unit = [], [], [], scene.units
+    """Fit every muscle, write the files, and return lines that say how well the fits hold where
+    they were not made.
+    """
+    fitted = []
+    lines = []
+    errors = []
+    unit = scene.units
     for found in sampled:
         path, row = _fit(found)
         fitted.append(path)
         errors.append(row)
         lines.append(
-            f"{path.muscle}: order {path.order} in {', '.join(path.coordinates)}; {row['held_out']} poses held out: "
+            f"{path.muscle}: order {path.order} in {', '.join(path.coordinates)}; "
+            f"{row['held_out']} poses held out: "
             f"length {row['length_rms']:.3g} {unit} RMS, {row['length_max']:.3g} at most; "
             f"arms {row['arm_rms']:.3g} {unit} RMS, {row['arm_max']:.3g} at most"
             + (f"; {row['failed']} poses could not be solved" if row["failed"] else "")
@@ -222,14 +246,19 @@ def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[s
         writer.writeheader()
         writer.writerows(errors)
     file = directory / "paths.xml"
-    return [*lines, f"{file}: {len(fitted)} paths; OpenSim puts them in by their names, /forceset/MUSCLE"]
+    return [
+        *lines,
+        f"{file}: {len(fitted)} paths; OpenSim puts them in by their names, /forceset/MUSCLE",
+    ]
 
 
 def _fit(found):
     """The path of a muscle, and its errors at poses that the fit has not seen."""
     solved = np.isfinite(found.lengths) & np.isfinite(found.arms).all(axis=1)
     held = np.arange(len(solved)) % HELD_OUT == HELD_OUT - 1
-    use, out, failed = solved & ~held, solved & held, int((~solved).sum())
+    use = solved & ~held
+    out = solved & held
+    failed = int((~solved).sum())
     if use.sum() < 2 * (len(found.coordinates) + 1) or not out.any():
         why = f"{failed} of {len(solved)} poses failed, too few are left to fit"
         raise SolveError(f"muscle {found.muscle!r}: {why}")
@@ -240,16 +269,20 @@ def _fit(found):
     length = path.length(found.values[out]) - found.lengths[out]
     arm = path.arms(found.values[out]) - found.arms[out]
     for name, error in {"length": length, "arm": arm}.items():
-        row |= {f"{name}_rms": float(np.sqrt(np.mean(error**2))), f"{name}_max": float(np.abs(error).max())}
+        row |= {
+            f"{name}_rms": float(np.sqrt(np.mean(error**2))),
+            f"{name}_max": float(np.abs(error).max()),
+        }
     return path, row
 
 
 @dataclass(frozen=True)
 class FittedPath:
-    """A polynomial for a muscle's length over coordinates (full names); minus its derivatives are the moment arms.
+    """A polynomial for a muscle's length over coordinates (full names); minus its derivatives are
+    the moment arms.
 
-    ``order`` is the largest sum of exponents; ``coefficients`` are those of the terms in `exponents`, for coordinates
-    in radians or scene units [scene unit].
+    ``order`` is the largest sum of exponents; ``coefficients`` are those of the terms in
+    `exponents`, for coordinates in radians or scene units [scene unit].
     """
 
     muscle: str
@@ -267,7 +300,9 @@ class FittedPath:
 
 
 def exponents(dimension: int, order: int) -> np.ndarray:
-    """Return the exponents (m, d) of every term up to an order, the last coordinate's going fastest, as OpenSim's."""
+    """Return the exponents (m, d) of every term up to an order, the last coordinate's going
+    fastest, as OpenSim's.
+    """
     powers = itertools.product(range(order + 1), repeat=dimension)
     return np.array([power for power in powers if sum(power) <= order])
 
@@ -295,8 +330,9 @@ def fit_path(
 ) -> FittedPath:
     """Fit a polynomial to lengths (n,) and, by its derivatives, to moment arms (n, d).
 
-    ``values`` (n, d) are the coordinates [radian or scene unit]. The order, at most ``most``, is the one whose fit
-    without a fifth of the poses, each in turn, errs least there; there are always more equations than terms.
+    ``values`` (n, d) are the coordinates [radian or scene unit]. The order, at most ``most``, is
+    the one whose fit without a fifth of the poses, each in turn, errs least there; there are always
+    more equations than terms.
     """
     count, dimension = values.shape
     weights = np.r_[1.0, np.full(dimension, ARM_WEIGHT)][:, None]
@@ -317,16 +353,21 @@ def fit_path(
 
 
 def _solve(rows, wanted):
-    """Coefficients by least squares; columns are scaled, as powers of coordinates differ by orders of magnitude."""
+    """Coefficients by least squares; columns are scaled, as powers of coordinates differ by orders
+    of magnitude.
+    """
     matrix = rows.reshape(-1, rows.shape[2])
     size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     return np.linalg.lstsq(matrix / size, wanted.ravel(), rcond=None)[0] / size
 
 
-def write_paths(file: Path, fitted: list[FittedPath], metre: float, turning: dict[str, bool]) -> None:
+def write_paths(
+    file: Path, fitted: list[FittedPath], metre: float, turning: dict[str, bool]
+) -> None:
     """Write paths as the set of ``FunctionBasedPath`` that OpenSim loads.
 
-    ``metre`` is its length in scene units; ``turning`` says which coordinates are no shifts, which are in metres there.
+    ``metre`` is its length in scene units; ``turning`` says which coordinates are no shifts, which
+    are in metres there.
     """
     add = ElementTree.SubElement
     root = ElementTree.Element("OpenSimDocument", Version="40600")

@@ -1,4 +1,6 @@
-"""Progress of a command on stderr: a bar on a terminal, else a line per stage and some for the count."""
+"""Progress of a command on stderr: a bar on a terminal, else a line per stage and some for the
+count.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ FIRST, EVERY = 2.0, 10.0  # Time before the first line for a count, and then bet
 
 
 class Progress:
-    """Context manager; call it with (done, total). A nested one is shown under the title of the outer one.
+    """Context manager; call it with (done, total). A nested one is shown under the title of the
+    outer one.
 
     ``title`` is that of the command or scene, ``what`` is what is counted.
     """
@@ -48,10 +51,17 @@ class Progress:
         self.last = time.monotonic()
         if self.bar is not None:
             self.bar.update(
-                self.bar.task_ids[0], description=f"{self.title}: {text}", completed=done, total=total
+                self.bar.task_ids[0],
+                description=f"{self.title}: {text}",
+                completed=done,
+                total=total,
             )
         else:
-            print(f"{self.title}: {text} ({self.last - self.begun:.0f} s)", file=sys.stderr, flush=True)
+            print(
+                f"{self.title}: {text} ({self.last - self.begun:.0f} s)",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def __exit__(self, *error: object) -> None:
         if Progress.shown is self:

@@ -1,4 +1,6 @@
-"""One run of a scene: its models through the frame loop, measured and clocked, a generator of frames for a sink."""
+"""One run of a scene: its models through the frame loop, measured and clocked, a generator of
+frames for a sink.
+"""
 
 import time
 import warnings
@@ -57,8 +59,8 @@ class MemorySink:
 class Recording:
     """One run of a scene: its models through the frame loop, measured and clocked, into a sink.
 
-    ``model``, ``settings`` and ``frames`` are those of `configure_scene`; ``fields`` of the bones, by name, stand in
-    place of `BoneSDF`, and all muscles are then in this process.
+    ``model``, ``settings`` and ``frames`` are those of `configure_scene`; ``fields`` of the bones,
+    by name, stand in place of `BoneSDF`, and all muscles are then in this process.
     """
 
     def __init__(
@@ -70,13 +72,21 @@ class Recording:
         frames: slice | str | None = None,
         fields: Mapping[str, BoneField] | None = None,
     ) -> None:
-        self.started, self._start, self._end = datetime.now(UTC), time.perf_counter(), 0.0
+        self.started = datetime.now(UTC)
+        self._start = time.perf_counter()
+        self._end = 0.0
         scene = configure_scene(scene, settings, model=model, frames=frames)
         self.scene = orient_scene(scene.validate())
         if fields is not None and set(fields) != {bone.name for bone in scene.bones}:
             bones = ", ".join(bone.name for bone in scene.bones)
-            raise UsageError(f"fields must name each bone ({bones}), got {', '.join(fields) or 'none'}")
-        self.options = {"model": model, "frames": str(frames or ""), "settings": dict(settings or {})}
+            raise UsageError(
+                f"fields must name each bone ({bones}), got {', '.join(fields) or 'none'}"
+            )
+        self.options = {
+            "model": model,
+            "frames": str(frames or ""),
+            "settings": dict(settings or {}),
+        }
         self.times: dict[str, float] = {}
         self.status, self.message = "running", ""
         self.summary, self.neighbours = Summary(), Neighbours()
@@ -134,7 +144,9 @@ class Recording:
     def finish(
         self, writer: RunWriter, limits: Mapping[str, float], *, pictures: bool = True
     ) -> dict[str, Any]:
-        """Write report and pictures of a run that is in a folder, then hold it to limits; what ``run.json`` holds."""
+        """Write report and pictures of a run that is in a folder, then hold it to limits; what
+        ``run.json`` holds.
+        """
         start = time.perf_counter()
         with timed(self.times, "report"), stage("drawing pictures"):
             if self.scene.output.report:
@@ -178,7 +190,9 @@ class Recording:
             message=self.message,
             options=self.options,
             kernels=kernel_names(self.scene),
-            times={part: here.get(part, 0.0) + shared.get(part, 0.0) for part in {**here, **shared}},
+            times={
+                part: here.get(part, 0.0) + shared.get(part, 0.0) for part in {**here, **shared}
+            },
             limits=limits,
             verdict=describe_verdict(table, limits, self.scene.left_out),
             beyond=exceeded(table, limits),
@@ -190,7 +204,9 @@ Found = tuple[list[Event], dict[str, float]]
 
 
 def _check_skeleton(scene: Scene) -> dict[int, Found]:
-    """Events and values of the bones for some frames of the motion, and a warning for each pair that meets."""
+    """Events and values of the bones for some frames of the motion, and a warning for each pair
+    that meets.
+    """
     collisions = bone_collisions(scene)
     for finding in bone_findings(collisions, scene.units):
         warnings.warn(f"{finding.place}: {finding.message}", SceneWarning, stacklevel=5)

@@ -58,8 +58,8 @@ def simulate(
     frames : slice or str, optional
         Frames of the motion, a slice or "A:B:S".
     progress : callable or bool, optional
-        Called as ``progress(done, total)`` after each frame; ``True`` shows on stderr what goes on, compiling and
-        building included.
+        Called as ``progress(done, total)`` after each frame; ``True`` shows on stderr what goes on,
+        compiling and building included.
     fields : mapping of str to BoneField, optional
         Distance fields of the bones, by the bone's name; `BoneSDF` where not given.
 
@@ -86,7 +86,9 @@ def simulate(
     scene = open_scene(scene)
     if progress is True:
         with Progress(scene.name) as shown:
-            return simulate(scene, model, settings=settings, frames=frames, progress=shown, fields=fields)
+            return simulate(
+                scene, model, settings=settings, frames=frames, progress=shown, fields=fields
+            )
     recording = Recording(scene, model=model, settings=settings, frames=frames, fields=fields)
     memory = MemorySink()
     run = Run(memory.frames, memory.rows, recording=recording)
@@ -111,9 +113,10 @@ def stream_run(
 ) -> dict[str, Any]:
     """Run a scene and write it to a folder frame by frame, and return what ``run.json`` holds.
 
-    Memory does not grow with the frames. The scene's ``output`` table says what is written; ``model``, ``settings``,
-    ``frames`` and ``progress`` are as for `simulate`; ``fail_on`` are limits, see
-    `rbfmuscle.metrics.summary.parse_limits`; ``pictures`` are those of the report and the preview.
+    Memory does not grow with the frames. The scene's ``output`` table says what is written;
+    ``model``, ``settings``, ``frames`` and ``progress`` are as for `simulate`; ``fail_on`` are
+    limits, see `rbfmuscle.metrics.summary.parse_limits`; ``pictures`` are those of the report and
+    the preview.
 
     Raises
     ------
@@ -136,7 +139,8 @@ def stream_run(
 class Run:
     """A run: in memory, or of a folder that holds one.
 
-    ``len(run)`` is the number of its frames, ``run["extensor"]`` one muscle; iteration gives every muscle.
+    ``len(run)`` is the number of its frames, ``run["extensor"]`` one muscle; iteration gives every
+    muscle.
 
     Attributes
     ----------
@@ -233,10 +237,14 @@ class Run:
 
     def values(self, muscle: str, quantity: str) -> NDArray[np.float64]:
         """Values of a quantity over the frames, (n,) ndarray."""
-        return np.array([r.value for r in self.metrics if r.muscle == muscle and r.quantity == quantity])
+        return np.array(
+            [r.value for r in self.metrics if r.muscle == muscle and r.quantity == quantity]
+        )
 
     def table(self) -> pandas.DataFrame:
-        """Return the metrics as a pandas DataFrame, or raise MissingPartError if pandas is not installed."""
+        """Return the metrics as a pandas DataFrame, or raise MissingPartError if pandas is not
+        installed.
+        """
         try:
             import pandas
         except ImportError:
@@ -246,7 +254,9 @@ class Run:
     def plot(self, quantity: str = "penetration_max") -> Axes:
         """Plot a quantity of every muscle over the motion, and return the matplotlib Axes."""
         if quantity not in self.quantities:
-            raise UsageError(f"unknown quantity {quantity!r}, {did_you_mean(quantity, self.quantities)}")
+            raise UsageError(
+                f"unknown quantity {quantity!r}, {did_you_mean(quantity, self.quantities)}"
+            )
         from matplotlib import pyplot
 
         rows = [row for row in self.metrics if row.quantity == quantity]
@@ -261,7 +271,8 @@ class Run:
     def save(self, directory: str | Path, *, pictures: bool = True) -> None:
         """Write what `stream_run` would have written; a run that was loaded is copied.
 
-        ``pictures`` are those of the report and the preview. UsageError if the folder cannot be written to.
+        ``pictures`` are those of the report and the preview. UsageError if the folder cannot be
+        written to.
         """
         check_writable(directory)
         if self._recording is not None:
@@ -274,8 +285,9 @@ class Run:
     ) -> list[Path]:
         """Write the surfaces in other formats, into a folder for each, and return the files.
 
-        Formats are ``pvd``, ``vtp``, ``ply``, ``stl``, ``obj``, ``glb``, ``usd`` and ``animated-glb``; ``units`` are
-        ``"m"``, ``"cm"`` or ``"mm"``, the scene's where not given; glTF is in metres.
+        Formats are ``pvd``, ``vtp``, ``ply``, ``stl``, ``obj``, ``glb``, ``usd`` and
+        ``animated-glb``; ``units`` are ``"m"``, ``"cm"`` or ``"mm"``, the scene's where not given;
+        glTF is in metres.
         """
         names = [formats] if isinstance(formats, str) else list(formats)
         return export_run(self.saved.directory, names, output=directory, units=units)
@@ -295,14 +307,19 @@ class Run:
         return writer
 
     def __repr__(self) -> str:
-        return f"<Run of {self.info['scene']['name']!r}: {len(self)} frames, {', '.join(self.muscles)}>"
+        return (
+            f"<Run of {self.info['scene']['name']!r}: {len(self)} frames, "
+            f"{', '.join(self.muscles)}>"
+        )
 
     def _repr_html_(self) -> str:
         from rbfmuscle.report.render import figure_html, render_run
 
         if not self.saved.has_surfaces():
             return html.escape(repr(self))
-        return figure_html(lambda file: render_run(self.saved.directory, file), f"{self!r} {self.verdict}")
+        return figure_html(
+            lambda file: render_run(self.saved.directory, file), f"{self!r} {self.verdict}"
+        )
 
 
 class MuscleRun:

@@ -60,7 +60,9 @@ class MissingPartError(RBFMuscleError, ImportError):
 
 
 class NotFiniteError(ValueError):
-    """Numbers hold NaN or infinity; a solver's loop turns it into a `SolveError` that names muscle and frame."""
+    """Numbers hold NaN or infinity; a solver's loop turns it into a `SolveError` that names muscle
+    and frame.
+    """
 
 
 class SceneWarning(UserWarning):
@@ -68,7 +70,9 @@ class SceneWarning(UserWarning):
 
 
 class NumericalWarning(UserWarning):
-    """A result is usable but less accurate than asked; the message names the cause and the remedy."""
+    """A result is usable but less accurate than asked; the message names the cause and the
+    remedy.
+    """
 
 
 MOST_NAMED = 40  # names that a message lists
@@ -90,7 +94,9 @@ def shown_path(path: str | os.PathLike[str]) -> str:
 
 
 def read_text(path: Path, *, place: str) -> str:
-    """Return the text of a file that a scene names, or raise SceneError that begins with ``place``."""
+    """Return the text of a file that a scene names, or raise SceneError that begins with
+    ``place``.
+    """
     if not os.path.isfile(path):
         raise SceneError(f"{place}{shown_path(path)}: cannot read it: no such file")
     try:
@@ -100,7 +106,9 @@ def read_text(path: Path, *, place: str) -> str:
 
 
 def check_points(points: ArrayLike, *, name: str = "points") -> NDArray[np.float64]:
-    """Return points as a finite, C-contiguous (n, 3) float64 array, or raise ValueError that calls them ``name``."""
+    """Return points as a finite, C-contiguous (n, 3) float64 array, or raise ValueError that calls
+    them ``name``.
+    """
     points = _as_floats(points, name)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name} must have shape (n, 3), got {points.shape}")

@@ -1,4 +1,6 @@
-"""A muscle without mechanics, for tests of what lies around models: vertices blend their bones' motion."""
+"""A muscle without mechanics, for tests of what lies around models: vertices blend their bones'
+motion.
+"""
 
 from pathlib import Path
 
@@ -38,7 +40,9 @@ class BlendMuscle(ToyMuscle):
 
 
 def arm_scene(*, end=20, step=10, units="mm"):
-    """Two boxes with a hinge between them and an egg of a muscle above, from rest to ``end`` degrees."""
+    """Two boxes with a hinge between them and an egg of a muscle above, from rest to ``end``
+    degrees.
+    """
     scene = Scene("arm", units=units)
     for name, place in (("upper", -22), ("fore", 22)):
         scene.add_bone(name, trimesh.creation.box((40, 6, 6)).apply_translation([place, 0, 0]))
@@ -56,13 +60,17 @@ ARM_FILE = Path(__file__).parent / "data" / "arm.toml"
 
 
 def arm_files(folder, name="arm.toml", *, end=10, step=5, muscles=(("biceps", 0.0),), defaults=""):
-    """Write `arm_scene` as files, its muscle once for each name and shift sideways; return the scene file's path."""
+    """Write `arm_scene` as files, its muscle once for each name and shift sideways; return the
+    scene file's path.
+    """
     scene = arm_scene()
     for bone in scene.bones:
         bone.mesh.export(folder / f"{bone.name}.ply")
     text = ARM_FILE.read_text(encoding="utf-8").format(end=end, step=step, defaults=defaults)
     for muscle, shift in muscles:
-        scene.muscles[0].mesh.copy().apply_translation([0, shift, 0]).export(folder / f"{muscle}.ply")
+        scene.muscles[0].mesh.copy().apply_translation([0, shift, 0]).export(
+            folder / f"{muscle}.ply"
+        )
         text += f'[[muscle]]\nname = "{muscle}"\nmesh = "{muscle}.ply"\n'
     for attachment in scene.muscles[0].attachments:
         np.savetxt(folder / f"{attachment.bone}.txt", attachment.vertices, fmt="%d")
@@ -78,4 +86,6 @@ def use_blend_model(monkeypatch, fail_at=None):
 
 def files_in(folder):
     """Names of all files below a folder, relative to it."""
-    return sorted(str(path.relative_to(folder)) for path in Path(folder).rglob("*") if path.is_file())
+    return sorted(
+        str(path.relative_to(folder)) for path in Path(folder).rglob("*") if path.is_file()
+    )

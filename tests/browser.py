@@ -1,4 +1,6 @@
-"""Chromium without a display, driven over its DevTools protocol with the websockets package that viser brings."""
+"""Chromium without a display, driven over its DevTools protocol with the websockets package that
+viser brings.
+"""
 
 import base64
 import io
@@ -12,11 +14,18 @@ import urllib.request
 import numpy as np
 
 SIZE = (750, 500)
-# Drawing in software, so that it works where there is no graphics card; root may not use the sandbox.
+# Drawing in software, so that it works where there is no graphics card; root may not use the
+# sandbox.
 OPTIONS = (
-    "--headless=new", "--no-sandbox", "--remote-debugging-port=0", "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader", "--disable-dev-shm-usage", "--no-first-run", "about:blank",
-)  # fmt: skip
+    "--headless=new",
+    "--no-sandbox",
+    "--remote-debugging-port=0",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-dev-shm-usage",
+    "--no-first-run",
+    "about:blank",
+)
 
 
 # The page warns where drawing is in software, over the picture.
@@ -78,13 +87,17 @@ class Tab:
 
     def run(self, script):
         """Value of a script."""
-        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get(
+            "value"
+        )
 
     def text(self):
         return self.run("document.body ? document.body.innerText : ''") or ""
 
     def place(self, condition):
-        """Middle of the first innermost element for which a condition on ``e`` holds, None where there is none."""
+        """Middle of the first innermost element for which a condition on ``e`` holds, None where
+        there is none.
+        """
         return self.run(
             f"(() => {{ const e = [...document.querySelectorAll('*')].find(e => {condition});"
             "if (!e) return null; const r = e.getBoundingClientRect();"
@@ -96,7 +109,14 @@ class Tab:
         self.socket.close()
 
     def mouse(self, kind, place):
-        self.call("Input.dispatchMouseEvent", type=kind, x=place[0], y=place[1], button="left", clickCount=1)
+        self.call(
+            "Input.dispatchMouseEvent",
+            type=kind,
+            x=place[0],
+            y=place[1],
+            button="left",
+            clickCount=1,
+        )
 
     def click(self, text):
         """Click on what has this text."""
@@ -104,7 +124,10 @@ class Tab:
 
     def tick(self, label):
         """Click on the checkbox in the row of a label."""
-        self._press(f"e.type == 'checkbox' && e.closest('.mantine-Flex-root')?.innerText.trim() == {label!r}")
+        self._press(
+            "e.type == 'checkbox' && e.closest('.mantine-Flex-root')?.innerText.trim() == "
+            f"{label!r}"
+        )
 
     def _press(self, condition):
         place = wait_for(lambda: self.place(condition), 20)
@@ -114,9 +137,12 @@ class Tab:
     def slider(self, number):
         """Value of a slider, its handle's place, and those of the ends of its track."""
         return self.run(
-            f"(() => {{ const e = document.querySelectorAll('[role=slider]')[{number}]; if (!e) return null;"
-            "const r = e.getBoundingClientRect(), t = e.parentElement.getBoundingClientRect(), y = r.y + r.height / 2;"
-            "return [Number(e.ariaValueNow), [r.x + r.width / 2, y], [t.left, y], [t.right, y]] })()"
+            "(() => "
+            f"{{ const e = document.querySelectorAll('[role=slider]')[{number}];"
+            "if (!e) return null;"
+            "const r = e.getBoundingClientRect(), t = e.parentElement.getBoundingClientRect();"
+            "const y = r.y + r.height / 2, x = r.x + r.width / 2;"
+            "return [Number(e.ariaValueNow), [x, y], [t.left, y], [t.right, y]] })()"
         )
 
     def drag(self, number, share):

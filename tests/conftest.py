@@ -11,13 +11,15 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# The threads of BLAS spin while they wait: beside another worker, or on a busy machine, they take the cores from what
-# they wait for, at two to six times the processor time. Loops keep theirs, so what runs side by side is tested as such.
+# The threads of BLAS spin while they wait: beside another worker, or on a busy machine, they take
+# the cores from what they wait for, at two to six times the processor time. Loops keep theirs, so
+# what runs side by side is tested as such.
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-# Vertices of every scene, and of the shapes that tests make, moved at random by this share of their size. What
-# another processor rounds otherwise differs by less: a test that fails then hangs on last digits (make portability).
+# Vertices of every scene, and of the shapes that tests make, moved at random by this share of their
+# size. What another processor rounds otherwise differs by less: a test that fails then hangs on
+# last digits (make portability).
 MOVED = float(os.environ.get("RBFMUSCLE_MOVED_VERTICES", "0"))
 
 
@@ -56,7 +58,9 @@ if MOVED:
 
 
 def find_data(name):
-    """A folder of real data; the test is skipped where it is absent, or would take hours without compiler."""
+    """A folder of real data; the test is skipped where it is absent, or would take hours without
+    compiler.
+    """
     if os.environ.get("NUMBA_DISABLE_JIT"):
         pytest.skip("real data takes hours without compiler")
     for place in (os.environ.get("RBFMUSCLE_DATA"), ROOT.parent / "shared" / "data"):
@@ -87,7 +91,9 @@ def leg_data():
 
 @pytest.fixture(scope="session")
 def arm_run(tmp_path_factory):
-    """A run of the blended arm, seven frames to 60 degrees in mm, and its folder; copy before changing it."""
+    """A run of the blended arm, seven frames to 60 degrees in mm, and its folder; copy before
+    changing it.
+    """
     from blend_model import arm_scene, use_blend_model
 
     from rbfmuscle.run import simulate
@@ -102,7 +108,9 @@ def arm_run(tmp_path_factory):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Each reading of the time is a 64th of a second after the one before, so that what is timed is the same anew."""
+    """Each reading of the time is a 64th of a second after the one before, so that what is timed is
+    the same anew.
+    """
     ticks = itertools.count()
     for name in ("time.perf_counter", "time.process_time", "rbfmuscle.cli.check.perf_counter"):
         monkeypatch.setattr(name, lambda: next(ticks) / 64.0)
@@ -111,8 +119,13 @@ def clock(monkeypatch):
 @pytest.fixture(scope="session")
 def graphics():
     """Skip where VTK cannot draw; asked in a process of its own, which it may end."""
-    code = "import pyvista as p; q = p.Plotter(off_screen=True); q.add_mesh(p.Cube()); q.screenshot(None)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=120, check=False)
+    code = (
+        "import pyvista as p; q = p.Plotter(off_screen=True); q.add_mesh(p.Cube()); "
+        "q.screenshot(None)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, timeout=120, check=False
+    )
     if done.returncode != 0:
         pytest.skip("no graphics here")
 
@@ -122,8 +135,12 @@ def pytest_terminal_summary(terminalreporter):
     reasons = [str(report.longrepr[-1]) for report in terminalreporter.stats.get("skipped", [])]
     if reasons:
         data = sum("RBFMUSCLE_DATA" in reason for reason in reasons)
-        missing = sorted({m[1] for reason in reasons if (m := re.search(r"could not import '(\w+)", reason))})
+        missing = sorted(
+            {m[1] for reason in reasons if (m := re.search(r"could not import '(\w+)", reason))}
+        )
         folder = "RBFMUSCLE_DATA names the folder that holds hip/, leg/ and osim/"
         parts = [f"{data} need data ({folder})"] if data else []
         parts += [f"packages not installed: {', '.join(missing)}"] if missing else []
-        terminalreporter.write_line(f"{len(reasons)} skipped: {'; '.join([*parts, 'pytest -rs lists all'])}")
+        terminalreporter.write_line(
+            f"{len(reasons)} skipped: {'; '.join([*parts, 'pytest -rs lists all'])}"
+        )

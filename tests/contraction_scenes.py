@@ -1,4 +1,6 @@
-"""Scenes of muscles along x that contract, whose answers are known, by closed forms or finite elements [mm]."""
+"""Scenes of muscles along x that contract, whose answers are known, by closed forms or finite
+elements [mm].
+"""
 
 import itertools
 import math
@@ -16,17 +18,22 @@ from rbfmuscle.scene.phantom_shapes import stitch
 from rbfmuscle.scene.scene import Scene
 
 MUSCLE = "muscle"
-# A flat pennate muscle between two plates: their length and width, the fibres' length and their angle [degree] at rest.
-PLATES, FIBRE, PENNATION = (120.0, 40.0), 60.0, 25.0
+# A flat pennate muscle between two plates: their length and width, the fibres' length and their
+# angle [degree] at rest.
+PLATES = (120.0, 40.0)
+FIBRE = 60.0
+PENNATION = 25.0
 # How far the plates are apart, which does not change, nor does the volume, and how far fibres lean.
 HEIGHT, LEAN = FIBRE * math.sin(math.radians(PENNATION)), FIBRE * math.cos(math.radians(PENNATION))
 
 
 @dataclass(frozen=True)
 class Spindle:
-    """A belly between two tendons, round, with flat ends and a dome of the tendon's radius beyond each, of radius
+    """A belly between two tendons, round, with flat ends and a dome of the tendon's radius beyond
+    each, of radius
 
-    r(x) = tendon + (belly - tendon) cos²(π x / belly_length)    for |x| < belly_length / 2, else tendon.
+    r(x) = tendon + (belly - tendon) cos²(π x / belly_length)    for |x| < belly_length / 2, else
+    tendon.
     """
 
     length: float = 320.0
@@ -52,13 +59,19 @@ class Spindle:
         for k, (place, r) in enumerate(zip(x, radius)):
             count = 1 if r == 0.0 else max(6, round(2 * np.pi * r / spacing))
             angle = 2 * np.pi * (np.arange(count) + 0.5 * (k % 2)) / count
-            rings.append(np.column_stack([np.full(count, place), r * np.cos(angle), r * np.sin(angle)]))
+            rings.append(
+                np.column_stack([np.full(count, place), r * np.cos(angle), r * np.sin(angle)])
+            )
         vertices = np.concatenate(rings)
         numbers = np.split(np.arange(len(vertices)), np.cumsum([len(ring) for ring in rings])[:-1])
-        return vertices, np.concatenate([stitch(vertices, *pair) for pair in itertools.pairwise(numbers)])
+        return vertices, np.concatenate(
+            [stitch(vertices, *pair) for pair in itertools.pairwise(numbers)]
+        )
 
     def fibres(self):
-        """Lines at constant shares of the radius, in the middle, at a half and at nine tenths of it."""
+        """Lines at constant shares of the radius, in the middle, at a half and at nine tenths of
+        it.
+        """
         x = np.linspace(-0.5, 0.5, 60) * self.length
         radius = self.radius(x)
         lines = [np.column_stack([x, 0 * x, 0 * x])]
@@ -73,9 +86,13 @@ SPINDLE = Spindle()
 
 
 def spindle_scene(*, spacing=3.0, frames=10, model="rbf", **contraction):
-    """The spindle between two bones that stand still, and keys of its contraction; activation rises from 0 to 1."""
+    """The spindle between two bones that stand still, and keys of its contraction; activation rises
+    from 0 to 1.
+    """
     scene = Scene("spindle", units="mm")
-    ends = Bar(length=SPINDLE.length, width=SPINDLE.tendon, thickness=SPINDLE.tendon, dome=SPINDLE.tendon)
+    ends = Bar(
+        length=SPINDLE.length, width=SPINDLE.tendon, thickness=SPINDLE.tendon, dome=SPINDLE.tendon
+    )
     _add_slider(scene, ends)
     vertices, faces = SPINDLE.mesh(spacing)
     contraction.setdefault("activation", [0.0, 1.0])
@@ -90,7 +107,9 @@ def bar_scene(*, bar, spacing, model, **contraction):
     _add_slider(scene, bar)
     vertices, faces = bar.mesh(spacing)
     # Only the domes are held, so that little of the bar keeps its girth.
-    _add(scene, vertices, faces, 0.5 * bar.length + 0.5 * bar.dome, bar.fibres(), model, contraction)
+    _add(
+        scene, vertices, faces, 0.5 * bar.length + 0.5 * bar.dome, bar.fibres(), model, contraction
+    )
     return scene
 
 
@@ -106,22 +125,30 @@ def _add_slider(scene, bar):
     """Two bones; the insertion turns about a far joint, so that it moves along x."""
     scene.add_bone("origin", _block(bar, -1.0)).add_bone("insertion", _block(bar, 1.0))
     far = FAR * bar.length
-    scene.add_joint("slider", "origin", "insertion", (0.5 * bar.length, 0.0, far), {"pull": (0, 1, 0)})
+    scene.add_joint(
+        "slider", "origin", "insertion", (0.5 * bar.length, 0.0, far), {"pull": (0, 1, 0)}
+    )
 
 
 def _add(scene, vertices, faces, edge, fibres, model, contraction):
     x = vertices[:, 0]
     attach = held(origin=x <= -edge, insertion=x >= edge)
-    scene.add_muscle(MUSCLE, (vertices, faces), attach=attach, model=model, fibres=fibres, **contraction)
+    scene.add_muscle(
+        MUSCLE, (vertices, faces), attach=attach, model=model, fibres=fibres, **contraction
+    )
 
 
 def panel_pennation(stretch):
-    """Pennation [degree] at a stretch of the fibres: height / (fibre stretch) is its sine (constant thickness)."""
+    """Pennation [degree] at a stretch of the fibres: height / (fibre stretch) is its sine (constant
+    thickness).
+    """
     return math.degrees(math.asin(HEIGHT / (FIBRE * stretch)))
 
 
 def panel_scene(stretch, *, frames=5, model="rbf"):
-    """The panel with its upper plate slid so far that straight fibres have the stretch, fully active at the end."""
+    """The panel with its upper plate slid so far that straight fibres have the stretch, fully
+    active at the end.
+    """
     length, width = PLATES
     box = trimesh.creation.box((length, width, HEIGHT))
     for _ in range(4):
@@ -133,12 +160,18 @@ def panel_scene(stretch, *, frames=5, model="rbf"):
         plate = trimesh.creation.box(extents=(0.5 * length, width, 4.0))
         plate.apply_translation((0.0 if low < 0 else LEAN, 0.0, low + 2.0))
         scene.add_bone(name, plate)
-    scene.add_joint("slider", "lower", "upper", (LEAN, 0.0, HEIGHT + FAR * length), {"pull": (0, 1, 0)})
+    scene.add_joint(
+        "slider", "lower", "upper", (LEAN, 0.0, HEIGHT + FAR * length), {"pull": (0, 1, 0)}
+    )
     attach = held(lower=vertices[:, 2] <= 1e-9, upper=vertices[:, 2] >= HEIGHT - 1e-9)
     share = np.linspace(0.02, 0.98, 12)[:, None]
     places = itertools.product((-0.3, 0.0, 0.3), (-0.25, 0.25))
-    fibres = [np.array([x * length, y * width, 0.0]) + share * [LEAN, 0.0, HEIGHT] for x, y in places]
-    scene.add_muscle(MUSCLE, (vertices, faces), attach=attach, model=model, fibres=fibres, activation=[0, 1])
+    fibres = [
+        np.array([x * length, y * width, 0.0]) + share * [LEAN, 0.0, HEIGHT] for x, y in places
+    ]
+    scene.add_muscle(
+        MUSCLE, (vertices, faces), attach=attach, model=model, fibres=fibres, activation=[0, 1]
+    )
     shortened = math.sqrt((FIBRE * stretch) ** 2 - HEIGHT**2)
     return with_frames(scene, np.linspace(0.0, LEAN - shortened, frames + 1), length)
 
@@ -153,7 +186,9 @@ def settings(model):
 
 
 def compare_spindle(vertices, faces, activation, kept):
-    """Errors of a spindle's surface against finite elements: RMS [mm], greatest section (relative), and its place."""
+    """Errors of a spindle's surface against finite elements: RMS [mm], greatest section (relative),
+    and its place.
+    """
     row = int(np.argmin(np.abs(kept["activations"] - activation)))
     wanted = kept["vertices"][row].astype(float)
     between = np.abs(wanted[:, 0]) < 0.5 * SPINDLE.length - 5.0
@@ -168,12 +203,15 @@ def compare_spindle(vertices, faces, activation, kept):
 
 
 def belly_length(rest, now):
-    """Length between the sections that lay at the ends of the belly at rest, of points that move with the muscle."""
+    """Length between the sections that lay at the ends of the belly at rest, of points that move
+    with the muscle.
+    """
     half = 0.5 * SPINDLE.belly_length
     moved = now[:, 0] - rest[:, 0]
     ends = []
     for side in (-half, half):
         near = np.abs(rest[:, 0] - side) < 6.0
-        # A line through the points about the section, as they do not lie evenly on both sides of it.
+        # A line through the points about the section, as they do not lie evenly on both sides of
+        # it.
         ends.append(side + np.polyval(np.polyfit(rest[near, 0] - side, moved[near], 1), 0.0))
     return ends[1] - ends[0]

@@ -1,4 +1,6 @@
-"""Numbers that are kept in ``tests/data/references`` and compared with; ``make references`` writes them anew."""
+"""Numbers that are kept in ``tests/data/references`` and compared with; ``make references`` writes
+them anew.
+"""
 
 import json
 import math
@@ -17,12 +19,13 @@ from rbfmuscle.output.vtp import read_vtp
 
 FOLDER = Path(__file__).resolve().parent / "data" / "references"
 WRITES = bool(os.environ.get("RBFMUSCLE_WRITE_REFERENCES"))
-# Shares of the size of what is compared. Over one and two threads and the code that OpenBLAS has for four generations
-# of processors (Nehalem, Haswell, SkylakeX, its own) results of the mesh models differed by 5e-12.
+# Shares of the size of what is compared. Over one and two threads and the code that OpenBLAS has
+# for four generations of processors (Nehalem, Haswell, SkylakeX, its own) results of the mesh
+# models differed by 5e-12.
 TOLERANCE = 1e-9
-# By the key that is nearest to a number. Triangles equally near are told apart by rounding, so lists of them may differ
-# by one in thousands; another release of matplotlib may move what it draws by a tenth of a pixel; in single precision
-# a last digit may be rounded up or down.
+# By the key that is nearest to a number. Triangles equally near are told apart by rounding, so
+# lists of them may differ by one in thousands; another release of matplotlib may move what it draws
+# by a tenth of a pixel; in single precision a last digit may be rounded up or down.
 LOOSE = {"about": 1e-3, "plots": 1e-3, "single": 1e-6}
 NUMBER = re.compile(r"(?<![\w#.])-?\d+\.?\d*(?:e[-+]?\d+)?")
 
@@ -61,7 +64,9 @@ def digest(value):
 
 
 def _array_digest(array):
-    """Shape, how many numbers are none, root mean square, mean, and two weighted means, which tell the order."""
+    """Shape, how many numbers are none, root mean square, mean, and two weighted means, which tell
+    the order.
+    """
     flat, wave = array.ravel(), np.sin(1.0 + np.arange(array.size))
     known = np.isfinite(flat)
     flat = np.where(known, flat, 0.0)
@@ -74,13 +79,19 @@ def _array_digest(array):
 
 
 def text_facts(text):
-    """Numbers of a text; of a page how many elements of each kind there are too, and where its plots draw."""
+    """Numbers of a text; of a page how many elements of each kind there are too, and where its
+    plots draw.
+    """
     plots = re.findall(r"<svg.*?</svg>", text, re.S)
     text = re.sub(r"<(svg|script|style)\b.*?</\1>", "", text, flags=re.S)
-    tags = Counter(f"{tag} {kind}".strip() for tag, kind in re.findall(r'<(\w+)(?: class="([\w ]+)")?', text))
+    tags = Counter(
+        f"{tag} {kind}".strip() for tag, kind in re.findall(r'<(\w+)(?: class="([\w ]+)")?', text)
+    )
     said = [one for one in re.findall(r">([^<>]+)<", text) or [text] if len(one) < 60 or not tags]
     drawn = [re.findall(rf' {key}="([^"]*)"', plot) for plot in plots for key in ("d", "x", "y")]
-    found = [np.array([float(x) for x in NUMBER.findall(" ".join(part))]) for part in (said, *drawn)]
+    found = [
+        np.array([float(x) for x in NUMBER.findall(" ".join(part))]) for part in (said, *drawn)
+    ]
     return {"tags": tags, "numbers": found[0], "plots": np.concatenate([np.zeros(0), *found[1:]])}
 
 
@@ -88,7 +99,9 @@ def file_facts(folder):
     """`text_facts` of the text files of a folder, and its meshes and animations."""
     texts = (".csv", ".html", ".pvd", ".toml", ".txt", ".obj", ".xml")
     read = dict.fromkeys(texts, lambda path: text_facts(path.read_text()))
-    read |= dict.fromkeys((".stl", ".ply"), lambda path: {"single": trimesh.load(path, process=False)})
+    read |= dict.fromkeys(
+        (".stl", ".ply"), lambda path: {"single": trimesh.load(path, process=False)}
+    )
     read |= {".vtp": read_vtp, ".glb": lambda path: {"single": _glb_facts(path.read_bytes())}}
     files = [path for path in sorted(Path(folder).rglob("*")) if path.suffix in read]
     return {path.relative_to(folder).as_posix(): read[path.suffix](path) for path in files}
@@ -98,7 +111,9 @@ def _glb_facts(content):
     """Numbers of a glTF file: of its tree, and its arrays."""
     start = 20 + int.from_bytes(content[12:16], "little")
     tree, kinds = json.loads(content[20:start]), {5125: "<u4", 5126: "<f4"}
-    views = [(kinds[a["componentType"]], tree["bufferViews"][a["bufferView"]]) for a in tree["accessors"]]
+    views = [
+        (kinds[a["componentType"]], tree["bufferViews"][a["bufferView"]]) for a in tree["accessors"]
+    ]
     places = [(kind, start + 8 + view["byteOffset"], view["byteLength"]) for kind, view in views]
     numbers = np.array([float(text) for text in NUMBER.findall(content[20:start].decode())])
     return numbers, [np.frombuffer(content[at : at + size], kind) for kind, at, size in places]
@@ -110,7 +125,9 @@ def differences(kept, found, place=""):
     Differences are in shares of numbers beyond 1.
     """
     worst = {}
-    for (where, kind, a), (other, _, b) in zip(_numbers(kept, place), _numbers(found, place), strict=True):
+    for (where, kind, a), (other, _, b) in zip(
+        _numbers(kept, place), _numbers(found, place), strict=True
+    ):
         if where != other or (a is None) != (b is None):
             raise AssertionError(f"{where}: {a} is kept, {other}: {b} is there")
         if a is not None:
@@ -121,7 +138,9 @@ def differences(kept, found, place=""):
 
 
 def _numbers(value, place, kind=""):
-    """Place, nearest key and value of each number below a value; None with its length for each list."""
+    """Place, nearest key and value of each number below a value; None with its length for each
+    list.
+    """
     if isinstance(value, dict):
         for key in sorted(value):
             yield from _numbers(value[key], f"{place} {key}", kind if kind in LOOSE else key)
@@ -134,9 +153,13 @@ def _numbers(value, place, kind=""):
 
 
 def write(name, found):
-    """Write one reference anew; twelve digits, and each list a line, so that a change reads as a difference."""
+    """Write one reference anew; twelve digits, and each list a line, so that a change reads as a
+    difference.
+    """
     rounded = json.loads(json.dumps(found), parse_float=lambda t: float(f"{float(t):.12g}"))
-    text = re.sub(r"\[[^\[\]{}]*\]", lambda m: " ".join(m[0].split()), json.dumps(rounded, indent=0))
+    text = re.sub(
+        r"\[[^\[\]{}]*\]", lambda m: " ".join(m[0].split()), json.dumps(rounded, indent=0)
+    )
     FOLDER.mkdir(parents=True, exist_ok=True)
     (FOLDER / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 

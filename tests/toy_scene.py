@@ -1,4 +1,5 @@
-"""Analytic bones and a small elastic muscle for tests of contact: no distance grids, no real model."""
+"""Analytic bones and a small elastic muscle for tests of contact: no distance grids, no real
+model."""
 
 import numpy as np
 import trimesh
@@ -21,7 +22,9 @@ class Formula:
         return self.formula(points)
 
     def value_and_gradient(self, points):
-        slopes = [(self.formula(points + e) - self.formula(points - e)) / 4e-4 for e in 2e-4 * np.eye(3)]
+        slopes = [
+            (self.formula(points + e) - self.formula(points - e)) / 4e-4 for e in 2e-4 * np.eye(3)
+        ]
         return self.formula(points), np.stack(slopes, axis=1)
 
     def value_and_gradient_below(self, points, limit):
@@ -82,7 +85,9 @@ def box(half, centre=(0, 0, 0)):
         outer = np.maximum(a, 0)
         far = np.linalg.norm(outer, axis=1)
         face = np.eye(3)[np.argmax(a, axis=1)]
-        gradient = np.where((far > 1e-12)[:, None], outer / np.maximum(far, 1e-12)[:, None], face) * sign
+        gradient = (
+            np.where((far > 1e-12)[:, None], outer / np.maximum(far, 1e-12)[:, None], face) * sign
+        )
         return far + np.minimum(a.max(axis=1), 0), gradient
 
     return AnalyticBone(formula, [centre - half, centre + half])
@@ -109,7 +114,8 @@ def press(target, now, inverse, index, gap, normal):
 
 
 class ToyMuscle(MuscleModel):
-    """Vertices on springs to t, where the bones' blended motion would take them; attached ones go with their bones.
+    """Vertices on springs to t, where the bones' blended motion would take them; attached ones go
+    with their bones.
 
     Energy (x - t)' K (x - t) / 2 with K a graph Laplacian plus a share of the identity.
     """
@@ -131,18 +137,24 @@ class ToyMuscle(MuscleModel):
     def _prepare(self):
         n = len(self.rest)
         laplacian = np.zeros((n, n))
-        for a, b in np.vstack([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]):
+        for a, b in np.vstack(
+            [self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]
+        ):
             laplacian[a, b] = laplacian[b, a] = -1
         laplacian -= np.diag(laplacian.sum(axis=1))
         free, held = np.flatnonzero(self.contact_bone < 0), np.flatnonzero(self.contact_bone >= 0)
         inner = laplacian[np.ix_(free, free)]
         self.weights = np.eye(len(self.names))[self.contact_bone]
-        self.weights[free] = -np.linalg.solve(inner, laplacian[np.ix_(free, held)] @ self.weights[held])
+        self.weights[free] = -np.linalg.solve(
+            inner, laplacian[np.ix_(free, held)] @ self.weights[held]
+        )
         self.inverse = np.zeros((n, n))
         self.inverse[np.ix_(free, free)] = np.linalg.inv(inner + 0.05 * np.eye(len(free)))
 
     def _blend(self, poses):
-        moved = np.stack([self.rest @ poses[n][:3, :3].T + poses[n][:3, 3] for n in self.names], axis=1)
+        moved = np.stack(
+            [self.rest @ poses[n][:3, :3].T + poses[n][:3, 3] for n in self.names], axis=1
+        )
         return np.einsum("nb,nbk->nk", self.weights, moved)
 
     def contact_points(self):
@@ -163,7 +175,9 @@ class ToyMuscle(MuscleModel):
         self.x[which] = self.x[which] @ transform[:3, :3].T + transform[:3, 3]
 
     def transform(self, motion):
-        self.x, self.target = (points @ motion[:3, :3].T + motion[:3, 3] for points in (self.x, self.target))
+        self.x, self.target = (
+            points @ motion[:3, :3].T + motion[:3, 3] for points in (self.x, self.target)
+        )
 
     def snapshot(self):
         return self.x.copy(), self.target.copy()
@@ -175,12 +189,16 @@ class ToyMuscle(MuscleModel):
         return self.x.copy(), self.faces
 
     def drawing(self, contacts):
-        return FinishedDrawing(ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0}))
+        return FinishedDrawing(
+            ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0})
+        )
 
 
 def ellipsoid(half, centre=(0, 0, 0), *, subdivisions=2):
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return trimesh.Trimesh(mesh.vertices * np.asarray(half) + np.asarray(centre), mesh.faces, process=False)
+    return trimesh.Trimesh(
+        mesh.vertices * np.asarray(half) + np.asarray(centre), mesh.faces, process=False
+    )
 
 
 def attach(mesh, bone, where):
@@ -189,7 +207,9 @@ def attach(mesh, bone, where):
 
 def held(**bones):
     """Attachments as a scene takes them: a mask of a mesh's vertices for each bone."""
-    return [{"bone": name, "vertices": np.flatnonzero(where).tolist()} for name, where in bones.items()]
+    return [
+        {"bone": name, "vertices": np.flatnonzero(where).tolist()} for name, where in bones.items()
+    ]
 
 
 def bone(name, field):
@@ -202,7 +222,13 @@ def bone(name, field):
 
 def joint(name, parent, child, centre, **axes):
     axes = {key: list(map(float, axis)) for key, axis in axes.items()}
-    row = {"name": name, "parent": parent, "child": child, "centre": list(map(float, centre)), "axes": axes}
+    row = {
+        "name": name,
+        "parent": parent,
+        "child": child,
+        "centre": list(map(float, centre)),
+        "axes": axes,
+    }
     return JointTable.build(row, place="toy ").joint()
 
 
@@ -216,14 +242,21 @@ def scene(fields, joints, muscles, frames, *, initial="keep", sliding=None, tunn
     parts = {"bones": bones, "joints": joints, "muscles": muscles}
     detect = None if tunnelling is None else DetectOptions(tunnelling=tunnelling)
     contact = ContactOptions(initial=initial)
-    return SceneData("toy", **parts, motion=Motion(frames), contact=contact, sliding=sliding, detect=detect)
+    return SceneData(
+        "toy", **parts, motion=Motion(frames), contact=contact, sliding=sliding, detect=detect
+    )
 
 
 def hinged_scene(angles, **options):
-    """An arm that turns about z at the origin, with a long muscle over a round bone: (scene, fields)."""
+    """An arm that turns about z at the origin, with a long muscle over a round bone: (scene,
+    fields).
+    """
     fields = {"trunk": sphere(8.0, (0, 0, 0)), "arm": box((15, 2, 2), (30, 0, 0))}
     mesh = ellipsoid((32, 4, 4), (0, 14, 0))
-    ends = [attach(mesh, "trunk", lambda v: v[:, 0] < -24), attach(mesh, "arm", lambda v: v[:, 0] > 24)]
+    ends = [
+        attach(mesh, "trunk", lambda v: v[:, 0] < -24),
+        attach(mesh, "arm", lambda v: v[:, 0] > 24),
+    ]
     frames = [{"hinge.bend": np.radians(a)} for a in angles]
     hinge = joint("hinge", "trunk", "arm", (0, 0, 0), bend=(0, 0, -1))
     return scene(fields, [hinge], [muscle("strap", mesh, ends)], frames, **options), fields
@@ -240,15 +273,21 @@ def box_mesh(low, high):
 def neighbour_scene(angles, gap=1.0, *, sliding, order=(0, 1)):
     """Two long muscles side by side, "lower" and "upper", in a scene, and its fields.
 
-    An arm presses an end of the upper, lifts it or rolls it, by a dict of angles in degrees for each frame.
+    An arm presses an end of the upper, lifts it or rolls it, by a dict of angles in degrees for
+    each frame.
     """
     fields = {"trunk": sphere(1.0, (0, 0, -60)), "arm": box((1, 1, 1), (60, 0, -40))}
     muscles = []
     for k, (name, far) in enumerate((("lower", "trunk"), ("upper", "arm"))):
         mesh = ellipsoid((30, 4, 4), (0, 0, (8 + gap) * k), subdivisions=3)
-        ends = [attach(mesh, "trunk", lambda v: v[:, 0] < -25), attach(mesh, far, lambda v: v[:, 0] > 25)]
+        ends = [
+            attach(mesh, "trunk", lambda v: v[:, 0] < -25),
+            attach(mesh, far, lambda v: v[:, 0] > 25),
+        ]
         muscles.append(muscle(name, mesh, ends))
-    hinge = joint("hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0), lift=(0, -1, 0), roll=(1, 0, 0))
+    hinge = joint(
+        "hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0), lift=(0, -1, 0), roll=(1, 0, 0)
+    )
     frames = [{f"hinge.{name}": np.radians(a) for name, a in angle.items()} for angle in angles]
     return scene(fields, [hinge], [muscles[k] for k in order], frames, sliding=sliding), fields
 

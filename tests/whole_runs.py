@@ -56,9 +56,13 @@ def _sliding(model):
 def _substeps(model):
     """One frame of 30 degrees, in sub-steps of 5, and points that pass through bone looked for."""
     return _phantom(
-        ["abductor"], model, end=30.0, step=30.0, contact=ContactOptions(substep_angle=5.0),
+        ["abductor"],
+        model,
+        end=30.0,
+        step=30.0,
+        contact=ContactOptions(substep_angle=5.0),
         detect=DetectOptions(tunnelling=TunnellingOptions(action="rotate")),
-    )  # fmt: skip
+    )
 
 
 def _contraction(model):
@@ -67,8 +71,14 @@ def _contraction(model):
 
 
 def _tunnelling(model, **options):
-    """A bag held at both ends is swung through a fixed plate of 6 mm, by 40 degrees in one sub-step."""
-    bag = trimesh.creation.icosphere(subdivisions=3).apply_scale([25, 25, 120]).apply_translation([201, 0, 1])
+    """A bag held at both ends is swung through a fixed plate of 6 mm, by 40 degrees in one
+    sub-step.
+    """
+    bag = (
+        trimesh.creation.icosphere(subdivisions=3)
+        .apply_scale([25, 25, 120])
+        .apply_translation([201, 0, 1])
+    )
     bag.apply_transform(trimesh.transformations.rotation_matrix(math.radians(-21.0), [0.1, 0, 1]))
     scene = rm.Scene("plate", units="mm")
     scene.add_bone("plate", trimesh.creation.box((240, 6, 800)).apply_translation([200, 0, 0]))
@@ -84,12 +94,14 @@ def _tunnelling(model, **options):
     return scene
 
 
-# No RBF muscle is swung through a plate here: its shape then depends on rounding errors. `test_models_contract` asserts
-# what holds for any shape.
+# No RBF muscle is swung through a plate here: its shape then depends on rounding errors.
+# `test_models_contract` asserts what holds for any shape.
 SCENES = {
     "contact_rbf": lambda: _contact(RBF),
     "contact_rbf_marching": lambda: _contact({**RBF, "surface": "marching"}),
-    "contact_rbf_fibres": lambda: _contact({**RBF, "nodes": 120, "fibre_ratio": 4.0, "resolution": 0}),
+    "contact_rbf_fibres": lambda: _contact(
+        {**RBF, "nodes": 120, "fibre_ratio": 4.0, "resolution": 0}
+    ),
     "contact_pbd": lambda: _bent("pbd"),
     "contact_pbd_serendipity": lambda: _bent("pbd"),
     "contact_pbd_voxel": lambda: _bent("pbd"),
@@ -104,7 +116,9 @@ SCENES = {
     "contraction_rbf": lambda: _contraction(RBF),
     "contraction_arap_volume": lambda: _contraction("arap-volume"),
     "tunnelling_arap_volume": lambda: _tunnelling("arap-volume", action="rotate"),
-    "tunnelling_arap_volume_angle": lambda: _tunnelling("arap-volume", action="report", swept=False),
+    "tunnelling_arap_volume_angle": lambda: _tunnelling(
+        "arap-volume", action="report", swept=False
+    ),
 }
 
 
@@ -113,7 +127,9 @@ FIELDS = {"contact_pbd_serendipity": SerendipityField, "contact_pbd_voxel": Voxe
 
 
 def measure(name):
-    """What is kept of a run, in shares of the muscle's longest side, its square and cube: one tolerance is for all."""
+    """What is kept of a run, in shares of the muscle's longest side, its square and cube: one
+    tolerance is for all.
+    """
     scene, kind = SCENES[name](), FIELDS.get(name)
     fields = {bone.name: kind.from_mesh(bone.mesh) for bone in scene.bones} if kind else None
     run = rm.simulate(scene, fields=fields)
@@ -124,10 +140,17 @@ def measure(name):
         frames = []
         for frame in run.frames:
             surface = frame.surfaces[muscle.name]
-            shown = trimesh.Trimesh((surface.vertices - middle) / size, surface.faces, process=False)
-            moment, points = shown.volume * shown.center_mass, (frame.carried[muscle.name][0] - middle) / size
+            shown = trimesh.Trimesh(
+                (surface.vertices - middle) / size, surface.faces, process=False
+            )
+            moment, points = (
+                shown.volume * shown.center_mass,
+                (frame.carried[muscle.name][0] - middle) / size,
+            )
             lines = [
-                line.points / size for end, line in frame.tendons.items() if end.startswith(f"{muscle.name} ")
+                line.points / size
+                for end, line in frame.tendons.items()
+                if end.startswith(f"{muscle.name} ")
             ]
             facts = {
                 "area": shown.area,
@@ -137,7 +160,8 @@ def measure(name):
                 "tendons": lines,
             }
             frames.append(
-                facts | {"work": frame.work[muscle.name], "active": frame.activations.get(muscle.name)}
+                facts
+                | {"work": frame.work[muscle.name], "active": frame.activations.get(muscle.name)}
             )
         metrics = {}
         for row in run.metrics:
@@ -146,8 +170,12 @@ def measure(name):
                 metrics.setdefault(f"{row.quantity} {row.coordinate}", []).append(value)
         metrics = {name: np.array(values) for name, values in metrics.items()}
         events = [
-            [e.frame, e.count, len(e.bone), len(e.action)] for e in run.events if e.muscle == muscle.name
+            [e.frame, e.count, len(e.bone), len(e.action)]
+            for e in run.events
+            if e.muscle == muscle.name
         ]
         found[muscle.name] = {"frames": frames, "metrics": metrics, "events": events}
-    pairs = [{"+".join(pair): value for pair, value in frame.neighbours.items()} for frame in run.frames]
+    pairs = [
+        {"+".join(pair): value for pair, value in frame.neighbours.items()} for frame in run.frames
+    ]
     return {**found, "neighbours": pairs, "poses": [frame.poses for frame in run.frames]}

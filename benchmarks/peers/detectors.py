@@ -1,4 +1,5 @@
-"""Other ways to detect that a point is in a bone, behind the interface of `BoneSDF`, to be compared with it.
+"""Other ways to detect that a point is in a bone, behind the interface of `BoneSDF`, to be compared
+with it.
 
 A run is driven by them with ``rbfmuscle.simulate(scene, fields={bone: field})``.
 """
@@ -32,8 +33,8 @@ class PointDetector:
     def distance_and_gradient(
         self, points: Floats, pose: Floats | None = None, reach: Floats | float = np.inf
     ) -> tuple[Floats, Floats]:
-        """Signed distance (n,) and gradient (n, 3), in the axes of ``points``; ``reach`` is not made use
-        of.
+        """Signed distance (n,) and gradient (n, 3), in the axes of ``points``; ``reach`` is not
+        made use of.
         """
         points = check_points(points)
         if pose is None:
@@ -65,7 +66,8 @@ class PointDetector:
 
 
 class TreeDetector(PointDetector):
-    """Every query asks the bounding volume tree for the nearest triangle: exact, and the slowest."""
+    """Every query asks the bounding volume tree for the nearest triangle: exact, and the
+    slowest."""
 
     def __init__(self, exact: ExactDistance) -> None:
         self.exact = exact
@@ -95,14 +97,16 @@ class TreeDetector(PointDetector):
 class VoxelDetector(PointDetector):
     """Voxels inside or outside, as in the paper's first code; depths are counted in voxels.
 
-    Distances are exact to the nearest voxel's centre on the other side, so they err by up to a voxel's
-    diagonal.
+    Distances are exact to the nearest voxel's centre on the other side, so they err by up to a
+    voxel's diagonal.
     """
 
     def __init__(self, inside: Booleans, origin: Floats, edge: Floats | float) -> None:
         from scipy.ndimage import distance_transform_edt
 
-        self.inside, self.origin, self.edge = inside, origin, edge
+        self.inside = inside
+        self.origin = origin
+        self.edge = edge
         self.bounds = np.array([origin, origin + edge * np.array(inside.shape)])
         outward = distance_transform_edt(~inside, sampling=edge)
         inward = distance_transform_edt(inside, sampling=edge)
@@ -146,7 +150,11 @@ def grid_of(mesh: MeshLike) -> tuple[Any, Floats, Floats]:
     margin = MARGIN * (high - low).max()
     if bone.closed:
         return exact, low - margin, high + margin
-    return _WoundDistance(exact, inside_test(bone.vertices, bone.faces)), low - margin, high + margin
+    return (
+        _WoundDistance(exact, inside_test(bone.vertices, bone.faces)),
+        low - margin,
+        high + margin,
+    )
 
 
 class _WoundDistance:

@@ -1,22 +1,25 @@
 """Transversely isotropic fibre with active stress, for `finite_element.HexSolid`.
 
-The law is that of Blemker, Pinsky and Delp (Journal of Biomechanics 38, 2005), with the fibre's stress along the
-stretch λ = |F a| itself:
+The law is that of Blemker, Pinsky and Delp (Journal of Biomechanics 38, 2005), with the fibre's
+stress along the stretch λ = |F a| itself:
 
     dW/dλ = peak (passive(x) + activation active(x)) / optimal,    x = λ / optimal,
 
-    active(x)  = 9 (x - 0.4)² for 0.4 <= x < 0.6,  1 - 4 (1 - x)² for 0.6 <= x < 1.4,  9 (x - 1.6)² to 1.6, else 0,
-    passive(x) = 0.05 (exp(6.6 (x - 1)) - 1) for 1 < x < 1.4, straight beyond,
+    active(x)  = 9 (x - 0.4)² for 0.4 <= x < 0.6,  1 - 4 (1 - x)² for 0.6 <= x < 1.4,  9 (x - 1.6)²
+    to 1.6, else 0, passive(x) = 0.05 (exp(6.6 (x - 1)) - 1) for 1 < x < 1.4, straight beyond,
 
-and for tendon dW/dλ = stiffness (λ - 1) where stretched. ``density`` is the number of fibres through a unit area, in
-units of that where the peak stress holds: where fibres converge it rises, and with it what they pull.
+and for tendon dW/dλ = stiffness (λ - 1) where stretched. ``density`` is the number of fibres
+through a unit area, in units of that where the peak stress holds: where fibres converge it rises,
+and with it what they pull.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-_P1, _P2, _STRAIGHT = 0.05, 6.6, 1.4
+_P1 = 0.05
+_P2 = 6.6
+_STRAIGHT = 1.4
 
 
 @dataclass(frozen=True)
@@ -64,9 +67,11 @@ class FibreMaterial:
 
 @dataclass(frozen=True)
 class PassiveFibres:
-    """Fibres that make a solid stiffer along them, alike in tension and compression: W = stiffness (λ - 1)².
+    """Fibres that make a solid stiffer along them, alike in tension and compression: W = stiffness
+    (λ - 1)².
 
-    For small strains Young's modulus along them is 3 μ + 2 stiffness, in an incompressible ground of shear modulus μ.
+    For small strains Young's modulus along them is 3 μ + 2 stiffness, in an incompressible ground
+    of shear modulus μ.
 
     Attributes
     ----------
@@ -132,7 +137,9 @@ def free_stretch(peak, activation=1.0, *, optimal=1.0):
     from scipy.optimize import brentq
 
     one = np.ones(1)
-    material = FibreMaterial(np.eye(3)[:1], np.zeros(1, dtype=bool), one, peak=peak, optimal=optimal)
+    material = FibreMaterial(
+        np.eye(3)[:1], np.zeros(1, dtype=bool), one, peak=peak, optimal=optimal
+    )
 
     def pull(stretch):
         slope = material.evaluate(np.array([[stretch]]), activation)[1][0, 0]

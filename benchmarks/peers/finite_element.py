@@ -1,13 +1,15 @@
-"""A volumetric finite-element solid, nearly incompressible, quasi-static, against bones: a reference for models.
+"""A volumetric finite-element solid, nearly incompressible, quasi-static, against bones: a
+reference for models.
 
-Eight-node bricks, or tetrahedra of ten nodes, with a constant pressure each (mean dilatation: Simo, Taylor and Pister
-1985), neo-Hookean,
+Eight-node bricks, or tetrahedra of ten nodes, with a constant pressure each (mean dilatation: Simo,
+Taylor and Pister 1985), neo-Hookean,
 
     W = mu/2 (J^(-2/3) tr(F'F) - 3) + kappa/2 (Jm - 1)^2,   Jm = mean of J over the cell,
 
-with fibres, where a `peers.fibre_material.FibreMaterial` is given, whose energy along the stretch |F a| is added;
-solved by Newton's method with a line search on the energy. Bones push by a penalty on the surface's quadrature
-points. Mesh, shape functions and quadrature are scikit-fem's (the extra ``fem``).
+with fibres, where a `peers.fibre_material.FibreMaterial` is given, whose energy along the stretch
+|F a| is added; solved by Newton's method with a line search on the energy. Bones push by a penalty
+on the surface's quadrature points. Mesh, shape functions and quadrature are scikit-fem's (the extra
+``fem``).
 """
 
 import time
@@ -21,8 +23,8 @@ from scipy.spatial import cKDTree
 from rbfmuscle.validation import MissingPartError, SolveError
 
 MOST_ITERATIONS = 60
-# A step that would lower the energy by a smaller share than this changes nothing that is looked at; facets of bones
-# have edges, at which the forces themselves need not settle.
+# A step that would lower the energy by a smaller share than this changes nothing that is looked at;
+# facets of bones have edges, at which the forces themselves need not settle.
 ENERGY_TOLERANCE = 2e-6
 # Least stiffness of a point where the true ones are not all positive [shear modulus].
 LEAST_STIFF = 0.01
@@ -34,11 +36,15 @@ def positive_factor(matrix):
     Raises
     ------
     numpy.linalg.LinAlgError
-        If the matrix is not positive definite: pivots are taken from the diagonal, and some are not positive.
+        If the matrix is not positive definite: pivots are taken from the diagonal, and some are not
+        positive.
     """
     try:
         factor = splu(
-            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            matrix.tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
         )
     except RuntimeError as error:  # exactly singular
         raise np.linalg.LinAlgError(str(error)) from None
@@ -52,7 +58,8 @@ def _skfem():
         import skfem
     except ImportError as error:
         raise MissingPartError(
-            "solids of finite elements need scikit-fem: pip install -e '.[fem]' in rbfmuscle's folder"
+            "solids of finite elements need scikit-fem: pip install -e '.[fem]' in "
+            "rbfmuscle's folder"
         ) from error
     return skfem
 
@@ -67,7 +74,8 @@ class SolidState:
 
 
 def follow(advance, displacement, goals, steps):
-    """Solve from place to place, in shorter steps where one fails; yield each goal and the displacement there.
+    """Solve from place to place, in shorter steps where one fails; yield each goal and the
+    displacement there.
 
     Parameters
     ----------
@@ -96,10 +104,13 @@ def follow(advance, displacement, goals, steps):
                 if step < smallest:
                     raise SolveError(f"{error} (on the way to {target})") from None
                 continue
-            displacement, place, step = state.displacement, target, min(largest, 2 * step)
+            displacement = state.displacement
+            place = target
+            step = min(largest, 2 * step)
             spent = time.process_time() - began
             print(
-                f"  {place:7.3f}: {state.iterations} iterations, {state.residual:.1e}, {spent:.0f} s",
+                f"  {place:7.3f}: {state.iterations} iterations, {state.residual:.1e}, "
+                f"{spent:.0f} s",
                 flush=True,
             )
         yield goal, displacement
@@ -150,7 +161,9 @@ class HexSolid:
         3,
     )  # in scikit-fem, and the degree that is integrated exactly
 
-    def __init__(self, points, cells, *, shear=1.0, poisson=0.495, penalty=30.0, fibres=None, stiffer=None):
+    def __init__(
+        self, points, cells, *, shear=1.0, poisson=0.495, penalty=30.0, fibres=None, stiffer=None
+    ):
         skfem = _skfem()
         self.shear, self.penalty = shear, penalty
         self.fibres, self.activation = fibres, 0.0
@@ -235,7 +248,9 @@ class HexSolid:
                 return SolidState(u, iteration, residual)
             u = self._walk(u, step.reshape(-1, 3), force, moving=first.any())
             first = np.zeros_like(first)
-        raise SolveError(f"no equilibrium after {MOST_ITERATIONS} iterations, residual {residual:.1e}")
+        raise SolveError(
+            f"no equilibrium after {MOST_ITERATIONS} iterations, residual {residual:.1e}"
+        )
 
     def _direction(self, u, force, matrix, free, first):
         """Newton's step; where the stiffness is not positive, with that of each cell made so."""
@@ -254,7 +269,9 @@ class HexSolid:
         raise SolveError("the stiffness of the cells is singular, take smaller steps")
 
     def _walk(self, u, step, force, *, moving):
-        """Longest of the halved steps that lowers the energy; one that moves held nodes must only stay valid."""
+        """Longest of the halved steps that lowers the energy; one that moves held nodes must only
+        stay valid.
+        """
         if moving:
             if not np.isfinite(self.energy(u + step)):
                 raise SolveError("cells turn inside out, take smaller steps")
@@ -276,9 +293,13 @@ class HexSolid:
         mean = (j * self.weights).sum(axis=1) / self.weights.sum(axis=1)
         shape = j ** (-2 / 3) * np.einsum("eqij,eqij->eq", f, f) - 3.0
         total = 0.5 * self.shear * (shape * self.weights * self.stiffer[:, None]).sum()
-        total += 0.5 * self.bulk * ((mean - 1.0) ** 2 * self.weights.sum(axis=1) * self.stiffer).sum()
+        total += (
+            0.5 * self.bulk * ((mean - 1.0) ** 2 * self.weights.sum(axis=1) * self.stiffer).sum()
+        )
         if self.fibres is not None:
-            total += (self.fibres.evaluate(self._along(f)[1], self.activation)[0] * self.weights).sum()
+            total += (
+                self.fibres.evaluate(self._along(f)[1], self.activation)[0] * self.weights
+            ).sum()
         if self.obstacles:
             depth = np.minimum(self.gaps(displacement)[0], 0.0)
             total += 0.5 * self.penalty * (depth**2 * self.side_weights[self.touching]).sum()
@@ -290,29 +311,38 @@ class HexSolid:
         return along, np.linalg.norm(along, axis=-1)
 
     def _fibre_stress(self, f):
-        """Stress (cell, point, 3, 3) of the fibres, and its derivative by F (brick, point, 9, 9)."""
+        """Stress (cell, point, 3, 3) of the fibres, and its derivative by F (brick, point, 9,
+        9)."""
         along, stretch = self._along(f)
         _, slope, bend = self.fibres.evaluate(stretch, self.activation)
         a = self.fibres.direction
         unit = along / stretch[..., None]
         stress = np.einsum("eq,eqi,ej->eqij", slope, unit, a)
         across = np.einsum("eqi,eqk->eqik", unit, unit)
-        spatial = bend[..., None, None] * across + (slope / stretch)[..., None, None] * (np.eye(3) - across)
+        spatial = bend[..., None, None] * across + (slope / stretch)[..., None, None] * (
+            np.eye(3) - across
+        )
         tangent = np.einsum("eqik,ej,el->eqijkl", spatial, a, a)
         return stress, tangent.reshape(*stretch.shape, 9, 9)
 
     def _gradient(self, displacement):
-        return np.eye(3) + np.einsum("eni,eqnj->eqij", displacement[self.nodes], self.slopes, optimize=True)
+        return np.eye(3) + np.einsum(
+            "eni,eqnj->eqij", displacement[self.nodes], self.slopes, optimize=True
+        )
 
     def gaps(self, displacement):
-        """Distances (faces, points) and directions (faces, points, 3) of the free surface to the bones."""
+        """Distances (faces, points) and directions (faces, points, 3) of the free surface to the
+        bones.
+        """
         shape, nodes = self.side_shape[self.touching], self.side_nodes[self.touching]
         points = np.einsum("fqn,fni->fqi", shape, (self.rest + displacement)[nodes])
         gap, direction = self.obstacles(points.reshape(-1, 3))
         return gap.reshape(points.shape[:2]), direction.reshape(points.shape)
 
     def _assemble(self, displacement, *, positive=False):
-        """Forces (3 n,) and their derivative, a sparse (3 n, 3 n) matrix, or one near it that is positive."""
+        """Forces (3 n,) and their derivative, a sparse (3 n, 3 n) matrix, or one near it that is
+        positive.
+        """
         local, stiffness = self._elastic(displacement, positive)
         if self.obstacles:
             # A face's nodes are those of its cell.
@@ -325,7 +355,9 @@ class HexSolid:
         return force, sparse.csr_array((data, pattern.indices, pattern.indptr), shape=pattern.shape)
 
     def _pattern(self):
-        """Unknowns of each cell, the matrix's pattern, and where each entry of the cells' stiffnesses goes in it."""
+        """Unknowns of each cell, the matrix's pattern, and where each entry of the cells'
+        stiffnesses goes in it.
+        """
         if self.places is None:
             index = (3 * self.nodes[:, :, None] + np.arange(3)).reshape(len(self.nodes), -1)
             size, width = 3 * len(self.rest), index.shape[1]
@@ -355,9 +387,9 @@ class HexSolid:
             stress, tangent = stress + pull, tangent + bend
         if positive:
             value, vector = np.linalg.eigh(tangent)
-            tangent = (vector * np.maximum(value, LEAST_STIFF * self.shear)[..., None, :]) @ np.swapaxes(
-                vector, -1, -2
-            )
+            tangent = (
+                vector * np.maximum(value, LEAST_STIFF * self.shear)[..., None, :]
+            ) @ np.swapaxes(vector, -1, -2)
         weighted = self.slopes * self.weights[..., None, None]
         count, size = len(self.nodes), 3 * self.nodes.shape[1]
         force = np.einsum("eqij,eqnj->eni", stress, weighted, optimize=True).reshape(count, size)
@@ -374,11 +406,15 @@ class HexSolid:
         """Derivative of the stress by F at fixed mean dilatation, (cell, point, 9, 9)."""
         count = f.shape[:2]
         g, h = f.reshape(*count, 9), inverse.reshape(*count, 9)
-        crossed = np.einsum("eqil,eqkj->eqijkl", inverse, inverse, optimize=True).reshape(*count, 9, 9)
+        crossed = np.einsum("eqil,eqkj->eqijkl", inverse, inverse, optimize=True).reshape(
+            *count, 9, 9
+        )
         mixed = g[..., :, None] * h[..., None, :]
         out = np.eye(9) - (2 / 3) * (mixed + np.swapaxes(mixed, -1, -2))
         square = h[..., :, None] * h[..., None, :]
-        out = out + (2 / 9) * trace[..., None, None] * square + (trace / 3)[..., None, None] * crossed
+        out = (
+            out + (2 / 9) * trace[..., None, None] * square + (trace / 3)[..., None, None] * crossed
+        )
         return factor[..., None, None] * out + pressure[..., None, None] * (square - crossed)
 
     def _contact(self, displacement):
@@ -403,7 +439,9 @@ class TetSolid(HexSolid):
         return np.unique(self.side_nodes[on_face])
 
     def at(self, points):
-        """Nodes (n, 10) and their shares (n, 10) at points of the solid at rest, or just outside of it."""
+        """Nodes (n, 10) and their shares (n, 10) at points of the solid at rest, or just outside of
+        it.
+        """
         corners = self.rest[self.nodes[:, :4]]
         inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
         _, near = cKDTree(corners.mean(axis=1)).query(points, k=min(NEAR, len(corners)))
@@ -415,7 +453,8 @@ class TetSolid(HexSolid):
         return self.nodes[near[row, best]], np.stack([*(b * (2.0 * b - 1.0)).T, *middles], axis=1)
 
 
-# Cells around a point that are asked whether they hold it; corners of a tetrahedron's edges, in scikit-fem's order.
+# Cells around a point that are asked whether they hold it; corners of a tetrahedron's edges, in
+# scikit-fem's order.
 NEAR = 60
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 

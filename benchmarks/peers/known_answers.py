@@ -42,7 +42,9 @@ def section(vertices, faces, point, normal):
     row = np.arange(len(crossed))
     a, b, c = (crossed[row, (lone + k) % 3] for k in range(3))
     p, q = (
-        vertices[a] + (height[a] / (height[a] - height[o]))[:, None] * (vertices[o] - vertices[a]) - point
+        vertices[a]
+        + (height[a] / (height[a] - height[o]))[:, None] * (vertices[o] - vertices[a])
+        - point
         for o in (b, c)
     )
     # The outline runs anticlockwise about the normal where the lone corner is above it.
@@ -51,7 +53,11 @@ def section(vertices, faces, point, normal):
     twice = np.cross(p, q) @ normal
     area = 0.5 * twice.sum()
     with np.errstate(invalid="ignore"):
-        centroid = (twice[:, None] * (p + q)).sum(axis=0) / 6.0 / area if len(twice) else np.full(3, np.nan)
+        centroid = (
+            (twice[:, None] * (p + q)).sum(axis=0) / 6.0 / area
+            if len(twice)
+            else np.full(3, np.nan)
+        )
     return float(abs(area)), point + centroid
 
 
@@ -104,7 +110,8 @@ def richardson(sizes, values):
     Returns
     -------
     order, limit : float
-        NaN where the differences change sign or hardly shrink: the sequence is not in its asymptotic range.
+        NaN where the differences change sign or hardly shrink: the sequence is not in its
+        asymptotic range.
     """
     h, v = np.asarray(sizes, dtype=float)[-3:], np.asarray(values, dtype=float)[-3:]
     coarse, fine = v[0] - v[1], v[1] - v[2]
@@ -140,9 +147,10 @@ def stretched_bar_errors(stretch, bar, rest, frame):
     Returns
     -------
     dict of str to float
-        ``radius``: of the middle half against r / sqrt(stretch of the material there); ``radius_ends``: against
-        r / sqrt(stretch between the ends); ``waviness``: spread of the radius over the middle half; ``path``: of
-        the carried middle against the distance of the ends; ``volume``: of the surface against the closed form.
+        ``radius``: of the middle half against r / sqrt(stretch of the material there);
+        ``radius_ends``: against r / sqrt(stretch between the ends); ``waviness``: spread of the
+        radius over the middle half; ``path``: of the carried middle against the distance of the
+        ends; ``volume``: of the surface against the closed form.
     """
     name = next(iter(frame.surfaces))
     skin, (places, _) = frame.surfaces[name], frame.carried[name]
@@ -177,8 +185,9 @@ def bent_bar_errors(angle, bar, line_rest, line, frame):
     Returns
     -------
     dict of str to float
-        ``path``: length of the centreline against that at rest; ``arc``: mean radius of the centreline against
-        length / angle; ``radius``: of the sections in the middle half; ``volume``.
+        ``path``: length of the centreline against that at rest; ``arc``: mean radius of the
+        centreline against length / angle; ``radius``: of the sections in the middle half;
+        ``volume``.
     """
     (skin,) = frame.surfaces.values()
     radius = bar.length / angle
@@ -188,8 +197,13 @@ def bent_bar_errors(angle, bar, line_rest, line, frame):
     between = (turned > 0.02 * angle) & (turned < 0.98 * angle)
     radii = []
     for q in angle * np.linspace(0.25, 0.75, 9):
-        out, along = np.array([math.sin(q), 0, math.cos(q)]), np.array([math.cos(q), 0, -math.sin(q)])
-        radii.append(math.sqrt(section(skin.vertices, skin.faces, centre + radius * out, along)[0] / math.pi))
+        out, along = (
+            np.array([math.sin(q), 0, math.cos(q)]),
+            np.array([math.cos(q), 0, -math.sin(q)]),
+        )
+        radii.append(
+            math.sqrt(section(skin.vertices, skin.faces, centre + radius * out, along)[0] / math.pi)
+        )
     return {
         "path": path_length(line) / path_length(line_rest) - 1.0,
         "arc": np.hypot(offset[between, 0], offset[between, 2]).mean() / radius - 1.0,
@@ -217,18 +231,22 @@ def wrapped_strip_errors(angle, over, added, lifted, bone_radius, line_rest, lin
     Returns
     -------
     dict of str to float
-        ``path``, ``radius`` (of the centreline in the middle half of the arc), ``contact`` (arc in contact;
-        -1 where nothing touches).
+        ``path``, ``radius`` (of the centreline in the middle half of the arc), ``contact`` (arc in
+        contact; -1 where nothing touches).
 
     Notes
     -----
-    Points nearer than ``TOUCH`` count as touching. A straight line that leaves the bone stays that near for another
-    arccos(R / (R + TOUCH)) at each end, which is taken off.
+    Points nearer than ``TOUCH`` count as touching. A straight line that leaves the bone stays that
+    near for another arccos(R / (R + TOUCH)) at each end, which is taken off.
     """
     turned = np.arctan2(line[:, 0], line[:, 2])
     middle = np.abs(turned - 0.5 * angle) < 0.25 * angle
     radius = np.hypot(line[middle, 0], line[middle, 2]).mean() if middle.any() else math.nan
-    away = np.hypot(places[:, 0], places[:, 2]) if over == "cylinder" else np.linalg.norm(places, axis=1)
+    away = (
+        np.hypot(places[:, 0], places[:, 2])
+        if over == "cylinder"
+        else np.linalg.norm(places, axis=1)
+    )
     touching = places[away < bone_radius + TOUCH]
     touched = 0.0
     if len(touching):

@@ -1,4 +1,5 @@
-"""Scenes whose answer is known: a bar pulled and bent, a strip wrapped around a cylinder and a sphere.
+"""Scenes whose answer is known: a bar pulled and bent, a strip wrapped around a cylinder and a
+sphere.
 
 All lengths are in millimetres; bars lie along x at rest. The closed forms stand with each scene.
 """
@@ -12,8 +13,8 @@ from rbfmuscle.scene.objects import Attachment
 from rbfmuscle.scene.phantom_shapes import stitch
 from rbfmuscle.scene.scene import Scene
 
-# The centre of the joint that pulls lies this many bar lengths away: the path of the end is straight to half of
-# its inverse (5e-5 of the pull) and turns by 1e-4 radian at most.
+# The centre of the joint that pulls lies this many bar lengths away: the path of the end is
+# straight to half of its inverse (5e-5 of the pull) and turns by 1e-4 radian at most.
 FAR = 1e4
 STEPS_A_LENGTH = 50  # sub-steps in which an end is pulled by the bar's length
 MUSCLE = "bar"
@@ -24,8 +25,9 @@ FIBRE_POINTS = 30
 class Bar:
     """A straight bar along x with a stadium for a section and rounded ends, of known volume.
 
-    The section (two half circles joined by straight sides; a circle where width and thickness agree) is the same
-    over ``length`` and shrinks beyond it as sqrt(1 - (d / dome)^2) with the distance d, so that
+    The section (two half circles joined by straight sides; a circle where width and thickness
+    agree) is the same over ``length`` and shrinks beyond it as sqrt(1 - (d / dome)^2) with the
+    distance d, so that
 
         V = A (length + 4/3 dome),    A = 4 (width - thickness) thickness + pi thickness^2.
 
@@ -60,17 +62,21 @@ class Bar:
         return 4 * (self.width - self.thickness) + 2 * np.pi * self.thickness
 
     def ring(self, count, offset, scale=1.0):
-        """Points (count, 2) of the outline at equal arcs, the first ``offset`` shares of an arc on."""
+        """Points (count, 2) of the outline at equal arcs, the first ``offset`` shares of an
+        arc on."""
         side, half = 2 * (self.width - self.thickness), 0.5 * np.pi * self.thickness
         arc = ((np.arange(count) + offset) / count * self.girth) % self.girth
         # Quarter circle, upper side, half circle, lower side, quarter circle.
         ends = np.cumsum([half, side, 2 * half, side, half])
         places = [
-            np.clip(arc - start, 0.0, end - start) for start, end in zip([0.0, *ends[:-1]], ends, strict=True)
+            np.clip(arc - start, 0.0, end - start)
+            for start, end in zip([0.0, *ends[:-1]], ends, strict=True)
         ]
         turned = (places[0] + places[2] + places[4]) / self.thickness
         along = 0.5 * side - places[1] + places[3]
-        return scale * np.stack([along + self.thickness * np.cos(turned), self.thickness * np.sin(turned)], 1)
+        return scale * np.stack(
+            [along + self.thickness * np.cos(turned), self.thickness * np.sin(turned)], 1
+        )
 
     def mesh(self, spacing):
         """Closed outward triangles of about equal sides, vertices on the bar.
@@ -113,7 +119,9 @@ class Bar:
         x = np.linspace(-0.5, 0.5, FIBRE_POINTS) * self.length
         places = [(0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)]
         return [
-            np.column_stack([x, np.full(len(x), y * self.width), np.full(len(x), z * self.thickness)])
+            np.column_stack(
+                [x, np.full(len(x), y * self.width), np.full(len(x), z * self.thickness)]
+            )
             for y, z in places
         ]
 
@@ -131,8 +139,8 @@ DRUM_RADIUS = 25.0
 def stretched_bar(stretch, *, bar=ROUND_BAR, spacing=2.0, frames=1, model="rbf"):
     """A bar held at both ends, one of which is pulled along the axis.
 
-    At constant volume and even stretch its radius is r / sqrt(stretch). The held ends keep theirs, which moves
-    the middle of a bar of 20 radii by less than 1 % at a stretch of 1.3.
+    At constant volume and even stretch its radius is r / sqrt(stretch). The held ends keep theirs,
+    which moves the middle of a bar of 20 radii by less than 1 % at a stretch of 1.3.
 
     Parameters
     ----------
@@ -152,7 +160,9 @@ def stretched_bar(stretch, *, bar=ROUND_BAR, spacing=2.0, frames=1, model="rbf")
     scene = Scene("stretched_bar", units="mm")
     _add_blocks(scene, bar)
     far = FAR * bar.length
-    scene.add_joint("far", "origin", "insertion", (0.5 * bar.length, 0.0, far), {"pull": (0, -1, 0)})
+    scene.add_joint(
+        "far", "origin", "insertion", (0.5 * bar.length, 0.0, far), {"pull": (0, -1, 0)}
+    )
     _add_bar(scene, bar, spacing, model, ("origin", "insertion"))
     angle = math.degrees(math.asin((stretch - 1.0) * bar.length / far))
     scene.set_motion(ramp={"far.pull": {"to": angle, "step": abs(angle) / frames}})
@@ -163,9 +173,10 @@ def stretched_bar(stretch, *, bar=ROUND_BAR, spacing=2.0, frames=1, model="rbf")
 def bent_bar(angle, *, bar=BENT_BAR, spacing=2.0, step=2.0, model="rbf"):
     """A bar whose end is turned and moved so that its axis becomes an arc of its own length.
 
-    The insertion turns about y around the pole of the whole motion, so the ends fit an arc of radius
-    length / angle in the last frame (and nearly so before it). A bar under end moments alone takes that shape; its
-    axis keeps its length and, by Pappus, its volume: area of the section times length.
+    The insertion turns about y around the pole of the whole motion, so the ends fit an arc of
+    radius length / angle in the last frame (and nearly so before it). A bar under end moments alone
+    takes that shape; its axis keeps its length and, by Pappus, its volume: area of the section
+    times length.
 
     Parameters
     ----------
@@ -182,7 +193,9 @@ def bent_bar(angle, *, bar=BENT_BAR, spacing=2.0, step=2.0, model="rbf"):
     """
     turn = math.radians(angle)
     radius, start = bar.length / turn, -0.5 * bar.length
-    rotation = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])  # of (x, z)
+    rotation = np.array(
+        [[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]
+    )  # of (x, z)
     end = np.array([start + radius * math.sin(turn), -radius * (1.0 - math.cos(turn))])
     pole = np.linalg.solve(np.eye(2) - rotation, end - rotation @ [-start, 0.0])
     scene = Scene("bent_bar", units="mm")
@@ -197,14 +210,15 @@ def wrapped_strip(
 ):
     """A strip over a cylinder or a sphere whose insertion turns about the middle of that bone.
 
-    At rest the strip touches the bone at its top. After a turn by q it consists of two straight parts, each as long
-    as before, and an arc over the angle q between them, so its path is longer by (radius + h) q, with h the
-    distance of its centreline from the bone: half of its thickness, which shrinks with the stretch t as
-    1 / sqrt(t) (`wrapped_path`). This is the answer for a string; a strip that resists bending touches less.
+    At rest the strip touches the bone at its top. After a turn by q it consists of two straight
+    parts, each as long as before, and an arc over the angle q between them, so its path is longer
+    by (radius + h) q, with h the distance of its centreline from the bone: half of its thickness,
+    which shrinks with the stretch t as 1 / sqrt(t) (`wrapped_path`). This is the answer for a
+    string; a strip that resists bending touches less.
 
-    On a sphere the middle plane is the shortest way only where the straight line between the ends passes the
-    sphere's centre on the strip's side, tan(q / 2) < (radius + thickness) / (length / 2); beyond that the strip
-    slides off sideways.
+    On a sphere the middle plane is the shortest way only where the straight line between the ends
+    passes the sphere's centre on the strip's side, tan(q / 2) < (radius + thickness) / (length /
+    2); beyond that the strip slides off sideways.
 
     Parameters
     ----------
@@ -227,7 +241,8 @@ def wrapped_strip(
     bar = bar or STRIPS[over]
     lift = radius + bar.thickness
     scene = Scene(f"strip_over_{over}", units="mm")
-    # Vertices on the surface, sides of about 1 degree: the bone is nowhere more than 0.01 % too thin.
+    # Vertices on the surface, sides of about 1 degree: the bone is nowhere more than 0.01 % too
+    # thin.
     if over == "sphere":
         bone = trimesh.creation.icosphere(subdivisions=5, radius=radius)
     else:
@@ -241,9 +256,13 @@ def wrapped_strip(
 
 
 def wrapped_path(angle, *, bar, radius=DRUM_RADIUS):
-    """Length added to the path by a turn by ``angle`` [radian], and the centreline's radius on the bone [mm]."""
+    """Length added to the path by a turn by ``angle`` [radian], and the centreline's radius on the
+    bone [mm].
+    """
     stretch = 1.0
-    for _ in range(20):  # thickness follows stretch, stretch follows the path: contracts by 1e-2 a round
+    for _ in range(
+        20
+    ):  # thickness follows stretch, stretch follows the path: contracts by 1e-2 a round
         lifted = radius + bar.thickness / math.sqrt(stretch)
         stretch = 1.0 + lifted * angle / bar.length
     return lifted * angle, lifted

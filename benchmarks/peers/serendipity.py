@@ -38,7 +38,9 @@ class SerendipityField(PointDetector):
         thirds = [(np.arange(n)[:, None] + np.array([1.0, 2.0]) / 3.0).reshape(-1) for n in shape]
         self.nodes = [self._sample(function, corners)]
         for axis in range(3):
-            self.nodes.append(self._sample(function, [*corners[:axis], thirds[axis], *corners[axis + 1 :]]))
+            self.nodes.append(
+                self._sample(function, [*corners[:axis], thirds[axis], *corners[axis + 1 :]])
+            )
 
     def _sample(self, function, steps):
         return sample_nodes(function, [self.low[k] + self.edge[k] * steps[k] for k in range(3)])
@@ -64,7 +66,9 @@ class SerendipityField(PointDetector):
 @njit
 def _serendipity_loop(points, low, edge, nodes, distance, gradient):
     corners, on_x, on_y, on_z = nodes
-    cell, t, grad = np.empty(3, np.int64), np.empty(3), np.empty(3)
+    cell = np.empty(3, np.int64)
+    t = np.empty(3)
+    grad = np.empty(3)
     for n in range(len(points)):
         for k in range(3):
             u = min(max((points[n, k] - low[k]) / edge[k], 0.0), corners.shape[k] - 1.0)
@@ -93,8 +97,13 @@ def _serendipity_loop(points, low, edge, nodes, distance, gradient):
 
 @njit
 def _corner(t, a, b, c, square, node, grad):
-    """Add (1/64)(1 + a x)(1 + b y)(1 + c z)(9 (x^2 + y^2 + z^2) - 19) times the node to the gradient."""
-    x, y, z, w = 1.0 + a * t[0], 1.0 + b * t[1], 1.0 + c * t[2], 9.0 * square - 19.0
+    """Add (1/64)(1 + a x)(1 + b y)(1 + c z)(9 (x^2 + y^2 + z^2) - 19) times the node to the
+    gradient.
+    """
+    x = 1.0 + a * t[0]
+    y = 1.0 + b * t[1]
+    z = 1.0 + c * t[2]
+    w = 9.0 * square - 19.0
     s = node / 64.0
     grad[0] += s * y * z * (a * w + 18.0 * t[0] * x)
     grad[1] += s * x * z * (b * w + 18.0 * t[1] * y)
@@ -104,11 +113,16 @@ def _corner(t, a, b, c, square, node, grad):
 
 @njit
 def _edge(t, axes, sides, node, grad):
-    """Add (9/64)(1 - x^2)(1 + 9 x_i x)(1 + b y)(1 + c z), x_i = a/3, x along axis i, times the node."""
+    """Add (9/64)(1 - x^2)(1 + 9 x_i x)(1 + b y)(1 + c z), x_i = a/3, x along axis i, times the
+    node.
+    """
     i, j, k = axes
     a, b, c = sides
     x = t[i]
-    y, z, u, v = 1.0 + b * t[j], 1.0 + c * t[k], 1.0 - x * x, 1.0 + 3.0 * a * x
+    y = 1.0 + b * t[j]
+    z = 1.0 + c * t[k]
+    u = 1.0 - x * x
+    v = 1.0 + 3.0 * a * x
     s = 9.0 * node / 64.0
     grad[i] += s * y * z * (3.0 * a * u - 2.0 * x * v)
     grad[j] += s * u * v * b * z

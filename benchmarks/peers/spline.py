@@ -28,7 +28,9 @@ class SplineField(PointDetector):
         Edge of a cell.
     """
 
-    def __init__(self, function: Callable[..., Any], low: ArrayLike, high: ArrayLike, spacing: float) -> None:
+    def __init__(
+        self, function: Callable[..., Any], low: ArrayLike, high: ArrayLike, spacing: float
+    ) -> None:
         from scipy.ndimage import spline_filter
 
         self.bounds = np.array([low, high], dtype=np.float64)
@@ -41,8 +43,8 @@ class SplineField(PointDetector):
 
     @classmethod
     def from_mesh(cls, mesh: MeshLike, *, nodes: int = 1_900_000) -> SplineField:
-        """Field of a mesh over its box, widened by a tenth of the longest side, with about this many
-        nodes.
+        """Field of a mesh over its box, widened by a tenth of the longest side, with about this
+        many nodes.
         """
         exact, low, high = grid_of(mesh)
         return cls(exact.signed_distance, low, high, float(np.prod(high - low) / nodes) ** (1 / 3))
@@ -61,7 +63,9 @@ class SplineField(PointDetector):
 
 @njit
 def _spline_loop(points, origin, spacing, coefficients, distance, gradient):
-    weight, slope, base = np.empty((3, 4)), np.empty((3, 4)), np.empty(3, np.int64)
+    weight = np.empty((3, 4))
+    slope = np.empty((3, 4))
+    base = np.empty(3, np.int64)
     for n in range(len(points)):
         for k in range(3):
             u = (points[n, k] - origin[k]) / spacing
@@ -70,4 +74,6 @@ def _spline_loop(points, origin, spacing, coefficients, distance, gradient):
             bspline_weights(u - int(u), weight[k], slope[k])
         value, gx, gy, gz = bspline_sum(coefficients, base, weight, slope)
         distance[n] = value
-        gradient[n, 0], gradient[n, 1], gradient[n, 2] = gx / spacing, gy / spacing, gz / spacing
+        gradient[n, 0] = gx / spacing
+        gradient[n, 1] = gy / spacing
+        gradient[n, 2] = gz / spacing

@@ -1,8 +1,8 @@
 """Builds the sparse cells of a bone's distance field from exact distances at their corners.
 
-Four levels: coarse cells over the whole grid; blocks, four times finer, where a coarse cell may meet the
-outer band about the surface or errs; half blocks in the outer band; fine cells, four to a block's edge, in
-the inner band.
+Four levels: coarse cells over the whole grid; blocks, four times finer, where a coarse cell may
+meet the outer band about the surface or errs; half blocks in the outer band; fine cells, four to a
+block's edge, in the inner band.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,8 @@ CUT = BLOCK**3
 OUTER = 3.0
 # Shift of the grid from the middle of the bone, in coarse cells.
 OFF_MIDDLE = np.array([0.0137, 0.0291, 0.0173])
-# A coarse cell is cut where its corners' triangles err at its centre by more than this share of the distance.
+# A coarse cell is cut where its corners' triangles err at its centre by more than this share of the
+# distance.
 COARSE_ERROR = 0.02
 # Lower bounds of the distance are held in multiples of this share of a fine cell.
 UNIT_SHARE = 1 / 16
@@ -41,7 +42,9 @@ FAR_DIRECTIONS = 200
 
 
 class _Nodes(NamedTuple):
-    """Points where the exact distance was asked for: nearest record, signed distance, doubt about the sign."""
+    """Points where the exact distance was asked for: nearest record, signed distance, doubt about
+    the sign.
+    """
 
     record: np.ndarray
     distance: np.ndarray
@@ -52,11 +55,21 @@ class _Builder:
     """What all levels share, and the lists so far."""
 
     def __init__(
-        self, exact: ExactDistance, origin: Floats, unit: float, inside: Any, doubtful: Booleans | None
+        self,
+        exact: ExactDistance,
+        origin: Floats,
+        unit: float,
+        inside: Any,
+        doubtful: Booleans | None,
     ) -> None:
-        self.exact, self.origin, self.unit, self.inside = exact, origin, unit, inside
+        self.exact = exact
+        self.origin = origin
+        self.unit = unit
+        self.inside = inside
         self.doubtful = (
-            np.zeros(len(exact.faces), dtype=np.bool_) if doubtful is None else doubtful[exact.order]
+            np.zeros(len(exact.faces), dtype=np.bool_)
+            if doubtful is None
+            else doubtful[exact.order]
         )
         place = np.full(len(exact.order) + 1, -1, dtype=np.int32)
         place[exact.order] = np.arange(len(exact.order))
@@ -69,7 +82,9 @@ class _Builder:
         self.sound = True
 
     def nodes(self, index: Array, edge: float, near: Array | None = None) -> Any:
-        """Exact distances at lattice points ``index`` (n, 3) times ``edge``; ``near`` names a near record."""
+        """Exact distances at lattice points ``index`` (n, 3) times ``edge``; ``near`` names a near
+        record.
+        """
         points = np.ascontiguousarray(self.origin + edge * index)
         record, distance = np.empty(len(points), dtype=np.int32), np.empty(len(points))
         near = np.full(len(points), -1, dtype=np.int32) if near is None else near
@@ -97,7 +112,9 @@ class _Builder:
         *,
         probe: bool = True,
     ) -> Array:
-        """Lists of cells with least corner ``low`` (n, 3) in edges, probed inside; returns their offsets (n,)."""
+        """Lists of cells with least corner ``low`` (n, 3) in edges, probed inside; returns their
+        offsets (n,).
+        """
         count = len(ids)
         offsets = np.empty(count, dtype=np.int32)
         rows = np.empty((count if self.inside is not None else 0, 12), dtype=np.float32)
@@ -134,21 +151,26 @@ def build_cells(
     region: Floats | None = None,
     doubtful: Booleans | None = None,
 ) -> tuple[FieldData, bool]:
-    """What queries read: sparse cells about the mesh of an exact tree; and whether signs agree with the distances.
+    """What queries read: sparse cells about the mesh of an exact tree; and whether signs agree with
+    the distances.
 
-    ``spacing`` is the edge of a fine cell; fine cells cover all points nearer than ``band``, coarse ones serve
-    outside of the box ``region`` (2, 3). ``inside`` gives the sign where the mesh itself has no reliable one,
-    ``doubtful`` (m,) marks faces whose pseudonormals are not to be believed. Records are in single precision and
-    relative to the grid's origin, where that loses nothing.
+    ``spacing`` is the edge of a fine cell; fine cells cover all points nearer than ``band``, coarse
+    ones serve outside of the box ``region`` (2, 3). ``inside`` gives the sign where the mesh itself
+    has no reliable one, ``doubtful`` (m,) marks faces whose pseudonormals are not to be believed.
+    Records are in single precision and relative to the grid's origin, where that loses nothing.
     """
     block, coarse = BLOCK * spacing, BLOCK * BLOCK * spacing
     low, high = exact.vertices.min(axis=0), exact.vertices.max(axis=0)
     margin = band + block
     shape = grid_shape(low, high, spacing, band)
-    # Off the middle, so that corners do not lie on the planes of symmetry of symmetric meshes: two triangles
-    # equally near would be told apart by rounding.
+    # Off the middle, so that corners do not lie on the planes of symmetry of symmetric meshes: two
+    # triangles equally near would be told apart by rounding.
     origin = 0.5 * (low + high) - (0.5 + OFF_MIDDLE / shape) * coarse * shape
-    box = np.array([low - margin, high + margin]) if region is None else np.asarray(region, dtype=np.float64)
+    box = (
+        np.array([low - margin, high + margin])
+        if region is None
+        else np.asarray(region, dtype=np.float64)
+    )
     builder = _Builder(exact, origin, UNIT_SHARE * spacing, inside, doubtful)
 
     bands = (band, band + OUTER * spacing)
@@ -179,11 +201,15 @@ def build_cells(
 def grid_shape(low: Floats, high: Floats, spacing: float, band: float) -> Integers:
     """Coarse cells of the grid along each axis."""
     margin = band + BLOCK * spacing
-    return np.maximum(np.ceil((high - low + 2 * margin) / (BLOCK * BLOCK * spacing)).astype(np.int64), 1)
+    return np.maximum(
+        np.ceil((high - low + 2 * margin) / (BLOCK * BLOCK * spacing)).astype(np.int64), 1
+    )
 
 
 def _coarse_level(builder, shape, edge, band, box):
-    """Block table filled with the lists of coarse cells, and the (n, 3) blocks that are to replace them."""
+    """Block table filled with the lists of coarse cells, and the (n, 3) blocks that are to replace
+    them.
+    """
     low = lattice(shape)
     corners, centres = builder.nodes(lattice(shape + 1), edge), builder.nodes(low + 0.5, edge)
     ids = corner_ids(low, np.arange(len(corners.record), dtype=np.int32).reshape(shape + 1))
@@ -192,7 +218,9 @@ def _coarse_level(builder, shape, edge, band, box):
     for axis in range(3):
         table = table.repeat(BLOCK, axis)
     guess = np.empty(len(low))
-    _guess_loop(builder.origin + edge * (low + 0.5), ids, corners.record, builder.exact.records, guess)
+    _guess_loop(
+        builder.origin + edge * (low + 0.5), ids, corners.record, builder.exact.records, guess
+    )
     distance = np.abs(centres.distance)
     near = distance - 0.5 * np.sqrt(3) * edge < band
     wanted = near | (guess > (1 + COARSE_ERROR) * distance)
@@ -202,7 +230,9 @@ def _coarse_level(builder, shape, edge, band, box):
 
 
 def _block_level(builder, table, chosen, edge, bands, box):
-    """Put the blocks' lists, and what refers to smaller cells, in the table; return the smaller cells (k, 64)."""
+    """Put the blocks' lists, and what refers to smaller cells, in the table; return the smaller
+    cells (k, 64).
+    """
     if len(chosen) == 0:
         return np.zeros((0, CUT), dtype=np.int32)
     index, wanted = mark_corners(chosen, table.shape)
@@ -227,7 +257,9 @@ def _block_level(builder, table, chosen, edge, bands, box):
 
 
 def _cut_blocks(builder, shape, blocks, offsets, samples, edge, bands):
-    """Offsets (k, 64) of the smaller cells of blocks, those of the block itself where it suffices."""
+    """Offsets (k, 64) of the smaller cells of blocks, those of the block itself where it
+    suffices.
+    """
     lists = np.concatenate(builder.lists)
     marks = []
     for side, band in zip((BLOCK, 2), bands):
@@ -273,7 +305,9 @@ def _small_cells(builder, shape, blocks, active, edge, side):
 
 
 def _far_records(exact, diagonal):
-    """Records nearest to points spread over large spheres: what a point beyond the grid is tested against."""
+    """Records nearest to points spread over large spheres: what a point beyond the grid is tested
+    against.
+    """
     turn = np.arange(FAR_DIRECTIONS) * np.pi * (3 - np.sqrt(5))
     z = 1 - (2 * np.arange(FAR_DIRECTIONS) + 1) / FAR_DIRECTIONS
     flat = np.sqrt(1 - z * z)
@@ -287,11 +321,15 @@ def _far_records(exact, diagonal):
 
 @compiled
 def _node_loop(points, near, tree, normals, record, distance):
-    records, closest, normal = tree.records, np.empty(3), np.empty(3)
+    records = tree.records
+    closest = np.empty(3)
+    normal = np.empty(3)
     stack = np.empty(STACK, np.int64), np.empty(STACK)
     best = 0
     for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        x = points[i, 0]
+        y = points[i, 1]
+        z = points[i, 2]
         # Where nothing nearer is named, the last answer bounds this one.
         best = near[i] if near[i] >= 0 else best
         square = record_square(records, best, x, y, z)
@@ -314,7 +352,9 @@ def _guess_loop(points, ids, record, records, guess):
 
 @compiled
 def _active_loop(ids, distance, centre, edge, band, side, active):
-    """Mark small cells that may hold a point nearer than ``band``, by bounds from a block's nine samples."""
+    """Mark small cells that may hold a point nearer than ``band``, by bounds from a block's nine
+    samples.
+    """
     small = edge / side
     half = 0.5 * edge
     for i in range(len(ids)):
@@ -324,14 +364,17 @@ def _active_loop(ids, distance, centre, edge, band, side, active):
             z = (cell % side + 0.5) * small
             bound = abs(centre[i]) - np.sqrt((x - half) ** 2 + (y - half) ** 2 + (z - half) ** 2)
             for k in range(8):
-                dx, dy, dz = x - edge * (k // 4), y - edge * (k // 2 % 2), z - edge * (k % 2)
+                dx = x - edge * (k // 4)
+                dy = y - edge * (k // 2 % 2)
+                dz = z - edge * (k % 2)
                 bound = max(bound, abs(distance[ids[i, k]]) - np.sqrt(dx * dx + dy * dy + dz * dz))
             active[i, cell] = bound - 0.5 * np.sqrt(3.0) * small < band
 
 
 @compiled
 def _near_loop(blocks, offsets, lists, records, cut, active):
-    """Unmark small cells that a block's triangles show to be out of the band, unless the surface is folded.
+    """Unmark small cells that a block's triangles show to be out of the band, unless the surface is
+    folded.
 
     ``cut`` holds origin, edge of a block, width of the band and small cells along an edge.
     """

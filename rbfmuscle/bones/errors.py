@@ -10,8 +10,9 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 def measure_field(field: BoneSDF, *, count: int = 50_000) -> dict[str, float]:
     """Errors of a field against exact distances at random points near the surface.
 
-    ``width`` is a mean edge of the mesh, up to which points lie away; ``error_rms``, ``error_max``; ``sign_wrong`` a
-    share of the points; ``angle_median`` [degree] between the gradient and the exact direction.
+    ``width`` is a mean edge of the mesh, up to which points lie away; ``error_rms``, ``error_max``;
+    ``sign_wrong`` a share of the points; ``angle_median`` [degree] between the gradient and the
+    exact direction.
     """
     exact = ExactDistance(field.vertices, field.faces)
     width = mean_edge(field.vertices, field.faces)
@@ -22,7 +23,9 @@ def measure_field(field: BoneSDF, *, count: int = 50_000) -> dict[str, float]:
         distance = np.abs(distance) * np.sign(found)
     away = np.abs(distance) > 1e-3 * width
     direction = (points[away] - closest[away]) / distance[away, None]
-    cosine = np.einsum("ni,ni->n", gradient[away], direction) / np.linalg.norm(gradient[away], axis=1)
+    cosine = np.einsum("ni,ni->n", gradient[away], direction) / np.linalg.norm(
+        gradient[away], axis=1
+    )
     error = found - distance
     return {
         "width": width,

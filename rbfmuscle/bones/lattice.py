@@ -15,7 +15,9 @@ def lattice(shape: Iterable[int]) -> Integers:
 
 
 def mark_corners(blocks: Integers, shape: tuple[int, int, int]) -> tuple[Array, Integers]:
-    """Number of each corner of the blocks in a dense table (-1 elsewhere), and the corners (n, 3) in order."""
+    """Number of each corner of the blocks in a dense table (-1 elsewhere), and the corners (n, 3)
+    in order.
+    """
     index = np.full(np.array(shape) + 1, -1, dtype=np.int32)
     for step in lattice((2, 2, 2)):
         index[tuple((blocks + step).T)] = 0
@@ -25,7 +27,9 @@ def mark_corners(blocks: Integers, shape: tuple[int, int, int]) -> tuple[Array, 
 
 
 def corner_ids(low: Integers, index: Array) -> Array:
-    """Numbers (n, 8) of the corners of cells with least corner ``low`` (n, 3), from a dense table."""
+    """Numbers (n, 8) of the corners of cells with least corner ``low`` (n, 3), from a dense
+    table.
+    """
     ids = [index[tuple((low + step).T)] for step in lattice((2, 2, 2))]
     return np.ascontiguousarray(np.stack(ids, axis=1))
 
@@ -53,7 +57,9 @@ def mark_loop(blocks, active, owner, side, number):
 
 @compiled
 def small_ids_loop(blocks, which, cell, owner, side, number, ids):
-    """Numbers ``ids`` (n, 8) of the corners of small cells, given by their block and place in it."""
+    """Numbers ``ids`` (n, 8) of the corners of small cells, given by their block and place in
+    it.
+    """
     for i in range(len(which)):
         for k in range(8):
             home, place = _slot(blocks[which[i]], cell[i], k, owner, side)

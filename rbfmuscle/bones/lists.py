@@ -8,14 +8,17 @@ from rbfmuscle.geometry.exact_distance import STACK, nearest_triangle, record_fe
 from rbfmuscle.geometry.triangles import CORNER, EDGE, FACE
 from rbfmuscle.jit import compiled
 
-# Points of a cell, beside its corners, from which a walk over the surface looks for triangles to list.
-PROBES = 0.25 * np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=np.float64)
+# Points of a cell, beside its corners, from which a walk over the surface looks for triangles to
+# list.
+PROBES = 0.25 * np.array(
+    [[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=np.float64
+)
 # At most this many triangles a cell; a header, and the row of the corners' distances.
 MOST, LONGEST = 15, 17
 # Steps of one walk, at most.
 WALK = 8
-# Cells whose triangles' normals differ by more than 40 degrees ask the tree at their probes, unless further
-# away than this many of their edges.
+# Cells whose triangles' normals differ by more than 40 degrees ask the tree at their probes, unless
+# further away than this many of their edges.
 FOLD, FOLD_REACH = 0.75, 2.0
 # Triangles whose squared distances differ by less than this share are equally near.
 SLACK = 1e-9
@@ -25,11 +28,15 @@ LOOK_BACK = 6
 
 @compiled
 def list_loop(cells, nodes, edge, unit, mesh, probe, out):
-    """Write the list of each cell; return the lengths used and whether all signs agree with the distances."""
+    """Write the list of each cell; return the lengths used and whether all signs agree with the
+    distances.
+    """
     low, ids, centre = cells
     record, distance, doubt = nodes
     lists, offsets, rows, first_row = out
-    used, mixed, sound = 0, 0, True
+    used = 0
+    mixed = 0
+    sound = True
     stack = np.empty(STACK, np.int64), np.empty(STACK)
     for i in range(len(ids)):
         listed = lists[used + 1 : used + 1 + MOST]
@@ -41,7 +48,9 @@ def list_loop(cells, nodes, edge, unit, mesh, probe, out):
                 count = _add(listed, count, np.int64(n))
             if k < 8:
                 doubted = doubted or doubt[ids[i, k]]
-        folded = abs(distance[ids[i, 0]]) < FOLD_REACH * edge and folded_list(mesh[0].records, listed, count)
+        folded = abs(distance[ids[i, 0]]) < FOLD_REACH * edge and folded_list(
+            mesh[0].records, listed, count
+        )
         if probe or folded:
             count = _probe(listed, count, folded, low[i], edge, mesh, stack)
         for k in range(count):
@@ -64,7 +73,9 @@ def list_loop(cells, nodes, edge, unit, mesh, probe, out):
 
 @compiled
 def _add(listed, count, n):
-    """Append n to the first ``count`` triangles of a list if it is new and has room; return their number."""
+    """Append n to the first ``count`` triangles of a list if it is new and has room; return their
+    number.
+    """
     for m in range(count):
         if listed[m] == n:
             return count
@@ -91,9 +102,10 @@ def folded_list(records, listed, count):
 def _probe(listed, count, folded, low, edge, mesh, stack):
     """Add the triangles nearest to points inside the cell.
 
-    Where a corner's nearest point lies on an edge or a vertex, several triangles are equally near and the
-    corner names only one of them; inside the cell another may be nearer by far. A walk downhill over the
-    surface, from the nearest triangle listed, finds it; where the surface is folded the tree is asked.
+    Where a corner's nearest point lies on an edge or a vertex, several triangles are equally near
+    and the corner names only one of them; inside the cell another may be nearer by far. A walk
+    downhill over the surface, from the nearest triangle listed, finds it; where the surface is
+    folded the tree is asked.
     """
     tree, across, origin, _ = mesh
     records = tree.records

@@ -1,4 +1,6 @@
-"""What a bone's mesh allows: which triangles count, and where the sign of the distance comes from."""
+"""What a bone's mesh allows: which triangles count, and where the sign of the distance comes
+from.
+"""
 
 from dataclasses import dataclass, field
 
@@ -29,10 +31,12 @@ class BoneMesh:
 
 
 def prepare_bone(vertices: Floats, faces: Integers, *, name: str = "bone") -> BoneMesh:
-    """Clean arrays for a distance field: no degenerate or duplicate faces, outward as far as can be told.
+    """Clean arrays for a distance field: no degenerate or duplicate faces, outward as far as can be
+    told.
 
-    Closed meshes are taken as they are. Of others equal vertices are merged, and patches oriented alike. Raises
-    MeshError on NaN, indices out of range, an empty mesh, or one whose faces all have no area.
+    Closed meshes are taken as they are. Of others equal vertices are merged, and patches oriented
+    alike. Raises MeshError on NaN, indices out of range, an empty mesh, or one whose faces all have
+    no area.
     """
     vertices, faces = check_mesh(vertices, faces, name=name)
     mesh = BoneMesh(vertices, faces, np.zeros(len(faces), dtype=np.bool_))
@@ -93,7 +97,9 @@ def _mend(mesh):
     return across
 
 
-def points_near(vertices: Floats, faces: Integers, count: int, width: float, *, seed: int = 0) -> Floats:
+def points_near(
+    vertices: Floats, faces: Integers, count: int, width: float, *, seed: int = 0
+) -> Floats:
     """Random points (count, 3) up to ``width`` from the surface, along the faces' normals."""
     rng = np.random.default_rng(seed)
     corners = vertices[faces]

@@ -1,22 +1,34 @@
 """Queries of a bone's distance field inside compiled loops.
 
-The field is a sparse grid of cells. Each cell names the few triangles that are nearest to its corners; a
-query takes the nearest of them, so it answers with a true distance to the mesh, with its sharp gradient, and
-not with an interpolation. Cells are fine in a band about the surface and coarser elsewhere, and outside the
-grid those of its border serve.
+The field is a sparse grid of cells. Each cell names the few triangles that are nearest to its
+corners; a query takes the nearest of them, so it answers with a true distance to the mesh, with its
+sharp gradient, and not with an interpolation. Cells are fine in a band about the surface and
+coarser elsewhere, and outside the grid those of its border serve.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.bones.cells import BOUND, INVERSE, UNIT, _beyond, _block_entry, _common_bound, _placed
+from rbfmuscle.bones.cells import (
+    BOUND,
+    INVERSE,
+    UNIT,
+    _beyond,
+    _block_entry,
+    _common_bound,
+    _placed,
+)
 from rbfmuscle.geometry.triangles import CORNER, EDGE, FACE, nearest_in_frame
 from rbfmuscle.jit import compiled
 
 # What a cell says of its side.
-CROSSED, OUTSIDE, INSIDE, MIXED = 0, 1, 2, 3
-# A header counts triangles in its low four bits, holds the side in two more and the lower bound above.
+CROSSED = 0
+OUTSIDE = 1
+INSIDE = 2
+MIXED = 3
+# A header counts triangles in its low four bits, holds the side in two more and the lower bound
+# above.
 COUNT, SIDE = 15, 4
 # Offsets below this share of the unit are lost in the rounding of the records (single precision).
 ROUNDING = 1e-3
@@ -33,13 +45,16 @@ LEAST_TOGETHER = 16
 class FieldData(NamedTuple):
     """What a query reads: integers are int32, the rest but ``grid`` is float32."""
 
-    grid: np.ndarray  # (5,) origin, 1 / edge of a block, and the unit of the lower bounds in ``lists``
+    grid: (
+        np.ndarray
+    )  # (5,) origin, 1 / edge of a block, and the unit of the lower bounds in ``lists``
     # (a, b, c) offset of each block's list, or -1 - k where it is cut into the fine cells k
     blocks: np.ndarray
     cells: np.ndarray  # (k, 64) offsets of the fine cells' lists
     # (l,) header and triangles of each cell; of mixed cells the row of ``corners`` after them
     lists: np.ndarray
-    # (q, 12) signed distances at the corners of cells where the mesh gives no sign, least corner, 1 / edge
+    # (q, 12) signed distances at the corners of cells where the mesh gives no sign, least corner, 1
+    # / edge
     corners: np.ndarray
     far: np.ndarray  # (f,) triangles that face the outside, for points beyond the grid
     records: np.ndarray  # (m, 16) frames of the triangles, relative to the grid's origin
@@ -50,7 +65,9 @@ class FieldData(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Of the points of one stage: where relative to the origin, cell, nearest record, offset in its frame."""
+    """Of the points of one stage: where relative to the origin, cell, nearest record, offset in its
+    frame.
+    """
 
     local: np.ndarray
     entry: np.ndarray
@@ -60,15 +77,19 @@ class Found(NamedTuple):
 
 @compiled(error_model="numpy", inline="always")
 def _square(n, x, y, z, records):
-    """Squared distance to record n of a point relative to the origin, in single precision; without branches, as they
-    are a toss-up.
+    """Squared distance to record n of a point relative to the origin, in single precision; without
+    branches, as they are a toss-up.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
-    qx, qy, qz = np.float32(x) - records[n, 0], np.float32(y) - records[n, 1], np.float32(z) - records[n, 2]
+    qx = np.float32(x) - records[n, 0]
+    qy = np.float32(y) - records[n, 1]
+    qz = np.float32(z) - records[n, 2]
     u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
     v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
     w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
-    bx, cx, cy = records[n, 12], records[n, 13], records[n, 14]
+    bx = records[n, 12]
+    cx = records[n, 13]
+    cy = records[n, 14]
     du = u - min(max(u, zero), bx)
     ab = du * du + v * v
     ex, eu = cx - bx, u - bx
@@ -121,7 +142,9 @@ def _mixed_side(x, y, z, entry, lists, corners):
 @compiled(error_model="numpy", inline="always")
 def _in_frame(n, x, y, z, records):
     """A point in the frame of record n."""
-    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    qx = x - records[n, 0]
+    qy = y - records[n, 1]
+    qz = z - records[n, 2]
     u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
     v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
     w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
@@ -130,9 +153,13 @@ def _in_frame(n, x, y, z, records):
 
 @compiled(error_model="numpy", inline="always")
 def _offset(n, x, y, z, records):
-    """Offset of a point from its nearest point of record n, in the record's frame; and whether that is inside."""
+    """Offset of a point from its nearest point of record n, in the record's frame; and whether that
+    is inside.
+    """
     u, v, w = _in_frame(n, x, y, z, records)
-    bx, cx, cy = records[n, 12], records[n, 13], records[n, 14]
+    bx = records[n, 12]
+    cx = records[n, 13]
+    cy = records[n, 14]
     ex, eu = cx - bx, u - bx
     inside = (v >= 0.0) & (eu * cy - v * ex <= 0.0) & (v * cx - u * cy <= 0.0)
     if inside:
@@ -145,13 +172,17 @@ def _offset(n, x, y, z, records):
 def _walk(best, square, x, y, z, records, across):
     """Record at which a walk over neighbours, always to a nearer one, ends.
 
-    The nearest triangle listed in a cell is not always the nearest of all; then the point lies beyond one of
-    its edges, mostly that to the nearest.
+    The nearest triangle listed in a cell is not always the nearest of all; then the point lies
+    beyond one of its edges, mostly that to the nearest.
     """
     for _ in range(WALK):
         u, v, _ = _in_frame(best, x, y, z, records)
-        bx, cx, cy = records[best, 12], records[best, 13], records[best, 14]
-        _, _, feature = nearest_in_frame(bx, cx, cy, records[best, 15], 1.0 / (cx * cx + cy * cy), u, v)
+        bx = records[best, 12]
+        cx = records[best, 13]
+        cy = records[best, 14]
+        _, _, feature = nearest_in_frame(
+            bx, cx, cy, records[best, 15], 1.0 / (cx * cx + cy * cy), u, v
+        )
         if feature == FACE:
             return best
         # The edges at corner k are k and k - 1.
@@ -200,7 +231,9 @@ def _slow_side(x, y, z, entry, n, data):
     """Positive outside: where neither the cell nor the side of a face tells."""
     if data.lists[entry] >> SIDE & 3 == MIXED:
         return _mixed_side(x, y, z, entry, data.lists, data.corners)
-    return _crossed_side(x, y, z, n, data.records, data.edge_normals, data.vertex_normals, data.vertices)
+    return _crossed_side(
+        x, y, z, n, data.records, data.edge_normals, data.vertex_normals, data.vertices
+    )
 
 
 @compiled(error_model="numpy", inline="always")
@@ -215,13 +248,18 @@ def _unit_gradient(n, distance, du, dv, dw, least, records):
 def _stage(points, pose, reach, data, found, square):
     """Nearest record of up to STAGE points; each pass reads what the next one needs.
 
-    Fills the points relative to the origin, their cells, their nearest record (-1 where out of reach)
-    and the squared distance (the lower bound where out of reach).
+    Fills the points relative to the origin, their cells, their nearest record (-1 where out of
+    reach) and the squared distance (the lower bound where out of reach).
     """
-    grid, blocks, cells, lists, far, records = (
-        data.grid, data.blocks, data.cells, data.lists, data.far, data.records
-    )  # fmt: skip
-    local, entry, best = found.local, found.entry, found.best
+    grid = data.grid
+    blocks = data.blocks
+    cells = data.cells
+    lists = data.lists
+    far = data.far
+    records = data.records
+    local = found.local
+    entry = found.entry
+    best = found.best
     scale, unit = grid[INVERSE], grid[UNIT]
     if len(points) >= LEAST_TOGETHER:
         bound = _common_bound(points, pose, grid, blocks, cells, lists)
@@ -231,7 +269,9 @@ def _stage(points, pose, reach, data, found, square):
             return
     for n in range(len(points)):
         x, y, z = _placed(points[n], pose, grid)
-        local[n, 0], local[n, 1], local[n, 2] = x, y, z
+        local[n, 0] = x
+        local[n, 1] = y
+        local[n, 2] = z
         entry[n], cell, far_point = _block_entry(x, y, z, scale, blocks)
         best[n] = cell | (CELL_FAR if far_point else 0)
         square[n] = _beyond(x, y, z, scale, blocks) if far_point else 0.0
@@ -241,7 +281,8 @@ def _stage(points, pose, reach, data, found, square):
     for n in range(len(points)):
         bound = (lists[entry[n]] >> BOUND) * unit
         if square[n] > 0.0:
-            # The bone lies in the grid, so the way to the grid and the way on from there are at a right angle or more.
+            # The bone lies in the grid, so the way to the grid and the way on from there are at a
+            # right angle or more.
             bound = np.sqrt(bound * bound + square[n])
         square[n] = bound
         if bound > reach[n]:
@@ -252,19 +293,28 @@ def _stage(points, pose, reach, data, found, square):
     for n in range(len(points)):
         if best[n] >= 0:
             far_point = best[n] >= CELL_FAR
-            x, y, z = local[n, 0], local[n, 1], local[n, 2]
+            x = local[n, 0]
+            y = local[n, 1]
+            z = local[n, 2]
             best[n], square[n] = _nearest_listed(x, y, z, entry[n], far_point, lists, far, records)
 
 
 @compiled(error_model="numpy")
 def _finish(count, data, found, square):
-    """Turn squared into signed distances, and fill the offsets from the surface in the frames of the records."""
+    """Turn squared into signed distances, and fill the offsets from the surface in the frames of
+    the records.
+    """
     local, entry, best, offset = found
-    lists, records, across = data.lists, data.records, data.across
+    lists = data.lists
+    records = data.records
+    across = data.across
     for n in range(count):
         if best[n] < 0:
             continue
-        x, y, z, m = local[n, 0], local[n, 1], local[n, 2], best[n]
+        x = local[n, 0]
+        y = local[n, 1]
+        z = local[n, 2]
+        m = best[n]
         du, dv, dw, inside = _offset(m, x, y, z, records)
         if not inside:
             m = _walk(m, square[n], x, y, z, records, across)
@@ -272,7 +322,9 @@ def _finish(count, data, found, square):
             best[n] = m
         # The nearest was found in single precision.
         square[n] = du * du + dv * dv + dw * dw
-        offset[n, 0], offset[n, 1], offset[n, 2] = du, dv, dw
+        offset[n, 0] = du
+        offset[n, 1] = dv
+        offset[n, 2] = dw
         state = lists[entry[n]] >> SIDE & 3
         side = 1.0 if state == OUTSIDE else (-1.0 if state == INSIDE else dw)
         if state == MIXED or (state == CROSSED and not inside):
@@ -283,12 +335,17 @@ def _finish(count, data, found, square):
 
 @compiled(error_model="numpy")
 def query_loop(points, pose, reach, size, distance, gradient, data):
-    """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates; ``gradient`` may be empty.
+    """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates; ``gradient``
+    may be empty.
 
-    ``pose`` takes local units to the world, one of which is ``size`` long; ``reach`` (n,) is in the world's.
+    ``pose`` takes local units to the world, one of which is ``size`` long; ``reach`` (n,) is in the
+    world's.
     """
     found = Found(
-        np.empty((STAGE, 3)), np.empty(STAGE, np.int32), np.empty(STAGE, np.int32), np.empty((STAGE, 3))
+        np.empty((STAGE, 3)),
+        np.empty(STAGE, np.int32),
+        np.empty(STAGE, np.int32),
+        np.empty((STAGE, 3)),
     )
     least = ROUNDING * data.grid[UNIT]
     near = np.empty(STAGE)
@@ -311,9 +368,13 @@ def _turn(count, pose, size, least, found, distance, records, gradient):
     """Gradients in world axes; zero where the bone is out of reach."""
     best, offset = found.best, found.offset
     for n in range(count):
-        gx, gy, gz = 0.0, 0.0, 0.0
+        gx = 0.0
+        gy = 0.0
+        gz = 0.0
         if best[n] >= 0:
-            du, dv, dw = offset[n, 0], offset[n, 1], offset[n, 2]
+            du = offset[n, 0]
+            dv = offset[n, 1]
+            dw = offset[n, 2]
             gx, gy, gz = _unit_gradient(best[n], distance[n], du, dv, dw, least, records)
         for k in range(3):
             gradient[n, k] = size * (pose[k, 0] * gx + pose[k, 1] * gy + pose[k, 2] * gz)

@@ -1,7 +1,8 @@
 """BoneSDF: signed distance and gradient of a rigid bone, in any pose.
 
-The field stays in bone coordinates and is never rebuilt; queries carry points there inside their loop.
-Distances are negative inside. What a query reads, and how, is in ``query.py``; how it is built, in ``build.py``.
+The field stays in bone coordinates and is never rebuilt; queries carry points there inside their
+loop. Distances are negative inside. What a query reads, and how, is in ``query.py``; how it is
+built, in ``build.py``.
 """
 
 from __future__ import annotations
@@ -62,8 +63,8 @@ class BoneSDF:
     notes : tuple of str
         What was found about the mesh.
     data : FieldData
-        What queries read, in a frame of the bone's own: a scene that is moved, turned or written in another unit
-        gives the same field.
+        What queries read, in a frame of the bone's own: a scene that is moved, turned or written in
+        another unit gives the same field.
 
     Examples
     --------
@@ -75,7 +76,9 @@ class BoneSDF:
     """
 
     def __init__(self, vertices: Floats, frame: BoneFrame, parts: _Parts) -> None:
-        self.vertices, self.faces, self.notes = vertices, parts.faces, tuple(parts.notes)
+        self.vertices = vertices
+        self.faces = parts.faces
+        self.notes = tuple(parts.notes)
         used = self.vertices[np.unique(self.faces)]
         self.bounds = np.array([used.min(axis=0), used.max(axis=0)])
         self.data, self.closed = parts.data, parts.closed
@@ -109,13 +112,14 @@ class BoneSDF:
         Parameters
         ----------
         mesh : trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
-            Rest (bone) coordinates. Closed and outward for exact signs; others are signed by winding
-            numbers, and the log says so.
+            Rest (bone) coordinates. Closed and outward for exact signs; others are signed by
+            winding numbers, and the log says so.
         tolerance : float, optional
-            RMS error near the surface [unit of the mesh]. By default 0.4 % of the mean edge, or what the
-            memory allows.
+            RMS error near the surface [unit of the mesh]. By default 0.4 % of the mean edge, or
+            what the memory allows.
         region : (2, 3) array_like, optional
-            Box, bone coordinates, that points come from. Outside of it the field is coarse, but still right.
+            Box, bone coordinates, that points come from. Outside of it the field is coarse, but
+            still right.
         cache : bool
             Look the field up on disk, and keep it there.
         memory_limit : int
@@ -144,7 +148,12 @@ class BoneSDF:
         frame = BoneFrame(vertices)
         if parts is None:
             parts = _build(
-                prepare_bone(frame.local, faces, name=name), frame, tolerance, region, memory_limit, name
+                prepare_bone(frame.local, faces, name=name),
+                frame,
+                tolerance,
+                region,
+                memory_limit,
+                name,
             )
             if key is not None:
                 store_arrays(key, _to_arrays(parts))
@@ -164,8 +173,8 @@ class BoneSDF:
         pose : (4, 4) array_like, optional
             Bone to world, rigid.
         reach : float or (n,) array_like
-            Points further away than this may get any lower bound of their distance that is above it: much
-            faster.
+            Points further away than this may get any lower bound of their distance that is above
+            it: much faster.
         """
         return self._query(points, pose, reach, gradient=False)[0]
 
@@ -176,17 +185,22 @@ class BoneSDF:
     def distance_and_gradient(
         self, points: Floats, pose: Floats | None = None, reach: Floats | float = np.inf
     ) -> tuple[Floats, Floats]:
-        """Signed distance (n,) and its gradient (n, 3), which is a unit vector; parameters as for `distance`.
+        """Signed distance (n,) and its gradient (n, 3), which is a unit vector; parameters as for
+        `distance`.
 
-        On the surface the gradient is the normal of the triangle. It is zero where only a lower bound is
-        given.
+        On the surface the gradient is the normal of the triangle. It is zero where only a lower
+        bound is given.
         """
         return self._query(points, pose, reach, gradient=True)
 
     def _query(self, points, pose, reach, *, gradient):
         points, pose = check_points(points), _check_pose(pose)
         placed, size = self._frame.placed(pose), self._frame.size
-        reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
+        reach = (
+            np.full(len(points), reach)
+            if np.ndim(reach) == 0
+            else np.asarray(reach, dtype=np.float64)
+        )
         distance, slope = np.empty(len(points)), np.empty((len(points) if gradient else 0, 3))
 
         def work(a, b):
@@ -242,13 +256,16 @@ def _build(mesh, frame, tolerance, region, memory_limit, name):
             return reached
         spacing *= max(0.5, 0.9 * (wanted / error) ** (1 / 3))
     mesh.notes.append(
-        f"errs by {error * frame.size:.3g} RMS near the surface, {wanted * frame.size:.3g} was asked for"
+        f"errs by {error * frame.size:.3g} RMS near the surface, {wanted * frame.size:.3g} was "
+        "asked for"
     )
     return reached
 
 
 def _check_memory(mesh, exact, spacing, tolerance, limit, name):
-    """Spacing that fits in the memory: larger if the caller asked for no tolerance, else an error."""
+    """Spacing that fits in the memory: larger if the caller asked for no tolerance, else an
+    error.
+    """
     low, high = exact.vertices.min(axis=0), exact.vertices.max(axis=0)
     area = float(np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1).sum())
 
@@ -276,7 +293,9 @@ def _measure(mesh, data, exact, band, region):
     faces = mesh.faces
     if region is not None:
         corners = mesh.vertices[faces]
-        faces = faces[np.all((corners.min(axis=1) <= region[1]) & (corners.max(axis=1) >= region[0]), axis=1)]
+        faces = faces[
+            np.all((corners.min(axis=1) <= region[1]) & (corners.max(axis=1) >= region[0]), axis=1)
+        ]
     if len(faces) == 0:
         return 0.0
     points = points_near(mesh.vertices, faces, PROBES, band)
@@ -289,7 +308,12 @@ def _measure(mesh, data, exact, band, region):
 def _to_arrays(parts):
     arrays = {"data_" + name: array for name, array in parts.data._asdict().items()}
     numbers = np.array([parts.spacing, parts.error, float(parts.closed)])
-    return {**arrays, "faces": parts.faces, "numbers": numbers, "notes": np.array("\n".join(parts.notes))}
+    return {
+        **arrays,
+        "faces": parts.faces,
+        "numbers": numbers,
+        "notes": np.array("\n".join(parts.notes)),
+    }
 
 
 def _from_arrays(arrays):

@@ -1,4 +1,6 @@
-"""Entry point of the command line; light, so that interrupts work before anything heavy is loaded."""
+"""Entry point of the command line; light, so that interrupts work before anything heavy is
+loaded.
+"""
 
 import sys
 
@@ -6,7 +8,9 @@ from rbfmuscle import interruption
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line, on the process's own arguments by default, and leave with the promised exit code."""
+    """Run the command line, on the process's own arguments by default, and leave with the promised
+    exit code.
+    """
     whole_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     interruption.install(as_json="--json" in arguments, watch=whole_process)

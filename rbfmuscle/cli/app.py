@@ -1,7 +1,8 @@
-"""The command line: reads the arguments, runs a command, turns errors into one line and an exit code.
+"""The command line: reads the arguments, runs a command, turns errors into one line and an exit
+code.
 
-0 done; 2 wrong usage; 3 bad scene; 4 unusable mesh; 5 solve failed, frames so far kept; 6 a ``--fail-on``
-limit exceeded; 7 an optional part missing; 130 interrupted, frames so far kept.
+0 done; 2 wrong usage; 3 bad scene; 4 unusable mesh; 5 solve failed, frames so far kept; 6 a
+``--fail-on`` limit exceeded; 7 an optional part missing; 130 interrupted, frames so far kept.
 """
 
 import contextlib
@@ -31,7 +32,9 @@ GROUPS = {
     "Look": (view, render),
 }
 app = App(
-    name="rbfmuscle", help="Muscles as implicit RBF surfaces that move with the bones.", version=__version__
+    name="rbfmuscle",
+    help="Muscles as implicit RBF surfaces that move with the bones.",
+    version=__version__,
 )
 app["--help"].group = app["--version"].group = Group("Options", sort_key=1000)
 for title, commands in GROUPS.items():
@@ -46,7 +49,9 @@ def run_command(arguments: list[str]) -> int:
     warnings.showwarning = _show_warning
     logging.lastResort = _LogLines(logging.WARNING)
     if sys.stdout is None:
-        return _fail("standard output is closed; send it to a file, or to /dev/null", UsageError.exit_code)
+        return _fail(
+            "standard output is closed; send it to a file, or to /dev/null", UsageError.exit_code
+        )
     try:
         code = _run(arguments, "--json" in arguments)
         sys.stdout.flush()
@@ -110,7 +115,9 @@ def _show_warning(message, category, filename, lineno, file=None, line=None):
 
 
 class _LogLines(logging.Handler):
-    """Prints log records as warnings in one line, without tracebacks, where logging is not configured."""
+    """Prints log records as warnings in one line, without tracebacks, where logging is not
+    configured.
+    """
 
     def emit(self, record):
         print(f"rbfmuscle: warning: {one_line(record.getMessage())}", file=sys.stderr)

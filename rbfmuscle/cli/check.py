@@ -1,4 +1,6 @@
-"""``rbfmuscle check`` and ``rbfmuscle plan``: a scene file and what a run of it would build, nothing solved."""
+"""``rbfmuscle check`` and ``rbfmuscle plan``: a scene file and what a run of it would build,
+nothing solved.
+"""
 
 import json
 import logging
@@ -10,7 +12,9 @@ from rbfmuscle.progress import Progress, stage
 from rbfmuscle.validation import SceneError
 
 
-def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_json: Json = False) -> int:
+def check(
+    scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_json: Json = False
+) -> int:
     """Check a scene file and its meshes; nothing is solved.
 
     Parameters
@@ -28,7 +32,10 @@ def check(scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_j
             from rbfmuscle.bones.sdf import BoneSDF
 
             with stage("errors of the bones' fields"):
-                errors = {b.name: measure_field(BoneSDF.from_mesh(b.mesh, name=b.name)) for b in loaded.bones}
+                errors = {
+                    b.name: measure_field(BoneSDF.from_mesh(b.mesh, name=b.name))
+                    for b in loaded.bones
+                }
         drawn = {}
         if picture:
             from rbfmuscle.report.render import draw_scene
@@ -91,8 +98,10 @@ def _field_notes(scene):
 
 def _describe_field(name, found, units):
     return (
-        f"  field of {name}: within {found['width']:.3g} {units} of the surface {found['error_rms']:.2g} {units} RMS, "
-        f"{found['error_max']:.2g} at most; sign wrong for {100 * found['sign_wrong']:.4f} %; direction off by "
+        f"  field of {name}: within {found['width']:.3g} {units} of the surface "
+        f"{found['error_rms']:.2g} {units} RMS, "
+        f"{found['error_max']:.2g} at most; sign wrong for {100 * found['sign_wrong']:.4f} %; "
+        "direction off by "
         f"{found['angle_median']:.2g} degrees in the median"
     )
 
@@ -103,9 +112,15 @@ def _scene_lines(scene):
     unknown = " (assumed, as no femur or tibia shows them; set superior and anterior in [scene])"
     yield f"  superior is ({up}), anterior ({front}){unknown if scene.superior is None else ''}"
     for bone in scene.bones:
-        yield f"  bone {bone.name}: {len(bone.mesh.vertices)} vertices, {len(bone.mesh.faces)} triangles"
+        yield (
+            f"  bone {bone.name}: {len(bone.mesh.vertices)} vertices, {len(bone.mesh.faces)} "
+            "triangles"
+        )
     for joint in scene.joints:
-        yield f"  joint {joint.name}: {joint.parent} to {joint.child}, {', '.join(joint.coordinates) or joint.kind}"
+        yield (
+            f"  joint {joint.name}: {joint.parent} to {joint.child}, "
+            f"{', '.join(joint.coordinates) or joint.kind}"
+        )
     for muscle in scene.muscles:
         held = ", ".join(
             f"{len(a.vertices)} {'on' if a.tendon is None else 'by a tendon to'} {a.bone}"
@@ -124,7 +139,8 @@ def plan(scene: SceneName, *, time: Flag = False, as_json: Json = False) -> None
     Parameters
     ----------
     time
-        Also build the muscles, solve two frames after the first, and extrapolate to the whole motion.
+        Also build the muscles, solve two frames after the first, and extrapolate to the whole
+        motion.
     """
     from rbfmuscle.models import check_models, solved_points
     from rbfmuscle.scene.phantom import open_scene
@@ -143,13 +159,17 @@ def plan(scene: SceneName, *, time: Flag = False, as_json: Json = False) -> None
 
 
 def _measure_time(scene):
-    """Wall time of a run without report, pictures and files [s], extrapolated from its first three frames."""
+    """Wall time of a run without report, pictures and files [s], extrapolated from its first three
+    frames.
+    """
     from rbfmuscle.run import simulate
 
     start = perf_counter()
     frames = simulate(scene, frames=slice(0, 3)).frames
     spent, count = perf_counter() - start, len(scene.motion)
-    frame = spent / count if len(frames) < 2 else sum(f.wall for f in frames[1:]) / (len(frames) - 1)
+    frame = (
+        spent / count if len(frames) < 2 else sum(f.wall for f in frames[1:]) / (len(frames) - 1)
+    )
     build = max(0.0, spent - frame * (len(frames) - 1))
     return {"build": build, "frame": frame, "total": build + frame * (count - 1)}
 
@@ -162,10 +182,14 @@ def _lines(made):
             f"{', '.join(muscle['bones']) or 'no bone'}; solved in {muscle['substeps']} sub-steps"
         )
     for field in made["fields"]:
-        yield f"field of {field['bone']}: {field['share']:.0%} of its box, {field['triangles']} triangles"
+        yield (
+            f"field of {field['bone']}: {field['share']:.0%} of its box, {field['triangles']} "
+            "triangles"
+        )
     if "time" in made:
         spent = made["time"]
         yield (
-            f"expected time: {spent['total']:.3g} s without report, pictures and files; build and first frame "
+            f"expected time: {spent['total']:.3g} s without report, pictures and files; build and "
+            "first frame "
             f"{spent['build']:.2g} s, {1e3 * spent['frame']:.3g} ms per frame"
         )

@@ -1,4 +1,6 @@
-"""``rbfmuscle view``, ``render`` and ``export``: a scene or a run in the browser, in pictures and other formats."""
+"""``rbfmuscle view``, ``render`` and ``export``: a scene or a run in the browser, in pictures and
+other formats.
+"""
 
 import math
 import threading
@@ -23,14 +25,17 @@ def view(
     port: int = 0,
     screenshot: Path | None = None,
 ) -> None:
-    """Show a scene or a run in the browser, with a slider for each joint coordinate or for the frames.
+    """Show a scene or a run in the browser, with a slider for each joint coordinate or for the
+    frames.
 
     Parameters
     ----------
     scene
-        Scene file (TOML), "phantom" for the embedded hip, or the folder of a run or of a comparison.
+        Scene file (TOML), "phantom" for the embedded hip, or the folder of a run or of a
+        comparison.
     at
-        Where to begin: COORDINATE=DEGREES, for instance hip.flexion=60; may be repeated. For a saved run: frame=N.
+        Where to begin: COORDINATE=DEGREES, for instance hip.flexion=60; may be repeated. For a
+        saved run: frame=N.
     colour
         What muscles are coloured by at first, in the browser.
     browser
@@ -76,13 +81,17 @@ def _parse_stop(text):
             raise ValueError
         return name, number
     except ValueError:
-        raise UsageError(f"--at {text!r} is not COORDINATE=DEGREES, for instance hip.flexion=60") from None
+        raise UsageError(
+            f"--at {text!r} is not COORDINATE=DEGREES, for instance hip.flexion=60"
+        ) from None
 
 
 def _check_stops(stops, known):
     for name in stops:
         if name not in known:
-            raise UsageError(f"--at: unknown coordinate {name!r}, {did_you_mean(name, list(known))}")
+            raise UsageError(
+                f"--at: unknown coordinate {name!r}, {did_you_mean(name, list(known))}"
+            )
 
 
 def _open(path):
@@ -103,7 +112,9 @@ def _open_runs(folder):
 
 
 def _draw(opened, model, stops, path):
-    """Draw a run's frame, or a scene's pose after a run to it, in the way `rbfmuscle render` does."""
+    """Draw a run's frame, or a scene's pose after a run to it, in the way `rbfmuscle render`
+    does.
+    """
     from rbfmuscle.report.render import render_run
     from rbfmuscle.run import simulate
 
@@ -125,7 +136,9 @@ def _posed(scene, stops):
 
     _check_stops(stops, coordinate_limits(scene))
     rest, scene = rest_coordinates(scene), scene.copy()
-    scene.motion = Motion([rest, rest | {name: inner_value(scene, name, x) for name, x in stops.items()}])
+    scene.motion = Motion(
+        [rest, rest | {name: inner_value(scene, name, x) for name, x in stops.items()}]
+    )
     return scene
 
 
@@ -144,8 +157,8 @@ def export(
     directory
         Folder of the run.
     formats
-        pvd, vtp, ply, stl, obj or glb: files for each frame; animated-glb (Blender) or usd: all frames in one
-        animated file. Several may be given.
+        pvd, vtp, ply, stl, obj or glb: files for each frame; animated-glb (Blender) or usd: all
+        frames in one animated file. Several may be given.
     output
         Folder to write to, DIR/export by default.
     units
@@ -182,8 +195,8 @@ def render(
     frame
         Frame of a picture; the last one by default.
     view
-        front, back, left, right, top, bottom or motion (in its plane); may be repeated; front, right and back
-        by default.
+        front, back, left, right, top, bottom or motion (in its plane); may be repeated; front,
+        right and back by default.
     seconds
         Length of an animation.
     """

@@ -1,4 +1,6 @@
-"""``rbfmuscle new`` and ``rbfmuscle import``: scene files from meshes, volumes of labels and OpenSim models."""
+"""``rbfmuscle new`` and ``rbfmuscle import``: scene files from meshes, volumes of labels and
+OpenSim models.
+"""
 
 import re
 from pathlib import Path
@@ -23,30 +25,39 @@ def new(
     Parameters
     ----------
     source
-        Folder with STL, OBJ, PLY, VTK or VTP files, one bone or muscle each (or in folders bones and muscles);
-        or a segmentation: .nii, .nii.gz, .nrrd, or a folder with one file for each mask.
+        Folder with STL, OBJ, PLY, VTK or VTP files, one bone or muscle each (or in folders bones
+        and muscles); or a segmentation: .nii, .nii.gz, .nrrd, or a folder with one file for each
+        mask.
     units
-        Unit of the meshes; by default chosen from the size of the bones. Label volumes are always in mm.
+        Unit of the meshes; by default chosen from the size of the bones. Label volumes are always
+        in mm.
     labels
-        Names of a segmentation's labels: JSON, CSV, TSV or ITK-SNAP's descriptions, or a known table, as
-        totalsegmentator, musclemap-thigh.
+        Names of a segmentation's labels: JSON, CSV, TSV or ITK-SNAP's descriptions, or a known
+        table, as totalsegmentator, musclemap-thigh.
     output
-        Scene file (.toml) to write, or a folder for scene.toml; the folder of the meshes by default.
+        Scene file (.toml) to write, or a folder for scene.toml; the folder of the meshes by
+        default.
     """
     from rbfmuscle.importers.guess.guess import guess_scene, write_scene
     from rbfmuscle.importers.guess.orientation import HEADER
 
     volume = _is_segmentation(source)
     if volume and units not in (None, "mm"):
-        raise UsageError(f"{source}: a segmentation says its unit, its scene is in mm; leave --units out")
+        raise UsageError(
+            f"{source}: a segmentation says its unit, its scene is in mm; leave --units out"
+        )
     if labels is not None and not volume:
-        raise UsageError(f"--labels names the labels of a segmentation, {source} is a folder of meshes")
+        raise UsageError(
+            f"--labels names the labels of a segmentation, {source} is a folder of meshes"
+        )
     folder = _beside(source, output) if volume else source
     output = _scene_file(output, folder)
     _check_target(output, force)
     if volume:
         folder = _write_surfaces(source, labels, folder, force)
-    guess = guess_scene(folder, "mm" if volume else units, output.parent, header=HEADER if volume else None)
+    guess = guess_scene(
+        folder, "mm" if volume else units, output.parent, header=HEADER if volume else None
+    )
     scene = write_scene(guess, output)
     print(f"{output} written; check the lines marked GUESS")
     for note in guess.parts.notes:
@@ -88,8 +99,13 @@ def import_(
     for note in found.notes:
         print(f"note: {note}")
     scene = found.scene
-    counts = f"{len(scene.bones)} bones, {len(scene.links)} without a mesh, {len(scene.joints)} joints"
-    print(f"{written}: {counts}, {len(scene.couplings)} couplings, {len(scene.muscles)} muscles as tubes")
+    counts = (
+        f"{len(scene.bones)} bones, {len(scene.links)} without a mesh, {len(scene.joints)} joints"
+    )
+    print(
+        f"{written}: {counts}, {len(scene.couplings)} couplings, {len(scene.muscles)} muscles "
+        "as tubes"
+    )
     print(f"next: rbfmuscle check {written}, then rbfmuscle run {written} -o out")
 
 
@@ -124,7 +140,9 @@ def _beside(source, output):
 
 
 def _write_surfaces(source, labels, folder, force):
-    """Surfaces of all labels as PLY beside the scene, with ``force`` in place of those there; their folder."""
+    """Surfaces of all labels as PLY beside the scene, with ``force`` in place of those there; their
+    folder.
+    """
     from rbfmuscle.importers.guess.names import name_facts
     from rbfmuscle.importers.labels.read import read_labels
     from rbfmuscle.importers.labels.surfaces import label_surface

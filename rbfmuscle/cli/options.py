@@ -15,18 +15,22 @@ SceneName = Annotated[Path, Parameter(help='Scene file (TOML), or "phantom" for 
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Folder for the results.")]
 Model = Annotated[
     str | None,
-    Parameter(help="Model of every muscle, in place of the scene's: rbf, pbd, pbd-converged, xpbd, ..."),
+    Parameter(
+        help="Model of every muscle, in place of the scene's: rbf, pbd, pbd-converged, xpbd, ..."
+    ),
 ]
 Settings = Annotated[
     list[str] | None,
     Parameter(
         name="--set",
         negative="",
-        help="KEY=VALUE, for instance model.centres=200 or contact.substep_angle=1; may be repeated.",
+        help="KEY=VALUE, for instance model.centres=200 or contact.substep_angle=1; may be "
+        "repeated.",
     ),
 ]
 Frames = Annotated[
-    str | None, Parameter(help="Frames FIRST:END:STEP of the motion, as a Python slice: END not included.")
+    str | None,
+    Parameter(help="Frames FIRST:END:STEP of the motion, as a Python slice: END not included."),
 ]
 Json = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON and nothing else.")]
 Flag = Annotated[bool, Parameter(negative="")]

@@ -10,7 +10,11 @@ from rbfmuscle.validation import SolveError
 
 
 def demo(
-    *, output: Output = Path("demo_output"), model: Model = None, frames: Frames = None, as_json: Json = False
+    *,
+    output: Output = Path("demo_output"),
+    model: Model = None,
+    frames: Frames = None,
+    as_json: Json = False,
 ) -> None:
     """Run the embedded hip: no data, no network."""
     run(Path("phantom"), output=output, model=model, frames=frames, as_json=as_json)

@@ -1,4 +1,6 @@
-"""``rbfmuscle compare``, ``kernels``, ``sweep`` and ``paths``: models, kernels, settings, and paths for OpenSim."""
+"""``rbfmuscle compare``, ``kernels``, ``sweep`` and ``paths``: models, kernels, settings, and paths
+for OpenSim.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +36,9 @@ def compare(
     Parameters
     ----------
     models
-        Models, separated by commas, for instance rbf,pbd; distances are measured to the first. By default rbf, the
-        mesh models but pbd-paper, and pbd-converged, which takes long: it sweeps until no vertex moves.
+        Models, separated by commas, for instance rbf,pbd; distances are measured to the first. By
+        default rbf, the mesh models but pbd-paper, and pbd-converged, which takes long: it sweeps
+        until no vertex moves.
     pictures
         Draw pictures and the animation.
     """
@@ -48,7 +51,10 @@ def compare(
     names = [name.strip() for name in (models or "").split(",") if name.strip()] or list(COMPARED)
     changes = parse_settings(settings)
     kept = f"finished runs are kept in {output}"
-    with Progress("compare") as progress, interruption.keeping(lambda: kept if output.exists() else ""):
+    with (
+        Progress("compare") as progress,
+        interruption.keeping(lambda: kept if output.exists() else ""),
+    ):
 
         def advance(model, done, total):
             if done == 0:
@@ -70,7 +76,9 @@ def _print_table(table, output):
     print(" " * 24 + "".join(f"{name:>18}" for name in table["models"]))
     for quantity in LIGHTS:
         values = [table["results"][name]["all"].get(quantity) for name in table["models"]]
-        print(f"{quantity:24}" + "".join(f"{shown(table, quantity, value):>18}" for value in values))
+        print(
+            f"{quantity:24}" + "".join(f"{shown(table, quantity, value):>18}" for value in values)
+        )
     print(table["answer"])
     print(f"{table['frames']} frames, in {output}, open {output / 'report.html'}")
 
@@ -87,7 +95,8 @@ def kernels(
     units: str = "",
     error: float | None = None,
 ) -> None:
-    """Rank kernels, shape parameters and numbers of centres on a surface, or on each muscle of a scene.
+    """Rank kernels, shape parameters and numbers of centres on a surface, or on each muscle of a
+    scene.
 
     Parameters
     ----------
@@ -100,13 +109,15 @@ def kernels(
     muscle
         Name of one muscle of a scene; all by default.
     placement
-        Places of the centres: fitted (moved off the surface until the whole surface is met) or greedy (on it).
+        Places of the centres: fitted (moved off the surface until the whole surface is met) or
+        greedy (on it).
     resolution
         Cells along the longest side of extracted surfaces; 0 for 128, and more for slender muscles.
     units
         Name of the mesh's unit, for tables and plots; nothing is converted.
     error
-        Find the fewest centres, and the kernel, that reach this RMS distance (in the mesh's unit), in place of a table.
+        Find the fewest centres, and the kernel, that reach this RMS distance (in the mesh's unit),
+        in place of a table.
     """
     from rbfmuscle.output.writer import check_writable
 
@@ -169,9 +180,15 @@ def _find_wanted(meshes, output, error, options, units):
         with Progress(f"kernels of {name}", what="fit") as bar:
             found = reach_error(mesh, error, **options, progress=bar)
         facts[name] = {
-            "reached": found.reached, "error": found.error, "wanted": error, "units": units, "row": found.row,
-            "toml": row_toml(found.row), "tried": found.tried, "said": found.describe(name, units),
-        }  # fmt: skip
+            "reached": found.reached,
+            "error": found.error,
+            "wanted": error,
+            "units": units,
+            "row": found.row,
+            "toml": row_toml(found.row),
+            "tried": found.tried,
+            "said": found.describe(name, units),
+        }
     output.mkdir(parents=True, exist_ok=True)
     (output / "error.json").write_text(json_text(facts), encoding="utf-8")
     print("\n".join(found["said"] for found in facts.values()))
@@ -204,12 +221,14 @@ def sweep(
     grid
         KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300.
     reference
-        KEY=VALUE settings of the reference that errors are measured against; by default the finest values
-        of the grid.
+        KEY=VALUE settings of the reference that errors are measured against; by default the finest
+        values of the grid.
     jobs
-        Points that run at the same time; as many as cores by default. Each gets cores / jobs threads.
+        Points that run at the same time; as many as cores by default. Each gets cores / jobs
+        threads.
     cluster
-        Address of a Dask scheduler, for instance tcp://127.0.0.1:8786; its workers must see the folder.
+        Address of a Dask scheduler, for instance tcp://127.0.0.1:8786; its workers must see the
+        folder.
     error
         The error on the axis of the Pareto front; the other axis is time.
     """
@@ -226,7 +245,9 @@ def sweep(
         raise UsageError(f"--jobs must be 1 or more, got {jobs}")
     axes, changes = parse_grid(grid or []), parse_settings(settings)
     if not scenes or (len(scenes) == 1 and not axes):
-        raise UsageError("a sweep needs several scenes, or a grid, for instance --grid model.centres=100,200")
+        raise UsageError(
+            "a sweep needs several scenes, or a grid, for instance --grid model.centres=100,200"
+        )
     opened = {name: open_scene(path) for name, path in _names(scenes).items()}
     loaded = {name: configure_scene(each, changes, model=model) for name, each in opened.items()}
     points = plan_sweep(loaded, axes, frames=frames, reference=parse_settings(reference))
@@ -263,10 +284,16 @@ def _finish(points, output, units, error):
     write_page(table, output)
     for verdict in table["verdicts"]:
         print(verdict["text"])
-    print(f"{table['done']} points done, {table['failed']} failed, in {output}, open {output}/sweep.html")
+    print(
+        f"{table['done']} points done, {table['failed']} failed, in {output}, open "
+        f"{output}/sweep.html"
+    )
     bad = [row for row in table["rows"] if row["status"] != "done"]
     for row in bad[:5]:
-        print(f"rbfmuscle: {row['scene']} {row['label']}: {row['error'] or row['status']}", file=sys.stderr)
+        print(
+            f"rbfmuscle: {row['scene']} {row['label']}: {row['error'] or row['status']}",
+            file=sys.stderr,
+        )
     if bad:
         remedy = "the others are kept, the same command runs these again"
         raise SolveError(f"{len(bad)} of {len(table['rows'])} points failed; {remedy}")
@@ -282,7 +309,8 @@ def paths(
     model: Model = None,
     settings: Settings = None,
 ) -> None:
-    """Sample a muscle's lengths and moment arms over its coordinates and fit a path that OpenSim loads.
+    """Sample a muscle's lengths and moment arms over its coordinates and fit a path that OpenSim
+    loads.
 
     Parameters
     ----------
@@ -291,7 +319,8 @@ def paths(
     muscles
         Names, separated by commas; all by default.
     ranges
-        COORDINATE=LOW:HIGH in degrees or scene units; else the coordinate's range, or what the motion covers.
+        COORDINATE=LOW:HIGH in degrees or scene units; else the coordinate's range, or what the
+        motion covers.
     """
     from rbfmuscle.models import configure_scene
     from rbfmuscle.output.writer import check_writable
@@ -303,7 +332,9 @@ def paths(
         raise UsageError(f"--samples {samples} is too few to fit anything, give 10 or more")
     loaded = configure_scene(open_scene(scene), parse_settings(settings), model=model)
     if muscles is not None:
-        loaded.muscles = [chosen_muscle(loaded, name.strip()) for name in dict.fromkeys(muscles.split(","))]
+        loaded.muscles = [
+            chosen_muscle(loaded, name.strip()) for name in dict.fromkeys(muscles.split(","))
+        ]
     given = parse_ranges(loaded, ranges or [])
     check_writable(output)
     with Progress(loaded.name, "pose") as progress:

@@ -1,4 +1,5 @@
-"""Which kernel, which shape parameter, how many centres: one surface fitted by all of them, and a table.
+"""Which kernel, which shape parameter, how many centres: one surface fitted by all of them, and a
+table.
 
 Accuracy, conditioning and time are measured together, since each can be bought with the others.
 """
@@ -31,31 +32,39 @@ ALIKE = 1.05
 SOUND = 1e10
 # Points of the mesh at which errors are measured, and others that choose epsilon.
 JUDGES, HELD_OUT = 20_000, 2000
-# Cells along the longest side (so many a mean radius, between two bounds). With too few thin rims fall between the
-# nodes: iliacus seems to miss 1.7 mm with 64, sartorius 7.3 with 128, where they miss 0.9 and 1.2.
+# Cells along the longest side (so many a mean radius, between two bounds). With too few thin rims
+# fall between the nodes: iliacus seems to miss 1.7 mm with 64, sartorius 7.3 with 128, where they
+# miss 0.9 and 1.2.
 CELLS, RANGE = 5.0, (128, 320)
 # Placements of the centres of a muscle.
 PLACEMENTS = ("greedy", FITTED)
-# Points of one timed evaluation, and the processor time after which enough of them, or of fits, are made [s].
+# Points of one timed evaluation, and the processor time after which enough of them, or of fits, are
+# made [s].
 TIMED, MEASURED = 20_000, 0.05
 # A level zero that encloses so much more or less than the mesh has lost or gained a part of it.
 VOLUME_BOUND = 0.1
 
 
 class ReferenceSurface:
-    """The surface (vertices (n, 3), faces (m, 3)) that is to be met, and how far another one is from it.
+    """The surface (vertices (n, 3), faces (m, 3)) that is to be met, and how far another one is
+    from it.
 
-    ``resolution`` counts cells along the longest side of extracted surfaces; as many as one so slender needs where 0.
+    ``resolution`` counts cells along the longest side of extracted surfaces; as many as one so
+    slender needs where 0.
     """
 
     def __init__(self, vertices: Floats, faces: Integers, resolution: int = 0) -> None:
-        self.vertices, self.faces, self.volume = vertices, faces, mesh_volume(vertices, faces)
+        self.vertices = vertices
+        self.faces = faces
+        self.volume = mesh_volume(vertices, faces)
         radius = 2.0 * self.volume / vertex_areas(vertices, faces).sum()
         self.axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
         self.axes[2] *= np.sign(np.linalg.det(self.axes))
         if resolution and resolution < 4:
             raise UsageError(f"resolution must be at least 4 cells, got {resolution}")
-        self.resolution = resolution or int(np.clip(CELLS * np.ptp(vertices @ self.axes[0]) / radius, *RANGE))
+        self.resolution = resolution or int(
+            np.clip(CELLS * np.ptp(vertices @ self.axes[0]) / radius, *RANGE)
+        )
         self.distance = MeshDistance(vertices, faces)
         self.points, which = spread_points(vertices, faces, JUDGES)
         normal = face_normals(vertices, faces)[which]
@@ -73,7 +82,9 @@ class ReferenceSurface:
 def check_request(
     mesh: MeshLike, kernels: Iterable[str], placement: str
 ) -> tuple[Floats, Integers, list[Kernel]]:
-    """Vertices and faces of a mesh, and kernels by name; MeshError and UsageError for what cannot be studied."""
+    """Vertices and faces of a mesh, and kernels by name; MeshError and UsageError for what cannot
+    be studied.
+    """
     named = [get_kernel(name) for name in kernels]
     if placement not in PLACEMENTS:
         raise UsageError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
@@ -81,7 +92,9 @@ def check_request(
 
 
 class Measured(NamedTuple):
-    """What one row found: a row of `KernelStudy.rows` without times, the fitted centres, how, and the surface."""
+    """What one row found: a row of `KernelStudy.rows` without times, the fitted centres, how, and
+    the surface.
+    """
 
     row: dict
     sample: SurfaceSample
@@ -89,30 +102,52 @@ class Measured(NamedTuple):
     surface: tuple[Floats, Integers] | None
 
 
-def measure_row(judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel, placement: str) -> Measured:
-    """One row of the table, its times left open, and its surface; ``sample`` holds greedy centres."""
+def measure_row(
+    judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel, placement: str
+) -> Measured:
+    """One row of the table, its times left open, and its surface; ``sample`` holds greedy
+    centres.
+    """
     placement = placement if kernel.hermite else "greedy"
     fit = FieldFit(kernel, 1.0, BOUND if kernel.has_epsilon else np.inf)
     row = {
-        "kernel": kernel.name, "centres": len(sample.points), "placement": placement, "epsilon": 0.0, "shape": None,
-        "condition": None, "bound": 0.0, "rms": None, "hausdorff": None, "normal_error": None, "volume_error": None,
-        "fit_time": None, "evaluation_time": None, "unfit": "",
+        "kernel": kernel.name,
+        "centres": len(sample.points),
+        "placement": placement,
+        "epsilon": 0.0,
+        "shape": None,
+        "condition": None,
+        "bound": 0.0,
+        "rms": None,
+        "hausdorff": None,
+        "normal_error": None,
+        "volume_error": None,
+        "fit_time": None,
+        "evaluation_time": None,
+        "unfit": "",
         "note": "" if kernel.hermite else "values on and off the surface, the kernel is not C2",
-    }  # fmt: skip
+    }
     surface = None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
         try:
             if placement == FITTED:
                 if kernel.has_epsilon:
-                    blind = choose_epsilon(sample.points, sample.normals, fit, held_out=judge.held_out)
+                    blind = choose_epsilon(
+                        sample.points, sample.normals, fit, held_out=judge.held_out
+                    )
                     fit = replace(fit, epsilon=blind.epsilon)
                 sample = fit_sample(sample, judge.vertices, judge.faces, fit=fit)
             if kernel.has_epsilon:  # what was best for the greedy centres need not be so for these
                 places, unseen = (sample.points, sample.normals), judge.held_out
-                choice = choose_epsilon(*places, fit, held_out=unseen, distance=judge.distance.unsigned)
+                choice = choose_epsilon(
+                    *places, fit, held_out=unseen, distance=judge.distance.unsigned
+                )
                 fit = replace(fit, epsilon=choice.epsilon)
-                row["epsilon"], row["shape"] = fit.epsilon, fit.epsilon * float(spacing(sample.points).mean())
+                row["epsilon"], row["shape"] = (
+                    fit.epsilon,
+                    fit.epsilon * float(spacing(sample.points).mean()),
+                )
                 if choice.broken:
                     raise ValueError(choice.broken)
             elif fit.fit(sample.points, sample.normals).condition > BOUND:
@@ -131,23 +166,35 @@ def _measure(
     gradient = field.gradient(judge.points[::5])
     cosine = np.einsum("ij,ij->i", gradient, judge.normals[::5])
     cosine /= np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(float).tiny)
-    row["normal_error"] = float(np.degrees(np.sqrt((np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2).mean())))
+    row["normal_error"] = float(
+        np.degrees(np.sqrt((np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2).mean()))
+    )
     sheets = find_sheets(field, sample.points, judge.distance.unsigned)
     if sheets.is_open:
-        raise ValueError("the level set is open: it leaves the box of the muscle; take more centres")
+        raise ValueError(
+            "the level set is open: it leaves the box of the muscle; take more centres"
+        )
     if sheets.stray:
         raise ValueError(f"{sheets.stray} sheets beside those of the mesh; take more centres")
-    found = extract_surface(field, points=sample.points, resolution=judge.resolution, axes=judge.axes)
+    found = extract_surface(
+        field, points=sample.points, resolution=judge.resolution, axes=judge.axes
+    )
     row["volume_error"] = found.volume / judge.volume - 1.0
     if abs(row["volume_error"]) > VOLUME_BOUND:
-        row["unfit"] = f"{100 * row['volume_error']:+.3g} % of volume, beyond {100 * VOLUME_BOUND:g}"
+        row["unfit"] = (
+            f"{100 * row['volume_error']:+.3g} % of volume, beyond {100 * VOLUME_BOUND:g}"
+        )
     row["rms"], row["hausdorff"] = judge.apart(found.vertices, found.faces)
     return found.vertices, found.faces
 
 
 def time_row(found: Measured, points: Floats) -> None:
-    """Write into a row what a fit, and values at 20,000 points (n, 3), cost [s of processor time, one thread]."""
-    row, sample, parts = found.row, found.sample, overlapping_parts(found.sample.points)
+    """Write into a row what a fit, and values at 20,000 points (n, 3), cost [s of processor time,
+    one thread].
+    """
+    row = found.row
+    sample = found.sample
+    parts = overlapping_parts(found.sample.points)
     with warnings.catch_warnings(), threads_limited(1):
         warnings.simplefilter("ignore", NumericalWarning)  # it stands in the row's condition
         field = found.fit.fit(sample.points, sample.normals, parts)
@@ -169,10 +216,10 @@ def _spent(work: Callable[[], object]) -> float:
 class KernelStudy:
     """What `study_kernels` found.
 
-    ``rows`` holds a dict for each kernel and number of centres, the smallest error first; unfit ones (``unfit`` says
-    why) last. Lengths are in the mesh's unit, times in seconds of one thread. ``surfaces`` (vertices, faces) are those
-    of the rows, None where there is none. ``recommended`` is the quickest row that errs at most 5 % more than the best,
-    None where every one is unfit.
+    ``rows`` holds a dict for each kernel and number of centres, the smallest error first; unfit
+    ones (``unfit`` says why) last. Lengths are in the mesh's unit, times in seconds of one thread.
+    ``surfaces`` (vertices, faces) are those of the rows, None where there is none. ``recommended``
+    is the quickest row that errs at most 5 % more than the best, None where every one is unfit.
     """
 
     rows: list[dict] = field(repr=False)
@@ -183,7 +230,12 @@ class KernelStudy:
 
 def row_toml(row: dict) -> str:
     """The lines of a scene file's model table that give a row of a study."""
-    lines = ["[muscle.model]", 'name = "rbf"', f'kernel = "{row["kernel"]}"', f"centres = {row['centres']}"]
+    lines = [
+        "[muscle.model]",
+        'name = "rbf"',
+        f'kernel = "{row["kernel"]}"',
+        f"centres = {row['centres']}",
+    ]
     if row["epsilon"]:
         lines.append(f"epsilon = {row['epsilon']:.6g}")
     if row["bound"]:
@@ -201,10 +253,18 @@ def describe(rows: list[dict]) -> str:
     tied = [row for row in good if row["rms"] <= ALIKE * least]
     use = f"Use {best['kernel']} with {best['centres']} centres"
     if len(tied) == 1:
-        less = 100 * (1 - best["rms"] / min((row["rms"] for row in good if row is not best), default=np.inf))
-        behind = f": its error is {less:.0f} % less than that of the next kernel" if len(good) > 1 else ""
+        less = 100 * (
+            1 - best["rms"] / min((row["rms"] for row in good if row is not best), default=np.inf)
+        )
+        behind = (
+            f": its error is {less:.0f} % less than that of the next kernel"
+            if len(good) > 1
+            else ""
+        )
         return f"{use}{behind}."
-    near = f"the errors of {len(tied)} kernels are within {100 * (ALIKE - 1):.0f} % of the least one"
+    near = (
+        f"the errors of {len(tied)} kernels are within {100 * (ALIKE - 1):.0f} % of the least one"
+    )
     shape = "" if best["epsilon"] else " and needs no shape parameter"
     return f"{use}: {near}, and of these {best['kernel']} is among the quickest{shape}."
 
@@ -234,10 +294,11 @@ def study_kernels(
         All by default.
     centres : sequence of int
     placement : {"greedy", "fitted"}
-        Fitted centres lie beside the surface, so that the whole of it is met in the least-squares sense
-        (`fit_sample`); kernels that are not C2 have greedy ones.
+        Fitted centres lie beside the surface, so that the whole of it is met in the least-squares
+        sense (`fit_sample`); kernels that are not C2 have greedy ones.
     resolution : int
-        Cells along the longest side of the extracted surfaces; as many as a muscle so slender needs by default.
+        Cells along the longest side of the extracted surfaces; as many as a muscle so slender needs
+        by default.
     units, progress : str, callable, optional
         Name of the mesh's unit, for the page. ``progress(done, total)`` is called along the way.
 
@@ -250,7 +311,8 @@ def study_kernels(
     --------
     >>> import trimesh
     >>> ball = trimesh.creation.icosphere(3, 10.0)
-    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], placement="greedy", resolution=16)
+    >>> options = {"placement": "greedy", "resolution": 16}
+    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], **options)
     >>> study.rows[0]["kernel"]
     'cubic'
     """
@@ -266,7 +328,9 @@ def study_kernels(
     for one in found:  # when nothing else runs
         if not one.row["unfit"]:
             time_row(one, judge.points)
-    found.sort(key=lambda one: (bool(one.row["unfit"]), one.row["rms"] is None, one.row["rms"] or 0.0))
+    found.sort(
+        key=lambda one: (bool(one.row["unfit"]), one.row["rms"] is None, one.row["rms"] or 0.0)
+    )
     rows = [one.row for one in found]
     good = [row for row in rows if not row["unfit"]]
     front = pareto_front([row["rms"] for row in good], [cost(row) for row in good])
@@ -276,7 +340,9 @@ def study_kernels(
 
 
 def _measure_all(
-    judge: ReferenceSurface, calls: list[tuple[SurfaceSample, Kernel, str]], progress: OnProgress | None
+    judge: ReferenceSurface,
+    calls: list[tuple[SurfaceSample, Kernel, str]],
+    progress: OnProgress | None,
 ) -> list[Measured]:
     """What the rows of calls found, in their order, measured side by side on threads."""
     from threadpoolctl import threadpool_limits
@@ -298,8 +364,12 @@ def _measure_all(
 
 
 def _refuse_coarse(rows: list[dict]) -> None:
-    """Name rows unfit that err more than `linear`, the coarsest sensible kernel, with as many centres."""
-    bounds = {row["centres"]: row["rms"] for row in rows if row["kernel"] == "linear" and not row["unfit"]}
+    """Name rows unfit that err more than `linear`, the coarsest sensible kernel, with as many
+    centres.
+    """
+    bounds = {
+        row["centres"]: row["rms"] for row in rows if row["kernel"] == "linear" and not row["unfit"]
+    }
     for row in rows:
         bound = bounds.get(row["centres"])
         if not row["unfit"] and bound is not None and row["rms"] > bound:
@@ -307,14 +377,18 @@ def _refuse_coarse(rows: list[dict]) -> None:
 
 
 def cost(row: dict) -> float:
-    """What a frame pays for a row's field: a fit and the values at 20,000 points [s of processor time]."""
+    """What a frame pays for a row's field: a fit and the values at 20,000 points [s of processor
+    time].
+    """
     return float(row["fit_time"] + row["evaluation_time"])
 
 
 def recommend(rows: list[dict]) -> dict | None:
-    """The quickest of the rows that err at most 5 % more than the best, None where every one is unfit.
+    """The quickest of the rows that err at most 5 % more than the best, None where every one is
+    unfit.
 
-    Sound conditions come first; of rows alike in time, within 15 %, those without a parameter to choose.
+    Sound conditions come first; of rows alike in time, within 15 %, those without a parameter to
+    choose.
     """
     good = [row for row in rows if not row["unfit"]]
     if not good:

@@ -1,4 +1,6 @@
-"""A sweep: one or several scenes under a grid of settings, laid out as points that are run once each."""
+"""A sweep: one or several scenes under a grid of settings, laid out as points that are run once
+each.
+"""
 
 import hashlib
 import itertools
@@ -15,7 +17,8 @@ from rbfmuscle.validation import UsageError
 # Values of each setting that is varied.
 Grid = dict[str, list[Any]]
 
-# Of these keys the reference takes the greatest value of the grid, or the least; of all others the scene's own.
+# Of these keys the reference takes the greatest value of the grid, or the least; of all others the
+# scene's own.
 FINER_UP = ("model.centres", "model.samples", "model.nodes", "model.iterations", "model.resolution")
 FINER_DOWN = ("contact.substep_angle", "motion.step")
 
@@ -24,9 +27,10 @@ FINER_DOWN = ("contact.substep_angle", "motion.step")
 class SweepPoint:
     """One combination of settings of one scene.
 
-    ``key`` is a hash of the scene's content and the settings; ``scene`` a name; ``settings`` are dotted keys with their
-    values, the model first; ``role`` is "reference", "default" (the scene's own settings) or ""; ``reference`` is the
-    key of the point that the error is measured against, "" without a grid.
+    ``key`` is a hash of the scene's content and the settings; ``scene`` a name; ``settings`` are
+    dotted keys with their values, the model first; ``role`` is "reference", "default" (the scene's
+    own settings) or ""; ``reference`` is the key of the point that the error is measured against,
+    "" without a grid.
     """
 
     key: str
@@ -42,7 +46,9 @@ class SweepPoint:
 
 
 def parse_grid(texts: Sequence[str]) -> Grid:
-    """Return the grid of ``["KEY=a,b,c", ...]``; UsageError on other text, or a key given twice or without values."""
+    """Return the grid of ``["KEY=a,b,c", ...]``; UsageError on other text, or a key given twice or
+    without values.
+    """
     grid: Grid = {}
     for text in texts:
         name, found, values = text.partition("=")
@@ -54,8 +60,12 @@ def parse_grid(texts: Sequence[str]) -> Grid:
         try:
             parts = tomllib.loads(f"value = [{values}]")["value"]
         except tomllib.TOMLDecodeError:
-            parts = [parse_value(part.strip(), place=key) for part in values.split(",") if part.strip()]
-        if key in (*FINER_UP, *FINER_DOWN) and not all(isinstance(part, int | float) for part in parts):
+            parts = [
+                parse_value(part.strip(), place=key) for part in values.split(",") if part.strip()
+            ]
+        if key in (*FINER_UP, *FINER_DOWN) and not all(
+            isinstance(part, int | float) for part in parts
+        ):
             raise UsageError(f"{key}: {values} are not all numbers")
         grid[key] = [part for k, part in enumerate(parts) if part not in parts[:k]]
     return grid
@@ -68,17 +78,25 @@ def plan_sweep(
     frames: str | None = None,
     reference: Mapping[str, Any] | None = None,
 ) -> list[SweepPoint]:
-    """Lay out a sweep scene by scene: reference, the scene's own settings, the grid; nothing is run.
+    """Lay out a sweep scene by scene: reference, the scene's own settings, the grid; nothing is
+    run.
 
-    Without a grid scenes (by name) are compared as they are. ``frames`` are those of the motion, "A:B:S". ``reference``
-    holds settings of the reference, over those that follow from the grid: the greatest number of centres, samples,
-    nodes, iterations and cells in it and the least angle and step.
+    Without a grid scenes (by name) are compared as they are. ``frames`` are those of the motion,
+    "A:B:S". ``reference`` holds settings of the reference, over those that follow from the grid:
+    the greatest number of centres, samples, nodes, iterations and cells in it and the least angle
+    and step.
     """
-    return [point for n, s in scenes.items() for point in _points(n, s, grid, frames, dict(reference or {}))]
+    return [
+        point
+        for n, s in scenes.items()
+        for point in _points(n, s, grid, frames, dict(reference or {}))
+    ]
 
 
 def _points(name, scene, grid, frames, reference):
-    content, found, target = scene_content(scene, frames), {}, ""
+    content = scene_content(scene, frames)
+    found = {}
+    target = ""
     if grid:
         up = {key: max(values) for key, values in grid.items() if key in FINER_UP}
         down = {key: min(values) for key, values in grid.items() if key in FINER_DOWN}
@@ -105,7 +123,10 @@ def scene_content(scene: Scene, frames: str | None = None) -> str:
     for item in [*facts["bones"], *facts["muscles"]]:
         item.pop("mesh")
     ends = [muscle.attachments for muscle in scene.muscles]
-    held = [[(a.bone, a.vertices.tolist(), a.tendon and a.tendon.model_dump()) for a in end] for end in ends]
+    held = [
+        [(a.bone, a.vertices.tolist(), a.tendon and a.tendon.model_dump()) for a in end]
+        for end in ends
+    ]
     fibres = [[line.tolist() for line in muscle.fibres or []] for muscle in scene.muscles]
     track = [sorted(frame.items()) for frame in scene.motion.frames]
     return _hash([facts, held, fibres, track, str(frames or "")])

@@ -1,4 +1,6 @@
-"""Running the points of a sweep side by side, in processes or on a Dask cluster; tables and Pareto front."""
+"""Running the points of a sweep side by side, in processes or on a Dask cluster; tables and Pareto
+front.
+"""
 
 import json
 import math
@@ -27,12 +29,25 @@ CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
 Runner = Callable[[Scene, dict[str, Any], str | None], Any]
 OnProgress = Callable[[int, int], None]  # of what is done and the total
 # What a point may fail with and leave the others standing.
-POINT_ERRORS = (RBFMuscleError, ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, ValueError)
+POINT_ERRORS = (
+    RBFMuscleError,
+    ArithmeticError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    ValueError,
+)
 # Worst over muscles and frames, by magnitude.
 WORST = (
-    "volume_error", "penetration_max", "bone_penetration_max", "solver_penetration_max", "rest_error_rms",
-    "edge_strain_rms", "components",
-)  # fmt: skip
+    "volume_error",
+    "penetration_max",
+    "bone_penetration_max",
+    "solver_penetration_max",
+    "rest_error_rms",
+    "edge_strain_rms",
+    "components",
+)
 TIMES = ("time_frame", "time_frame_p95", "time_extract")
 VALUES = ("error_rms", "error_max", *WORST, *TIMES)
 # The default may be this much worse than the front, in error and in time at once.
@@ -42,7 +57,9 @@ LENGTHS = ("error_rms", "error_max", *(name for name in WORST if QUANTITIES[name
 
 
 class SweepFolder:
-    """``points/KEY.json``, a result each, and ``references/KEY.npz``, surfaces that errors are measured against."""
+    """``points/KEY.json``, a result each, and ``references/KEY.npz``, surfaces that errors are
+    measured against.
+    """
 
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(os.path.abspath(directory))
@@ -67,8 +84,13 @@ class SweepFolder:
         return self.references / f"{key}.npz"
 
     def is_done(self, point: SweepPoint) -> bool:
-        """Whether a point need not be run again: it is done, and was measured against the same reference."""
-        kept, found = point.role != "reference" or self.surfaces(point.key).exists(), self.read(point.key)
+        """Whether a point need not be run again: it is done, and was measured against the same
+        reference.
+        """
+        kept, found = (
+            point.role != "reference" or self.surfaces(point.key).exists(),
+            self.read(point.key),
+        )
         return kept and (found.get("status"), found.get("reference")) == ("done", point.reference)
 
 
@@ -85,10 +107,11 @@ def run_sweep(
 ) -> int:
     """Run the points that the folder does not hold done, references first; how many were run.
 
-    ``runner(scene, settings, frames)`` gives a finished `Run`; it is module-level, so that it can be sent away.
-    ``scenes``, ``points`` and ``frames`` are those of `plan_sweep`. Of ``jobs`` points beside each other (as many as
-    cores by default) each has cores / jobs threads. ``cluster`` is the address of a Dask scheduler whose workers see
-    the folder; ``progress(done, total)`` is called along the way.
+    ``runner(scene, settings, frames)`` gives a finished `Run`; it is module-level, so that it can
+    be sent away. ``scenes``, ``points`` and ``frames`` are those of `plan_sweep`. Of ``jobs``
+    points beside each other (as many as cores by default) each has cores / jobs threads.
+    ``cluster`` is the address of a Dask scheduler whose workers see the folder; ``progress(done,
+    total)`` is called along the way.
     """
     from joblib import cpu_count, parallel_config
 
@@ -117,24 +140,31 @@ def run_sweep(
 
 
 def _connect_cluster(address: str) -> "Client":
-    """A client of a Dask scheduler, as soon as two workers are there: to one alone joblib sends nothing."""
+    """A client of a Dask scheduler, as soon as two workers are there: to one alone joblib sends
+    nothing.
+    """
     try:
         from distributed import Client
     except ImportError as error:
         message = (
-            "Dask is not installed, which --cluster needs: pip install -e '.[cluster]' in rbfmuscle's folder"
+            "Dask is not installed, which --cluster needs: pip install -e '.[cluster]' in "
+            "rbfmuscle's folder"
         )
         raise MissingPartError(message) from error
     try:
         client = Client(address, timeout=CONNECT_WITHIN)
         client.wait_for_workers(2, timeout=CONNECT_WITHIN)
     except (OSError, ValueError) as error:
-        raise UsageError(f"no Dask scheduler with two workers answers at {address!r} ({error})") from None
+        raise UsageError(
+            f"no Dask scheduler with two workers answers at {address!r} ({error})"
+        ) from None
     return client
 
 
 def _side_by_side(calls, folder, jobs, advance):
-    """Run calls; after a process has died, those that were running each in a process of its own, then the others."""
+    """Run calls; after a process has died, those that were running each in a process of its own,
+    then the others.
+    """
     from joblib import Parallel, delayed
     from joblib.externals.loky import BrokenProcessPool, ProcessPoolExecutor
 
@@ -158,11 +188,22 @@ def _side_by_side(calls, folder, jobs, advance):
 
 
 def measure_point(
-    runner: Runner, scene: Scene, point: SweepPoint, folder: SweepFolder, frames: str | None, threads: int
+    runner: Runner,
+    scene: Scene,
+    point: SweepPoint,
+    folder: SweepFolder,
+    frames: str | None,
+    threads: int,
 ) -> None:
-    """Run one point, measure it and keep the result; an error becomes the result of a failed point."""
+    """Run one point, measure it and keep the result; an error becomes the result of a failed
+    point.
+    """
     start = time.perf_counter()
-    result: dict[str, Any] = {"key": point.key, "reference": point.reference, "settings": point.settings}
+    result: dict[str, Any] = {
+        "key": point.key,
+        "reference": point.reference,
+        "settings": point.settings,
+    }
     result |= {"status": "done", "error": ""}
     try:
         with threads_limited(threads):
@@ -179,7 +220,10 @@ def measure_point(
                 values |= _errors(shown, folder.surfaces(point.reference))
             result["values"] = values
     except POINT_ERRORS as error:
-        result |= {"status": "failed", "error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
+        result |= {
+            "status": "failed",
+            "error": f"{type(error).__name__}: {' '.join(str(error).split())}",
+        }
     result |= {"threads": threads, "machine": platform.node(), "process": os.getpid()}
     folder.write({**result, "seconds": time.perf_counter() - start})
 
@@ -194,7 +238,9 @@ def _values(run):
     # The first frame loads and compiles, and settles what overlaps at rest.
     shown = run.frames[1:] or run.frames
     walls = np.array([frame.wall for frame in shown])
-    extract = [sum(s.quantities.get("time_extract", 0.0) for s in f.surfaces.values()) for f in shown]
+    extract = [
+        sum(s.quantities.get("time_extract", 0.0) for s in f.surfaces.values()) for f in shown
+    ]
     times = np.median(walls), np.percentile(walls, 95), np.median(extract)
     return values | {name: float(value) for name, value in zip(TIMES, times)}
 
@@ -210,11 +256,16 @@ def _errors(shown, path):
         raise UsageError("its reference is missing: that point failed, or the folder is not shared")
     with np.load(path) as kept:
         met = [(mesh, place) for place, mesh in shown.items() if f"{place}|0" in kept]
-        pairs = [surface_distance(*mesh, kept[f"{place}|0"], kept[f"{place}|1"]) for mesh, place in met]
+        pairs = [
+            surface_distance(*mesh, kept[f"{place}|0"], kept[f"{place}|1"]) for mesh, place in met
+        ]
     found = np.array(pairs)
     if not len(found):
         raise UsageError("no frame of this point is at a pose of the reference")
-    return {"error_rms": math.sqrt(np.mean(found[:, 0] ** 2)), "error_max": float(found[:, 1].max())}
+    return {
+        "error_rms": math.sqrt(np.mean(found[:, 0] ** 2)),
+        "error_max": float(found[:, 1].max()),
+    }
 
 
 @contextmanager
@@ -235,24 +286,34 @@ def threads_limited(count: int) -> Iterator[None]:
 def sweep_rows(
     points: Sequence[SweepPoint], folder: SweepFolder, units: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """One dict a point: scene, its units, role, status, settings, values, threads, error; NaN where unknown."""
+    """One dict a point: scene, its units, role, status, settings, values, threads, error; NaN where
+    unknown.
+    """
     rows = []
     for point in points:
         result = folder.read(point.key)
         values = result.get("values", {})
         row = {
-            "scene": point.scene, "units": units[point.scene], "role": point.role,
-            "status": result.get("status", "missing"), "front": False, "settings": point.settings,
+            "scene": point.scene,
+            "units": units[point.scene],
+            "role": point.role,
+            "status": result.get("status", "missing"),
+            "front": False,
+            "settings": point.settings,
             **{name: math.nan if values.get(name) is None else values[name] for name in VALUES},
             **{name: result.get(name, "") for name in ("seconds", "threads", "machine", "error")},
-            "label": point.label, "reference": point.reference, "key": point.key,
-        }  # fmt: skip
+            "label": point.label,
+            "reference": point.reference,
+            "key": point.key,
+        }
         rows.append(row)
     return rows
 
 
 def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
-    """Indices, by growing time, of points that no other beats in error or time without loss; NaN takes no part."""
+    """Indices, by growing time, of points that no other beats in error or time without loss; NaN
+    takes no part.
+    """
     front, least = [], math.inf
     for k in sorted(range(len(errors)), key=lambda k: (times[k], errors[k])):
         if math.isfinite(errors[k]) and math.isfinite(times[k]) and errors[k] < least:
@@ -262,12 +323,14 @@ def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
 
 
 def mark_front(rows: list[dict[str, Any]], quantity: str = "error_rms") -> list[dict[str, Any]]:
-    """Mark the front among the points of each reference, and judge the default of each against ``time_frame``.
+    """Mark the front among the points of each reference, and judge the default of each against
+    ``time_frame``.
 
-    References take no part: their error is zero by definition. A verdict holds ``factor``: the least by which both
-    error and time of the default must fall to lie on the front, 1 on it; ``near``: up to `NEAR`; ``faster``,
-    ``better``: keys of the quickest point of no greater error and the most accurate of no greater time, None where
-    there is none; ``text``: all of it in words.
+    References take no part: their error is zero by definition. A verdict holds ``factor``: the
+    least by which both error and time of the default must fall to lie on the front, 1 on it;
+    ``near``: up to `NEAR`; ``faster``, ``better``: keys of the quickest point of no greater error
+    and the most accurate of no greater time, None where there is none; ``text``: all of it in
+    words.
     """
     verdicts = []
     for group in dict.fromkeys(row["reference"] for row in rows if row["reference"]):
@@ -275,7 +338,9 @@ def mark_front(rows: list[dict[str, Any]], quantity: str = "error_rms") -> list[
         usable = [row for row in mine if row["status"] == "done"]
         for k in pareto_front([r[quantity] for r in usable], [r["time_frame"] for r in usable]):
             usable[k]["front"] = True
-        default = [row for row in usable if row["role"] == "default" and math.isfinite(row[quantity])]
+        default = [
+            row for row in usable if row["role"] == "default" and math.isfinite(row[quantity])
+        ]
         verdicts += [_judge(row, usable, quantity) for row in default]
     return verdicts
 
@@ -283,18 +348,33 @@ def mark_front(rows: list[dict[str, Any]], quantity: str = "error_rms") -> list[
 def _judge(default: dict[str, Any], rows: list[dict[str, Any]], quantity: str) -> dict[str, Any]:
     error, time = default[quantity], default["time_frame"]
     others = [r for r in rows if r is not default and math.isfinite(r[quantity])]
-    factor = max([1.0, *(min(_ratio(error, r[quantity]), _ratio(time, r["time_frame"])) for r in others)])
+    factor = max(
+        [1.0, *(min(_ratio(error, r[quantity]), _ratio(time, r["time_frame"])) for r in others)]
+    )
     quicker = [r for r in others if r[quantity] <= error and r["time_frame"] < time]
     finer = [r for r in others if r["time_frame"] <= time and r[quantity] < error]
     faster = min(quicker, key=lambda r: r["time_frame"], default=None)
     better = min(finer, key=lambda r: r[quantity], default=None)
     off = "within 10 % of" if factor <= NEAR else f"a factor of {factor:.2g} off"
     where = "on" if default["front"] else off
-    text = f"{default['scene']}: the default lies {where} the Pareto front ({_figures(default, quantity)})"
+    text = (
+        f"{default['scene']}: the default lies {where} the Pareto front "
+        f"({_figures(default, quantity)})"
+    )
     for row, words in ((faster, "as accurate and quicker"), (better, "as quick and more accurate")):
         text += f"; {words}: {row['label']} ({_figures(row, quantity)})" if row else ""
-    keys = {"faster": faster and faster["key"], "better": better and better["key"], "default": default["key"]}
-    return {"scene": default["scene"], "factor": factor, "near": factor <= NEAR, **keys, "text": f"{text}."}
+    keys = {
+        "faster": faster and faster["key"],
+        "better": better and better["key"],
+        "default": default["key"],
+    }
+    return {
+        "scene": default["scene"],
+        "factor": factor,
+        "near": factor <= NEAR,
+        **keys,
+        "text": f"{text}.",
+    }
 
 
 def _ratio(mine: float, other: float) -> float:
@@ -303,13 +383,21 @@ def _ratio(mine: float, other: float) -> float:
 
 def _figures(row: dict[str, Any], quantity: str) -> str:
     unit = row["units"] if quantity in LENGTHS else ""
-    return f"{shown_number(row[quantity], unit)} at {shown_number(row['time_frame'], 's')} per frame"
+    return (
+        f"{shown_number(row[quantity], unit)} at {shown_number(row['time_frame'], 's')} per frame"
+    )
 
 
 def write_table(
-    points: Sequence[SweepPoint], directory: str | Path, units: dict[str, str], *, quantity: str = "error_rms"
+    points: Sequence[SweepPoint],
+    directory: str | Path,
+    units: dict[str, str],
+    *,
+    quantity: str = "error_rms",
 ) -> dict[str, Any]:
-    """Write ``sweep.csv``, a line a point, and ``sweep.json``; what the latter holds: counts, verdicts, rows."""
+    """Write ``sweep.csv``, a line a point, and ``sweep.json``; what the latter holds: counts,
+    verdicts, rows.
+    """
     folder = SweepFolder(directory)
     rows = sweep_rows(points, folder, units)
     verdicts = mark_front(rows, quantity)
@@ -321,7 +409,9 @@ def write_table(
         # Digits beyond nine places are rounding.
         lines.append([f"{round(v, 9):.6g}" if isinstance(v, float) else v for v in values])
     write_csv(folder.directory / "sweep.csv", lines)
-    counts = {status: sum(r["status"] == status for r in rows) for status in ("done", "failed", "missing")}
+    counts = {
+        status: sum(r["status"] == status for r in rows) for status in ("done", "failed", "missing")
+    }
     table = {"quantity": quantity, **counts, "verdicts": verdicts, "rows": rows}
     write_json(folder.directory / "sweep.json", table)
     return table

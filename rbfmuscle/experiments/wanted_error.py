@@ -1,7 +1,8 @@
 """The fewest centres that meet a surface to a wanted error, with the kernel and the setting.
 
-The error falls with the number of centres by a power, but for some per cent of chance: the power law brackets the
-number and a bisection narrows it to 4 %. Other kernels take part where they may need fewer centres.
+The error falls with the number of centres by a power, but for some per cent of chance: the power
+law brackets the number and a bisection narrows it to 4 %. Other kernels take part where they may
+need fewer centres.
 """
 
 import math
@@ -30,8 +31,9 @@ STEP, POWER = 0.04, 1.4
 class WantedError:
     """What `reach_error` found.
 
-    ``row`` is as in `KernelStudy.rows`: the one that reached the ``wanted`` error, else that of the smallest error;
-    ``error`` is its [length]; ``tried`` lists ``kernel, centres, error`` of all that was measured, in order.
+    ``row`` is as in `KernelStudy.rows`: the one that reached the ``wanted`` error, else that of the
+    smallest error; ``error`` is its [length]; ``tried`` lists ``kernel, centres, error`` of all
+    that was measured, in order.
     """
 
     reached: bool
@@ -41,14 +43,17 @@ class WantedError:
     tried: list[dict] = field(default_factory=list)
 
     def describe(self, name: str, units: str = "") -> str:
-        """One line on the surface of this name: what reaches the wanted error, or what the best reached."""
+        """One line on the surface of this name: what reaches the wanted error, or what the best
+        reached.
+        """
         unit, said = f" {units}" if units else "", kernel_study.row_name(self.row)
         if self.row["unfit"]:
             return f"{name}: no field is fit; take more centres or another kernel"
         if self.reached:
             return f"{name}: {said} reaches {self.error:.3g}{unit} RMS, wanted {self.wanted:g}"
         return (
-            f"{name}: {self.wanted:g}{unit} RMS is not reached; the best, {said}, reaches {self.error:.3g}; "
+            f"{name}: {self.wanted:g}{unit} RMS is not reached; the best, {said}, reaches "
+            f"{self.error:.3g}; "
             "take other kernels, or a larger error"
         )
 
@@ -61,7 +66,8 @@ def reach_error(
     placement: str = FITTED,
     progress: OnProgress | None = None,
 ) -> WantedError:
-    """Find the fewest centres, 20 to 1000, the kernel and its setting that meet a surface to a wanted error.
+    """Find the fewest centres, 20 to 1000, the kernel and its setting that meet a surface to a
+    wanted error.
 
     Parameters
     ----------
@@ -92,7 +98,9 @@ def reach_error(
     if not 0.0 < error < np.inf:
         raise UsageError(f"error must be a positive length, got {error}")
     vertices, faces, named = kernel_study.check_request(mesh, kernels or CANDIDATES, placement)
-    search = _Search(kernel_study.ReferenceSurface(vertices, faces), float(error), placement, progress)
+    search = _Search(
+        kernel_study.ReferenceSurface(vertices, faces), float(error), placement, progress
+    )
     for kernel in named:
         search.try_kernel(kernel)
     return search.result()
@@ -102,10 +110,19 @@ class _Search:
     """Rows by kernel and number of centres, and the best so far."""
 
     def __init__(
-        self, judge: kernel_study.ReferenceSurface, error: float, placement: str, progress: OnProgress | None
+        self,
+        judge: kernel_study.ReferenceSurface,
+        error: float,
+        placement: str,
+        progress: OnProgress | None,
     ) -> None:
-        self.judge, self.error, self.placement, self.progress = judge, error, placement, progress
-        self.sample = cache(partial(sample_surface, judge.vertices, judge.faces, placement="greedy"))
+        self.judge = judge
+        self.error = error
+        self.placement = placement
+        self.progress = progress
+        self.sample = cache(
+            partial(sample_surface, judge.vertices, judge.faces, placement="greedy")
+        )
         self.found: dict[tuple[str, int], kernel_study.Measured] = {}
         self.best: tuple[str, int] | None = None
 
@@ -113,7 +130,9 @@ class _Search:
         """Error of a kernel with so many centres [length], infinite where it broke."""
         key = kernel.name, count
         if key not in self.found:
-            self.found[key] = kernel_study.measure_row(self.judge, self.sample(count), kernel, self.placement)
+            self.found[key] = kernel_study.measure_row(
+                self.judge, self.sample(count), kernel, self.placement
+            )
             if self.progress is not None:
                 self.progress(len(self.found), max(len(self.found) + 1, 8))
         error = _error(self.found[key])
@@ -145,7 +164,9 @@ class _Search:
         found = min(self.found.values(), key=_error) if self.best is None else self.found[self.best]
         if not found.row["unfit"]:
             kernel_study.time_row(found, self.judge.points)
-        tried = [{"kernel": k, "centres": n, "error": _error(one)} for (k, n), one in self.found.items()]
+        tried = [
+            {"kernel": k, "centres": n, "error": _error(one)} for (k, n), one in self.found.items()
+        ]
         return WantedError(self.best is not None, found.row, _error(found), self.error, tried)
 
 

@@ -1,11 +1,15 @@
-"""Uniform cubic B-splines on a lattice, for compiled loops: weights of the nodes about a place, and their sum."""
+"""Uniform cubic B-splines on a lattice, for compiled loops: weights of the nodes about a place, and
+their sum.
+"""
 
 from rbfmuscle.jit import compiled
 
 
 @compiled(error_model="numpy")
 def bspline_weights(t, weight, slope):
-    """Fill the weights (4,) of the nodes about a place ``t`` in [0, 1] of a cell, and their derivatives by ``t``."""
+    """Fill the weights (4,) of the nodes about a place ``t`` in [0, 1] of a cell, and their
+    derivatives by ``t``.
+    """
     s = 1.0 - t
     weight[0], weight[3] = s * s * s / 6.0, t * t * t / 6.0
     weight[1] = (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0
@@ -17,8 +21,13 @@ def bspline_weights(t, weight, slope):
 
 @compiled(error_model="numpy")
 def bspline_sum(nodes, first, weight, slope):
-    """Value and gradient, in units of a cell, from the 4 x 4 x 4 nodes from ``first`` on and weights (3, 4)."""
-    value, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
+    """Value and gradient, in units of a cell, from the 4 x 4 x 4 nodes from ``first`` on and
+    weights (3, 4).
+    """
+    value = 0.0
+    gx = 0.0
+    gy = 0.0
+    gz = 0.0
     for a in range(4):
         for b in range(4):
             line, lean = 0.0, 0.0

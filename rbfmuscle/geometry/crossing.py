@@ -7,7 +7,8 @@ from rbfmuscle.geometry.surfaces import opposite_half_edges, touching_faces
 from rbfmuscle.geometry.triangles import triangle_normal
 from rbfmuscle.jit import compiled
 
-# Triangles in a leaf of the tree, and bits of their places along each axis by which they are sorted.
+# Triangles in a leaf of the tree, and bits of their places along each axis by which they are
+# sorted.
 LEAF, BITS = 4, 10
 # Pairs of nodes that wait at a time: less than four for each level of the tree.
 WAITING = 512
@@ -26,11 +27,15 @@ def morton_order(points: Floats) -> Integers:
 
 
 class FaceTree:
-    """Boxes around the triangles of a mesh, by nearness at one moment; good for later ones with the same faces."""
+    """Boxes around the triangles of a mesh, by nearness at one moment; good for later ones with the
+    same faces.
+    """
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         self.faces = np.ascontiguousarray(faces, dtype=np.int64)
-        middle = (vertices[self.faces[:, 0]] + vertices[self.faces[:, 1]] + vertices[self.faces[:, 2]]) / 3.0
+        middle = (
+            vertices[self.faces[:, 0]] + vertices[self.faces[:, 1]] + vertices[self.faces[:, 2]]
+        ) / 3.0
         self.order = morton_order(middle)
         self._corners = self.faces[self.order]
         self.leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
@@ -39,16 +44,19 @@ class FaceTree:
         self._room = 16 * self.leaves
 
     def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
-        """Which triangles cross others, as `crossing_faces` says, for places of the vertices (n, 3) now.
+        """Which triangles cross others, as `crossing_faces` says, for places of the vertices (n, 3)
+        now.
 
-        With ``among`` (m,) only pairs with one of these, or with one at a corner whose triangles do not lie side by
-        side.
+        With ``among`` (m,) only pairs with one of these, or with one at a corner whose triangles do
+        not lie side by side.
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         faces, count = self._corners, len(self._corners)
         plain = np.full(len(vertices), self.closed, dtype=np.bool_)
         if self.closed:
-            _plain_loop(vertices, faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain)
+            _plain_loop(
+                vertices, faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain
+            )
         asked = np.ones(count, dtype=np.bool_)
         if among is not None:
             asked = among[self.order] | touching_faces(faces, ~plain)
@@ -77,9 +85,10 @@ class FaceTree:
 def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
     """Which triangles (m,) cross others of the same surface.
 
-    An edge crosses a triangle where its ends lie on either side of it and its line passes through the inside.
-    Triangles that share an edge are never counted, those that share a corner are where the far edge of one goes
-    through the other. Triangles that lie in one plane and only overlap do not cross.
+    An edge crosses a triangle where its ends lie on either side of it and its line passes through
+    the inside. Triangles that share an edge are never counted, those that share a corner are where
+    the far edge of one goes through the other. Triangles that lie in one plane and only overlap do
+    not cross.
     """
     if len(faces) == 0:
         return np.zeros(0, dtype=bool)
@@ -89,14 +98,18 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
 
 @compiled
 def _boxes_loop(vertices, faces, box, leaves, node):
-    """Boxes of the triangles, leaf by leaf, and of the tree's nodes: node k holds those of 2k and 2k + 1."""
+    """Boxes of the triangles, leaf by leaf, and of the tree's nodes: node k holds those of 2k and
+    2k + 1.
+    """
     box[:, :3], box[:, 3:] = np.inf, -np.inf
     node[:, :3], node[:, 3:] = np.inf, -np.inf
     for f in range(len(faces)):
         leaf, place = f // LEAF, f % LEAF
         k = leaves + leaf
         for a in range(3):
-            x, y, z = vertices[faces[f, 0], a], vertices[faces[f, 1], a], vertices[faces[f, 2], a]
+            x = vertices[faces[f, 0], a]
+            y = vertices[faces[f, 1], a]
+            z = vertices[faces[f, 2], a]
             low, high = min(x, y, z), max(x, y, z)
             box[leaf, a, place], box[leaf, 3 + a, place] = low, high
             node[k, a], node[k, 3 + a] = min(node[k, a], low), max(node[k, 3 + a], high)
@@ -118,19 +131,25 @@ def _wanted_loop(asked, leaves, wanted):
 @compiled
 def _apart(one, i, other, j):
     """Whether two boxes do not touch."""
-    # All six are compared: which of them tells cannot be foreseen, and a wrong guess costs more than the rest.
+    # All six are compared: which of them tells cannot be foreseen, and a wrong guess costs more
+    # than the rest.
     return (
-        (one[i, 0] > other[j, 3]) | (other[j, 0] > one[i, 3]) | (one[i, 1] > other[j, 4])
-        | (other[j, 1] > one[i, 4]) | (one[i, 2] > other[j, 5]) | (other[j, 2] > one[i, 5])
-    )  # fmt: skip
+        (one[i, 0] > other[j, 3])
+        | (other[j, 0] > one[i, 3])
+        | (one[i, 1] > other[j, 4])
+        | (other[j, 1] > one[i, 4])
+        | (one[i, 2] > other[j, 5])
+        | (other[j, 2] > one[i, 5])
+    )
 
 
 @compiled
 def _plain_loop(vertices, faces, normals, turns, plain):
-    """Unmark the vertices whose triangles do not lie side by side when seen along the mean normal there.
+    """Unmark the vertices whose triangles do not lie side by side when seen along the mean normal
+    there.
 
-    Of a closed surface these triangles are a ring around the vertex. Where all of them are seen from outside and
-    the ring goes round once, none covers another, so no two of them cross.
+    Of a closed surface these triangles are a ring around the vertex. Where all of them are seen
+    from outside and the ring goes round once, none covers another, so no two of them cross.
     """
     for f in range(len(faces)):
         normal = triangle_normal(vertices, faces, f)
@@ -140,21 +159,30 @@ def _plain_loop(vertices, faces, normals, turns, plain):
     for f in range(len(faces)):
         x, y, z = triangle_normal(vertices, faces, f)
         for k in range(3):
-            v, p, q = faces[f, k], faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            v = faces[f, k]
+            p = faces[f, (k + 1) % 3]
+            q = faces[f, (k + 2) % 3]
             u = normals[v]
             along = x * u[0] + y * u[1] + z * u[2]
             least = 1e-12 * (x * x + y * y + z * z) * (u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
             if along <= 0.0 or along * along <= least:
                 plain[v] = False
-            # The side of a plane through the normal that a neighbour lies on: once round, once from below to above.
+            # The side of a plane through the normal that a neighbour lies on: once round, once from
+            # below to above.
             a = (
                 0
                 if abs(u[0]) <= abs(u[1]) and abs(u[0]) <= abs(u[2])
                 else (1 if abs(u[1]) <= abs(u[2]) else 2)
             )
             b, c = (a + 1) % 3, (a + 2) % 3
-            below = u[c] * (vertices[p, b] - vertices[v, b]) - u[b] * (vertices[p, c] - vertices[v, c]) < 0.0
-            above = u[c] * (vertices[q, b] - vertices[v, b]) - u[b] * (vertices[q, c] - vertices[v, c]) >= 0.0
+            below = (
+                u[c] * (vertices[p, b] - vertices[v, b]) - u[b] * (vertices[p, c] - vertices[v, c])
+                < 0.0
+            )
+            above = (
+                u[c] * (vertices[q, b] - vertices[v, b]) - u[b] * (vertices[q, c] - vertices[v, c])
+                >= 0.0
+            )
             turns[v] += below and above
     for v in range(len(plain)):
         plain[v] &= turns[v] == 1
@@ -162,7 +190,9 @@ def _plain_loop(vertices, faces, normals, turns, plain):
 
 @compiled
 def _pairs_loop(node, wanted, pairs):
-    """Pairs of leaves whose boxes touch, from the root down; how many there are, also beyond the room for them."""
+    """Pairs of leaves whose boxes touch, from the root down; how many there are, also beyond the
+    room for them.
+    """
     leaves = len(node) // 2
     waiting = np.empty((WAITING, 2), dtype=np.int64)
     waiting[0, 0], waiting[0, 1] = 1, 1
@@ -187,25 +217,35 @@ def _pairs_loop(node, wanted, pairs):
 
 @compiled
 def _cross_loop(vertices, faces, leaves, asked, found):
-    """The triangles of pairs of leaves: which of them touch by their boxes, then which of these cross."""
+    """The triangles of pairs of leaves: which of them touch by their boxes, then which of these
+    cross.
+    """
     pairs, box = leaves
     among, plain = asked
     near = np.empty(LEAF, np.bool_)
     for k in range(len(pairs)):
         i, j = pairs[k, 0], pairs[k, 1]
         for m in range(LEAF):
-            # All six are compared, and all boxes of the leaf: side by side, which is quicker than to choose.
+            # All six are compared, and all boxes of the leaf: side by side, which is quicker than
+            # to choose.
             for n in range(LEAF):
                 near[n] = (
-                    (box[i, 0, m] <= box[j, 3, n]) & (box[j, 0, n] <= box[i, 3, m])
-                    & (box[i, 1, m] <= box[j, 4, n]) & (box[j, 1, n] <= box[i, 4, m])
-                    & (box[i, 2, m] <= box[j, 5, n]) & (box[j, 2, n] <= box[i, 5, m])
-                )  # fmt: skip
+                    (box[i, 0, m] <= box[j, 3, n])
+                    & (box[j, 0, n] <= box[i, 3, m])
+                    & (box[i, 1, m] <= box[j, 4, n])
+                    & (box[j, 1, n] <= box[i, 4, m])
+                    & (box[i, 2, m] <= box[j, 5, n])
+                    & (box[j, 2, n] <= box[i, 5, m])
+                )
             for n in range(m + 1 if i == j else 0, LEAF):
                 if not near[n]:
                     continue
                 f, g = LEAF * i + m, LEAF * j + n
-                if not _meet(faces, f, g, plain) or (found[f] and found[g]) or not (among[f] or among[g]):
+                if (
+                    not _meet(faces, f, g, plain)
+                    or (found[f] and found[g])
+                    or not (among[f] or among[g])
+                ):
                     continue
                 if _cross(vertices, faces, f, g):
                     found[f], found[g] = True, True
@@ -213,15 +253,20 @@ def _cross_loop(vertices, faces, leaves, asked, found):
 
 @compiled
 def _meet(faces, f, g, plain):
-    """Whether two triangles can cross: not if they share an edge, or a corner around which none covers another."""
-    # Without branches: nearly all pairs that touch share a corner, and which one cannot be foreseen.
-    p, q, r = faces[f, 0], faces[f, 1], faces[f, 2]
-    a, b, c = faces[g, 0], faces[g, 1], faces[g, 2]
-    first, second, third = (
-        (p == a) | (p == b) | (p == c),
-        (q == a) | (q == b) | (q == c),
-        (r == a) | (r == b) | (r == c),
-    )
+    """Whether two triangles can cross: not if they share an edge, or a corner around which none
+    covers another.
+    """
+    # Without branches: nearly all pairs that touch share a corner, and which one cannot be
+    # foreseen.
+    p = faces[f, 0]
+    q = faces[f, 1]
+    r = faces[f, 2]
+    a = faces[g, 0]
+    b = faces[g, 1]
+    c = faces[g, 2]
+    first = (p == a) | (p == b) | (p == c)
+    second = (q == a) | (q == b) | (q == c)
+    third = (r == a) | (r == b) | (r == c)
     shared = np.int64(first) + np.int64(second) + np.int64(third)
     ringed = (first & plain[p]) | (second & plain[q]) | (third & plain[r])
     return (shared == 0) | ((shared == 1) & (not ringed))
@@ -238,7 +283,9 @@ def _cross(vertices, faces, f, g):
 @compiled
 def _straddles(vertices, faces, f, g):
     """Whether f has corners on both sides of the plane of g; those that they share lie in it."""
-    a, b, c = faces[g, 0], faces[g, 1], faces[g, 2]
+    a = faces[g, 0]
+    b = faces[g, 1]
+    c = faces[g, 2]
     above, below = False, False
     for k in range(3):
         p = faces[f, k]
@@ -253,18 +300,18 @@ def _straddles(vertices, faces, f, g):
 @compiled
 def _edges_cross(vertices, faces, f, g):
     """Whether an edge of f goes through the inside of g."""
-    a, b, c = faces[g, 0], faces[g, 1], faces[g, 2]
+    a = faces[g, 0]
+    b = faces[g, 1]
+    c = faces[g, 2]
     for k in range(3):
         p, q = faces[f, k], faces[f, (k + 1) % 3]
         if p in (a, b, c) or q in (a, b, c):
             continue
         if _side(vertices, a, b, c, p) * _side(vertices, a, b, c, q) >= 0.0:
             continue
-        one, two, three = (
-            _side(vertices, p, q, a, b),
-            _side(vertices, p, q, b, c),
-            _side(vertices, p, q, c, a),
-        )
+        one = _side(vertices, p, q, a, b)
+        two = _side(vertices, p, q, b, c)
+        three = _side(vertices, p, q, c, a)
         if (one > 0.0 and two > 0.0 and three > 0.0) or (one < 0.0 and two < 0.0 and three < 0.0):
             return True
     return False
@@ -272,10 +319,18 @@ def _edges_cross(vertices, faces, f, g):
 
 @compiled
 def _side(vertices, a, b, c, d):
-    """Six times the signed volume of a tetrahedron: which side of the triangle abc the point d lies on."""
-    x, y, z = vertices[a, 0], vertices[a, 1], vertices[a, 2]
-    ux, uy, uz = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z
-    vx, vy, vz = vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z
+    """Six times the signed volume of a tetrahedron: which side of the triangle abc the point d lies
+    on.
+    """
+    x = vertices[a, 0]
+    y = vertices[a, 1]
+    z = vertices[a, 2]
+    ux = vertices[b, 0] - x
+    uy = vertices[b, 1] - y
+    uz = vertices[b, 2] - z
+    vx = vertices[c, 0] - x
+    vy = vertices[c, 1] - y
+    vz = vertices[c, 2] - z
     return (
         (uy * vz - uz * vy) * (vertices[d, 0] - x)
         + (uz * vx - ux * vz) * (vertices[d, 1] - y)

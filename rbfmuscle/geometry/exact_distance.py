@@ -1,6 +1,8 @@
-"""Exact signed distance to a triangle mesh: a bounding volume tree with angle-weighted pseudonormals.
+"""Exact signed distance to a triangle mesh: a bounding volume tree with angle-weighted
+pseudonormals.
 
-The tree is a balanced binary heap over triangles in an order that halves them along the longest extent.
+The tree is a balanced binary heap over triangles in an order that halves them along the longest
+extent.
 """
 
 from functools import cached_property
@@ -35,7 +37,9 @@ STACK = 64
 
 
 class Tree(NamedTuple):
-    """Boxes of the heap's nodes, starts of the leaves, records of the triangles and the face of each record."""
+    """Boxes of the heap's nodes, starts of the leaves, records of the triangles and the face of
+    each record.
+    """
 
     boxes: NDArray[np.float64]
     starts: NDArray[np.int64]
@@ -44,7 +48,9 @@ class Tree(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """What stays where vertices move: order of the triangles, starts of the leaves, faces across the edges."""
+    """What stays where vertices move: order of the triangles, starts of the leaves, faces across
+    the edges.
+    """
 
     order: NDArray[np.int64]
     starts: NDArray[np.int64]
@@ -59,8 +65,8 @@ class ExactDistance:
     vertices : (n, 3) array_like
         Finite.
     faces : (m, 3) array_like of int
-        At least one, outward; vertices are shared by index. The sign is exact where the mesh is closed and
-        consistently oriented, and that of the nearest face elsewhere.
+        At least one, outward; vertices are shared by index. The sign is exact where the mesh is
+        closed and consistently oriented, and that of the nearest face elsewhere.
     layout : Layout, optional
         Of the same faces with their vertices elsewhere, as in a frame before: halves the time.
 
@@ -72,12 +78,16 @@ class ExactDistance:
     [-0.02, 3.0]
     """
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike, *, layout: Layout | None = None) -> None:
+    def __init__(
+        self, vertices: ArrayLike, faces: ArrayLike, *, layout: Layout | None = None
+    ) -> None:
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         faces = np.ascontiguousarray(faces, dtype=np.int64)
         self.vertices, self.faces = vertices, faces
         self.layout = _layout(vertices, faces) if layout is None else layout
-        self.order, self.starts, self.across = self.layout.order, self.layout.starts, self.layout.across
+        self.order = self.layout.order
+        self.starts = self.layout.starts
+        self.across = self.layout.across
         self.records = np.empty((len(faces), WIDTH))
         self.boxes = np.empty((2 * len(self.starts) - 2, 6))
         fill_records(vertices, faces, self.order, self.records)
@@ -96,16 +106,19 @@ class ExactDistance:
     def signed_distance(self, points: ArrayLike, *, reach: float = np.inf) -> NDArray[np.float64]:
         """Signed distance (n,) of points (n, 3) [unit of the mesh], negative inside.
 
-        Distances beyond ``reach`` are not looked for, which is much faster, and come out as ``reach``.
+        Distances beyond ``reach`` are not looked for, which is much faster, and come out as
+        ``reach``.
         """
         return self.nearest(points, reach=reach)[0]
 
     def nearest(
         self, points: ArrayLike, *, reach: float = np.inf
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-        """Signed distance (n,), nearest point (n, 3), nearest face (n,) and the sign's pseudonormal (n, 3).
+        """Signed distance (n,), nearest point (n, 3), nearest face (n,) and the sign's pseudonormal
+        (n, 3).
 
-        Where the mesh is further away than ``reach`` these are ``reach``, the point itself, -1 and zero.
+        Where the mesh is further away than ``reach`` these are ``reach``, the point itself, -1 and
+        zero.
         """
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         if not reach > 0.0:
@@ -142,7 +155,9 @@ def faces_across(faces: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @compiled
 def _order_loop(centres, order, depth, starts):
-    """Order triangles so that each node of the heap holds a range, halved along its longest extent."""
+    """Order triangles so that each node of the heap holds a range, halved along its longest
+    extent.
+    """
     count = len(order)
     leaves = 1 << depth
     for leaf in range(leaves + 1):
@@ -221,23 +236,37 @@ def _box_square(boxes, node, x, y, z):
 @compiled(inline="always")
 def record_square(records, n, x, y, z):
     """Squared distance from a point to the triangle of record n."""
-    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    qx = x - records[n, 0]
+    qy = y - records[n, 1]
+    qz = z - records[n, 2]
     u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
     v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
     w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
     du, dv, _ = nearest_in_frame(
-        records[n, BX], records[n, CX], records[n, CY], records[n, INVERSE_BC], records[n, INVERSE_CA], u, v
+        records[n, BX],
+        records[n, CX],
+        records[n, CY],
+        records[n, INVERSE_BC],
+        records[n, INVERSE_CA],
+        u,
+        v,
     )
     return du * du + dv * dv + w * w
 
 
 @compiled
 def record_feature(records, n, x, y, z):
-    """Feature of the triangle of record n (FACE, EDGE + k, CORNER + k) that is nearest to a point."""
-    qx, qy, qz = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    """Feature of the triangle of record n (FACE, EDGE + k, CORNER + k) that is nearest to a
+    point.
+    """
+    qx = x - records[n, 0]
+    qy = y - records[n, 1]
+    qz = z - records[n, 2]
     u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
     v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
-    bx, cx, cy = records[n, BX], records[n, CX], records[n, CY]
+    bx = records[n, BX]
+    cx = records[n, CX]
+    cy = records[n, CY]
     return nearest_in_frame(bx, cx, cy, records[n, INVERSE_BC], records[n, INVERSE_CA], u, v)[2]
 
 
@@ -245,10 +274,10 @@ def record_feature(records, n, x, y, z):
 def nearest_triangle(tree, at, best, square, slack, stack):
     """Record of the triangle of a `Tree` nearest to a point ``at``, and the squared distance.
 
-    ``best`` and ``square`` are a record known to be as near as that, or -1 and the squared reach. Of triangles whose
-    squared distances differ by a smaller share than ``slack`` that of the least face number is taken, so that
-    rounding and the order of the questions decide nothing. ``stack`` is two (STACK,) arrays to work in, of int64 and
-    float64.
+    ``best`` and ``square`` are a record known to be as near as that, or -1 and the squared reach.
+    Of triangles whose squared distances differ by a smaller share than ``slack`` that of the least
+    face number is taken, so that rounding and the order of the questions decide nothing. ``stack``
+    is two (STACK,) arrays to work in, of int64 and float64.
     """
     boxes, starts, records, order = tree
     x, y, z = at
@@ -292,7 +321,9 @@ def _nearest_loop(points, reach, tree, normals, out):
     stack = np.empty(STACK, np.int64), np.empty(STACK)
     best = np.int64(-1)
     for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        x = points[i, 0]
+        y = points[i, 1]
+        z = points[i, 2]
         square = reach * reach
         if best >= 0:
             # The last answer bounds the next one where points come in order.
@@ -330,7 +361,9 @@ def signed_side(record, face, point, normals, closest, normal):
 @compiled
 def _closest_in_record(record, point, closest):
     """Fill the point of one triangle that is nearest to a point; return its feature."""
-    u, v, w = 0.0, 0.0, 0.0
+    u = 0.0
+    v = 0.0
+    w = 0.0
     for k in range(3):
         u += (point[k] - record[k]) * record[3 + k]
         v += (point[k] - record[k]) * record[6 + k]

@@ -1,4 +1,6 @@
-"""What a scalar field in space offers: the port between those who have one and those who draw or cut by it."""
+"""What a scalar field in space offers: the port between those who have one and those who draw or
+cut by it.
+"""
 
 from typing import Protocol
 
@@ -22,21 +24,31 @@ class ClipDistance(Protocol):
     """
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Values (n,) at points (n, 3); a lower bound where they are farther than a surface comes."""
+        """Values (n,) at points (n, 3); a lower bound where they are farther than a surface
+        comes.
+        """
 
     def value_and_gradient_below(
         self, points: np.ndarray, limit: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Values (n,) and gradients (n, 3), only lower bounds where a value is beyond its limit (n,)."""
+        """Values (n,) and gradients (n, 3), only lower bounds where a value is beyond its limit
+        (n,).
+        """
 
 
 class BoneField(Protocol):
-    """What tells how far points are from a bone, in bone coordinates or, with a pose (4, 4), in the world."""
+    """What tells how far points are from a bone, in bone coordinates or, with a pose (4, 4), in the
+    world.
+    """
 
     bounds: np.ndarray  # (2, 3) box of the bone, at rest
 
     def distance(
-        self, points: np.ndarray, pose: np.ndarray | None = None, *, reach: np.ndarray | float = np.inf
+        self,
+        points: np.ndarray,
+        pose: np.ndarray | None = None,
+        *,
+        reach: np.ndarray | float = np.inf,
     ) -> np.ndarray:
         """Signed distances (n,), negative inside; a lower bound where they are beyond ``reach``."""
 

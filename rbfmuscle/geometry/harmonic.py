@@ -14,12 +14,16 @@ from rbfmuscle.jit import compiled
 def cotangent_laplacian(vertices: Floats, faces: Integers) -> sparse.csc_matrix:
     """Positive semi-definite cotangent Laplacian (n, n) with weights clamped from below.
 
-    Negative cotangents (22 % on a long muscle mesh) would break the maximum principle, so that weights would leave
-    [0, 1]; they are raised to a small positive share of the mean weight.
+    Negative cotangents (22 % on a long muscle mesh) would break the maximum principle, so that
+    weights would leave [0, 1]; they are raised to a small positive share of the mean weight.
     """
-    rows, cols, values = [], [], []
+    rows = []
+    cols = []
+    values = []
     for k in range(3):
-        i, j, o = faces[:, (k + 1) % 3], faces[:, (k + 2) % 3], faces[:, k]
+        i = faces[:, (k + 1) % 3]
+        j = faces[:, (k + 2) % 3]
+        o = faces[:, k]
         u, v = vertices[i] - vertices[o], vertices[j] - vertices[o]
         twice_area = np.linalg.norm(np.cross(u, v), axis=1)
         cotangent = 0.5 * np.einsum("ij,ij->i", u, v) / np.maximum(twice_area, 1e-300)
@@ -34,18 +38,23 @@ def cotangent_laplacian(vertices: Floats, faces: Integers) -> sparse.csc_matrix:
     return graph_laplacian(edges.row, edges.col, weights, count)
 
 
-def graph_laplacian(first: Integers, second: Integers, weights: Floats, count: int) -> sparse.csc_matrix:
-    """Laplacian (count, count) of edges between vertices; the weights of an edge that is given twice are added."""
+def graph_laplacian(
+    first: Integers, second: Integers, weights: Floats, count: int
+) -> sparse.csc_matrix:
+    """Laplacian (count, count) of edges between vertices; the weights of an edge that is given
+    twice are added.
+    """
     half = sparse.csr_matrix((weights, (first, second)), shape=(count, count))
     links = half + half.T
     return (sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links).tocsc()
 
 
 def harmonic_weights(vertices: Floats, faces: Integers, groups: Sequence[Integers]) -> Floats:
-    """Weights (n, groups) in [0, 1] that sum to one, by Laplace's equation on the surface for each group.
+    """Weights (n, groups) in [0, 1] that sum to one, by Laplace's equation on the surface for each
+    group.
 
-    Group g has weight 1 on its own vertices and 0 on the others'; groups are disjoint. Raises LinAlgError if a part
-    of the surface has no fixed vertex.
+    Group g has weight 1 on its own vertices and 0 on the others'; groups are disjoint. Raises
+    LinAlgError if a part of the surface has no fixed vertex.
     """
     count = len(vertices)
     weights = np.zeros((count, len(groups)))
@@ -66,8 +75,12 @@ def harmonic_weights(vertices: Floats, faces: Integers, groups: Sequence[Integer
 
 
 def surface_gradient(vertices: Floats, faces: Array, values: Floats) -> Floats:
-    """Area-weighted tangential gradient (n, 3) of a piecewise linear function at the vertices of a surface."""
-    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    """Area-weighted tangential gradient (n, 3) of a piecewise linear function at the vertices of a
+    surface.
+    """
+    a = vertices[faces[:, 0]]
+    b = vertices[faces[:, 1]]
+    c = vertices[faces[:, 2]]
     normal = np.cross(b - a, c - a)
     squared = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-300)[:, None]
     fa, fb, fc = (values[faces[:, k]][:, None] for k in range(3))
@@ -81,10 +94,12 @@ def surface_gradient(vertices: Floats, faces: Array, values: Floats) -> Floats:
 
 
 def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
-    """Move each point (n, 3) by a mean of rigid motions (b, 4, 4) with weights (n, b) that sum to one.
+    """Move each point (n, 3) by a mean of rigid motions (b, 4, 4) with weights (n, b) that sum to
+    one.
 
-    The motions' twists (logarithms in se(3)) are averaged with the point's weights and exponentiated, so a motion
-    that all bones share moves every point rigidly, and a weight of one gives that bone's motion exactly.
+    The motions' twists (logarithms in se(3)) are averaged with the point's weights and
+    exponentiated, so a motion that all bones share moves every point rigidly, and a weight of one
+    gives that bone's motion exactly.
     """
     twists, out = np.empty((len(motions), 6)), np.empty((len(points), 3))
     _logarithm_loop(motions, twists)
@@ -96,19 +111,31 @@ def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
 def _exponential_loop(points, twists, out):
     """Move each point by the exponential of its twist (omega, velocity)."""
     for n in range(len(points)):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        a, b, c = twists[n, 0], twists[n, 1], twists[n, 2]
-        u, v, w = twists[n, 3], twists[n, 4], twists[n, 5]
+        x = points[n, 0]
+        y = points[n, 1]
+        z = points[n, 2]
+        a = twists[n, 0]
+        b = twists[n, 1]
+        c = twists[n, 2]
+        u = twists[n, 3]
+        v = twists[n, 4]
+        w = twists[n, 5]
         square = a * a + b * b + c * c
         angle = np.sqrt(square)
         if angle < 1e-6:
-            first, second, third = 1 - square / 6, 0.5 - square / 24, 1 / 6 - square / 120
+            first = 1 - square / 6
+            second = 0.5 - square / 24
+            third = 1 / 6 - square / 120
         else:
             first, second = np.sin(angle) / angle, (1 - np.cos(angle)) / square
             third = (angle - np.sin(angle)) / (square * angle)
         # omega x point and omega x velocity, and omega x these.
-        px, py, pz = b * z - c * y, c * x - a * z, a * y - b * x
-        sx, sy, sz = b * w - c * v, c * u - a * w, a * v - b * u
+        px = b * z - c * y
+        py = c * x - a * z
+        pz = a * y - b * x
+        sx = b * w - c * v
+        sy = c * u - a * w
+        sz = a * v - b * u
         out[n, 0] = x + u + first * px + second * (b * pz - c * py + sx) + third * (b * sz - c * sy)
         out[n, 1] = y + v + first * py + second * (c * px - a * pz + sy) + third * (c * sx - a * sz)
         out[n, 2] = z + w + first * pz + second * (a * py - b * px + sz) + third * (a * sy - b * sx)
@@ -125,11 +152,19 @@ def _logarithm_loop(motions, twists):
         third = 1.0 / 12.0 + half * half / 180.0
         if half > 5e-5:
             third = (0.25 - 0.25 * half * abs(w) / sine) / (half * half)
-        a, b, c = share * a, share * b, share * c
-        x, y, z = motions[n, 0, 3], motions[n, 1, 3], motions[n, 2, 3]
+        a = share * a
+        b = share * b
+        c = share * c
+        x = motions[n, 0, 3]
+        y = motions[n, 1, 3]
+        z = motions[n, 2, 3]
         # omega x shift, and omega x that.
-        px, py, pz = b * z - c * y, c * x - a * z, a * y - b * x
-        twists[n, 0], twists[n, 1], twists[n, 2] = a, b, c
+        px = b * z - c * y
+        py = c * x - a * z
+        pz = a * y - b * x
+        twists[n, 0] = a
+        twists[n, 1] = b
+        twists[n, 2] = c
         twists[n, 3] = x - 0.5 * px + third * (b * pz - c * py)
         twists[n, 4] = y - 0.5 * py + third * (c * px - a * pz)
         twists[n, 5] = z - 0.5 * pz + third * (a * py - b * px)

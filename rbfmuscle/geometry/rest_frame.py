@@ -9,7 +9,9 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 
 
 def diameter(points: Floats) -> float:
-    """Twice the greatest distance from the mean: a size that does not change when the scene is turned."""
+    """Twice the greatest distance from the mean: a size that does not change when the scene is
+    turned.
+    """
     return 2.0 * float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
 
 
@@ -27,11 +29,13 @@ def moved_box(bounds: Floats, poses: Floats) -> Floats:
 
 
 class RestFrame:
-    """Coordinates of a rest mesh that do not change when the scene is moved, turned or written in another unit.
+    """Coordinates of a rest mesh that do not change when the scene is moved, turned or written in
+    another unit.
 
-    Sampling and binding choose between points; two that are equally good must not be told apart by rounding, or a
-    moved scene would get other centres. Here they see the same numbers, ``local`` (n, 3), wherever the scene lies:
-    vertices in a frame spanned by the first of them, in units of the mesh's size, rounded to 1e-8.
+    Sampling and binding choose between points; two that are equally good must not be told apart by
+    rounding, or a moved scene would get other centres. Here they see the same numbers, ``local``
+    (n, 3), wherever the scene lies: vertices in a frame spanned by the first of them, in units of
+    the mesh's size, rounded to 1e-8.
     """
 
     def __init__(self, vertices: Floats) -> None:
@@ -70,7 +74,9 @@ def on_one_line(vertices: Floats) -> bool:
 
 
 def _principal_axes(points: Floats) -> Floats:
-    """Right-handed principal axes as rows; the axes themselves where rounding would choose between others."""
+    """Right-handed principal axes as rows; the axes themselves where rounding would choose between
+    others.
+    """
     _, sizes, axes = np.linalg.svd(points, full_matrices=False)
     if np.diff(sizes).max() > -0.02 * sizes[0]:
         return np.eye(3)
@@ -81,15 +87,18 @@ def _principal_axes(points: Floats) -> Floats:
 class BoneFrame:
     """The rest frame of a bone, along its principal axes so that a grid in it is small.
 
-    ``axes`` are rows in bone coordinates, ``size`` is the length of a local unit, and ``local`` the vertices (n, 3)
-    in these, rounded to 1e-8. They must not all lie on one line.
+    ``axes`` are rows in bone coordinates, ``size`` is the length of a local unit, and ``local`` the
+    vertices (n, 3) in these, rounded to 1e-8. They must not all lie on one line.
     """
 
     def __init__(self, vertices: Floats) -> None:
         frame = RestFrame(vertices)
-        # Found in rounded numbers, so that equal moments give the same axes for every pose of the scene.
+        # Found in rounded numbers, so that equal moments give the same axes for every pose of the
+        # scene.
         turn = _principal_axes(frame.local)
-        self.origin, self.size, self.axes = frame.origin, frame.size, turn @ frame.axes
+        self.origin = frame.origin
+        self.size = frame.size
+        self.axes = turn @ frame.axes
         self.local = np.round(frame.local @ turn.T, 8) + 0.0
         self._placed = lru_cache(maxsize=16)(self._place)
 
@@ -99,7 +108,9 @@ class BoneFrame:
         return np.array([local.min(axis=0), local.max(axis=0)])
 
     def placed(self, pose: Floats) -> Floats:
-        """Transform (4, 4) whose transpose takes world points to local units, for a pose of the bone."""
+        """Transform (4, 4) whose transpose takes world points to local units, for a pose of the
+        bone.
+        """
         # The same pose is asked for many times a frame.
         return self._placed(pose.tobytes())
 

@@ -1,4 +1,6 @@
-"""Rigid motions that fit moved points; rotations as unit quaternions (w, x, y, z), for compiled loops."""
+"""Rigid motions that fit moved points; rotations as unit quaternions (w, x, y, z), for compiled
+loops.
+"""
 
 from collections.abc import Callable
 
@@ -9,7 +11,9 @@ from rbfmuscle.jit import compiled
 
 
 def rigid_fit(points: Floats, targets: Floats) -> Floats:
-    """Rigid (4, 4) transform that takes points (n, 3) nearest to targets (n, 3) by least squares (Kabsch 1976)."""
+    """Rigid (4, 4) transform that takes points (n, 3) nearest to targets (n, 3) by least squares
+    (Kabsch 1976).
+    """
     middle, aim = points.mean(axis=0), targets.mean(axis=0)
     u, _, vt = np.linalg.svd((points - middle).T @ (targets - aim))
     mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
@@ -21,7 +25,8 @@ def rigid_fit(points: Floats, targets: Floats) -> Floats:
 
 
 def smooth_displacement(rest: Floats, points: Floats, smooth: Callable[[Floats], None]) -> Floats:
-    """The shape at rest, moved as the points on the whole, and deformed as they are where that is smooth, (n, 3).
+    """The shape at rest, moved as the points on the whole, and deformed as they are where that is
+    smooth, (n, 3).
 
     ``smooth`` smooths, in place, what the points do beside the rigid motion.
     """
@@ -41,7 +46,9 @@ def turned_quaternions(quaternions: Floats, rotation: Floats) -> Floats:
 
 @compiled(error_model="numpy")
 def matrix_quaternion(m):
-    """Unit quaternion of a rotation matrix, as four numbers, from the greatest of them (Shepperd 1978)."""
+    """Unit quaternion of a rotation matrix, as four numbers, from the greatest of them (Shepperd
+    1978).
+    """
     trace, i = m[0, 0] + m[1, 1] + m[2, 2], 0
     for k in range(1, 3):
         if m[k, k] > m[i, i]:
@@ -49,7 +56,10 @@ def matrix_quaternion(m):
     j, k = (i + 1) % 3, (i + 2) % 3
     q = np.empty(4)
     if trace > m[i, i]:
-        q[0], q[1], q[2], q[3] = 1.0 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+        q[0] = 1.0 + trace
+        q[1] = m[2, 1] - m[1, 2]
+        q[2] = m[0, 2] - m[2, 0]
+        q[3] = m[1, 0] - m[0, 1]
     else:
         q[0], q[1 + i] = m[k, j] - m[j, k], 1.0 + 2.0 * m[i, i] - trace
         q[1 + j], q[1 + k] = m[j, i] + m[i, j], m[k, i] + m[i, k]
@@ -60,7 +70,10 @@ def matrix_quaternion(m):
 @compiled(error_model="numpy", inline="always")
 def quaternion_matrix(q):
     """Rows of the rotation matrix of a unit quaternion, as three tuples."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
+    w = q[0]
+    x = q[1]
+    y = q[2]
+    z = q[3]
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -83,13 +96,18 @@ def rotate(q, v):
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def rotation_loop(m, q):
-    """Turn the unit quaternion q in place to the rotational part of the 3x3 matrix m, by Newton's method.
+    """Turn the unit quaternion q in place to the rotational part of the 3x3 matrix m, by Newton's
+    method.
 
-    The torque that aligns R with m is the skew part of P = m Rᵀ, and tr(P) I - P its change with the angle. Where
-    that is not positive definite, as far from the solution, steps are those of Müller et al. (2016).
+    The torque that aligns R with m is the skew part of P = m Rᵀ, and tr(P) I - P its change with
+    the angle. Where that is not positive definite, as far from the solution, steps are those of
+    Müller et al. (2016).
     """
     for _ in range(20):
-        w, x, y, z = q[0], q[1], q[2], q[3]
+        w = q[0]
+        x = q[1]
+        y = q[2]
+        z = q[3]
         (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = quaternion_matrix(q)
         p00 = m[0, 0] * r00 + m[0, 1] * r01 + m[0, 2] * r02
         p01 = m[0, 0] * r10 + m[0, 1] * r11 + m[0, 2] * r12
@@ -100,10 +118,18 @@ def rotation_loop(m, q):
         p20 = m[2, 0] * r00 + m[2, 1] * r01 + m[2, 2] * r02
         p21 = m[2, 0] * r10 + m[2, 1] * r11 + m[2, 2] * r12
         p22 = m[2, 0] * r20 + m[2, 1] * r21 + m[2, 2] * r22
-        ox, oy, oz = p21 - p12, p02 - p20, p10 - p01
-        a, b, c = p11 + p22, p00 + p22, p00 + p11
-        d, e, f = -0.5 * (p01 + p10), -0.5 * (p02 + p20), -0.5 * (p12 + p21)
-        ab, ac, bc = e * f - d * c, d * f - b * e, d * e - a * f
+        ox = p21 - p12
+        oy = p02 - p20
+        oz = p10 - p01
+        a = p11 + p22
+        b = p00 + p22
+        c = p00 + p11
+        d = -0.5 * (p01 + p10)
+        e = -0.5 * (p02 + p20)
+        f = -0.5 * (p12 + p21)
+        ab = e * f - d * c
+        ac = d * f - b * e
+        bc = d * e - a * f
         det = a * (b * c - f * f) + d * ab + e * ac
         newton = a > 0.0 and a * b > d * d and det > 1e-9 * (a + b + c) ** 3
         if newton:
@@ -113,17 +139,26 @@ def rotation_loop(m, q):
             vz = t * (ac * ox + bc * oy + (a * b - d * d) * oz)
         else:
             t = 1.0 / (abs(p00 + p11 + p22) + 1e-12)
-            vx, vy, vz = t * ox, t * oy, t * oz
+            vx = t * ox
+            vy = t * oy
+            vz = t * oz
         square = vx * vx + vy * vy + vz * vz
         if square < 1e-16:
             break
         if square > 1.0:
             t = 1.0 / np.sqrt(square)
-            vx, vy, vz = t * vx, t * vy, t * vz
-        vx, vy, vz = 0.5 * vx, 0.5 * vy, 0.5 * vz
+            vx = t * vx
+            vy = t * vy
+            vz = t * vz
+        vx = 0.5 * vx
+        vy = 0.5 * vy
+        vz = 0.5 * vz
         q0, q1 = w - vx * x - vy * y - vz * z, x + vx * w + vy * z - vz * y
         q2, q3 = y - vx * z + vy * w + vz * x, z + vx * y - vy * x + vz * w
         t = 1.0 / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
-        q[0], q[1], q[2], q[3] = q0 * t, q1 * t, q2 * t, q3 * t
+        q[0] = q0 * t
+        q[1] = q1 * t
+        q[2] = q2 * t
+        q[3] = q3 * t
         if newton and square < 1e-8:
             break  # the next step would be of the order of its square

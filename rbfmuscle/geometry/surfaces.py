@@ -10,12 +10,16 @@ from rbfmuscle.jit import compiled
 
 def face_normals(vertices: Floats, faces: Integers) -> Floats:
     """Area vectors (m, 3) of triangles: outward, as long as the area [unit^2]."""
-    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    a = vertices[faces[:, 0]]
+    b = vertices[faces[:, 1]]
+    c = vertices[faces[:, 2]]
     return 0.5 * np.cross(b - a, c - a)
 
 
 def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
-    """Unit normals (n, 3) at vertices, mean of the faces around weighted by area; zero where these cancel."""
+    """Unit normals (n, 3) at vertices, mean of the faces around weighted by area; zero where these
+    cancel.
+    """
     normals = np.zeros((len(vertices), 3))
     _vertex_normal_loop(np.asarray(vertices, dtype=np.float64), faces, normals)
     return normals
@@ -24,7 +28,9 @@ def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
 @compiled
 def _vertex_normal_loop(vertices, faces, normals):
     for f in range(len(faces)):
-        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        a = vertices[faces[f, 0]]
+        b = vertices[faces[f, 1]]
+        c = vertices[faces[f, 2]]
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
             area = (b[i] - a[i]) * (c[j] - a[j]) - (b[j] - a[j]) * (c[i] - a[i])
@@ -44,8 +50,8 @@ def touching_faces(faces: Integers, marked: Booleans) -> Booleans:
 def unique_edges(faces: Integers) -> Integers:
     """Edges of a triangle mesh, (e, 2), each once, its lesser vertex first.
 
-    In the order of the sides that run from the lesser to the greater vertex, which is one of each two on a closed,
-    oriented mesh; then those that have none such.
+    In the order of the sides that run from the lesser to the greater vertex, which is one of each
+    two on a closed, oriented mesh; then those that have none such.
     """
     faces = np.asarray(faces)
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
@@ -56,7 +62,8 @@ def unique_edges(faces: Integers) -> Integers:
 
 
 def opposite_half_edges(faces: Integers) -> Integers:
-    """Number (3m,) of the opposite half-edge of each half-edge ``3 * face + corner``, which runs to the next corner.
+    """Number (3m,) of the opposite half-edge of each half-edge ``3 * face + corner``, which runs to
+    the next corner.
 
     -1 where the edge has no other face; -2 where it has several, or one that runs the same way.
     """
@@ -77,7 +84,8 @@ def opposite_half_edges(faces: Integers) -> Integers:
 def split_pinched_vertices(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
     """Repeat each vertex where several fans of triangles meet, so that every fan has its own.
 
-    For closed and consistently oriented faces, which keep their order; repeated vertices come after those given.
+    For closed and consistently oriented faces, which keep their order; repeated vertices come after
+    those given.
     """
     size, twin = len(vertices), opposite_half_edges(faces)
     # the corner after the opposite side, in the neighbouring triangle, is at the same vertex
@@ -108,13 +116,21 @@ def edge_lengths(vertices: Floats, edges: Integers) -> Floats:
 def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
     """Area that each vertex stands for: a third of its triangles' (n,)."""
     corners = vertices[faces]
-    twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return np.bincount(faces.ravel(), np.repeat(twice / 6.0, 3), minlength=len(vertices)).astype(np.float64)
+    twice = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    return np.bincount(faces.ravel(), np.repeat(twice / 6.0, 3), minlength=len(vertices)).astype(
+        np.float64
+    )
 
 
 def barycentric_weights(points: Floats, corners: Floats) -> Floats:
-    """Weights (n, 3) in [0, 1] of the corners (n, 3, 3) of one triangle for each point (n, 3) in or near it."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    """Weights (n, 3) in [0, 1] of the corners (n, 3, 3) of one triangle for each point (n, 3) in or
+    near it.
+    """
+    a = corners[:, 0]
+    b = corners[:, 1]
+    c = corners[:, 2]
     normal = np.cross(b - a, c - a)
     square = np.einsum("ij,ij->i", normal, normal)
     v = np.einsum("ij,ij->i", np.cross(points - a, c - a), normal) / square
@@ -124,7 +140,8 @@ def barycentric_weights(points: Floats, corners: Floats) -> Floats:
 
 
 def mesh_volume(vertices: Floats, faces: Integers) -> float:
-    """Volume enclosed by a closed, outward mesh, about one of its vertices, so that a far origin costs no digits.
+    """Volume enclosed by a closed, outward mesh, about one of its vertices, so that a far origin
+    costs no digits.
 
     Examples
     --------
@@ -138,7 +155,9 @@ def mesh_volume(vertices: Floats, faces: Integers) -> float:
 
 @compiled(error_model="numpy", inline="always")
 def six_volumes(p, q, r):
-    """Six times the signed volume of the tetrahedron of the origin and three points: r . (p x q)."""
+    """Six times the signed volume of the tetrahedron of the origin and three points: r . (p x
+    q).
+    """
     return (
         (p[1] * q[2] - p[2] * q[1]) * r[0]
         + (p[2] * q[0] - p[0] * q[2]) * r[1]
@@ -168,12 +187,19 @@ def volume_loop(vertices, faces):
 
 @compiled(error_model="numpy")
 def volume_cubic(vertices, faces, direction):
-    """Coefficients c of the volume V(x + s d) = c0 + c1 s + c2 s^2 + c3 s^3 along directions d (n, 3)."""
-    c0, c1, c2, c3 = 0.0, 0.0, 0.0, 0.0
+    """Coefficients c of the volume V(x + s d) = c0 + c1 s + c2 s^2 + c3 s^3 along directions d (n,
+    3).
+    """
+    c0 = 0.0
+    c1 = 0.0
+    c2 = 0.0
+    c3 = 0.0
     still = (0.0, 0.0, 0.0)
     origin = corner_from(vertices, faces[0, 0], still)
     for f in range(len(faces)):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        i = faces[f, 0]
+        j = faces[f, 1]
+        k = faces[f, 2]
         p = corner_from(vertices, i, origin)
         q = corner_from(vertices, j, origin)
         r = corner_from(vertices, k, origin)
@@ -189,8 +215,8 @@ def volume_cubic(vertices, faces, direction):
 
 @compiled
 def touching_balls(points, normals, steps, nearest):
-    """Radii ``steps`` (2, n) of the empty balls that touch each point from outside and inside, infinite where no
-    point limits them, and how far the nearest other point is.
+    """Radii ``steps`` (2, n) of the empty balls that touch each point from outside and inside,
+    infinite where no point limits them, and how far the nearest other point is.
     """
     for i in range(len(points)):
         steps[:, i] = np.inf

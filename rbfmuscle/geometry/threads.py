@@ -1,4 +1,6 @@
-"""Large loops over points, split over a few threads; the loops themselves are serial and release the lock."""
+"""Large loops over points, split over a few threads; the loops themselves are serial and release
+the lock.
+"""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -40,12 +42,14 @@ def each(act: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
 
 
 def in_chunks(count: int, work: Callable[[int, int], object], *, least: int = LEAST_SHARE) -> None:
-    """Call ``work(start, stop)`` over the range of ``count``, on at most ``numba.get_num_threads()`` threads.
+    """Call ``work(start, stop)`` over the range of ``count``, on at most
+    ``numba.get_num_threads()`` threads.
 
-    The number of threads is the caller's own (numba keeps it for each thread), so what already runs in
-    parallel sets it to one and stays serial here.
+    The number of threads is the caller's own (numba keeps it for each thread), so what already runs
+    in parallel sets it to one and stays serial here.
     """
-    # Small questions are asked by the dozen in a frame, and asking for the number of threads takes longer than they do.
+    # Small questions are asked by the dozen in a frame, and asking for the number of threads takes
+    # longer than they do.
     workers = min(numba.get_num_threads(), count // least) if count >= 2 * least else 1
     if workers < 2:
         work(0, count)

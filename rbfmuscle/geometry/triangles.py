@@ -1,9 +1,9 @@
 """Distance from a point to a triangle, and the normals that give it a sign.
 
-Each triangle has a record: a plane frame with the longest edge on its x-axis. In that frame the two angles at
-the x-axis are acute, so the nearest feature follows from a few comparisons. A triangle of zero area is its
-longest edge. The sign comes from angle-weighted pseudonormals (Baerentzen & Aanaes 2005, "Signed distance
-computation using the angle weighted pseudonormal").
+Each triangle has a record: a plane frame with the longest edge on its x-axis. In that frame the two
+angles at the x-axis are acute, so the nearest feature follows from a few comparisons. A triangle of
+zero area is its longest edge. The sign comes from angle-weighted pseudonormals (Baerentzen & Aanaes
+2005, "Signed distance computation using the angle weighted pseudonormal").
 """
 
 import numpy as np
@@ -11,18 +11,27 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.jit import compiled
 
-# Columns of a record: corner A, x-axis, y-axis, normal, then x of B, x and y of C, and 1/|BC|^2, 1/|CA|^2.
+# Columns of a record: corner A, x-axis, y-axis, normal, then x of B, x and y of C, and 1/|BC|^2,
+# 1/|CA|^2.
 WIDTH = 18
-BX, CX, CY, INVERSE_BC, INVERSE_CA = 12, 13, 14, 15, 16
+BX = 12
+CX = 13
+CY = 14
+INVERSE_BC = 15
+INVERSE_CA = 16
 # The last column tells which corner of the face is A.
 FIRST = 17
 # Features: the face, the edges AB, BC, CA, the corners A, B, C.
-FACE, EDGE, CORNER = 0, 1, 4
+FACE = 0
+EDGE = 1
+CORNER = 4
 
 
 @compiled
 def fill_records(vertices, faces, order, records):
-    """Fill ``records`` (m, WIDTH) with the frames of the triangles ``faces[order]``; zero area is allowed."""
+    """Fill ``records`` (m, WIDTH) with the frames of the triangles ``faces[order]``; zero area is
+    allowed.
+    """
     length = np.empty(3)
     corner = np.empty((3, 3))
     for n in range(len(order)):
@@ -45,7 +54,9 @@ def fill_records(vertices, faces, order, records):
 
 @compiled
 def _fill_record(corner, record):
-    bx, along, cy = 0.0, 0.0, 0.0
+    bx = 0.0
+    along = 0.0
+    cy = 0.0
     for j in range(3):
         record[j] = corner[0, j]
         record[3 + j] = corner[1, j] - corner[0, j]
@@ -55,7 +66,9 @@ def _fill_record(corner, record):
         for j in range(3):
             record[3 + j] /= bx
     else:
-        record[3], record[4], record[5] = 1.0, 0.0, 0.0
+        record[3] = 1.0
+        record[4] = 0.0
+        record[5] = 0.0
     for j in range(3):
         along += (corner[2, j] - corner[0, j]) * record[3 + j]
     for j in range(3):
@@ -71,7 +84,9 @@ def _fill_record(corner, record):
     for j in range(3):
         a, b = (j + 1) % 3, (j + 2) % 3
         record[9 + j] = record[3 + a] * record[6 + b] - record[3 + b] * record[6 + a]
-    record[BX], record[CX], record[CY] = bx, along, cy
+    record[BX] = bx
+    record[CX] = along
+    record[CY] = cy
     bc, ca = (along - bx) ** 2 + cy**2, along**2 + cy**2
     record[INVERSE_BC] = 1.0 / bc if bc > 0.0 else 0.0
     record[INVERSE_CA] = 1.0 / ca if ca > 0.0 else 0.0
@@ -91,7 +106,9 @@ def _any_normal(record):
 
 @compiled(inline="always")
 def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
-    """In-plane offset from the triangle to (x, y), and the feature nearest to it: ``(dx, dy, feature)``."""
+    """In-plane offset from the triangle to (x, y), and the feature nearest to it: ``(dx, dy,
+    feature)``.
+    """
     if y <= 0.0 or cy <= 0.0:
         if x <= 0.0:
             return x, y, CORNER
@@ -103,7 +120,10 @@ def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
     beyond_ca = y * cx - x * cy
     if beyond_bc <= 0.0 and beyond_ca <= 0.0:
         return 0.0, 0.0, FACE
-    best, dx, dy, feature = np.inf, 0.0, 0.0, FACE
+    best = np.inf
+    dx = 0.0
+    dy = 0.0
+    feature = FACE
     if beyond_bc > 0.0:
         t = ((x - bx) * (cx - bx) + y * cy) * inverse_bc
         feature = CORNER + 1 if t <= 0.0 else (CORNER + 2 if t >= 1.0 else EDGE + 1)
@@ -122,8 +142,9 @@ def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
 def pseudonormals(vertices: Floats, faces: Integers, across: Integers) -> tuple[Floats, Floats]:
     """Directions that sign a distance, of edges (m, 3, 3) and of vertices (n, 3).
 
-    Edge k of a face takes the sum of the unit normals of the face and of that ``across`` (m, 3) it, below zero where
-    there is none; a vertex takes the normals weighted by their angle. Faces without area have no normal.
+    Edge k of a face takes the sum of the unit normals of the face and of that ``across`` (m, 3) it,
+    below zero where there is none; a vertex takes the normals weighted by their angle. Faces
+    without area have no normal.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     u, v = b - a, c - a
@@ -141,23 +162,25 @@ def pseudonormals(vertices: Floats, faces: Integers, across: Integers) -> tuple[
 @compiled
 def _dot(a, b, p, q):
     """(b - a) . (p - q), without temporary arrays."""
-    return (b[0] - a[0]) * (p[0] - q[0]) + (b[1] - a[1]) * (p[1] - q[1]) + (b[2] - a[2]) * (p[2] - q[2])
+    return (
+        (b[0] - a[0]) * (p[0] - q[0])
+        + (b[1] - a[1]) * (p[1] - q[1])
+        + (b[2] - a[2]) * (p[2] - q[2])
+    )
 
 
 @compiled
 def triangle_normal(vertices, faces, f):
     """Normal of a triangle, twice its area long."""
-    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-    ux, uy, uz = (
-        vertices[b, 0] - vertices[a, 0],
-        vertices[b, 1] - vertices[a, 1],
-        vertices[b, 2] - vertices[a, 2],
-    )
-    vx, vy, vz = (
-        vertices[c, 0] - vertices[a, 0],
-        vertices[c, 1] - vertices[a, 1],
-        vertices[c, 2] - vertices[a, 2],
-    )
+    a = faces[f, 0]
+    b = faces[f, 1]
+    c = faces[f, 2]
+    ux = vertices[b, 0] - vertices[a, 0]
+    uy = vertices[b, 1] - vertices[a, 1]
+    uz = vertices[b, 2] - vertices[a, 2]
+    vx = vertices[c, 0] - vertices[a, 0]
+    vy = vertices[c, 1] - vertices[a, 1]
+    vz = vertices[c, 2] - vertices[a, 2]
     return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
 
 
@@ -177,7 +200,9 @@ def nearest_weights(p, a, b, c, weights):
     if d6 >= 0.0 and d5 <= d6:
         weights[2] = 1.0
         return
-    vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
+    vc = d1 * d4 - d3 * d2
+    vb = d5 * d2 - d1 * d6
+    va = d3 * d6 - d5 * d4
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
         weights[1] = d1 / (d1 - d3)
         weights[0] = 1.0 - weights[1]

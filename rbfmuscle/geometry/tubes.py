@@ -25,9 +25,11 @@ def points_along(line: Floats, places: Floats) -> Floats:
 
 
 def tube_mesh(line: Floats, radii: Floats) -> tuple[Floats, Integers]:
-    """Rings about the points (n, 3) of a line, closed by a vertex at either end; and outward faces (m, 3).
+    """Rings about the points (n, 3) of a line, closed by a vertex at either end; and outward faces
+    (m, 3).
 
-    Vertices are ring by ring, then both ends; neighbouring rings are turned as little as they can be.
+    Vertices are ring by ring, then both ends; neighbouring rings are turned as little as they can
+    be.
     """
     first, second = _frames(line)
     angles = np.linspace(0.0, 2.0 * np.pi, SIDES, endpoint=False)
@@ -37,7 +39,9 @@ def tube_mesh(line: Floats, radii: Floats) -> tuple[Floats, Integers]:
 
 
 def _frames(line: Floats) -> tuple[Floats, Floats]:
-    """Unit vectors (n, 3) across a line that turn with it as little as they can, and those across both."""
+    """Unit vectors (n, 3) across a line that turn with it as little as they can, and those across
+    both.
+    """
     ahead = np.gradient(line, axis=0)
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-300)
     across = np.empty_like(line)
@@ -54,7 +58,9 @@ def _tube_faces(rings: int) -> Integers:
     after = np.roll(side, -1)
     base = SIDES * np.arange(rings - 1)[:, None]
     a, b, c, d = (base + k for k in (side, after, SIDES + side, SIDES + after))
-    wall = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(-1, 3)
+    wall = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(
+        -1, 3
+    )
     last, tips = SIDES * (rings - 1), SIDES * rings
     fans = [
         np.stack([np.full(SIDES, tips), after, side], axis=-1),

@@ -9,7 +9,9 @@ from rbfmuscle.jit import compiled
 
 
 def inside_test(vertices: Floats, faces: Integers) -> Callable[[Floats], Booleans]:
-    """``inside(points) -> (n,) bool`` by fast generalised winding numbers (Barill 2018), for meshes with holes too."""
+    """``inside(points) -> (n,) bool`` by fast generalised winding numbers (Barill 2018), for meshes
+    with holes too.
+    """
     import igl
 
     tree = igl.FastWindingNumberBVH()
@@ -23,15 +25,23 @@ def inside_test(vertices: Floats, faces: Integers) -> Callable[[Floats], Boolean
 
 @compiled(error_model="numpy")
 def winding_loop(vertices, faces, points, out):
-    """Winding numbers (n,) of a few points by the sum over all triangles' solid angles, without a tree.
+    """Winding numbers (n,) of a few points by the sum over all triangles' solid angles, without a
+    tree.
 
     Van Oosterom & Strackee 1983, "The solid angle of a plane triangle".
     """
-    a, b, c = np.empty(3), np.empty(3), np.empty(3)
+    a = np.empty(3)
+    b = np.empty(3)
+    c = np.empty(3)
     for q in range(len(points)):
         total = 0.0
         for f in range(len(faces)):
-            aa, bb, cc, ab, bc, ca = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            aa = 0.0
+            bb = 0.0
+            cc = 0.0
+            ab = 0.0
+            bc = 0.0
+            ca = 0.0
             for k in range(3):
                 a[k] = vertices[faces[f, 0], k] - points[q, k]
                 b[k] = vertices[faces[f, 1], k] - points[q, k]
@@ -42,7 +52,9 @@ def winding_loop(vertices, faces, points, out):
                 ab += a[k] * b[k]
                 bc += b[k] * c[k]
                 ca += c[k] * a[k]
-            x, y, z = np.sqrt(aa), np.sqrt(bb), np.sqrt(cc)
+            x = np.sqrt(aa)
+            y = np.sqrt(bb)
+            z = np.sqrt(cc)
             volume = (
                 a[0] * (b[1] * c[2] - b[2] * c[1])
                 + a[1] * (b[2] * c[0] - b[0] * c[2])

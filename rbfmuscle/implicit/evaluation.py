@@ -1,6 +1,7 @@
 """Values and gradients of an RBF field at many points.
 
-Points are handled in blocks that stay in the first-level cache; the inner loops run over the points of a block.
+Points are handled in blocks that stay in the first-level cache; the inner loops run over the points
+of a block.
 """
 
 from typing import NamedTuple
@@ -26,10 +27,11 @@ NEAR = 0.15
 class Terms(NamedTuple):
     """A field of P local fits of n centres each, as the loops read it.
 
-    In the coordinates of a fit, (points - origin) / scale with ``origin`` (P, 3) and ``scale`` (P,): ``centres``
-    (P, 3, n); ``a`` (P, n) and ``b`` (P, 3, n) are the weights of the values and of the derivatives, which count where
-    ``hermite``; ``epsilon`` (P,); ``coefficients`` (P, q) and ``powers`` (q, 3) are the polynomial's. A fit counts in a
-    ball, in the caller's coordinates, with ``middle`` (P, 3) and ``radius`` (P,); a single fit counts everywhere.
+    In the coordinates of a fit, (points - origin) / scale with ``origin`` (P, 3) and ``scale``
+    (P,): ``centres`` (P, 3, n); ``a`` (P, n) and ``b`` (P, 3, n) are the weights of the values and
+    of the derivatives, which count where ``hermite``; ``epsilon`` (P,); ``coefficients`` (P, q) and
+    ``powers`` (q, 3) are the polynomial's. A fit counts in a ball, in the caller's coordinates,
+    with ``middle`` (P, 3) and ``radius`` (P,); a single fit counts everywhere.
     """
 
     origin: np.ndarray
@@ -45,8 +47,12 @@ class Terms(NamedTuple):
     radius: np.ndarray
 
 
-def evaluate(points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool) -> tuple[Floats, Floats]:
-    """A field's values (n,) at points (n, 3), and its gradients (n, 3) by these, which are empty where not wanted."""
+def evaluate(
+    points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool
+) -> tuple[Floats, Floats]:
+    """A field's values (n,) at points (n, 3), and its gradients (n, 3) by these, which are empty
+    where not wanted.
+    """
     count = len(points)
     value, gradient = np.empty(count), np.empty((count if with_gradient else 0, 3))
     form = None if kernel.plain_cube and bool((terms.epsilon == 1.0).all()) else kernel.form
@@ -58,19 +64,24 @@ def evaluate(points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool) 
     return value, gradient
 
 
-# The length of a block is a multiple of a cache line, so that all rows are contiguous and filled alike. The cubic
-# kernel has a loop of its own; without a form nothing else is compiled, so that muscles need not wait for the others.
+# The length of a block is a multiple of a cache line, so that all rows are contiguous and filled
+# alike. The cubic kernel has a loop of its own; without a form nothing else is compiled, so that
+# muscles need not wait for the others.
 
 
 @compiled(error_model="numpy")
 def _evaluate_loop(points, terms, form, start, stop, value, gradient):
-    """Value and, where there is room for it, gradient at points[start:stop]; form None is the cube with epsilon 1."""
+    """Value and, where there is room for it, gradient at points[start:stop]; form None is the cube
+    with epsilon 1.
+    """
     wanted, rows = len(gradient) > 0, np.empty(_BLOCK, np.int64)
     for low in range(start, stop, _CHUNK):
         x = points[low : min(low + _CHUNK, stop)]
         shares, growth, total = _shares_loop(x, terms)
         for fit in range(len(shares)):
-            first = np.int64(0)  # of the type that `_fill_block` returns, which is then compiled once
+            first = np.int64(
+                0
+            )  # of the type that `_fill_block` returns, which is then compiled once
             while first < len(x):
                 first, p, acc, g = _fill_block(x, terms, fit, shares, first, rows)
                 if p.shape[1] == 0:  # no point in this fit
@@ -87,9 +98,9 @@ def _evaluate_loop(points, terms, form, start, stop, value, gradient):
 def _shares_loop(x, terms):
     """Where points (n, 3) lie in the balls of the fits, and zeros (8, n) for sums over these.
 
-    Squared distances (P, n) from the middles over the squared radii, 0 for a single fit. For points beyond `RIM` of all
-    balls these grow until the nearest is met there: by what the squares are multiplied then, and the derivatives of its
-    logarithm, halved, are (4, n).
+    Squared distances (P, n) from the middles over the squared radii, 0 for a single fit. For points
+    beyond `RIM` of all balls these grow until the nearest is met there: by what the squares are
+    multiplied then, and the derivatives of its logarithm, halved, are (4, n).
     """
     fits, n = len(terms.middle), len(x)
     shares, growth = np.zeros((fits, n)), np.zeros((4, n))
@@ -98,7 +109,9 @@ def _shares_loop(x, terms):
         for k in range(fits):
             (a, b, c), scale = terms.middle[k], 1.0 / terms.radius[k] ** 2
             for i in range(n):
-                shares[k, i] = scale * ((x[i, 0] - a) ** 2 + (x[i, 1] - b) ** 2 + (x[i, 2] - c) ** 2)
+                shares[k, i] = scale * (
+                    (x[i, 0] - a) ** 2 + (x[i, 1] - b) ** 2 + (x[i, 2] - c) ** 2
+                )
         for i in range(n):
             nearest = 0
             for k in range(fits):
@@ -116,10 +129,11 @@ def _shares_loop(x, terms):
 
 @compiled(error_model="numpy")
 def _fill_block(x, terms, fit, shares, first, rows):
-    """The next points that lie in a fit's ball, from the first on: where to go on, and these in the fit's coordinates.
+    """The next points that lie in a fit's ball, from the first on: where to go on, and these in the
+    fit's coordinates.
 
-    Their numbers are put into ``rows`` (`_BLOCK`,), -1 after the last; the points are (3, m), the last repeated, and
-    zeros (m,) and (3, m) to add to.
+    Their numbers are put into ``rows`` (`_BLOCK`,), -1 after the last; the points are (3, m), the
+    last repeated, and zeros (m,) and (3, m) to add to.
     """
     count = 0
     while first < len(x) and count < _BLOCK:
@@ -140,11 +154,17 @@ def _fill_block(x, terms, fit, shares, first, rows):
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def _closeness_loop(p, centres, soft, gradient, out):
-    """Add the sum over a fit's centres of 1 / (distance^2 + soft^2)^4 at points (3, m), and its gradient, to (4, m)."""
+    """Add the sum over a fit's centres of 1 / (distance^2 + soft^2)^4 at points (3, m), and its
+    gradient, to (4, m).
+    """
     for j in range(centres.shape[1]):
-        cx, cy, cz = centres[0, j], centres[1, j], centres[2, j]
+        cx = centres[0, j]
+        cy = centres[1, j]
+        cz = centres[2, j]
         for i in range(p.shape[1]):
-            dx, dy, dz = p[0, i] - cx, p[1, i] - cy, p[2, i] - cz
+            dx = p[0, i] - cx
+            dy = p[1, i] - cy
+            dz = p[2, i] - cz
             q = 1.0 / (dx * dx + dy * dy + dz * dz + soft * soft)
             v = (q * q) * (q * q)
             out[0, i] += v
@@ -159,10 +179,12 @@ def _closeness_loop(p, centres, soft, gradient, out):
 def _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total):
     """Add a fit's weight w, w f, and the gradients of both, to their sums (8, n).
 
-    w is (1 - t^2)^2 at t of the ball's radius, times how close the fit's own centres are: a sheet of another
-    part of the muscle may have come into the ball, of which the fit knows nothing.
+    w is (1 - t^2)^2 at t of the ball's radius, times how close the fit's own centres are: a sheet
+    of another part of the muscle may have come into the ball, of which the fit knows nothing.
     """
-    size, radius, single = terms.scale[fit], terms.radius[fit], len(terms.middle) == 1
+    size = terms.scale[fit]
+    radius = terms.radius[fit]
+    single = len(terms.middle) == 1
     near = np.zeros((4, p.shape[1]))
     if not single:
         _closeness_loop(p, terms.centres[fit], NEAR * radius / size, wanted, near)
@@ -176,7 +198,10 @@ def _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total):
         total[0, i] += ball * close
         total[1, i] += ball * close * acc[n]
         for c in range(3):
-            away = growth[0, i] * (x[i, c] - terms.middle[fit, c]) + share * radius**2 * growth[1 + c, i]
+            away = (
+                growth[0, i] * (x[i, c] - terms.middle[fit, c])
+                + share * radius**2 * growth[1 + c, i]
+            )
             slope = steep * away * close + ball * near[1 + c, n] / size**9
             total[2 + c, i] += slope
             total[5 + c, i] += ball * close * g[c, n] / size + slope * acc[n]
@@ -189,7 +214,9 @@ def _give_loop(low, total, value, gradient):
         value[low + i] = total[1, i] / total[0, i]
         if len(gradient) > 0:
             for c in range(3):
-                gradient[low + i, c] = (total[5 + c, i] - value[low + i] * total[2 + c, i]) / total[0, i]
+                gradient[low + i, c] = (total[5 + c, i] - value[low + i] * total[2 + c, i]) / total[
+                    0, i
+                ]
 
 
 @compiled(error_model="numpy")
@@ -198,7 +225,9 @@ def _general_block_loop(terms, fit, form, gradient, p, acc, g):
     d, u = np.empty_like(p), np.empty_like(acc)
     work, radial = np.empty((3, u.size)), np.empty((3, u.size))
     hermite, epsilon = terms.hermite, terms.epsilon[fit]
-    centres, weight, slope = terms.centres[fit], terms.a[fit], terms.b[fit]
+    centres = terms.centres[fit]
+    weight = terms.a[fit]
+    slope = terms.b[fit]
     wanted = (2 << (int(gradient) + int(hermite))) - 1
     e2, ball = epsilon * epsilon, _ball(p)
     for j in range(centres.shape[1]):
@@ -230,7 +259,9 @@ def _ball(p):
 @compiled(error_model="numpy")
 def _out_of_reach(ball, at, epsilon):
     """Whether a kernel that ends at 1 / epsilon is zero in the whole ball."""
-    dx, dy, dz = ball[0] - at[0], ball[1] - at[1], ball[2] - at[2]
+    dx = ball[0] - at[0]
+    dy = ball[1] - at[1]
+    dz = ball[2] - at[2]
     reach = ball[3] + 1.0 / epsilon
     return dx * dx + dy * dy + dz * dz >= reach * reach
 
@@ -253,7 +284,10 @@ def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
     """Adds a fit's polynomial to acc, its gradient to g."""
     term = np.empty_like(acc)
     for q in range(len(coefficients)):
-        c, i, j, k = coefficients[q], powers[q, 0], powers[q, 1], powers[q, 2]
+        c = coefficients[q]
+        i = powers[q, 0]
+        j = powers[q, 1]
+        k = powers[q, 2]
         _monomial_loop(p, i, j, k, c, term, acc)
         if gradient and i > 0:
             _monomial_loop(p, i - 1, j, k, c * i, term, g[0])
@@ -266,7 +300,9 @@ def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
 @compiled(error_model="numpy")
 def _cubic_block_loop(terms, fit, wanted, p, acc, g):
     """The cubic kernel with epsilon 1."""
-    centres, a, b = terms.centres[fit], terms.a[fit], terms.b[fit]
+    centres = terms.centres[fit]
+    a = terms.a[fit]
+    b = terms.b[fit]
     for j in range(centres.shape[1]):
         at, slope = (centres[0, j], centres[1, j], centres[2, j]), (b[0, j], b[1, j], b[2, j])
         if wanted:
@@ -281,7 +317,9 @@ def _cubic_value_loop(p, at, a, b, acc):
     """acc += a r^3 - 3 r (B . d)."""
     bx, by, bz = b
     for i in range(acc.size):
-        dx, dy, dz = p[0, i] - at[0], p[1, i] - at[1], p[2, i] - at[2]
+        dx = p[0, i] - at[0]
+        dy = p[1, i] - at[1]
+        dz = p[2, i] - at[2]
         u = dx * dx + dy * dy + dz * dz
         acc[i] += np.sqrt(u) * (a * u - 3.0 * (bx * dx + by * dy + bz * dz))
 
@@ -291,7 +329,9 @@ def _cubic_gradient_loop(p, at, a, b, acc, g):
     """Adds 3 a r d - 3 r B - 3/r (B . d) d to g, the value to acc."""
     bx, by, bz = b
     for i in range(acc.size):
-        dx, dy, dz = p[0, i] - at[0], p[1, i] - at[1], p[2, i] - at[2]
+        dx = p[0, i] - at[0]
+        dy = p[1, i] - at[1]
+        dz = p[2, i] - at[2]
         u = dx * dx + dy * dy + dz * dz + 1e-300
         r = np.sqrt(u)
         bd = 3.0 * (bx * dx + by * dy + bz * dz)
@@ -307,7 +347,9 @@ def _cubic_gradient_loop(p, at, a, b, acc, g):
 def _offsets_loop(p, at, e2, d, u):
     """d = p - centre, u = e2 |d|^2."""
     for i in range(u.size):
-        dx, dy, dz = p[0, i] - at[0], p[1, i] - at[1], p[2, i] - at[2]
+        dx = p[0, i] - at[0]
+        dy = p[1, i] - at[1]
+        dz = p[2, i] - at[2]
         d[0, i] = dx
         d[1, i] = dy
         d[2, i] = dz

@@ -1,9 +1,11 @@
-"""RBFField: a scalar field f, negative inside, whose zero set is the surface; how those of muscles are fitted.
+"""RBFField: a scalar field f, negative inside, whose zero set is the surface; how those of muscles
+are fitted.
 
-f(x) = sum_j a_j phi(|x - c_j|) - B_j . grad phi(x - c_j) + p(x), with B = 0 for a fit to values. The field of a muscle
-is a blend of such fits, each to a few centres that are near each other at rest: sum_p w_p f_p / sum_p w_p with weights
-that fall from the middle of a fit to zero at its farthest centre (a partition of unity; Wendland 2002, "Fast evaluation
-of radial basis functions: methods based on partition of unity"). Its time grows as the number of centres does.
+f(x) = sum_j a_j phi(|x - c_j|) - B_j . grad phi(x - c_j) + p(x), with B = 0 for a fit to values.
+The field of a muscle is a blend of such fits, each to a few centres that are near each other at
+rest: sum_p w_p f_p / sum_p w_p with weights that fall from the middle of a fit to zero at its
+farthest centre (a partition of unity; Wendland 2002, "Fast evaluation of radial basis functions:
+methods based on partition of unity"). Its time grows as the number of centres does.
 """
 
 import warnings
@@ -70,17 +72,29 @@ class RBFField:
             raise UsageError(f"smoothing must be a number of at least 0, got {smoothing}")
         if not condition >= 1.0:
             raise UsageError(f"condition must be at least 1, got {condition}")
-        weights, coefficients, self.condition = solve(basis, right, smoothing=smoothing, condition=condition)
-        self.centres, self.kernel, self.epsilon = basis.centres, basis.kernel, epsilon
+        weights, coefficients, self.condition = solve(
+            basis, right, smoothing=smoothing, condition=condition
+        )
+        self.centres = basis.centres
+        self.kernel = basis.kernel
+        self.epsilon = epsilon
         fits, count = basis.parts.shape
         rows = weights.reshape(fits, -1, count)
         middle = basis.centres[basis.parts[:, 0]]
         away = basis.centres[basis.parts] - middle[:, None]
         self.terms = Terms(
-            basis.origin, basis.scale, basis.points, rows[:, 0].copy(),
-            rows[:, 1:].copy() if basis.hermite else np.zeros((fits, 3, count)), basis.hermite, basis.epsilon,
-            coefficients, basis.powers, middle, np.sqrt(np.einsum("pnc,pnc->pn", away, away).max(axis=1)),
-        )  # fmt: skip
+            basis.origin,
+            basis.scale,
+            basis.points,
+            rows[:, 0].copy(),
+            rows[:, 1:].copy() if basis.hermite else np.zeros((fits, 3, count)),
+            basis.hermite,
+            basis.epsilon,
+            coefficients,
+            basis.powers,
+            middle,
+            np.sqrt(np.einsum("pnc,pnc->pn", away, away).max(axis=1)),
+        )
 
     @classmethod
     def fit(
@@ -103,7 +117,8 @@ class RBFField:
         values : (K,) array_like
         kernel : str or Kernel
         epsilon : float
-            Shape parameter [1/scene unit]; without effect on the interpolant of polyharmonic kernels.
+            Shape parameter [1/scene unit]; without effect on the interpolant of polyharmonic
+            kernels.
         smoothing : float
             Added to the diagonal, in coordinates scaled to order one; 0 interpolates.
         condition : float
@@ -178,7 +193,9 @@ class RBFField:
         return evaluate(check_points(points), self.terms, self.kernel, True)
 
     def surface(self, resolution: int = 64) -> "trimesh.Trimesh":
-        """Zero set as a closed outward ``trimesh.Trimesh``; resolution in cells along the longest side."""
+        """Zero set as a closed outward ``trimesh.Trimesh``; resolution in cells along the longest
+        side.
+        """
         import trimesh
 
         from rbfmuscle.implicit.extraction.surface import extract_surface
@@ -188,14 +205,17 @@ class RBFField:
 
 
 def _warn_if_narrow(fitted: RBFField, points: Floats, normals: Floats) -> None:
-    """Warn where the field does not rise outwards between its centres: the kernel does not reach that far."""
+    """Warn where the field does not rise outwards between its centres: the kernel does not reach
+    that far.
+    """
     if len(points) < 20:
         return  # too few to say what lies between them
     near = cKDTree(points).query(points, k=6)[1][:, 5]
     slope = np.einsum("ij,ij->i", fitted.gradient(0.5 * (points + points[near])), normals)
     if np.median(slope) < 0.5 * np.median(np.linalg.norm(normals, axis=1)):
         warnings.warn(
-            f"kernel '{fitted.kernel.name}' with epsilon {fitted.epsilon:.3g} does not reach from centre to centre: "
+            f"kernel '{fitted.kernel.name}' with epsilon {fitted.epsilon:.3g} does not reach from "
+            "centre to centre: "
             "the field is flat between them and shows no surface; lower epsilon or add centres",
             NumericalWarning,
             stacklevel=4,
@@ -206,7 +226,8 @@ def _warn_if_narrow(fitted: RBFField, points: Floats, normals: Floats) -> None:
 class FieldFit:
     """How the field through a muscle's centres is fitted.
 
-    ``epsilon`` is the kernel's shape parameter [1 / length], ``condition`` the bound that a ridge keeps.
+    ``epsilon`` is the kernel's shape parameter [1 / length], ``condition`` the bound that a ridge
+    keeps.
     """
 
     kernel: Kernel
@@ -214,14 +235,19 @@ class FieldFit:
     condition: float = np.inf
 
     def fit(self, centres: Floats, normals: Floats, parts: Integers | None = None) -> RBFField:
-        """The field through centres (K, 3) with unit normals (K, 3), of local fits to ``parts`` (P, n) of them.
+        """The field through centres (K, 3) with unit normals (K, 3), of local fits to ``parts`` (P,
+        n) of them.
 
-        The parts are `overlapping_parts` of the centres, or of where these are at rest. Hermite fits where the kernel
-        is C2. Else fits to values on the surface and off it: three centres for each point, and normals only as good as
-        finite differences.
+        The parts are `overlapping_parts` of the centres, or of where these are at rest. Hermite
+        fits where the kernel is C2. Else fits to values on the surface and off it: three centres
+        for each point, and normals only as good as finite differences.
         """
         parts = overlapping_parts(centres) if parts is None else parts
-        how: dict[str, Any] = {"kernel": self.kernel, "epsilon": self.epsilon, "condition": self.condition}
+        how: dict[str, Any] = {
+            "kernel": self.kernel,
+            "epsilon": self.epsilon,
+            "condition": self.condition,
+        }
         if self.kernel.hermite:
             return RBFField.fit_hermite(centres, normals, parts=parts, **how)
         three = np.hstack([parts + k * len(centres) for k in range(3)])
@@ -232,10 +258,11 @@ class FieldFit:
 
 
 def overlapping_parts(points: Floats) -> Integers:
-    """Parts (P, n) of points (K, 3): `PART` nearest to one of them, which comes first, or all where there are few.
+    """Parts (P, n) of points (K, 3): `PART` nearest to one of them, which comes first, or all where
+    there are few.
 
-    Every point is among the first `COVERED` of a part: the middle of the next is always the point without one that is
-    farthest from the middles so far.
+    Every point is among the first `COVERED` of a part: the middle of the next is always the point
+    without one that is farthest from the middles so far.
     """
     if len(points) <= PART:
         return np.arange(len(points))[None]
@@ -251,15 +278,19 @@ def overlapping_parts(points: Floats) -> Integers:
 
 
 def off_surface_points(points: Floats, normals: Floats) -> tuple[Floats, Floats]:
-    """Points (3K, 3) on, outside and inside a surface with signed distances (3K,) 0, +d and -d, for fits to values.
+    """Points (3K, 3) on, outside and inside a surface with signed distances (3K,) 0, +d and -d, for
+    fits to values.
 
-    Each point x (K, 3), two or more, with unit outward normal n gives f(x) = 0, f(x + d n) = d and f(x - d n) = -d
-    (Carr et al. 2001). The step d is half the median distance to the nearest other point, and at most half the radius
-    of the empty ball that touches the surface in x, so that x stays the nearest of all points to x + d n.
+    Each point x (K, 3), two or more, with unit outward normal n gives f(x) = 0, f(x + d n) = d and
+    f(x - d n) = -d (Carr et al. 2001). The step d is half the median distance to the nearest other
+    point, and at most half the radius of the empty ball that touches the surface in x, so that x
+    stays the nearest of all points to x + d n.
     """
     steps = np.empty((2, len(points)))
     nearest = np.empty(len(points))
     touching_balls(points, normals, steps, nearest)
     outside, inside = np.minimum(SAFETY * steps, 0.5 * np.median(nearest))
-    where = np.vstack([points, points + outside[:, None] * normals, points - inside[:, None] * normals])
+    where = np.vstack(
+        [points, points + outside[:, None] * normals, points - inside[:, None] * normals]
+    )
     return where, np.concatenate([np.zeros(len(points)), outside, -inside])

@@ -26,7 +26,8 @@ def _key(key):
 def table_text(
     head: str, row: Mapping[str, Any], comments: Mapping[str, str | list[str]] | None = None
 ) -> str:
-    """A table as TOML, lists of tables with one a line, after its first line ``head``, as ``[[bone]]``.
+    """A table as TOML, lists of tables with one a line, after its first line ``head``, as
+    ``[[bone]]``.
 
     ``comments`` stand after the line of a key, or after each table of its list.
     """

@@ -1,9 +1,10 @@
 """Length and sections of a muscle, and the shortest path over the bones between its ends.
 
-The length is that of a line through the slices of a harmonic field between origin and insertion. The path is a taut
-string of `NODES` nodes that starts along it: the nodes take the places where the sum of the segments' squared lengths
-is least while each is on the outer side of the plane that touches the nearest bone there. Planes are taken again until
-the nodes are where they were one or two rounds before.
+The length is that of a line through the slices of a harmonic field between origin and insertion.
+The path is a taut string of `NODES` nodes that starts along it: the nodes take the places where the
+sum of the segments' squared lengths is least while each is on the outer side of the plane that
+touches the nearest bone there. Planes are taken again until the nodes are where they were one or
+two rounds before.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -26,8 +27,9 @@ from rbfmuscle.scene.tendons import TendonLine
 
 _LEVELS = 120  # by which the line is measured at rest
 
-# Of origin or insertion each attachment: its bone or tendon, attached vertices (k, 3) at rest, and their areas (k,):
-# where triangles are small there are more vertices, which must not draw the end of a line there.
+# Of origin or insertion each attachment: its bone or tendon, attached vertices (k, 3) at rest, and
+# their areas (k,): where triangles are small there are more vertices, which must not draw the end
+# of a line there.
 End = list[tuple[str, Floats, Floats]]
 STATIONS = 48  # sections along the line of action
 CALIPERS = 36  # directions in which a section's width is taken
@@ -35,18 +37,22 @@ NODES = 33
 ROUNDS = 40  # in which planes are taken, at most
 STILL = 1e-4  # of the string's length: what counts as the same place
 SWEEPS, OVER_RELAXATION = 100, 1.8  # of a round
-RENEWED = 0.1  # of its distance to the nearest bone: a node that has moved farther gets another plane
+RENEWED = (
+    0.1  # of its distance to the nearest bone: a node that has moved farther gets another plane
+)
 # Nearer to a bone than this its distance is no way to tell the normal, in lengths of the string.
 TOUCHING = 1e-9
 
 
 class Centreline:
-    """The centreline of one muscle on a mesh of constant topology: vertices (n, 3) at rest [scene unit], faces (m, 3).
+    """The centreline of one muscle on a mesh of constant topology: vertices (n, 3) at rest [scene
+    unit], faces (m, 3).
 
-    The harmonic field is 0 on the origin and 1 on the insertion. So many slices are taken at levels whose centroids lie
-    evenly along the muscle at rest. Each centroid is a fixed linear combination of the vertices, so the line costs one
-    sparse product a frame. Its ends are the centroids of the attached patches of the input mesh, by area, carried by
-    their bones. Bones that no joint, or none of the ``moving`` ones, separates count as one.
+    The harmonic field is 0 on the origin and 1 on the insertion. So many slices are taken at levels
+    whose centroids lie evenly along the muscle at rest. Each centroid is a fixed linear combination
+    of the vertices, so the line costs one sparse product a frame. Its ends are the centroids of the
+    attached patches of the input mesh, by area, carried by their bones. Bones that no joint, or
+    none of the ``moving`` ones, separates count as one.
     """
 
     def __init__(
@@ -72,7 +78,9 @@ class Centreline:
         along = distance_along(fine @ vertices)
         even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
         self.operator = slice_operator(vertices, faces, field, even)
-        self._pulled: Floats | None = None  # from the points along the line to the last shortest path
+        self._pulled: Floats | None = (
+            None  # from the points along the line to the last shortest path
+        )
 
     def points(self, vertices: Floats, poses: Mapping[str, Floats]) -> Floats:
         """The line now, (k, 3), from the carried mesh (n, 3) and the poses (4, 4) of the bones."""
@@ -86,24 +94,34 @@ class Centreline:
     def measure(
         self, vertices: Floats, poses: dict[str, Floats], probes: list[BoneProbe]
     ) -> tuple[float, float]:
-        """Length of the line now, and over that of the shortest path, which begins beside it as in the last frame."""
+        """Length of the line now, and over that of the shortest path, which begins beside it as in
+        the last frame.
+        """
         line = self.points(vertices, poses)
         path = shortest_path(line, probes, poses, offset=self._pulled)
         self._pulled = path - resampled(line, NODES - 1) if len(path) == NODES else None
         length, shortest = float(distance_along(line)[-1]), float(distance_along(path)[-1])
         return length, length / shortest if shortest > 0.0 else np.nan
 
-    def section(self, vertices: ArrayLike, faces: ArrayLike, poses: Mapping[str, Floats]) -> dict[str, float]:
-        """`belly_measures` of a surface across the line between the middles of origin and insertion."""
+    def section(
+        self, vertices: ArrayLike, faces: ArrayLike, poses: Mapping[str, Floats]
+    ) -> dict[str, float]:
+        """`belly_measures` of a surface across the line between the middles of origin and
+        insertion.
+        """
         first, last = (_carried_middle(end, poses) for end in self.ends)
         return belly_measures(np.asarray(vertices), np.asarray(faces), first, last)
 
     def tendon_length(self, tendons: Mapping[str, TendonLine]) -> float:
-        """Length of the tendons at both ends now [scene unit]; of several attachments of an end the mean by area."""
+        """Length of the tendons at both ends now [scene unit]; of several attachments of an end the
+        mean by area.
+        """
         total = 0.0
         for end in self.ends:
             areas = [patch.sum() for _, _, patch in end]
-            lengths = [line_length(tendons[name].points) if name in tendons else 0.0 for name, _, _ in end]
+            lengths = [
+                line_length(tendons[name].points) if name in tendons else 0.0 for name, _, _ in end
+            ]
             total += float(np.average(lengths, weights=areas))
         return total
 
@@ -118,8 +136,9 @@ def split_ends(
 ) -> list[list[Attachment]]:
     """The attachments of the origin and those of the insertion.
 
-    The origin is every attachment on the same rigid body as the first one; the rest is the insertion. Bones whose joint
-    does not move are one body with its parent. Where all are on one body, the first attachment is the origin.
+    The origin is every attachment on the same rigid body as the first one; the rest is the
+    insertion. Bones whose joint does not move are one body with its parent. Where all are on one
+    body, the first attachment is the origin.
     """
     joint_of = {joint.child: joint for joint in joints}
 
@@ -141,18 +160,23 @@ def split_ends(
 def moving_joints(scene: Scene) -> set[str]:
     """Names of the joints that a scene's motion moves, those that follow others among them."""
     facts = all_coordinates(scene.joints)
-    names = {name for frame in scene.motion.frames for name, x in frame.items() if x != facts[name].rest}
+    names = {
+        name for frame in scene.motion.frames for name, x in frame.items() if x != facts[name].rest
+    }
     for coupling in scene.couplings:  # in an order in which what they follow is known
         if names & set(coupling.of):
             names.add(coupling.coordinate)
     return {name.rpartition(".")[0] for name in names}
 
 
-def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Floats) -> sparse.csr_matrix:
-    """Sparse matrix (k, n), rows of sum one, that maps vertices to the centroids of a field's isolines.
+def slice_operator(
+    vertices: Floats, faces: Integers, field: Floats, levels: Floats
+) -> sparse.csr_matrix:
+    """Sparse matrix (k, n), rows of sum one, that maps vertices to the centroids of a field's
+    isolines.
 
-    The isolines' lengths at ``vertices`` (n, 3) weigh the centroids; ``field`` is (n,), and ``levels`` (k,) lie
-    strictly between its least and its greatest value.
+    The isolines' lengths at ``vertices`` (n, 3) weigh the centroids; ``field`` is (n,), and
+    ``levels`` (k,) lie strictly between its least and its greatest value.
     """
     (a, b, c), (s, t), row = _crossed_edges(faces, field, np.asarray(levels, dtype=float))
     p = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
@@ -167,7 +191,9 @@ def slice_operator(vertices: Floats, faces: Integers, field: Floats, levels: Flo
 def isolines(
     vertices: Floats, faces: Integers, field: Floats, levels: Floats
 ) -> tuple[Floats, Floats, Integers]:
-    """Segments of a field's isolines on an outward surface, in one direction: start, end (s, 3), level's place (s,)."""
+    """Segments of a field's isolines on an outward surface, in one direction: start, end (s, 3),
+    level's place (s,).
+    """
     (a, b, c), (s, t), row = _crossed_edges(faces, field, levels)
     start = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
     end = vertices[a] + t[:, None] * (vertices[c] - vertices[a])
@@ -176,7 +202,9 @@ def isolines(
 
 
 def _crossed_edges(faces, field, levels):
-    """Of each face that an isoline crosses: the corner alone on its side, the others, shares of both edges, level."""
+    """Of each face that an isoline crosses: the corner alone on its side, the others, shares of
+    both edges, level.
+    """
     at_corner = field[faces]
     # Levels not below a face's least value and below its greatest.
     low, high = at_corner.min(axis=1)[:, None], at_corner.max(axis=1)[:, None]
@@ -190,7 +218,9 @@ def _crossed_edges(faces, field, levels):
 
 
 def _sides(muscle, ends, vertices):
-    """Carried vertices of origin and insertion: those whose nearest input vertex is attached there."""
+    """Carried vertices of origin and insertion: those whose nearest input vertex is attached
+    there.
+    """
     mesh = np.asarray(muscle.mesh.vertices, dtype=float)
     nearest = cKDTree(mesh).query(vertices)[1]
     sides = []
@@ -206,18 +236,27 @@ def _sides(muscle, ends, vertices):
 def _carried_middle(end: End, poses: Mapping[str, Floats]) -> Floats:
     """Middle (3,) of an end's patches where its bones (their poses (4, 4)) carry them."""
     placed = [(poses[bone], points, areas) for bone, points, areas in end]
-    moved = [pose[:3, :3] @ (areas @ points) + areas.sum() * pose[:3, 3] for pose, points, areas in placed]
+    moved = [
+        pose[:3, :3] @ (areas @ points) + areas.sum() * pose[:3, 3]
+        for pose, points, areas in placed
+    ]
     return np.sum(moved, axis=0) / sum(areas.sum() for *_, areas in placed)
 
 
-def belly_measures(vertices: Floats, faces: Integers, first: Floats, last: Floats) -> dict[str, float]:
-    """Greatest section of a closed surface across the line between two points (3,): area [unit²], place, width."""
+def belly_measures(
+    vertices: Floats, faces: Integers, first: Floats, last: Floats
+) -> dict[str, float]:
+    """Greatest section of a closed surface across the line between two points (3,): area [unit²],
+    place, width.
+    """
     length = float(np.linalg.norm(last - first))
     axis = (last - first) / length
     height = (vertices - first) @ axis
     places = height.min() + np.ptp(height) * (np.arange(STATIONS) + 0.5) / STATIONS
     start, end, station = isolines(vertices, faces, height, places)
-    areas = np.abs(np.bincount(station, 0.5 * np.cross(start - first, end - first) @ axis, STATIONS))
+    areas = np.abs(
+        np.bincount(station, 0.5 * np.cross(start - first, end - first) @ axis, STATIONS)
+    )
     best = int(np.argmax(areas))
     area, place = areas[best], places[best]
     if 0 < best < STATIONS - 1:
@@ -227,7 +266,11 @@ def belly_measures(vertices: Floats, faces: Integers, first: Floats, last: Float
         place += shift * (places[1] - places[0])
         area -= 0.25 * (before - after) * shift
     thickness = _thickness(start[station == best], axis)
-    return {"csa_max": float(area), "csa_place": float(place / length), "belly_thickness": thickness}
+    return {
+        "csa_max": float(area),
+        "csa_place": float(place / length),
+        "belly_thickness": thickness,
+    }
 
 
 def _thickness(points: Floats, axis: Floats) -> float:
@@ -244,11 +287,13 @@ def _thickness(points: Floats, axis: Floats) -> float:
 def shortest_path(
     line: Floats, probes: list[BoneProbe], poses: dict[str, Floats], *, offset: Floats | None = None
 ) -> Floats:
-    """Nodes (`NODES`, 3) of the shortest path over the bones between the ends of a line, beside which it begins.
+    """Nodes (`NODES`, 3) of the shortest path over the bones between the ends of a line, beside
+    which it begins.
 
-    ``line`` (n, 3) says which side of the bones the path takes; the bones have poses (4, 4) by name. ``offset``
-    (`NODES`, 3) leads from the points at even distances along the line to where the string begins: what it did in the
-    frame before. Two nodes only where nothing lies between the ends.
+    ``line`` (n, 3) says which side of the bones the path takes; the bones have poses (4, 4) by
+    name. ``offset`` (`NODES`, 3) leads from the points at even distances along the line to where
+    the string begins: what it did in the frame before. Two nodes only where nothing lies between
+    the ends.
     """
     chord = np.linspace(line[0], line[-1], NODES)
     near = bones_about(line, probes, poses)
@@ -276,7 +321,9 @@ def shortest_path(
 def _planes(
     points: Floats, probes: list[BoneProbe], poses: dict[str, Floats], least: float
 ) -> tuple[Floats, Floats]:
-    """Signed distance (n,) to the nearest bone and the unit normal (n, 3) of the plane that touches it there."""
+    """Signed distance (n,) to the nearest bone and the unit normal (n, 3) of the plane that touches
+    it there.
+    """
     gap, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
     for probe in probes:
         pose = poses[probe.name]
@@ -291,7 +338,9 @@ def _planes(
 
 @compiled(error_model="numpy")
 def _tighten_loop(string, normal, offset, sweeps, relaxation):
-    """Move inner nodes to where the squared segments are least with normal · node >= offset, by projected SOR."""
+    """Move inner nodes to where the squared segments are least with normal · node >= offset, by
+    projected SOR.
+    """
     for _ in range(sweeps):
         for n in range(1, len(string) - 1):
             along = -offset[n]

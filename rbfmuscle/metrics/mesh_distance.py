@@ -1,4 +1,6 @@
-"""Distances that are measured: exact, sure of their side where a mesh is folded or open; depths in each other."""
+"""Distances that are measured: exact, sure of their side where a mesh is folded or open; depths in
+each other.
+"""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -8,7 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, Layout, nearest_triangle, record_square
+from rbfmuscle.geometry.exact_distance import (
+    STACK,
+    ExactDistance,
+    Layout,
+    nearest_triangle,
+    record_square,
+)
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.jit import compiled
@@ -25,8 +33,9 @@ _HERE = np.eye(4)
 class _Grid(NamedTuple):
     """Cells of the plane across the columns and the triangles whose boxes meet each.
 
-    ``axes`` are x and y of the plane and z along the columns; ``items[starts[c] : starts[c + 1]]`` are the triangles
-    of cell ``c``, between heights ``ends[c]``; ``width`` is the number of cells along x.
+    ``axes`` are x and y of the plane and z along the columns; ``items[starts[c] : starts[c + 1]]``
+    are the triangles of cell ``c``, between heights ``ends[c]``; ``width`` is the number of cells
+    along x.
     """
 
     axes: NDArray[np.int64]
@@ -40,11 +49,13 @@ class _Grid(NamedTuple):
 
 
 class Columns:
-    """Counts how often a closed, consistently oriented mesh winds around points, along a line from each of them.
+    """Counts how often a closed, consistently oriented mesh winds around points, along a line from
+    each of them.
 
-    A triangle that the line leaves the mesh through counts one, one that it enters by minus one; the sum is the winding
-    number, exact also where the mesh is folded on itself. Edges are half open, so that a line through an edge or a
-    vertex is counted once. The line runs along the shortest side of the mesh's box.
+    A triangle that the line leaves the mesh through counts one, one that it enters by minus one;
+    the sum is the winding number, exact also where the mesh is folded on itself. Edges are half
+    open, so that a line through an edge or a vertex is counted once. The line runs along the
+    shortest side of the mesh's box.
     """
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
@@ -74,18 +85,29 @@ class Columns:
 
 @compiled(error_model="numpy")
 def _count_loop(vertices, faces, grid, covered):
-    """Cells that each triangle's box covers, by column and row, and in ``starts`` how many triangles each cell has."""
-    u, v, w = grid.axes[0], grid.axes[1], grid.axes[2]
-    x, y, fine = grid.low[u], grid.low[v], grid.fine
+    """Cells that each triangle's box covers, by column and row, and in ``starts`` how many
+    triangles each cell has.
+    """
+    u = grid.axes[0]
+    v = grid.axes[1]
+    w = grid.axes[2]
+    x = grid.low[u]
+    y = grid.low[v]
+    fine = grid.fine
     for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        a = faces[f, 0]
+        b = faces[f, 1]
+        c = faces[f, 2]
         left = int((min(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
         right = int((max(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
         near = int((min(vertices[a, v], vertices[b, v], vertices[c, v]) - y) * fine)
         far = int((max(vertices[a, v], vertices[b, v], vertices[c, v]) - y) * fine)
         bottom = min(vertices[a, w], vertices[b, w], vertices[c, w])
         top = max(vertices[a, w], vertices[b, w], vertices[c, w])
-        covered[f, 0], covered[f, 1], covered[f, 2], covered[f, 3] = left, right, near, far
+        covered[f, 0] = left
+        covered[f, 1] = right
+        covered[f, 2] = near
+        covered[f, 3] = far
         for j in range(near, far + 1):
             for cell in range(j * grid.width + left, j * grid.width + right + 1):
                 grid.starts[cell] += 1
@@ -105,11 +127,17 @@ def _sort_loop(covered, width, starts, items):
 
 @compiled(error_model="numpy")
 def _inside_loop(points, pose, vertices, faces, grid, out):
-    low, high, fine = grid.low, grid.high, grid.fine
-    u, v, w = grid.axes[0], grid.axes[1], grid.axes[2]
+    low = grid.low
+    high = grid.high
+    fine = grid.fine
+    u = grid.axes[0]
+    v = grid.axes[1]
+    w = grid.axes[2]
     at = np.empty(3)
     for n in range(len(points)):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        x = points[n, 0]
+        y = points[n, 1]
+        z = points[n, 2]
         outside = False
         for k in range(3):
             at[k] = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
@@ -127,13 +155,22 @@ def _inside_loop(points, pose, vertices, faces, grid, out):
 
 @compiled(error_model="numpy")
 def _above(at, vertices, faces, f, axes):
-    """One where a triangle lies above a point and looks up, minus one where it looks down, else zero."""
-    u, v, w = axes[0], axes[1], axes[2]
-    x, y, z = at[u], at[v], at[w]
+    """1 where a triangle lies above a point and looks up, -1 where it looks down, else 0."""
+    u = axes[0]
+    v = axes[1]
+    w = axes[2]
+    x = at[u]
+    y = at[v]
+    z = at[w]
     if max(vertices[faces[f, 0], w], vertices[faces[f, 1], w], vertices[faces[f, 2], w]) <= z:
         return 0
     found = 0
-    west, west_height, west_falls, east, east_height, east_falls = 0.0, 0.0, False, 0.0, 0.0, False
+    west = 0.0
+    west_height = 0.0
+    west_falls = False
+    east = 0.0
+    east_height = 0.0
+    east_falls = False
     for k in range(3):
         a, b = faces[f, k], faces[f, (k + 1) % 3]
         if (vertices[a, v] <= y) == (vertices[b, v] <= y):
@@ -145,14 +182,24 @@ def _above(at, vertices, faces, f, axes):
         height = vertices[p, w] + t * (vertices[q, w] - vertices[p, w])
         falls = vertices[a, v] > vertices[b, v]
         if found == 0:
-            west, west_height, west_falls = place, height, falls
+            west = place
+            west_height = height
+            west_falls = falls
         else:
-            east, east_height, east_falls = place, height, falls
+            east = place
+            east_height = height
+            east_falls = falls
         found += 1
     if found < 2:
         return 0
     if east < west:
-        west, west_height, west_falls, east, east_height = east, east_height, east_falls, west, west_height
+        west, west_height, west_falls, east, east_height = (
+            east,
+            east_height,
+            east_falls,
+            west,
+            west_height,
+        )
     if not (west <= x < east):
         return 0
     if west_height + (x - west) / (east - west) * (east_height - west_height) <= z:
@@ -161,16 +208,23 @@ def _above(at, vertices, faces, f, axes):
 
 
 class MeshDistance:
-    """Exact distance of points to an outward mesh (vertices (n, 3) [scene unit], faces (m, 3)); negative inside.
+    """Exact distance of points to an outward mesh (vertices (n, 3) [scene unit], faces (m, 3));
+    negative inside.
 
-    A point is inside where the mesh winds around it: counted exactly for closed meshes (`Columns`); for those with
-    holes the winding number exceeds one half (Jacobson et al. 2013; Barill et al. 2018). The trees are built at the
-    first call and kept, so that a bone's are built once, in the bone's own coordinates. ``layout`` is that of the same
-    faces at another moment, as `ExactDistance` takes it.
+    A point is inside where the mesh winds around it: counted exactly for closed meshes (`Columns`);
+    for those with holes the winding number exceeds one half (Jacobson et al. 2013; Barill et al.
+    2018). The trees are built at the first call and kept, so that a bone's are built once, in the
+    bone's own coordinates. ``layout`` is that of the same faces at another moment, as
+    `ExactDistance` takes it.
     """
 
     def __init__(
-        self, vertices: ArrayLike, faces: ArrayLike, *, closed: bool = True, layout: Layout | None = None
+        self,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        *,
+        closed: bool = True,
+        layout: Layout | None = None,
     ) -> None:
         self.closed = closed
         self.vertices, self.faces = check_mesh(vertices, faces)
@@ -193,14 +247,16 @@ class MeshDistance:
         return self._exact.layout if "_exact" in self.__dict__ else self._known_layout
 
     def inside(self, points: ArrayLike, *, pose: Floats = _HERE) -> Booleans:
-        """Which points (n, 3) lie inside, (n,), once a pose (4, 4) has carried them into the mesh's coordinates."""
+        """Which points (n, 3) lie inside, (n,), once a pose (4, 4) has carried them into the mesh's
+        coordinates.
+        """
         return self._inside(check_points(points), pose)
 
     def unsigned(self, points: ArrayLike, *, near: Integers | None = None) -> Floats:
         """Distance (n,) of points (n, 3) to the surface [scene unit].
 
-        ``near`` (n,) holds the place in the tree of a triangle near each point, -1 where none is known; afterwards that
-        of the nearest one, for the next call with a mesh of the same layout.
+        ``near`` (n,) holds the place in the tree of a triangle near each point, -1 where none is
+        known; afterwards that of the nearest one, for the next call with a mesh of the same layout.
         """
         points = check_points(points)
         out, near = np.empty(len(points)), np.full(len(points), -1) if near is None else near
@@ -216,12 +272,16 @@ class MeshDistance:
         return np.where(self.inside(points), -1.0, 1.0) * self.unsigned(points, near=near)
 
     def nearest(self, points: Floats) -> tuple[Floats, Floats, Floats]:
-        """Distance (n,) on the side of the nearest face, nearest point (n, 3) and outward pseudonormal there (n, 3)."""
+        """Distance (n,) on the side of the nearest face, nearest point (n, 3) and outward
+        pseudonormal there (n, 3).
+        """
         distance, closest, _, normal = self._exact.nearest(points)
         return distance, closest, normal
 
     def depth(self, points: ArrayLike, *, pose: Floats = _HERE) -> Floats:
-        """How deep points (n, 3) lie inside, (n,) [scene unit], 0 where outside; the pose is as for `inside`."""
+        """How deep points (n, 3) lie inside, (n,) [scene unit], 0 where outside; the pose is as for
+        `inside`.
+        """
         points = check_points(points)
         out, inside = np.zeros(len(points)), self.inside(points, pose=pose)
         if inside.any():
@@ -234,7 +294,9 @@ def _distance_loop(points, tree, near, out):
     stack = np.empty(STACK, np.int64), np.empty(STACK)
     best = np.int64(-1)
     for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        x = points[i, 0]
+        y = points[i, 1]
+        z = points[i, 2]
         # The last answer bounds the next one where points come in order.
         best = near[i] if near[i] >= 0 else best
         square = np.inf if best < 0 else record_square(tree.records, best, x, y, z)
@@ -252,7 +314,9 @@ class BoneProbe(MeshDistance):
 
 
 def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> Floats:
-    """Greatest depth (n,) of vertices (n, 3) in the bones, of poses (4, 4) by name; 0 where in none [scene unit]."""
+    """Greatest depth (n,) of vertices (n, 3) in the bones, of poses (4, 4) by name; 0 where in none
+    [scene unit].
+    """
     out = np.zeros(len(vertices))
     for probe in bones_about(vertices, probes, poses):
         np.maximum(out, probe.depth(vertices, pose=inverse_pose(poses[probe.name])), out=out)
@@ -267,7 +331,9 @@ def inverse_pose(pose: Floats) -> Floats:
     return back
 
 
-def bones_about(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> list[BoneProbe]:
+def bones_about(
+    vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]
+) -> list[BoneProbe]:
     """The bones whose boxes, where they are now, meet the box of the points (n, 3)."""
     if not probes or len(vertices) == 0:
         return []
@@ -282,7 +348,11 @@ def bones_about(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floa
 
 
 def bone_depth(surface: MeshDistance, probes: list[BoneProbe], poses: dict[str, Floats]) -> float:
-    """Greatest depth of any bone vertex in a closed, outward surface in the world, 0 where none is [scene unit]."""
+    """Greatest depth of any bone vertex in a closed, outward surface in the world, 0 where none is
+    [scene unit].
+    """
     near = bones_about(surface.vertices, probes, poses)
-    depths = [surface.depth(probe.vertices, pose=poses[probe.name]).max(initial=0.0) for probe in near]
+    depths = [
+        surface.depth(probe.vertices, pose=poses[probe.name]).max(initial=0.0) for probe in near
+    ]
     return float(max(depths, default=0.0))

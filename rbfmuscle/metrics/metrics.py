@@ -19,8 +19,13 @@ from rbfmuscle.simulation.frame import Frame, ModelSurface
 Values = dict[str, float]
 
 _FROM_MODEL = (
-    "solver_penetration_max", "sweeps", "unfitted_fraction", "condition", "time_fit", "time_extract",
-)  # fmt: skip
+    "solver_penetration_max",
+    "sweeps",
+    "unfitted_fraction",
+    "condition",
+    "time_fit",
+    "time_extract",
+)
 
 # Events whose points stayed beyond a bone; those turned back or halved away are in events.csv only.
 _THROUGH = ("reported", "unresolved")
@@ -30,12 +35,16 @@ _OVERLAPS = ("penetration_max", "bone_penetration_max", "solver_penetration_max"
 
 
 class MuscleMeasures:
-    """Measures muscles frame by frame, those with a carried mesh (vertices, faces) at rest; keeps no surfaces."""
+    """Measures muscles frame by frame, those with a carried mesh (vertices, faces) at rest; keeps
+    no surfaces.
+    """
 
     def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
         self.probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
         mine = [muscle for muscle in scene.muscles if muscle.name in carried]
-        self.trackers = {muscle.name: _Tracker(muscle, scene, *carried[muscle.name]) for muscle in mine}
+        self.trackers = {
+            muscle.name: _Tracker(muscle, scene, *carried[muscle.name]) for muscle in mine
+        }
 
     def measure(self, frame: Frame) -> dict[str, Values]:
         """Measure a frame: for each muscle its values by quantity, in the order of `QUANTITIES`."""
@@ -49,7 +58,9 @@ class _Tracker:
     """What has to be kept of one muscle from frame to frame."""
 
     def __init__(self, muscle: Any, scene: Any, vertices: Floats, faces: Integers) -> None:
-        self.name, self.mesh, self.attachments = muscle.name, muscle.mesh, muscle.attachments
+        self.name = muscle.name
+        self.mesh = muscle.mesh
+        self.attachments = muscle.attachments
         self.rest_volume = float(muscle.mesh.volume)
         self.edges = _edge_operator(vertices, faces)
         self.contracts = muscle.contraction is not None
@@ -112,7 +123,9 @@ class _Tracker:
         }
 
     def _flicker(self, carried, vertices, same):
-        """Change of the signed distances of the carried vertices to the surface; of a mesh that is shown, none."""
+        """Change of the signed distances of the carried vertices to the surface; of a mesh that is
+        shown, none.
+        """
         if np.array_equal(carried, vertices):
             return {}
         if self.near is None or not same:
@@ -140,7 +153,9 @@ def _edge_operator(vertices: Floats, faces: Integers) -> sparse.csr_matrix:
     edges, lengths = edges[lengths > 0.0], lengths[lengths > 0.0]
     rows, inverse = np.arange(len(edges)), 1.0 / lengths
     places = np.tile(rows, 2), edges.T.ravel()
-    return sparse.csr_matrix((np.concatenate([inverse, -inverse]), places), (len(edges), len(vertices)))
+    return sparse.csr_matrix(
+        (np.concatenate([inverse, -inverse]), places), (len(edges), len(vertices))
+    )
 
 
 def surface_distance(
@@ -157,7 +172,9 @@ def surface_distance(
 
 
 def euler_characteristic(faces: Integers) -> int:
-    """Vertices less edges plus triangles, of those that faces (m, 3) use; 2 for a sphere, two less for each handle."""
+    """Vertices less edges plus triangles, of those that faces (m, 3) use; 2 for a sphere, two less
+    for each handle.
+    """
     faces = np.asarray(faces, dtype=np.int64)
     ends = np.sort(np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]]), axis=1)
     edges = np.unique(ends[:, 0] * (faces.max(initial=0) + 1) + ends[:, 1])
@@ -165,7 +182,9 @@ def euler_characteristic(faces: Integers) -> int:
 
 
 class SurfaceForm:
-    """Pieces, handles and crossings of one muscle's surfaces, looked for again only where they can have changed."""
+    """Pieces, handles and crossings of one muscle's surfaces, looked for again only where they can
+    have changed.
+    """
 
     def __init__(self) -> None:
         self._drawn: ModelSurface | None = None
@@ -173,7 +192,9 @@ class SurfaceForm:
         self._found: dict[str, float] = {}
 
     def measure(self, surface: "ModelSurface", *, same_faces: bool) -> dict[str, float]:
-        """``components``, ``euler`` and ``self_crossings``; ``same_faces`` where the last surface had these faces."""
+        """``components``, ``euler`` and ``self_crossings``; ``same_faces`` where the last surface
+        had these faces.
+        """
         vertices, faces = surface.vertices, np.asarray(surface.faces)
         if self._tree is None or not same_faces:
             self._tree = FaceTree(vertices, faces)

@@ -1,12 +1,18 @@
-"""What is measured of a frame, in which unit, and a row of it; for those who read what others measured."""
+"""What is measured of a frame, in which unit, and a row of it; for those who read what others
+measured.
+"""
 
 from typing import NamedTuple
 
-# Quantity: kind of unit (volume and length follow the scene's unit), meaning; in the order of the tables.
+# Quantity: kind of unit (volume and length follow the scene's unit), meaning; in the order of the
+# tables.
 QUANTITIES = {
     "volume": ("volume", "volume enclosed by the surface"),
     "volume_error": ("1", "volume relative to the input mesh's, minus one"),
-    "penetration_max": ("length", "deepest surface vertex inside a bone, exact distance to the bone mesh"),
+    "penetration_max": (
+        "length",
+        "deepest surface vertex inside a bone, exact distance to the bone mesh",
+    ),
     "penetration_fraction": ("1", "share of surface vertices inside a bone"),
     "bone_penetration_max": ("length", "deepest bone vertex inside the muscle"),
     "solver_penetration_max": (
@@ -17,15 +23,25 @@ QUANTITIES = {
     "components": ("1", "closed pieces of the surface"),
     "euler": ("1", "Euler characteristic of the surface: 2 for a sphere, two less for each handle"),
     "self_crossings": ("1", "triangles of the surface that cross others of it"),
-    "unfitted_fraction": ("1", "share of surface vertices kept off the level set; 1 where none is shown"),
+    "unfitted_fraction": (
+        "1",
+        "share of surface vertices kept off the level set; 1 where none is shown",
+    ),
     "flicker": (
         "length",
-        "greatest change, from frame to frame, of distances from material mesh to surface; depends on the frame step",
+        "greatest change, from frame to frame, of distances from material mesh to surface; "
+        "depends on the frame step",
     ),
     "tunnelled": ("1", "points that passed through a bone and were not brought back"),
-    "rest_error_rms": ("length", "distance between surface and input mesh at rest, in both directions"),
+    "rest_error_rms": (
+        "length",
+        "distance between surface and input mesh at rest, in both directions",
+    ),
     "rest_error_max": ("length", "the same, greatest (Hausdorff)"),
-    "thickness": ("length", "least width of the input mesh's greatest section across its line of action"),
+    "thickness": (
+        "length",
+        "least width of the input mesh's greatest section across its line of action",
+    ),
     "initial_overlap": ("length", "deepest overlap of muscle and bones that is left at rest"),
     "end_gap": ("length", "distance of the end that lies furthest from its bone at rest"),
     "edge_strain_rms": ("1", "relative change of edge lengths of the material mesh"),
@@ -33,15 +49,22 @@ QUANTITIES = {
     "length": ("length", "centreline from origin to insertion, with its tendons"),
     "slack": (
         "1",
-        "length of the centreline without tendons / that of the shortest path over the bones between its ends",
+        "length of the centreline without tendons / that of the shortest path over the bones "
+        "between its ends",
     ),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
     "activation": ("1", "activation, 0 to 1; this and the next three for muscles that contract"),
     "belly_thickness": ("length", "least width of the greatest section across the line of action"),
     "csa_max": ("area", "area of the greatest section across the line of action"),
     "csa_place": ("1", "where it lies: 0 at the origin, 1 at the insertion"),
-    "bone_overlap": ("length", "depth of two bones in each other beyond rest; muscle 'all', some frames"),
-    "joint_gap": ("length", "a joint's bones farther apart than at rest; muscle 'all', some frames"),
+    "bone_overlap": (
+        "length",
+        "depth of two bones in each other beyond rest; muscle 'all', some frames",
+    ),
+    "joint_gap": (
+        "length",
+        "a joint's bones farther apart than at rest; muscle 'all', some frames",
+    ),
     "bones_left_out": ("1", "bones of which no mesh could be used; muscle 'all', first frame"),
     "time": ("s", "time of the frame in the motion file; muscle 'all'"),
     "time_solve": ("s", "prediction, solution and contacts"),
@@ -53,7 +76,9 @@ ALL = "all"
 
 
 class Row(NamedTuple):
-    """One line of ``metrics.csv``; the angle is in degrees, the value of a translation in scene units."""
+    """One line of ``metrics.csv``; the angle is in degrees, the value of a translation in scene
+    units.
+    """
 
     frame: int
     coordinate: str

@@ -1,4 +1,6 @@
-"""Rows of ``metrics.csv``, made from what was recorded: of a frame, and of moment arms and joints along the motion."""
+"""Rows of ``metrics.csv``, made from what was recorded: of a frame, and of moment arms and joints
+along the motion.
+"""
 
 import itertools
 import math
@@ -16,21 +18,28 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame
 
 Coordinates = Mapping[str, float]
-# A slope is fitted over the frames within so many degrees, or millimetres of a shift, and over the frames next to it.
-# In motions by one degree moment arms then ripple about smooth curves by at most 0.3 mm RMS (docs/validation.md).
+# A slope is fitted over the frames within so many degrees, or millimetres of a shift, and over the
+# frames next to it. In motions by one degree moment arms then ripple about smooth curves by at most
+# 0.3 mm RMS (docs/validation.md).
 REACH = 8.0
 # Coordinates that change by less [radian or scene unit] rest.
 _STILL = 1e-9
-# Bones of a joint that are nearer than this at rest [mm] meet there; others, as a tendon's end, are held apart.
+# Bones of a joint that are nearer than this at rest [mm] meet there; others, as a tendon's end, are
+# held apart.
 MEETING = 10.0
 # Vertices of a bone whose distance to the other is taken, at most.
 _VERTICES = 2000
 
 
 def frame_rows(
-    scene: Scene, frame: Frame, before: Coordinates | None, measured: Mapping[str, Mapping[str, float]]
+    scene: Scene,
+    frame: Frame,
+    before: Coordinates | None,
+    measured: Mapping[str, Mapping[str, float]],
 ) -> list[Row]:
-    """Rows of one frame from values by muscle and quantity; ``before`` are the last frame's coordinates, or None."""
+    """Rows of one frame from values by muscle and quantity; ``before`` are the last frame's
+    coordinates, or None.
+    """
     name, angle = _leading_coordinate(scene, frame, before)
     together = dict(measured.get(ALL, {}))
     if scene.motion.times is not None:
@@ -47,7 +56,9 @@ def frame_rows(
 def moment_arm_rows(
     scene: Scene, path: Mapping[int, Coordinates], lengths: Mapping[str, Mapping[int, float]]
 ) -> list[Row]:
-    """Rows of the moment arms, from each frame's coordinates [radian or scene unit] and muscles' lengths by frame."""
+    """Rows of the moment arms, from each frame's coordinates [radian or scene unit] and muscles'
+    lengths by frame.
+    """
     facts, rows = all_coordinates(scene.joints), []
     shifts = {name for name, fact in facts.items() if fact.motion == "translation"}
     names, near = {name for row in path.values() for name in row}, REACH / MM_PER_UNIT[scene.units]
@@ -64,7 +75,9 @@ def moment_arm_rows(
 
 
 def _leading_coordinate(scene, frame, before):
-    """The coordinate that moved most to reach a frame, and its value there [degree or scene unit]."""
+    """The coordinate that moved most to reach a frame, and its value there [degree or scene
+    unit].
+    """
     names = scene.motion.coordinates or list(frame.coordinates)
     if not names:
         return "", 0.0
@@ -76,14 +89,18 @@ def _leading_coordinate(scene, frame, before):
 
 
 def moment_arms(
-    path: Sequence[Mapping[str, float]], lengths: Sequence[float], reach: Mapping[str, float] | None = None
+    path: Sequence[Mapping[str, float]],
+    lengths: Sequence[float],
+    reach: Mapping[str, float] | None = None,
 ) -> list[dict[str, float]]:
-    """Moment arms -dl/dq along a motion, for each frame by coordinate that moves alone before or after it.
+    """Moment arms -dl/dq along a motion, for each frame by coordinate that moves alone before or
+    after it.
 
-    A parabola is fitted to the ``lengths`` [scene unit] of the frames within ``reach`` [radian or scene unit, `REACH`
-    degrees by default], and always of both neighbours, as far as the coordinate goes on alone and in one direction:
-    with two neighbours it is the central difference, at an end the difference to the one. ``path`` holds the
-    coordinates of each frame; lengths are NaN where not known. Moment arms are in scene units per radian, or 1.
+    A parabola is fitted to the ``lengths`` [scene unit] of the frames within ``reach`` [radian or
+    scene unit, `REACH` degrees by default], and always of both neighbours, as far as the coordinate
+    goes on alone and in one direction: with two neighbours it is the central difference, at an end
+    the difference to the one. ``path`` holds the coordinates of each frame; lengths are NaN where
+    not known. Moment arms are in scene units per radian, or 1.
     """
     values, found = np.asarray(lengths, dtype=float), [dict[str, float]() for _ in path]
     for name, first, last in _single_motions(path, values):
@@ -99,7 +116,9 @@ def moment_arms(
 
 
 def _single_motions(path, lengths):
-    """Name, first and last frame of each stretch in which one coordinate moves alone and in one direction."""
+    """Name, first and last frame of each stretch in which one coordinate moves alone and in one
+    direction.
+    """
     stretches = []
     for k, (before, after) in enumerate(itertools.pairwise(path)):
         moved = {n: after.get(n, 0.0) - before.get(n, 0.0) for n in {*before, *after}}
@@ -115,14 +134,19 @@ def _single_motions(path, lengths):
 
 
 def joint_gaps(scene: Scene, frames: Iterable[int]) -> list[tuple[int, str, str, float]]:
-    """How much wider than at rest the bones of a joint are apart, by their vertices, where they meet at rest.
+    """How much wider than at rest the bones of a joint are apart, by their vertices, where they
+    meet at rest.
 
     For each frame and such joint: (frame, parent, child, opening [scene unit]).
     """
     vertices = {bone.name: np.asarray(bone.mesh.vertices, dtype=float) for bone in scene.bones}
-    pairs = [(j.parent, j.child) for j in scene.joints if j.parent in vertices and j.child in vertices]
+    pairs = [
+        (j.parent, j.child) for j in scene.joints if j.parent in vertices and j.child in vertices
+    ]
     trees = {parent: cKDTree(vertices[parent]) for parent, _ in pairs}
-    points = {child: vertices[child][:: -(-len(vertices[child]) // _VERTICES)] for _, child in pairs}
+    points = {
+        child: vertices[child][:: -(-len(vertices[child]) // _VERTICES)] for _, child in pairs
+    }
     rest = {(p, c): float(trees[p].query(points[c])[0].min()) for p, c in pairs}
     meeting = [pair for pair in pairs if rest[pair] < scene.length(MEETING)]
     found = []

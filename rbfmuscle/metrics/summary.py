@@ -1,4 +1,6 @@
-"""What a run amounts to: least, greatest and mean of each quantity, the limits it is held to, and its verdict."""
+"""What a run amounts to: least, greatest and mean of each quantity, the limits it is held to, and
+its verdict.
+"""
 
 import math
 from collections import defaultdict
@@ -17,7 +19,9 @@ Table = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 
 class Limit(NamedTuple):
-    """Greatest allowed magnitude of a quantity (of those in `LEAST` the least), lengths in millimetres."""
+    """Greatest allowed magnitude of a quantity (of those in `LEAST` the least), lengths in
+    millimetres.
+    """
 
     value: float
     title: str
@@ -29,16 +33,24 @@ _MORE_CENTRES = "raise model.centres"
 _LOOK = "look at that frame: rbfmuscle render RUN --frame FRAME -o frame.png"
 _JOINT = "correct the joint's centre, axes or range"
 LIMITS = {
-    "volume_error": Limit(1e-9, "volume error", "let the model settle: raise its iterations or sweeps"),
+    "volume_error": Limit(
+        1e-9, "volume error", "let the model settle: raise its iterations or sweeps"
+    ),
     "penetration_max": Limit(0.1, "surface in a bone", _SMALLER_STEPS),
-    "bone_penetration_max": Limit(0.3, "bone in the muscle", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"),
-    "initial_overlap": Limit(0.3, "overlap left at rest", "move muscle or bone apart: rbfmuscle check SCENE"),
+    "bone_penetration_max": Limit(
+        0.3, "bone in the muscle", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"
+    ),
+    "initial_overlap": Limit(
+        0.3, "overlap left at rest", "move muscle or bone apart: rbfmuscle check SCENE"
+    ),
     "components": Limit(1.0, "pieces", f"{_LOOK}; {_MORE_CENTRES}"),
     "euler": Limit(2.0, "Euler characteristic", f"{_LOOK}; {_MORE_CENTRES}"),
     "self_crossings": Limit(
         0.0, "self-crossing triangles", "raise model.iterations, or use model pbd-converged"
     ),
-    "unfitted_fraction": Limit(0.999, "surface shown without a fit", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"),
+    "unfitted_fraction": Limit(
+        0.999, "surface shown without a fit", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"
+    ),
     "flicker": Limit(0.5, "flicker", f"take frames closer together, or {_SMALLER_STEPS}"),
     "slack": Limit(1.03, "centreline over shortest path", _LOOK),
     "tunnelled": Limit(0.0, "points beyond a bone", _SMALLER_STEPS),
@@ -62,7 +74,9 @@ class Summary:
     """Collects rows of metrics; keeps numbers only, no surfaces."""
 
     def __init__(self) -> None:
-        self._values: dict[str, dict[str, list[tuple[int, float]]]] = defaultdict(lambda: defaultdict(list))
+        self._values: dict[str, dict[str, list[tuple[int, float]]]] = defaultdict(
+            lambda: defaultdict(list)
+        )
         self._units: dict[str, str] = {}
 
     def add(self, rows: Iterable[Row]) -> None:
@@ -76,42 +90,56 @@ class Summary:
 
     def series(self, quantity: str) -> dict[str, dict[int, float]]:
         """Values of a quantity by muscle and frame."""
-        return {muscle: dict(found[quantity]) for muscle, found in self._values.items() if quantity in found}
+        return {
+            muscle: dict(found[quantity])
+            for muscle, found in self._values.items()
+            if quantity in found
+        }
 
     def table(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """Nested dict: muscle -> quantity -> unit, count, min, max, mean, median, first, last, worst and its frame.
+        """Nested dict: muscle -> quantity -> unit, count, min, max, mean, median, first, last,
+        worst and its frame.
 
-        ``worst`` is the value of greatest magnitude, or the least where that is what is limited (`LEAST`). A moment
-        arm is named with its coordinate.
+        ``worst`` is the value of greatest magnitude, or the least where that is what is limited
+        (`LEAST`). A moment arm is named with its coordinate.
         """
         return {
-            muscle: {quantity: self._facts(quantity, found) for quantity, found in quantities.items()}
+            muscle: {
+                quantity: self._facts(quantity, found) for quantity, found in quantities.items()
+            }
             for muscle, quantities in self._values.items()
         }
 
     def _facts(self, quantity, found):
         frames, values = (np.array(part) for part in zip(*found))
         facts = {
-            "unit": self._units[quantity], "count": len(values), "first": float(values[0]), "last": float(values[-1])
-        }  # fmt: skip
+            "unit": self._units[quantity],
+            "count": len(values),
+            "first": float(values[0]),
+            "last": float(values[-1]),
+        }
         known = np.isfinite(values)
         if known.any():
             finite = values[known]
             worst = int(np.argmin(finite) if quantity in LEAST else np.argmax(np.abs(finite)))
             facts |= {
-                "min": float(finite.min()), "max": float(finite.max()), "mean": float(finite.mean()),
-                "median": float(np.median(finite)), "worst": float(finite[worst]),
+                "min": float(finite.min()),
+                "max": float(finite.max()),
+                "mean": float(finite.mean()),
+                "median": float(np.median(finite)),
+                "worst": float(finite[worst]),
                 "worst_frame": int(frames[known][worst]),
-            }  # fmt: skip
+            }
         return facts
 
 
 def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> dict[str, float]:
     """Limits as a dict of quantity to greatest allowed magnitude.
 
-    ``limits`` are like ``"penetration_max=0.5,volume_error"``, or a list of such: a quantity with a value in the unit
-    of ``metrics.csv``, or alone with the limit of `LIMITS`; ``"all"`` for every one of `LIMITS`. UsageError on an
-    unknown quantity, a value that is no number, or limits that are no text.
+    ``limits`` are like ``"penetration_max=0.5,volume_error"``, or a list of such: a quantity with a
+    value in the unit of ``metrics.csv``, or alone with the limit of `LIMITS`; ``"all"`` for every
+    one of `LIMITS`. UsageError on an unknown quantity, a value that is no number, or limits that
+    are no text.
     """
     if isinstance(limits, Mapping):
         raise UsageError("limits are text, for instance 'penetration_max=0.5,volume_error'")
@@ -124,7 +152,9 @@ def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> dict[str, 
         name, given, value = part.replace("<=", "=").partition("=")
         name = name.strip()
         if name not in QUANTITIES:
-            raise UsageError(f"--fail-on: unknown quantity {name!r}, {did_you_mean(name, QUANTITIES)}")
+            raise UsageError(
+                f"--fail-on: unknown quantity {name!r}, {did_you_mean(name, QUANTITIES)}"
+            )
         if given:
             found[name] = _number(value, part)
         elif name in LIMITS:
@@ -154,7 +184,9 @@ def _in_unit(value, quantity, unit):
 
 
 def muscle_limit(quantity: str, limit: float, found: Mapping[str, Mapping[str, Any]]) -> float:
-    """Limit of one muscle: thin ones and those slack at rest have their own, by its facts, in place of the default."""
+    """Limit of one muscle: thin ones and those slack at rest have their own, by its facts, in place
+    of the default.
+    """
     unit = found[quantity]["unit"]
     if quantity not in LIMITS or limit != _in_unit(LIMITS[quantity].value, quantity, unit):
         return limit
@@ -166,12 +198,18 @@ def muscle_limit(quantity: str, limit: float, found: Mapping[str, Mapping[str, A
 
 
 def within(quantity: str, worst: float, limit: float) -> bool:
-    """Whether a worst value keeps to a limit, which is the least allowed value for those in `LEAST`; NaN does not."""
+    """Whether a worst value keeps to a limit, which is the least allowed value for those in
+    `LEAST`; NaN does not.
+    """
     return worst >= limit if quantity in LEAST else abs(worst) <= limit
 
 
-def exceeded(table: Table, limits: Mapping[str, float]) -> list[tuple[str, str, float, float, int | None]]:
-    """List of (muscle, quantity, worst value, limit, frame) beyond the limits; NaN counts as beyond."""
+def exceeded(
+    table: Table, limits: Mapping[str, float]
+) -> list[tuple[str, str, float, float, int | None]]:
+    """List of (muscle, quantity, worst value, limit, frame) beyond the limits; NaN counts as
+    beyond.
+    """
     found = []
     for muscle, quantities in table.items():
         for name, facts in quantities.items():
@@ -187,14 +225,20 @@ def exceeded(table: Table, limits: Mapping[str, float]) -> list[tuple[str, str, 
 
 
 def excess(quantity: str, worst: float, limit: float) -> float:
-    """How many times its limit a worst value is; of limits that cannot say so, 0 within and infinite beyond."""
+    """How many times its limit a worst value is; of limits that cannot say so, 0 within and
+    infinite beyond.
+    """
     if quantity in LEAST or limit <= 0 or not math.isfinite(worst):
         return 0.0 if within(quantity, worst, limit) else math.inf
     return abs(worst) / limit
 
 
-def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequence[str] = ()) -> str:
-    """Which muscles are within all limits, the worst value of the others, and what to do; bones ``left_out``."""
+def describe_verdict(
+    table: Table, limits: Mapping[str, float], left_out: Sequence[str] = ()
+) -> str:
+    """Which muscles are within all limits, the worst value of the others, and what to do; bones
+    ``left_out``.
+    """
     muscles, found = [name for name in table if name != ALL], exceeded(table, limits)
     wrong = [name for name in dict.fromkeys(row[0] for row in found) if name != ALL]
     if not muscles:
@@ -205,7 +249,9 @@ def describe_verdict(table: Table, limits: Mapping[str, float], left_out: Sequen
         text = f"{muscles[0]} is not within all limits"
     else:
         right = len(muscles) - len(wrong)
-        count = f"{right} of {len(muscles)} muscles {'is' if right == 1 else 'are'} within all limits"
+        count = (
+            f"{right} of {len(muscles)} muscles {'is' if right == 1 else 'are'} within all limits"
+        )
         text = f"{count}; {_listed(wrong)} {'is' if len(wrong) == 1 else 'are'} not"
     if not found:
         return text
@@ -228,7 +274,11 @@ def _remedy(row, table):
     """What to do about one excess; smaller steps do not mend an overlap of the meshes at rest."""
     muscle, quantity, _, limit, _ = row
     first = table[muscle][quantity]["first"]
-    at_rest = quantity in ("penetration_max", "bone_penetration_max") and first is not None and first > limit
+    at_rest = (
+        quantity in ("penetration_max", "bone_penetration_max")
+        and first is not None
+        and first > limit
+    )
     return LIMITS["initial_overlap" if at_rest else quantity].remedy
 
 
@@ -248,7 +298,9 @@ def _describe_excess(row, table, left_out):
 
 
 def shown_number(value: float | None, unit: str = "") -> str:
-    """A value with three digits and its unit: less than 1e-12 and 0.01 mm as such, seconds as milliseconds."""
+    """A value with three digits and its unit: less than 1e-12 and 0.01 mm as such, seconds as
+    milliseconds.
+    """
     if value is None or math.isnan(value):
         return "–"
     if unit == "s" and abs(value) < 1.0:

@@ -1,13 +1,15 @@
-"""The fibres of an RBF muscle that contracts: springs along the solid's fibres, in its shear modulus.
+"""The fibres of an RBF muscle that contracts: springs along the solid's fibres, in its shear
+modulus.
 
 A fibre that is stretched by λ against the scan bears, beside the tension of the passive solid,
 
     a d PEAK μ (λ - l) / (1/s - l),   l = 0.5 / s,
 
-with a the activation, s the stretch in the scan, l the stretch at which active fibres bear nothing and d the number of
-fibres through a unit area, 1 where the belly is widest: fibres run from end to end, so where it narrows each area bears
-more. At the slack length a fully active fibre bears `PEAK` shear moduli (Blemker, Pinsky & Delp 2005). Tendon is a
-spring that this tension stretches by ``tendon_strain``.
+with a the activation, s the stretch in the scan, l the stretch at which active fibres bear nothing
+and d the number of fibres through a unit area, 1 where the belly is widest: fibres run from end to
+end, so where it narrows each area bears more. At the slack length a fully active fibre bears `PEAK`
+shear moduli (Blemker, Pinsky & Delp 2005). Tendon is a spring that this tension stretches by
+``tendon_strain``.
 """
 
 import numpy as np
@@ -21,7 +23,9 @@ from rbfmuscle.scene.objects import Muscle
 
 PEAK = 30.0  # greatest isometric tension of active fibres, in shear moduli
 WIDEST = 0.2  # share of the belly that counts as its widest part
-DENSEST = 10.0  # fibres through a unit area, in those of the widest part: the rims of attachments draw more together
+# fibres through a unit area, in those of the widest part: the rims of attachments draw more
+# together
+DENSEST = 10.0
 LEAST_STRAIN = 1e-3
 
 
@@ -56,7 +60,9 @@ class FibrePull:
         passive, strain = self.passive.passive.copy(), max(given.tendon_strain, LEAST_STRAIN)
         passive[self.tendon] = self.density[self.tendon] * 0.5 * PEAK / strain
         self.solid.take_fibres(
-            self.passive._replace(passive=passive, active=active, content=np.full(len(active), content))
+            self.passive._replace(
+                passive=passive, active=active, content=np.full(len(active), content)
+            )
         )
 
 

@@ -12,8 +12,11 @@ from rbfmuscle.muscle.placement import cached_sample
 from rbfmuscle.muscle.rest import RestState
 from rbfmuscle.scene.objects import Muscle
 
-# Edges of the shown mesh for each thickness of a muscle, and bounds on its vertices: by themselves, and asked for.
-EDGES_THROUGH, USUAL, WANTED = 3.0, (2500, 4000), (200, 12_000)
+# Edges of the shown mesh for each thickness of a muscle, and bounds on its vertices: by themselves,
+# and asked for.
+EDGES_THROUGH = 3.0
+USUAL = (2500, 4000)
+WANTED = (200, 12_000)
 # Vertices of a triangulation on an area of one edge squared.
 VERTICES_AN_EDGE = 1.15
 
@@ -58,18 +61,22 @@ class DisplayMesh:
 
             self.mesh, vertices = mend_slivers(self.mesh, onto(self.mesh, points), onto)
         except (ValueError, np.linalg.LinAlgError):
-            # What the input mesh holds is a surface too; the frames say what is wrong with the field.
+            # What the input mesh holds is a surface too; the frames say what is wrong with the
+            # field.
             return points
         self.mesh.slope = np.linalg.norm(field.value_and_gradient(vertices)[1], axis=1)
         return vertices
 
     def smooth_displacement(self, vertices: np.ndarray, sweeps: int) -> np.ndarray:
-        """The shape at rest, moved to vertices (n, 3) and deformed as these are where that is smooth.
+        """The shape at rest, moved to vertices (n, 3) and deformed as these are where that is
+        smooth.
 
         What the material does beside the rigid motion is smoothed in so many sweeps.
         """
         rows = np.arange(len(vertices))
-        return smooth_displacement(self.rest, vertices, lambda beside: self.mesh.smooth(beside, rows, sweeps))
+        return smooth_displacement(
+            self.rest, vertices, lambda beside: self.mesh.smooth(beside, rows, sweeps)
+        )
 
     def stretch(self, vertices: np.ndarray) -> float:
         """Length of edges relative to rest that a tenth of them exceeds."""

@@ -1,4 +1,6 @@
-"""How an RBF muscle is shown: its field refitted, the bones cut away, the closed surface brought onto the level set."""
+"""How an RBF muscle is shown: its field refitted, the bones cut away, the closed surface brought
+onto the level set.
+"""
 
 import time
 from collections.abc import Callable
@@ -29,9 +31,12 @@ REACH = 3.0
 # A tenth of the edges this much longer than at rest is the cause of what cannot be fitted.
 STRETCHED = 1.6
 
-# Where the material is no sound surface, what it does beside a rigid motion is smoothed so often, until it is one;
-# how deep in a bone a vertex of a sound one may be, in mean edges, and how much volume may be lacking.
-CALM, SUNKEN, LOST = (30, 120, 500, 2000, 10_000), 0.01, 1e-10
+# Where the material is no sound surface, what it does beside a rigid motion is smoothed so often,
+# until it is one; how deep in a bone a vertex of a sound one may be, in mean edges, and how much
+# volume may be lacking.
+CALM = (30, 120, 500, 2000, 10_000)
+SUNKEN = 0.01
+LOST = 1e-10
 
 
 class Configuration(NamedTuple):
@@ -54,19 +59,24 @@ class _Surroundings(TypedDict):
 class SurfaceBuilder:
     """Draws the surface of one muscle, from frame to frame.
 
-    ``level`` is that of the field that met the rest volume last, where the next search begins; ``shown`` the
-    material's mesh, None where marching cubes show the surface.
+    ``level`` is that of the field that met the rest volume last, where the next search begins;
+    ``shown`` the material's mesh, None where marching cubes show the surface.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene, rest: RestState, options: RBFOptions) -> None:
         self.name = f"muscle {muscle.name!r}" + (f" ({muscle.source})" if muscle.source else "")
         self.rest, self.options = rest, options
-        self._bones = [PointGrid(np.asarray(bone.mesh.vertices, dtype=float)) for bone in scene.bones]
+        self._bones = [
+            PointGrid(np.asarray(bone.mesh.vertices, dtype=float)) for bone in scene.bones
+        ]
         self.level = 0.0
         self.shown = DisplayMesh(muscle, rest, options) if options.surface == "material" else None
 
-    def draw(self, fit: Callable[[], RBFField], now: Configuration, contacts: BoneContacts) -> ModelSurface:
-        """The closed surface at the rest volume, of the field that ``fit`` gives, cut by the contacts.
+    def draw(
+        self, fit: Callable[[], RBFField], now: Configuration, contacts: BoneContacts
+    ) -> ModelSurface:
+        """The closed surface at the rest volume, of the field that ``fit`` gives, cut by the
+        contacts.
 
         Raises SolveError if marching cubes find no closed surface.
         """
@@ -80,7 +90,11 @@ class SurfaceBuilder:
             if left == 1.0:
                 bone, cause = self._cause(now, contacts)
                 notes.append((bone, len(now.carried), f"carried_{cause}"))
-        quantities = {"components": result.components, "level": self.level, "unfitted_fraction": left}
+        quantities = {
+            "components": result.components,
+            "level": self.level,
+            "unfitted_fraction": left,
+        }
         return ModelSurface(result.vertices, result.faces, quantities, notes)
 
     def _of_material(
@@ -95,24 +109,37 @@ class SurfaceBuilder:
             "excess": contacts.excess if contacts.beside else None,
         }
         try:
-            result = project_to_level_set(mesh, carried, fit(), volume=volume, level=self.level, **where)
+            result = project_to_level_set(
+                mesh, carried, fit(), volume=volume, level=self.level, **where
+            )
         except (ValueError, np.linalg.LinAlgError):
             return self._carry(mesh, carried, volume, where)
         self.level = result.level
         return self._sounder(result, mesh, carried, volume, where) if result.crossing else result
 
     def _sounder(
-        self, fitted: FittedMesh, mesh: MaterialMesh, carried: Floats, volume: float, where: _Surroundings
+        self,
+        fitted: FittedMesh,
+        mesh: MaterialMesh,
+        carried: Floats,
+        volume: float,
+        where: _Surroundings,
     ) -> FittedMesh:
-        """What was fitted and crosses itself, or the surface without a fit where that has fewer faults."""
+        """What was fitted and crosses itself, or the surface without a fit where that has fewer
+        faults.
+        """
         try:
             other = self._carry(mesh, carried, volume, where)
         except SolveError:
             return fitted
         return min(fitted, other, key=lambda result: _faults(result, where["cut"], volume))
 
-    def _carry(self, mesh: MaterialMesh, carried: Floats, volume: float, where: _Surroundings) -> FittedMesh:
-        """The mesh where the material is; where no sound surface comes of that, where the material is on the whole."""
+    def _carry(
+        self, mesh: MaterialMesh, carried: Floats, volume: float, where: _Surroundings
+    ) -> FittedMesh:
+        """The mesh where the material is; where no sound surface comes of that, where the material
+        is on the whole.
+        """
         found: list[tuple[float, FittedMesh]] = []
         reason: ValueError | None = None
         for sweeps in (0, *CALM):
@@ -129,7 +156,8 @@ class SurfaceBuilder:
         if found:
             return min(found, key=lambda pair: pair[0])[1]
         raise SolveError(
-            f"{self.name}: no surface outside the bones holds its volume of {volume:.6g} ({reason}); look for spikes "
+            f"{self.name}: no surface outside the bones holds its volume of {volume:.6g} "
+            f"({reason}); look for spikes "
             "in its mesh, and check where its attachments lie and what the motion drives into it"
         ) from reason
 
@@ -141,14 +169,20 @@ class SurfaceBuilder:
         reach = 1.25 * float(np.ptp(now.points @ axes.T, axis=0).max()) / resolution
         try:
             result = extract_surface(
-                fit(), points=now.points, resolution=resolution,
+                fit(),
+                points=now.points,
+                resolution=resolution,
                 cut=_BoneCut(contacts, reach) if contacts.names else None,
-                volume=self.rest.mesh_volume, level=self.level, axes=axes, obstacles=self._obstacles(contacts),
-            )  # fmt: skip
+                volume=self.rest.mesh_volume,
+                level=self.level,
+                axes=axes,
+                obstacles=self._obstacles(contacts),
+            )
         except (ValueError, np.linalg.LinAlgError) as error:
             raise SolveError(
                 f"{self.name}: no closed surface by marching cubes with kernel "
-                f"{self.options.kernel!r} and {len(now.centres)} centres: {error}; surface = 'material' shows one"
+                f"{self.options.kernel!r} and {len(now.centres)} centres: {error}; surface = "
+                "'material' shows one"
             ) from error
         self.level = result.level
         return result
@@ -162,7 +196,9 @@ class SurfaceBuilder:
         return [(self._bones[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
 
     def _cause(self, now: Configuration, contacts: BoneContacts) -> tuple[str, str]:
-        """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or sheets that met."""
+        """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or
+        sheets that met.
+        """
         depth, found = self.shown.mesh.edge(now.carried), ""
         attached_bone = self.rest.attached_bone[: len(now.centres)]
         for b in contacts.reached:
@@ -178,11 +214,15 @@ class SurfaceBuilder:
 
 
 def _faults(result: FittedMesh, cut: ClipDistance | None, volume: float) -> float:
-    """Triangles that cross others, mean edges of depth in a bone, thousandths of volume lost; 0 where it is sound."""
+    """Triangles that cross others, mean edges of depth in a bone, thousandths of volume lost; 0
+    where it is sound.
+    """
     deep = 0.0 if cut is None else -float(cut(result.vertices).min()) / result.spacing
     lost = abs(result.volume / volume - 1.0)
     # Asked the other way round: NaN is no sound surface.
-    return result.crossing + (0.0 if deep <= SUNKEN else deep) + (0.0 if lost <= LOST else 1e3 * lost)
+    return (
+        result.crossing + (0.0 if deep <= SUNKEN else deep) + (0.0 if lost <= LOST else 1e3 * lost)
+    )
 
 
 class RBFDrawing:
@@ -197,9 +237,15 @@ class RBFDrawing:
         self._time_fit = 0.0
 
     def carried(self) -> Mesh | None:
-        """The shown mesh where the material takes it; None where marching cubes show the surface."""
+        """The shown mesh where the material takes it; None where marching cubes show the
+        surface.
+        """
         shown = self._drawer.shown
-        return None if shown is None or self._now.carried is None else (self._now.carried, shown.mesh.faces)
+        return (
+            None
+            if shown is None or self._now.carried is None
+            else (self._now.carried, shown.mesh.faces)
+        )
 
     def surface(self) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lay in the way."""
@@ -223,7 +269,9 @@ class RBFDrawing:
 
 
 class _BoneCut:
-    """What the bones cut away: their smallest distance, a lower bound where it is beyond ``reach``."""
+    """What the bones cut away: their smallest distance, a lower bound where it is beyond
+    ``reach``.
+    """
 
     def __init__(self, contacts: BoneContacts, reach: float) -> None:
         self.contacts, self.reach = contacts, reach

@@ -13,12 +13,17 @@ NEAREST = 3
 
 
 def fibre_directions(
-    points: np.ndarray, along: np.ndarray, fibres: Sequence[np.ndarray] | None, *, fallback: np.ndarray
+    points: np.ndarray,
+    along: np.ndarray,
+    fibres: Sequence[np.ndarray] | None,
+    *,
+    fallback: np.ndarray,
 ) -> np.ndarray:
     """Unit direction of the fibres at each point (n, 3).
 
-    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the harmonic field
-    from the first attachment to the last; where neither has a direction the ``fallback`` (3,).
+    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the
+    harmonic field from the first attachment to the last; where neither has a direction the
+    ``fallback`` (3,).
     """
     if fibres:
         middles = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in fibres])
@@ -44,7 +49,9 @@ def rise(solid: EmbeddedSolid) -> Floats:
 
 
 def flux(solid: EmbeddedSolid) -> Floats:
-    """Gradient (Q, 3) of a potential whose flux from the first bone's held points to the others' is one."""
+    """Gradient (Q, 3) of a potential whose flux from the first bone's held points to the others' is
+    one.
+    """
     first = solid.owner[solid.held] == solid.bones[0]
     source = np.where(first, -1.0 / max(first.sum(), 1), 1.0 / max((~first).sum(), 1))
     right = solid.spring @ source / (HOLD * solid.side)

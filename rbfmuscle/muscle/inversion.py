@@ -1,8 +1,9 @@
 """What keeps the material of a muscle's solid from being turned inside out where bones squeeze it.
 
-A quadrature point whose volume det F falls below `LEAST` of that at rest is pulled to the nearest deformation that
-has it: the energy gains μ Σ_q w_q `STIFFNESS` min over G of |F_q - G|² with det G >= `LEAST`, nothing for all other
-points. Its matrix, as for the other terms, is constant, but has only the points that need it.
+A quadrature point whose volume det F falls below `LEAST` of that at rest is pulled to the nearest
+deformation that has it: the energy gains μ Σ_q w_q `STIFFNESS` min over G of |F_q - G|² with det G
+>= `LEAST`, nothing for all other points. Its matrix, as for the other terms, is constant, but has
+only the points that need it.
 """
 
 import numpy as np
@@ -26,7 +27,9 @@ def _determinant(m):
 
 @compiled(error_model="numpy")
 def nearest_volume(f, out):
-    """The nearest matrix to ``f`` (3, 3) with a determinant of at least `LEAST`: squared distance, and ``out``."""
+    """The nearest matrix to ``f`` (3, 3) with a determinant of at least `LEAST`: squared distance,
+    and ``out``.
+    """
     u, s, vt = np.linalg.svd(f)
     if _determinant(u) * _determinant(vt) < 0.0:
         s[2] = -s[2]
@@ -39,7 +42,9 @@ def nearest_volume(f, out):
         # Each round goes to the foot of the perpendicular on the tangent plane of d0 d1 d2 = LEAST.
         for _ in range(ROUNDS):
             lacking, square = LEAST - d[0] * d[1] * d[2], 0.0
-            g[0], g[1], g[2] = d[1] * d[2], d[0] * d[2], d[0] * d[1]
+            g[0] = d[1] * d[2]
+            g[1] = d[0] * d[2]
+            g[2] = d[0] * d[1]
             for k in range(3):
                 lacking += g[k] * (d[k] - s[k])
                 square += g[k] * g[k]
@@ -50,7 +55,9 @@ def nearest_volume(f, out):
         away += (d[k] - s[k]) ** 2
     for a in range(3):
         for b in range(3):
-            out[a, b] = u[a, 0] * d[0] * vt[0, b] + u[a, 1] * d[1] * vt[1, b] + u[a, 2] * d[2] * vt[2, b]
+            out[a, b] = (
+                u[a, 0] * d[0] * vt[0, b] + u[a, 1] * d[1] * vt[1, b] + u[a, 2] * d[2] * vt[2, b]
+            )
     return away
 
 
@@ -58,7 +65,8 @@ def nearest_volume(f, out):
 def unfold_loop(f, stiffened, weights, columns, slopes, out):
     """Add what pulls squeezed points apart to the right side ``out`` (N, 3).
 
-    Points that are squeezed join those ``stiffened`` (Q,); returns how many did, and the energy over 2 μ.
+    Points that are squeezed join those ``stiffened`` (Q,); returns how many did, and the energy
+    over 2 μ.
     """
     joined, energy = 0, 0.0
     goal = np.empty((3, 3))
@@ -79,6 +87,8 @@ def unfold_loop(f, stiffened, weights, columns, slopes, out):
         for k in range(columns.shape[1]):
             for a in range(3):
                 out[columns[i, k], a] += share * (
-                    goal[a, 0] * slopes[i, k, 0] + goal[a, 1] * slopes[i, k, 1] + goal[a, 2] * slopes[i, k, 2]
+                    goal[a, 0] * slopes[i, k, 0]
+                    + goal[a, 1] * slopes[i, k, 1]
+                    + goal[a, 2] * slopes[i, k, 2]
                 )
     return joined, energy

@@ -17,7 +17,8 @@ from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 
-# Neighbours meet a muscle at contact points so far apart, of the side of a lattice cell, which has three nodes on it.
+# Neighbours meet a muscle at contact points so far apart, of the side of a lattice cell, which has
+# three nodes on it.
 DETAIL = 0.3
 
 
@@ -99,7 +100,9 @@ class RBFMuscle:
         self.points = self.solid.centres(points)
 
     def solve(self, contacts: BoneContacts) -> None:
-        """Solve for the equilibrium under elasticity, volume and contact at the bones' present poses."""
+        """Solve for the equilibrium under elasticity, volume and contact at the bones' present
+        poses.
+        """
         self.solid.settle(contacts)
         self.points = self.solid.centres(self.points)
 
@@ -114,7 +117,9 @@ class RBFMuscle:
             self.law.activate(activation)
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
-        """Move the centres that carry contact points marked in a bool mask by a (4, 4) transform; held ones stay."""
+        """Move the centres that carry contact points marked in a bool mask by a (4, 4) transform;
+        held ones stay.
+        """
         self.solid.turn(which, transform)
         self.points = self.solid.centres(self.points)
 
@@ -134,7 +139,9 @@ class RBFMuscle:
         self.solid.restore(solid)
 
     def normals(self) -> np.ndarray:
-        """Unit normals at the centres, turned with the local deformation by its cofactor, (K, 3)."""
+        """Unit normals at the centres, turned with the local deformation by its cofactor, (K,
+        3).
+        """
         return self.solid.turned_normals(self.rest.normals)
 
     def field(self) -> RBFField:
@@ -153,17 +160,32 @@ def _build_solid(
     muscle: Muscle, scene: Scene, rest: RestState, options: RBFOptions
 ) -> tuple[EmbeddedSolid, FibrePull | None]:
     """The solid that carries the centres, and the law of its fibres where the muscle contracts."""
-    frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
-    points, centres, owner = rest.contact_points(), len(rest.centres), rest.attached_bone
+    frame, faces = (
+        RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)),
+        np.asarray(muscle.mesh.faces),
+    )
+    points = rest.contact_points()
+    centres = len(rest.centres)
+    owner = rest.attached_bone
     held = centres + np.flatnonzero(owner[centres:] >= 0)
     for bone in range(len(rest.bones)):
         if (owner[held] == bone).sum() < LEAST_ATTACHED:
             held = np.concatenate([held, np.flatnonzero(owner[:centres] == bone)])
     solid = EmbeddedSolid(
-        Lattice(frame.local, faces, options.nodes), frame, points, owner.copy(), held, free=rest.free, count=centres,
-        area=float(muscle.mesh.area) / len(rest.samples), iterations=options.iterations,
-        bones={bone.name: (np.asarray(bone.mesh.vertices), np.asarray(bone.mesh.faces)) for bone in scene.bones},
-    )  # fmt: skip
+        Lattice(frame.local, faces, options.nodes),
+        frame,
+        points,
+        owner.copy(),
+        held,
+        free=rest.free,
+        count=centres,
+        area=float(muscle.mesh.area) / len(rest.samples),
+        iterations=options.iterations,
+        bones={
+            bone.name: (np.asarray(bone.mesh.vertices), np.asarray(bone.mesh.faces))
+            for bone in scene.bones
+        },
+    )
     axis = points[held].mean(axis=0) - points.mean(axis=0)
     along = fibre_directions(solid.quad_points, rise(solid), muscle.fibres, fallback=axis)
     count = len(along)

@@ -27,17 +27,19 @@ def _known_kernel(name: str) -> str:
 class RBFOptions(Table):
     """``[muscle.model]`` of an RBF muscle.
 
-    ``centres``, where none are given, follow from the muscle's area, and are more where the surface at rest would
-    err by more than ``rest_error`` (RMS; 0 for 0.5 mm, or a tenth of the muscle's thickness where that is less), and
-    ``epsilon`` (a kernel's shape parameter) from the error at rest. A ridge keeps the ``condition`` of every fit below
-    a bound, 0 for 1e10 where the kernel has a shape parameter and none where not. ``samples`` of the surface meet the
-    bones. ``nodes`` of the elastic solid that carries the centres, and the greatest number of ``iterations`` of a
-    solve. Fibres shorten without resistance from their length in the scan to 1 / ``slack`` of it (1: no slack);
-    beyond, the solid is stiffer along them than across by ``fibre_ratio``, a ratio of Young's moduli.
-    ``surface`` is shown by a mesh of the ``material`` that is brought onto the level set, or by ``marching`` cubes;
-    ``resolution`` is the number of edges or cells along the longest side, 0 for as many as the muscle's thickness
-    wants. ``placement`` of the centres: ``greedy`` where a fit misses the surface, or ``fitted`` beside it so that all
-    of it is met, for slower fits.
+    ``centres``, where none are given, follow from the muscle's area, and are more where the surface
+    at rest would err by more than ``rest_error`` (RMS; 0 for 0.5 mm, or a tenth of the muscle's
+    thickness where that is less), and ``epsilon`` (a kernel's shape parameter) from the error at
+    rest. A ridge keeps the ``condition`` of every fit below a bound, 0 for 1e10 where the kernel
+    has a shape parameter and none where not. ``samples`` of the surface meet the bones. ``nodes``
+    of the elastic solid that carries the centres, and the greatest number of ``iterations`` of a
+    solve. Fibres shorten without resistance from their length in the scan to 1 / ``slack`` of it
+    (1: no slack); beyond, the solid is stiffer along them than across by ``fibre_ratio``, a ratio
+    of Young's moduli. ``surface`` is shown by a mesh of the ``material`` that is brought onto the
+    level set, or by ``marching`` cubes; ``resolution`` is the number of edges or cells along the
+    longest side, 0 for as many as the muscle's thickness wants. ``placement`` of the centres:
+    ``greedy`` where a fit misses the surface, or ``fitted`` beside it so that all of it is met, for
+    slower fits.
     """
 
     centres: Annotated[int, Field(ge=0, le=20_000)] = 0

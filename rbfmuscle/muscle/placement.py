@@ -23,19 +23,25 @@ from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import NumericalWarning, SceneError
 
-# Area for each centre [mm²], from which their number follows where the scene names none, and the least number.
+# Area for each centre [mm²], from which their number follows where the scene names none, and the
+# least number.
 AREA_FOR_EACH = 212.0
 LEAST_CENTRES = 150
-# A field at rest that is looked at before it is used: cells along its longest side, and the share of the mesh's volume
-# by which its level zero may be off.
+# A field at rest that is looked at before it is used: cells along its longest side, and the share
+# of the mesh's volume by which its level zero may be off.
 CELLS, VOLUME_BOUND = 48, 0.2
-# What the surface at rest may err by where the scene says nothing: a length [mm], or a share of the muscle's thickness.
+# What the surface at rest may err by where the scene says nothing: a length [mm], or a share of the
+# muscle's thickness.
 REST_ERROR, REST_SHARE = 0.5, 0.1
-# How fast the error falls with the centres, taken low; trials of their number, and the most, in the usual number.
-FALL, TRIALS, MOST_CENTRES = 1.2, 5, 4.0
+# How fast the error falls with the centres, taken low; trials of their number, and the most, in the
+# usual number.
+FALL = 1.2
+TRIALS = 5
+MOST_CENTRES = 4.0
 # What is aimed at, in what is wanted: the shown mesh adds its own.
 AIM = 0.97
-# Parts of the names under which samples and numbers of centres are cached: raise one when the way to find them changes.
+# Parts of the names under which samples and numbers of centres are cached: raise one when the way
+# to find them changes.
 SAMPLING, SEARCH = 4, 2
 SEED = 0
 
@@ -46,7 +52,9 @@ def default_centres(area: float, scene: Scene) -> int:
 
 
 def wanted_error(muscle: Muscle, scene: Scene, options: RBFOptions) -> float:
-    """What a muscle's surface at rest may err by, RMS [scene unit]: as asked for, or by its size."""
+    """What a muscle's surface at rest may err by, RMS [scene unit]: as asked for, or by its
+    size.
+    """
     if options.rest_error:
         return options.rest_error
     thickness = 2.0 * float(muscle.mesh.volume) / float(muscle.mesh.area)
@@ -61,18 +69,32 @@ class Chosen(NamedTuple):
     reason: str
 
 
-def choose_centres(muscle: Muscle, scene: Scene, options: RBFOptions, *, known_only: bool = False) -> Chosen:
-    """How many centres a muscle has: as many as the scene says, else as its area and the error at rest ask for.
+def choose_centres(
+    muscle: Muscle, scene: Scene, options: RBFOptions, *, known_only: bool = False
+) -> Chosen:
+    """How many centres a muscle has: as many as the scene says, else as its area and the error at
+    rest ask for.
 
-    The number is kept on disk; with ``known_only`` nothing is fitted, and where it is not on disk it is the least
-    that it can be.
+    The number is kept on disk; with ``known_only`` nothing is fitted, and where it is not on disk
+    it is the least that it can be.
     """
     if options.centres:
         return Chosen(options.centres, np.nan, "as given")
     usual, wanted = default_centres(muscle.mesh.area, scene), wanted_error(muscle, scene, options)
-    frame, faces = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)), np.asarray(muscle.mesh.faces)
-    fit = (options.kernel, round(options.epsilon * frame.size, 9), options.condition, options.placement, SEED)
-    key = content_key(frame.local, faces, ("centres", SEARCH, usual, round(wanted / frame.size, 9), *fit))
+    frame, faces = (
+        RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)),
+        np.asarray(muscle.mesh.faces),
+    )
+    fit = (
+        options.kernel,
+        round(options.epsilon * frame.size, 9),
+        options.condition,
+        options.placement,
+        SEED,
+    )
+    key = content_key(
+        frame.local, faces, ("centres", SEARCH, usual, round(wanted / frame.size, 9), *fit)
+    )
     found = load_arrays(key)
     if found is None and known_only:
         return Chosen(usual, np.nan, "by its area; more where the rest error asks for them")
@@ -83,14 +105,18 @@ def choose_centres(muscle: Muscle, scene: Scene, options: RBFOptions, *, known_o
     count, error = int(found["count"]), float(found["error"]) * frame.size
     how = "by its area" if count == usual else f"more than the {usual} of its area"
     met = "met" if error <= wanted else "not met"
-    return Chosen(count, error, f"{how}, rest error {error:.2g}, {wanted:.2g} {scene.units} wanted: {met}")
+    return Chosen(
+        count, error, f"{how}, rest error {error:.2g}, {wanted:.2g} {scene.units} wanted: {met}"
+    )
 
 
 def _search_centres(
     muscle: Muscle, frame: RestFrame, options: RBFOptions, usual: int, wanted: float
 ) -> tuple[int, float]:
     """The number of centres that errs little enough, or the best within reach, and its error."""
-    most, count, tried = min(int(MOST_CENTRES * usual), GREEDY_LARGEST), usual, []
+    most = min(int(MOST_CENTRES * usual), GREEDY_LARGEST)
+    count = usual
+    tried = []
     for _ in range(TRIALS):
         centres, _, fit = place_points(muscle, frame, options, count)
         error = _rest_miss(frame, centres, fit)
@@ -116,7 +142,8 @@ def _rest_miss(frame: RestFrame, centres: SurfaceSample, fit: FieldFit) -> float
 def place_points(
     muscle: Muscle, frame: RestFrame, options: RBFOptions, count: int
 ) -> tuple[SurfaceSample, SurfaceSample, FieldFit]:
-    """Centres and samples of a muscle in the coordinates of its frame, and their fit in the scene's.
+    """Centres and samples of a muscle in the coordinates of its frame, and their fit in the
+    scene's.
 
     Raises SceneError if the placement cannot be had with this kernel.
     """
@@ -142,7 +169,9 @@ def _choose_fit(
     centres: SurfaceSample,
     samples: SurfaceSample,
 ) -> FieldFit:
-    """The kernel, and its shape parameter where the scene leaves it open: by the error at the samples at rest."""
+    """The kernel, and its shape parameter where the scene leaves it open: by the error at the
+    samples at rest.
+    """
     frame, faces = mesh
     kernel = get_kernel(options.kernel)
     fit = FieldFit(
@@ -153,7 +182,8 @@ def _choose_fit(
     if not kernel.hermite:
         warnings.warn(
             f"muscle {name!r}: kernel {kernel.name!r} is C{kernel.smoothness} only; the field is "
-            "fitted to values on and off the surface, with three centres a point, in place of normals",
+            "fitted to values on and off the surface, with three centres a point, in place "
+            "of normals",
             NumericalWarning,
             stacklevel=6,
         )
@@ -182,7 +212,10 @@ def _refuse_broken(
     shape = f" and epsilon {fit.epsilon:.3g}" if fit.kernel.has_epsilon else ""
     said = f"muscle {name!r}: kernel {fit.kernel.name!r} with {len(centres.points)} centres{shape}"
     bound = ", a greater condition" if np.isfinite(fit.condition) else ""
-    remedy = f"take kernel 'cubic', more centres{bound}, or another epsilon (rbfmuscle kernels ranks them)"
+    remedy = (
+        f"take kernel 'cubic', more centres{bound}, or another epsilon (rbfmuscle kernels "
+        "ranks them)"
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
         try:
@@ -193,27 +226,37 @@ def _refuse_broken(
     off = found.volume / mesh_volume(frame.local, faces) - 1.0
     if found.components > 1 or abs(off) > VOLUME_BOUND:
         raise SceneError(
-            f"{said} breaks at rest: {found.components} sheets, {100 * off:+.3g} % of volume; {remedy}"
+            f"{said} breaks at rest: {found.components} sheets, {100 * off:+.3g} % of volume; "
+            f"{remedy}"
         )
 
 
 def _fit_centres(
-    name: str, mesh: tuple[RestFrame, Integers], options: RBFOptions, centres: SurfaceSample, fit: FieldFit
+    name: str,
+    mesh: tuple[RestFrame, Integers],
+    options: RBFOptions,
+    centres: SurfaceSample,
+    fit: FieldFit,
 ) -> SurfaceSample:
     """Centres beside the surface, whose field lies nearer to all of it."""
     frame, faces = mesh
     if not fit.kernel.hermite:
         raise SceneError(
-            f"muscle {name!r}: placement {FITTED!r} needs a C2 kernel, got {fit.kernel.name!r}; take placement 'greedy'"
+            f"muscle {name!r}: placement {FITTED!r} needs a C2 kernel, got {fit.kernel.name!r}; "
+            "take placement 'greedy'"
         )
     local = replace(fit, epsilon=fit.epsilon * frame.size)
     return fit_sample(centres, frame.local, faces, fit=local, seed=SEED)
 
 
-def cached_sample(vertices: np.ndarray, faces: np.ndarray, count: int, placement: str) -> SurfaceSample:
-    """`sample_surface` of a muscle's mesh, from the cache on disk by content: greedy placement takes a second.
+def cached_sample(
+    vertices: np.ndarray, faces: np.ndarray, count: int, placement: str
+) -> SurfaceSample:
+    """`sample_surface` of a muscle's mesh, from the cache on disk by content: greedy placement
+    takes a second.
 
-    Points are in an order in which near ones are mostly near each other, except for greedy placement.
+    Points are in an order in which near ones are mostly near each other, except for greedy
+    placement.
     """
     key = content_key(vertices, faces, ("surface sample", SAMPLING, count, SEED, placement))
     arrays = load_arrays(key)
@@ -222,6 +265,8 @@ def cached_sample(vertices: np.ndarray, faces: np.ndarray, count: int, placement
         if placement != "greedy":
             order = morton_order(arrays["points"])
             corners = np.argsort(order)[arrays.pop("control_faces")]
-            arrays = {name: part[order] for name, part in arrays.items()} | {"control_faces": corners}
+            arrays = {name: part[order] for name, part in arrays.items()} | {
+                "control_faces": corners
+            }
         store_arrays(key, arrays)
     return SurfaceSample(**arrays)

@@ -22,7 +22,9 @@ LEAST_ATTACHED = 4
 
 @dataclass(frozen=True)
 class RestState:
-    """An RBF muscle at rest: K centres, whose field is its surface, and S samples of the surface."""
+    """An RBF muscle at rest: K centres, whose field is its surface, and S samples of the
+    surface.
+    """
 
     centres: np.ndarray  # (K, 3)
     normals: np.ndarray  # (K, 3)
@@ -31,7 +33,9 @@ class RestState:
     fit: FieldFit  # how the field through the centres is fitted
     parts: np.ndarray  # (P, n) centres of its local fits
     bones: list[str]  # bones, and ends of tendons, that hold the muscle, in the order of the scene
-    attached_bone: np.ndarray  # (K + S,) position in ``bones`` of what holds a contact point, -1 where free
+    attached_bone: (
+        np.ndarray
+    )  # (K + S,) position in ``bones`` of what holds a contact point, -1 where free
     free: np.ndarray  # centres that move
     held: np.ndarray  # centres that their bones carry
     mesh_volume: float  # of the muscle's mesh [scene unit cubed]
@@ -39,7 +43,9 @@ class RestState:
 
     @classmethod
     def from_muscle(cls, muscle: Muscle, scene: Scene, options: RBFOptions) -> RestState:
-        """Measure a muscle; SceneError if the placement cannot be had or no centre is left free to move."""
+        """Measure a muscle; SceneError if the placement cannot be had or no centre is left free to
+        move.
+        """
         frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         count = choose_centres(muscle, scene, options).centres
         centres, samples, fit = place_points(muscle, frame, options, count)
@@ -48,18 +54,31 @@ class RestState:
         free, held = np.flatnonzero(held_by.centres < 0), np.flatnonzero(held_by.centres >= 0)
         if len(free) == 0:
             raise SceneError(
-                f"muscle {muscle.name!r}: every centre lies on an attachment; nothing is free to move"
+                f"muscle {muscle.name!r}: every centre lies on an attachment; nothing is "
+                "free to move"
             )
         attached_bone = np.concatenate([held_by.centres, held_by.samples])
         return cls(
-            points, frame.directions(centres.normals), frame.points(samples.points), samples.control_faces, fit,
-            overlapping_parts(centres.points), held_by.bones, attached_bone, free, held, float(muscle.mesh.volume),
-            # Cells along the muscle's own axes are smaller than along the scene's, and turn with the scene.
+            points,
+            frame.directions(centres.normals),
+            frame.points(samples.points),
+            samples.control_faces,
+            fit,
+            overlapping_parts(centres.points),
+            held_by.bones,
+            attached_bone,
+            free,
+            held,
+            float(muscle.mesh.volume),
+            # Cells along the muscle's own axes are smaller than along the scene's, and turn with
+            # the scene.
             frame.directions(_principal_axes(samples.points)),
-        )  # fmt: skip
+        )
 
     def field(self, centres: Floats, normals: Floats) -> RBFField:
-        """The field through the centres (K, 3) where they are now, with their unit normals (K, 3)."""
+        """The field through the centres (K, 3) where they are now, with their unit normals
+        (K, 3).
+        """
         return self.fit.fit(centres, normals, self.parts)
 
     def contact_points(self) -> np.ndarray:
@@ -68,10 +87,17 @@ class RestState:
 
 
 class _Attachment:
-    """Which bone holds each centre and each sample, as a position in ``bones``; -1 where none does."""
+    """Which bone holds each centre and each sample, as a position in ``bones``; -1 where none
+    does.
+    """
 
     def __init__(
-        self, muscle: Muscle, scene: Scene, frame: RestFrame, centres: np.ndarray, samples: np.ndarray
+        self,
+        muscle: Muscle,
+        scene: Scene,
+        frame: RestFrame,
+        centres: np.ndarray,
+        samples: np.ndarray,
     ) -> None:
         names = scene.holders(muscle)
         patches = [np.asarray(attachment.vertices) for attachment in muscle.attachments]

@@ -1,23 +1,24 @@
 """The elastic solid that carries the centres of an RBF muscle.
 
-With y the nodes of a `Lattice` and F = Σ y_k ∇N_k the deformation gradient at its quadrature points q, the nodes
-minimise
+With y the nodes of a `Lattice` and F = Σ y_k ∇N_k the deformation gradient at its quadrature points
+q, the nodes minimise
 
-    E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² + c (|F_q a| - t)² - 2 τ (1 - t)),
-    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    τ = min(TONE (1 - d / d₀), MOST_TONE) >= 0,
+    E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² + c (|F_q a| - t)² - 2 τ (1 - t)), D(t) = t
+    aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    τ = min(TONE (1 - d / d₀), MOST_TONE) >= 0,
 
-subject to the volumes of the regions r of the lattice, V_r(y) = Σ_{q in r} w_q det F_q, and to the contacts. R is a
-rotation, a the fibre direction. Between 1 / slack and 1 a fibre shortens without resistance while the section
-thickens, and bears a small tension, 2 μ τ, which keeps a slack muscle straight. It grows as the muscle's ends
-approach, from their distance d₀ at rest to d, and depends on the bones alone: a tension that grew with the fibres'
-shortening would be a negative stiffness. c = 3/2 (fibre_ratio - 1) stiffens fibres that are longer or shorter than the
-band.
-For small stretches beyond the slack band and more and more nodes this is the incompressible solid of shear modulus μ,
-Young's modulus 3 μ across and 3 μ · fibre_ratio along the fibres.
+subject to the volumes of the regions r of the lattice, V_r(y) = Σ_{q in r} w_q det F_q, and to the
+contacts. R is a rotation, a the fibre direction. Between 1 / slack and 1 a fibre shortens without
+resistance while the section thickens, and bears a small tension, 2 μ τ, which keeps a slack muscle
+straight. It grows as the muscle's ends approach, from their distance d₀ at rest to d, and depends
+on the bones alone: a tension that grew with the fibres' shortening would be a negative stiffness. c
+= 3/2 (fibre_ratio - 1) stiffens fibres that are longer or shorter than the band. For small
+stretches beyond the slack band and more and more nodes this is the incompressible solid of shear
+modulus μ, Young's modulus 3 μ across and 3 μ · fibre_ratio along the fibres.
 
-Each iteration minimises over R and t at each point, then over y with the matrix of E for these, which never changes
-(Bouaziz et al. 2014, "Projective dynamics"), and corrects the regions' volumes and the contacts in its metric. The
-pressures are kept from iteration to iteration, so that the fixed point of the iteration is the equilibrium.
+Each iteration minimises over R and t at each point, then over y with the matrix of E for these,
+which never changes (Bouaziz et al. 2014, "Projective dynamics"), and corrects the regions' volumes
+and the contacts in its metric. The pressures are kept from iteration to iteration, so that the
+fixed point of the iteration is the equilibrium.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,22 +40,28 @@ from rbfmuscle.muscle.solid_step import Anderson, global_loop, local_loop, press
 from rbfmuscle.simulation.contact import BoneContacts
 
 MEMORY = 5  # steps that Anderson acceleration combines
-# Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.82 of their distance at rest, and for shorter ones,
-# it is 0.03 of that at full activation.
+# Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.82 of their distance at rest,
+# and for shorter ones, it is 0.03 of that at full activation.
 TONE, MOST_TONE = 2.5, 0.45
 HOLD = 25.0  # stiffness of the spring at a held point, relative to that of a cell
-GHOST = 1e-3  # stiffness of second differences, relative to a cell: for nodes that hold hardly any material
-# Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in volume. The surface
-# is drawn at the volume at rest in any case.
+# stiffness of second differences, relative to a cell: for nodes that hold hardly any material
+GHOST = 1e-3
+# Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in
+# volume. The surface is drawn at the volume at rest in any case.
 BULK, MOST_PRESSURE = 50.0, 3.0
-MOST_TREND = 1.5  # greatest multiple of the last sub-step's correction that the next one starts with
-MOBILE = 0.02  # points that move by less than this fraction of the median for a unit force count as attached
+MOST_TREND = (
+    1.5  # greatest multiple of the last sub-step's correction that the next one starts with
+)
+# points that move by less than this fraction of the median for a unit force count as attached
+MOBILE = 0.02
 SETTLED = 2e-5  # of the size: an iteration that moves no node farther was the last one
 SETTLED_BESIDE = 1e-4  # the same beside neighbours, whose planes are not known better
-# The same where the bones stand still and only the activation changes, and how many times the iterations it may take.
+# The same where the bones stand still and only the activation changes, and how many times the
+# iterations it may take.
 SETTLED_STILL, ROUNDS_STILL = 1e-7, 10
 LONGEST = 0.2  # of the size: a longer step is shortened to it
-# Over 2 μ: at higher pressures det F bends the energy more than the iteration's matrix does, and steps are shortened.
+# Over 2 μ: at higher pressures det F bends the energy more than the iteration's matrix does, and
+# steps are shortened.
 CALM_PRESSURE = 0.5
 GROWTH = 2.0  # a motion beyond this multiple of the least so far restarts the acceleration
 NODES_PER_REGION = 8
@@ -76,11 +83,12 @@ class SolidState(NamedTuple):
 class EmbeddedSolid:
     """An elastic solid on a lattice, with volume and contact solved inside the iteration.
 
-    Contact points (n, 3) at rest [scene unit] are ``count`` centres, then samples of the surface, each of which
-    stands for an ``area``; ``owner`` (n,) is the bone that each is attached to, -1 where it is free. The bones hold
-    the muscle by the points ``held``; ``free`` centres move. Nodes ``y`` (N, 3) are in equilibrium with contacts that
-    yield a little, ``shown`` are the same nodes with what is left in a bone moved out. ``history`` holds the greatest
-    motion of a node in each iteration of the last solve.
+    Contact points (n, 3) at rest [scene unit] are ``count`` centres, then samples of the surface,
+    each of which stands for an ``area``; ``owner`` (n,) is the bone that each is attached to, -1
+    where it is free. The bones hold the muscle by the points ``held``; ``free`` centres move. Nodes
+    ``y`` (N, 3) are in equilibrium with contacts that yield a little, ``shown`` are the same nodes
+    with what is left in a bone moved out. ``history`` holds the greatest motion of a node in each
+    iteration of the last solve.
     """
 
     def __init__(
@@ -97,9 +105,18 @@ class EmbeddedSolid:
         iterations: int,
         bones: Mapping[str, tuple[Floats, Integers]],
     ) -> None:
-        self.lattice, self.frame, self.iterations = lattice, frame, iterations
-        self.points, self.owner, self.held, self.free, self.count = points, owner, held, free, count
-        self.scale, self.side = diameter(points), float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
+        self.lattice = lattice
+        self.frame = frame
+        self.iterations = iterations
+        self.points = points
+        self.owner = owner
+        self.held = held
+        self.free = free
+        self.count = count
+        self.scale, self.side = (
+            diameter(points),
+            float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size,
+        )
         self.rest = frame.points(lattice.rest)
         self.columns, self.shares, self.slopes_at = self._embed(points)
         self.carrier = Carrier(self.columns, self.shares)
@@ -128,26 +145,34 @@ class EmbeddedSolid:
         self._followed: tuple[Floats, Carrier] | None = None
 
     def _embed(self, points: Floats) -> tuple[Integers, Floats, Floats]:
-        """Nodes (n, 27), shape functions (n, 27) and their slopes (n, 27, 3) at points of the muscle at rest."""
+        """Nodes (n, 27), shape functions (n, 27) and their slopes (n, 27, 3) at points of the
+        muscle at rest.
+        """
         frame = self.frame
         found = self.lattice.embed((points - frame.origin) @ frame.axes.T / frame.size)
         return found.indices, found.weights, found.slopes @ frame.axes / frame.size
 
     def _assemble(self, lattice: Lattice) -> None:
-        """Matrix of the energy for frozen targets, with its springs; its inverse; the weights of the bones."""
+        """Matrix of the energy for frozen targets, with its springs; its inverse; the weights of
+        the bones.
+        """
         size = len(self.rest)
         matrix = GHOST * self.side * lattice.second_differences() + self._stiffness(
             np.arange(len(self.weights))
         )
         hangs = np.zeros((size, len(self.held)))
-        np.add.at(hangs, (self.columns[self.held].T, np.arange(len(self.held))), self.shares[self.held].T)
+        np.add.at(
+            hangs, (self.columns[self.held].T, np.arange(len(self.held))), self.shares[self.held].T
+        )
         self.spring = HOLD * self.side * hangs
         self.without_springs, self.without_fibres = matrix, matrix + self.spring @ hangs.T
         self.matrix = self.without_fibres
         self._invert()
         own = self.owner[self.held]
         self.bones = sorted(set(own.tolist()))
-        weights = np.stack([self.inverse @ self.spring[:, own == bone].sum(axis=1) for bone in self.bones], 1)
+        weights = np.stack(
+            [self.inverse @ self.spring[:, own == bone].sum(axis=1) for bone in self.bones], 1
+        )
         self.motion_weights = weights / weights.sum(axis=1, keepdims=True)
 
     def _stiffness(self, which: Integers) -> Floats:
@@ -161,7 +186,9 @@ class EmbeddedSolid:
 
     def _invert(self) -> None:
         matrix, stiff = self.matrix, np.flatnonzero(self.stiffened)
-        inverse = np.linalg.inv(matrix + STIFFNESS * self._stiffness(stiff) if len(stiff) else matrix)
+        inverse = np.linalg.inv(
+            matrix + STIFFNESS * self._stiffness(stiff) if len(stiff) else matrix
+        )
         self.inverse = np.ascontiguousarray(0.5 * (inverse + inverse.T))
 
     def _number_regions(self, region: Integers) -> None:
@@ -176,7 +203,7 @@ class EmbeddedSolid:
         self.volumes = np.empty(count)
         self.rest_volumes = np.bincount(region, self.weights, minlength=count)
 
-    # --- fibres -----------------------------------------------------------------------------------------------
+    # --- fibres
 
     def take_fibres(self, fibres: Fibres) -> None:
         """Take springs along the fibres; their stiffness becomes part of the matrix."""
@@ -190,7 +217,9 @@ class EmbeddedSolid:
         self._invert()
 
     def _farthest_ends(self) -> tuple[tuple[Integers, Integers] | None, float]:
-        """Held points of the two bones that hold the muscle farthest apart, and their distance at rest."""
+        """Held points of the two bones that hold the muscle farthest apart, and their distance at
+        rest.
+        """
         held, own = self.points[self.held], self.owner[self.held]
         ends, most = None, 0.0
         for first, second in combinations([np.flatnonzero(own == bone) for bone in self.bones], 2):
@@ -200,7 +229,9 @@ class EmbeddedSolid:
         return ends, most
 
     def _take_anchor(self, anchor: Floats) -> None:
-        """Take positions (h, 3) of the held points, and the tension of slack fibres that goes with them."""
+        """Take positions (h, 3) of the held points, and the tension of slack fibres that goes with
+        them.
+        """
         self.anchor, self.tension = anchor, 0.0
         if self._ends is not None:
             first, second = (anchor[end].mean(axis=0) for end in self._ends)
@@ -214,7 +245,9 @@ class EmbeddedSolid:
         return out
 
     def attach_immobile(self) -> None:
-        """Count free contact points that a force hardly moves to the bone of the nearest attached one."""
+        """Count free contact points that a force hardly moves to the bone of the nearest attached
+        one.
+        """
         mobility = self.mobility()
         free, fixed = self.owner < 0, np.flatnonzero(self.owner >= 0)
         stuck = np.flatnonzero(free & (mobility < MOBILE * np.median(mobility[free])))
@@ -222,20 +255,25 @@ class EmbeddedSolid:
             away = ((self.points[fixed] - self.points[point]) ** 2).sum(axis=1)
             self.owner[point] = self.owner[fixed[np.argmin(away)]]
 
-    # --- what the nodes carry ---------------------------------------------------------------------------------
+    # --- what the nodes carry
+    # ---------------------------------------------------------------------------------
 
     def carry(self) -> Floats:
         """Contact points now, (n, 3)."""
         return self.carrier.carry(self.shown)
 
     def follow(self, points: Floats) -> Floats:
-        """Present positions of points (n, 3) of the muscle at rest; the embedding of the last array is kept."""
+        """Present positions of points (n, 3) of the muscle at rest; the embedding of the last array
+        is kept.
+        """
         if self._followed is None or self._followed[0] is not points:
             self._followed = points, Carrier(*self._embed(points)[:2])
         return self._followed[1].carry(self.shown)
 
     def centres(self, before: Floats) -> Floats:
-        """Centres (K, 3): the free ones where the nodes carry them, the held ones as in ``before``."""
+        """Centres (K, 3): the free ones where the nodes carry them, the held ones as in
+        ``before``.
+        """
         out = before.copy()
         out[self.free] = self._free_carrier.carry(self.shown)
         return out
@@ -246,14 +284,15 @@ class EmbeddedSolid:
         normals_loop(self.shown, self.columns, self.slopes_at, normals, out)
         return out
 
-    # --- motion -----------------------------------------------------------------------------------------------
+    # --- motion
 
     def move(self, motions: Floats, poses: Sequence[Floats]) -> None:
         """Predict the nodes.
 
-        They take a weighted mean of the motions of the bones (b, 4, 4); held points follow the ``poses`` (4, 4) from
-        rest, a list by bone. Where the motion goes on as before, so does the last correction. What is shown
-        has no part in that: neighbours add a mean of several corrections (`NeighbourSurface`).
+        They take a weighted mean of the motions of the bones (b, 4, 4); held points follow the
+        ``poses`` (4, 4) from rest, a list by bone. Where the motion goes on as before, so does the
+        last correction. What is shown has no part in that: neighbours add a mean of several
+        corrections (`NeighbourSurface`).
         """
         self.y = blended_motion(self.y, self.motion_weights, motions)
         anchor, own = np.empty_like(self.anchor), self.owner[self.held]
@@ -273,7 +312,9 @@ class EmbeddedSolid:
             self.pressure = self.pressure + share * pressed
 
     def turn(self, which: Integers, transform: Floats) -> None:
-        """Move the nodes by a rigid transform as far as they carry free contact points of the mask ``which``."""
+        """Move the nodes by a rigid transform as far as they carry free contact points of the mask
+        ``which``.
+        """
         hit, every = np.zeros((2, len(self.y)))
         marked = np.asarray(which) & (self.owner < 0)
         np.add.at(hit, self.columns[marked], self.shares[marked])
@@ -285,7 +326,9 @@ class EmbeddedSolid:
     def transform(self, motion: Floats) -> None:
         """Apply a rigid motion (4, 4) to the whole solid."""
         turn, shift = motion[:3, :3].T, motion[:3, 3]
-        self.y, self.shown, self.anchor = (at @ turn + shift for at in (self.y, self.shown, self.anchor))
+        self.y, self.shown, self.anchor = (
+            at @ turn + shift for at in (self.y, self.shown, self.anchor)
+        )
         self.quaternion = turned_quaternions(self.quaternion, motion[:3, :3])
         self.begun = None
         if self.trend is not None:
@@ -295,9 +338,15 @@ class EmbeddedSolid:
     def snapshot(self) -> SolidState:
         """State that ``restore`` brings back."""
         return SolidState(
-            self.y.copy(), self.shown.copy(), self.quaternion.copy(), self.stretch.copy(), self.pressure.copy(),
-            self.forces.copy(), self.anchor.copy(), self.trend,
-        )  # fmt: skip
+            self.y.copy(),
+            self.shown.copy(),
+            self.quaternion.copy(),
+            self.stretch.copy(),
+            self.pressure.copy(),
+            self.forces.copy(),
+            self.anchor.copy(),
+            self.trend,
+        )
 
     def restore(self, state: SolidState) -> None:
         """Return to an earlier ``snapshot``."""
@@ -307,10 +356,13 @@ class EmbeddedSolid:
         self._take_anchor(state.anchor.copy())
         self.trend, self.begun = state.trend, None
 
-    # --- equilibrium ------------------------------------------------------------------------------------------
+    # --- equilibrium
+    # ------------------------------------------------------------------------------------------
 
     def settle(self, contacts: BoneContacts) -> None:
-        """Bring the nodes to equilibrium under pressures and contacts; FloatingPointError if it diverges."""
+        """Bring the nodes to equilibrium under pressures and contacts; FloatingPointError if it
+        diverges.
+        """
         self.history, self._pull = [], self.spring @ self.anchor
         self._begin()
         near = self.contact.near(contacts, None)
@@ -336,7 +388,8 @@ class EmbeddedSolid:
             if moved < settled * self.scale or len(self.history) == self.iterations * rounds:
                 break
             state, image = (
-                np.concatenate((y.ravel(), p)) for y, p in ((self.y, self.pressure), (new, pressure))
+                np.concatenate((y.ravel(), p))
+                for y, p in ((self.y, self.pressure), (new, pressure))
             )
             mixed = mixer.mix(state, image)
             self.y, self.pressure = mixed[:size].reshape(-1, 3), mixed[size:]
@@ -357,7 +410,9 @@ class EmbeddedSolid:
         self.shown = self.contact.parted(contacts)
 
     def _begin(self) -> None:
-        """Forces and responses for the nodes that a solve starts from, with the points that are squeezed there."""
+        """Forces and responses for the nodes that a solve starts from, with the points that are
+        squeezed there.
+        """
         before = bool(self.stiffened.any())
         self.stiffened[:] = False
         if self.localise() or before:
@@ -379,7 +434,9 @@ class EmbeddedSolid:
         beyond = along - np.clip(along, given.lower, given.upper)
         springs = given.passive * beyond**2 + given.active * (along - given.content) ** 2
         tone = 2.0 * self.tension * (1.0 - self.stretch)
-        return 0.5 * float(self.weights @ ((gap**2).sum(axis=(1, 2)) + springs - tone)) + self.squeezed
+        return (
+            0.5 * float(self.weights @ ((gap**2).sum(axis=(1, 2)) + springs - tone)) + self.squeezed
+        )
 
     def localise(self) -> bool:
         """Find deformation gradients, targets, volumes and forces for the present nodes.
@@ -389,27 +446,54 @@ class EmbeddedSolid:
         cells = self.quad_columns, self.slopes, self.weights, self.region, self.slot
         state = self.quaternion, self.stretch
         joined, self.squeezed = local_loop(
-            self.y, cells, self.fibres, self.tension, self.stiffened, state, self.f, self.target, self.right,
-            self.gradient, self.volumes,
-        )  # fmt: skip
+            self.y,
+            cells,
+            self.fibres,
+            self.tension,
+            self.stiffened,
+            state,
+            self.f,
+            self.target,
+            self.right,
+            self.gradient,
+            self.volumes,
+        )
         return bool(joined)
 
     def _find_responses(self) -> None:
-        """Motion of the nodes for a unit pressure of each region: the metric of this solve's corrections."""
+        """Motion of the nodes for a unit pressure of each region: the metric of this solve's
+        corrections.
+        """
         count = len(self.pressure)
         self.response, self.factor = np.empty((count, 3, len(self.y))), np.zeros((count, count))
         regions = self.start, self.touched, self.gradient
-        if not respond_loop(regions, self.inverse, self.rest_volumes / BULK, self.response, self.factor):
+        if not respond_loop(
+            regions, self.inverse, self.rest_volumes / BULK, self.response, self.factor
+        ):
             raise np.linalg.LinAlgError("the volumes of the solid's regions depend on each other")
 
     def _iterate(self, near: NearPoints) -> tuple[Floats, Floats, float]:
-        """One global step with volumes and contacts: nodes (N, 3), pressures (M,), greatest motion of a node."""
-        step, change, pressure = np.empty_like(self.y), np.empty(len(self.pressure)), self.pressure.copy()
+        """One global step with volumes and contacts: nodes (N, 3), pressures (M,), greatest motion
+        of a node.
+        """
+        step = np.empty_like(self.y)
+        change = np.empty(len(self.pressure))
+        pressure = self.pressure.copy()
         regions = self.start, self.touched, self.gradient, self.volumes, self.rest_volumes
         part = global_loop(
-            self.y, self.right + self._pull, self.inverse, regions, pressure, (BULK, CALM_PRESSURE), self.response,
-            self.factor, step, change,
-        )  # fmt: skip
+            self.y,
+            self.right + self._pull,
+            self.inverse,
+            regions,
+            pressure,
+            (BULK, CALM_PRESSURE),
+            self.response,
+            self.factor,
+            step,
+            change,
+        )
         push, taken = self.contact.push(near, self.y, step, part)
-        moved = pressure_loop(self.y, step, push, change, taken, self.factor, part, MOST_PRESSURE, pressure)
+        moved = pressure_loop(
+            self.y, step, push, change, taken, self.factor, part, MOST_PRESSURE, pressure
+        )
         return step, pressure, float(moved)

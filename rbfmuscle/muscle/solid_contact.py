@@ -1,9 +1,11 @@
-"""How the elastic solid of a muscle meets bones and neighbours: yielding while it settles, exactly in the end.
+"""How the elastic solid of a muscle meets bones and neighbours: yielding while it settles, exactly
+in the end.
 
-A surface of points on a bone of flat facets has many equilibria, because each point has to be lifted over each edge. A
-muscle on a bone has not. So the solid settles with contacts that yield a little, on bones whose facets are rounded
-(`RoundedBones`): one shape for each pose. What is then left in a bone is lifted out of it in the metric of the energy,
-volumes kept. The next sub-step starts from the settled shape, not from the lifted one.
+A surface of points on a bone of flat facets has many equilibria, because each point has to be
+lifted over each edge. A muscle on a bone has not. So the solid settles with contacts that yield a
+little, on bones whose facets are rounded (`RoundedBones`): one shape for each pose. What is then
+left in a bone is lifted out of it in the metric of the energy, volumes kept. The next sub-step
+starts from the settled shape, not from the lifted one.
 """
 
 from collections.abc import Mapping
@@ -22,14 +24,22 @@ from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
 
 TOLERANCE = 2e-5  # violation of a contact that is left, of the muscle's size
 REACH_MARGIN = 0.003  # of the muscle's size
-NEAR = 0.03  # contact points nearer to an obstacle than this take part in a solve, of the muscle's size
-BATCH, ROUNDS, SWEEPS = 24, 10, 400  # contacts that join the working set in one round, rounds, sweeps in each
-# How far a contact yields under a pressure of 2 μ, of the muscle's size, and the greatest pressure that it takes, over
-# 2 μ. With 5 the gluteus maximus is pressed 6.6 mm into the femur in 90 degrees of flexion.
+# contact points nearer to an obstacle than this take part in a solve, of the muscle's size
+NEAR = 0.03
+# contacts that join the working set in one round, rounds, sweeps in each
+BATCH = 24
+ROUNDS = 10
+SWEEPS = 400
+# How far a contact yields under a pressure of 2 μ, of the muscle's size, and the greatest pressure
+# that it takes, over 2 μ. With 5 the gluteus maximus is pressed 6.6 mm into the femur in 90 degrees
+# of flexion.
 YIELDING, MOST_CONTACT_PRESSURE = 1e-4, 40.0
-SHOWN_YIELDING = 0.1  # share of YIELDING by which obstacles yield where room is made in what is shown
-# Edge of the cells that a bone is rounded over, relative to the spacing of the samples. With 0.7 to 1.0 one pose of the
-# phantom's extensor has shapes 0.6 to 1.6 mm RMS apart, from 1.5 to 2 at most 0.06.
+SHOWN_YIELDING = (
+    0.1  # share of YIELDING by which obstacles yield where room is made in what is shown
+)
+# Edge of the cells that a bone is rounded over, relative to the spacing of the samples. With 0.7 to
+# 1.0 one pose of the phantom's extensor has shapes 0.6 to 1.6 mm RMS apart, from 1.5 to 2 at most
+# 0.06.
 ROUNDING = 1.7
 LEAST_ROUNDING = 0.1  # of that
 LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
@@ -78,12 +88,15 @@ class NearPoints(NamedTuple):
 
 
 class SolidContact:
-    """Contact of an `EmbeddedSolid`: forces of a linear complementarity problem through the inverse of its matrix.
+    """Contact of an `EmbeddedSolid`: forces of a linear complementarity problem through the inverse
+    of its matrix.
 
     ``area`` is that of the surface per sample, ``bones`` has their (vertices, faces) by name.
     """
 
-    def __init__(self, solid: Solid, area: float, bones: Mapping[str, tuple[Floats, Integers]]) -> None:
+    def __init__(
+        self, solid: Solid, area: float, bones: Mapping[str, tuple[Floats, Integers]]
+    ) -> None:
         self.bones = bones
         self.solid, self.reach = solid, NEAR * solid.scale
         self.tolerance, self.margin = TOLERANCE * solid.scale, REACH_MARGIN * solid.scale
@@ -93,9 +106,11 @@ class SolidContact:
         self._last_push = np.zeros_like(solid.rest)
 
     def _greatest_forces(self, area: float) -> Floats:
-        """Greatest force on each contact point, less where it moves less than the median for a unit force.
+        """Greatest force on each contact point, less where it moves less than the median for a unit
+        force.
 
-        What a bone that is driven into an attachment would need to lift the points beside it bends the whole muscle.
+        What a bone that is driven into an attachment would need to lift the points beside it bends
+        the whole muscle.
         """
         mobility = self.solid.mobility()
         free = self.solid.owner < 0
@@ -118,37 +133,54 @@ class SolidContact:
         index = np.unique(contacts.half_spaces(solid.carrier.carry(solid.y), self.reach).index)
         contacts = contacts.only(index)
         return NearPoints(
-            index, solid.columns[index], solid.shares[index], solid.forces[index],
-            RoundedContacts(self._rounded(contacts), contacts, len(index)), contacts.unyielding(), solid.y.copy(),
-            self.reach, self.most[index], softness,
-        )  # fmt: skip
+            index,
+            solid.columns[index],
+            solid.shares[index],
+            solid.forces[index],
+            RoundedContacts(self._rounded(contacts), contacts, len(index)),
+            contacts.unyielding(),
+            solid.y.copy(),
+            self.reach,
+            self.most[index],
+            softness,
+        )
 
     def _rounded(self, contacts: BoneContacts) -> RoundedBones:
         """The bones in reach, rounded."""
         fields, kept = [contacts.fields[b] for b in contacts.reached], self._round
         if kept is None or [*map(id, fields)] != [*map(id, kept.fields)]:
             edges = [self._edge(contacts.fields[b], contacts.names[b]) for b in contacts.reached]
-            kept = self._round = RoundedBones(fields, self.solid.frame, np.array(edges, dtype=np.float64))
+            kept = self._round = RoundedBones(
+                fields, self.solid.frame, np.array(edges, dtype=np.float64)
+            )
         return kept
 
     def _edge(self, field: BoneField, bone: str) -> float:
-        """Cells over which a bone is rounded: no larger than it is thick, or a thin plate would vanish."""
+        """Cells over which a bone is rounded: no larger than it is thick, or a thin plate would
+        vanish.
+        """
         if bone not in self.bones:
             return self.edge
         thickness = bone_thickness(field, *self.bones[bone], self.edge)
         return max(thickness, LEAST_ROUNDING * self.edge)
 
     def push(self, near: NearPoints, y: Floats, step: Floats, part: float) -> tuple[Floats, Floats]:
-        """Contact correction (N, 3) of a step of the nodes from ``y`` to ``step``, ``part`` of a full one.
+        """Contact correction (N, 3) of a step of the nodes from ``y`` to ``step``, ``part`` of a
+        full one.
 
         Also what the contacts take from the whitened pressures, (M,).
         """
         here, motion = np.empty((2, len(near.which), 3))
         reach = np.empty(len(near.which))
-        # Contacts that push now push in the next iteration too: where the points will then go decides what they meet.
-        ways_loop(y, step, self._last_push, near.columns, near.shares, self.margin, here, motion, reach)
+        # Contacts that push now push in the next iteration too: where the points will then go
+        # decides what they meet.
+        ways_loop(
+            y, step, self._last_push, near.columns, near.shares, self.margin, here, motion, reach
+        )
         spaces = near.contacts.half_spaces(here, reach)
-        push, taken = self._touch(near, spaces, motion, near.forces, self.yielding / part, near.most * part)
+        push, taken = self._touch(
+            near, spaces, motion, near.forces, self.yielding / part, near.most * part
+        )
         self._last_push = push
         return push, taken
 
@@ -159,7 +191,9 @@ class SolidContact:
         return self.lifted(near, y + self._push_out(near, spaces, SHOWN_YIELDING * self.yielding))
 
     def lifted(self, near: NearPoints, y: Floats) -> Floats:
-        """Nodes (N, 3), moved so far that no contact point is left in an obstacle that does not yield."""
+        """Nodes (N, 3), moved so far that no contact point is left in an obstacle that does not
+        yield.
+        """
         for _ in range(LIFTS):
             spaces = near.hard.half_spaces(near.carry(y), self.margin)
             if spaces.gap.min(initial=0.0) > -self.tolerance:
@@ -184,8 +218,19 @@ class SolidContact:
         solid, source = self.solid, spaces.source % forces.shape[1]
         push, taken = np.empty_like(solid.y), np.empty(len(solid.pressure))
         contact_loop(
-            spaces.index, spaces.gap, spaces.normal, source, motion, solid.inverse, near.columns, near.shares,
-            solid.response, forces, (BATCH, ROUNDS, SWEEPS, self.tolerance),
-            (yielding * near.softness[source], most[spaces.index]), push, taken,
-        )  # fmt: skip
+            spaces.index,
+            spaces.gap,
+            spaces.normal,
+            source,
+            motion,
+            solid.inverse,
+            near.columns,
+            near.shares,
+            solid.response,
+            forces,
+            (BATCH, ROUNDS, SWEEPS, self.tolerance),
+            (yielding * near.softness[source], most[spaces.index]),
+            push,
+            taken,
+        )
         return push, taken

@@ -9,7 +9,9 @@ from rbfmuscle.jit import compiled
 
 
 class Fibres(NamedTuple):
-    """Springs along the fibres at the quadrature points, stiffnesses over twice the shear modulus."""
+    """Springs along the fibres at the quadrature points, stiffnesses over twice the shear
+    modulus.
+    """
 
     direction: np.ndarray  # (Q, 3) at rest, unit
     passive: np.ndarray  # (Q,) stiffness of a spring that is slack from lower to upper
@@ -22,15 +24,32 @@ class Fibres(NamedTuple):
 @compiled(error_model="numpy", fastmath={"contract"})
 def gradient_rows(y, columns, slopes):
     """Rows of the deformation gradient Σ_k y_k ∇N_k at one point."""
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    xx = 0.0
+    xy = 0.0
+    xz = 0.0
+    yx = 0.0
+    yy = 0.0
+    yz = 0.0
+    zx = 0.0
+    zy = 0.0
+    zz = 0.0
     for k in range(len(columns)):
-        j, u, v, w = columns[k], slopes[k, 0], slopes[k, 1], slopes[k, 2]
+        j = columns[k]
+        u = slopes[k, 0]
+        v = slopes[k, 1]
+        w = slopes[k, 2]
         x = y[j, 0]
-        xx, xy, xz = xx + x * u, xy + x * v, xz + x * w
+        xx = xx + x * u
+        xy = xy + x * v
+        xz = xz + x * w
         x = y[j, 1]
-        yx, yy, yz = yx + x * u, yy + x * v, yz + x * w
+        yx = yx + x * u
+        yy = yy + x * v
+        yz = yz + x * w
         x = y[j, 2]
-        zx, zy, zz = zx + x * u, zy + x * v, zz + x * w
+        zx = zx + x * u
+        zy = zy + x * v
+        zz = zz + x * w
     return (xx, xy, xz), (yx, yy, yz), (zx, zy, zz)
 
 
@@ -38,14 +57,16 @@ def gradient_rows(y, columns, slopes):
 def target_loop(y, columns, slopes, fibre, least, tension, q, t, f, target):
     """Deformation gradients F and their targets R (t aaᵀ + t^(-1/2) (I - aaᵀ)) at all points.
 
-    R is the rotation of F D(t) for the last t, then t minimises |RᵀF - D(t)|² + 2 tension t in [least, 1] by
-    Newton's method; over the iterations both converge.
+    R is the rotation of F D(t) for the last t, then t minimises |RᵀF - D(t)|² + 2 tension t in
+    [least, 1] by Newton's method; over the iterations both converge.
     """
     fd = np.empty((3, 3))
     for i in range(len(columns)):
         first, second, third = gradient_rows(y, columns[i], slopes[i])
         for b in range(3):
-            f[i, 0, b], f[i, 1, b], f[i, 2, b] = first[b], second[b], third[b]
+            f[i, 0, b] = first[b]
+            f[i, 1, b] = second[b]
+            f[i, 2, b] = third[b]
         e = fibre[i]
         u = 1.0 / np.sqrt(t[i])
         for a in range(3):
@@ -56,7 +77,9 @@ def target_loop(y, columns, slopes, fibre, least, tension, q, t, f, target):
         r = target[i]
         first, second, third = quaternion_matrix(q[i])
         for b in range(3):
-            r[0, b], r[1, b], r[2, b] = first[b], second[b], third[b]
+            r[0, b] = first[b]
+            r[1, b] = second[b]
+            r[2, b] = third[b]
         if least[i] < 1.0:
             # S = RᵀF: s is its part along the fibre, m the sum of those across.
             s, m = 0.0, 0.0
@@ -123,9 +146,15 @@ def stress_loop(f, target, fibres, weights, columns, slopes, region, slot, out, 
         for k in range(columns.shape[1]):
             j, s = columns[i, k], slot[i, k]
             for a in range(3):
-                out[j, a] += v[a, 0] * slopes[i, k, 0] + v[a, 1] * slopes[i, k, 1] + v[a, 2] * slopes[i, k, 2]
+                out[j, a] += (
+                    v[a, 0] * slopes[i, k, 0]
+                    + v[a, 1] * slopes[i, k, 1]
+                    + v[a, 2] * slopes[i, k, 2]
+                )
                 gradient[s, a] += (
-                    c[a, 0] * slopes[i, k, 0] + c[a, 1] * slopes[i, k, 1] + c[a, 2] * slopes[i, k, 2]
+                    c[a, 0] * slopes[i, k, 0]
+                    + c[a, 1] * slopes[i, k, 1]
+                    + c[a, 2] * slopes[i, k, 2]
                 )
 
 
@@ -150,10 +179,11 @@ def swell_loop(motion, start, node, gradient, out):
 
 @compiled(error_model="numpy")
 def respond_loop(regions, inverse, yielding, response, factor):
-    """Motion of the nodes for a unit of each whitened pressure (M, 3, N); returns whether there is one.
+    """Motion of the nodes for a unit of each whitened pressure (M, 3, N); returns whether there is
+    one.
 
-    ``factor`` becomes the Cholesky factor (M, M) of the volumes that a unit pressure of each region adds to all, and
-    of what each yields.
+    ``factor`` becomes the Cholesky factor (M, M) of the volumes that a unit pressure of each region
+    adds to all, and of what each yields.
     """
     start, node, gradient = regions
     count, nodes = len(start) - 1, len(inverse)
@@ -187,7 +217,9 @@ def respond_loop(regions, inverse, yielding, response, factor):
 
 @compiled(error_model="numpy")
 def _factor_small(matrix):
-    """Turn the lower triangle of a small matrix into its Cholesky factor; returns whether it is positive definite."""
+    """Turn the lower triangle of a small matrix into its Cholesky factor; returns whether it is
+    positive definite.
+    """
     for r in range(len(matrix)):
         for o in range(r + 1):
             for k in range(o):
@@ -204,18 +236,24 @@ def _factor_small(matrix):
 def carry_loop(y, columns, shares, out):
     """Places Σ_k share_k y_k of embedded points."""
     for s in range(len(columns)):
-        ax, ay, az = 0.0, 0.0, 0.0
+        ax = 0.0
+        ay = 0.0
+        az = 0.0
         for k in range(columns.shape[1]):
             j, share = columns[s, k], shares[s, k]
             ax += share * y[j, 0]
             ay += share * y[j, 1]
             az += share * y[j, 2]
-        out[s, 0], out[s, 1], out[s, 2] = ax, ay, az
+        out[s, 0] = ax
+        out[s, 1] = ay
+        out[s, 2] = az
 
 
 @compiled(error_model="numpy")
 def normals_loop(y, columns, slopes, normals, out):
-    """Unit normals of the deformed surface: the cofactor of the deformation gradient times those at rest."""
+    """Unit normals of the deformed surface: the cofactor of the deformation gradient times those at
+    rest.
+    """
     f = np.empty((3, 3))
     for s in range(len(normals)):
         f[:] = 0.0
@@ -239,7 +277,9 @@ def normals_loop(y, columns, slopes, normals, out):
 
 @compiled(error_model="numpy")
 def _rows_loop(start, index, normal, response, columns, shares, rows):
-    """Motion along its normal that each contact from ``start`` on makes for a unit of each whitened pressure."""
+    """Motion along its normal that each contact from ``start`` on makes for a unit of each whitened
+    pressure.
+    """
     for c in range(start, len(index)):
         i = index[c]
         for r in range(response.shape[0]):
@@ -267,13 +307,19 @@ def _answers_loop(start, index, columns, shares, inverse, answers):
 
 @compiled(error_model="numpy")
 def _pairs_loop(start, index, normal, rows, answers, columns, shares, gram, own):
-    """Motion at contact c >= ``start`` for a unit force at contact d, the regions' volumes kept; ``own`` for d = c."""
+    """Motion at contact c >= ``start`` for a unit force at contact d, the regions' volumes kept;
+    ``own`` for d = c.
+    """
     for c in range(start, len(index)):
         for d in range(c + 1):
             value = 0.0
             for k in range(columns.shape[1]):
                 value += shares[index[c], k] * answers[d, columns[index[c], k]]
-            value *= normal[c, 0] * normal[d, 0] + normal[c, 1] * normal[d, 1] + normal[c, 2] * normal[d, 2]
+            value *= (
+                normal[c, 0] * normal[d, 0]
+                + normal[c, 1] * normal[d, 1]
+                + normal[c, 2] * normal[d, 2]
+            )
             for r in range(rows.shape[1]):
                 value -= rows[c, r] * rows[d, r]
             gram[c, d] = value
@@ -295,8 +341,9 @@ def mobility_loop(columns, shares, inverse, out):
 def solve_contact_forces(gram, need, force, sweeps, tolerance, most):
     """Contact forces with 0 <= force <= most and gram · force >= need where force < most.
 
-    By projected Gauss-Seidel from a first guess, in place, until no gap moves by more than the tolerance. ``gram``
-    (c, c) is the motion at contact i for a unit force at contact j, ``need`` (c,) the motion that each asks for.
+    By projected Gauss-Seidel from a first guess, in place, until no gap moves by more than the
+    tolerance. ``gram`` (c, c) is the motion at contact i for a unit force at contact j, ``need``
+    (c,) the motion that each asks for.
     """
     lacking = need.copy()
     for c in range(len(need)):
@@ -369,12 +416,26 @@ def _lacking_loop(index, normal, need, columns, shares, push, lacking):
 
 @compiled(error_model="numpy")
 def contact_loop(
-    index, gap, normal, source, motion, inverse, columns, shares, response, table, effort, law, push, taken
+    index,
+    gap,
+    normal,
+    source,
+    motion,
+    inverse,
+    columns,
+    shares,
+    response,
+    table,
+    effort,
+    law,
+    push,
+    taken,
 ):
-    """Contact: fill the nodes' ``push`` (N, 3), what it takes from the whitened pressures (M,), and the forces.
+    """Contact: fill the nodes' ``push`` (N, 3), what it takes from the whitened pressures (M,), and
+    the forces.
 
-    The working set starts from the contacts that pushed before and takes in the deepest violations until none is
-    left; forces solve the complementarity problem on it.
+    The working set starts from the contacts that pushed before and takes in the deepest violations
+    until none is left; forces solve the complementarity problem on it.
     """
     batch, rounds, sweeps, tolerance = effort
     yielding, most = law
@@ -397,9 +458,14 @@ def contact_loop(
             is_chosen[c] = True
             total += 1
     room = min(count, total + rounds * batch)
-    # Of the working set the contacts, their points, normals, needs, forces and the greatest of these.
-    chosen, points, ways = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 3))
-    wants, strength, limits = np.empty(room), np.empty(room), np.empty(room)
+    # Of the working set the contacts, their points, normals, needs, forces and the greatest of
+    # these.
+    chosen = np.empty(room, np.int64)
+    points = np.empty(room, np.int64)
+    ways = np.empty((room, 3))
+    wants = np.empty(room)
+    strength = np.empty(room)
+    limits = np.empty(room)
     rows, answers = np.empty((room, response.shape[0])), np.empty((room, len(push)))
     gram, own = np.empty((room, room)), np.empty(room)
     done, total = 0, 0
@@ -417,7 +483,10 @@ def contact_loop(
             break
         for k in range(done, total):
             c = chosen[k]
-            points[k], wants[k], strength[k], limits[k] = index[c], need[c], force[c], most[c]
+            points[k] = index[c]
+            wants[k] = need[c]
+            strength[k] = force[c]
+            limits[k] = most[c]
             for a in range(3):
                 ways[k, a] = normal[c, a]
         some = points[:total], ways[:total]

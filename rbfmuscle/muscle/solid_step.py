@@ -1,4 +1,6 @@
-"""Steps of the iteration that brings a muscle's elastic solid to equilibrium, compiled, and its acceleration."""
+"""Steps of the iteration that brings a muscle's elastic solid to equilibrium, compiled, and its
+acceleration.
+"""
 
 import numpy as np
 
@@ -9,13 +11,16 @@ from rbfmuscle.muscle.solid_loops import press_loop, stress_loop, swell_loop, ta
 
 
 class Anderson:
-    """Anderson acceleration of a fixed-point map (Walker & Ni 2011), plain steps until it has memory.
+    """Anderson acceleration of a fixed-point map (Walker & Ni 2011), plain steps until it has
+    memory.
 
-    ``memory`` steps are combined, 0 for plain ones; the first ``measured`` of a state's components are the residual.
+    ``memory`` steps are combined, 0 for plain ones; the first ``measured`` of a state's components
+    are the residual.
     """
 
     def __init__(self, memory: int, size: int, measured: int) -> None:
-        # Differences from step to step, of the residuals and of the images; then the last of either.
+        # Differences from step to step, of the residuals and of the images; then the last of
+        # either.
         self._residuals, self._images = np.empty((memory, measured)), np.empty((memory, size))
         self._last_residual, self._last_image = np.empty(measured), np.empty(size)
         self._steps = 0
@@ -28,15 +33,24 @@ class Anderson:
         """Next state (m,) from a state (m,) and its image (m,)."""
         out = image.copy()
         _mix_loop(
-            state, image, self._steps, self._residuals, self._images, self._last_residual, self._last_image, out
-        )  # fmt: skip
+            state,
+            image,
+            self._steps,
+            self._residuals,
+            self._images,
+            self._last_residual,
+            self._last_image,
+            out,
+        )
         self._steps += 1
         return out
 
 
 @compiled(error_model="numpy")
 def _mix_loop(state, image, steps, residuals, images, last_residual, last_image, out):
-    """Subtract from ``out`` the combination of past images whose residuals come nearest to the present one."""
+    """Subtract from ``out`` the combination of past images whose residuals come nearest to the
+    present one.
+    """
     memory, size = len(residuals), len(last_residual)
     if steps > 0 and memory > 0:
         row = (steps - 1) % memory
@@ -89,25 +103,29 @@ def _solve_definite(matrix, right):
 
 @compiled(error_model="numpy")
 def local_loop(y, cells, fibres, tension, stiffened, state, f, target, right, gradient, volume):
-    """Targets, forces and volumes for nodes ``y``: how many points joined the squeezed ones, and the energy of these.
+    """Targets, forces and volumes for nodes ``y``: how many points joined the squeezed ones, and
+    the energy of these.
 
-    ``cells`` holds nodes and slopes of the quadrature points, their weights, and their regions and slots, ``state``
-    the rotations and stretches, changed in place.
+    ``cells`` holds nodes and slopes of the quadrature points, their weights, and their regions and
+    slots, ``state`` the rotations and stretches, changed in place.
     """
     columns, slopes, weights, region, slot = cells
     quaternion, stretch = state
-    target_loop(y, columns, slopes, fibres.direction, fibres.lower, tension, quaternion, stretch, f, target)
+    target_loop(
+        y, columns, slopes, fibres.direction, fibres.lower, tension, quaternion, stretch, f, target
+    )
     stress_loop(f, target, fibres, weights, columns, slopes, region, slot, right, gradient, volume)
     return unfold_loop(f, stiffened, weights, columns, slopes, right)
 
 
 @compiled(error_model="numpy")
 def global_loop(y, force, inverse, regions, pressure, law, response, factor, step, change):
-    """Nodes ``step`` under a force and the regions' pressures, volumes corrected; the whitened ``change`` of pressure.
+    """Nodes ``step`` under a force and the regions' pressures, volumes corrected; the whitened
+    ``change`` of pressure.
 
-    ``regions`` holds where each begins, its nodes, gradients, volumes now and at rest; ``law`` the bulk modulus and
-    the pressure beyond which steps are shortened. Returns the share of a full step that was taken.
-    Bouaziz et al. (2014) call it the global step.
+    ``regions`` holds where each begins, its nodes, gradients, volumes now and at rest; ``law`` the
+    bulk modulus and the pressure beyond which steps are shortened. Returns the share of a full step
+    that was taken. Bouaziz et al. (2014) call it the global step.
     """
     start, node, gradient, volume, rest = regions
     bulk, calm = law
@@ -139,7 +157,8 @@ def global_loop(y, force, inverse, regions, pressure, law, response, factor, ste
 
 @compiled(error_model="numpy")
 def ways_loop(y, step, push, columns, shares, margin, here, motion, reach):
-    """Embedded points ``here``, their ``motion`` in a step of the nodes, and how far to look for obstacles.
+    """Embedded points ``here``, their ``motion`` in a step of the nodes, and how far to look for
+    obstacles.
 
     That is half as far again as they go in the step with the last push on top, and a margin.
     """
@@ -147,7 +166,9 @@ def ways_loop(y, step, push, columns, shares, margin, here, motion, reach):
     ways = np.empty((size, 9))
     for n in range(size):
         for a in range(3):
-            ways[n, a], ways[n, 3 + a], ways[n, 6 + a] = y[n, a], step[n, a] - y[n, a], push[n, a]
+            ways[n, a] = y[n, a]
+            ways[n, 3 + a] = step[n, a] - y[n, a]
+            ways[n, 6 + a] = push[n, a]
     total = np.empty(9)
     for s in range(len(columns)):
         total[:] = 0.0

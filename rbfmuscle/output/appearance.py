@@ -1,4 +1,6 @@
-"""How muscles, tendons, bones and views look in files, pictures and pages: colours, groups, directions."""
+"""How muscles, tendons, bones and views look in files, pictures and pages: colours, groups,
+directions.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,8 +13,18 @@ from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.tendons import TendonLine
 
 BONE_COLOUR, TENDON_COLOUR = "#e9e0cd", "#cfd8dc"
-# People who are colour-blind can distinguish them (P. Tol, "muted"); its sand is left out, as bones have that colour.
-MUSCLE_COLOURS = ("#cc6677", "#332288", "#44aa99", "#882255", "#88ccee", "#117733", "#aa4499", "#999933")
+# People who are colour-blind can distinguish them (P. Tol, "muted"); its sand is left out, as bones
+# have that colour.
+MUSCLE_COLOURS = (
+    "#cc6677",
+    "#332288",
+    "#44aa99",
+    "#882255",
+    "#88ccee",
+    "#117733",
+    "#aa4499",
+    "#999933",
+)
 # How much nearer to white or black the muscles of one group are, one after the other.
 _SHADES = (0.0, 0.3, -0.25)
 # From the subject to the camera, along the body's axes: left, posterior, superior.
@@ -33,8 +45,8 @@ LONGEST_TAPER = 0.6
 def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
     """Group of each muscle in what ``run.json`` holds, by the joints that it crosses.
 
-    Joints that carry a single bone without another joint (a patella, a tendon's end) are left out; a muscle that
-    crosses no other belongs to the bone that it lies along.
+    Joints that carry a single bone without another joint (a patella, a tendon's end) are left out;
+    a muscle that crosses no other belongs to the bone that it lies along.
     """
     joints = info["scene"].get("joints", [])
     above = {joint["child"]: joint for joint in joints}
@@ -50,18 +62,24 @@ def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
     groups = {}
     for muscle in info["scene"]["muscles"]:
         chains = [chain(part["bone"]) for part in muscle.get("attach", [])]
-        crossed = {bone for one in chains for bone in one if any(bone not in other for other in chains)}
+        crossed = {
+            bone for one in chains for bone in one if any(bone not in other for other in chains)
+        }
         names = [joint["name"] for joint in joints if joint["child"] in crossed & carrying]
         if len(joints) == 1 and crossed:
             names = [joints[0]["name"]]
-        shared = [bone for bone in (chains[0] if chains else []) if all(bone in one for one in chains)]
+        shared = [
+            bone for bone in (chains[0] if chains else []) if all(bone in one for one in chains)
+        ]
         along = f"along {shared[0]}" if shared else "without a joint"
         groups[muscle["name"]] = f"across {', '.join(names)}" if names else along
     return groups
 
 
 def muscle_colours(names: Sequence[str], groups: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Dict of muscle name to its colour in pictures and plots; of many muscles a hue for each of their groups."""
+    """Dict of muscle name to its colour in pictures and plots; of many muscles a hue for each of
+    their groups.
+    """
     if groups is None or len(names) <= len(MUSCLE_COLOURS):
         return {name: MUSCLE_COLOURS[k % len(MUSCLE_COLOURS)] for k, name in enumerate(names)}
     kinds = list(dict.fromkeys(groups[name] for name in names))
@@ -92,7 +110,9 @@ def linear_rgb(colour: Floats) -> Floats:
 
 
 def view_axes(direction: Sequence[float] | Floats, body: Floats) -> Floats:
-    """Right, up (superior, else anterior) and towards the camera (3, 3), from a direction along the body's axes."""
+    """Right, up (superior, else anterior) and towards the camera (3, 3), from a direction along the
+    body's axes.
+    """
     ahead = np.asarray(direction, dtype=float) @ body
     ahead /= np.linalg.norm(ahead)
     right = np.cross(body[2] if abs(ahead @ body[2]) < 0.99 else -body[1], ahead)
@@ -101,10 +121,12 @@ def view_axes(direction: Sequence[float] | Floats, body: Floats) -> Floats:
 
 
 def motion_direction(poses: Sequence[Mapping[str, Floats]], body: Floats) -> Floats:
-    """Direction (3,) from which the motion is seen in its plane: along the axis about which a bone turns most.
+    """Direction (3,) from which the motion is seen in its plane: along the axis about which a bone
+    turns most.
 
-    ``poses`` (4, 4) are those of each frame by bone. The direction is along ``body`` (3, 3): left, posterior and
-    superior; it is from the right where no bone turns, or about an axis that is nearly upright.
+    ``poses`` (4, 4) are those of each frame by bone. The direction is along ``body`` (3, 3): left,
+    posterior and superior; it is from the right where no bone turns, or about an axis that is
+    nearly upright.
     """
     from scipy.spatial.transform import Rotation
 
@@ -125,13 +147,19 @@ def tendon_name(muscle: str) -> str:
     return f"{muscle}_tendon"
 
 
-def tendon_mesh(muscle: Muscle, tendons: Mapping[str, TendonLine]) -> tuple[Floats, Integers] | None:
-    """Vertices (n, 3) and outward faces (m, 3), always the same, of all tendons of a muscle; None where it has none."""
+def tendon_mesh(
+    muscle: Muscle, tendons: Mapping[str, TendonLine]
+) -> tuple[Floats, Integers] | None:
+    """Vertices (n, 3) and outward faces (m, 3), always the same, of all tendons of a muscle; None
+    where it has none.
+    """
     tubes = [_tube(tendons[end.name]) for end in muscle.tendons if end.name in tendons]
     if not tubes:
         return None
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in tubes[:-1])])
-    return np.concatenate([v for v, _ in tubes]), np.concatenate([f + n for (_, f), n in zip(tubes, starts)])
+    return np.concatenate([v for v, _ in tubes]), np.concatenate(
+        [f + n for (_, f), n in zip(tubes, starts)]
+    )
 
 
 def _tube(tendon: TendonLine) -> tuple[Floats, Integers]:

@@ -32,19 +32,21 @@ def export_run(
     directory : path
         Folder of the run.
     formats : str or list of str
-        Of `FORMATS`. ``pvd`` is ``vtp`` and a collection over the frames; ``glb`` gives one file a frame, ``usd`` and
-        ``animated-glb`` one of all frames.
+        Of `FORMATS`. ``pvd`` is ``vtp`` and a collection over the frames; ``glb`` gives one file a
+        frame, ``usd`` and ``animated-glb`` one of all frames.
     output : path, optional
         ``DIR/export`` where not given; each format has its own folder there.
     units : {"m", "cm", "mm"}, optional
-        The scene's unit where not given; metres for ``glb`` and ``animated-glb``, which know no other.
+        The scene's unit where not given; metres for ``glb`` and ``animated-glb``, which know no
+        other.
     frames : slice, optional
         Of the written frames; all where not given.
 
     Raises
     ------
     UsageError
-        If the folder holds no run, or a format or unit is unknown, or a surface does not keep its vertices.
+        If the folder holds no run, or a format or unit is unknown, or a surface does not keep its
+        vertices.
     SolveError, MissingPartError
         If a file cannot be written; if a format needs a package that is absent.
     """
@@ -89,7 +91,9 @@ def _export(run: MovingRun, folder: Path, name: str, frames: list[int]) -> list[
         path = folder / f"{_file_name(run.name)}.usdc"
         write_usd(path, run)
     else:
-        path = folder / (f"frame_{frames[0]:04d}.glb" if name == "glb" else f"{_file_name(run.name)}.glb")
+        path = folder / (
+            f"frame_{frames[0]:04d}.glb" if name == "glb" else f"{_file_name(run.name)}.glb"
+        )
         path.write_bytes(animated_glb(run))
     return [path]
 
@@ -116,7 +120,9 @@ def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -
 
 
 def write_mesh(path: Path, vertices: Floats, faces: Integers) -> None:
-    """Write a triangle mesh as ``.vtp``, ``.ply``, ``.stl`` or ``.obj``, by suffix; PLY and STL in single precision."""
+    """Write a triangle mesh as ``.vtp``, ``.ply``, ``.stl`` or ``.obj``, by suffix; PLY and STL in
+    single precision.
+    """
     if path.suffix == ".vtp":
         write_vtp(path, vertices, faces)
         return

@@ -1,4 +1,6 @@
-"""A saved run, read from its folder, and its muscles and bones over time, which exports turn into files."""
+"""A saved run, read from its folder, and its muscles and bones over time, which exports turn into
+files.
+"""
 
 import csv
 import io
@@ -23,17 +25,19 @@ from rbfmuscle.validation import UsageError
 
 # Coordinates that a caption names at most.
 MOST_SHOWN = 4
-# Frames a second of a motion that has no times of its own: frame k of the run is frame k of the animation.
+# Frames a second of a motion that has no times of its own: frame k of the run is frame k of the
+# animation.
 FRAMES_A_SECOND = 24.0
 
 
 class SavedRun:
     """A run in a folder, UsageError if it holds none; surfaces are read one by one.
 
-    Of a run that was killed, or still goes on, the frames up to the last whole one are found on the disk. ``info`` is
-    ``run.json``, ``frames`` are the numbers of those that were written. ``tendons`` are names of meshes, which
-    `surface` takes as it takes muscles; ``groups`` and ``colours`` are the muscles'. ``body`` (3, 3) is left,
-    posterior and superior; x, y and z where they are not known.
+    Of a run that was killed, or still goes on, the frames up to the last whole one are found on the
+    disk. ``info`` is ``run.json``, ``frames`` are the numbers of those that were written.
+    ``tendons`` are names of meshes, which `surface` takes as it takes muscles; ``groups`` and
+    ``colours`` are the muscles'. ``body`` (3, 3) is left, posterior and superior; x, y and z where
+    they are not known.
     """
 
     def __init__(self, directory: str | Path) -> None:
@@ -43,14 +47,18 @@ class SavedRun:
         try:
             self.info = json.loads(path.read_text(encoding="utf-8"))
             self.units = self.info["scene"]["units"]
-            self.body = body_axes(*(self.info["scene"].get(word) for word in ("superior", "anterior")))
+            self.body = body_axes(
+                *(self.info["scene"].get(word) for word in ("superior", "anterior"))
+            )
             muscles, output = self.info["scene"]["muscles"], self.info["scene"]["output"]
             self.muscles = [muscle["name"] for muscle in muscles]
             self.bones = [bone["name"] for bone in self.info["scene"]["bones"]]
             self.groups = look.muscle_groups(self.info)
             self.colours = look.muscle_colours(self.muscles, self.groups)
             self._meshes = bool(output["surfaces"])
-            held = [m["name"] for m in muscles if any("tendon" in end for end in m.get("attach", ()))]
+            held = [
+                m["name"] for m in muscles if any("tendon" in end for end in m.get("attach", ()))
+            ]
             self.tendons = [look.tendon_name(name) for name in held if output.get("tendons")]
             self.frames = [frame["frame"] for frame in self.info["frames"]]
         except OSError:
@@ -94,30 +102,44 @@ class SavedRun:
             self._bones[name] = read_vtp(self.directory / "bones" / f"{name}.vtp")
         return self._bones[name]
 
-    def series(self, muscle: str, quantity: str, coordinate: str | None = None) -> tuple[Integers, Floats]:
-        """Frames and values of a quantity of a muscle, of moment arms those of a coordinate, as two arrays."""
+    def series(
+        self, muscle: str, quantity: str, coordinate: str | None = None
+    ) -> tuple[Integers, Floats]:
+        """Frames and values of a quantity of a muscle, of moment arms those of a coordinate, as two
+        arrays.
+        """
         found = [r for r in self._rows[muscle, quantity] if coordinate in (None, r.coordinate)]
         return np.array([r.frame for r in found]), np.array([r.value for r in found], dtype=float)
 
     @cached_property
     def _rows(self) -> dict[tuple[str, str], list[Row]]:
-        """Rows of ``metrics.csv`` by muscle and quantity: of dozens of muscles there are tens of thousands."""
+        """Rows of ``metrics.csv`` by muscle and quantity: of dozens of muscles there are tens of
+        thousands.
+        """
         found = defaultdict(list)
         for row in self.metrics:
             found[row.muscle, row.quantity].append(row)
         return found
 
     def moment_arm_coordinates(self, muscle: str | None = None) -> list[str]:
-        """The coordinates that a muscle, or any, has moment arms about, in their order in ``metrics.csv``."""
-        rows = (r for r in self.metrics if r.quantity == "moment_arm" and muscle in (None, r.muscle))
+        """The coordinates that a muscle, or any, has moment arms about, in their order in
+        ``metrics.csv``.
+        """
+        rows = (
+            r for r in self.metrics if r.quantity == "moment_arm" and muscle in (None, r.muscle)
+        )
         return list(dict.fromkeys(r.coordinate for r in rows))
 
     def caption(self, frame: int) -> str:
-        """Frame number, time and coordinates of a frame, as text; of many coordinates those that move most."""
+        """Frame number, time and coordinates of a frame, as text; of many coordinates those that
+        move most.
+        """
         rows, units = self.info["frames"], self.info["scene"].get("coordinate_units", {})
         entry = next(row for row in rows if row["frame"] == frame)
         values = entry["coordinates"]
-        spans = {name: np.ptp([row["coordinates"].get(name, 0.0) for row in rows]) for name in values}
+        spans = {
+            name: np.ptp([row["coordinates"].get(name, 0.0) for row in rows]) for name in values
+        }
         most = sorted(values, key=lambda name: -spans[name])[:MOST_SHOWN]
         texts = [f"{n} {value:.4g}{units.get(n, '°')}" for n, value in values.items() if n in most]
         clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
@@ -129,11 +151,19 @@ class SavedRun:
 
     def _whole_frames(self):
         """Entries of ``run.json`` for the frames of which every file is there."""
-        planned, meshes = self.info.get("planned", []), [*self.muscles, *self.tendons] if self._meshes else []
+        planned, meshes = (
+            self.info.get("planned", []),
+            [*self.muscles, *self.tendons] if self._meshes else [],
+        )
         return [
-            {"frame": frame, "coordinates": planned[frame] if frame < len(planned) else {}, "wall": None}
+            {
+                "frame": frame,
+                "coordinates": planned[frame] if frame < len(planned) else {},
+                "wall": None,
+            }
             for frame, poses in self.poses.items()
-            if set(poses) >= set(self.bones) and all(self._surface_file(m, frame).is_file() for m in meshes)
+            if set(poses) >= set(self.bones)
+            and all(self._surface_file(m, frame).is_file() for m in meshes)
         ]
 
     def _surface_file(self, muscle, frame):
@@ -141,7 +171,9 @@ class SavedRun:
 
     def _check_surfaces(self):
         if not self._meshes:
-            raise UsageError(f"{self.directory} has no surfaces: the run's scene had output.surfaces = false")
+            raise UsageError(
+                f"{self.directory} has no surfaces: the run's scene had output.surfaces = false"
+            )
 
     def _table(self, name):
         path = self.directory / name
@@ -171,14 +203,18 @@ class _SavedSurfaces(Mapping[str, ModelSurface]):
 
 
 def saved_frames(saved: SavedRun) -> list[Frame]:
-    """The frames of a saved run, without what no file holds: material surfaces and times of single muscles."""
+    """The frames of a saved run, without what no file holds: material surfaces and times of single
+    muscles.
+    """
     units, found = saved.info["scene"].get("coordinate_units", {}), []
     for entry in saved.info["frames"]:
         index = entry["frame"]
         angles = {n: v if n in units else math.radians(v) for n, v in entry["coordinates"].items()}
         events = [Event(*row) for row in saved.events if row[0] == index]
         surfaces = _SavedSurfaces(saved, index)
-        found.append(Frame(index, angles, saved.poses[index], surfaces, {}, events, {}, entry["wall"]))
+        found.append(
+            Frame(index, angles, saved.poses[index], surfaces, {}, events, {}, entry["wall"])
+        )
     return found
 
 
@@ -186,9 +222,9 @@ def saved_frames(saved: SavedRun) -> list[Frame]:
 class MovingPart:
     """The surface of a muscle or of its tendons in each frame, or a rigid bone.
 
-    Vertices (n, 3) and faces (m, 3) are those of each frame, with the same array of faces where it stays; of a bone
-    there is one of each, at rest, and poses (T, 4, 4) from there to the world. ``colour`` is "#rrggbb"; muscles of one
-    ``group`` cross the same joints.
+    Vertices (n, 3) and faces (m, 3) are those of each frame, with the same array of faces where it
+    stays; of a bone there is one of each, at rest, and poses (T, 4, 4) from there to the world.
+    ``colour`` is "#rrggbb"; muscles of one ``group`` cross the same joints.
     """
 
     name: str
@@ -217,10 +253,12 @@ class MovingPart:
 
 @dataclass(frozen=True)
 class MovingRun:
-    """All muscles and bones of a run over time; ``name`` is the scene's, all lengths are in ``unit``: m, cm or mm.
+    """All muscles and bones of a run over time; ``name`` is the scene's, all lengths are in
+    ``unit``: m, cm or mm.
 
-    ``times`` (T,) of the frames [s] are the motion's own where ``timed``, ``captions`` those of the frames. ``body``
-    (3, 3) is left, posterior and superior; the motion is seen in its plane from ``direction`` (3,) along these.
+    ``times`` (T,) of the frames [s] are the motion's own where ``timed``, ``captions`` those of the
+    frames. ``body`` (3, 3) is left, posterior and superior; the motion is seen in its plane from
+    ``direction`` (3,) along these.
     """
 
     name: str
@@ -239,7 +277,9 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
     factor = MM_PER_UNIT[saved.units] / MM_PER_UNIT[unit]
     groups = saved.groups | dict.fromkeys(saved.tendons, "tendons")
     colours = saved.colours | dict.fromkeys(saved.tendons, look.TENDON_COLOUR)
-    muscles = [MovingPart(name, colour, [], [], group=groups[name]) for name, colour in colours.items()]
+    muscles = [
+        MovingPart(name, colour, [], [], group=groups[name]) for name, colour in colours.items()
+    ]
     bones = []
     for muscle in muscles:
         for frame in frames:
@@ -259,4 +299,6 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
     at = np.array([k / FRAMES_A_SECOND if times is None else times[k] for k in frames], dtype=float)
     captions = [saved.caption(frame) for frame in frames]
     direction = look.motion_direction([saved.poses[frame] for frame in frames], saved.body)
-    return MovingRun(name, unit, at, times is not None, captions, muscles, bones, saved.body, direction)
+    return MovingRun(
+        name, unit, at, times is not None, captions, muscles, bones, saved.body, direction
+    )

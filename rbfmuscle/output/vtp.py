@@ -1,4 +1,6 @@
-"""VTK files written and read directly: PolyData (.vtp) and collections over time (.pvd), without loading VTK."""
+"""VTK files written and read directly: PolyData (.vtp) and collections over time (.pvd), without
+loading VTK.
+"""
 
 import os
 import re
@@ -14,13 +16,15 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError
 
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32"}
-# Last bits of double precision that are rounded away: 1e-11 of a coordinate is kept, and a quarter of the space saved.
+# Last bits of double precision that are rounded away: 1e-11 of a coordinate is kept, and a quarter
+# of the space saved.
 _ROUNDED_BITS = 16
 _HEAD = """<?xml version="1.0"?>
 <VTKFile type="PolyData" version="1.0"
  byte_order="LittleEndian" header_type="UInt32" compressor="vtkZLibDataCompressor">
 <PolyData>
-<Piece NumberOfPoints="{}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" NumberOfPolys="{}">
+<Piece NumberOfPoints="{}" NumberOfVerts="0" NumberOfLines="0"
+ NumberOfStrips="0" NumberOfPolys="{}">
 <Points>
 {}</Points>
 <Polys>
@@ -32,7 +36,9 @@ _BEFORE_DATA, _AFTER_DATA = b'<AppendedData encoding="raw">\n_', b"\n</AppendedD
 
 
 def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
-    """Write vertices (n, 3), single precision as it is, double rounded to 1e-11 of each number, and faces (m, 3)."""
+    """Write vertices (n, 3), single precision as it is, double rounded to 1e-11 of each number, and
+    faces (m, 3).
+    """
     points = np.ascontiguousarray(vertices)
     points = _rounded(points) if points.dtype != np.float32 else points
     corners = np.ascontiguousarray(faces, dtype="<i4")
@@ -52,7 +58,9 @@ def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
 
 @lru_cache(maxsize=128)
 def _packed_faces(corners: bytes) -> tuple[bytes, bytes]:
-    """Blocks of corners and of where each face ends, kept because a mesh has the same ones in every frame."""
+    """Blocks of corners and of where each face ends, kept because a mesh has the same ones in every
+    frame.
+    """
     ends = np.arange(3, len(corners) // 4 + 1, 3, dtype="<i4")
     return _packed(corners), _packed(ends.tobytes())
 
@@ -64,7 +72,9 @@ def _packed(raw: bytes) -> bytes:
 
 
 def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
-    """Vertices (n, 3) and faces (m, 3) of what `write_vtp` has written; MeshError if missing, another or damaged."""
+    """Vertices (n, 3) and faces (m, 3) of what `write_vtp` has written; MeshError if missing,
+    another or damaged.
+    """
     try:
         text, _, data = Path(path).read_bytes().partition(_BEFORE_DATA)
         starts = re.findall(rb'type="(\w+)" Name="(Points|connectivity)"[^>]*offset="(\d+)"', text)
@@ -74,7 +84,9 @@ def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
     except FileNotFoundError:
         raise MeshError(f"{path} is missing") from None
     except (KeyError, ValueError, IndexError, StopIteration, zlib.error):
-        raise MeshError(f"{path} is damaged or was not written by a run; run the scene again") from None
+        raise MeshError(
+            f"{path} is damaged or was not written by a run; run the scene again"
+        ) from None
 
 
 def _unpacked(data, kind, start):
@@ -90,7 +102,9 @@ def _rounded(points):
 
 
 class Collection:
-    """A .pvd file, complete after every frame, as runs are interrupted; it names files relative to its folder."""
+    """A .pvd file, complete after every frame, as runs are interrupted; it names files relative to
+    its folder.
+    """
 
     def __init__(self, path: str | Path) -> None:
         self._path, self._lines = Path(path), ""
@@ -106,7 +120,9 @@ class Collection:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a text in one move, so that whoever reads it finds the old file or the new, never half of it."""
+    """Write a text in one move, so that whoever reads it finds the old file or the new, never half
+    of it.
+    """
     part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         part.write_text(text, encoding="utf-8", newline="\n")

@@ -1,4 +1,6 @@
-"""Writes a run to a folder while it goes on: whatever ends it, the frames so far can be read; ``run.json``."""
+"""Writes a run to a folder while it goes on: whatever ends it, the frames so far can be read;
+``run.json``.
+"""
 
 import csv
 import hashlib
@@ -40,20 +42,26 @@ _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "v
 
 
 def check_writable(directory: str | Path) -> None:
-    """Write to a folder, or where it would be made, before what takes time is begun; UsageError where that fails."""
+    """Write to a folder, or where it would be made, before what takes time is begun; UsageError
+    where that fails.
+    """
     path = Path(directory).absolute()
     there = next(place for place in (path, *path.parents) if place.exists())
     try:
         with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:
-        raise UsageError(f"cannot write to {directory}: {error.strerror}; choose another folder") from None
+        raise UsageError(
+            f"cannot write to {directory}: {error.strerror}; choose another folder"
+        ) from None
 
 
 class RunWriter:
-    """Streams frames to a folder and keeps none of them; the scene's ``output`` table says which parts are written.
+    """Streams frames to a folder and keeps none of them; the scene's ``output`` table says which
+    parts are written.
 
-    The folder is made where it is missing, UsageError where that fails; a run that lies there already is replaced.
+    The folder is made where it is missing, UsageError where that fails; a run that lies there
+    already is replaced.
     """
 
     def __init__(self, directory: str | Path, scene: Scene) -> None:
@@ -75,14 +83,18 @@ class RunWriter:
             raise UsageError(message) from None
 
     def write(self, frame: Frame, rows: Sequence[Any] = ()) -> None:
-        """Write one frame, and the rows of metrics that are complete; SolveError if the disk refuses."""
+        """Write one frame, and the rows of metrics that are complete; SolveError if the disk
+        refuses.
+        """
         try:
             self._write(frame, rows)
         except OSError as error:
             self._failed = True
             self._remove(frame.index - 1)
             kept = f"{self.count} frames are kept in {self.directory}"
-            raise SolveError(f"cannot write frame {frame.index}: {error.strerror}; {kept}") from None
+            raise SolveError(
+                f"cannot write frame {frame.index}: {error.strerror}; {kept}"
+            ) from None
         self.count += 1
 
     def close(self, rows: Sequence[Any] = ()) -> None:
@@ -90,13 +102,19 @@ class RunWriter:
         try:
             write_csv(self.directory / "metrics.csv", () if self._failed else rows, mode="a")
         except OSError as error:
-            raise SolveError(f"cannot finish the tables in {self.directory}: {error.strerror}") from None
+            raise SolveError(
+                f"cannot finish the tables in {self.directory}: {error.strerror}"
+            ) from None
 
     def write_info(self, info: dict[str, Any]) -> None:
-        """Write ``run.json`` in one piece; while the run goes on with the coordinates of all frames to come."""
+        """Write ``run.json`` in one piece; while the run goes on with the coordinates of all frames
+        to come.
+        """
         if info.get("status") == "running":
             frames = self.scene.motion.frames
-            planned = [{name: shown_value(self.scene, name, x) for name, x in k.items()} for k in frames]
+            planned = [
+                {name: shown_value(self.scene, name, x) for name, x in k.items()} for k in frames
+            ]
             info = {**info, "planned": planned}
         write_json(self.directory / "run.json", info)
 
@@ -107,9 +125,11 @@ class RunWriter:
             surfaces = self._write_surfaces(frame)
             self._collections["bones"].add(step, self._write_bones(frame))
             self._collections["surfaces"].add(step, surfaces)
-        # A frame's surfaces are on the disk before its poses: readers of a run that was killed rely on it.
+        # A frame's surfaces are on the disk before its poses: readers of a run that was killed rely
+        # on it.
         poses = [
-            (frame.index, bone.name, *frame.poses[bone.name].ravel().tolist()) for bone in self.scene.bones
+            (frame.index, bone.name, *frame.poses[bone.name].ravel().tolist())
+            for bone in self.scene.bones
         ]
         events = [(e.frame, e.muscle, e.bone, e.count, e.action) for e in frame.events]
         for name, table in {"poses": poses, "events": events, "metrics": rows}.items():
@@ -117,18 +137,28 @@ class RunWriter:
 
     def _write_surfaces(self, frame):
         """Surfaces of a frame, side by side: most of the time goes into packing them."""
-        meshes = {name: (surface.vertices, surface.faces) for name, surface in frame.surfaces.items()}
+        meshes = {
+            name: (surface.vertices, surface.faces) for name, surface in frame.surfaces.items()
+        }
         if self.scene.output.tendons:
-            tendons = {muscle.name: tendon_mesh(muscle, frame.tendons) for muscle in self.scene.muscles}
-            meshes |= {tendon_name(name): mesh for name, mesh in tendons.items() if mesh is not None}
+            tendons = {
+                muscle.name: tendon_mesh(muscle, frame.tendons) for muscle in self.scene.muscles
+            }
+            meshes |= {
+                tendon_name(name): mesh for name, mesh in tendons.items() if mesh is not None
+            }
         entries = [(name, f"surfaces/{name}_{frame.index:04d}.vtp") for name in meshes]
         each(lambda entry: write_vtp(self.directory / entry[1], *meshes[entry[0]]), entries)
         return entries
 
     def _write_bones(self, frame):
-        """Bones where they are now: the mesh at rest once, and few triangles of one that has moved, in a series."""
+        """Bones where they are now: the mesh at rest once, and few triangles of one that has moved,
+        in a series.
+        """
         for bone in self.scene.bones:
-            name, mesh, pose = bone.name, bone.mesh, frame.poses[bone.name]
+            name = bone.name
+            mesh = bone.mesh
+            pose = frame.poses[bone.name]
             if name not in self._bones:
                 self._bones[name] = np.eye(4), f"bones/{name}.vtp"
                 write_vtp(self.directory / self._bones[name][1], mesh.vertices, mesh.faces)
@@ -168,7 +198,9 @@ def write_csv(path: Path, rows: Iterable[Sequence[Any]], *, mode: str = "w") -> 
 
 
 def write_json(path: Path, data: dict[str, Any]) -> None:
-    """Write JSON in one move, so that whoever reads it finds the old or the new; NaN and infinity become null."""
+    """Write JSON in one move, so that whoever reads it finds the old or the new; NaN and infinity
+    become null.
+    """
     try:
         write_whole(Path(path), json_text(data) + "\n")
     except OSError as error:
@@ -176,7 +208,9 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
 
 
 def json_text(data: Any) -> str:
-    """JSON that every reader takes: NaN and infinity become null, what has no form in JSON its text."""
+    """JSON that every reader takes: NaN and infinity become null, what has no form in JSON its
+    text.
+    """
     from pydantic_core import to_json
 
     def plain(value: Any) -> Any:
@@ -190,9 +224,10 @@ def build_info(
 ) -> dict[str, Any]:
     """Assemble ``run.json``; ``summary`` is from `Summary.table`.
 
-    Other facts are kept as they are: ``status`` ("running", "complete", "interrupted" or "failed"), ``message`` (why it
-    did not complete), ``options`` of the caller, ``kernels`` by muscle, ``times`` of the parts of the run [s],
-    ``limits``, ``verdict``, ``beyond`` (muscle, quantity, worst value, limit, frame), ``frames`` (`frame_facts`).
+    Other facts are kept as they are: ``status`` ("running", "complete", "interrupted" or "failed"),
+    ``message`` (why it did not complete), ``options`` of the caller, ``kernels`` by muscle,
+    ``times`` of the parts of the run [s], ``limits``, ``verdict``, ``beyond`` (muscle, quantity,
+    worst value, limit, frame), ``frames`` (`frame_facts`).
     """
     return {
         "format": FORMAT,
@@ -210,12 +245,16 @@ def build_info(
 
 
 def frame_facts(scene: Scene, frame: Frame) -> dict:
-    """What ``run.json`` says of a written frame; coordinates in degrees, those of shifts in scene units."""
+    """What ``run.json`` says of a written frame; coordinates in degrees, those of shifts in scene
+    units.
+    """
     times = scene.motion.times
     return {
         "frame": frame.index,
         **({} if times is None else {"time": times[frame.index]}),
-        "coordinates": {name: shown_value(scene, name, value) for name, value in frame.coordinates.items()},
+        "coordinates": {
+            name: shown_value(scene, name, value) for name, value in frame.coordinates.items()
+        },
         "wall": frame.wall,
     }
 
@@ -237,7 +276,9 @@ class Neighbours:
     def table(self) -> list[dict[str, Any]]:
         """Pairs of neighbours, the deepest overlap first [scene unit]."""
         names = ("overlap_max", "overlap_frame", "gap_rms", "gap_frame")
-        found = [{"muscles": list(pair), **dict(zip(names, worst))} for pair, worst in self.pairs.items()]
+        found = [
+            {"muscles": list(pair), **dict(zip(names, worst))} for pair, worst in self.pairs.items()
+        ]
         return sorted(found, key=lambda row: -row["overlap_max"])
 
 
@@ -258,13 +299,17 @@ def machine() -> dict[str, Any]:
     return {
         "system": platform.platform(),
         "processor": platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
         "threads": numba.get_num_threads(),
     }
 
 
 def input_hashes(scene: Scene) -> dict[str, Any]:
-    """SHA-256 of the scene file and of the meshes and motion that it names; files that are gone are left out."""
+    """SHA-256 of the scene file and of the meshes and motion that it names; files that are gone are
+    left out.
+    """
     sources = [
         scene.path,
         scene.motion.options.file,
@@ -272,4 +317,6 @@ def input_hashes(scene: Scene) -> dict[str, Any]:
         *(m.source for m in scene.muscles),
     ]
     paths = [Path(source) for source in dict.fromkeys(str(source) for source in sources if source)]
-    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.is_file()}
+    return {
+        str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.is_file()
+    }

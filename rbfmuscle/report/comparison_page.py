@@ -1,4 +1,6 @@
-"""The page of a comparison: what it amounts to, the models moving beside each other, five rows; all else folded."""
+"""The page of a comparison: what it amounts to, the models moving beside each other, five rows; all
+else folded.
+"""
 
 from collections.abc import Mapping
 from itertools import cycle
@@ -17,13 +19,16 @@ from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.report import packed_scene
 
 LIGHTS = ("penetration_max", "bone_penetration_max", "slack", "return_rms", "time_frame")
-_READING = """All models ran through the same frames and sub-steps, with the same bone fields and number of threads. The
-time per frame leaves out the first, which loads and compiles. The distance to the first model is no error. A mesh
-model keeps the overlap with bones that its mesh has at rest; the first sentence leaves that out."""
+_READING = """All models ran through the same frames and sub-steps, with the same bone fields and
+number of threads. The time per frame leaves out the first, which loads and compiles. The
+distance to the first model is no error. A mesh model keeps the overlap with bones that its mesh
+has at rest; the first sentence leaves that out."""
 
 
 def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:
-    """Write ``report.html`` of what `write_tables` found to the folder of its runs; raises SolveError."""
+    """Write ``report.html`` of what `write_tables` found to the folder of its runs; raises
+    SolveError.
+    """
     runs = {found["labels"][name]: SavedRun(folder / name) for name in found["models"]}
     page = _page(found, runs)
     if pictures:
@@ -38,7 +43,10 @@ def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
     failed = [f"{name} did not finish: {reason}" for name, reason in found["failed"].items()]
     counts = {"muscles": len(first.muscles), "frames": found["frames"], **found["machine"]}
     # Of the slack each muscle has a limit of its own.
-    limits, terms = first.info["limits"] | {"slack": None}, [(m.title, m.meaning) for m in MEASURES.values()]
+    limits, terms = (
+        first.info["limits"] | {"slack": None},
+        [(m.title, m.meaning) for m in MEASURES.values()],
+    )
     return Page(
         f"{found['scene']}: models compared",
         [f"{counts[what]} {what}" for what in ("muscles", "frames", "threads")],
@@ -47,7 +55,11 @@ def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
         lights=[_light(found, name, limits.get(name)) for name in LIGHTS if _values(found, name)],
         heads=list(runs),
         sections=[
-            Section("Every measure", "worst of muscles and frames, best in green", table=_measures(found)),
+            Section(
+                "Every measure",
+                "worst of muscles and frames, best in green",
+                table=_measures(found),
+            ),
             Section("Over the motion", plots=_plots(runs)),
             Section("How to read this", text=_READING, terms=terms),
         ],
@@ -82,14 +94,18 @@ def _measures(found: dict[str, Any]) -> Table:
     for quantity, measure in MEASURES.items():
         if values := _values(found, quantity):
             best, models = best_models(found["results"], quantity, found["units"]), found["models"]
-            states = [GOOD if name in best and len(best) < len(models) else PLAIN for name in models]
+            states = [
+                GOOD if name in best and len(best) < len(models) else PLAIN for name in models
+            ]
             texts = [shown(found, quantity, value) for value in values]
             rows.append([Cell(measure.title), Cell(measure.against), *map(Cell, texts, states)])
     return Table(["", "against", *(found["labels"][name] for name in found["models"])], rows)
 
 
 def _plots(runs: Mapping[str, SavedRun]) -> list[str]:
-    """Moment arms, length and depths of each muscle, then the time; a line for each model, no plot of constants."""
+    """Moment arms, length and depths of each muscle, then the time; a line for each model, no plot
+    of constants.
+    """
     first, pictures = next(iter(runs.values())), []
     axis, label = motion_axis(first)
     panels: list[tuple[str, str, str, str, str | None]] = [
@@ -110,7 +126,9 @@ def _plots(runs: Mapping[str, SavedRun]) -> list[str]:
             frames, values = run.series(muscle, quantity, about)
             kept = slice(quantity == "time_frame", None)
             if np.isfinite(values[kept]).any():
-                tracks.append(Track(name, colour, np.array([axis[k] for k in frames])[kept], values[kept]))
+                tracks.append(
+                    Track(name, colour, np.array([axis[k] for k in frames])[kept], values[kept])
+                )
         if any(np.ptp(track.y) != 0 for track in tracks):
             pictures.append(line_plot(title, tracks, (label, unit), legend=True))
     return pictures

@@ -5,7 +5,14 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
-from rbfmuscle.experiments.kernel_study import ALIKE, KernelStudy, cost, describe, row_name, row_toml
+from rbfmuscle.experiments.kernel_study import (
+    ALIKE,
+    KernelStudy,
+    cost,
+    describe,
+    row_name,
+    row_toml,
+)
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.writer import json_text
 from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, number_cell
@@ -13,21 +20,31 @@ from rbfmuscle.report.plots import Point, front_plot
 
 # Quantity: heading, factor.
 COLUMNS = {
-    "centres": ("centres", 1.0), "placement": ("placement", 1.0), "shape": ("epsilon times spacing", 1.0),
-    "rms": ("RMS error", 1.0), "hausdorff": ("greatest error", 1.0), "normal_error": ("normals [°]", 1.0),
-    "volume_error": ("volume [%]", 100.0), "condition": ("condition", 1.0),
-    "fit_time": ("fit [ms]", 1e3), "evaluation_time": ("20,000 values [ms]", 1e3),
-}  # fmt: skip
+    "centres": ("centres", 1.0),
+    "placement": ("placement", 1.0),
+    "shape": ("epsilon times spacing", 1.0),
+    "rms": ("RMS error", 1.0),
+    "hausdorff": ("greatest error", 1.0),
+    "normal_error": ("normals [°]", 1.0),
+    "volume_error": ("volume [%]", 100.0),
+    "condition": ("condition", 1.0),
+    "fit_time": ("fit [ms]", 1e3),
+    "evaluation_time": ("20,000 values [ms]", 1e3),
+}
 _MOST_LIGHTS = 5
-_READING = """A kernel's shape parameter is chosen by the error at other points of the mesh. Distances are measured both
-ways between mesh and extracted surface, root mean square and greatest. Recommended is the quickest row (a fit and
-20,000 values) whose error is at most 5 % more than the least one; of rows with the same time, one without a shape
-parameter, then the best-conditioned one. No other row has both a smaller error and a shorter time than a row on the
-front. A kernel that is not C2 cannot be fitted to normals: it is fitted to values on and off the surface."""
+_READING = """A kernel's shape parameter is chosen by the error at other points of the mesh.
+Distances are measured both ways between mesh and extracted surface, root mean square and
+greatest. Recommended is the quickest row (a fit and 20,000 values) whose error is at most 5 %
+more than the least one; of rows with the same time, one without a shape parameter, then the
+best-conditioned one. No other row has both a smaller error and a shorter time than a row on the
+front. A kernel that is not C2 cannot be fitted to normals: it is fitted to values on and off the
+surface."""
 
 
 def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> None:
-    """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html`` of studies by the names of their surfaces."""
+    """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html`` of studies by the names of their
+    surfaces.
+    """
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
     rows = [{"surface": name, **row} for name, study in studies.items() for row in study.rows]
@@ -36,12 +53,16 @@ def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> 
         writer.writeheader()
         writer.writerows(rows)
     units = next(iter(studies.values())).units
-    (directory / "kernels.json").write_text(json_text({"units": units, "rows": rows}), encoding="utf-8")
+    (directory / "kernels.json").write_text(
+        json_text({"units": units, "rows": rows}), encoding="utf-8"
+    )
     _page(studies).write(directory / "kernels.html")
 
 
 def answer(studies: Mapping[str, KernelStudy]) -> str:
-    """What to use and why: of one surface its own sentence, of several the kernel that is near the best on most."""
+    """What to use and why: of one surface its own sentence, of several the kernel that is near the
+    best on most.
+    """
     if len(studies) == 1:
         return describe(next(iter(studies.values())).rows)
     tied: Counter[str] = Counter()
@@ -84,21 +105,31 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
 
 
 def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
-    """Of one surface its best rows, each with whether it ties; of several what is recommended for each."""
-    chosen = [(name, study.recommended, GOOD) for name, study in studies.items() if study.recommended]
+    """Of one surface its best rows, each with whether it ties; of several what is recommended for
+    each.
+    """
+    chosen = [
+        (name, study.recommended, GOOD) for name, study in studies.items() if study.recommended
+    ]
     if len(studies) == 1:
         (study,) = studies.values()
         good = [row for row in study.rows if not row["unfit"]]
         others = [row for row in good if row is not study.recommended]
         chosen = [("recommended", row, GOOD) for _, row, _ in chosen]
-        chosen += [("", row, GOOD if row["rms"] <= ALIKE * good[0]["rms"] else PLAIN) for row in others]
+        chosen += [
+            ("", row, GOOD if row["rms"] <= ALIKE * good[0]["rms"] else PLAIN) for row in others
+        ]
         chosen = chosen[:_MOST_LIGHTS]
-    cells = [[number_cell(row["rms"], units, s), number_cell(cost(row), "s")] for _, row, s in chosen]
+    cells = [
+        [number_cell(row["rms"], units, s), number_cell(cost(row), "s")] for _, row, s in chosen
+    ]
     return [Light(row_name(row), pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
 
 
 def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
-    """Error against the time of a fit and 20,000 values: a colour a surface, or of one a number of centres."""
+    """Error against the time of a fit and 20,000 values: a colour a surface, or of one a number of
+    centres.
+    """
     points = []
     for name, study in studies.items():
         for row in study.rows:
@@ -117,6 +148,9 @@ def _rows(study: KernelStudy) -> Table:
         front = "on the front" if row["front"] else ""
         verdict = row["unfit"] or ("recommended" if row is study.recommended else front)
         values = [(row[name], factor) for name, (_, factor) in COLUMNS.items()]
-        texts = [shown_number(x * factor) if isinstance(x, float) else str(x or "") for x, factor in values]
+        texts = [
+            shown_number(x * factor) if isinstance(x, float) else str(x or "")
+            for x, factor in values
+        ]
         rows.append([Cell(row["kernel"]), Cell(verdict, state), *map(Cell, texts)])
     return Table(["kernel", "verdict", *(head for head, _ in COLUMNS.values())], rows)

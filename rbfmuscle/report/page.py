@@ -1,4 +1,6 @@
-"""The page of a run, a comparison, a kernel study or a sweep: answer, picture, rows with lights, all else folded."""
+"""The page of a run, a comparison, a kernel study or a sweep: answer, picture, rows with lights,
+all else folded.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +10,10 @@ from typing import NamedTuple
 from rbfmuscle.metrics.summary import COUNTS, shown_number, within
 from rbfmuscle.validation import SolveError
 
-GOOD, NEAR, BAD, PLAIN = "good", "near", "bad", "plain"
+GOOD = "good"
+NEAR = "near"
+BAD = "bad"
+PLAIN = "plain"
 # From this share of a limit a value is near it.
 _NEAR_LIMIT = 0.8
 
@@ -42,7 +47,9 @@ class Light(NamedTuple):
 
 
 class Section(NamedTuple):
-    """What is folded: plots (SVG), a table, a text, terms with their meaning, text to copy; left out where empty."""
+    """What is folded: plots (SVG), a table, a text, terms with their meaning, text to copy; left
+    out where empty.
+    """
 
     title: str
     hint: str = ""
@@ -57,9 +64,9 @@ class Section(NamedTuple):
 class Page:
     """What a page says, in its order.
 
-    The ``answer`` is one sentence, ``detail`` stands below it. ``scene``, from `pack_runs`, moves; ``plot`` is SVG;
-    ``missing`` says why there is none of them. ``heads`` are those of the lights' columns; the lights stand beside the
-    picture, below a scene where they have several.
+    The ``answer`` is one sentence, ``detail`` stands below it. ``scene``, from `pack_runs`, moves;
+    ``plot`` is SVG; ``missing`` says why there is none of them. ``heads`` are those of the lights'
+    columns; the lights stand beside the picture, below a scene where they have several.
     """
 
     title: str
@@ -90,7 +97,9 @@ class Page:
 
 
 def limit_state(quantity: str, value: float | None, limit: float | None) -> str:
-    """Light of a value: bad beyond its limit, near from four fifths of it (no count is), good, or plain without one."""
+    """Light of a value: bad beyond its limit, near from four fifths of it (no count is), good, or
+    plain without one.
+    """
     if value is None or limit is None:
         return PLAIN
     if not within(quantity, value, limit):

@@ -18,11 +18,24 @@ if TYPE_CHECKING:
 
 _SOFT, _LIMIT = "#5f646b", "#a3281f"
 _STYLE = {
-    "svg.fonttype": "none", "svg.hashsalt": "rbfmuscle", "font.size": 8.5, "axes.titlesize": 9,
-    "axes.titleweight": "bold", "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#b9b5ab",
-    "axes.labelcolor": _SOFT, "xtick.color": _SOFT, "ytick.color": _SOFT, "axes.grid": True, "grid.color": "#e8e6e0",
-    "axes.axisbelow": True, "lines.linewidth": 1.4, "legend.frameon": False, "text.parse_math": False,
-}  # fmt: skip
+    "svg.fonttype": "none",
+    "svg.hashsalt": "rbfmuscle",
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.titleweight": "bold",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#b9b5ab",
+    "axes.labelcolor": _SOFT,
+    "xtick.color": _SOFT,
+    "ytick.color": _SOFT,
+    "axes.grid": True,
+    "grid.color": "#e8e6e0",
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+    "text.parse_math": False,
+}
 # Height of a row of labels, and width of a letter [inch].
 _ROW, _LETTER = 0.16, 0.075
 
@@ -37,7 +50,9 @@ class Track(NamedTuple):
 
 
 class Point(NamedTuple):
-    """A point of error against time: a star where it is the default; its label is drawn there and on the front."""
+    """A point of error against time: a star where it is the default; its label is drawn there and
+    on the front.
+    """
 
     x: float
     y: float
@@ -58,7 +73,8 @@ def line_plot(
 ) -> str:
     """Markup of a plot of lines; one that bears a muscle's name is switched on and off with it.
 
-    ``labels`` are those of the axes, ``limits`` dashed lines; the axis begins at ``zero``; a ``legend`` stands below.
+    ``labels`` are those of the axes, ``limits`` dashed lines; the axis begins at ``zero``; a
+    ``legend`` stands below.
     """
     from matplotlib import style
     from matplotlib.figure import Figure
@@ -72,7 +88,9 @@ def line_plot(
         for limit in limits:
             axes.axhline(limit, color=_LIMIT, linestyle="--", linewidth=0.8)
         for track in tracks:
-            axes.plot(track.x, track.y, color=track.colour, label=track.name, gid=f"muscle:{track.name}")
+            axes.plot(
+                track.x, track.y, color=track.colour, label=track.name, gid=f"muscle:{track.name}"
+            )
         axes.margins(x=0.0)
         axes.set_ylim(bottom=0.0 if zero else None)
         if legend:
@@ -81,7 +99,9 @@ def line_plot(
 
 
 def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
-    """Markup of error against time on logarithmic axes: each group's front joined, it and the default labelled."""
+    """Markup of error against time on logarithmic axes: each group's front joined, it and the
+    default labelled.
+    """
     from matplotlib import style
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
@@ -97,16 +117,25 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
     with style.context(["default", _STYLE]):
         figure = Figure((wide, tall))
         place = (0.6 / wide, 0.45 / tall, 4.6 / wide, 1.0 - 0.55 / tall)
-        axes = figure.add_axes(place, xscale="log", yscale="log", xlabel=labels[0], ylabel=labels[1])
+        axes = figure.add_axes(
+            place, xscale="log", yscale="log", xlabel=labels[0], ylabel=labels[1]
+        )
         for group, colour in colours.items():
             front = sorted(point for point in shown if point.front and point.group == group)
-            axes.plot([point.x for point in front], [point.y for point in front], color=colour, linewidth=1.0)
+            axes.plot(
+                [point.x for point in front],
+                [point.y for point in front],
+                color=colour,
+                linewidth=1.0,
+            )
         for point in shown:
             marker, size = ("*", 13.0) if point.star else ("o", 6.0)
             shade = colours[point.group] + ("" if point.star or point.front else "66")
             axes.plot(point.x, point.y, marker, color=shade, markersize=size, markeredgewidth=0.0)
         for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-            axis.set_major_locator(MaxNLocator(5) if high < 10.0 * low else LogLocator(subs=(1, 2, 5)))
+            axis.set_major_locator(
+                MaxNLocator(5) if high < 10.0 * low else LogLocator(subs=(1, 2, 5))
+            )
             axis.set_minor_locator(NullLocator())
             axis.set_major_formatter("{x:.4g}")
         _label_beside(axes, named, groups, _ROW / (tall - 0.55))
@@ -114,7 +143,9 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
 
 
 def _label_beside(axes, points, groups, row):
-    """Write groups, then the points' labels, below each other beside the plot, each joined to its point."""
+    """Write groups, then the points' labels, below each other beside the plot, each joined to its
+    point.
+    """
     top, whole = 1.0, axes.transAxes
     for name, colour in groups.items():
         axes.text(1.04, top, name, color=colour, weight="bold", transform=whole, va="center")
@@ -130,11 +161,15 @@ def _label_beside(axes, points, groups, row):
 
 
 def _svg(figure: "Figure", title: str) -> str:
-    """Markup of a figure, without what only a file of its own needs; lines of muscles bear their names."""
+    """Markup of a figure, without what only a file of its own needs; lines of muscles bear their
+    names.
+    """
     from markupsafe import escape
 
     file = io.BytesIO()
-    figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    figure.savefig(
+        file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    )
     text = file.getvalue().decode()
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text[text.index("<svg") :])
     text = re.sub(r'<g id="muscle:([^"]*)">', r'<g data-muscle="\1"><title>\1</title>', text)
@@ -143,7 +178,9 @@ def _svg(figure: "Figure", title: str) -> str:
 
 
 def motion_axis(saved: SavedRun) -> tuple[dict[int, float], str]:
-    """Place of each frame on plots and their label: the only coordinate that moves, if one way, or frame numbers."""
+    """Place of each frame on plots and their label: the only coordinate that moves, if one way, or
+    frame numbers.
+    """
     rows, units = saved.info["frames"], saved.info["scene"].get("coordinate_units", {})
     names = sorted({name for row in rows for name in row["coordinates"]})
     tracks = {name: np.array([row["coordinates"].get(name, 0.0) for row in rows]) for name in names}
@@ -158,4 +195,8 @@ def motion_axis(saved: SavedRun) -> tuple[dict[int, float], str]:
 
 def arm_unit(saved: SavedRun, coordinate: str) -> str:
     """Unit of the moment arms about a coordinate of a saved run."""
-    return "1" if saved.info["scene"].get("coordinate_units", {}).get(coordinate, "").strip() else saved.units
+    return (
+        "1"
+        if saved.info["scene"].get("coordinate_units", {}).get(coordinate, "").strip()
+        else saved.units
+    )

@@ -1,4 +1,6 @@
-"""Pictures of saved runs and scenes, drawn by a depth buffer in memory: neither graphics nor a display is needed."""
+"""Pictures of saved runs and scenes, drawn by a depth buffer in memory: neither graphics nor a
+display is needed.
+"""
 
 import base64
 import html
@@ -22,12 +24,19 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import AT_REST
 from rbfmuscle.validation import SolveError, UsageError
 
-# Views where none are asked for; muscles that are named, more are named by their groups; pixels of a view.
-USUAL_VIEWS, _MOST_CHIPS, _AREA = ("front", "right", "back"), 8, 220_000
+# Views where none are asked for; muscles that are named, more are named by their groups; pixels of
+# a view.
+USUAL_VIEWS = ("front", "right", "back")
+_MOST_CHIPS = 8
+_AREA = 220_000
 # Of pictures of scenes: pixels of a view, the views, how pale bones are.
-_SCENE_SIZE, _SCENE_SIDES, _PALE = (480, 860), ("front", "right", "back", "left"), 0.72
+_SCENE_SIZE = (480, 860)
+_SCENE_SIDES = ("front", "right", "back", "left")
+_PALE = 0.72
 _SMALL = 900, 600  # pixels of a picture in a notebook, at most
-_MUSCLE, _OPACITY, _AXIS = "#9a8f8f", 0.12, "#0057d9"
+_MUSCLE = "#9a8f8f"
+_OPACITY = 0.12
+_AXIS = "#0057d9"
 # Each pixel is the mean of so many by so many.
 _FINER = 2
 _MARGIN = 0.05
@@ -45,7 +54,9 @@ class Solid(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """A parallel projection: ``axes`` (3, 3) are right, up and towards the camera; ``scale`` is pixels per unit."""
+    """A parallel projection: ``axes`` (3, 3) are right, up and towards the camera; ``scale`` is
+    pixels per unit.
+    """
 
     axes: Floats
     centre: Floats
@@ -61,7 +72,9 @@ class Camera(NamedTuple):
 
 
 def aim(axes: Floats, points: Floats, size: tuple[int, int]) -> Camera:
-    """A camera of these axes that sees all points (n, 3), as large as a picture of ``size`` holds them."""
+    """A camera of these axes that sees all points (n, 3), as large as a picture of ``size`` holds
+    them.
+    """
     seen = points @ axes.T
     low, high = seen.min(axis=0), seen.max(axis=0)
     wide, tall, _ = np.maximum(high - low, 1e-9)
@@ -70,7 +83,9 @@ def aim(axes: Floats, points: Floats, size: tuple[int, int]) -> Camera:
 
 
 def fitted_size(axes: Floats, points: Floats, area: float) -> tuple[int, int]:
-    """Width and height of so many pixels, in the proportions of what is seen; even numbers, as films ask for."""
+    """Width and height of so many pixels, in the proportions of what is seen; even numbers, as
+    films ask for.
+    """
     wide, tall, _ = np.maximum(np.ptp(points @ axes.T, axis=0), 1e-9)
     shape = float(np.clip(tall / wide, 0.6, 2.2))
     return 2 * round(0.5 * (area / shape) ** 0.5), 2 * round(0.5 * (area * shape) ** 0.5)
@@ -83,8 +98,13 @@ def draw_solids(solids: Sequence[Solid], camera: Camera) -> Integers:
     depth = np.full(fine.size[::-1], -np.inf, dtype=np.float32)
     image = np.ones((*depth.shape, 3), dtype=np.float32)
     for solid in sorted(solids, key=lambda solid: -solid.opacity):
-        points, shades = fine.project(np.asarray(solid.vertices, dtype=float)), _shaded(solid, camera.axes)
-        _raster_loop(points, np.asarray(solid.faces, dtype=np.int64), shades, solid.opacity, depth, image)
+        points, shades = (
+            fine.project(np.asarray(solid.vertices, dtype=float)),
+            _shaded(solid, camera.axes),
+        )
+        _raster_loop(
+            points, np.asarray(solid.faces, dtype=np.int64), shades, solid.opacity, depth, image
+        )
     mean = image.reshape(height, _FINER, width, _FINER, 3).mean(axis=(1, 3))
     return np.round(255.0 * np.clip(mean, 0.0, 1.0)).astype(np.uint8)
 
@@ -100,11 +120,17 @@ def _shaded(solid: Solid, axes: Floats) -> Floats:
     return rgb(solid.colour) * (0.42 + 0.62 * facing) + 0.1 * gloss
 
 
-def labelled(image: Integers, text: str, titles: Sequence[str], chips: Mapping[str, str]) -> Image.Image:
-    """Image (h, w, 3) with a strip above that has a title for each column, and one below: text and colours."""
+def labelled(
+    image: Integers, text: str, titles: Sequence[str], chips: Mapping[str, str]
+) -> Image.Image:
+    """Image (h, w, 3) with a strip above that has a title for each column, and one below: text and
+    colours.
+    """
     font = ImageFont.load_default(13)
     height, width = image.shape[:2]
-    x, y, places = 8, height + _LINE + 5, []
+    x = 8
+    y = height + _LINE + 5
+    places = []
     for name, colour in [*((part, "") for part in text.split(", ")), *chips.items()]:
         wide = int(font.getlength(name)) + (_CHIP if colour else 0)
         if places and x + wide > width:
@@ -128,7 +154,9 @@ def _raster_loop(points, faces, shades, opacity, depth, image):
     height, width = depth.shape
     for f in range(len(faces)):
         i, j, k = faces[f]
-        a, b, c = points[i], points[j], points[k]
+        a = points[i]
+        b = points[j]
+        c = points[k]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
         if area == 0.0:
             continue
@@ -159,12 +187,13 @@ def render_run(
     most: int | None = None,
     seconds: float = 5.0,
 ) -> None:
-    """Draw a saved run to a picture (``.png``, one frame) or an animation (``.gif`` or ``.webp``, all of them).
+    """Draw a saved run to a picture (``.png``, one frame) or an animation (``.gif`` or ``.webp``,
+    all of them).
 
-    ``frame`` is that of a picture, by default the last. ``views``, side by side, are of `VIEWS`, or "motion" for the
-    plane of the motion; `USUAL_VIEWS` where not given. A view has ``area`` pixels. An animation of so many ``seconds``
-    has at ``most`` so many frames, chosen evenly. UsageError if the folder holds nothing to draw, or the suffix, frame
-    or view is unknown.
+    ``frame`` is that of a picture, by default the last. ``views``, side by side, are of `VIEWS`, or
+    "motion" for the plane of the motion; `USUAL_VIEWS` where not given. A view has ``area`` pixels.
+    An animation of so many ``seconds`` has at ``most`` so many frames, chosen evenly. UsageError if
+    the folder holds nothing to draw, or the suffix, frame or view is unknown.
     """
     saved, output = SavedRun(directory), Path(output)
     if output.suffix not in (".png", ".gif", ".webp"):
@@ -184,14 +213,20 @@ def render_run(
         if view not in directions:
             raise UsageError(f"unknown view {view!r}; known: {', '.join(directions)}")
     axes = {view: look.view_axes(directions[view], saved.body) for view in views or USUAL_VIEWS}
-    frames = [frame] if output.suffix == ".png" else chosen_frames(saved.frames, most or len(saved.frames))
+    frames = (
+        [frame]
+        if output.suffix == ".png"
+        else chosen_frames(saved.frames, most or len(saved.frames))
+    )
     save_images(_draw_views(saved, axes, frames, area), output, seconds)
 
 
 def _draw_views(
     run: SavedRun, axes: Mapping[str, Floats], frames: Sequence[int], area: float
 ) -> list[Image.Image]:
-    """A picture of each frame: views of so many pixels side by side, with titles, caption and colours."""
+    """A picture of each frame: views of so many pixels side by side, with titles, caption and
+    colours.
+    """
     some = {run.frames[0], run.frames[len(run.frames) // 2], run.frames[-1]}
     names = [*run.muscles, *run.tendons]
     seen = np.concatenate([run.surface(name, k)[0][::3] for name in names for k in some])
@@ -224,7 +259,9 @@ def chosen_frames(frames: Sequence[int], most: int) -> list[int]:
 
 
 def save_images(images: Sequence[Image.Image], path: Path, seconds: float) -> None:
-    """Save one picture, or several of one width as an animation of so many seconds; raises SolveError if it fails."""
+    """Save one picture, or several of one width as an animation of so many seconds; raises
+    SolveError if it fails.
+    """
     size = images[0].width, max(image.height for image in images)
     sheets = [ImageOps.pad(image, size, color="white", centering=(0, 0)) for image in images]
     kind: dict[str, Any] = {"quality": 82, "method": 2} if path.suffix == ".webp" else {}
@@ -266,7 +303,10 @@ def figure_html(draw: Callable[[Path], None], caption: str) -> str:
             image.save(small, quality=80)
         data = base64.b64encode(small.read_bytes()).decode()
     text = html.escape(caption)
-    return f'<figure><img alt="{text}" src="data:image/webp;base64,{data}"><figcaption>{text}</figcaption></figure>'
+    return (
+        f'<figure><img alt="{text}" '
+        f'src="data:image/webp;base64,{data}"><figcaption>{text}</figcaption></figure>'
+    )
 
 
 def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:

@@ -1,4 +1,6 @@
-"""The report of a run: its verdict, the moving scene, five rows with limits; plots and tables folded."""
+"""The report of a run: its verdict, the moving scene, five rows with limits; plots and tables
+folded.
+"""
 
 import math
 from collections import Counter
@@ -21,14 +23,29 @@ from rbfmuscle.metrics.summary import (
 )
 from rbfmuscle.output.animation.page import pack_runs
 from rbfmuscle.output.saved import SavedRun, read_moving
-from rbfmuscle.report.page import BAD, GOOD, Cell, Light, Page, Section, Table, limit_state, number_cell
+from rbfmuscle.report.page import (
+    BAD,
+    GOOD,
+    Cell,
+    Light,
+    Page,
+    Section,
+    Table,
+    limit_state,
+    number_cell,
+)
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, render_run
 
 # What the rows beside the picture say, and the quantities that each holds to a limit.
 LIGHTS = {
     "Keeps its volume": ("volume_error",),
-    "Stays out of bones": ("penetration_max", "bone_penetration_max", "initial_overlap", "tunnelled"),
+    "Stays out of bones": (
+        "penetration_max",
+        "bone_penetration_max",
+        "initial_overlap",
+        "tunnelled",
+    ),
     "Is the scanned shape at rest": ("rest_error_rms",),
     "Is one closed piece": ("components", "euler", "self_crossings", "unfitted_fraction"),
     "Moves without jumps or bowing": ("flicker", "slack"),
@@ -47,13 +64,16 @@ PANELS = (
 _MOST_POINTS = 2_600_000
 # Tables or plots of their own.
 _ELSEWHERE = ("volume", "moment_arm", "time_solve", "time_fit", "time_extract")
-_READING = """Depths in bones are exact distances to the bone meshes. A row is amber from 80 % of its limit on.
-Times are medians, as the first frame may load and compile. Drag to turn the picture, scroll or pinch to zoom, drag with
-shift to move it; names below it switch muscles and their lines on and off."""
+_READING = """Depths in bones are exact distances to the bone meshes. A row is amber from 80 % of
+its limit on. Times are medians, as the first frame may load and compile. Drag to turn the
+picture, scroll or pinch to zoom, drag with shift to move it; names below it switch muscles and
+their lines on and off."""
 
 
 def write_report(directory: str | Path, *, pictures: bool = True) -> None:
-    """Write a saved run's ``report.html``, with ``pictures`` a moving scene and ``preview.webp``; raises SolveError."""
+    """Write a saved run's ``report.html``, with ``pictures`` a moving scene and ``preview.webp``;
+    raises SolveError.
+    """
     saved = SavedRun(directory)
     page = _page(saved)
     if not pictures or not saved.has_surfaces():
@@ -63,16 +83,22 @@ def write_report(directory: str | Path, *, pictures: bool = True) -> None:
         page.scene = packed_scene({"": saved})
         if len(saved.frames) > 1:
             preview = saved.directory / "preview.webp"
-            render_run(saved.directory, preview, views=["motion"], area=110_000, most=12, seconds=4.0)
+            render_run(
+                saved.directory, preview, views=["motion"], area=110_000, most=12, seconds=4.0
+            )
     page.write(saved.directory / "report.html")
 
 
 def packed_scene(runs: Mapping[str, SavedRun]) -> str:
     """Runs of one scene as data of a moving picture, of as many frames as a page holds."""
     first = next(iter(runs.values()))
-    points = sum(len(run.surface(name, run.frames[0])[0]) for run in runs.values() for name in run.muscles)
+    points = sum(
+        len(run.surface(name, run.frames[0])[0]) for run in runs.values() for name in run.muscles
+    )
     frames = chosen_frames(first.frames, max(2, _MOST_POINTS // max(points, 1)))
-    return pack_runs({title: read_moving(run, frames, unit=run.units) for title, run in runs.items()})
+    return pack_runs(
+        {title: read_moving(run, frames, unit=run.units) for title, run in runs.items()}
+    )
 
 
 def _page(saved: SavedRun) -> Page:
@@ -91,7 +117,9 @@ def _page(saved: SavedRun) -> Page:
         lights=_lights(saved),
         sections=[
             *_plots(saved),
-            Section("Every quantity of every muscle", "worst over the frames", table=_summary(saved)),
+            Section(
+                "Every quantity of every muscle", "worst over the frames", table=_summary(saved)
+            ),
             Section("Events", "each with its frame in events.csv", text=_events(saved.events)),
             Section("How to read this", text=_READING, terms=terms),
         ],
@@ -129,19 +157,28 @@ def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | No
             if facts and limits.get(name) is not None and muscle != ALL:
                 worst = math.nan if facts.get("worst") is None else facts["worst"]
                 limit = muscle_limit(name, limits[name], table)
-                near = 0.0 if name in COUNTS and within(name, worst, limit) else excess(name, worst, limit)
+                near = (
+                    0.0
+                    if name in COUNTS and within(name, worst, limit)
+                    else excess(name, worst, limit)
+                )
                 found.append((near, muscle, name, worst, facts, limit))
     if not found:
         return None
     _, muscle, name, worst, facts, limit = max(found, key=lambda entry: entry[0])
-    unit, place = facts["unit"], f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}"
+    unit, place = (
+        facts["unit"],
+        f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}",
+    )
     allowed = f"{'≥' if name in LEAST else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}"
     cells, note = [number_cell(worst, unit, limit_state(name, worst, limit))], _title(name)
     return Light(title, cells, allowed, note + place if worst else note)
 
 
 def _title(name: str) -> str:
-    """A quantity in the words of the verdict, with its name in ``metrics.csv`` where that is another."""
+    """A quantity in the words of the verdict, with its name in ``metrics.csv`` where that is
+    another.
+    """
     title = LIMITS[name].title if name in LIMITS else name
     return title if title.replace(" ", "_") == name else f"{title} ({name})"
 
@@ -152,7 +189,9 @@ def _plots(saved: SavedRun) -> list[Section]:
     mechanics, errors = "Moment arms and lengths", "Errors and times over the motion"
     plots: dict[str, list[str]] = {mechanics: [], errors: []}
     about = saved.moment_arm_coordinates()
-    arms = [(f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), name) for name in about]
+    arms = [
+        (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), name) for name in about
+    ]
     for title, quantity, factor, unit, coordinate in [*arms, *((*panel, None) for panel in PANELS)]:
         tracks = _tracks(saved, quantity, factor, axis, coordinate)
         if tracks:
@@ -168,27 +207,40 @@ def _plots(saved: SavedRun) -> list[Section]:
 def _tracks(
     saved: SavedRun, quantity: str, factor: float, axis: Mapping[int, float], coordinate: str | None
 ) -> list[Track]:
-    """Lines of the muscles in the colours of the picture; of times without the first frame, and all together."""
-    tracks, together = [], {ALL: "#26282b"} if quantity == "time_frame" and len(saved.muscles) > 1 else {}
+    """Lines of the muscles in the colours of the picture; of times without the first frame, and all
+    together.
+    """
+    tracks, together = (
+        [],
+        {ALL: "#26282b"} if quantity == "time_frame" and len(saved.muscles) > 1 else {},
+    )
     for name, colour in (saved.colours | together).items():
         frames, values = saved.series(name, quantity, coordinate)
         if quantity == "time_frame":
             frames, values = frames[1:], values[1:]
         if len(frames) and np.isfinite(values).any():
-            tracks.append(Track(name, colour, np.array([axis[frame] for frame in frames]), factor * values))
+            tracks.append(
+                Track(name, colour, np.array([axis[frame] for frame in frames]), factor * values)
+            )
     return tracks
 
 
 def _summary(saved: SavedRun) -> Table:
     """A row for each muscle, those beyond most limits first."""
     muscles, limits = saved.info["muscles"], saved.info["limits"]
-    used = [q for q in QUANTITIES if q not in _ELSEWHERE and any(q in found for found in muscles.values())]
+    used = [
+        q
+        for q in QUANTITIES
+        if q not in _ELSEWHERE and any(q in found for found in muscles.values())
+    ]
     head = ["muscle"]
     for name in used:
         unit = next(found[name]["unit"] for found in muscles.values() if name in found)
         limit = "" if name not in limits else f" ({'≥' if name in LEAST else '≤'} {limits[name]:g})"
         head.append(f"{name.replace('_', ' ')}{'' if unit == '1' else f' [{unit}]'}{limit}")
-    rows = [[Cell(name), *(_cell(q, found, limits) for q in used)] for name, found in muscles.items()]
+    rows = [
+        [Cell(name), *(_cell(q, found, limits) for q in used)] for name, found in muscles.items()
+    ]
     return Table(head, sorted(rows, key=lambda row: -sum(cell.state == BAD for cell in row)))
 
 

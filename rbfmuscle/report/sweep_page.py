@@ -1,4 +1,6 @@
-"""The page of a sweep: the default's place, the Pareto front with labelled points, rows to choose from, every point."""
+"""The page of a sweep: the default's place, the Pareto front with labelled points, rows to choose
+from, every point.
+"""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,12 +11,20 @@ from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section,
 from rbfmuscle.report.plots import Point, front_plot
 
 ROUNDING = 1e-9  # errors below it are none
-SHOWN = ("error_rms", "error_max", "volume_error", "penetration_max", "bone_penetration_max", "time_frame")
-_READING = """error_rms is the distance between a point's surfaces and those of the reference at the same poses, both
-ways, root mean square over frames and muscles: how far a setting is from the reference, not how far the model is from a
-real muscle. A point is on the front if no other is as accurate in less time."""
-_INSIDE = """ The reference is itself a point of the grid, so points near it err little by definition. Give a finer one
-(--reference) to judge the default."""
+SHOWN = (
+    "error_rms",
+    "error_max",
+    "volume_error",
+    "penetration_max",
+    "bone_penetration_max",
+    "time_frame",
+)
+_READING = """error_rms is the distance between a point's surfaces and those of the reference at
+the same poses, both ways, root mean square over frames and muscles: how far a setting is from
+the reference, not how far the model is from a real muscle. A point is on the front if no other
+is as accurate in less time."""
+_INSIDE = """ The reference is itself a point of the grid, so points near it err little by
+definition. Give a finer one (--reference) to judge the default."""
 
 
 def write_page(found: dict[str, Any], directory: str | Path) -> None:
@@ -26,8 +36,13 @@ def write_page(found: dict[str, Any], directory: str | Path) -> None:
     judged = PLAIN if inside or not verdicts else GOOD if all(v["near"] for v in verdicts) else NEAR
     Page(
         f"Sweep of {', '.join(scenes)}"[:120],
-        [f"{found[status]} points {status}" for status in ("done", "failed", "missing") if found[status]],
-        " ".join(v["text"] for v in verdicts) or f"{found['done']} points are done; none is judged.",
+        [
+            f"{found[status]} points {status}"
+            for status in ("done", "failed", "missing")
+            if found[status]
+        ],
+        " ".join(v["text"] for v in verdicts)
+        or f"{found['done']} points are done; none is judged.",
         judged,
         plot=picture,
         missing="" if picture else "No front: no point has both an error and a time.",
@@ -42,13 +57,17 @@ def write_page(found: dict[str, Any], directory: str | Path) -> None:
 
 def inside_grid(rows: Iterable[dict[str, Any]]) -> bool:
     """Whether a reference has no setting beyond those of the other points."""
-    found = [(row["role"], {(key, str(value)) for key, value in row["settings"].items()}) for row in rows]
+    found = [
+        (row["role"], {(key, str(value)) for key, value in row["settings"].items()}) for row in rows
+    ]
     others = set().union(*(settings for role, settings in found if role != "reference"))
     return any(settings <= others for role, settings in found if role == "reference")
 
 
 def front_picture(rows: Iterable[dict[str, Any]], quantity: str) -> str:
-    """SVG of error against time per frame: a colour for each scene and model, fronts joined; no reference itself."""
+    """SVG of error against time per frame: a colour for each scene and model, fronts joined; no
+    reference itself.
+    """
     points = []
     for row in rows:
         if row["role"] != "reference" and row["status"] == "done" and row[quantity] > ROUNDING:
@@ -62,12 +81,18 @@ def _short(row: dict[str, Any]) -> str:
     """A point's settings without what names the table that they are in."""
     if row["role"] == "default":
         return "default"
-    named = {key.rpartition(".")[2]: value for key, value in row["settings"].items() if key != "model"}
+    named = {
+        key.rpartition(".")[2]: value for key, value in row["settings"].items() if key != "model"
+    }
     return ", ".join(f"{key} {value}" for key, value in named.items())
 
 
-def _lights(rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity: str) -> list[Light]:
-    """Of each default: itself, what is quicker, what is more accurate; then the two ends of the front."""
+def _lights(
+    rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity: str
+) -> list[Light]:
+    """Of each default: itself, what is quicker, what is more accurate; then the two ends of the
+    front.
+    """
     front = sorted((row for row in rows if row["front"]), key=lambda row: row["time_frame"])
     chosen: list[tuple[str, str | None, str]] = []
     for verdict in verdicts:
@@ -79,7 +104,10 @@ def _lights(rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity
             ("as quick, more accurate", verdict["better"], PLAIN),
         ]
     if front:
-        chosen += [("the quickest", front[0]["key"], PLAIN), ("the most accurate", front[-1]["key"], PLAIN)]
+        chosen += [
+            ("the quickest", front[0]["key"], PLAIN),
+            ("the most accurate", front[-1]["key"], PLAIN),
+        ]
     by_key = {row["key"]: row for row in rows}
     return [_light(by_key[key], title, quantity, state) for title, key, state in chosen if key]
 
@@ -92,11 +120,20 @@ def _light(row: dict[str, Any], title: str, quantity: str, state: str) -> Light:
 
 def _points(rows: list[dict[str, Any]]) -> Table:
     settings = list(dict.fromkeys(key for row in rows for key in row["settings"]))
-    head = ["scene", *settings, "role", "front", *(name.replace("_", " ") for name in SHOWN), "status"]
+    head = [
+        "scene",
+        *settings,
+        "role",
+        "front",
+        *(name.replace("_", " ") for name in SHOWN),
+        "status",
+    ]
     lines = []
     for row in rows:
         values = (str(row["settings"].get(key, "")) for key in settings)
-        numbers = (number_cell(row[name], "s" if name.startswith("time_") else "") for name in SHOWN)
+        numbers = (
+            number_cell(row[name], "s" if name.startswith("time_") else "") for name in SHOWN
+        )
         texts = row["scene"], *values, row["role"], "yes" if row["front"] else ""
         lines.append([*map(Cell, texts), *numbers, Cell(row["error"] or row["status"])])
     return Table(head, lines)

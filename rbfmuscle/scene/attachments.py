@@ -41,7 +41,9 @@ def _check_vertices(value: object, info: ValidationInfo) -> object:
 
 
 class AttachTable(Table):
-    """A bone, and one of: a file or list of vertex numbers, a distance to the bone, a ball; maybe a tendon."""
+    """A bone, and one of: a file or list of vertex numbers, a distance to the bone, a ball; maybe a
+    tendon.
+    """
 
     bone: str
     vertices: Annotated[Path | list[int] | None, BeforeValidator(_check_vertices)] = None
@@ -59,7 +61,8 @@ def resolve_attachments(
 ) -> list[Attachment]:
     """Return the attachments of the muscle of that name and mesh.
 
-    SceneError on an unknown bone, an empty selection, an index out of range, or a vertex held by two bones.
+    SceneError on an unknown bone, an empty selection, an index out of range, or a vertex held by
+    two bones.
     """
     found = []
     for number, entry in enumerate(attach):
@@ -69,7 +72,9 @@ def resolve_attachments(
             entry = AttachTable.build({k: v for k, v in row.items() if k != "holder"}, place=place)
         bone = find_named(bones, entry.bone, "bone", place=place)
         holder = "" if entry.tendon is None else f"{muscle} tendon {number + 1} to {bone.name}"
-        held = Attachment(bone.name, np.unique(_select(entry, read, bone, place)), entry.tendon, holder)
+        held = Attachment(
+            bone.name, np.unique(_select(entry, read, bone, place)), entry.tendon, holder
+        )
         for name in held.bones:
             find_named(bones, name, "bone", place=f"{place}tendon: ")
         found.append(held)
@@ -77,21 +82,26 @@ def resolve_attachments(
         shared = np.intersect1d(first.vertices, second.vertices)
         if first.holder != second.holder and len(shared):
             raise SceneError(
-                f"muscle {muscle!r}: {len(shared)} vertices (first: {shared[0]}) are attached to both "
+                f"muscle {muscle!r}: {len(shared)} vertices (first: {shared[0]}) are attached "
+                "to both "
                 f"{first.bone!r} and {second.bone!r}, make the attachments smaller"
             )
     return found
 
 
 def tendon_ends(muscle: Muscle, scene: SceneData) -> list[TendonEnd]:
-    """The ends of a muscle's belly that tendons hold, in the order of its attachments; the scene has its joints."""
+    """The ends of a muscle's belly that tendons hold, in the order of its attachments; the scene
+    has its joints.
+    """
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
     areas = vertex_areas(vertices, np.asarray(muscle.mesh.faces))
     ends = []
     for attachment in muscle.attachments:
         if attachment.tendon is not None:
             line = _line(attachment.bone, attachment.tendon)
-            middle, radius = _patch(vertices[attachment.vertices], areas[attachment.vertices], line[0][1])
+            middle, radius = _patch(
+                vertices[attachment.vertices], areas[attachment.vertices], line[0][1]
+            )
             section = abs(muscle.mesh.volume) / np.linalg.norm(vertices - middle, axis=1).max()
             thin = float(np.sqrt(THIN * section / np.pi))
             radii = radius, min(thin, radius)
@@ -116,13 +126,17 @@ def tendon_ends(muscle: Muscle, scene: SceneData) -> list[TendonEnd]:
 def _line(bone: str, tendon: LineTable) -> list[BonePoint]:
     """Via points and insertion of a tendon to a bone."""
     return [
-        (point.bone, np.array(point.point)) if isinstance(point, ViaTable) else (bone, np.array(point))
+        (point.bone, np.array(point.point))
+        if isinstance(point, ViaTable)
+        else (bone, np.array(point))
         for point in [*tendon.via, tendon.to]
     ]
 
 
 def _patch(points: Floats, areas: Floats, towards: Floats) -> tuple[Floats, float]:
-    """Middle of an end, and its radius about the line towards the tendon, as of a disc with the same moment of area."""
+    """Middle of an end, and its radius about the line towards the tendon, as of a disc with the
+    same moment of area.
+    """
     middle = np.average(points, axis=0, weights=areas)
     direction = (towards - middle) / max(float(np.linalg.norm(towards - middle)), 1e-300)
     away = np.linalg.norm(np.cross(points - middle, direction), axis=1)
@@ -132,7 +146,9 @@ def _patch(points: Floats, areas: Floats, towards: Floats) -> tuple[Floats, floa
 def _select(table, read, bone, place):
     given = [key for key in ("vertices", "near", "sphere") if getattr(table, key) is not None]
     if len(given) != 1:
-        raise SceneError(f"{place}give one of vertices, near and sphere, got {' and '.join(given) or 'none'}")
+        raise SceneError(
+            f"{place}give one of vertices, near and sphere, got {' and '.join(given) or 'none'}"
+        )
     if table.vertices is not None:
         kept = read.vertex_map[_listed(table.vertices, len(read.vertex_map), place)]
         if not (kept >= 0).any():
@@ -155,7 +171,9 @@ def _select(table, read, bone, place):
 
 
 def _listed(listed: Path | list[int], count: int, place: str) -> Integers:
-    """Vertex numbers of a list or of a text file, below ``count``; ``place`` begins each message."""
+    """Vertex numbers of a list or of a text file, below ``count``; ``place`` begins each
+    message.
+    """
     numbers = listed if isinstance(listed, list) else []
     if isinstance(listed, Path):
         words, place = read_text(listed, place=place).split(), f"{place}{shown_path(listed)}: "

@@ -48,14 +48,18 @@ class Bone:
         return None if self.mesh.is_watertight else inside_test(self.mesh.vertices, self.mesh.faces)
 
     def distances(self, points: Floats) -> Floats:
-        """Distances (n,) of points (n, 3) to the mesh, negative inside, of an open mesh by winding numbers."""
+        """Distances (n,) of points (n, 3) to the mesh, negative inside, of an open mesh by winding
+        numbers.
+        """
         distance = self._distance.signed_distance(points)
         if self._inside is None:
             return distance
         return np.where(self._inside(points), -1.0, 1.0) * np.abs(distance)
 
     def nearest(self, points: Floats) -> tuple[Floats, Floats]:
-        """Distances (n,) to the mesh, negative inside, and the nearest places (n, 3) on it, of points (n, 3)."""
+        """Distances (n,) to the mesh, negative inside, and the nearest places (n, 3) on it, of
+        points (n, 3).
+        """
         distances, places, *_ = self._distance.nearest(points)
         return distances, places
 

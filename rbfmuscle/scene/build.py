@@ -1,4 +1,6 @@
-"""Building a scene, part by part, and checking that it is whole. Each function is a method of `Scene` too."""
+"""Building a scene, part by part, and checking that it is whole. Each function is a method of
+`Scene` too.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,7 +34,8 @@ def add_bone(scene: S, name: str, mesh: MeshInput | None = None, *, scale: float
     ----------
     name : str
     mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh, optional
-        Mended where that is safe; holes are kept, with a note. A bone without one carries joints only.
+        Mended where that is safe; holes are kept, with a note. A bone without one carries joints
+        only.
     scale : float
         Factor from the mesh's unit to the scene's.
     """
@@ -66,9 +69,16 @@ def add_joint(
     axes : dict of str -> (3,) array_like
         Axis of each coordinate, in any length.
     **keys
-        Any other key of ``[[joint]]`` [degree, scene unit]: ``type``, ``coordinates``, ``rotations``, ...
+        Any other key of ``[[joint]]`` [degree, scene unit]: ``type``, ``coordinates``,
+        ``rotations``, ...
     """
-    row = {"name": name, "parent": parent, "child": child, "centre": centre, "axes": axes and dict(axes)}
+    row = {
+        "name": name,
+        "parent": parent,
+        "child": child,
+        "centre": centre,
+        "axes": axes and dict(axes),
+    }
     row |= keys
     return place_joint(scene, JointTable.build(row, place=f"joint {name!r}: ").joint())
 
@@ -99,7 +109,8 @@ def add_coupling(scene: S, coordinate: str, of: Sequence[str], **function: Any) 
     coordinate : str
     of : list of str
     **function
-        One of ``constant``, ``linear``, ``polynomial``, ``piecewise`` and ``spline`` [degree, scene unit].
+        One of ``constant``, ``linear``, ``polynomial``, ``piecewise`` and ``spline`` [degree, scene
+        unit].
     """
     row = {"coordinate": coordinate, "of": list(of), **function}
     table = CouplingTable.build(row, place=f"coupling of {coordinate!r}: ")
@@ -132,7 +143,8 @@ def add_muscle(
         Closed; mended where that is safe.
     attach : list of Attachment or dict
         A dict holds ``bone`` and one of ``vertices`` (indices or a file), ``near`` (distance) and
-        ``sphere`` (``centre``, ``radius``); a ``tendon`` (``to``, ``via``) where the mesh ends short of the bone.
+        ``sphere`` (``centre``, ``radius``); a ``tendon`` (``to``, ``via``) where the mesh ends
+        short of the bone.
     model : str or dict
         A model's name, or a table with ``name`` and the model's own options.
     fibres : path or list of (k, 3) array_like, optional
@@ -147,7 +159,9 @@ def add_muscle(
     attachments = resolve_attachments(attach, read, scene.bones, muscle=name)
     lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
     keys = contraction_keys(contraction, muscle=name)
-    muscle = Muscle(name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys)
+    muscle = Muscle(
+        name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys
+    )
     muscle.tendons = tendon_ends(muscle, scene)
     scene.muscles.append(muscle)
     return scene
@@ -163,19 +177,25 @@ def set_motion(scene: S, *, folder: Path | None = None, **options: Any) -> S:
     **options
         ``ramp``, ``waypoints`` with ``step``, or ``file``.
     """
-    scene.motion = make_motion(scene, MotionOptions.build(options, place="[motion] ", folder=folder))
+    scene.motion = make_motion(
+        scene, MotionOptions.build(options, place="[motion] ", folder=folder)
+    )
     return scene
 
 
 def validate(scene: S) -> S:
-    """Return the scene, or raise SceneError if it cannot be simulated: no bones, no muscles, loose muscles."""
+    """Return the scene, or raise SceneError if it cannot be simulated: no bones, no muscles, loose
+    muscles.
+    """
     for what in ("bones", "muscles"):
         if not getattr(scene, what):
             raise SceneError(f"scene {scene.name!r} has no {what}, add a [[{what[:-1]}]]")
     known = all_coordinates(scene.joints)
     for name in (name for frame in scene.motion.frames for name in frame):
         if name not in known:
-            raise SceneError(f"[motion]: unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}")
+            raise SceneError(
+                f"[motion]: unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}"
+            )
     for muscle in scene.muscles:
         place, bones = f"muscle {muscle.name!r}", sorted({a.bone for a in muscle.attachments})
         if not bones:

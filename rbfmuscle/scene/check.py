@@ -1,4 +1,6 @@
-"""Looking a scene over before it is solved: sizes, overlaps at rest, bones that meet in the motion."""
+"""Looking a scene over before it is solved: sizes, overlaps at rest, bones that meet in the
+motion.
+"""
 
 import itertools
 import math
@@ -21,8 +23,12 @@ Item: TypeAlias = Bone | Muscle | ReadMesh
 
 SMALLEST_MM = 2.0  # across: the bones of a mouse
 LARGEST_MM = 3000.0  # across: a person with arms raised
-FAR_AWAY = 1.0  # a muscle further from the bones than this many diagonals of their box is in another frame
-FARTHEST_CENTRE = 1000.0  # the same for the centre of a joint: a nearly straight path has one far away
+FAR_AWAY = (
+    1.0  # a muscle further from the bones than this many diagonals of their box is in another frame
+)
+FARTHEST_CENTRE = (
+    1000.0  # the same for the centre of a joint: a nearly straight path has one far away
+)
 MOTION_SAMPLES = 10
 COUNTED_DEPTH_MM = 0.05  # bones that touch by less are not reported
 
@@ -40,7 +46,9 @@ class Finding:
 
 
 def check_scene(scene: SceneData) -> list[Finding]:
-    """Return all findings about a scene, the first error among them, the worst first; nothing is solved or changed."""
+    """Return all findings about a scene, the first error among them, the worst first; nothing is
+    solved or changed.
+    """
     items: list[Bone | Muscle] = [*scene.bones, *scene.muscles]
     findings = [Finding("note", item.name, note) for item in items for note in item.notes]
     opened = "the bone is open, its inside follows from winding numbers"
@@ -79,8 +87,10 @@ def check_size(scene: SceneData, kind: str, name: str, item: Item) -> None:
     if not SMALLEST_MM <= millimetres <= LARGEST_MM:
         best = 10.0 ** round(math.log10(300.0 / max(millimetres, 1e-12)))
         raise MeshError(
-            f"{kind} {name!r} ({item.source or 'built in code'}) is {size:.4g} {scene.units} across, which "
-            f"cannot be right; correct the scene's units, or set its scale ({best:g} times the present one would "
+            f"{kind} {name!r} ({item.source or 'built in code'}) is {size:.4g} {scene.units} "
+            "across, which "
+            f"cannot be right; correct the scene's units, or set its scale ({best:g} times the "
+            "present one would "
             f"make it {millimetres * best:.4g} mm)"
         )
 
@@ -90,23 +100,29 @@ def check_place(scene: SceneData, name: str, muscle: Item) -> None:
     away, size = _away_from_bones(scene, *muscle.mesh.bounds)
     if away > FAR_AWAY * size:
         raise MeshError(
-            f"muscle {name!r} ({muscle.source or 'built in code'}) lies {away:.4g} {scene.units} away from "
+            f"muscle {name!r} ({muscle.source or 'built in code'}) lies {away:.4g} {scene.units} "
+            "away from "
             "all bones; bring the meshes into one frame and unit (scale)"
         )
 
 
 def check_centre(scene: SceneData, name: str, centre: Floats) -> None:
-    """Raise SceneError for a joint whose centre lies so far from all bones that poses lose their digits."""
+    """Raise SceneError for a joint whose centre lies so far from all bones that poses lose their
+    digits.
+    """
     away, size = _away_from_bones(scene, centre, centre)
     if away > FARTHEST_CENTRE * size:
         raise SceneError(
-            f"joint {name!r}: centre {np.asarray(centre).tolist()} lies {away:.4g} {scene.units} away from all bones; "
+            f"joint {name!r}: centre {np.asarray(centre).tolist()} lies {away:.4g} {scene.units} "
+            "away from all bones; "
             f"correct it, it is in the scene's unit ({scene.units})"
         )
 
 
 def _away_from_bones(scene, low, high):
-    """Distance of a box from that of all bones, and the diagonal of that; no distance without bones."""
+    """Distance of a box from that of all bones, and the diagonal of that; no distance without
+    bones.
+    """
     if not scene.bones:
         return 0.0, 0.0
     corners = np.concatenate([bone.mesh.bounds for bone in scene.bones])
@@ -161,10 +177,11 @@ def _depths(points, bone):
 def bone_collisions(
     scene: SceneData, frames: Iterable[int] | None = None
 ) -> list[tuple[int, str, str, float]]:
-    """Return where a motion drives bones into each other, as (frame, bone, other, depth [scene unit]).
+    """Return where a motion drives bones into each other, as (frame, bone, other, depth [scene
+    unit]).
 
-    The depth is that of the deepest vertex of either bone in the other; pairs that do not move are left out. ``frames``
-    are about ten of the motion by default.
+    The depth is that of the deepest vertex of either bone in the other; pairs that do not move are
+    left out. ``frames`` are about ten of the motion by default.
     """
     found = []
     for frame in sampled_frames(scene) if frames is None else frames:
@@ -181,7 +198,9 @@ def sampled_frames(scene: SceneData) -> list[int]:
 
 
 def _pair_depths(scene, poses):
-    """Deepest vertex of either bone in the other, for the pairs that move against each other and overlap."""
+    """Deepest vertex of either bone in the other, for the pairs that move against each other and
+    overlap.
+    """
     depths = {}
     for first, second in itertools.combinations(scene.bones, 2):
         relative = np.linalg.solve(poses[second.name], poses[first.name])
@@ -200,13 +219,19 @@ def _pair_depths(scene, poses):
 
 
 def bone_findings(collisions: list[tuple[int, str, str, float]], units: str) -> list[Finding]:
-    """Return a warning for each pair of bones that the motion drives into each other, from `bone_collisions`."""
+    """Return a warning for each pair of bones that the motion drives into each other, from
+    `bone_collisions`.
+    """
     worst = {}
     for frame, first, second, depth in collisions:
         start, deepest = worst.get((first, second), (frame, 0.0))
         worst[first, second] = (start, max(deepest, depth))
     said = "the motion drives the bones into each other"
     return [
-        Finding("warning", f"{a} and {b}", f"{said}, from about frame {start}, up to {deepest:.3g} {units}")
+        Finding(
+            "warning",
+            f"{a} and {b}",
+            f"{said}, from about frame {start}, up to {deepest:.3g} {units}",
+        )
         for (a, b), (start, deepest) in worst.items()
     ]

@@ -15,7 +15,13 @@ from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.build import add_bone, add_muscle, place_coupling, place_joint, validate
 from rbfmuscle.scene.check import check_centre, check_place, check_size
 from rbfmuscle.scene.joints.joint import all_coordinates
-from rbfmuscle.scene.joints.tables import CouplingTable, JointTable, coupling_row, joint_row, make_coupling
+from rbfmuscle.scene.joints.tables import (
+    CouplingTable,
+    JointTable,
+    coupling_row,
+    joint_row,
+    make_coupling,
+)
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.motion import make_motion, unit_sign
 from rbfmuscle.scene.objects import Muscle, SceneData
@@ -90,7 +96,8 @@ class SceneFile(Table):
 
 
 def read_scene_file(path: Path) -> SceneFile:
-    """Return the checked SceneFile of a TOML file; relative names of files become relative to its folder.
+    """Return the checked SceneFile of a TOML file; relative names of files become relative to its
+    folder.
 
     SceneError names the file, the table, the key, the value and what is right.
     """
@@ -108,7 +115,8 @@ def _read_toml(path):
     size = os.path.getsize(path)
     if size > LARGEST_FILE:
         raise SceneError(
-            f"{path}: has {size} bytes, a scene file at most {LARGEST_FILE}; put long lists of vertices into "
+            f"{path}: has {size} bytes, a scene file at most {LARGEST_FILE}; put long lists of "
+            "vertices into "
             "files of their own"
         )
     try:
@@ -153,9 +161,13 @@ def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
 def _fill(scene: SceneData, tables: SceneFile) -> None:
     about = tables.scene
     up, front = about.superior, about.anterior
-    if (up is None) != (front is None) or (up and front and np.abs(np.cross(up, front)).max() < 1e-9):
+    if (up is None) != (front is None) or (
+        up and front and np.abs(np.cross(up, front)).max() < 1e-9
+    ):
         raise SceneError("[scene]: give superior and anterior, of different directions, or neither")
-    scene.left_out, scene.superior, scene.anterior = about.left_out, about.superior, about.anterior
+    scene.left_out = about.left_out
+    scene.superior = about.superior
+    scene.anterior = about.anterior
     for bone in tables.bone:
         add_bone(scene, bone.name, bone.mesh, scale=bone.scale)
         if bone.mesh is not None:
@@ -173,19 +185,25 @@ def _fill(scene: SceneData, tables: SceneFile) -> None:
 
 
 def _add_muscle(scene, muscle, defaults):
-    given = {key: getattr(table, key) for table in (defaults, muscle) for key in table.model_fields_set}
+    given = {
+        key: getattr(table, key) for table in (defaults, muscle) for key in table.model_fields_set
+    }
     scale = given.get("scale", 1.0)
     read = read_mesh(muscle.mesh, name=muscle.name, scale=scale)
     check_size(scene, "muscle", muscle.name, read)
     check_place(scene, muscle.name, read)
     model, default = given.get("model", "rbf"), defaults.model
-    if isinstance(model, dict) and "name" not in model:  # some options of the default model are changed
+    if (
+        isinstance(model, dict) and "name" not in model
+    ):  # some options of the default model are changed
         model = {**(default if isinstance(default, dict) else {"name": default}), **model}
     add_muscle(scene, **given | {"mesh": read, "model": model})
 
 
 def _place(location, data):
-    """Words for a pydantic location: ("muscle", 1, "attach", 0) -> [[muscle]] 'iliacus' attach 1."""
+    """Words for a pydantic location: ("muscle", 1, "attach", 0) -> [[muscle]] 'iliacus'
+    attach 1.
+    """
     words = []
     here = data
     for depth, part in enumerate(location):
@@ -193,7 +211,11 @@ def _place(location, data):
         missing = depth == len(location) - 1 and isinstance(here, dict) and str(part).islower()
         if isinstance(part, str) and not known and not missing:
             continue  # the name of one of several types that pydantic tried
-        here = here[part] if known and not (isinstance(here, list) and not isinstance(part, int)) else None
+        here = (
+            here[part]
+            if known and not (isinstance(here, list) and not isinstance(part, int))
+            else None
+        )
         if isinstance(part, int):
             name = here.get("name") if isinstance(here, dict) else None
             words.append(repr(name) if name else str(part + 1))
@@ -205,7 +227,9 @@ def _place(location, data):
 
 
 def describe_scene(scene: SceneData) -> dict[str, Any]:
-    """Return the scene as plain data for ``run.json``: names, counts, options, sources and hashes."""
+    """Return the scene as plain data for ``run.json``: names, counts, options, sources and
+    hashes.
+    """
     units = {name: unit_sign(scene, name) for name in all_coordinates(scene.joints)}
     motion = scene.motion.options.model_dump(mode="json", by_alias=True, exclude_none=True)
     times = {} if scene.motion.times is None else {"times": scene.motion.times}

@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.joints.joint import Coordinate, all_coordinates, joint_poses, joint_values, resolve
+from rbfmuscle.scene.joints.joint import (
+    Coordinate,
+    all_coordinates,
+    joint_poses,
+    joint_values,
+    resolve,
+)
 from rbfmuscle.scene.joints.tables import FACTORS, full_name
 from rbfmuscle.scene.objects import Motion, SceneData
 from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions
@@ -19,7 +25,9 @@ SHIFT_LEVER = 50.0  # lever [mm] at which a shift of a joint is counted as a tur
 NOT_MOVED = 1e-9  # A locked coordinate may be given, at its rest value.
 # Share of a turn [radian] or of a length that rounding may take a coordinate beyond its range.
 RANGE_TOLERANCE = 1e-6
-IN_DEGREES = dict.fromkeys(("yes", "true", "1"), math.pi / 180) | dict.fromkeys(("no", "false", "0"), 1.0)
+IN_DEGREES = dict.fromkeys(("yes", "true", "1"), math.pi / 180) | dict.fromkeys(
+    ("no", "false", "0"), 1.0
+)
 
 
 def make_motion(scene: SceneData, options: MotionOptions) -> Motion:
@@ -31,13 +39,17 @@ def make_motion(scene: SceneData, options: MotionOptions) -> Motion:
     followers = {coupling.coordinate for coupling in scene.couplings}
     times, notes = None, []
     if options.file is not None:
-        frames, times, notes = read_motion_file(options.file, facts, followers, metre=scene.length(1000.0))
+        frames, times, notes = read_motion_file(
+            options.file, facts, followers, metre=scene.length(1000.0)
+        )
     else:
         frames = _asked_frames(options, facts)
         _refuse_followers(frames, followers, facts)
     frames = [_with_rest(frame, facts, followers) for frame in frames]
     notes += _range_notes(frames, facts)
-    frames = [{name: facts[name].honoured(value) for name, value in frame.items()} for frame in frames]
+    frames = [
+        {name: facts[name].honoured(value) for name, value in frame.items()} for frame in frames
+    ]
     return Motion(frames, options=options, times=times, notes=notes)
 
 
@@ -49,12 +61,19 @@ def slice_motion(motion: Motion, frames: slice) -> Motion:
         raise SceneError(f"frames {text} selects none of the {len(motion)} frames of the motion")
     times = None if motion.times is None else motion.times[frames]
     progress = motion.progress[frames]
-    return Motion(chosen, options=motion.options, times=times, progress=progress, notes=motion.notes)
+    return Motion(
+        chosen, options=motion.options, times=times, progress=progress, notes=motion.notes
+    )
 
 
 def rest_coordinates(scene: SceneData) -> dict[str, float]:
-    """Return the coordinates that follow no other and whose rest value is not zero [radian or scene unit]."""
-    facts, followers = all_coordinates(scene.joints), {coupling.coordinate for coupling in scene.couplings}
+    """Return the coordinates that follow no other and whose rest value is not zero [radian or scene
+    unit].
+    """
+    facts, followers = (
+        all_coordinates(scene.joints),
+        {coupling.coordinate for coupling in scene.couplings},
+    )
     if not any(coordinate.rest for coordinate in facts.values()):
         return {}
     rest = resolve({}, facts, scene.couplings)
@@ -67,40 +86,50 @@ def completed(scene: SceneData, coordinates: Mapping[str, float]) -> dict[str, f
 
 
 def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> dict[str, float]:
-    """Return the values between two tables by name, linear in each; t = 0 gives ``before``, an absent one is 0."""
+    """Return the values between two tables by name, linear in each; t = 0 gives ``before``, an
+    absent one is 0.
+    """
     names = [*before, *(name for name in after if name not in before)]
     return {name: (1 - t) * before.get(name, 0.0) + t * after.get(name, 0.0) for name in names}
 
 
 def bone_poses(scene: SceneData, coordinates: dict[str, float]) -> Poses:
-    """Return the pose (4, 4) of every bone, and of every end of a muscle that a tendon holds: rest -> world.
+    """Return the pose (4, 4) of every bone, and of every end of a muscle that a tendon holds: rest
+    -> world.
 
-    A joint moves its child, and all that hangs on it, against its parent. Where the scene's meshes are (``rest``),
-    every pose is the identity. A bone without a joint is fixed. ``coordinates`` are values of "joint.coordinate"
-    [radian or scene unit]; absent ones are at rest.
+    A joint moves its child, and all that hangs on it, against its parent. Where the scene's meshes
+    are (``rest``), every pose is the identity. A bone without a joint is fixed. ``coordinates`` are
+    values of "joint.coordinate" [radian or scene unit]; absent ones are at rest.
     """
     known = all_coordinates(scene.joints)
     for name in coordinates:
         if name not in known:
             raise SceneError(f"unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}")
-    poses = joint_poses([bone.name for bone in scene.bones], scene.joints, scene.couplings, coordinates)
+    poses = joint_poses(
+        [bone.name for bone in scene.bones], scene.joints, scene.couplings, coordinates
+    )
     return Poses(poses, {end.name: end for muscle in scene.muscles for end in muscle.tendons})
 
 
 def step_angle(
     scene: SceneData, before: dict[str, float], after: dict[str, float], *, shifts: bool = True
 ) -> float:
-    """Return the largest turn of a bone against its parent between two sets of coordinates [radian].
+    """Return the largest turn of a bone against its parent between two sets of coordinates
+    [radian].
 
     With ``shifts``, a shift counts as the turn that moves a place 50 mm from its axis as far.
     """
-    first, second, rest = (joint_values(scene.joints, scene.couplings, q) for q in (before, after, {}))
+    first, second, rest = (
+        joint_values(scene.joints, scene.couplings, q) for q in (before, after, {})
+    )
     lever, largest = scene.length(SHIFT_LEVER), 0.0
     for joint in scene.joints:
         name = joint.name
         if first[name] == second[name]:
             continue
-        motion = joint.motion(second[name], rest[name]) @ np.linalg.inv(joint.motion(first[name], rest[name]))
+        motion = joint.motion(second[name], rest[name]) @ np.linalg.inv(
+            joint.motion(first[name], rest[name])
+        )
         largest = max(largest, float(turned_angle(motion[:3, :3])))
         if shifts and joint.translations:
             shift = motion[:3, :3] @ joint.centre + motion[:3, 3] - joint.centre
@@ -126,7 +155,9 @@ def inner_value(scene: SceneData, name: str, value: float) -> float:
 
 
 def unit_sign(scene: SceneData, name: str) -> str:
-    """Return what follows a coordinate's value in text: the sign for degrees, the scene's unit, or nothing."""
+    """Return what follows a coordinate's value in text: the sign for degrees, the scene's unit, or
+    nothing.
+    """
     facts = all_coordinates(scene.joints).get(name)
     return {"translation": f" {scene.units}", "coupled": ""}.get(facts.motion if facts else "", "°")
 
@@ -135,7 +166,9 @@ def _asked_frames(options, facts):
     """Frames of a ramp or of waypoints; the rest pose alone without either."""
 
     def named(table):
-        return {full_name(name, list(facts), place="[motion]"): value for name, value in table.items()}
+        return {
+            full_name(name, list(facts), place="[motion]"): value for name, value in table.items()
+        }
 
     if options.ramp is not None:
         ramps = named(options.ramp)
@@ -150,10 +183,16 @@ def _asked_frames(options, facts):
 
 
 def _frames_between(stops, names, steps, facts):
-    """Frames from stop to stop [degree or scene unit] in whole steps; the coordinate that needs most sets the pace."""
-    table = np.array([[stop.get(name, np.nan) for name in names] for stop in stops]).reshape(len(stops), -1)
+    """Frames from stop to stop [degree or scene unit] in whole steps; the coordinate that needs
+    most sets the pace.
+    """
+    table = np.array([[stop.get(name, np.nan) for name in names] for stop in stops]).reshape(
+        len(stops), -1
+    )
     factors = np.array([FACTORS[facts[name].motion] for name in names])
-    for column, name in enumerate(names):  # what a stop does not mention stays where it was, at rest at first
+    for column, name in enumerate(
+        names
+    ):  # what a stop does not mention stays where it was, at rest at first
         held = facts[name].rest / factors[column]
         for row in range(len(stops)):
             held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
@@ -163,7 +202,8 @@ def _frames_between(stops, names, steps, facts):
         count = np.ceil(paces).sum()
     if not count <= MAX_FRAMES:
         raise SceneError(
-            f"[motion]: about {count:.3g} frames, more than {MAX_FRAMES}: a step is too small for its range; "
+            f"[motion]: about {count:.3g} frames, more than {MAX_FRAMES}: a step is too small for "
+            "its range; "
             "make the step larger or the range smaller"
         )
     for pace, (before, after) in zip(paces.tolist(), itertools.pairwise(table)):
@@ -176,15 +216,23 @@ def _frames_between(stops, names, steps, facts):
 def _refuse_followers(frames, followers, facts):
     for name in dict.fromkeys(name for frame in frames for name in frame):
         if name in followers:
-            raise SceneError(f"[motion]: {name!r} follows other coordinates by a coupling, move those")
+            raise SceneError(
+                f"[motion]: {name!r} follows other coordinates by a coupling, move those"
+            )
         rest = facts[name].rest
-        if facts[name].locked and any(abs(frame.get(name, rest) - rest) > NOT_MOVED for frame in frames):
-            raise SceneError(f"[motion]: {name!r} is locked, unlock it in its joint or leave it out")
+        if facts[name].locked and any(
+            abs(frame.get(name, rest) - rest) > NOT_MOVED for frame in frames
+        ):
+            raise SceneError(
+                f"[motion]: {name!r} is locked, unlock it in its joint or leave it out"
+            )
 
 
 def _with_rest(frame, facts, followers):
     """The frame without followers; coordinates that it does not mention are at rest."""
-    unsaid = {n: c.rest for n, c in facts.items() if n not in frame and n not in followers and c.rest}
+    unsaid = {
+        n: c.rest for n, c in facts.items() if n not in frame and n not in followers and c.rest
+    }
     return {**unsaid, **{name: value for name, value in frame.items() if name not in followers}}
 
 
@@ -195,12 +243,15 @@ def _range_notes(frames: list[dict[str, float]], facts: dict[str, Coordinate]) -
             continue
         low, high = coordinate.range
         beyond = [max(low - frame[name], frame[name] - high) for frame in frames if name in frame]
-        beyond = [excess for excess in beyond if excess > RANGE_TOLERANCE * max(1.0, abs(low), abs(high))]
+        beyond = [
+            excess for excess in beyond if excess > RANGE_TOLERANCE * max(1.0, abs(low), abs(high))
+        ]
         if beyond:
             what = "is cut to" if coordinate.clamped else "leaves"
             low, high, most = (x / FACTORS[coordinate.motion] for x in (low, high, max(beyond)))
             notes.append(
-                f"coordinate {name!r} {what} its range {low:.6g} to {high:.6g} in {len(beyond)} of {len(frames)} "
+                f"coordinate {name!r} {what} its range {low:.6g} to {high:.6g} in {len(beyond)} "
+                f"of {len(frames)} "
                 f"frames, by up to {most:.3g}"
             )
     return notes
@@ -211,10 +262,11 @@ def read_motion_file(
 ) -> tuple[list[dict[str, float]], list[float] | None, list[str]]:
     """Frames, times [s] (None without a column ``time``) and notes of an OpenSim motion file.
 
-    It holds a header up to ``endheader``, column names and rows of numbers. Angles are turned from degrees where the
-    header says ``inDegrees=yes``, lengths from metres, ``metre`` scene units each; numbers of coordinates that are
-    neither are taken as they are, as OpenSim does. ``facts`` are the scene's coordinates by full name; columns of
-    ``followers``, which follow others, are not used.
+    It holds a header up to ``endheader``, column names and rows of numbers. Angles are turned from
+    degrees where the header says ``inDegrees=yes``, lengths from metres, ``metre`` scene units
+    each; numbers of coordinates that are neither are taken as they are, as OpenSim does. ``facts``
+    are the scene's coordinates by full name; columns of ``followers``, which follow others, are not
+    used.
     """
     header, labels, values = _read_storage(path)
     if len(values) > MAX_FRAMES:
@@ -223,7 +275,9 @@ def read_motion_file(
     for column, label in enumerate(labels):
         name = match_label(label, list(facts))
         if name in columns:
-            raise SceneError(f"[motion]: {path} has two columns of coordinate {name!r}, leave one out")
+            raise SceneError(
+                f"[motion]: {path} has two columns of coordinate {name!r}, leave one out"
+            )
         if name is not None:
             columns[name] = column
     if not columns:
@@ -233,7 +287,9 @@ def read_motion_file(
     bad = np.argwhere(~np.isfinite(values[:, used]))
     if len(bad):
         row, column = bad[0]
-        raise SceneError(f"[motion]: {path} row {row + 1}: {labels[used[column]]} is not a finite number")
+        raise SceneError(
+            f"[motion]: {path} row {row + 1}: {labels[used[column]]} is not a finite number"
+        )
     factor, notes = _angle_factor(path, header)
     units = {"rotation": factor, "translation": metre, "coupled": 1.0}
     tracks = {}
@@ -248,14 +304,21 @@ def read_motion_file(
 
 
 def _read_storage(path: Path) -> tuple[dict[str, str], list[str], Floats]:
-    """Header (lower case), labels of the columns, and values (rows, columns) of an OpenSim storage file."""
+    """Header (lower case), labels of the columns, and values (rows, columns) of an OpenSim storage
+    file.
+    """
     lines = read_text(path, place="[motion]: ").splitlines()
-    end = next((row for row, line in enumerate(lines) if line.strip().lower() == "endheader"), len(lines))
+    end = next(
+        (row for row, line in enumerate(lines) if line.strip().lower() == "endheader"), len(lines)
+    )
     if len(lines) < end + 3:
         words = "no 'endheader' line with columns and rows after it"
         raise SceneError(f"[motion]: {path} is no OpenSim motion: {words}")
     pairs = [line.lower().split("=", 1) for line in lines[:end] if "=" in line]
-    labels, rows = lines[end + 1].split(), [line.split() for line in lines[end + 2 :] if line.strip()]
+    labels, rows = (
+        lines[end + 1].split(),
+        [line.split() for line in lines[end + 2 :] if line.strip()],
+    )
     for number, row in enumerate(rows, 1):
         if len(row) != len(labels):
             words = f"row {number} has {len(row)} values, the header names {len(labels)}"
@@ -270,7 +333,9 @@ def _read_storage(path: Path) -> tuple[dict[str, str], list[str], Floats]:
 
 
 def match_label(label: str, known: list[str]) -> str | None:
-    """Return the coordinate that a column is of: ``joint.coordinate``, ``coordinate`` or ``.../joint/name/value``."""
+    """Return the coordinate that a column is of: ``joint.coordinate``, ``coordinate`` or
+    ``.../joint/name/value``.
+    """
     parts = label.removesuffix("/value").split("/")
     for name in (label, ".".join(parts[-2:]), parts[-1]):
         owners = [full for full in known if name in (full, full.split(".", 1)[1])]

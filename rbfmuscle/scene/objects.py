@@ -41,7 +41,9 @@ class ViaTable(Table):
 
 
 class LineTable(Table):
-    """The tendon of an attachment: from the belly's end past ``via`` to ``to``, points at rest [scene unit]."""
+    """The tendon of an attachment: from the belly's end past ``via`` to ``to``, points at rest
+    [scene unit].
+    """
 
     to: Vector
     via: list[Vector | ViaTable] = Field(default_factory=list)
@@ -51,8 +53,8 @@ class LineTable(Table):
 class Attachment:
     """Vertices (n,) of a muscle's mesh that move with a bone.
 
-    ``tendon`` joins them to it where they end short of it. ``holder`` is the name, among the poses, of what they move
-    with: the bone, or the end of the tendon.
+    ``tendon`` joins them to it where they end short of it. ``holder`` is the name, among the poses,
+    of what they move with: the bone, or the end of the tendon.
     """
 
     bone: str
@@ -74,8 +76,8 @@ class Attachment:
 class Muscle:
     """A closed surface (outward, rest pose) held by bones, and the model that moves it.
 
-    ``contraction`` holds the keys of a muscle that contracts, None for any other; ``tendons`` are the ends that
-    tendons hold.
+    ``contraction`` holds the keys of a muscle that contracts, None for any other; ``tendons`` are
+    the ends that tendons hold.
     """
 
     name: str
@@ -92,7 +94,9 @@ class Muscle:
 
 @dataclass(eq=False)
 class Motion:
-    """The frames of a motion, each a dict of "joint.coordinate" -> value [radian or scene unit]; absent ones rest."""
+    """The frames of a motion, each a dict of "joint.coordinate" -> value [radian or scene unit];
+    absent ones rest.
+    """
 
     frames: Sequence[dict[str, float]] = ({},)
     _: KW_ONLY
@@ -100,7 +104,9 @@ class Motion:
     times: Sequence[float] | None = None  # of each frame [s], where a motion file gives it
     # Where each frame lies in the whole motion (n,), 0 to 1; even where not given.
     progress: Floats = field(default_factory=lambda: np.empty(0))
-    notes: list[str] = field(default_factory=list)  # coordinates that leave their range, columns not used
+    notes: list[str] = field(
+        default_factory=list
+    )  # coordinates that leave their range, columns not used
 
     def __post_init__(self) -> None:
         if not len(self.progress):
@@ -134,7 +140,8 @@ class SceneData:
     left_out : list of str
         Bones of which no mesh could be used; they count in the verdict of a run.
     superior, anterior : list of float or None
-        Anatomical directions (3,) at rest: those of the file, or found from the bones before a run or a picture.
+        Anatomical directions (3,) at rest: those of the file, or found from the bones before a run
+        or a picture.
     """
 
     name: str = "scene"
@@ -189,13 +196,17 @@ class SceneData:
         return other
 
     def __repr__(self) -> str:
-        muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles) or "no muscles"
+        muscles = (
+            ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles) or "no muscles"
+        )
         counts = f"{len(self.bones)} bones, {muscles}, {len(self.motion)} frames"
         return f"<Scene {self.name!r}, {self.units}: {counts}>"
 
 
 def body_axes(superior: Sequence[float] | None, anterior: Sequence[float] | None) -> Floats:
-    """Left, posterior and superior (3, 3) of a body with these directions; x, y and z where one is None."""
+    """Left, posterior and superior (3, 3) of a body with these directions; x, y and z where one is
+    None.
+    """
     if superior is None or anterior is None:
         return np.eye(3)
     up = np.asarray(superior, dtype=float) / np.linalg.norm(superior)

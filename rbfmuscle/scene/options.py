@@ -1,4 +1,6 @@
-"""The tables of a scene that hold settings; the same rules hold for a file, for code and for ``--set``."""
+"""The tables of a scene that hold settings; the same rules hold for a file, for code and for
+``--set``.
+"""
 
 import math
 import re
@@ -21,8 +23,8 @@ from pydantic_core import PydanticCustomError
 
 from rbfmuscle.validation import SceneError, did_you_mean, shown
 
-# How deep tables and lists of a scene file may lie in each other, and how large a whole number may be: beyond
-# 2^53 it is no longer the number that was written once it meets a float.
+# How deep tables and lists of a scene file may lie in each other, and how large a whole number may
+# be: beyond 2^53 it is no longer the number that was written once it meets a float.
 DEEPEST = 20
 LARGEST_INTEGER = 2**53
 MAX_FRAMES = 100_000
@@ -63,7 +65,9 @@ Axis = Annotated[Vector, AfterValidator(_check_length)]
 
 
 def check_plain(value: object, *, place: str, depth: int = 0) -> None:
-    """Raise SceneError where TOML holds what no key can mean: deep nesting, vast integers, nan or inf."""
+    """Raise SceneError where TOML holds what no key can mean: deep nesting, vast integers, nan or
+    inf.
+    """
     if depth > DEEPEST:
         raise SceneError(f"{shown(place)}: tables or lists are nested more than {DEEPEST} deep")
     if isinstance(value, (dict, list)):
@@ -72,7 +76,9 @@ def check_plain(value: object, *, place: str, depth: int = 0) -> None:
             if not isinstance(item, str):
                 check_plain(item, place=f"{place}{dot}{shown(str(key))}", depth=depth + 1)
     elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-        raise SceneError(f"{place}: a whole number must be at most 2^53 in size, got {shown(value)}")
+        raise SceneError(
+            f"{place}: a whole number must be at most 2^53 in size, got {shown(value)}"
+        )
     elif isinstance(value, float) and not math.isfinite(value):
         raise SceneError(f"{place}: must be a finite number, got {value}")
 
@@ -108,7 +114,8 @@ class Table(BaseModel):
     ) -> Self:
         """Return the table made from a mapping, or raise SceneError that begins with ``place``.
 
-        Relative names of files are relative to ``folder``; ``name_row`` turns pydantic's location into words.
+        Relative names of files are relative to ``folder``; ``name_row`` turns pydantic's location
+        into words.
         """
         try:
             return cls.model_validate(values, context={"folder": folder})
@@ -117,7 +124,9 @@ class Table(BaseModel):
 
 
 def set_dotted(table: dict[str, Any], key: str, value: object, *, place: str) -> None:
-    """Set the dotted ``key`` of nested tables, in place; ``place`` begins the message where a value is no table."""
+    """Set the dotted ``key`` of nested tables, in place; ``place`` begins the message where a value
+    is no table.
+    """
     *parents, last = key.split(".")
     for parent in parents:
         inner = table.get(parent, {})
@@ -135,7 +144,9 @@ def _describe_error(error, name_row):
     parts = [str(part) for part in first["loc"] if not str(part).endswith("Options")]
     where = name_row(first["loc"]) if name_row else ".".join(parts)
     message = first["msg"].removeprefix("Value error, ")
-    message = re.sub(r"a valid dictionary( or instance of \w+)?", "a table", message[0].lower() + message[1:])
+    message = re.sub(
+        r"a valid dictionary( or instance of \w+)?", "a table", message[0].lower() + message[1:]
+    )
     given = first.get("input")
     value = ""
     if first["type"] not in ("unknown_key", "missing") and not isinstance(given, dict):

@@ -12,7 +12,16 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.objects import Attachment
 from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
-from rbfmuscle.scene.phantom_shapes import Tube, ball, blend, carve, ellipsoid, plate, rod, solid_mesh
+from rbfmuscle.scene.phantom_shapes import (
+    Tube,
+    ball,
+    blend,
+    carve,
+    ellipsoid,
+    plate,
+    rod,
+    solid_mesh,
+)
 from rbfmuscle.scene.scene import Scene
 
 PHANTOM = "phantom"
@@ -35,9 +44,13 @@ def femur_distance(points: Floats) -> Floats:
 
 
 def pelvis_distance(points: Floats) -> Floats:
-    """Nearly the signed distance to the hip bone: ilium, socket, ischium, pubis and the ring between them."""
+    """Nearly the signed distance to the hip bone: ilium, socket, ischium, pubis and the ring
+    between them.
+    """
     tilt = np.radians(14.0)
-    turn = np.array([[np.cos(tilt), 0.0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0.0, np.cos(tilt)]])
+    turn = np.array(
+        [[np.cos(tilt), 0.0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0.0, np.cos(tilt)]]
+    )
     ilium = plate(points, (10, 16, 94), (70, 50), 5.5, turn)
     ilium = blend(ilium, rod(points, [(10, 10, 20), (12, 14, 70)], [27, 10]), 30)
     ischium = rod(points, [(16, 18, -12), (26, 36, -52), (30, 32, -84)], [20, 15, 17])
@@ -59,21 +72,37 @@ def bone_meshes(spacing: float = 3.5) -> dict[str, Any]:
     }
 
 
-# The first is long and wraps the back of the hip; the second is a fan; the last two lie 1.2 mm apart.
+# The first is long and wraps the back of the hip; the second is a fan; the last two lie 1.2 mm
+# apart.
 ADDUCTOR: dict[str, Any] = {"radius": 220, "width": 14, "thickness": 9, "twist": (0.29, 0.045)}
 MUSCLES = {
     "extensor": Tube(
         ((8.2, 45.5, 76.1), (-46, 52.5, -36), (-43, 18, -137)),
-        radius=90, width=27, thickness=11, fullness=5, spread=1.3, twist=(0.7, -0.62),
+        radius=90,
+        width=27,
+        thickness=11,
+        fullness=5,
+        spread=1.3,
+        twist=(0.7, -0.62),
     ),
     "abductor": Tube(
         ((-9.5, -19, 130), (-28, -6, 50), (-60.3, 8, 1.8)),
-        radius=200, width=23, thickness=7, fullness=5, spread=1.6, twist=(0.04, -0.6),
+        radius=200,
+        width=23,
+        thickness=7,
+        fullness=5,
+        spread=1.6,
+        twist=(0.04, -0.6),
     ),
-    "adductor_anterior": Tube(((66.4, -42, -44), (23.2, -14, -125.1), (-20.3, -13.5, -211.9)), **ADDUCTOR),
-    "adductor_posterior": Tube(((49.7, -14.8, -66.6), (6.5, 13.2, -147.7), (-38.7, 14.2, -234.6)), **ADDUCTOR),
-}  # fmt: skip
-# Muscle vertices within the first and last parts of the axis, and this near to the bone [mm], are attached.
+    "adductor_anterior": Tube(
+        ((66.4, -42, -44), (23.2, -14, -125.1), (-20.3, -13.5, -211.9)), **ADDUCTOR
+    ),
+    "adductor_posterior": Tube(
+        ((49.7, -14.8, -66.6), (6.5, 13.2, -147.7), (-38.7, 14.2, -234.6)), **ADDUCTOR
+    ),
+}
+# Muscle vertices within the first and last parts of the axis, and this near to the bone [mm], are
+# attached.
 ATTACHED_ENDS = {"extensor": (0.17, 0.83), "abductor": (0.3, 0.87)}
 USUAL_ENDS, ATTACHED_WITHIN = (0.12, 0.88), 6.0
 FIBRE_PLACES = ((0, 0), (0.55, 0), (-0.55, 0), (0, 0.5), (0, -0.5))
@@ -101,11 +130,13 @@ def _parts(spacing):
     return bone_meshes(), muscles
 
 
-def phantom_scene(*, model: str = "rbf", end: float = 90.0, step: float = 2.0, spacing: float = 3.0) -> Scene:
+def phantom_scene(
+    *, model: str = "rbf", end: float = 90.0, step: float = 2.0, spacing: float = 3.0
+) -> Scene:
     """Return the embedded hip as a scene: flexion from 0 to ``end`` by ``step`` [degree].
 
-    The muscles' volumes are known in closed form (``MUSCLES[name].volume``); a mesh of triangles with edges
-    of 3 mm, its vertices on the surface, holds up to 1.5 % less.
+    The muscles' volumes are known in closed form (``MUSCLES[name].volume``); a mesh of triangles
+    with edges of 3 mm, its vertices on the surface, holds up to 1.5 % less.
 
     Parameters
     ----------
@@ -140,7 +171,8 @@ def phantom_scene(*, model: str = "rbf", end: float = 90.0, step: float = 2.0, s
 
 
 def open_scene(scene: Scene | str | Path, *, skeleton: bool = False) -> Scene:
-    """Return the scene of a file; the embedded hip for "phantom" where there is no file of that name.
+    """Return the scene of a file; the embedded hip for "phantom" where there is no file of that
+    name.
 
     A Scene is returned as it is; ``skeleton`` is that of `Scene.load`.
     """

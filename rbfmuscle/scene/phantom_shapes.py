@@ -13,11 +13,12 @@ from rbfmuscle.geometry.tubes import distance_along
 class Tube:
     """A muscle as a generalised cylinder with closed-form volume.
 
-    Its axis runs straight, along a circular arc, and straight again (a polyline of three points with a
-    rounded corner). The section at the fraction u of the axis is an ellipse in the normal plane, centred on
-    the axis, with half-axes ``width * w(u) * g(u)`` and ``thickness * w(u) / g(u)``, where
-    w = sqrt(1 - |2u - 1|^fullness) rounds the ends and g runs from ``spread`` to 1 / spread (a fan). The
-    section's centroid lies on the axis, so by Pappus the volume is the integral of the section's area,
+    Its axis runs straight, along a circular arc, and straight again (a polyline of three points
+    with a rounded corner). The section at the fraction u of the axis is an ellipse in the normal
+    plane, centred on the axis, with half-axes ``width * w(u) * g(u)`` and ``thickness * w(u) /
+    g(u)``, where w = sqrt(1 - |2u - 1|^fullness) rounds the ends and g runs from ``spread`` to 1 /
+    spread (a fan). The section's centroid lies on the axis, so by Pappus the volume is the integral
+    of the section's area,
 
         V = pi * width * thickness * length * fullness / (fullness + 1).
     """
@@ -28,7 +29,10 @@ class Tube:
     thickness: float
     fullness: float = 4.0  # 2 gives an ellipsoid's ends, more gives blunter ones
     spread: float = 1.0  # above 1 the start is wider and thinner than the end
-    twist: tuple = (0.0, 0.0)  # of the wide half-axis from the bend's binormal at both ends [radian]
+    twist: tuple = (
+        0.0,
+        0.0,
+    )  # of the wide half-axis from the bend's binormal at both ends [radian]
 
     def _bend(self):
         start, corner, end = np.asarray(self.points, dtype=float)
@@ -48,7 +52,9 @@ class Tube:
     @property
     def volume(self) -> float:
         """Volume in closed form."""
-        return np.pi * self.width * self.thickness * self.length * self.fullness / (self.fullness + 1)
+        return (
+            np.pi * self.width * self.thickness * self.length * self.fullness / (self.fullness + 1)
+        )
 
     def axis(self, u: Floats) -> tuple[Floats, Floats, Floats]:
         """Position, tangent and binormal (each (n, 3)) at fractions u of the length."""
@@ -66,7 +72,9 @@ class Tube:
         return position, tangent, np.broadcast_to(np.cross(first, side), position.shape)
 
     def sections(self, u: Floats) -> tuple[Floats, Floats, Floats]:
-        """Centre, wide half-axis and thin half-axis (each (n, 3)) of the ellipses at fractions u."""
+        """Centre, wide half-axis and thin half-axis (each (n, 3)) of the ellipses at
+        fractions u.
+        """
         u = np.asarray(u, dtype=float)
         centre, tangent, binormal = self.axis(u)
         normal = np.cross(binormal, tangent)
@@ -75,10 +83,16 @@ class Tube:
         g = self.spread ** (1 - 2 * u)
         wide = np.cos(turn) * binormal + np.sin(turn) * normal
         thin = np.cross(tangent, wide)
-        return centre, (self.width * w * g)[:, None] * wide, (self.thickness * w / g)[:, None] * thin
+        return (
+            centre,
+            (self.width * w * g)[:, None] * wide,
+            (self.thickness * w / g)[:, None] * thin,
+        )
 
     def points_inside(self, u: Floats, across: float, thick: float) -> Floats:
-        """Points at fractions u of the axis and fixed fractions (within the unit disc) of the half-axes."""
+        """Points at fractions u of the axis and fixed fractions (within the unit disc) of the
+        half-axes.
+        """
         centre, wide, thin = self.sections(u)
         return centre + across * wide + thick * thin
 
@@ -101,7 +115,9 @@ class Tube:
 
 
 def _stations(tube, spacing):
-    """Fractions of the axis, so spaced that neighbouring rings are about ``spacing`` apart on the surface."""
+    """Fractions of the axis, so spaced that neighbouring rings are about ``spacing`` apart on the
+    surface.
+    """
     fine = (1 - np.cos(np.linspace(0, np.pi, 2001))) / 2
     centre, wide, thin = tube.sections(fine)
     path = np.zeros(len(fine))
@@ -122,7 +138,9 @@ def _ring(centre, wide, thin, spacing):
 
 
 def stitch(vertices: Floats, lower: Integers, upper: Integers) -> Integers:
-    """Triangles between two rings with different numbers of points, always along the shorter diagonal."""
+    """Triangles between two rings with different numbers of points, always along the shorter
+    diagonal.
+    """
     faces = []
     i = j = 0
     n, m = len(lower), len(upper)
@@ -131,7 +149,8 @@ def stitch(vertices: Floats, lower: Integers, upper: Integers) -> Integers:
         next_a, next_b = lower[(i + 1) % n], upper[(j + 1) % m]
         along_lower = j >= m or (
             i < n
-            and np.sum((vertices[next_a] - vertices[b]) ** 2) <= np.sum((vertices[next_b] - vertices[a]) ** 2)
+            and np.sum((vertices[next_a] - vertices[b]) ** 2)
+            <= np.sum((vertices[next_b] - vertices[a]) ** 2)
         )
         if along_lower:
             if n > 1:
@@ -158,9 +177,15 @@ def ellipsoid(points: Floats, centre: Sequence[float], radii: Sequence[float]) -
 
 
 def plate(
-    points: Floats, centre: Sequence[float], radii: Sequence[float], half_thickness: float, turn: Floats
+    points: Floats,
+    centre: Sequence[float],
+    radii: Sequence[float],
+    half_thickness: float,
+    turn: Floats,
 ) -> Floats:
-    """Nearly the signed distance to an elliptic plate with a round rim, its first axis across the plate."""
+    """Nearly the signed distance to an elliptic plate with a round rim, its first axis across the
+    plate.
+    """
     local = (points - np.asarray(centre)) @ np.asarray(turn).T
     flat = np.stack([local[..., 1], local[..., 2]], axis=-1)
     outside = np.maximum(ellipsoid(flat, (0, 0), radii), 0)
@@ -168,7 +193,9 @@ def plate(
 
 
 def rod(points: Floats, stops: Sequence[Sequence[float]], radii: Sequence[float]) -> Floats:
-    """Nearly the signed distance to a rod along a polyline whose radius is linear between its points."""
+    """Nearly the signed distance to a rod along a polyline whose radius is linear between its
+    points.
+    """
     stops = np.asarray(stops, dtype=float)
     nearest = np.full(points.shape[:-1], np.inf)
     for a, b, ra, rb in zip(stops[:-1], stops[1:], radii[:-1], radii[1:]):
@@ -179,7 +206,9 @@ def rod(points: Floats, stops: Sequence[Sequence[float]], radii: Sequence[float]
 
 
 def blend(first: Floats, second: Floats, width: float) -> Floats:
-    """Smooth union of two distance fields: a fillet where they are within ``width`` of each other."""
+    """Smooth union of two distance fields: a fillet where they are within ``width`` of each
+    other.
+    """
     overlap = np.clip(width - np.abs(first - second), 0, None) / width
     return np.minimum(first, second) - overlap**3 * width / 6
 
@@ -190,9 +219,14 @@ def carve(solid: Floats, hole: Floats, width: int) -> Floats:
 
 
 def solid_mesh(
-    distance: Callable[[Floats], Floats], low: Sequence[float], high: Sequence[float], spacing: float
+    distance: Callable[[Floats], Floats],
+    low: Sequence[float],
+    high: Sequence[float],
+    spacing: float,
 ) -> tuple[Floats, Integers]:
-    """Closed outward triangles of the zero set of ``distance`` within a box, vertices projected onto it."""
+    """Closed outward triangles of the zero set of ``distance`` within a box, vertices projected
+    onto it.
+    """
     from skimage.measure import marching_cubes
 
     low = np.asarray(low, dtype=float)
@@ -205,7 +239,11 @@ def solid_mesh(
     for _ in range(2):
         value = distance(vertices)
         slope = np.stack(
-            [(distance(vertices + h * e) - distance(vertices - h * e)) / (2 * h) for e in np.eye(3)], axis=1
+            [
+                (distance(vertices + h * e) - distance(vertices - h * e)) / (2 * h)
+                for e in np.eye(3)
+            ],
+            axis=1,
         )
         step = (value / np.maximum(np.einsum("ij,ij->i", slope, slope), 0.1))[:, None] * slope
         vertices -= np.clip(step, -spacing / 2, spacing / 2)

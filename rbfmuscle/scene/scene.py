@@ -1,4 +1,6 @@
-"""`Scene`: the data of a scene with the functions that load, build, check and change it as methods."""
+"""`Scene`: the data of a scene with the functions that load, build, check and change it as
+methods.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ if TYPE_CHECKING:
 
 
 class Scene(SceneData):
-    """Bones, joints, muscles, a motion and the settings of a simulation; attributes as of `SceneData`.
+    """Bones, joints, muscles, a motion and the settings of a simulation; attributes as of
+    `SceneData`.
 
     Parameters
     ----------

@@ -1,4 +1,6 @@
-"""Changing a scene by dotted keys: ``--set KEY=VALUE``, grids of a sweep, ``Scene.with_options``."""
+"""Changing a scene by dotted keys: ``--set KEY=VALUE``, grids of a sweep,
+``Scene.with_options``.
+"""
 
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -10,7 +12,13 @@ from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
 from rbfmuscle.scene.build import split_model
 from rbfmuscle.scene.motion import make_motion, slice_motion
 from rbfmuscle.scene.objects import Muscle, SceneData
-from rbfmuscle.scene.options import DetectOptions, MotionOptions, SlidingOptions, check_plain, set_dotted
+from rbfmuscle.scene.options import (
+    DetectOptions,
+    MotionOptions,
+    SlidingOptions,
+    check_plain,
+    set_dotted,
+)
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
 S = TypeVar("S", bound=SceneData)
@@ -25,16 +33,18 @@ def change_scene(
     model: str | dict[str, Any] | None = None,
     frames: slice | str | None = None,
 ) -> S:
-    """Return a copy of a scene with other settings, another model or other frames; meshes are shared.
+    """Return a copy of a scene with other settings, another model or other frames; meshes are
+    shared.
 
     Parameters
     ----------
     settings : mapping, optional
-        Dotted keys with their values: ``{"model.centres": 200, "contact.substep_angle": 1}``. ``model`` and
-        ``model.KEY`` change every muscle, ``muscle.NAME.model.KEY`` one; so do the keys of contraction.
-        ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY`` change a table, one that the scene
-        lacks is switched on. ``motion.step`` changes the step of every ramp, ``motion.ramp.NAME.COORDINATE.KEY``
-        one key of one. Whole models come first, as another model drops the settings of the one before.
+        Dotted keys with their values: ``{"model.centres": 200, "contact.substep_angle": 1}``.
+        ``model`` and ``model.KEY`` change every muscle, ``muscle.NAME.model.KEY`` one; so do the
+        keys of contraction. ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY``
+        change a table, one that the scene lacks is switched on. ``motion.step`` changes the step of
+        every ramp, ``motion.ramp.NAME.COORDINATE.KEY`` one key of one. Whole models come first, as
+        another model drops the settings of the one before.
     model : str or dict, optional
         For every muscle. Options of another model are dropped.
     frames : slice or str, optional
@@ -132,7 +142,9 @@ def _changed_motion(options, rest, value, key):
 
 
 def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:
-    """Return the settings of several "KEY=VALUE", of which the last of a key counts; values are as in TOML, or text."""
+    """Return the settings of several "KEY=VALUE", of which the last of a key counts; values are as
+    in TOML, or text.
+    """
     found = {}
     for text in texts or ():
         key, equals, value = (part.strip() for part in text.partition("="))
@@ -145,7 +157,8 @@ def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:
 def parse_value(text: str, *, place: str) -> dict[str, Any] | int | str:
     """Return the value of a TOML literal (number, true, list, table), or the text itself.
 
-    NaN, infinity, numbers beyond 2^53 and deep nesting raise a UsageError that begins with ``place``.
+    NaN, infinity, numbers beyond 2^53 and deep nesting raise a UsageError that begins with
+    ``place``.
     """
     try:
         value = tomllib.loads(f"value = {text}")["value"]

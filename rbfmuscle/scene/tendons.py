@@ -1,10 +1,11 @@
 """Tendons: lines from the end of a muscle's belly to the insertion, along which that end moves.
 
-A taut string runs from the muscle's other end past the belly's end and the via points to the insertion, around the
-bones. It takes up a change of its length as two springs in series do: the tendon's strain is `STIFFNESS_RATIO` of the
-belly's, at most `TENDON_STRAIN`, and zero where the string is shorter than at rest. The belly's end lies on the string
-at the tendon's length from the insertion, displaced from it as at rest and out of the bones. All this depends on the
-poses of the bones alone and continuously: a pose has the same ends however it is reached.
+A taut string runs from the muscle's other end past the belly's end and the via points to the
+insertion, around the bones. It takes up a change of its length as two springs in series do: the
+tendon's strain is `STIFFNESS_RATIO` of the belly's, at most `TENDON_STRAIN`, and zero where the
+string is shorter than at rest. The belly's end lies on the string at the tendon's length from the
+insertion, displaced from it as at rest and out of the bones. All this depends on the poses of the
+bones alone and continuously: a pose has the same ends however it is reached.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import rotation_about
 
-# Strain of a passive belly at which it bears the force that strains its tendon by `TENDON_STRAIN` (Zajac 1989), and
-# the tendon's strain over the belly's.
+# Strain of a passive belly at which it bears the force that strains its tendon by `TENDON_STRAIN`
+# (Zajac 1989), and the tendon's strain over the belly's.
 BELLY_STRAIN = 0.6
 STIFFNESS_RATIO = TENDON_STRAIN / BELLY_STRAIN
 CHORD = 0.06  # the string's direction is that of a chord so long, in lengths of the string
-# Steps to the place of the end where its tendon has the wanted length, and the relative error that ends them.
+# Steps to the place of the end where its tendon has the wanted length, and the relative error that
+# ends them.
 STEPS, TOLERANCE = 8, 1e-9
 NODES = 33  # points of a tendon as it is drawn
 STEEPEST = 2.0  # greatest slope of a line against the chord of its ends
@@ -40,7 +42,9 @@ BonePoint: TypeAlias = tuple[str, Floats]
 
 
 class TendonLine(NamedTuple):
-    """A tendon as it is drawn: points (n, 3) from the belly's end to the insertion, and its radii at both."""
+    """A tendon as it is drawn: points (n, 3) from the belly's end to the insertion, and its radii
+    at both.
+    """
 
     points: Floats
     radii: tuple[float, float]
@@ -57,7 +61,8 @@ AT_REST = AtRest()
 
 
 class Poses(dict[str, Floats]):
-    """Poses (4, 4) of bones by name; those of ends that tendons hold are computed when they are first asked for.
+    """Poses (4, 4) of bones by name; those of ends that tendons hold are computed when they are
+    first asked for.
 
     ``tendons`` are the `TendonLine` of the ends asked for so far.
     """
@@ -74,7 +79,9 @@ class Poses(dict[str, Floats]):
 
 
 class _Mark(NamedTuple):
-    """A point (3,) on a string, the direction (3,) there, and how many legs of the string end before it."""
+    """A point (3,) on a string, the direction (3,) there, and how many legs of the string end
+    before it.
+    """
 
     point: Floats
     direction: Floats
@@ -90,7 +97,8 @@ class TendonEnd:
     middle: Floats  # of the patch (3,)
     radii: tuple[float, float]  # of the belly there, and of the tendon as it is drawn [scene unit]
     line: list[BonePoint]  # via points, then the insertion
-    # The muscle's other end: a point of its bone, or of its tendon the insertion and the via points.
+    # The muscle's other end: a point of its bone, or of its tendon the insertion and the via
+    # points.
     other: list[BonePoint] = field(default_factory=list)
     slack: float = 0.0  # length of that tendon at rest, zero where there is none
     obstacles: Sequence[Bone] = ()  # bones that string and tendon go around
@@ -108,20 +116,28 @@ class TendonEnd:
 
     @cached_property
     def _share(self) -> float:
-        """Place of the belly's end between the string's fixed points before and after it at rest, 0 to 1."""
-        before, after = (float(np.linalg.norm(self.middle - p)) for _, p in (self.other[-1], self.line[0]))
+        """Place of the belly's end between the string's fixed points before and after it at rest, 0
+        to 1.
+        """
+        before, after = (
+            float(np.linalg.norm(self.middle - p)) for _, p in (self.other[-1], self.line[0])
+        )
         return before / max(before + after, 1e-300)
 
     @cached_property
     def _sides(self) -> list[Floats]:
-        """Directions (3,) at rest out of the nearest bone, on whose side each leg of the string passes the bones."""
+        """Directions (3,) at rest out of the nearest bone, on whose side each leg of the string
+        passes the bones.
+        """
         stops = [point for _, point in (*self.other, *self.line)]
         places = [0.5 * (a + b) for a, b in itertools.pairwise(stops)]
         places[len(self.other) - 1] = self.middle
         return [self._outwards(*leg) for leg in zip(places, stops, stops[1:])]
 
     def _outwards(self, place: Floats, start: Floats, end: Floats) -> Floats:
-        """Unit direction (3,) across a leg, out of or away from the bone nearest to a place (3,), all at rest."""
+        """Unit direction (3,) across a leg, out of or away from the bone nearest to a place (3,),
+        all at rest.
+        """
         found = (bone.nearest(place[None]) for bone in self.obstacles)
         distance, closest = min(((float(d[0]), c[0]) for d, c in found), key=lambda one: one[0])
         way, along = place - closest if distance > 0.0 else closest - place, end - start
@@ -129,7 +145,9 @@ class TendonEnd:
         return way / max(float(np.linalg.norm(way)), 1e-300)
 
     def place(self, poses: Mapping[str, Floats]) -> tuple[TendonLine, Floats]:
-        """The tendon, and the pose (4, 4) of the belly's end from rest to world, at poses (4, 4) of the bones."""
+        """The tendon, and the pose (4, 4) of the belly's end from rest to world, at poses (4, 4) of
+        the bones.
+        """
         at_rest, before = self._rest
         legs = self._string(poses)
         length = self.length * (1.0 + self._strain(sum(map(line_length, legs)) - at_rest))
@@ -150,8 +168,12 @@ class TendonEnd:
         pose[:3, :3], pose[:3, 3] = turn, middle - turn @ self.middle
         return TendonLine(_with_nodes(tendon), self.radii), pose
 
-    def _lift(self, turn: Floats, middle: Floats, direction: Floats, poses: Mapping[str, Floats]) -> Floats:
-        """Shift (3,) across the string that takes the patch out of bones, as far as it is deeper there than at rest."""
+    def _lift(
+        self, turn: Floats, middle: Floats, direction: Floats, poses: Mapping[str, Floats]
+    ) -> Floats:
+        """Shift (3,) across the string that takes the patch out of bones, as far as it is deeper
+        there than at rest.
+        """
         points = (self.patch - self.middle) @ turn.T + middle
         deepest = 0.0
         for bone, at_rest in zip(self.obstacles, self._rest_depths):
@@ -181,7 +203,9 @@ class TendonEnd:
         return self._legs([_moved(*point, poses) for point in stops], stops, self._sides, poses)
 
     def _tendon(self, middle: Floats, passed: int, poses: Mapping[str, Floats]) -> Floats:
-        """The line from the belly's end to the insertion, without the via points that the end has passed."""
+        """The line from the belly's end to the insertion, without the via points that the end has
+        passed.
+        """
         first = len(self.other) - 1 + passed
         stops = [*self.other, *self.line][first:]
         points = [middle, *(_moved(*point, poses) for point in stops[1:])]
@@ -204,12 +228,17 @@ class TendonEnd:
         return legs
 
     def _turn(self, before: Floats, now: Floats, poses: Mapping[str, Floats]) -> Floats:
-        """Rotation (3, 3) from one direction to the other; the twist between two fixed points is spread evenly."""
-        # Seen from the bones of the string's fixed points before and after the end it would be the least rotation.
+        """Rotation (3, 3) from one direction to the other; the twist between two fixed points is
+        spread evenly.
+        """
+        # Seen from the bones of the string's fixed points before and after the end it would be the
+        # least rotation.
         near, far = (poses[bone][:3, :3] for bone, _ in (self.other[-1], self.line[0]))
         first, last = (turn @ _least_turn(turn.T @ now, before) for turn in (near, far))
         twist = last @ first.T
-        skew = np.array([twist[2, 1] - twist[1, 2], twist[0, 2] - twist[2, 0], twist[1, 0] - twist[0, 1]])
+        skew = np.array(
+            [twist[2, 1] - twist[1, 2], twist[0, 2] - twist[2, 0], twist[1, 0] - twist[0, 1]]
+        )
         angle = self._share * np.arctan2(skew @ now, np.trace(twist) - 1.0)
         return rotation_about(now, float(angle), np.zeros(3))[:3, :3] @ first
 
@@ -243,9 +272,13 @@ def _mark(legs: Sequence[Floats], distance: float) -> _Mark:
     """The point of a string at a distance along it from its end."""
     ends = np.cumsum([line_length(leg) for leg in legs])
     place, half = max(float(ends[-1]) - distance, 0.0), 0.5 * CHORD * float(ends[-1])
-    point, behind, ahead = points_along(np.concatenate(legs), place + half * np.array([0.0, -1.0, 1.0]))
+    point, behind, ahead = points_along(
+        np.concatenate(legs), place + half * np.array([0.0, -1.0, 1.0])
+    )
     chord = ahead - behind
-    return _Mark(point, chord / max(float(np.linalg.norm(chord)), 1e-300), int((ends[:-1] <= place).sum()))
+    return _Mark(
+        point, chord / max(float(np.linalg.norm(chord)), 1e-300), int((ends[:-1] <= place).sum())
+    )
 
 
 def _least_turn(now: Floats, before: Floats) -> Floats:
@@ -258,13 +291,15 @@ def _least_turn(now: Floats, before: Floats) -> Floats:
 def taut_line(
     start: Floats, end: Floats, side: Floats, bones: Sequence[tuple[Floats, Floats]], width: float
 ) -> Floats:
-    """Points (n, 3) of the taut line between two points (3,) that passes bones on one side, a direction (3,).
+    """Points (n, 3) of the taut line between two points (3,) that passes bones on one side, a
+    direction (3,).
 
-    The line lies in the plane of its ends and ``side``. A point of a bone at a distance z from the plane is an obstacle
-    in it, lower by z² / (2 ``width``), as for a round band. One that the line could only pass by leaving an end more
-    steeply than `STEEPEST` is lowered below that slope by as much as it is above. So the line changes continuously
-    where the plane comes to meet a bone, and parts of bones that lie far to the side do not count. ``bones`` are poses
-    (4, 4) and points (n, 3) at rest.
+    The line lies in the plane of its ends and ``side``. A point of a bone at a distance z from the
+    plane is an obstacle in it, lower by z² / (2 ``width``), as for a round band. One that the line
+    could only pass by leaving an end more steeply than `STEEPEST` is lowered below that slope by as
+    much as it is above. So the line changes continuously where the plane comes to meet a bone, and
+    parts of bones that lie far to the side do not count. ``bones`` are poses (4, 4) and points (n,
+    3) at rest.
     """
     size = float(np.linalg.norm(end - start))
     along = (end - start) / max(size, 1e-300)
@@ -273,7 +308,9 @@ def taut_line(
     axes = np.stack([along, up, np.cross(along, up)])
     profile = []
     for pose, points in bones:
-        turn, shift, found = axes @ pose[:3, :3], axes @ (pose[:3, 3] - start), np.empty((len(points), 2))
+        turn = axes @ pose[:3, :3]
+        shift = axes @ (pose[:3, 3] - start)
+        found = np.empty((len(points), 2))
         profile.append(found[: _profile_loop(points, turn, shift, size, max(width, 1e-300), found)])
     if not any(len(found) for found in profile):
         return np.stack([start, end])
@@ -282,10 +319,14 @@ def taut_line(
 
 @compiled(error_model="numpy")
 def _profile_loop(points, turn, shift, size, width, found):
-    """Fill ``found`` with points along and above a chord, counted as in `taut_line`; return how many there are."""
+    """Fill ``found`` with points along and above a chord, counted as in `taut_line`; return how
+    many there are.
+    """
     count = 0
     for i in range(len(points)):
-        a, b, c = points[i, 0], points[i, 1], points[i, 2]
+        a = points[i, 0]
+        b = points[i, 1]
+        c = points[i, 2]
         x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0]
         if x <= 0.0 or x >= size:
             continue
@@ -302,7 +343,9 @@ def _upper_hull(points: Floats) -> Floats:
     """Upper convex hull (k, 2) of points (n, 2), from left to right (Andrew 1979)."""
     # Nearly all points lie below the hull of those that are outermost in some directions.
     angles = np.linspace(0.0, np.pi, DIRECTIONS)
-    outermost = np.unique(np.argmax(np.stack([-np.cos(angles), np.sin(angles)], axis=1) @ points.T, axis=1))
+    outermost = np.unique(
+        np.argmax(np.stack([-np.cos(angles), np.sin(angles)], axis=1) @ points.T, axis=1)
+    )
     outermost = outermost[np.argsort(points[outermost, 0], kind="stable")]
     above = points[:, 1] >= np.interp(points[:, 0], *points[outermost].T)
     hull: list[Floats] = []

@@ -1,7 +1,7 @@
 """A run's muscles on several processes, merged frame by frame.
 
-Two threads of one interpreter share its lock and do 1.2 to 1.35 times the work of one, two processes 1.7 times
-(docs/speed.md).
+Two threads of one interpreter share its lock and do 1.2 to 1.35 times the work of one, two
+processes 1.7 times (docs/speed.md).
 """
 
 import contextlib
@@ -20,16 +20,18 @@ from rbfmuscle.progress import stage
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.sharing.share import Solved
 
-# A process more takes about two seconds to begin: fewer muscles, or fewer muscles times frames, are quicker in one.
+# A process more takes about two seconds to begin: fewer muscles, or fewer muscles times frames, are
+# quicker in one.
 LEAST_MUSCLES, LEAST_WORK = 5, 400
 MOST_HELPERS = 4
 
 
 def helpers_for(scene: Scene, threads: int) -> int:
-    """How many processes should share the muscles of a run that may use ``threads``; fewer than two: one's own alone.
+    """How many processes should share the muscles of a run that may use ``threads``; fewer than
+    two: one's own alone.
 
-    Muscles that slide on each other see each other at every sub-step, those that contract share all sub-steps: they
-    stay together.
+    Muscles that slide on each other see each other at every sub-step, those that contract share all
+    sub-steps: they stay together.
     """
     count, contracts = len(scene.muscles), any(m.contraction is not None for m in scene.muscles)
     if scene.sliding is not None or contracts or count * len(scene.motion.frames) < LEAST_WORK:
@@ -38,10 +40,12 @@ def helpers_for(scene: Scene, threads: int) -> int:
 
 
 class WorkerPool:
-    """Several `MuscleGroup` in two or more processes; the frames are those of one process, to the last digit.
+    """Several `MuscleGroup` in two or more processes; the frames are those of one process, to the
+    last digit.
 
-    A process continues while its last frame is taken, and waits with the next one until it is asked for: memory is
-    bounded by the pipes. ``times`` are wall times so far [s], of the helper that spent most.
+    A process continues while its last frame is taken, and waits with the next one until it is asked
+    for: memory is bounded by the pipes. ``times`` are wall times so far [s], of the helper that
+    spent most.
     """
 
     def __init__(self, scene: Scene, helpers: int) -> None:
@@ -52,8 +56,9 @@ class WorkerPool:
         threads = max(1, numba.get_num_threads() // helpers)
         names = [muscle.name for muscle in scene.muscles]
         for k in range(helpers):
-            # In turn: neighbours in a scene's list are often alike in size. Pickled here, not in the thread: what a
-            # scene computes on demand would change it while another thread pickles it.
+            # In turn: neighbours in a scene's list are often alike in size. Pickled here, not in
+            # the thread: what a scene computes on demand would change it while another thread
+            # pickles it.
             job = pickle.dumps((scene, names[k::helpers]), protocol=pickle.HIGHEST_PROTOCOL)
             process = start_child("rbfmuscle.sharing.helper", threads)
             self._processes.append(process)
@@ -91,7 +96,9 @@ class WorkerPool:
                 raise what
             if kind == "done":
                 solved, times = what
-                self.times |= {part: max(spent, self.times.get(part, 0.0)) for part, spent in times.items()}
+                self.times |= {
+                    part: max(spent, self.times.get(part, 0.0)) for part, spent in times.items()
+                }
                 return solved
             if str(what) in self._repeated:
                 continue

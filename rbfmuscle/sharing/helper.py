@@ -1,7 +1,9 @@
-"""A process that takes some of a run's muscles: ``python -m rbfmuscle.sharing.helper``, started by `WorkerPool`.
+"""A process that takes some of a run's muscles: ``python -m rbfmuscle.sharing.helper``, started by
+`WorkerPool`.
 
-It reads a scene and the names of its muscles from standard input, and writes pairs of a kind and its content to
-standard output: first that the muscles are built, then frame by frame. It ends with the process that started it.
+It reads a scene and the names of its muscles from standard input, and writes pairs of a kind and
+its content to standard output: first that the muscles are built, then frame by frame. It ends with
+the process that started it.
 """
 
 import logging
@@ -38,7 +40,11 @@ def main() -> None:
         for solved in group.frames():
             outbox.put(("done", (solved, group.times)))
         outbox.put(("done", (None, group.times)))
-    except (RBFMuscleError, MemoryError, OSError) as error:  # which the command line reports in one line
+    except (
+        RBFMuscleError,
+        MemoryError,
+        OSError,
+    ) as error:  # which the command line reports in one line
         outbox.put(("failed", error))
     except Exception:  # noqa: BLE001 - any other error is reported where the run was asked for
         outbox.put(("failed", RuntimeError(traceback.format_exc())))

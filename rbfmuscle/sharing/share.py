@@ -15,17 +15,21 @@ from rbfmuscle.simulation.frame_loop import simulate_frames
 
 
 class Solved(NamedTuple):
-    """A frame of some muscles, or of all, and its values by muscle and quantity, none where metrics are off."""
+    """A frame of some muscles, or of all, and its values by muscle and quantity, none where metrics
+    are off.
+    """
 
     frame: Frame
     measured: dict[str, Values]
 
 
 class MuscleGroup:
-    """The models of some muscles of a scene, by ``names``, or of all; SceneError or MeshError if one cannot be built.
+    """The models of some muscles of a scene, by ``names``, or of all; SceneError or MeshError if
+    one cannot be built.
 
-    The scene is whole: what does not belong to a muscle is the same in every share. ``fields`` of the bones by name
-    replace `BoneSDF`; ``times`` are wall times spent so far [s], by ``simulate`` and ``metrics``.
+    The scene is whole: what does not belong to a muscle is the same in every share. ``fields`` of
+    the bones by name replace `BoneSDF`; ``times`` are wall times spent so far [s], by ``simulate``
+    and ``metrics``.
     """
 
     def __init__(
@@ -42,7 +46,9 @@ class MuscleGroup:
         self._measures = MuscleMeasures(scene, carried)
 
     def frames(self) -> Iterator[Solved]:
-        """The frames as they are solved and measured; SolveError names muscle, frame and coordinates."""
+        """The frames as they are solved and measured; SolveError names muscle, frame and
+        coordinates.
+        """
         frames = simulate_frames(self.scene, self.models, fields=self._fields)
         with stage("solving the first frame"), timed(self.times, "simulate"):
             frame = next(frames, None)

@@ -1,10 +1,13 @@
-"""Broad phase of contact: loops over points and boxes that find which points may be near which bones."""
+"""Broad phase of contact: loops over points and boxes that find which points may be near which
+bones.
+"""
 
 import numpy as np
 
 from rbfmuscle.jit import compiled
 
-# Fraction of a queried distance that later calls rely on: a field is exact near its bone, coarser far away.
+# Fraction of a queried distance that later calls rely on: a field is exact near its bone, coarser
+# far away.
 TRUSTED_SHARE = 0.8
 
 
@@ -39,7 +42,9 @@ def closer_loop(distance, direction, smallest, gradient):
 
 @compiled(error_model="numpy")
 def note_query(points, i, pose, distance, anchor, bound):
-    """Keep where point i was asked about, in bone coordinates, and a lower bound of its distance there."""
+    """Keep where point i was asked about, in bone coordinates, and a lower bound of its distance
+    there.
+    """
     bound[i] = TRUSTED_SHARE * distance
     for k in range(3):
         anchor[i, k] = 0.0
@@ -49,7 +54,8 @@ def note_query(points, i, pose, distance, anchor, bound):
 
 @compiled(error_model="numpy", nogil=False)
 def answer_loop(points, pose, box, near, distance, gradient, anchor, bound):
-    """Normalise the gradients at the points ``near`` in place; store where they were queried, and bounds there.
+    """Normalise the gradients at the points ``near`` in place; store where they were queried, and
+    bounds there.
 
     ``anchor`` (n, 3) is in bone coordinates, ``bound`` (n,) a lower bound of the distance.
     """
@@ -63,9 +69,11 @@ def answer_loop(points, pose, box, near, distance, gradient, anchor, bound):
 
 @compiled(error_model="numpy", nogil=False)
 def take_contacts_loop(near, distance, direction, limits, found):
-    """Copy the contacts nearer than their reach into the arrays ``found``; return how many there are.
+    """Copy the contacts nearer than their reach into the arrays ``found``; return how many there
+    are.
 
-    ``limits`` holds the reach (n,) of every point and the depth (n,) that is allowed, or an empty array.
+    ``limits`` holds the reach (n,) of every point and the depth (n,) that is allowed, or an empty
+    array.
     """
     reach, allowed = limits
     index, gap, normal = found
@@ -85,7 +93,9 @@ def take_contacts_loop(near, distance, direction, limits, found):
 
 @compiled(error_model="numpy")
 def lower_bound(points, i, pose, bounds, anchor, bound):
-    """Lower bound of the distance of point i: from the bone's box, or an earlier bound less the motion since."""
+    """Lower bound of the distance of point i: from the bone's box, or an earlier bound less the
+    motion since.
+    """
     moved, outside = 0.0, 0.0
     for k in range(3):
         local = 0.0
@@ -111,7 +121,9 @@ def box_loop(points, chosen, box):
 
 @compiled(error_model="numpy")
 def boxes_apart(box, pose, bounds):
-    """Lower bound of the distance between a box in world axes and a box (2, 3) in bone axes, in a pose of the bone."""
+    """Lower bound of the distance between a box in world axes and a box (2, 3) in bone axes, in a
+    pose of the bone.
+    """
     square = 0.0
     for k in range(3):
         middle, half = pose[k, 3], 0.0
@@ -134,7 +146,8 @@ def apart_loop(points, poses, boxes, apart):
 
 @compiled(error_model="numpy")
 def near_loop(points, free, reach, bones, known, found, counts):
-    """Fill ``found`` (b, n) with the free points that may be nearer than ``reach`` to each bone, and ``counts``.
+    """Fill ``found`` (b, n) with the free points that may be nearer than ``reach`` to each bone,
+    and ``counts``.
 
     ``reach`` (b, n) or (1, n) holds the reach of each point, for each bone or for all.
     """
@@ -143,14 +156,19 @@ def near_loop(points, free, reach, bones, known, found, counts):
     box = np.empty((2, 3))
     box_loop(points, free, box)
     for b in range(len(poses)):
-        count, farthest, limit = 0, -np.inf, reach[b % len(reach)]
+        count = 0
+        farthest = -np.inf
+        limit = reach[b % len(reach)]
         for i in range(len(points)):
             if free[i]:
                 farthest = max(farthest, limit[i])
         if boxes_apart(box, poses[b], boxes[b]) > farthest:
             continue
         for i in range(len(points)):
-            if free[i] and lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) <= limit[i]:
+            if (
+                free[i]
+                and lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) <= limit[i]
+            ):
                 found[b, count] = i
                 count += 1
         counts[b] = count
@@ -158,7 +176,9 @@ def near_loop(points, free, reach, bones, known, found, counts):
 
 @compiled(error_model="numpy")
 def path_loop(start, end, before, after, length):
-    """Fill ``length`` (b, n) with the lengths of straight paths as seen from each of some bones that move too."""
+    """Fill ``length`` (b, n) with the lengths of straight paths as seen from each of some bones
+    that move too.
+    """
     for b in range(len(before)):
         for i in range(len(start)):
             square = 0.0

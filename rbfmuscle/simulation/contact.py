@@ -1,7 +1,8 @@
 """Contacts as half-spaces, with several bones and neighbouring muscles at once.
 
-Obstacles are the bones' distance fields, which stay in bone coordinates and are never rebuilt, and, with sliding, the
-surfaces of neighbouring muscles. Nothing here depends on how a muscle is represented.
+Obstacles are the bones' distance fields, which stay in bone coordinates and are never rebuilt, and,
+with sliding, the surfaces of neighbouring muscles. Nothing here depends on how a muscle is
+represented.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ NONE_ALLOWED: Floats = np.zeros(0)
 
 @dataclass(frozen=True)
 class HalfSpaces:
-    """Linearised contacts: moving point ``index`` by ``dp`` is admissible where ``gap + normal . dp >= 0``."""
+    """Linearised contacts: moving point ``index`` by ``dp`` is admissible where ``gap + normal . dp
+    >= 0``.
+    """
 
     index: np.ndarray  # (c,) contact point
     gap: np.ndarray  # (c,) signed distance now [scene unit], negative is violated
@@ -40,9 +43,11 @@ class HalfSpaces:
 
 
 class Planes:
-    """Half-spaces of one kind against one obstacle, at points ``anchor`` (c, 3), fixed through a sub-step.
+    """Half-spaces of one kind against one obstacle, at points ``anchor`` (c, 3), fixed through a
+    sub-step.
 
-    ``softness`` says how far they yield to a force, relative to a bone; for models that solve for forces.
+    ``softness`` says how far they yield to a force, relative to a bone; for models that solve for
+    forces.
     """
 
     def __init__(self, softness: float = 1.0) -> None:
@@ -55,7 +60,10 @@ class Planes:
 
     def set(self, index: Integers, gap: Floats, normal: Floats, anchor: Floats) -> None:
         """Replace the planes."""
-        self.index, self.gap, self.normal, self.anchor = index, gap, normal, anchor
+        self.index = index
+        self.gap = gap
+        self.normal = normal
+        self.anchor = anchor
 
 
 @dataclass(frozen=True)
@@ -69,7 +77,9 @@ class _PlaneStack:
     source: Integers
 
     def near(self, points: Floats, reach: float) -> tuple[Integers, Floats, Floats, Integers]:
-        """``(index, gap, normal, source)`` of the planes nearer than ``reach`` to the contact points now."""
+        """``(index, gap, normal, source)`` of the planes nearer than ``reach`` to the contact
+        points now.
+        """
         gap = self.gap + np.einsum("ij,ij->i", self.normal, points[self.index] - self.anchor)
         near = gap < reach
         return self.index[near], gap[near], self.normal[near], self.source[near]
@@ -82,29 +92,39 @@ class _PlaneStack:
     def where(self, kept: Booleans) -> _PlaneStack:
         """Those of a mask."""
         return _PlaneStack(
-            self.index[kept], self.gap[kept], self.normal[kept], self.anchor[kept], self.source[kept]
+            self.index[kept],
+            self.gap[kept],
+            self.normal[kept],
+            self.anchor[kept],
+            self.source[kept],
         )
 
 
 class BoneContacts:
     """The obstacles of one muscle, in one pose.
 
-    ``fields`` has one entry for each bone of the scene, None where the muscle cannot reach it; muscles may share
-    fields. ``contact_bone`` (n,) holds the bone that each contact point is attached to, -1 where it is free; attached
-    points take no contact. ``reached`` lists the bones that have a field, ``boxes`` (r, 2, 3) has theirs at rest and
-    ``placed`` (r, 4, 4) their poses.
+    ``fields`` has one entry for each bone of the scene, None where the muscle cannot reach it;
+    muscles may share fields. ``contact_bone`` (n,) holds the bone that each contact point is
+    attached to, -1 where it is free; attached points take no contact. ``reached`` lists the bones
+    that have a field, ``boxes`` (r, 2, 3) has theirs at rest and ``placed`` (r, 4, 4) their poses.
     """
 
-    def __init__(self, names: list[str], fields: list[Any], *, contact_bone: ArrayLike | None = None) -> None:
+    def __init__(
+        self, names: list[str], fields: list[Any], *, contact_bone: ArrayLike | None = None
+    ) -> None:
         if len(names) != len(fields):
-            raise ValueError(f"one field per bone is needed, got {len(fields)} for {len(names)} bones")
+            raise ValueError(
+                f"one field per bone is needed, got {len(fields)} for {len(names)} bones"
+            )
         self.names = list(names)
         self.fields = list(fields)
         self.reached = [b for b, field in enumerate(self.fields) if field is not None]
         self._row = {b: row for row, b in enumerate(self.reached)}
         boxes = [self.fields[b].bounds for b in self.reached]
         self.boxes = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3)
-        self.contact_bone = None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
+        self.contact_bone = (
+            None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
+        )
         self.move(AtRest((name, np.eye(4)) for name in self.names))
         self.allowed: dict[int, Floats] = {}
         #: Planes of sliding neighbours, and those that hold points on their side of a bone.
@@ -151,7 +171,9 @@ class BoneContacts:
         return other
 
     def allow(self, bone_index: int, depth: Floats) -> None:
-        """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it back."""
+        """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it
+        back.
+        """
         if np.any(depth > 0.0):
             self.allowed[bone_index] = np.array(depth, dtype=np.float64)
         else:
@@ -160,28 +182,34 @@ class BoneContacts:
     def distance_and_direction(
         self, points: Floats, bone_index: int, reach: Floats | float = np.inf
     ) -> tuple[Floats, Floats]:
-        """Signed distance (n,) to one bone and the unit direction (n, 3) in which it grows, world axes.
+        """Signed distance (n,) to one bone and the unit direction (n, 3) in which it grows, world
+        axes.
 
-        Where the bone is farther than ``reach``, a number or (n,), a lower bound beyond it suffices [scene unit].
+        Where the bone is farther than ``reach``, a number or (n,), a lower bound beyond it suffices
+        [scene unit].
         """
         pose, points = self.poses[self.names[bone_index]], check_points(points)
         field = self.fields[bone_index]
         distance, gradient = field.distance_and_gradient(points, pose=pose, reach=reach)
-        # On the medial surface the field has no direction: away from the middle of the bone is used.
+        # On the medial surface the field has no direction: away from the middle of the bone is
+        # used.
         direction_loop(points, gradient, pose, self.boxes[self._row[bone_index]])
         return distance, gradient
 
     def nearest(self, points: ArrayLike, limit: Floats | float = np.inf) -> tuple[Floats, Floats]:
         """Smallest distance (n,) over bones, and its gradient (n, 3) in world axes, for clipping.
 
-        [scene unit], negative inside a bone, infinity where none is in reach. Beyond ``limit``, a number or (n,), it
-        is only a lower bound above the limit, without a gradient.
+        [scene unit], negative inside a bone, infinity where none is in reach. Beyond ``limit``, a
+        number or (n,), it is only a lower bound above the limit, without a gradient.
         """
         points = check_points(points)
         apart = np.empty(len(self.reached))
         apart_loop(points, self.placed, self.boxes, apart)
         far = apart > np.max(limit, initial=0.0)
-        smallest, gradient = np.full(len(points), apart[far].min(initial=np.inf)), np.zeros((len(points), 3))
+        smallest, gradient = (
+            np.full(len(points), apart[far].min(initial=np.inf)),
+            np.zeros((len(points), 3)),
+        )
         for b in np.array(self.reached, dtype=int)[~far].tolist():
             # No farther than what was found: elsewhere a lower bound will do.
             found = self.distance_and_direction(points, b, np.minimum(smallest, limit))
@@ -189,11 +217,17 @@ class BoneContacts:
         return smallest, gradient
 
     def excess(self, points: Floats) -> Floats:
-        """How far (n,) points (n, 3) of the surface are to move inwards for sliding neighbours [scene unit]."""
-        return np.max([np.zeros(len(points)), *(pair.excess(points) for pair in self.beside)], axis=0)
+        """How far (n,) points (n, 3) of the surface are to move inwards for sliding neighbours
+        [scene unit].
+        """
+        return np.max(
+            [np.zeros(len(points)), *(pair.excess(points) for pair in self.beside)], axis=0
+        )
 
     def depths(self, points: Floats) -> dict[int, Floats]:
-        """Depth (n,) of each free contact point in each bone, by the bone's index [scene unit]; 0 outside."""
+        """Depth (n,) of each free contact point in each bone, by the bone's index [scene unit]; 0
+        outside.
+        """
         points = check_points(points)
         found = {b: np.zeros(len(points)) for b in self.reached}
         for b, near in self.near(points, np.zeros((1, len(points)))):
@@ -201,13 +235,21 @@ class BoneContacts:
         return found
 
     def half_spaces(self, points: ArrayLike, reach: ArrayLike) -> HalfSpaces:
-        """Pairs of contact point (n, 3) and obstacle nearer than ``reach``, one or (n,) [scene unit]."""
+        """Pairs of contact point (n, 3) and obstacle nearer than ``reach``, one or (n,) [scene
+        unit].
+        """
         points = check_points(points)
-        reach = np.full(len(points), reach) if np.ndim(reach) == 0 else np.asarray(reach, dtype=np.float64)
+        reach = (
+            np.full(len(points), reach)
+            if np.ndim(reach) == 0
+            else np.asarray(reach, dtype=np.float64)
+        )
         near = self.near(points, reach[None])
         most = sum(len(some) for _, some in near)
         index, source = np.empty(most, np.int64), np.empty(most, np.int64)
-        gap, normal, count = np.empty(most), np.empty((most, 3)), 0
+        gap = np.empty(most)
+        normal = np.empty((most, 3))
+        count = 0
         for b, some in near:
             distance, direction = self._ask(points, some, b, reach[some])
             allowed = self.allowed.get(b, NONE_ALLOWED)
@@ -221,7 +263,9 @@ class BoneContacts:
         )
 
     def with_planes(self, spaces: HalfSpaces, points: Floats, reach: Floats) -> HalfSpaces:
-        """Half-spaces of bones and, behind them, of the neighbours of contact points (n, 3) nearer than ``reach``."""
+        """Half-spaces of bones and, behind them, of the neighbours of contact points (n, 3) nearer
+        than ``reach``.
+        """
         if not self.neighbours:
             return spaces
         bones = spaces.index, spaces.gap, spaces.normal, spaces.source
@@ -229,20 +273,29 @@ class BoneContacts:
         return HalfSpaces(*map(np.concatenate, zip(bones, planes)))
 
     def near(self, points: Floats, reach: Floats) -> list[tuple[int, Integers]]:
-        """Bones in reach, each with the free contact points (n, 3) that may be nearer to it than their reach.
+        """Bones in reach, each with the free contact points (n, 3) that may be nearer to it than
+        their reach.
 
         ``reach`` is (1, n) for all bones, or (r, n) for each of the bones ``reached``.
         """
         found = np.empty((len(self.reached), len(points)), dtype=np.int64)
         counts = np.zeros(len(self.reached), dtype=np.int64)
         bones = self.placed, self.boxes
-        near_loop(points, self.free(len(points)), reach, bones, self._bounds(len(points)), found, counts)
-        return [(b, near[:count]) for b, near, count in zip(self.reached, found, counts.tolist()) if count]
+        near_loop(
+            points, self.free(len(points)), reach, bones, self._bounds(len(points)), found, counts
+        )
+        return [
+            (b, near[:count])
+            for b, near, count in zip(self.reached, found, counts.tolist())
+            if count
+        ]
 
     def path_lengths(
         self, start: Floats, end: Floats, before: dict[str, Floats], after: dict[str, Floats]
     ) -> Floats:
-        """Lengths (r, n) of straight paths as each of the bones ``reached`` sees them, moving from pose to pose."""
+        """Lengths (r, n) of straight paths as each of the bones ``reached`` sees them, moving from
+        pose to pose.
+        """
         length = np.empty((len(self.reached), len(start)))
         path_loop(start, end, self._stacked(before), self._stacked(after), length)
         return length
@@ -252,7 +305,9 @@ class BoneContacts:
         if self.contact_bone is None:
             return np.ones(count, dtype=np.bool_)
         if len(self.contact_bone) != count:
-            raise ValueError(f"half-spaces need all {len(self.contact_bone)} contact points, got {count}")
+            raise ValueError(
+                f"half-spaces need all {len(self.contact_bone)} contact points, got {count}"
+            )
         return self.contact_bone < 0
 
     def _planes(self) -> _PlaneStack:
@@ -273,8 +328,8 @@ class BoneContacts:
         return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)
 
     def _bounds(self, count):
-        """Positions (r, n, 3) of the last queries, in bone coordinates, and lower bounds (r, n) of the distances
-        there; -infinity where nothing is known.
+        """Positions (r, n, 3) of the last queries, in bone coordinates, and lower bounds (r, n) of
+        the distances there; -infinity where nothing is known.
         """
         if self._known[1].shape[1] != count:
             rows = len(self.reached)
@@ -282,9 +337,15 @@ class BoneContacts:
         return self._known
 
     def _ask(self, points, near, b, reach):
-        """Distances and directions of some of the contact points to bone b; stored as bounds for later queries."""
+        """Distances and directions of some of the contact points to bone b; stored as bounds for
+        later queries.
+        """
         pose, row = self.poses[self.names[b]], self._row[b]
-        distance, gradient = self.fields[b].distance_and_gradient(points[near], pose=pose, reach=reach)
+        distance, gradient = self.fields[b].distance_and_gradient(
+            points[near], pose=pose, reach=reach
+        )
         anchor, bound = self._bounds(len(points))
-        answer_loop(points, pose, self.boxes[row], near, distance, gradient, anchor[row], bound[row])
+        answer_loop(
+            points, pose, self.boxes[row], near, distance, gradient, anchor[row], bound[row]
+        )
         return distance, gradient

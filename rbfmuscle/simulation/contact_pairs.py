@@ -18,17 +18,24 @@ from rbfmuscle.simulation.substeps import check_substeps, path_angle
 
 # Poses of a motion that a swept box is made of; arcs between them are covered by the padding.
 SAMPLED_POSES = 48
-# Padding of a swept box, relative to the muscle's diagonal: a muscle bulges beyond its bones' motions.
+# Padding of a swept box, relative to the muscle's diagonal: a muscle bulges beyond its bones'
+# motions.
 PADDING = 0.1
 
 # By muscle and bone: box (2, 3) in the bone's coordinates.
 Regions = dict[tuple[str, str], Floats]
 
 
-def swept_boxes(muscle: Muscle, bones: Sequence[str], poses: Sequence[Mapping[str, Floats]]) -> Floats:
-    """Boxes (b, 2, 3), in the coordinates of some bones, that hold a muscle in all these poses of the bones."""
+def swept_boxes(
+    muscle: Muscle, bones: Sequence[str], poses: Sequence[Mapping[str, Floats]]
+) -> Floats:
+    """Boxes (b, 2, 3), in the coordinates of some bones, that hold a muscle in all these poses of
+    the bones.
+    """
     there = np.linalg.inv(np.array([[pose[name] for pose in poses] for name in bones]))
-    held = np.array([[pose[name] for pose in poses] for name in {a.holder for a in muscle.attachments}])
+    held = np.array(
+        [[pose[name] for pose in poses] for name in {a.holder for a in muscle.attachments}]
+    )
     bounds = np.asarray(muscle.mesh.bounds, dtype=np.float64)
     boxes = moved_box(bounds, there[:, None] @ held)
     pad = PADDING * float(np.linalg.norm(bounds[1] - bounds[0]))
@@ -39,17 +46,23 @@ def swept_boxes(muscle: Muscle, bones: Sequence[str], poses: Sequence[Mapping[st
 def sampled_poses(scene: Scene) -> list[Poses]:
     """Poses along the scene's motion, the rest pose first, thinned to a bounded number."""
     frames = scene.motion.frames
-    chosen = sorted({round(k) for k in np.linspace(0, len(frames) - 1, min(len(frames), SAMPLED_POSES))})
+    chosen = sorted(
+        {round(k) for k in np.linspace(0, len(frames) - 1, min(len(frames), SAMPLED_POSES))}
+    )
     stops = [rest_coordinates(scene), *(completed(scene, frames[k]) for k in chosen)]
     poses = [bone_poses(scene, {})]
     for before, after in itertools.pairwise(stops):
         count = max(1, math.ceil(path_angle(scene, before, after) / math.radians(10.0)))
-        poses.extend(bone_poses(scene, interpolate(before, after, (k + 1) / count)) for k in range(count))
+        poses.extend(
+            bone_poses(scene, interpolate(before, after, (k + 1) / count)) for k in range(count)
+        )
     return poses
 
 
 def find_contact_pairs(scene: Scene) -> Regions:
-    """Region of each bone that each muscle can reach: dict of (muscle name, bone name) to (2, 3) box."""
+    """Region of each bone that each muscle can reach: dict of (muscle name, bone name) to (2, 3)
+    box.
+    """
     check_substeps(scene)
     poses, names = sampled_poses(scene), [bone.name for bone in scene.bones]
     boxes = np.array([bone.mesh.bounds for bone in scene.bones])
@@ -62,7 +75,9 @@ def find_contact_pairs(scene: Scene) -> Regions:
 
 
 def build_fields(scene: Scene, regions: Regions) -> dict[str, BoneSDF]:
-    """Distance fields of the parts of bones that some muscle can reach: dict of bone name to field."""
+    """Distance fields of the parts of bones that some muscle can reach: dict of bone name to
+    field.
+    """
     parts = bone_regions(regions)
     bones = [bone for bone in scene.bones if bone.name in parts]
     fields = each(lambda bone: BoneSDF.from_mesh(bone.mesh, region=parts[bone.name]), bones)
@@ -75,5 +90,6 @@ def bone_regions(regions: Regions) -> dict[str, Floats]:
     for (_, bone), box in regions.items():
         boxes.setdefault(bone, []).append(box)
     return {
-        bone: np.array([np.min(found, axis=0)[0], np.max(found, axis=0)[1]]) for bone, found in boxes.items()
+        bone: np.array([np.min(found, axis=0)[0], np.max(found, axis=0)[1]])
+        for bone, found in boxes.items()
     }

@@ -15,13 +15,15 @@ Mesh: TypeAlias = tuple[np.ndarray, np.ndarray]
 class Event:
     """Something a user should know: ``count`` points of a muscle at a bone, and what was done.
 
-    ``action`` is ``"angle_flag"`` (the angle test found a crossing), ``"reported"`` (crossed, not corrected),
-    ``"rotated"``, ``"halved"`` (the step), ``"held_back"`` (kept on its side of a plane), ``"grazed"``
-    (crossed by the bone's field, by its triangles less than 0.1 mm deep), ``"unresolved"`` (crossed all the same),
-    ``"carried_stretched"``, ``"carried_held_end"`` or ``"carried_sheets"`` (no level set could be shown, so the surface
-    is where the material is: it is stretched too far, an end is held inside the bone named, or sheets have met),
-    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no muscle,
-    ``"bones_overlap"`` (the motion drives two bones into each other) or ``"joint_opens"`` (those of a joint apart).
+    ``action`` is ``"angle_flag"`` (the angle test found a crossing), ``"reported"`` (crossed, not
+    corrected), ``"rotated"``, ``"halved"`` (the step), ``"held_back"`` (kept on its side of a
+    plane), ``"grazed"`` (crossed by the bone's field, by its triangles less than 0.1 mm deep),
+    ``"unresolved"`` (crossed all the same), ``"carried_stretched"``, ``"carried_held_end"`` or
+    ``"carried_sheets"`` (no level set could be shown, so the surface is where the material is: it
+    is stretched too far, an end is held inside the bone named, or sheets have met),
+    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no
+    muscle, ``"bones_overlap"`` (the motion drives two bones into each other) or ``"joint_opens"``
+    (those of a joint apart).
     """
 
     frame: int
@@ -38,8 +40,11 @@ class ModelSurface:
     vertices: np.ndarray = field(repr=False)  # (n, 3)
     faces: np.ndarray = field(repr=False)  # (m, 3)
     quantities: dict = field(default_factory=dict)  # ``condition``, ``time_fit`` and others by name
-    notes: list = field(default_factory=list)  # (bone, count, action), turned into events of the frame
-    # An earlier ModelSurface and the rigid motion (4, 4) since, where the muscle moved rigidly; else None.
+    notes: list = field(
+        default_factory=list
+    )  # (bone, count, action), turned into events of the frame
+    # An earlier ModelSurface and the rigid motion (4, 4) since, where the muscle moved rigidly;
+    # else None.
     origin: Any = field(default=None, repr=False)
 
 
@@ -50,10 +55,15 @@ class Frame:
     index: int  # in the scene's motion
     coordinates: dict  # [radian]
     poses: dict = field(repr=False)  # (4, 4) by bone
-    surfaces: Mapping[str, ModelSurface] = field(repr=False)  # by muscle; empty where none were asked for
-    carried: dict = field(repr=False)  # (vertices, faces) by muscle: material surfaces of constant topology
+    surfaces: Mapping[str, ModelSurface] = field(
+        repr=False
+    )  # by muscle; empty where none were asked for
+    carried: dict = field(
+        repr=False
+    )  # (vertices, faces) by muscle: material surfaces of constant topology
     events: list  # since the frame written before
-    # Of each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since the last frame.
+    # Of each muscle ``time_predict``, ``time_solve``, ... and their sum ``time_frame`` [s], since
+    # the last frame.
     times: dict = field(repr=False)
     wall: float  # time for all muscles together [s], since the frame before
     activations: dict = field(default_factory=dict)  # of the muscles that contract
@@ -65,10 +75,14 @@ class Frame:
 
 
 class Drawing(Protocol):
-    """A copy of a model's state, from which its surface is computed, maybe while the model continues."""
+    """A copy of a model's state, from which its surface is computed, maybe while the model
+    continues.
+    """
 
     def carried(self) -> Mesh | None:
-        """Vertices and faces of the shown mesh, where the material takes them; None where that is the material's."""
+        """Vertices and faces of the shown mesh, where the material takes them; None where that is
+        the material's.
+        """
 
     def surface(self) -> ModelSurface:
         """The surface, closed and outward; called once."""
@@ -93,7 +107,9 @@ class MuscleModel(Protocol):
 
     name: str
     contact_bone: np.ndarray  # (n,) bone that a contact point is attached to, -1 where it is free
-    detail: float  # length over which it bends as a whole: neighbours meet it at points so far apart; 0 for all points
+    # length over which it bends as a whole: neighbours meet it at points so far apart; 0 for all
+    # points
+    detail: float
 
     def contact_points(self) -> np.ndarray:
         """Present contact points (n, 3); their number and order never change."""
@@ -105,7 +121,9 @@ class MuscleModel(Protocol):
         """Solve for equilibrium under the model's constraints and these contacts."""
 
     def make_room(self, contacts: BoneContacts) -> None:
-        """Move what is shown out of neighbours, by planes at where these are now; nothing where `solve` does that."""
+        """Move what is shown out of neighbours, by planes at where these are now; nothing where
+        `solve` does that.
+        """
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
         """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""

@@ -62,7 +62,9 @@ class FrameLoop:
         surfaces: bool = True,
     ) -> None:
         models = list(models)
-        self.scene, self.surfaces, self._poses = scene, surfaces, PoseCache(scene)
+        self.scene = scene
+        self.surfaces = surfaces
+        self._poses = PoseCache(scene)
         self.steppers = [
             MuscleStepper(model, contacts, scene, poses=self._poses)
             for model, contacts in zip(models, _obstacles(scene, models, fields))
@@ -72,7 +74,9 @@ class FrameLoop:
         for stepper in self.steppers:
             if scene.sliding is None and not stepper.contracts:
                 stepper.carrier = RigidTransport(scene.muscle(stepper.name), scene)
-        self._next_index, self._wall, self._blas = 0, 0.0, ThreadpoolController()
+        self._next_index = 0
+        self._wall = 0.0
+        self._blas = ThreadpoolController()
         with self.working():
             each(resolve_initial_overlap, self.steppers)
             self._sliding = None if scene.sliding is None else Sliding(scene, self.steppers)
@@ -98,17 +102,23 @@ class FrameLoop:
             paths = self._path_to(coordinates)
             if self.surfaces and self._sliding is None:
                 # No muscle waits for another: each thread takes one through all its sub-steps.
-                drawn = each(lambda stepper: stepper.go(*paths[stepper.name]).drawing().draw(), self.steppers)
+                drawn = each(
+                    lambda stepper: stepper.go(*paths[stepper.name]).drawing().draw(), self.steppers
+                )
             else:
                 self._solve(paths)
-                drawings = self._sliding.drawings() if self.surfaces and self._sliding is not None else []
+                drawings = (
+                    self._sliding.drawings() if self.surfaces and self._sliding is not None else []
+                )
                 drawn = each(TimedDrawing.draw, drawings)
             frame = self._frame(drawn)
         frame.wall, self._wall = self._wall, 0.0
         return frame
 
     def skip(self, coordinates: Mapping[str, float]) -> None:
-        """Advance without surfaces; times and events are counted to the next frame that is returned."""
+        """Advance without surfaces; times and events are counted to the next frame that is
+        returned.
+        """
         with self.working():
             self._solve(self._path_to(coordinates))
 
@@ -126,7 +136,9 @@ class FrameLoop:
             self._wall += time.perf_counter() - start
 
     def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, Path]:
-        """For each muscle the coordinates and the activations of its sub-steps to the next frame."""
+        """For each muscle the coordinates and the activations of its sub-steps to the next
+        frame.
+        """
         # Coordinates start at rest, which is zero for most.
         here = self.here or dict.fromkeys(coordinates, 0.0) | rest_coordinates(self.scene)
         self.here = completed(self.scene, coordinates)
@@ -157,19 +169,31 @@ class FrameLoop:
         poses = self._poses(self.here)
         for end in (end for name in carried for end in self.scene.muscle(name).tendons):
             poses[end.name]  # the pose of an end is computed, and kept, when it is first asked for
-        index, surfaces = self._next_index - 1, dict(zip(carried, (surface for surface, _ in drawn)))
+        index, surfaces = (
+            self._next_index - 1,
+            dict(zip(carried, (surface for surface, _ in drawn))),
+        )
         events = [event for _, events, _ in found for event in events]
-        events += [Event(index, name, *note) for name, shown in surfaces.items() for note in shown.notes]
+        events += [
+            Event(index, name, *note) for name, shown in surfaces.items() for note in shown.notes
+        ]
         for name, (_, seconds) in zip(carried, drawn):
             for key in ("time_surface", "time_frame"):
                 times[name][key] = times[name].get(key, 0.0) + seconds
         return Frame(
-            index, dict(self.here), dict(poses), surfaces, carried, events, times, 0.0,
+            index,
+            dict(self.here),
+            dict(poses),
+            surfaces,
+            carried,
+            events,
+            times,
+            0.0,
             activations=dict(self.activations.here),
             work=dict(zip(carried, (status for _, _, status in found))),
             neighbours={} if self._sliding is None else dict(self._sliding.pairs),
             tendons=dict(poses.tendons),
-        )  # fmt: skip
+        )
 
 
 def simulate_frames(
@@ -182,8 +206,8 @@ def simulate_frames(
 ) -> Iterator[Frame]:
     """Run models, from their rest state, through a scene's motion and yield its frames one by one.
 
-    Only frames whose index is in ``written`` are yielded, all where it is None. Frames yielded before an interrupt or
-    an error stay valid. Raises as `FrameLoop` does.
+    Only frames whose index is in ``written`` are yielded, all where it is None. Frames yielded
+    before an interrupt or an error stay valid. Raises as `FrameLoop` does.
     """
     loop = FrameLoop(scene, models, fields=fields, surfaces=surfaces)
     for index, coordinates in enumerate(scene.motion.frames):
@@ -202,7 +226,8 @@ def solve_pose(
 ) -> Frame:
     """Solve one pose [radian] straight from rest, so that the shapes depend on the pose alone.
 
-    The models are in their rest state, to which they return. Raises SolveError if a muscle cannot be solved.
+    The models are in their rest state, to which they return. Raises SolveError if a muscle cannot
+    be solved.
     """
     rest = [model.snapshot() for model in models]
     try:
@@ -217,7 +242,8 @@ def solve_pose(
 def _obstacles(scene, models, fields):
     """One BoneContacts for each model, with fields of the bones that it can reach.
 
-    A field covers the reach of all muscles of the scene, so that it does not depend on which are simulated.
+    A field covers the reach of all muscles of the scene, so that it does not depend on which are
+    simulated.
     """
     regions = find_contact_pairs(scene) if fields is None else None
     here = {model.name for model in models}
@@ -226,5 +252,7 @@ def _obstacles(scene, models, fields):
         fields = build_fields(scene, {pair: box for pair, box in regions.items() if pair[1] in met})
     names = [bone.name for bone in scene.bones]
     for model in models:
-        reached = [fields.get(n) if regions is None or (model.name, n) in regions else None for n in names]
+        reached = [
+            fields.get(n) if regions is None or (model.name, n) in regions else None for n in names
+        ]
         yield BoneContacts(names, reached, contact_bone=model.contact_bone)

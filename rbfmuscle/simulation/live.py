@@ -24,9 +24,9 @@ FREE_RANGE = 30.0
 class LiveSession:
     """Models that follow coordinates set interactively.
 
-    Coordinates at ``rest``, ``here`` and at their ``target`` are in radian, as are the ``limits`` of each;
-    ``activation`` holds the target, 0 to 1, of the muscles that contract. ``fields`` are as `live_fields` builds
-    them.
+    Coordinates at ``rest``, ``here`` and at their ``target`` are in radian, as are the ``limits``
+    of each; ``activation`` holds the target, 0 to 1, of the muscles that contract. ``fields`` are
+    as `live_fields` builds them.
     """
 
     def __init__(self, scene: Scene, *, fields: Mapping[str, BoneField] | None = None) -> None:
@@ -38,7 +38,8 @@ class LiveSession:
         self.activation = {m.name: 0.0 for m in scene.muscles if m.contraction is not None}
         #: A shift counts as the turn that moves a place at this lever as far.
         self._lever = {
-            n: scene.length(SHIFT_LEVER) if facts[n].motion == "translation" else 1.0 for n in self.rest
+            n: scene.length(SHIFT_LEVER) if facts[n].motion == "translation" else 1.0
+            for n in self.rest
         }
         self._loop: FrameLoop | None = None
 
@@ -63,7 +64,9 @@ class LiveSession:
     def activate(self, muscle: str, activation: float) -> None:
         """Give a muscle that contracts a new activation, kept from 0 to 1."""
         if muscle not in self.activation:
-            raise UsageError(f"muscle {muscle!r} does not contract: give it activation = 0 in the scene")
+            raise UsageError(
+                f"muscle {muscle!r} does not contract: give it activation = 0 in the scene"
+            )
         self.activation[muscle] = min(max(float(activation), 0.0), 1.0)
 
     @property
@@ -72,16 +75,21 @@ class LiveSession:
         return self.within(1e-9, 1e-9)
 
     def within(self, stride: float, step: float) -> bool:
-        """Whether no coordinate is farther than ``stride`` [radian] from its target, no activation than ``step``."""
+        """Whether no coordinate is farther than ``stride`` [radian] from its target, no activation
+        than ``step``.
+        """
         active = self._loop.activations.here if self._loop else dict.fromkeys(self.activation, 0.0)
         near = self._farthest() <= stride
-        return near and all(abs(value - active[name]) <= step for name, value in self.activation.items())
+        return near and all(
+            abs(value - active[name]) <= step for name, value in self.activation.items()
+        )
 
     def advance(self, stride: float = math.inf, *, surfaces: bool = True) -> Frame:
         """Move towards the target and return the frame reached.
 
-        No coordinate changes by more than ``stride`` [radian], and, if that is finite, no activation by more than a
-        sub-step's. Raises SolveError if a muscle cannot be solved; `reset` goes back to rest.
+        No coordinate changes by more than ``stride`` [radian], and, if that is finite, no
+        activation by more than a sub-step's. Raises SolveError if a muscle cannot be solved;
+        `reset` goes back to rest.
         """
         if self._loop is None:
             self._loop = FrameLoop(_wide_scene(self.scene), self.models, fields=self.fields)
@@ -100,11 +108,14 @@ class LiveSession:
 
     def _farthest(self) -> float:
         """How far coordinates are from their targets, at most [radian]."""
-        return max((abs(self.target[k] - self.here[k]) / self._lever[k] for k in self.target), default=0.0)
+        return max(
+            (abs(self.target[k] - self.here[k]) / self._lever[k] for k in self.target), default=0.0
+        )
 
 
 def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
-    """Range [radian] of each free coordinate: its own, or the motion's and 30 degrees (30 mm) both ways.
+    """Range [radian] of each free coordinate: its own, or the motion's and 30 degrees (30 mm) both
+    ways.
 
     Coordinates that are coupled or locked are left out.
     """
@@ -113,7 +124,9 @@ def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
     for name, facts in all_coordinates(scene.joints).items():
         if name in followers or facts.locked:
             continue
-        free = scene.length(FREE_RANGE) if facts.motion == "translation" else math.radians(FREE_RANGE)
+        free = (
+            scene.length(FREE_RANGE) if facts.motion == "translation" else math.radians(FREE_RANGE)
+        )
         values = [frame.get(name, facts.rest) for frame in scene.motion.frames]
         low, high = min([facts.rest - free, *values]), max([facts.rest + free, *values])
         if facts.range is not None and facts.range[0] < facts.range[1]:

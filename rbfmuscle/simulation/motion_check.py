@@ -1,4 +1,6 @@
-"""Checks a motion before the run: attachments that it moves into another bone, too far apart or too close together."""
+"""Checks a motion before the run: attachments that it moves into another bone, too far apart or too
+close together.
+"""
 
 import itertools
 import math
@@ -26,10 +28,14 @@ APART = 0.3
 
 
 class Fault(NamedTuple):
-    """An attachment that the motion moves into another bone, or two that it moves too far apart or together."""
+    """An attachment that the motion moves into another bone, or two that it moves too far apart or
+    together.
+    """
 
     muscle: str
-    bones: tuple[str, str]  # that holds the attachment and that it enters, or those that hold the two
+    bones: tuple[
+        str, str
+    ]  # that holds the attachment and that it enters, or those that hold the two
     rest: float  # distance between the two at rest [scene unit]; 0 for one that enters a bone
     value: float  # greatest depth beyond that at rest, or the distance farthest from that at rest
     frame: int  # where it is so
@@ -46,9 +52,19 @@ def check_motion(scene: Scene) -> list[Fault]:
         extent = float(np.linalg.norm(np.ptp(np.asarray(muscle.mesh.vertices), axis=0)))
         for bones, values, bad in _followed(scene, muscle, extent, poses):
             if bad.any():
-                worst, first = int(np.abs(values[1:] - values[0]).argmax()), int(np.flatnonzero(bad)[0])
+                worst, first = (
+                    int(np.abs(values[1:] - values[0]).argmax()),
+                    int(np.flatnonzero(bad)[0]),
+                )
                 faults.append(
-                    Fault(muscle.name, bones, values[0], values[1 + worst], frames[worst], frames[first])
+                    Fault(
+                        muscle.name,
+                        bones,
+                        values[0],
+                        values[1 + worst],
+                        frames[worst],
+                        frames[first],
+                    )
                 )
     return faults
 
@@ -56,7 +72,9 @@ def check_motion(scene: Scene) -> list[Fault]:
 def _followed(
     scene: Scene, muscle: Muscle, extent: float, poses: list[Any]
 ) -> Iterator[tuple[tuple[str, str], Floats, np.ndarray]]:
-    """For an attachment and a bone, or two attachments: a value (1 + p,) along the motion, and where it is bad."""
+    """For an attachment and a bone, or two attachments: a value (1 + p,) along the motion, and
+    where it is bad.
+    """
     patches = _patches(muscle)
     for bone, points in patches.items():
         bounds = np.array([points.min(axis=0), points.max(axis=0)])
@@ -68,7 +86,9 @@ def _followed(
                 yield (bone, other.name), deeper, deeper[1:] > scene.length(DEEPER)
     for pair in itertools.combinations(patches, 2):
         one, other = (np.append(patches[bone].mean(axis=0), 1.0) for bone in pair)
-        away = np.array([np.linalg.norm((pose[pair[0]] @ one - pose[pair[1]] @ other)[:3]) for pose in poses])
+        away = np.array(
+            [np.linalg.norm((pose[pair[0]] @ one - pose[pair[1]] @ other)[:3]) for pose in poses]
+        )
         if away[0] >= APART * extent:
             for bad, limit in (
                 (away > LONGEST * away[0], np.maximum),
@@ -104,20 +124,31 @@ def motion_findings(scene: Scene) -> list[Finding]:
     inside = sorted((one for one in faults if not one.rest), key=lambda one: -one.value)
     apart = [one for one in faults if one.rest]
     said = []
-    for one in [*inside, *sorted(apart, key=lambda one: -abs(math.log(max(one.value / one.rest, 1e-12))))]:
+    for one in [
+        *inside,
+        *sorted(apart, key=lambda one: -abs(math.log(max(one.value / one.rest, 1e-12)))),
+    ]:
         bone, other = one.bones
         if not one.rest:
             text = (
-                f"the motion drives the end held by {bone!r} into bone {other!r}, from about frame {one.first}, by up "
-                f"to {one.value:.3g} {units} at frame {one.frame}; give it a tendon, or its tendon via points, or end "
+                f"the motion drives the end held by {bone!r} into bone {other!r}, from about "
+                f"frame {one.first}, by up "
+                f"to {one.value:.3g} {units} at frame {one.frame}; give it a tendon, or its "
+                "tendon via points, or end "
                 "the motion sooner"
             )
         else:
-            how, ratio = "take apart" if one.value > one.rest else "bring together", one.value / one.rest
+            how, ratio = (
+                "take apart" if one.value > one.rest else "bring together",
+                one.value / one.rest,
+            )
             text = (
-                f"{bone!r} and {other!r} {how} its ends to {ratio:.2f} times their distance at rest ({one.rest:.4g} to "
-                f"{one.value:.4g} {units} at frame {one.frame}, too far from about frame {one.first}); a tendon may be "
-                "missing between mesh and bone: give one to the attachment, or correct the attachments"
+                f"{bone!r} and {other!r} {how} its ends to {ratio:.2f} times their distance at "
+                f"rest ({one.rest:.4g} to "
+                f"{one.value:.4g} {units} at frame {one.frame}, too far from about frame "
+                f"{one.first}); a tendon may be "
+                "missing between mesh and bone: give one to the attachment, or correct the "
+                "attachments"
             )
         said.append(Finding("warning", one.muscle, text))
     return said

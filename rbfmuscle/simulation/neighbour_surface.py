@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 # Index, distance, outward normal and nearest vertex of the points that are near a surface.
 Found = tuple[Integers, Floats, Floats, Integers]
-# Share of a muscle's last corrections that is expected again, and that of the earlier ones in their mean. With all of
-# the last one alone neighbours that push each other oscillate; with none they answer to a surface that lies a
-# millimetre or two from the equilibrium, and may pass each other.
+# Share of a muscle's last corrections that is expected again, and that of the earlier ones in their
+# mean. With all of the last one alone neighbours that push each other oscillate; with none they
+# answer to a surface that lies a millimetre or two from the equilibrium, and may pass each other.
 MOMENTUM, MEMORY = 0.75, 0.5
 # Greatest thickness of a muscle, relative to rest.
 DEEPER = 1.5
@@ -32,7 +32,9 @@ FOLDED = 0.3
 
 
 class Skin(NamedTuple):
-    """Vertices, their normals, faces, and the faces around vertex v, ring[start[v] : start[v + 1]]."""
+    """Vertices, their normals, faces, and the faces around vertex v, ring[start[v] : start[v
+    + 1]].
+    """
 
     vertices: np.ndarray
     normals: np.ndarray
@@ -44,10 +46,10 @@ class Skin(NamedTuple):
 class MovingSurface:
     """Signed distance to a mesh whose vertices move, for points near it.
 
-    The nearest point of the surface lies in one of the triangles around the nearest vertex, up to the square of an edge
-    over the radius of curvature.
-    Directions are interpolated vertex normals, or, around a rim, the direction to the point. The sign is that of the
-    triangles that meet at the nearest point.
+    The nearest point of the surface lies in one of the triangles around the nearest vertex, up to
+    the square of an edge over the radius of curvature. Directions are interpolated vertex normals,
+    or, around a rim, the direction to the point. The sign is that of the triangles that meet at the
+    nearest point.
 
     Parameters
     ----------
@@ -88,8 +90,13 @@ class MovingSurface:
         self._tree: cKDTree | None = None
 
     def nearest(self, points: Floats, reach: float) -> Integers:
-        """Nearest vertex (n,) of points (n, 3); as many as there are vertices where none is within ``reach``."""
-        found, near = np.full(len(points), len(self.vertices)), np.flatnonzero(self.boxed(points, reach))
+        """Nearest vertex (n,) of points (n, 3); as many as there are vertices where none is within
+        ``reach``.
+        """
+        found, near = (
+            np.full(len(points), len(self.vertices)),
+            np.flatnonzero(self.boxed(points, reach)),
+        )
         if len(near):
             if self._tree is None:
                 self._tree = cKDTree(self.vertices, balanced_tree=False, compact_nodes=False)
@@ -98,7 +105,10 @@ class MovingSurface:
 
     def boxed(self, points: Floats, reach: float) -> Booleans:
         """Whether points (n, 3) are within ``reach`` of the box about the surface."""
-        (low, high), near = (self.box[0] - reach, self.box[1] + reach), np.ones(len(points), dtype=np.bool_)
+        (low, high), near = (
+            (self.box[0] - reach, self.box[1] + reach),
+            np.ones(len(points), dtype=np.bool_),
+        )
         for a in range(3):
             near &= (points[:, a] > low[a]) & (points[:, a] < high[a])
         return near
@@ -111,7 +121,8 @@ class MovingSurface:
         points : (n, 3) ndarray
         reach : float or (n,) ndarray
         start : (n,) ndarray of int, optional
-            Vertices that were `nearest` not long ago, from which the nearest now is found over edges.
+            Vertices that were `nearest` not long ago, from which the nearest now is found over
+            edges.
 
         Returns
         -------
@@ -135,7 +146,8 @@ class MovingSurface:
         index, nearest = index[near], nearest[near]
         distance, normal = np.empty(len(index)), np.empty((len(index), 3))
         _distance_loop(points, index, nearest, skin, distance, normal)
-        # Beyond a sharp rim the normals of its sides disagree: no point is deeper than the muscle is thick.
+        # Beyond a sharp rim the normals of its sides disagree: no point is deeper than the muscle
+        # is thick.
         near = (distance < reach[index]) & (distance >= -self.deepest[nearest])
         # A folded triangle at a rim may give a point far outside a large depth.
         deep = np.flatnonzero(near & (distance < -FOLDED * self.edge))
@@ -176,13 +188,16 @@ class NeighbourSurface(MovingSurface):
         self.shown: MovingSurface = self
         self.contact = cKDTree(model.contact_points()).query(self.vertices)[1]
         self.fixed = np.asarray(model.contact_bone)[self.contact] >= 0
-        #: Change of the coordinates in the last sub-step, and a mean of how far solves moved points and vertices.
+        #: Change of the coordinates in the last sub-step, and a mean of how far solves moved points
+        #: and vertices.
         self._change: dict[str, float] = {}
         self._correction: list[Floats] = []
         self.refresh()
 
     def show(self, mesh: Mesh | None) -> None:
-        """Take the vertices and faces of the mesh that is shown; None where that is the material's."""
+        """Take the vertices and faces of the mesh that is shown; None where that is the
+        material's.
+        """
         if mesh is None:
             self.shown = self
         elif self.shown is self:
@@ -193,7 +208,8 @@ class NeighbourSurface(MovingSurface):
     def refresh(self, *path: Mapping[str, float]) -> None:
         """Update from the model's present state.
 
-        For a path from coordinates to others the prediction is extrapolated by the last corrections.
+        For a path from coordinates to others the prediction is extrapolated by the last
+        corrections.
         """
         self._predicted = self._present()
         share = MOMENTUM * self._share(_change(*path)) if path and self._correction else 0.0
@@ -204,12 +220,16 @@ class NeighbourSurface(MovingSurface):
         self.reach_box = np.array([self.points.min(axis=0), self.points.max(axis=0)])
 
     def learn(self, *path: Mapping[str, float]) -> None:
-        """Record how far the solve moved the model from its prediction, for a path from coordinates to others."""
+        """Record how far the solve moved the model from its prediction, for a path from coordinates
+        to others.
+        """
         change = _change(*path)
         found = [solved - predicted for solved, predicted in zip(self._present(), self._predicted)]
         if self._correction:
             old = MEMORY * self._share(change)
-            found = [(1.0 - MEMORY) * new + old * before for new, before in zip(found, self._correction)]
+            found = [
+                (1.0 - MEMORY) * new + old * before for new, before in zip(found, self._correction)
+            ]
         self._change, self._correction = change, found
 
     def _present(self) -> list[Floats]:
@@ -217,13 +237,17 @@ class NeighbourSurface(MovingSurface):
         return [np.array(self.model.contact_points()), np.array(self.model.material_mesh()[0])]
 
     def _share(self, change: dict[str, float]) -> float:
-        """Share of the last correction in another change of coordinates: 1 for the same, 0 across or back."""
+        """Share of the last correction in another change of coordinates: 1 for the same, 0 across
+        or back.
+        """
         square = sum(value**2 for value in self._change.values())
         along = sum(value * self._change.get(name, 0.0) for name, value in change.items())
         return min(max(along / square, 0.0), 1.0) if square else 0.0
 
     def apart(self, other: NeighbourSurface, reach: float) -> bool:
-        """Whether no point of the other muscle can be nearer than ``reach`` to this surface, by their boxes."""
+        """Whether no point of the other muscle can be nearer than ``reach`` to this surface, by
+        their boxes.
+        """
         return bool(
             np.any(other.reach_box[0] > self.box[1] + reach)
             or np.any(other.reach_box[1] < self.box[0] - reach)
@@ -246,7 +270,9 @@ def _walk_loop(points, index, skin, nearest, away):
     """From vertices over edges to the nearest ones, and how far away these are."""
     vertices, _, faces, start, ring = skin
     for q in range(len(index)):
-        here, least, last = nearest[q], np.inf, -1
+        here = nearest[q]
+        least = np.inf
+        last = -1
         while here != last:
             last = here
             for r in range(start[last], start[last + 1]):
@@ -262,13 +288,19 @@ def _walk_loop(points, index, skin, nearest, away):
 @compiled
 def _distance_loop(points, index, nearest, skin, distance, normal):
     vertices, normals, faces, start, ring = skin
-    weights, best, at, way, true = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    weights = np.empty(3)
+    best = np.empty(3)
+    at = np.empty(3)
+    way = np.empty(3)
+    true = np.empty(3)
     for q in range(len(index)):
         p = index[q]
         least, face = np.inf, -1
         for r in range(start[nearest[q]], start[nearest[q] + 1]):
             f = ring[r]
-            a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+            a = vertices[faces[f, 0]]
+            b = vertices[faces[f, 1]]
+            c = vertices[faces[f, 2]]
             nearest_weights(points[p], a, b, c, weights)
             squared = 0.0
             for k in range(3):
@@ -286,7 +318,9 @@ def _distance_loop(points, index, nearest, skin, distance, normal):
             if squared < least:
                 least, face = squared, f
                 best[:], way[:] = weights, at
-        size, side, agree = 0.0, 0.0, 0.0
+        size = 0.0
+        side = 0.0
+        agree = 0.0
         for k in range(3):
             n = 0.0
             for corner in range(3):

@@ -1,4 +1,6 @@
-"""What overlaps at rest, as bones and muscles come from different sources: kept, resolved or refused."""
+"""What overlaps at rest, as bones and muscles come from different sources: kept, resolved or
+refused.
+"""
 
 import math
 
@@ -11,16 +13,19 @@ from rbfmuscle.validation import SceneError
 # Depth [mm] below which nothing overlaps, and the movement [mm] below which a muscle has settled.
 DEPTH = 0.02
 SETTLED = 0.01
-# Bones grow into a muscle by this much [mm] in one solve, so that contact never has to guess the way out.
+# Bones grow into a muscle by this much [mm] in one solve, so that contact never has to guess the
+# way out.
 GROWTH = 1.0
 MOST_SOLVES = 60
 
 
 def resolve_initial_overlap(stepper: MuscleStepper) -> None:
-    """Deal with overlap at rest as the scene's ``[contact] initial`` says; for a muscle in its rest pose.
+    """Deal with overlap at rest as the scene's ``[contact] initial`` says; for a muscle in its rest
+    pose.
 
-    ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model holds its shape and
-    volume, ``"keep"`` measures every gap from the depth at rest, ``"error"`` raises SceneError.
+    ``"resolve"`` lets the bones grow from the muscle's surface to their true size while the model
+    holds its shape and volume, ``"keep"`` measures every gap from the depth at rest, ``"error"``
+    raises SceneError.
     """
     contacts, scene = stepper.contacts, stepper.scene
     least, initial = scene.length(DEPTH), scene.contact.initial
@@ -30,7 +35,8 @@ def resolve_initial_overlap(stepper: MuscleStepper) -> None:
         count, bone = int((depth > least).sum()), contacts.names[b]
         if initial == "error":
             raise SceneError(
-                f"muscle {stepper.name!r} overlaps bone {bone!r} at rest: {count} points, {depth.max():.3g} "
+                f"muscle {stepper.name!r} overlaps bone {bone!r} at rest: {count} points, "
+                f"{depth.max():.3g} "
                 f"{scene.units} deep; set [contact] initial to 'resolve' or 'keep'"
             )
         contacts.allow(b, depth)
@@ -40,7 +46,9 @@ def resolve_initial_overlap(stepper: MuscleStepper) -> None:
 
 
 def _resolve(stepper: MuscleStepper, overlap: dict[int, Floats]) -> None:
-    """Solve while the depth (n,) that is allowed in each bone shrinks to zero, until no contact point moves."""
+    """Solve while the depth (n,) that is allowed in each bone shrinks to zero, until no contact
+    point moves.
+    """
     contacts, model = stepper.contacts, stepper.model
     model.predict(contacts.poses, contacts.poses)
     deepest = max(float(depth.max()) for depth in overlap.values())

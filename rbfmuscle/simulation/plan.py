@@ -15,9 +15,9 @@ from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 def plan_scene(scene: Scene) -> dict[str, Any]:
     """Frames, sub-steps, muscles and fields of a run, by these names.
 
-    Muscles have the ``bones`` within reach and the ``substeps`` in which they are solved, fields the triangles and
-    the share of the bone's box. A listed bone need not be touched. A bone that comes near a muscle is not foreseen:
-    the muscle may then be solved in more sub-steps.
+    Muscles have the ``bones`` within reach and the ``substeps`` in which they are solved, fields
+    the triangles and the share of the bone's box. A listed bone need not be touched. A bone that
+    comes near a muscle is not foreseen: the muscle may then be solved in more sub-steps.
     """
     regions, poses = find_contact_pairs(scene), PoseCache(scene)
     muscles: list[dict[str, Any]] = []
@@ -25,7 +25,9 @@ def plan_scene(scene: Scene) -> dict[str, Any]:
     for muscle in scene.muscles:
         bones = [bone for name, bone in regions if name == muscle.name]
         facts = {"name": muscle.name, "model": muscle.model, "vertices": len(muscle.mesh.vertices)}
-        muscles.append({**facts, "bones": bones, "substeps": _count_substeps(muscle, scene, bones, poses)})
+        muscles.append(
+            {**facts, "bones": bones, "substeps": _count_substeps(muscle, scene, bones, poses)}
+        )
     for name, box in bone_regions(regions).items():
         mesh = scene.bone(name).mesh
         own = np.asarray(mesh.bounds, dtype=float)
@@ -41,7 +43,9 @@ def _count_substeps(muscle: Muscle, scene: Scene, bones: list[str], poses: PoseC
     """Sub-steps in which the motion requires a muscle to be solved."""
     always = scene.sliding is not None or muscle.contraction is not None
     cut = SubSteps(scene, muscle, bones=bones, poses=poses)
-    carrier, count, here = RigidTransport(muscle, scene), 0, rest_coordinates(scene)
+    carrier = RigidTransport(muscle, scene)
+    count = 0
+    here = rest_coordinates(scene)
     carrier.solved = poses(here)
     for frame in scene.motion.frames:
         there = completed(scene, frame)

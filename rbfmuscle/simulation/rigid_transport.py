@@ -1,7 +1,7 @@
 """Rigid motion of a muscle whose bones do not move against each other.
 
-Such a muscle keeps its shape and moves with its bones. The relative pose of the bones is compared with that of the last
-solve. If another bone comes near, the muscle is solved.
+Such a muscle keeps its shape and moves with its bones. The relative pose of the bones is compared
+with that of the last solve. If another bone comes near, the muscle is solved.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,8 @@ from rbfmuscle.simulation.frame import MuscleModel
 
 # Bones farther than this [mm] from a muscle do not act on it.
 CLEAR = 2.0
-# Rotations [radian] and displacements (relative to the muscle's size) below this are rounding errors.
+# Rotations [radian] and displacements (relative to the muscle's size) below this are rounding
+# errors.
 STILL = 1e-9
 # Displacement of an attachment, in sizes of its muscle, that counts as a rotation by one radian.
 ARC = 0.5
@@ -33,15 +34,19 @@ class MuscleStatus(NamedTuple):
 
 
 class RigidTransport:
-    """Moves one muscle rigidly where its bones do; for a muscle that neither slides on neighbours nor contracts.
+    """Moves one muscle rigidly where its bones do; for a muscle that neither slides on neighbours
+    nor contracts.
 
-    ``names`` holds the bones, and ends of tendons, that hold it, first that of most of it; ``solved`` their poses
-    when it was solved last, or None; ``since`` the rigid motion (4, 4) since its surface was drawn last.
+    ``names`` holds the bones, and ends of tendons, that hold it, first that of most of it;
+    ``solved`` their poses when it was solved last, or None; ``since`` the rigid motion (4, 4) since
+    its surface was drawn last.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene) -> None:
         vertices = np.asarray(muscle.mesh.vertices, dtype=float)
-        frame, self.size, self.clear = RestFrame(vertices), diameter(vertices), scene.length(CLEAR)
+        frame = RestFrame(vertices)
+        self.size = diameter(vertices)
+        self.clear = scene.length(CLEAR)
         held: dict[str, list[np.ndarray]] = {}
         for attachment in muscle.attachments:
             held.setdefault(attachment.holder, []).append(attachment.vertices)
@@ -57,9 +62,15 @@ class RigidTransport:
         return not any(self._moves(before, after, root, name) for name in self.names[1:])
 
     def try_carry(
-        self, model: MuscleModel, contacts: BoneContacts, before: dict[str, Floats], after: dict[str, Floats]
+        self,
+        model: MuscleModel,
+        contacts: BoneContacts,
+        before: dict[str, Floats],
+        after: dict[str, Floats],
     ) -> bool:
-        """Move the muscle rigidly from one set of poses to the next if it need not be solved; return whether it was."""
+        """Move the muscle rigidly from one set of poses to the next if it need not be solved;
+        return whether it was.
+        """
         self.solved, root = self.solved or before, self.names[0]
         if not self.keeps_shape(after):
             return False
@@ -89,10 +100,16 @@ class RigidTransport:
         """Whether one of these bones is near the muscle now."""
         if not bones:
             return False
-        return bool(np.isin(contacts.half_spaces(model.contact_points(), self.clear).source, bones).any())
+        return bool(
+            np.isin(contacts.half_spaces(model.contact_points(), self.clear).source, bones).any()
+        )
 
-    def _moves(self, before: Mapping[str, Floats], after: Mapping[str, Floats], root: str, name: str) -> bool:
-        """Whether a bone that holds the muscle rotates, or its attachment moves, as seen from another bone."""
+    def _moves(
+        self, before: Mapping[str, Floats], after: Mapping[str, Floats], root: str, name: str
+    ) -> bool:
+        """Whether a bone that holds the muscle rotates, or its attachment moves, as seen from
+        another bone.
+        """
         old, new = (np.linalg.inv(poses[root]) @ poses[name] for poses in (before, after))
         if np.array_equal(old, new):
             return False

@@ -1,11 +1,13 @@
 """Neighbouring muscles that keep their distance and slide: virtual edges as half-spaces.
 
-After Cervenka et al. 2023, section 5.4.1: a point nearer to its neighbour than a threshold at rest stays near
-the neighbour's surface; within a strip it is free, so that it slides; beyond a release distance the link ends.
+After Cervenka et al. 2023, section 5.4.1: a point nearer to its neighbour than a threshold at rest
+stays near the neighbour's surface; within a strip it is free, so that it slides; beyond a release
+distance the link ends.
 
-All muscles predict first. Each then gets planes through its own points from its neighbours' extrapolated surfaces. Each
-of two muscles may use half of the gap between them, or moves back by half of the overlap, so the result does not depend
-on the order of the muscles or on the number of threads.
+All muscles predict first. Each then gets planes through its own points from its neighbours'
+extrapolated surfaces. Each of two muscles may use half of the gap between them, or moves back by
+half of the overlap, so the result does not depend on the order of the muscles or on the number of
+threads.
 """
 
 import math
@@ -28,8 +30,8 @@ Coordinates = dict[str, float]
 class Sliding:
     """Muscles, in their rest state, that exchange their surfaces in all sliding pairs of a scene.
 
-    ``pairs`` has, for each that met by the last drawings, the overlap, and the RMS gap opened where they touched at
-    rest. Raises SceneError if the scene's ``pairs`` name an unknown muscle.
+    ``pairs`` has, for each that met by the last drawings, the overlap, and the RMS gap opened where
+    they touched at rest. Raises SceneError if the scene's ``pairs`` name an unknown muscle.
     """
 
     def __init__(self, scene: Scene, steppers: list[MuscleStepper]) -> None:
@@ -70,16 +72,19 @@ class Sliding:
 
     def _link(self, stepper: MuscleStepper, other: MuscleStepper) -> None:
         """Link a muscle to a neighbour."""
-        link = SlidingPair(stepper, self.surfaces[stepper.name], self.surfaces[other.name], self.limits)
+        link = SlidingPair(
+            stepper, self.surfaces[stepper.name], self.surfaces[other.name], self.limits
+        )
         self.links[stepper.name].append(link)
         stepper.contacts.neighbours += [link.push, link.pull]
         stepper.contacts.beside.append(link)
 
     def go(self, stops: Sequence[Coordinates], activations: Sequence[Mapping[str, float]]) -> None:
-        """Solve all muscles at the coordinates of the sub-steps; the first of them are the present ones.
+        """Solve all muscles at the coordinates of the sub-steps; the first of them are the present
+        ones.
 
-        The muscle with the most sub-steps divides the frame. Another muscle takes several of these at a time, as many
-        as its own bones allow; in between its neighbours see its prediction.
+        The muscle with the most sub-steps divides the frame. Another muscle takes several of these
+        at a time, as many as its own bones allow; in between its neighbours see its prediction.
         """
         for link in (link for links in self.links.values() for link in links):
             link.begin_frame()
@@ -94,7 +99,9 @@ class Sliding:
             here.update((stepper.name, stop) for stepper in due)
         self._link_near()
 
-    def _step(self, due: list[MuscleStepper], paths: Mapping[str, tuple[Coordinates, Coordinates]]) -> None:
+    def _step(
+        self, due: list[MuscleStepper], paths: Mapping[str, tuple[Coordinates, Coordinates]]
+    ) -> None:
         """One sub-step of some muscles, each from its own last coordinates."""
 
         def predict(stepper: MuscleStepper) -> None:
@@ -122,12 +129,17 @@ class Sliding:
 
         each(predict, due)
         seen = {link.other.model.name for stepper in due for link in self.links[stepper.name]}
-        each(wait, [stepper for stepper in self.steppers if stepper.name in seen and stepper not in due])
+        each(
+            wait,
+            [stepper for stepper in self.steppers if stepper.name in seen and stepper not in due],
+        )
         for act in (find_planes, MuscleStepper.correct, learn):
             each(act, due)
 
     def refresh(self, stepper: MuscleStepper, *path: Coordinates) -> None:
-        """Update a muscle's surface from its present state, extrapolated for a path from coordinates to others."""
+        """Update a muscle's surface from its present state, extrapolated for a path from
+        coordinates to others.
+        """
         if stepper.name in self.surfaces:
             with stepper.timed("sliding"):
                 self.surfaces[stepper.name].refresh(*path)
@@ -135,7 +147,9 @@ class Sliding:
     def drawings(self) -> list[TimedDrawing]:
         """Drawings of all muscles in their present state; updates ``pairs``."""
         each(self.refresh, self.steppers)
-        solved = [stepper for stepper in self.steppers if stepper.solves and self.links[stepper.name]]
+        solved = [
+            stepper for stepper in self.steppers if stepper.solves and self.links[stepper.name]
+        ]
         each(self._make_room, solved)
         each(self.refresh, solved)
         met: dict[tuple[str, str], list[tuple[float, int, float]]] = {}
@@ -145,7 +159,9 @@ class Sliding:
                 met.setdefault((min(names), max(names)), []).append(one)
         self.pairs = {
             pair: (max(overlap), math.sqrt(sum(opened) / max(sum(touching), 1)))
-            for pair, (overlap, touching, opened) in ((pair, zip(*found)) for pair, found in met.items())
+            for pair, (overlap, touching, opened) in (
+                (pair, zip(*found)) for pair, found in met.items()
+            )
             if any(touching) or any(overlap)
         }
         drawings = [stepper.drawing() for stepper in self.steppers]
@@ -174,7 +190,9 @@ def _stride(stepper, stops):
 
 
 def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset[str]]:
-    """Pairs of muscles that slide: those named, or all, as far as their swept boxes come within ``reach``."""
+    """Pairs of muscles that slide: those named, or all, as far as their swept boxes come within
+    ``reach``.
+    """
     named = scene.sliding.pairs if scene.sliding else None
     for name in sorted({name for pair in named or [] for name in pair}):
         if name not in names:
@@ -188,12 +206,16 @@ def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset
         return swept_boxes(muscles[k], [bone], poses)[0]
 
     def meet(i, k):
-        """Whether the swept boxes meet in the coordinates of every bone that holds one of the two."""
+        """Whether the swept boxes meet in the coordinates of every bone that holds one of the
+        two.
+        """
         bones = {held.bone for muscle in (muscles[i], muscles[k]) for held in muscle.attachments}
         boxes = ((box(i, bone), box(k, bone)) for bone in bones)
         return all(np.all(a[0] - reach <= b[1]) and np.all(b[0] - reach <= a[1]) for a, b in boxes)
 
     pairs = [
-        (i, k, frozenset((muscles[i].name, muscles[k].name))) for i in range(len(muscles)) for k in range(i)
+        (i, k, frozenset((muscles[i].name, muscles[k].name)))
+        for i in range(len(muscles))
+        for k in range(i)
     ]
     return {pair for i, k, pair in pairs if (wanted is None or pair in wanted) and meet(i, k)}

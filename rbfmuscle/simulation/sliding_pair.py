@@ -1,4 +1,6 @@
-"""Contact of a muscle with one neighbour: linked points (virtual edges), and planes through them."""
+"""Contact of a muscle with one neighbour: linked points (virtual edges), and planes through
+them.
+"""
 
 from __future__ import annotations
 
@@ -17,25 +19,36 @@ if TYPE_CHECKING:
     from rbfmuscle.simulation.stepper import MuscleStepper
 
 
-# Distances [mm]. Points nearer than THRESHOLD (the default) at rest are linked. A linked point is free to STRIP beyond
-# its gap at rest, and is released RELEASE beyond that.
-THRESHOLD, STRIP, RELEASE = 2.0, 0.5, 15.0
-# At rest points this share of a mean edge farther are linked too: a patch where two muscles touch may lie between them.
+# Distances [mm]. Points nearer than THRESHOLD (the default) at rest are linked. A linked point is
+# free to STRIP beyond its gap at rest, and is released RELEASE beyond that.
+THRESHOLD = 2.0
+STRIP = 0.5
+RELEASE = 15.0
+# At rest points this share of a mean edge farther are linked too: a patch where two muscles touch
+# may lie between them.
 BETWEEN = 0.5
 # Neighbours are looked for within this distance [mm] of points that are not linked.
 SEARCH = 3.0
-# Drawn surfaces are moved CLEAR [mm] apart where they overlap by less than DEEP, neither by more than DRAWN.
-CLEAR, DEEP, DRAWN = 0.2, 6.0, 1.0
+# Drawn surfaces are moved CLEAR [mm] apart where they overlap by less than DEEP, neither by more
+# than DRAWN.
+CLEAR = 0.2
+DEEP = 6.0
+DRAWN = 1.0
 # What comes near in a frame is within this many mean edges more at its start.
 AHEAD = 3.0
-# How far planes between muscles yield to a pressure, relative to a bone's. One point in each cell of SPARSE mean edges
-# has a plane that holds muscles together, which yields less in proportion.
+# How far planes between muscles yield to a pressure, relative to a bone's. One point in each cell
+# of SPARSE mean edges has a plane that holds muscles together, which yields less in proportion.
 YIELDS, SPARSE = 40.0, 2.0
 MOST = 3.0  # how far a plane pushes out of a neighbour at most in one sub-step [mm]
 
 
 # The result for muscles far from each other.
-_FAR: Found = (np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=np.int64))
+_FAR: Found = (
+    np.zeros(0, dtype=np.int64),
+    np.zeros(0),
+    np.zeros((0, 3)),
+    np.zeros(0, dtype=np.int64),
+)
 
 
 class SlidingPair:
@@ -57,7 +70,9 @@ class SlidingPair:
         other: NeighbourSurface,
         limits: SlidingLimits,
     ) -> None:
-        self.own, self.other, self.limits = own, other, limits
+        self.own = own
+        self.other = other
+        self.limits = limits
         self.begin_frame()
         self.free = stepper.contacts.free(len(stepper.model.contact_points()))
         at = np.flatnonzero(self.free)
@@ -75,7 +90,9 @@ class SlidingPair:
         self.held = np.zeros(len(self.at), dtype=bool)
         self.held[_nearest_by_cell(places[self.at], apart, SPARSE * own.edge)] = True
         #: Which of them are linked, and how far each may be from the neighbour.
-        self.linked = apart < min(limits.threshold + min(BETWEEN * own.edge, limits.threshold), limits.reach)
+        self.linked = apart < min(
+            limits.threshold + min(BETWEEN * own.edge, limits.threshold), limits.reach
+        )
         self.hold = np.where(self.linked, np.maximum(apart, 0.0) + limits.strip, limits.hold)
         #: Those that touch the neighbour at rest, and how far they are from it there.
         self.touching = np.flatnonzero(apart < limits.threshold)
@@ -87,12 +104,16 @@ class SlidingPair:
         self.pull = Planes(YIELDS / area * self.held.sum() / max(1, len(self.at)))
 
     def begin_frame(self) -> None:
-        """Look for nearest vertices anew, of the neighbour to contact points and of the muscle to the neighbour's."""
+        """Look for nearest vertices anew, of the neighbour to contact points and of the muscle to
+        the neighbour's.
+        """
         self._from: Integers | None = None
         self._fixed_from: Integers | None = None
 
     def update(self, *, relink: bool = True) -> None:
-        """Recompute the planes from the surfaces as last refreshed, and, with ``relink``, which points are linked."""
+        """Recompute the planes from the surfaces as last refreshed, and, with ``relink``, which
+        points are linked.
+        """
         limits, points = self.limits, self.own.points
         if self.other.apart(self.own, limits.reach):
             self.linked &= not relink
@@ -107,7 +128,8 @@ class SlidingPair:
             self.linked[index[distance < limits.threshold]] = True
         share = np.where(self.other.fixed[nearest], 1.0, 0.5)
         own = self.at[index], np.maximum(share * distance, -limits.most), normal
-        # Planes that keep the muscle out: at its own points, and at attached points of the neighbour.
+        # Planes that keep the muscle out: at its own points, and at attached points of the
+        # neighbour.
         at, gap, out = (np.concatenate(parts) for parts in zip(own, self._pushed()))
         self.push.set(at, gap, out, points[at])
         held = self.linked[index] & self.held[index]
@@ -115,9 +137,11 @@ class SlidingPair:
         self.pull.set(at, slack, -normal[held], points[at])
 
     def _pushed(self) -> tuple[Integers, Floats, Floats]:
-        """Planes (index, gap, normal) by which the muscle yields to attached points of the neighbour inside it.
+        """Planes (index, gap, normal) by which the muscle yields to attached points of the
+        neighbour inside it.
 
-        Attached points take no contact, and the muscle's own points may be too sparse to meet a thin end.
+        Attached points take no contact, and the muscle's own points may be too sparse to meet a
+        thin end.
         """
         if self.own.apart(self.other, self.limits.search):
             return _FAR[:3]
@@ -152,8 +176,12 @@ class SlidingPair:
         return max(0.0, -self.least), len(opened), float((opened**2).sum())
 
     def excess(self, points: Floats) -> Floats:
-        """How far (n,) points (n, 3) of the drawn muscle are to move inwards: half of the way out of the neighbour."""
-        limits, found, shown = self.limits, np.zeros(len(points)), self.other.shown
+        """How far (n,) points (n, 3) of the drawn muscle are to move inwards: half of the way out
+        of the neighbour.
+        """
+        limits = self.limits
+        found = np.zeros(len(points))
+        shown = self.other.shown
         if self.least > limits.clear + self.own.edge:
             return found
         near = np.flatnonzero(shown.boxed(points, limits.clear))
@@ -162,10 +190,15 @@ class SlidingPair:
         return found
 
     def _near(self) -> Found:
-        """Of the points ``at`` those near the neighbour: linked ones up to their release distance, others less far."""
+        """Of the points ``at`` those near the neighbour: linked ones up to their release distance,
+        others less far.
+        """
         far = self.linked.copy()
         far[self.touching] = True
-        reach, points = np.where(far, self.limits.reach, self.limits.search), self.own.points[self.at]
+        reach, points = (
+            np.where(far, self.limits.reach, self.limits.search),
+            self.own.points[self.at],
+        )
         most = float(np.max(reach, initial=0.0))
         if self.other.apart(self.own, most):
             return _FAR
@@ -175,7 +208,8 @@ class SlidingPair:
 
 
 def _nearest_by_cell(points: Floats, distance: Floats, size: float) -> Integers:
-    """Sorted indices of the points (n, 3) that are nearest in their cell of a grid; all points for size 0.
+    """Sorted indices of the points (n, 3) that are nearest in their cell of a grid; all points for
+    size 0.
 
     Of points that are equally near, but for rounding, the first.
     """
@@ -189,7 +223,9 @@ class BoneLink:
     """Points near a bone at rest, linked to it; the bone's own contact keeps them out."""
 
     def __init__(self, stepper: MuscleStepper, bone_index: int, limits: SlidingLimits) -> None:
-        self.stepper, self.bone, self.limits = stepper, bone_index, limits
+        self.stepper = stepper
+        self.bone = bone_index
+        self.limits = limits
         points = stepper.model.contact_points()
         distance, _ = stepper.contacts.distance_and_direction(points, bone_index)
         self.linked = stepper.contacts.free(len(points)) & (distance < limits.threshold)
@@ -202,7 +238,9 @@ class BoneLink:
         distance, normal = self.stepper.contacts.distance_and_direction(points[index], self.bone)
         held = distance <= limits.hold + limits.release
         self.linked[index[~held]] = False
-        index, distance, normal = index[held], distance[held], normal[held]
+        index = index[held]
+        distance = distance[held]
+        normal = normal[held]
         self.pull.set(index, limits.hold - distance, -normal, points[index])
 
 
@@ -210,7 +248,9 @@ class SlidingLimits:
     """The distances of sliding in the scene's unit."""
 
     def __init__(self, options: SlidingOptions, scene: Scene) -> None:
-        self.threshold = scene.length(THRESHOLD) if options.threshold is None else float(options.threshold)
+        self.threshold = (
+            scene.length(THRESHOLD) if options.threshold is None else float(options.threshold)
+        )
         self.strip = scene.length(STRIP)
         self.hold = self.threshold + self.strip
         self.release = scene.length(RELEASE)

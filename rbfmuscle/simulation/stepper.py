@@ -20,10 +20,16 @@ from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import Drawing, Event, ModelSurface, MuscleModel
 from rbfmuscle.simulation.rigid_transport import MuscleStatus, RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
-from rbfmuscle.simulation.tunnelling import find_crossings, one_sided_planes, only_grazed, rotate_with_bone
+from rbfmuscle.simulation.tunnelling import (
+    find_crossings,
+    one_sided_planes,
+    only_grazed,
+    rotate_with_bone,
+)
 from rbfmuscle.validation import NotFiniteError, SolveError
 
-# Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's field.
+# Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's
+# field.
 TOUCH = 0.1
 # Rounds in which points that still cross at the smallest step are held by planes.
 FENCES = 4
@@ -64,15 +70,17 @@ class CarriedDrawing:
         """The earlier surface, moved."""
         then, motion = self.before.surface(), self.motion
         vertices = then.vertices @ motion[:3, :3].T + motion[:3, 3]
-        quantities = {name: 0.0 if name.startswith("time_") else v for name, v in then.quantities.items()}
+        quantities = {
+            name: 0.0 if name.startswith("time_") else v for name, v in then.quantities.items()
+        }
         return ModelSurface(vertices, then.faces, quantities, list(then.notes), (then, motion))
 
 
 class MuscleStepper:
     """Advances one model through sub-steps, against obstacles of its own.
 
-    ``cut`` gives sub-steps by the relative motion of the bones that the muscle meets; ``carrier`` moves the muscle
-    rigidly where it need not be solved, None where it is always solved.
+    ``cut`` gives sub-steps by the relative motion of the bones that the muscle meets; ``carrier``
+    moves the muscle rigidly where it need not be solved, None where it is always solved.
     """
 
     def __init__(
@@ -83,7 +91,10 @@ class MuscleStepper:
         *,
         poses: Callable[[Mapping[str, float]], Poses] | None = None,
     ) -> None:
-        self.model, self.contacts, self.scene, self.name = model, contacts, scene, model.name
+        self.model = model
+        self.contacts = contacts
+        self.scene = scene
+        self.name = model.name
         self.poses = poses or PoseCache(scene)
         self.detect = scene.detect.tunnelling if scene.detect is not None else None
         self.tolerance = scene.length(TOUCH)
@@ -97,7 +108,8 @@ class MuscleStepper:
         self._path: Any = None
         self._saved: Any = None
         self._shown: TimedDrawing | None = None
-        # Whether points crossed a bone in this frame or the last that no step resolved: halving is not tried again.
+        # Whether points crossed a bone in this frame or the last that no step resolved: halving is
+        # not tried again.
         self._unresolved = False
 
     @contextmanager
@@ -113,11 +125,15 @@ class MuscleStepper:
     def go(
         self, stops: list[dict[str, float]], activations: Sequence[Mapping[str, float]] = ()
     ) -> MuscleStepper:
-        """Advance through a list of coordinates, the present ones first; ``activations`` by muscle at each end."""
+        """Advance through a list of coordinates, the present ones first; ``activations`` by muscle
+        at each end.
+        """
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
             self.set_activation(activation or {})
             poses = self.poses(before), self.poses(after)
-            if self.carrier is None or not self.carrier.try_carry(self.model, self.contacts, *poses):
+            if self.carrier is None or not self.carrier.try_carry(
+                self.model, self.contacts, *poses
+            ):
                 self.step(before, after)
         return self
 
@@ -153,7 +169,9 @@ class MuscleStepper:
             self.carrier.solved = self.poses(after)
 
     def solve(self, coordinates: Mapping[str, float]) -> None:
-        """Solve; raise SolveError with muscle, mesh, frame and coordinates where that fails or is not finite."""
+        """Solve; raise SolveError with muscle, mesh, frame and coordinates where that fails or is
+        not finite.
+        """
         try:
             with self.timed("solve"):
                 self.model.solve(self.contacts)
@@ -164,8 +182,10 @@ class MuscleStepper:
         except (np.linalg.LinAlgError, FloatingPointError, NotFiniteError) as error:
             source = self.scene.muscle(self.name).source
             raise SolveError(
-                f"{self._place(coordinates)}: {error}; look for spikes and thin triangles in its mesh"
-                f"{f' ({source})' if source else ''} and remesh it, or try a smaller substep_angle in [contact]"
+                f"{self._place(coordinates)}: {error}; look for spikes and thin triangles in "
+                "its mesh"
+                f"{f' ({source})' if source else ''} and remesh it, or try a smaller "
+                "substep_angle in [contact]"
             ) from error
 
     def drawing(self) -> TimedDrawing:
@@ -180,7 +200,9 @@ class MuscleStepper:
         return shown
 
     def report(self, bone: str, count: int, action: str) -> None:
-        """Record an event of the present frame; of one kind the greatest number of points is kept."""
+        """Record an event of the present frame; of one kind the greatest number of points is
+        kept.
+        """
         key = (self.frame, bone, action)
         self.events[key] = max(count, self.events.get(key, 0))
 
@@ -189,10 +211,18 @@ class MuscleStepper:
         times, solves = self.times, self.solves
         times["time_frame"] = sum(times.values())
         self._unresolved = any(action == "unresolved" for _, _, action in self.events)
-        events = [Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()]
+        events = [
+            Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()
+        ]
         moved = self.carrier is not None and self.carrier.collect()
-        self.times, self.events, self.solves = {}, {}, 0
-        return times, events, MuscleStatus("solved" if solves else "carried" if moved else "skipped", solves)
+        self.times = {}
+        self.events = {}
+        self.solves = 0
+        return (
+            times,
+            events,
+            MuscleStatus("solved" if solves else "carried" if moved else "skipped", solves),
+        )
 
     def _predict(self, poses):
         self.contacts.move(poses[1])
@@ -202,14 +232,18 @@ class MuscleStepper:
     def _crossings(self, start, poses, *, flag=True):
         with self.timed("tunnelling"):
             end = self.model.contact_points()
-            found = find_crossings(self.contacts, start, end, *poses, self.detect, tolerance=self.tolerance)
+            found = find_crossings(
+                self.contacts, start, end, *poses, self.detect, tolerance=self.tolerance
+            )
         for crossing in found:
             if flag and crossing.flagged:
                 self.report(self.contacts.names[crossing.bone], crossing.flagged, "angle_flag")
         return [crossing for crossing in found if len(crossing.index)]
 
     def _correct(self, state, start, poses, before, after, crossings):
-        """Rotate points that crossed with the bone and solve again; then halve the step, down to the smallest."""
+        """Rotate points that crossed with the bone and solve again; then halve the step, down to
+        the smallest.
+        """
         if self.detect.action == "report":
             self._report_all(crossings, "reported")
             return
@@ -226,7 +260,9 @@ class MuscleStepper:
             for crossing in self._held_back(state, start, poses, after, remaining):
                 name = self.contacts.names[crossing.bone]
                 paths, ends = (start, self.model.contact_points()), (poses[0][name], poses[1][name])
-                touched = only_grazed(crossing, self.scene.bone(name).mesh, paths, *ends, self.tolerance)
+                touched = only_grazed(
+                    crossing, self.scene.bone(name).mesh, paths, *ends, self.tolerance
+                )
                 self.report(name, len(crossing.index), "grazed" if touched else "unresolved")
                 self._unresolved |= not touched
             return
@@ -237,12 +273,17 @@ class MuscleStepper:
         self.step(middle, after)
 
     def _held_back(self, state, start, poses, after, crossings):
-        """Solve with crossing points held on their side by planes; return what crosses all the same."""
+        """Solve with crossing points held on their side by planes; return what crosses all the
+        same.
+        """
         neighbours = self.contacts.neighbours
         fenced = [*neighbours]
         try:
             for _ in range(FENCES):
-                fenced += [one_sided_planes(self.contacts, crossing, start, *poses) for crossing in crossings]
+                fenced += [
+                    one_sided_planes(self.contacts, crossing, start, *poses)
+                    for crossing in crossings
+                ]
                 self.contacts.neighbours = fenced
                 self.model.restore(state)
                 self._predict(poses)
@@ -262,7 +303,8 @@ class MuscleStepper:
     def _place(self, coordinates):
         scene = self.scene
         where = ", ".join(
-            f"{name} = {shown_value(scene, name, value):.6g}{unit_sign(scene, name).replace('°', ' deg')}"
+            f"{name} = "
+            f"{shown_value(scene, name, value):.6g}{unit_sign(scene, name).replace('°', ' deg')}"
             for name, value in coordinates.items()
         )
         return f"muscle {self.name!r}, frame {self.frame} ({where or 'rest'})"

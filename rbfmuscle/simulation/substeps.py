@@ -24,7 +24,8 @@ from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError
 
 Coordinates: TypeAlias = dict[str, float]
-# No attached point moves farther against a bone in one sub-step than this share of its muscle's diameter.
+# No attached point moves farther against a bone in one sub-step than this share of its muscle's
+# diameter.
 TRAVEL = 1.0 / 27.0
 # Sub-steps that one coordinate may take in a motion.
 MOST_SUBSTEPS = 100_000
@@ -35,10 +36,11 @@ PIECES = 8
 class SubSteps:
     """How a scene's motion is cut into sub-steps.
 
-    No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far against a bone.
-    Where one coordinate moves alone, sub-steps end at multiples of that angle, however the frames are spaced: a
-    muscle that can settle in several ways then comes to a pose by the same path. For one ``muscle`` only its own
-    bones and the others that it can meet, ``bones``, count.
+    No bone turns by more than the scene's ``substep_angle`` in one, and no attached point moves far
+    against a bone. Where one coordinate moves alone, sub-steps end at multiples of that angle,
+    however the frames are spaced: a muscle that can settle in several ways then comes to a pose by
+    the same path. For one ``muscle`` only its own bones and the others that it can meet, ``bones``,
+    count.
     """
 
     def __init__(
@@ -54,10 +56,14 @@ class SubSteps:
         attachments = [(part, attachment) for part in muscles for attachment in part.attachments]
         own = [attachment.holder for _, attachment in attachments]
         self._facts = all_coordinates(scene.joints)
-        #: The bones that count, and the coordinates that move them against each other. A muscle's are seen from the
+        #: The bones that count, and the coordinates that move them against each other. A muscle's
+        #: are seen from the
         #: first that holds it, a whole scene's from the world.
         if muscle is None:
-            self._root, self.bones = None, [*dict.fromkeys([*own, *(bone.name for bone in scene.bones)])]
+            self._root, self.bones = (
+                None,
+                [*dict.fromkeys([*own, *(bone.name for bone in scene.bones)])],
+            )
             self.relevant = set(self._facts)
         else:
             self._root, self.bones = own[0], [*dict.fromkeys([*own, *bones])]
@@ -66,13 +72,17 @@ class SubSteps:
         self.limit = math.radians(scene.contact.substep_angle)
         # Of each attachment: its bone, a box about it, and how far that may move in one sub-step.
         frames = {part.name: RestFrame(np.asarray(part.mesh.vertices)) for part in muscles}
-        corners = [frames[part.name].corners(attachment.vertices) for part, attachment in attachments]
+        corners = [
+            frames[part.name].corners(attachment.vertices) for part, attachment in attachments
+        ]
         sizes = [diameter(np.asarray(part.mesh.vertices)) for part, _ in attachments]
         self._owner = np.array([self.bones.index(name) for name in own], dtype=int)
         self._travel, self._corners = TRAVEL * np.array(sizes), np.array(corners).reshape(-1, 8, 3)
 
     def split(self, before: Coordinates, after: Coordinates) -> list[Coordinates]:
-        """Coordinates of the sub-steps to the next frame, ``before`` left out; empty where nothing moves."""
+        """Coordinates of the sub-steps to the next frame, ``before`` left out; empty where nothing
+        moves.
+        """
         before, after = completed(self.scene, before), completed(self.scene, after)
         moving = [k for k in {*before, *after} if before.get(k, 0.0) != after.get(k, 0.0)]
         if not moving:
@@ -92,7 +102,8 @@ class SubSteps:
         while True:
             if count > MOST_SUBSTEPS:
                 raise SceneError(
-                    f"[motion]: one frame takes more than {MOST_SUBSTEPS} sub-steps; make its step or "
+                    f"[motion]: one frame takes more than {MOST_SUBSTEPS} sub-steps; make its "
+                    "step or "
                     "the angles smaller"
                 )
             stops = [interpolate(before, after, k / count) for k in range(count + 1)]
@@ -103,7 +114,9 @@ class SubSteps:
             count = max(count + 1, math.ceil(count * min(excess, 4.0)))
 
     def estimate(self, name: str, changes: Floats) -> float:
-        """About how many sub-steps some changes of one coordinate take, from a small probe at rest; may be infinite."""
+        """About how many sub-steps some changes of one coordinate take, from a small probe at rest;
+        may be infinite.
+        """
         turns = self._facts[name].motion == "rotation"
         probe = self.limit if turns else self.scene.length(1.0)
         rest = rest_coordinates(self.scene)
@@ -133,7 +146,8 @@ class SubSteps:
                 inner.append(value)
         ordered = inner if end > start else inner[::-1]
         return [
-            {**interpolate(before, after, (value - start) / (end - start)), name: value} for value in ordered
+            {**interpolate(before, after, (value - start) / (end - start)), name: value}
+            for value in ordered
         ]
 
     def _matrices(self, coordinates):
@@ -142,14 +156,20 @@ class SubSteps:
         return found if self._root is None else np.linalg.inv(poses[self._root]) @ found
 
     def _excess(self, old, new):
-        """How far a step between poses (b, 4, 4) goes beyond what one sub-step may do: 1 is just allowed."""
+        """How far a step between poses (b, 4, 4) goes beyond what one sub-step may do: 1 is just
+        allowed.
+        """
         turns = new[:, :3, :3] @ old[:, :3, :3].transpose(0, 2, 1)
         excess = float(turned_angle(turns).max()) / self.limit
         # How the bones that carry the corners move, seen from every bone.
         change = (
-            np.linalg.inv(new)[:, None] @ new[self._owner] - np.linalg.inv(old)[:, None] @ old[self._owner]
+            np.linalg.inv(new)[:, None] @ new[self._owner]
+            - np.linalg.inv(old)[:, None] @ old[self._owner]
         )
-        moved = np.einsum("bkij,kcj->bkci", change[..., :3, :3], self._corners) + change[..., None, :3, 3]
+        moved = (
+            np.einsum("bkij,kcj->bkci", change[..., :3, :3], self._corners)
+            + change[..., None, :3, 3]
+        )
         length = np.sqrt((moved**2).sum(axis=-1)).max(axis=(0, 2))
         return max(excess, float((length / self._travel).max(initial=0.0)))
 
@@ -180,7 +200,9 @@ class PoseCache:
 
 
 def _moving_apart(scene: Scene, bones: Sequence[str]) -> set[str]:
-    """Coordinates that move some of these bones against others: those of the joints not common to all their chains."""
+    """Coordinates that move some of these bones against others: those of the joints not common to
+    all their chains.
+    """
     joint_of = {joint.child: joint for joint in scene.joints}
     chains: list[set[str]] = []
     for bone in bones:
@@ -199,15 +221,21 @@ def _moving_apart(scene: Scene, bones: Sequence[str]) -> set[str]:
 
 
 def check_substeps(scene: Scene) -> None:
-    """Raise SceneError for a motion of more than `MOST_SUBSTEPS`, before anything grows with their number."""
-    cut, frames, rest = SubSteps(scene), scene.motion.frames, rest_coordinates(scene)
+    """Raise SceneError for a motion of more than `MOST_SUBSTEPS`, before anything grows with their
+    number.
+    """
+    cut = SubSteps(scene)
+    frames = scene.motion.frames
+    rest = rest_coordinates(scene)
     for name in sorted({name for frame in frames for name in frame}):
         start = rest.get(name, 0.0)
         count = cut.estimate(name, np.diff([start, *(frame.get(name, start) for frame in frames)]))
         if count > MOST_SUBSTEPS:
             raise SceneError(
-                f"[motion]: {name!r} takes about {count:.3g} sub-steps, more than {MOST_SUBSTEPS} (its path is "
-                f"long, contact.substep_angle = {scene.contact.substep_angle:g} is small, or muscles lie far from "
+                f"[motion]: {name!r} takes about {count:.3g} sub-steps, more than {MOST_SUBSTEPS} "
+                "(its path is "
+                f"long, contact.substep_angle = {scene.contact.substep_angle:g} is small, or "
+                "muscles lie far from "
                 "the joint's centre); correct these"
             )
 
@@ -215,12 +243,17 @@ def check_substeps(scene: Scene) -> None:
 def path_angle(scene: Scene, before: Coordinates, after: Coordinates) -> float:
     """How far the bones turn from one set of coordinates to another [radian].
 
-    Angles count as they are given; where other coordinates move too, the path is followed in a few pieces.
+    Angles count as they are given; where other coordinates move too, the path is followed in a few
+    pieces.
     """
     facts = all_coordinates(scene.joints)
     changes = {k: abs(after.get(k, 0.0) - before.get(k, 0.0)) for k in {*before, *after}}
-    angle = max((change for k, change in changes.items() if facts[k].motion == "rotation"), default=0.0)
+    angle = max(
+        (change for k, change in changes.items() if facts[k].motion == "rotation"), default=0.0
+    )
     if not any(change for k, change in changes.items() if facts[k].motion != "rotation"):
         return angle
     stops = [interpolate(before, after, k / PIECES) for k in range(PIECES + 1)]
-    return max(angle, sum(step_angle(scene, a, b, shifts=False) for a, b in itertools.pairwise(stops)))
+    return max(
+        angle, sum(step_angle(scene, a, b, shifts=False) for a, b in itertools.pairwise(stops))
+    )

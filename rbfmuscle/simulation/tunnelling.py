@@ -1,9 +1,11 @@
-"""Points that pass through a bone within one sub-step: the angle test, the swept test, the correction.
+"""Points that pass through a bone within one sub-step: the angle test, the swept test, the
+correction.
 
-Both tests look at a point's path relative to the bone, that is in bone coordinates. The angle test compares
-the directions to the bone at the two ends (Cervenka et al. 2023, equation 1, with the bound on d . d' stated
-as the text means it: below cos 135 degrees); it misses most short crossings. The swept test follows the path
-by sphere tracing (Hart 1996) in the bone's distance field and cannot miss what is thicker than its tolerance.
+Both tests look at a point's path relative to the bone, that is in bone coordinates. The angle test
+compares the directions to the bone at the two ends (Cervenka et al. 2023, equation 1, with the
+bound on d . d' stated as the text means it: below cos 135 degrees); it misses most short crossings.
+The swept test follows the path by sphere tracing (Hart 1996) in the bone's distance field and
+cannot miss what is thicker than its tolerance.
 """
 
 import math
@@ -24,13 +26,15 @@ from rbfmuscle.simulation.frame import MuscleModel
 RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
 # The field's interpolation may change a little faster than the distance does.
 STEP_SHARE = 0.9
-# A path that leaves a bone facing within 90 degrees of where it went in has slid along, not passed through.
+# A path that leaves a bone facing within 90 degrees of where it went in has slid along, not passed
+# through.
 SLIDING_COSINE = 0.0
 # Halvings of a path to show that it stays outside, before it is traced.
 HALVINGS = 5
 # Greatest number of steps in tracing a path.
 MAX_ROUNDS = 10_000
-# Spacing, relative to the tolerance, of positions on a path that are compared with a bone's triangles.
+# Spacing, relative to the tolerance, of positions on a path that are compared with a bone's
+# triangles.
 GRAZE_STRIDE = 0.2
 
 
@@ -40,8 +44,12 @@ class Sweep:
 
     index: np.ndarray  # (c,) points whose paths may have touched the bone
     lowest: np.ndarray  # (c,) smallest distance along the path [scene unit], negative inside
-    through: np.ndarray  # (c,) entered deeper than the tolerance, and left (or ended) in another direction
-    flagged: np.ndarray  # (c,) directions at the two ends differ by more than the angle test's bound
+    through: (
+        np.ndarray
+    )  # (c,) entered deeper than the tolerance, and left (or ended) in another direction
+    flagged: (
+        np.ndarray
+    )  # (c,) directions at the two ends differ by more than the angle test's bound
 
 
 @dataclass(frozen=True)
@@ -54,12 +62,17 @@ class Crossing:
 
 
 def sweep_paths(
-    field: BoneSDF, start: Floats, end: Floats, *, tolerance: float, angle: float = RIGHT_ANGLE_AND_HALF
+    field: BoneSDF,
+    start: Floats,
+    end: Floats,
+    *,
+    tolerance: float,
+    angle: float = RIGHT_ANGLE_AND_HALF,
 ) -> Sweep:
     """Follow straight paths (n, 3) in bone coordinates through a bone's distance field.
 
-    No depth below ``tolerance``, the field's own error [scene unit], counts; ``angle`` bounds the angle test
-    [radian].
+    No depth below ``tolerance``, the field's own error [scene unit], counts; ``angle`` bounds the
+    angle test [radian].
     """
     length = np.linalg.norm(end - start, axis=1)
     distance = field.distance(start, reach=float(length.max(initial=0.0)))
@@ -96,9 +109,11 @@ def find_crossings(
     *,
     tolerance: float,
 ) -> list[Crossing]:
-    """Bones that points (n, 3) crossed, or that the angle test flags, while the bones went between two poses.
+    """Bones that points (n, 3) crossed, or that the angle test flags, while the bones went between
+    two poses.
 
-    Points are in world coordinates, the contacts in the poses ``after``, the tolerance in the scene's unit.
+    Points are in world coordinates, the contacts in the poses ``after``, the tolerance in the
+    scene's unit.
     """
     crossings = []
     # A path that is shorter than the distance of its end touches nothing.
@@ -107,7 +122,11 @@ def find_crossings(
         name = contacts.names[b]
         first, second = _local(start[index], before[name]), _local(end[index], after[name])
         sweep = sweep_paths(
-            contacts.fields[b], first, second, tolerance=tolerance, angle=math.radians(options.angle)
+            contacts.fields[b],
+            first,
+            second,
+            tolerance=tolerance,
+            angle=math.radians(options.angle),
         )
         crossed = sweep.through if options.swept else sweep.flagged
         if crossed.any() or sweep.flagged.any():
@@ -123,9 +142,11 @@ def rotate_with_bone(
     after: dict[str, Floats],
     names: list[str],
 ) -> None:
-    """Move points that crossed back to where they were relative to the bone: rotated with it about its joint.
+    """Move points that crossed back to where they were relative to the bone: rotated with it about
+    its joint.
 
-    The model has predicted already; it gets the rigid transform from the predicted to the corrected positions.
+    The model has predicted already; it gets the rigid transform from the predicted to the corrected
+    positions.
     """
     for crossing in crossings:
         motion = after[names[crossing.bone]] @ np.linalg.inv(before[names[crossing.bone]])
@@ -144,7 +165,8 @@ def one_sided_planes(
 ) -> Planes:
     """A half-space for each point that crossed, to hold it on its side of the bone.
 
-    The plane lies between the point and the bone, normal to the distance's gradient, and moves with the bone.
+    The plane lies between the point and the bone, normal to the distance's gradient, and moves with
+    the bone.
     """
     name = contacts.names[crossing.bone]
     motion, points = after[name] @ np.linalg.inv(before[name]), start[crossing.index]
@@ -164,10 +186,11 @@ def only_grazed(
     after: Floats,
     tolerance: float,
 ) -> bool:
-    """Whether, by the exact distance to the bone's triangles, no path was deeper than ``tolerance`` [scene unit].
+    """Whether, by the exact distance to the bone's triangles, no path was deeper than ``tolerance``
+    [scene unit].
 
-    Paths hold contact points (n, 3) before and after the step in world coordinates, ``before`` and ``after`` the
-    bone's poses (4, 4).
+    Paths hold contact points (n, 3) before and after the step in world coordinates, ``before`` and
+    ``after`` the bone's poses (4, 4).
     """
     exact = ExactDistance(mesh.vertices, mesh.faces)
     if (exact.across < 0).any():  # not closed
@@ -188,17 +211,26 @@ def only_grazed(
 
 
 def _halve(field, start, end, distance, last, tolerance):
-    """Smallest distance found along each path by halving it; -infinity where that does not show it clear.
+    """Smallest distance found along each path by halving it; -infinity where that does not show it
+    clear.
 
-    Between two places s apart, at distances d and d' from the bone, nothing is deeper than (s - d - d') / 2.
+    Between two places s apart, at distances d and d' from the bone, nothing is deeper than (s - d -
+    d') / 2.
     """
     length = np.linalg.norm(end - start, axis=1) / STEP_SHARE
     lowest = np.minimum(distance, last)
     # Pieces: which path, where they begin (fraction), the distances at their ends.
-    path, at, near, far, size = np.arange(len(start)), np.zeros(len(start)), distance, last, 1.0
+    path = np.arange(len(start))
+    at = np.zeros(len(start))
+    near = distance
+    far = last
+    size = 1.0
     for halvings in range(HALVINGS + 1):
         left = near + far - size * length[path] < -2.0 * tolerance
-        path, at, near, far = path[left], at[left], near[left], far[left]
+        path = path[left]
+        at = at[left]
+        near = near[left]
+        far = far[left]
         if len(path) == 0 or halvings == HALVINGS:
             break
         size *= 0.5
@@ -208,16 +240,21 @@ def _halve(field, start, end, distance, last, tolerance):
         path, at = np.concatenate([path, path]), np.concatenate([at, middle])
         near, far = np.concatenate([near, between]), np.concatenate([between, far])
         clear = lowest[path] >= -tolerance
-        path, at, near, far = path[clear], at[clear], near[clear], far[clear]
+        path = path[clear]
+        at = at[clear]
+        near = near[clear]
+        far = far[clear]
     lowest[path] = -np.inf
     lowest[lowest < -tolerance] = -np.inf
     return lowest
 
 
 def _trace(field, start, end, tolerance):
-    """Smallest distance along each path, and the places (fraction) right before it first went in and after it came out.
+    """Smallest distance along each path, and the places (fraction) right before it first went in
+    and after it came out.
 
-    Directions are compared outside the bone: near the medial surface of a crest they may be either side's.
+    Directions are compared outside the bone: near the medial surface of a crest they may be either
+    side's.
     """
     length = np.linalg.norm(end - start, axis=1)
     lowest = np.full(len(start), np.inf)
@@ -226,7 +263,9 @@ def _trace(field, start, end, tolerance):
     under_way = np.arange(len(start))
     for _ in range(MAX_ROUNDS):
         t = at[under_way]
-        distance = field.distance(start[under_way] + t[:, None] * (end[under_way] - start[under_way]))
+        distance = field.distance(
+            start[under_way] + t[:, None] * (end[under_way] - start[under_way])
+        )
         lowest[under_way] = np.minimum(lowest[under_way], distance)
         inside = distance < 0.0
         first = under_way[inside & ~entered[under_way]]
@@ -235,8 +274,9 @@ def _trace(field, start, end, tolerance):
         crossed = under_way[inside | within[under_way]]
         leave[crossed] = at[crossed]
         within[under_way], before[under_way] = inside, t
-        # Between two places outside, d and d' from the bone and s apart, no place is deeper than (s - d - d') / 2:
-        # with s = d + tolerance that is less than the tolerance where the second place is not itself that deep.
+        # Between two places outside, d and d' from the bone and s apart, no place is deeper than (s
+        # - d - d') / 2: with s = d + tolerance that is less than the tolerance where the second
+        # place is not itself that deep.
         outside = STEP_SHARE * distance + 0.9 * tolerance
         stride = np.where(inside, np.maximum(-0.5 * distance, 0.5 * tolerance), outside)
         at[under_way] = np.minimum(t + stride / np.maximum(length[under_way], 1e-300), 1.0)

@@ -22,8 +22,11 @@ from rbfmuscle.viewer.sources import LiveSource, SavedSource
 if TYPE_CHECKING:
     from viser import ViserServer
 
-COSTLY = 0.1  # Where a picture takes longer [s], those on the way to the controls' places are drawn coarse.
-READ = 1.0  # Time in which a browser has read a coloured mesh [s]; the one before it is removed then.
+# Where a picture takes longer [s], those on the way to the controls' places are drawn coarse.
+COSTLY = 0.1
+READ = (
+    1.0  # Time in which a browser has read a coloured mesh [s]; the one before it is removed then.
+)
 PACE = 0.04  # Least time of a picture while a motion is played [s].
 FIELD_OF_VIEW = 0.5
 FIRST = (-1.4, 1.6, 0.5)  # Where the camera stands at first, along the body's axes.
@@ -41,7 +44,8 @@ def show(shown: Scene | SavedRun, *, model: str | None = None) -> "Page":
     Returns
     -------
     Page
-        Shown by a notebook as the last value of a cell; elsewhere open its ``address``. ``close()`` ends it.
+        Shown by a notebook as the last value of a cell; elsewhere open its ``address``. ``close()``
+        ends it.
 
     Examples
     --------
@@ -51,31 +55,46 @@ def show(shown: Scene | SavedRun, *, model: str | None = None) -> "Page":
     True
     >>> page.close()
     """
-    return Page(SavedSource({"run": shown}) if isinstance(shown, SavedRun) else LiveSource(shown, model))
+    return Page(
+        SavedSource({"run": shown}) if isinstance(shown, SavedRun) else LiveSource(shown, model)
+    )
 
 
 class Page:
     """A scene or saved runs in a browser; a notebook shows it where it is the value of a cell.
 
-    ``at`` are controls that begin elsewhere than at rest, ``colour`` is of `COLOURINGS`, ``served`` is what
-    `open_server` returned, called where not given. A browser opens the ``address``, which holds a secret token.
+    ``at`` are controls that begin elsewhere than at rest, ``colour`` is of `COLOURINGS`, ``served``
+    is what `open_server` returned, called where not given. A browser opens the ``address``, which
+    holds a secret token.
     """
 
     def __init__(
-        self, source: LiveSource | SavedSource, *, at: dict[str, float] | None = None,
-        colour: str = "group", served: "tuple[ViserServer, str] | None" = None,
-    ) -> None:  # fmt: skip
+        self,
+        source: LiveSource | SavedSource,
+        *,
+        at: dict[str, float] | None = None,
+        colour: str = "group",
+        served: "tuple[ViserServer, str] | None" = None,
+    ) -> None:
         import trimesh
 
         self.source, (self.server, self.address) = source, served or open_server()
-        self._probes = [BoneProbe(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()]
-        self._wake, self._closed, self._resting = threading.Event(), False, False
-        self._cost, self._message, self._place = 0.0, "Building the models …", 0
+        self._probes = [
+            BoneProbe(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()
+        ]
+        self._wake = threading.Event()
+        self._closed = False
+        self._resting = False
+        self._cost = 0.0
+        self._message = "Building the models …"
+        self._place = 0
         self._shown: Look | None = None
         self.sides = [Side(self.server, f"/{name}", source) for name in ("first", "second")]
         self.panel = Panel(self.server, source, at or {}, colour, self._touch)
         self.panel.rest.on_click(lambda _: self._touch(rest=True))
-        self.panel.view.on_click(lambda e: self._aim(VIEWS[e.target.value.lower()], e.client.camera))
+        self.panel.view.on_click(
+            lambda e: self._aim(VIEWS[e.target.value.lower()], e.client.camera)
+        )
         self.server.scene.set_up_direction(source.body[2])
         self.sides[0].picture = self.sides[0].rest = source.rest
         self._aim(FIRST, self.server.initial_camera)
@@ -114,7 +133,10 @@ class Page:
         apart = 1.1 * max(wide, 0.7 * tall) * right
         self.sides[1].frame.position = apart
         middle = middle + both * apart / 2
-        away = 0.55 * max(tall, wide + both * np.linalg.norm(apart)) / math.tan(FIELD_OF_VIEW / 2) + deep / 2
+        away = (
+            0.55 * max(tall, wide + both * np.linalg.norm(apart)) / math.tan(FIELD_OF_VIEW / 2)
+            + deep / 2
+        )
         pole = self.source.body[2] if abs(ahead @ self.source.body[2]) < 0.99 else up
         with self.server.atomic():
             setattr(camera, "up_direction" if hasattr(camera, "up_direction") else "up", pole)
@@ -140,7 +162,9 @@ class Page:
                 self._write()
             self.server.flush()
             if more:
-                time.sleep(max(0.0, PACE - (time.perf_counter() - start)) if self.panel.play.value else 0.0)
+                time.sleep(
+                    max(0.0, PACE - (time.perf_counter() - start)) if self.panel.play.value else 0.0
+                )
                 self._wake.set()
 
     def _turn(self) -> bool:
@@ -183,7 +207,9 @@ class Page:
 
     def _rest(self, message: str) -> bool:
         """Set controls and models to rest; returns that no picture has to follow by itself."""
-        self._resting, self._message, self.panel.play.value = False, message, False
+        self._resting = False
+        self._message = message
+        self.panel.play.value = False
         self.panel.move_to({name: control.value for name, control in self.source.controls.items()})
         for side in self.sides:
             if side.figure is not None:

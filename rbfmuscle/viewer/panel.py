@@ -1,4 +1,6 @@
-"""The controls of the page, of viser's own elements; values are read from these when they are needed."""
+"""The controls of the page, of viser's own elements; values are read from these when they are
+needed.
+"""
 
 import math
 from collections.abc import Callable
@@ -15,13 +17,21 @@ HISTORY, LINES = 200, 8  # Pictures and lines in a plot.
 
 
 class Panel:
-    """Sliders by joint, play bar, choices, numbers and plot; ``touch`` is called whenever something was changed."""
+    """Sliders by joint, play bar, choices, numbers and plot; ``touch`` is called whenever something
+    was changed.
+    """
 
     def __init__(
-        self, server: Any, source: LiveSource | SavedSource, at: dict[str, float], colour: str,
+        self,
+        server: Any,
+        source: LiveSource | SavedSource,
+        at: dict[str, float],
+        colour: str,
         touch: Callable[[], None],
-    ) -> None:  # fmt: skip
-        self.gui, self.source, self._touch = server.gui, source, touch
+    ) -> None:
+        self.gui = server.gui
+        self.source = source
+        self._touch = touch
         self.gui.configure_theme(show_logo=False, show_share_button=False)
         self.gui.main_panel.dock_right()
         self.gui.main_panel.set_width(WIDTH)
@@ -43,7 +53,9 @@ class Panel:
 
     def _add_controls(self, at: dict[str, float]) -> None:
         last, folders = len(self.source.motion) - 1, {}
-        self.frame = self._watch(self.gui.add_slider("Frame", 0, max(last, 1), 1, 0, visible=last > 0))
+        self.frame = self._watch(
+            self.gui.add_slider("Frame", 0, max(last, 1), 1, 0, visible=last > 0)
+        )
         self.play = self._watch(self.gui.add_checkbox("Play", False))
         self.rest, self.controls = self.gui.add_button("Rest"), {}
         for name, (group, label, *limits, value) in self.source.controls.items():
@@ -61,7 +73,9 @@ class Panel:
         gui, choices = self.gui, self.source.choices
         places = {"Model": choices, "Beside it": ("none", *choices)}
         self.models = [self._watch(gui.add_dropdown(*place)) for place in places.items()]
-        self.colour = self._watch(gui.add_dropdown("Colour", tuple(COLOURINGS), initial_value=colour))
+        self.colour = self._watch(
+            gui.add_dropdown("Colour", tuple(COLOURINGS), initial_value=colour)
+        )
         self.view = gui.add_button_group("View", [view.capitalize() for view in VIEWS])
         self.cut = self._watch(gui.add_dropdown("Cut along", ("none", "x", "y", "z")))
         self.place = self._watch(gui.add_slider("Cut at", 0.0, 1.0, 0.01, 0.5))
@@ -75,7 +89,9 @@ class Panel:
         cut = None
         if self.cut.value != "none":
             axis = "xyz".index(self.cut.value)
-            points = np.concatenate([vertices[:, axis] for vertices, _ in self.source.muscles.values()])
+            points = np.concatenate(
+                [vertices[:, axis] for vertices, _ in self.source.muscles.values()]
+            )
             cut = axis, float(points.min() + self.place.value * np.ptp(points))
         hidden = frozenset(name for name, eye in self.eyes.items() if not eye.value)
         others = *(model.value for model in self.models), self.quantity.value
@@ -96,11 +112,14 @@ class Panel:
             cells = [f"<span style='color:{colour}'>■</span> {name.replace('_', ' ')}"]
             for key, digits in (("volume", 3), ("depth", 2)):
                 # 0.0 is added so that no -0 is shown.
-                numbers = (f"{round(side.numbers[name][key], digits) + 0.0:.{digits}f}" for side in sides)
+                numbers = (
+                    f"{round(side.numbers[name][key], digits) + 0.0:.{digits}f}" for side in sides
+                )
                 cells.append(" / ".join(numbers).replace("nan", "–"))
             rows.append(f"<tr><td style='text-align:left'>{'</td><td>'.join(cells)}</td></tr>")
         self._numbers.content = (
-            f"<div style='padding:4px 12px;font-size:12px'>{bar}<div style='max-height:170px;overflow:auto'>"
+            f"<div style='padding:4px 12px;font-size:12px'>{bar}<div "
+            "style='max-height:170px;overflow:auto'>"
             "<table style='width:100%;text-align:right;line-height:1.25'>"
             f"{''.join(rows)}</table></div>{'<br>'.join(text for text in texts if text)}</div>"
         )
@@ -110,7 +129,9 @@ class Panel:
         from viser import uplot
 
         key = self.quantity.value.partition(" ")[0]
-        shown = [(s, name) for s in sides for name in self.source.colours if self.eyes[name].value][:LINES]
+        shown = [(s, name) for s in sides for name in self.source.colours if self.eyes[name].value][
+            :LINES
+        ]
         row = [side.numbers[name][key] for side, name in shown if key != "none"]
         if not row or not np.isfinite(row).all():
             return
@@ -128,6 +149,10 @@ class Panel:
         for side, name in shown:
             dash = [] if side is sides[0] else [6, 4]
             label = f"{name} {side.choice}" if len(sides) > 1 else name
-            series.append(uplot.Series(label=label, stroke=self.source.colours[name], width=2, dash=dash))
+            series.append(
+                uplot.Series(label=label, stroke=self.source.colours[name], width=2, dash=dash)
+            )
         with self._tab:
-            self._plot = self.gui.add_uplot(data, tuple(series), height=260, scales={"x": {"time": False}})
+            self._plot = self.gui.add_uplot(
+                data, tuple(series), height=260, scales={"x": {"time": False}}
+            )

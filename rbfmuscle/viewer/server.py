@@ -1,4 +1,6 @@
-"""The page's server, for this machine alone; imports little, so that a browser loads the page while a scene is read."""
+"""The page's server, for this machine alone; imports little, so that a browser loads the page while
+a scene is read.
+"""
 
 import contextlib
 import http
@@ -19,14 +21,18 @@ INSTALL = 'python -m pip install "viser>=1.1,<2"'  # as the extra `web` in pypro
 
 
 class Gate:
-    """Refuses requests whose path does not begin with the token, and websockets of pages of another origin.
+    """Refuses requests whose path does not begin with the token, and websockets of pages of another
+    origin.
 
-    The ``Host`` is checked as well, because a foreign name can be made to point to the loopback address.
+    The ``Host`` is checked as well, because a foreign name can be made to point to the loopback
+    address.
     """
 
     def __init__(self, token: str) -> None:
         self.token = token
-        self.inner: Callable[..., Response | None] | None = None  # what answers requests that are let in
+        self.inner: Callable[..., Response | None] | None = (
+            None  # what answers requests that are let in
+        )
 
     def __call__(self, connection: "ServerConnection", request: "Request") -> "Response | None":
         """Answer a request; None lets a websocket begin."""
@@ -36,14 +42,18 @@ class Gate:
         known = secrets.compare_digest(token.encode(), self.token.encode())
         foreign = host not in hosts or ("Upgrade" in request.headers and origin != f"http://{host}")
         if not known or foreign or self.inner is None:
-            return connection.respond(http.HTTPStatus.FORBIDDEN, "Open the address that rbfmuscle printed.\n")
+            return connection.respond(
+                http.HTTPStatus.FORBIDDEN, "Open the address that rbfmuscle printed.\n"
+            )
         request.path = "/" + "/".join(rest)
         return self.inner(connection, request)
 
 
 @contextlib.contextmanager
 def _every_request_through(gate: Gate) -> Iterator[None]:
-    """Put the gate before any websocket server that starts meanwhile; viser has no setting for it."""
+    """Put the gate before any websocket server that starts meanwhile; viser has no setting
+    for it.
+    """
     from websockets.asyncio import server as module
 
     plain = module.serve
@@ -60,14 +70,17 @@ def _every_request_through(gate: Gate) -> Iterator[None]:
 
 
 def open_server(port: int = 0) -> "tuple[ViserServer, str]":
-    """Start a server on the loopback address, at any free port for 0; return it and its address with the token.
+    """Start a server on the loopback address, at any free port for 0; return it and its address
+    with the token.
 
     MissingPartError if viser is not installed, or does not let its requests be checked.
     """
     try:
         import viser
     except ImportError:
-        raise MissingPartError(f"the viewer needs viser, which is not installed; run: {INSTALL}") from None
+        raise MissingPartError(
+            f"the viewer needs viser, which is not installed; run: {INSTALL}"
+        ) from None
     if not 0 <= port <= 65535:
         raise UsageError(f"--port {port}: ports go from 0 to 65535")
     gate = Gate(secrets.token_urlsafe(16))
@@ -75,7 +88,9 @@ def open_server(port: int = 0) -> "tuple[ViserServer, str]":
         server = viser.ViserServer(host=LOOPBACK, port=port, label="rbfmuscle", verbose=False)
     if gate.inner is None:
         server.stop()
-        raise MissingPartError(f"requests to viser {viser.__version__} cannot be checked; run: {INSTALL}")
+        raise MissingPartError(
+            f"requests to viser {viser.__version__} cannot be checked; run: {INSTALL}"
+        )
     # Software drawing takes long for shadows, and longer for light from an image.
     server.scene.configure_default_lights(cast_shadow=False)
     server.scene.configure_environment_map(None)

@@ -1,4 +1,6 @@
-"""One of the models that stand beside each other: its bones and muscles in the browser's scene, and their colours."""
+"""One of the models that stand beside each other: its bones and muscles in the browser's scene, and
+their colours.
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -35,7 +37,9 @@ COLOURINGS = {
 
 
 class Look(NamedTuple):
-    """Colouring, hidden muscles and bones, axis and place [scene unit] of a cut, choices that ask for a new picture."""
+    """Colouring, hidden muscles and bones, axis and place [scene unit] of a cut, choices that ask
+    for a new picture.
+    """
 
     colour: str
     hidden: frozenset[str]
@@ -44,9 +48,16 @@ class Look(NamedTuple):
 
 
 def vertex_values(
-    colouring: str, name: str, picture: Picture, rest: Picture, probes: list[BoneProbe], other: Picture | None
+    colouring: str,
+    name: str,
+    picture: Picture,
+    rest: Picture,
+    probes: list[BoneProbe],
+    other: Picture | None,
 ) -> Floats:
-    """One number for each vertex of a muscle, NaN where it is not known; ``other`` is the model beside it."""
+    """One number for each vertex of a muscle, NaN where it is not known; ``other`` is the model
+    beside it.
+    """
     vertices, faces = picture.surfaces[name]
     if colouring == "activation":
         return np.full(len(vertices), picture.activation.get(name, np.nan))
@@ -72,7 +83,9 @@ def shades(colouring: Colouring, values: Floats, millimetre: float) -> Floats:
     from matplotlib import colormaps
 
     low, high = _limits(colouring, millimetre)
-    return colormaps[colouring.colours].with_extremes(bad="#b3b3b3")((values - low) / (high - low))[:, :3]
+    return colormaps[colouring.colours].with_extremes(bad="#b3b3b3")((values - low) / (high - low))[
+        :, :3
+    ]
 
 
 def legend(colouring: Colouring, units: str, millimetre: float) -> str:
@@ -101,21 +114,27 @@ def _make_matt(tree: Any) -> None:
 
 
 class Side:
-    """A model, or a run, under a node of a viser server; in metres, as the browser shows nothing far away.
+    """A model, or a run, under a node of a viser server; in metres, as the browser shows nothing
+    far away.
 
-    ``choice`` is which of the source's models or runs, "none" for none, ``figure`` the one chosen; ``picture`` is what
-    is shown of it, ``rest`` what it began with. ``numbers`` are by muscle volume error [%], depth in bones and mean of
-    the coloured quantity, NaN where not known.
+    ``choice`` is which of the source's models or runs, "none" for none, ``figure`` the one chosen;
+    ``picture`` is what is shown of it, ``rest`` what it began with. ``numbers`` are by muscle
+    volume error [%], depth in bones and mean of the coloured quantity, NaN where not known.
     """
 
     def __init__(self, server: Any, root: str, source: LiveSource | SavedSource) -> None:
-        self.server, self.root, self.source, self.choice = server, root, source, "none"
+        self.server = server
+        self.root = root
+        self.source = source
+        self.choice = "none"
         self.figure: Any = None
         self.picture: Any = None
         self.rest: Any = None
         self.numbers: dict[str, dict[str, float]] = {}
         self.frame = server.scene.add_frame(root, show_axes=False)
-        self._bones = {name: clustered(v, f, BONE_TRIANGLES) for name, (v, f) in source.bones.items()}
+        self._bones = {
+            name: clustered(v, f, BONE_TRIANGLES) for name, (v, f) in source.bones.items()
+        }
         self._volumes: dict[str, float] = {}
         self._nodes: dict[str, Any] = {}
         self._painted: list[Any] = []
@@ -139,7 +158,10 @@ class Side:
         for name, (vertices, faces) in self._bones.items():
             pose = self.picture.poses[name]
             _, kept = self._part((vertices @ pose[:3, :3].T + pose[:3, 3], faces), look.cut)
-            part, place = self._part((vertices, kept), None), f"bones/{name}"  # a muscle may have its name
+            part, place = (
+                self._part((vertices, kept), None),
+                f"bones/{name}",
+            )  # a muscle may have its name
             self._show(place, part, BONE_COLOUR, visible=name not in look.hidden)
             node = self._nodes[place]
             node.position = pose[:3, 3] * (0.001 / self.source.millimetre)
@@ -154,7 +176,9 @@ class Side:
             part, shown = self._part(mesh, look.cut), name not in look.hidden
             self._show(name, part, self.source.colours[name], visible=shown and colouring is None)
             if shown and colouring is not None:
-                painted.append((*part, linear_rgb(shades(colouring, values, self.source.millimetre))))
+                painted.append(
+                    (*part, linear_rgb(shades(colouring, values, self.source.millimetre)))
+                )
         for name, mesh in self.picture.tendons.items():
             part = self._part(mesh, look.cut)
             self._show(tendon_name(name), part, TENDON_COLOUR, visible=name not in look.hidden)
@@ -174,14 +198,18 @@ class Side:
         """Show a mesh in one colour."""
         if name not in self._nodes:
             shade = tuple(bytes.fromhex(colour[1:]))
-            self._nodes[name] = self.server.scene.add_mesh_simple(f"{self.root}/{name}", *mesh, color=shade)
+            self._nodes[name] = self.server.scene.add_mesh_simple(
+                f"{self.root}/{name}", *mesh, color=shade
+            )
         node = self._nodes[name]
         node.visible = visible
         if visible:
             node.vertices, node.faces = mesh
 
     def _paint(self, painted: list[Any]) -> None:
-        """Show coloured meshes as glTF, which the browser needs a moment to read: the last stays until the next."""
+        """Show coloured meshes as glTF, which the browser needs a moment to read: the last stays
+        until the next.
+        """
         import trimesh
 
         self.forget(bool(painted))
@@ -189,7 +217,9 @@ class Side:
             counts = [len(vertices) for vertices, _, _ in painted]
             vertices, faces, colours = (np.concatenate(parts) for parts in zip(*painted))
             starts = np.repeat(np.cumsum([0, *counts[:-1]]), [len(part) for _, part, _ in painted])
-            mesh = trimesh.Trimesh(vertices, faces + starts[:, None], vertex_colors=colours, process=False)
+            mesh = trimesh.Trimesh(
+                vertices, faces + starts[:, None], vertex_colors=colours, process=False
+            )
             free = "a" if self._painted and self._painted[0].name.endswith("b") else "b"
             glb = mesh.export(file_type="glb", tree_postprocessor=_make_matt)
             self._painted.append(self.server.scene.add_glb(f"{self.root}/painted_{free}", glb))
@@ -201,6 +231,8 @@ class Side:
 
     def points(self) -> list[Any]:
         """Vertices (n, 3) of bones and muscles, where they are shown."""
-        poses = [(vertices, self.picture.poses[name]) for name, (vertices, _) in self._bones.items()]
+        poses = [
+            (vertices, self.picture.poses[name]) for name, (vertices, _) in self._bones.items()
+        ]
         bones = [vertices @ pose[:3, :3].T + pose[:3, 3] for vertices, pose in poses]
         return bones + [vertices for vertices, _ in self.picture.surfaces.values()]

@@ -27,7 +27,9 @@ ACTIVATION = "activation "  # what the name of a muscle's control begins with
 
 
 class Control(NamedTuple):
-    """A number set by hand [degree, scene unit, activation or frame]: its group, label, limits and first value."""
+    """A number set by hand [degree, scene unit, activation or frame]: its group, label, limits and
+    first value.
+    """
 
     group: str
     label: str
@@ -37,7 +39,9 @@ class Control(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One picture's content by bone or muscle; tendons, activation and depth [scene unit] of those that have them."""
+    """One picture's content by bone or muscle; tendons, activation and depth [scene unit] of those
+    that have them.
+    """
 
     poses: dict[str, Floats]
     surfaces: dict[str, Mesh]
@@ -50,23 +54,33 @@ class Picture(NamedTuple):
 class LiveSource:
     """A scene whose coordinates and activations are set by hand, by its own model or the one named.
 
-    ``choices`` are models; bones and muscles (vertices, faces) by name are those at rest; ``body`` (3, 3) is left,
-    posterior and superior; ``rest`` is shown until a model is built. ``motion`` holds what the controls are set to in
-    each frame of the scene's motion.
+    ``choices`` are models; bones and muscles (vertices, faces) by name are those at rest; ``body``
+    (3, 3) is left, posterior and superior; ``rest`` is shown until a model is built. ``motion``
+    holds what the controls are set to in each frame of the scene's motion.
     """
 
     def __init__(self, scene: Scene, model: str | None = None) -> None:
         self.scene = scene = orient_scene(configure_scene(scene, model=model).validate())
-        self.title, self.units, self.millimetre = scene.name, scene.units, scene.length(1.0)
+        self.title = scene.name
+        self.units = scene.units
+        self.millimetre = scene.length(1.0)
         self.body = scene.body
         first = scene.muscles[0].model
         self.choices = [first, *(name for name in MODEL_NAMES if name != first)]
         self.bones, self.muscles = (
-            {item.name: (np.asarray(item.mesh.vertices), np.asarray(item.mesh.faces)) for item in items}
+            {
+                item.name: (np.asarray(item.mesh.vertices), np.asarray(item.mesh.faces))
+                for item in items
+            }
             for items in (scene.bones, scene.muscles)
         )
-        held = [{"name": m.name, "attach": [{"bone": a.bone} for a in m.attachments]} for m in scene.muscles]
-        groups = muscle_groups({"scene": {"joints": list(map(vars, scene.joints)), "muscles": held}})
+        held = [
+            {"name": m.name, "attach": [{"bone": a.bone} for a in m.attachments]}
+            for m in scene.muscles
+        ]
+        groups = muscle_groups(
+            {"scene": {"joints": list(map(vars, scene.joints)), "muscles": held}}
+        )
         self.colours = muscle_colours(list(self.muscles), groups)
         coarse = {name: clustered(*mesh, REST_TRIANGLES) for name, mesh in self.muscles.items()}
         self.rest = Picture(bone_poses(scene, {}), coarse, {}, {}, {}, "")
@@ -74,8 +88,13 @@ class LiveSource:
         self.controls = {
             name: _coordinate(scene, name, (*limits, session.rest[name]))
             for name, limits in session.limits.items()
-        } | {ACTIVATION + name: Control("Activation", name, 0.0, 1.0, 0.0) for name in session.activation}
-        moved = [{n: x for n, x in frame.items() if n in session.limits} for frame in scene.motion.frames]
+        } | {
+            ACTIVATION + name: Control("Activation", name, 0.0, 1.0, 0.0)
+            for name in session.activation
+        }
+        moved = [
+            {n: x for n, x in frame.items() if n in session.limits} for frame in scene.motion.frames
+        ]
         self.motion = [{n: shown_value(scene, n, x) for n, x in frame.items()} for frame in moved]
 
     @cached_property
@@ -127,7 +146,9 @@ class LiveFigure:
         return self.session.within(self.stride, STEP)
 
     def advance(self, *, coarse: bool = False) -> Picture:
-        """Go one sub-step further; coarse shows the material where it is and leaves fit and cut for later."""
+        """Go one sub-step further; coarse shows the material where it is and leaves fit and cut for
+        later.
+        """
         frame = self.session.advance(self.stride, surfaces=not coarse)
         self._unfinished = coarse
         surfaces = {n: (s.vertices, s.faces) for n, s in frame.surfaces.items()} or frame.carried
@@ -139,20 +160,30 @@ class LiveFigure:
 
 
 class SavedSource:
-    """Saved runs of one scene by name, scrubbed by frame; as `LiveSource`. UsageError if one holds no surfaces."""
+    """Saved runs of one scene by name, scrubbed by frame; as `LiveSource`. UsageError if one holds
+    no surfaces.
+    """
 
     def __init__(self, runs: dict[str, SavedRun]) -> None:
         for saved in runs.values():
             if not saved.has_surfaces():
-                raise UsageError(f"{saved.directory} has no surfaces to show; run it with output.surfaces")
-        self.runs, self.choices, first = runs, list(runs), next(iter(runs.values()))
-        self.title, self.units, self.body = str(first.directory), first.units, first.body
+                raise UsageError(
+                    f"{saved.directory} has no surfaces to show; run it with output.surfaces"
+                )
+        self.runs = runs
+        self.choices = list(runs)
+        first = next(iter(runs.values()))
+        self.title = str(first.directory)
+        self.units = first.units
+        self.body = first.body
         self.millimetre = 1.0 / MM_PER_UNIT[first.units]
         self.bones = {name: first.bone(name) for name in first.bones}
         self.muscles = {name: first.surface(name, first.frames[0]) for name in first.muscles}
         self.colours, self.rest = first.colours, SavedFigure(first).advance()
         self.motion = [{"frame": float(frame)} for frame in first.frames]
-        self.controls = {"frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])}
+        self.controls = {
+            "frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])
+        }
 
     def figure(self, choice: str) -> "SavedFigure":
         """A run at its first frame."""
@@ -165,7 +196,9 @@ class SavedFigure:
     near = True
 
     def __init__(self, saved: SavedRun) -> None:
-        self.saved, self.frame, self.pending = saved, saved.frames[0], True
+        self.saved = saved
+        self.frame = saved.frames[0]
+        self.pending = True
 
     def set(self, name: str, value: float) -> None:
         """Go to the frame nearest to a number."""
@@ -177,13 +210,25 @@ class SavedFigure:
 
     def advance(self, *, coarse: bool = False) -> Picture:
         """Read the frame."""
-        saved, frame, self.pending = self.saved, self.frame, False
+        saved = self.saved
+        frame = self.frame
+        self.pending = False
         surfaces = {name: saved.surface(name, frame) for name in saved.muscles}
         named = {name: tendon_name(name) for name in saved.muscles}
-        tendons = {n: saved.surface(mesh, frame) for n, mesh in named.items() if mesh in saved.tendons}
-        activation, depth = (self._known(quantity) for quantity in ("activation", "penetration_max"))
-        return Picture(saved.poses[frame], surfaces, tendons, activation, depth, saved.caption(frame))
+        tendons = {
+            n: saved.surface(mesh, frame) for n, mesh in named.items() if mesh in saved.tendons
+        }
+        activation, depth = (
+            self._known(quantity) for quantity in ("activation", "penetration_max")
+        )
+        return Picture(
+            saved.poses[frame], surfaces, tendons, activation, depth, saved.caption(frame)
+        )
 
     def _known(self, quantity: str) -> dict[str, float]:
         series = {name: self.saved.series(name, quantity) for name in self.saved.muscles}
-        return {n: float(x[k == self.frame][0]) for n, (k, x) in series.items() if (k == self.frame).any()}
+        return {
+            n: float(x[k == self.frame][0])
+            for n, (k, x) in series.items()
+            if (k == self.frame).any()
+        }

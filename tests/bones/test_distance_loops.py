@@ -1,4 +1,5 @@
-"""Laws of the distance fields' loops on a few triangles, small enough to run without the compiler."""
+"""Laws of the distance fields' loops on a few triangles, small enough to run without the
+compiler."""
 
 import igl
 import numpy as np

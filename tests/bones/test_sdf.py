@@ -64,7 +64,8 @@ def test_gradient_is_that_of_the_distance(shape):
     gradient = field.gradient(points)
     np.testing.assert_allclose(np.linalg.norm(gradient, axis=1), 1.0, atol=1e-5)  # single precision
     difference = np.linalg.norm(slope - gradient, axis=1)
-    # Records are held in single precision, 2e-6 at these sizes, over a step of 1e-4; creases are left out.
+    # Records are held in single precision, 2e-6 at these sizes, over a step of 1e-4; creases are
+    # left out.
     assert np.mean(difference < 0.05) > 0.97
 
 
@@ -111,7 +112,10 @@ def test_same_field_from_any_number_of_threads():
 def test_region_is_fine_inside_and_right_outside():
     mesh = SHAPES["torus"]()
     region = np.array([[5.0, -30.0, -10.0], [30.0, 30.0, 10.0]])
-    part, whole = BoneSDF.from_mesh(mesh, region=region, cache=False), BoneSDF.from_mesh(mesh, cache=False)
+    part, whole = (
+        BoneSDF.from_mesh(mesh, region=region, cache=False),
+        BoneSDF.from_mesh(mesh, cache=False),
+    )
     points = _near(mesh, 1.0)
     inside = np.all((points > region[0]) & (points < region[1]), axis=1)
     exact = whole.exact.signed_distance(points)
@@ -131,7 +135,9 @@ def test_smaller_tolerance_gives_smaller_errors():
     for tolerance in (0.3, 2e-4, 2e-5):
         field = BoneSDF.from_mesh(mesh, tolerance=tolerance, cache=False)
         assert field.error <= tolerance
-        errors.append(np.sqrt(np.mean((field.distance(points) - field.exact.signed_distance(points)) ** 2)))
+        errors.append(
+            np.sqrt(np.mean((field.distance(points) - field.exact.signed_distance(points)) ** 2))
+        )
         sizes.append(field.memory)
     assert errors == sorted(errors, reverse=True) and sizes == sorted(sizes)
     with pytest.raises(MeshError, match=r"tib: a tolerance .* needs about .* MB.*memory limit"):
@@ -150,7 +156,11 @@ def test_bad_points_and_poses_are_refused():
 
 @pytest.mark.parametrize(
     ("name", "turn", "scale"),
-    [("torus", [0.4, -1.0, 2.0], 1.0), ("sphere", [0.0, 0.0, 0.0], 1e-3), ("box", [3.0, 0.1, 0.0], 10.0)],
+    [
+        ("torus", [0.4, -1.0, 2.0], 1.0),
+        ("sphere", [0.0, 0.0, 0.0], 1e-3),
+        ("box", [3.0, 0.1, 0.0], 10.0),
+    ],
 )
 def test_a_moved_turned_or_scaled_bone_has_the_same_field(name, turn, scale):
     mesh = SHAPES[name]()
@@ -159,7 +169,8 @@ def test_a_moved_turned_or_scaled_bone_has_the_same_field(name, turn, scale):
     other = BoneSDF.from_mesh((scale * mesh.vertices @ rotation.T + shift, mesh.faces), cache=False)
     distance, gradient = BoneSDF.from_mesh(mesh, cache=False).distance_and_gradient(points)
     moved, turned = other.distance_and_gradient(scale * points @ rotation.T + shift)
-    # A vertex rounded the other way (1e-8 of the size) moves single-precision records by their last digit.
+    # A vertex rounded the other way (1e-8 of the size) moves single-precision records by their last
+    # digit.
     np.testing.assert_allclose(moved / scale, distance, rtol=0, atol=1e-7 * np.ptp(mesh.vertices))
     assert np.median(np.abs(turned @ rotation - gradient)) < 1e-6
 

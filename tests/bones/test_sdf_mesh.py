@@ -55,7 +55,9 @@ def test_bone_that_intersects_itself_is_signed_by_winding_numbers(ball):
     field = BoneSDF.from_mesh(trimesh.util.concatenate([ball, other]), cache=False)
     assert not field.closed
     points = _random() + [7.5, 0.0, 0.0]
-    depth = np.min([np.linalg.norm(points - [x, 0.0, 0.0], axis=1) for x in (0.0, 15.0)], axis=0) - 20.0
+    depth = (
+        np.min([np.linalg.norm(points - [x, 0.0, 0.0], axis=1) for x in (0.0, 15.0)], axis=0) - 20.0
+    )
     clear = np.abs(depth + 0.05) > 0.1
     # Cells that both surfaces cross take their sign from their corners.
     assert (field.distance(points) * depth < 0.0)[clear].mean() < 1e-3

@@ -51,13 +51,25 @@ class TestRun:
         scene = (folder / "arm.toml").read_text(encoding="utf-8")
         (folder / "spike.toml").write_text(scene.replace("biceps.ply", "spike.ply"))
         code, out, _ = call(capsys, "run", folder / "spike.toml", *command[2:])
-        assert code == 0 and re.search(r"verdict: biceps is not within all limits. Worst: biceps, ", out)
+        assert code == 0 and re.search(
+            r"verdict: biceps is not within all limits. Worst: biceps, ", out
+        )
 
     def test_json_is_all_there_is_on_stdout(self, folder, tmp_path, capsys):
         code, out, _ = call(
-            capsys, "run", folder / "arm.toml", "-o", tmp_path / "o", "--frames", "0:2", "--json",
-            "--set", "model.centres=80", "--set", "contact.initial=keep",
-        )  # fmt: skip
+            capsys,
+            "run",
+            folder / "arm.toml",
+            "-o",
+            tmp_path / "o",
+            "--frames",
+            "0:2",
+            "--json",
+            "--set",
+            "model.centres=80",
+            "--set",
+            "contact.initial=keep",
+        )
         info = json.loads(out)
         assert code == 0 and len(info["frames"]) == 2
         assert info["scene"]["muscles"][0]["model"] == {"name": "rbf", "centres": 80}
@@ -73,7 +85,9 @@ class TestRun:
 
     def test_export_of_a_run(self, folder, tmp_path, capsys):
         call(capsys, "run", folder / "arm.toml", "-o", tmp_path / "o", "--frames", "0:1")
-        code, out, _ = call(capsys, "export", tmp_path / "o", "--format", "stl", "obj", "--units", "m")
+        code, out, _ = call(
+            capsys, "export", tmp_path / "o", "--format", "stl", "obj", "--units", "m"
+        )
         folders = [tmp_path / "o" / "export" / name for name in ("obj", "stl")]
         written = [path for folder in folders for path in folder.iterdir()]
         assert code == 0 and out == f"{len(written)} files in {folders[0]}, {folders[1]}\n"
@@ -94,10 +108,14 @@ class TestRun:
             (("paths", "--samples", "10"), "rbfmuscle.paths.sample_muscles"),
         ],
     )
-    def test_unwritable_output_is_told_before_any_work(self, tmp_path, capsys, monkeypatch, words, work):
+    def test_unwritable_output_is_told_before_any_work(
+        self, tmp_path, capsys, monkeypatch, words, work
+    ):
         monkeypatch.setattr(work, lambda *given, **named: pytest.fail("work was begun"))
         (tmp_path / "file").write_text("in the way")
-        code, _, err = call(capsys, words[0], "phantom", *words[1:], "-o", tmp_path / "file" / "out")
+        code, _, err = call(
+            capsys, words[0], "phantom", *words[1:], "-o", tmp_path / "file" / "out"
+        )
         assert code == 2 and "cannot write to" in one_line(err)
 
 
@@ -124,14 +142,26 @@ class TestErrors:
             ("check mesh.toml", 4, "for.ply: no such mesh file, did you mean 'fore.ply'"),
             ("check arm.toml --bad", 2, "--bad"),
             ("paths phantom -o o --samples 9", 2, "--samples 9 is too few"),
-            ("check metres.toml", 4, "cannot be right; correct the scene's units, or set its scale (0.01"),
+            (
+                "check metres.toml",
+                4,
+                "cannot be right; correct the scene's units, or set its scale (0.01",
+            ),
             ("sweep arm.toml -o o --grid model.centers=60,70", 2, "did you mean 'centres'"),
             ("run arm.toml -o o --frames 90:99", 2, "none of the 5 frames"),
             ("run arm.toml -o o --fail-on volum_error", 2, "did you mean 'volume_error'"),
             ("run inside.toml -o o", 3, "start inside bone 'upper'"),
             ("compare arm.toml -o o --set model=xpdb", 2, "did you mean 'xpbd'"),
-            ("compare arm.toml -o o --models rbf,pbd --set pbd:model.sweeps=3", 2, "unknown key 'sweeps'"),
-            ("kernels phantom -o o --centres 100,7", 2, "--centres must be whole numbers of 8 and more"),
+            (
+                "compare arm.toml -o o --models rbf,pbd --set pbd:model.sweeps=3",
+                2,
+                "unknown key 'sweeps'",
+            ),
+            (
+                "kernels phantom -o o --centres 100,7",
+                2,
+                "--centres must be whole numbers of 8 and more",
+            ),
             ("export nowhere --format stl", 2, "holds no run"),
             ("new nowhere --units mm", 2, "is no folder"),
         ],
@@ -168,12 +198,20 @@ class TestOtherCommands:
         code, out, _ = call(capsys, "check", folder / "bones.toml")  # before there are muscles
         assert code == 3 and "joint elbow" in out and "add a [[muscle]]" in out
         assert err.splitlines()[-1].startswith("usable; next: rbfmuscle run ")
-        assert json.loads(call(capsys, "check", folder / "arm.toml", "--json")[1])["scene"]["units"] == "mm"
+        assert (
+            json.loads(call(capsys, "check", folder / "arm.toml", "--json")[1])["scene"]["units"]
+            == "mm"
+        )
         code, out, err = call(capsys, "check", folder / "none.toml", "--json")
-        assert json.loads(out) == {"error": one_line(err).removeprefix("rbfmuscle: "), "exit_code": code}
+        assert json.loads(out) == {
+            "error": one_line(err).removeprefix("rbfmuscle: "),
+            "exit_code": code,
+        }
 
     def test_numbers_that_are_printed_are_what_is_kept(self, folder, tmp_path, capsys, monkeypatch):
-        monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path))  # which may know how many centres are wanted
+        monkeypatch.setenv(
+            "RBFMUSCLE_CACHE", str(tmp_path)
+        )  # which may know how many centres are wanted
         arm, found = folder / "arm.toml", {}
         for words in (
             ["check", arm, "--fields"],
@@ -192,7 +230,9 @@ class TestOtherCommands:
             monkeypatch.setattr("rbfmuscle.run.simulate", lambda *_, run=run, **__: run)
             build = 1 / 64 - frame * (count - 1)
             found = _measure_time(SimpleNamespace(motion=range(11)))
-            assert found == pytest.approx({"build": build, "frame": frame, "total": build + 10 * frame})
+            assert found == pytest.approx(
+                {"build": build, "frame": frame, "total": build + 10 * frame}
+            )
 
     def test_help_lists_the_commands_in_four_groups(self, capsys):
         assert call(capsys)[0] == 2

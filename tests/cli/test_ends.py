@@ -1,4 +1,5 @@
-"""How a command ends when it may not go on: signals at any moment, full and closed outputs, a kill."""
+"""How a command ends when it may not go on: signals at any moment, full and closed outputs, a
+kill."""
 
 import json
 import os
@@ -29,7 +30,9 @@ def ends_clean(process, code=130):
     """The process's errors, once it has ended with the code and one line of its own."""
     _, err = process.communicate()
     assert process.returncode == code, err
-    lines = [line for line in err.splitlines() if "Traceback" in line or "bug" in line or "Error" in line]
+    lines = [
+        line for line in err.splitlines() if "Traceback" in line or "bug" in line or "Error" in line
+    ]
     assert not lines, err
     return err
 
@@ -47,7 +50,8 @@ class TestInterrupts:
         ],
     )
     def test_signal_ends_with_130_wherever_it_comes(self, tmp_path, number, moment, due, lost):
-        """The process signals itself at a known place, so that no machine is too slow or too quick."""
+        """The process signals itself at a known place, so that no machine is too slow or too
+        quick."""
         scene, out = write_scene(tmp_path, end=60), tmp_path / "out"
         module, _, name = moment.rpartition(".")
         code = f"""
@@ -65,12 +69,16 @@ module.{name} = struck
 sys.argv = ["rbfmuscle", "run", {str(scene)!r}, "-o", {str(out)!r}]
 cli.main()
 """
-        err = ends_clean(subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True))
+        err = ends_clean(
+            subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
+        )
         assert "interrupted" in err and ("frames are kept in" in err) == (name == "write_vtp")
         if name == "write_vtp":
             kept = SavedRun(out)
             assert kept.info["status"] == "interrupted" and 2 <= len(kept.frames) < 60
-            assert {row.frame for row in kept.metrics} == set(kept.frames) and export_run(out, ["stl"])
+            assert {row.frame for row in kept.metrics} == set(kept.frames) and export_run(
+                out, ["stl"]
+            )
 
     def test_json_is_told_of_an_interrupt(self, tmp_path):
         code = (
@@ -79,30 +87,42 @@ cli.main()
             "m.read_scene_file = lambda path: os.kill(os.getpid(), signal.SIGINT)\n"
             "sys.argv = ['rbfmuscle', 'check', 'a.toml', '--json']\ncli.main()\n"
         )
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
+        )
         assert done.returncode == 130 and done.stderr == "rbfmuscle: interrupted\n"
         assert json.loads(done.stdout) == {"error": "interrupted", "exit_code": 130}
 
 
 class TestOutputs:
-    @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full to play a full disk")
+    @pytest.mark.skipif(
+        not os.path.exists("/dev/full"), reason="needs /dev/full to play a full disk"
+    )
     @pytest.mark.parametrize("words", [["check"], ["plan"], ["check", "--json"]], ids=" ".join)
     def test_full_standard_output_is_one_line(self, tmp_path, words):
         scene = write_scene(tmp_path, end=2)
         with open("/dev/full", "w") as full:
-            done = subprocess.run([*PROGRAM, *words, scene], stdout=full, stderr=subprocess.PIPE, text=True)
+            done = subprocess.run(
+                [*PROGRAM, *words, scene], stdout=full, stderr=subprocess.PIPE, text=True
+            )
         # "usable" is the finding; lines that end in seconds tell what goes on, on a slow machine.
         busy = re.compile(r".* s\)|rbfmuscle: compiling loops .*|usable; .*")
         own = [line for line in done.stderr.splitlines() if not busy.fullmatch(line)]
         assert done.returncode == 2 and len(own) == 1
-        assert "cannot read or write standard output" in own[0] and ": No space left on device; " in own[0]
+        assert (
+            "cannot read or write standard output" in own[0]
+            and ": No space left on device; " in own[0]
+        )
 
     def test_closed_standard_output_is_one_line(self, tmp_path):
         scene = write_scene(tmp_path, end=2)
         words = ["sh", "-c", '"$@" >&-', "sh", *PROGRAM, "check", str(scene)]
         done = subprocess.run(words, stderr=subprocess.PIPE, text=True)
         assert done.returncode == 2
-        assert done.stderr == "rbfmuscle: standard output is closed; send it to a file, or to /dev/null\n"
+        assert (
+            done.stderr
+            == "rbfmuscle: standard output is closed; send it to a file, or to /dev/null\n"
+        )
 
     def test_reader_that_goes_away_is_no_error(self, tmp_path):
         scene = write_scene(tmp_path, end=2)
@@ -111,7 +131,9 @@ class TestOutputs:
         words = [*PROGRAM, "check", str(scene), "--json"]
         done = subprocess.run(words, stdout=writer, stderr=subprocess.PIPE, text=True)
         os.close(writer)
-        assert done.returncode == 0 and "Traceback" not in done.stderr and "Error" not in done.stderr
+        assert (
+            done.returncode == 0 and "Traceback" not in done.stderr and "Error" not in done.stderr
+        )
 
 
 class TestKilledRuns:
@@ -144,7 +166,9 @@ class TestKilledRuns:
 
     def test_what_was_cut_short_is_left_out_and_no_frame_at_all_is_said(self, killed):
         poses = (killed / "poses.csv").read_text(encoding="utf-8")
-        (killed / "poses.csv").write_text(poses[: poses.rindex("\n", 0, -1) + 30])  # within the last line
+        (killed / "poses.csv").write_text(
+            poses[: poses.rindex("\n", 0, -1) + 30]
+        )  # within the last line
         assert SavedRun(killed).frames == [0, 1, 2, 3, 4]
         (killed / "poses.csv").write_text(poses)
         (killed / "surfaces" / "biceps_0003.vtp").unlink()

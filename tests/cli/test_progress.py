@@ -18,8 +18,15 @@ def test_a_log_has_each_stage_the_last_count_and_others_ten_seconds_apart(monkey
             pass
     with stage("nobody looks"):
         pass
-    told = ["frame 2 of 6 (2 s)", "frame 5 of 6 (13 s)", "frame 6 of 6 (13 s)", "muscle 1 of 1 (13 s)"]
-    assert capsys.readouterr().err.splitlines() == [f"arm: {text}" for text in [*told, "report (13 s)"]]
+    told = [
+        "frame 2 of 6 (2 s)",
+        "frame 5 of 6 (13 s)",
+        "frame 6 of 6 (13 s)",
+        "muscle 1 of 1 (13 s)",
+    ]
+    assert capsys.readouterr().err.splitlines() == [
+        f"arm: {text}" for text in [*told, "report (13 s)"]
+    ]
 
 
 def test_a_terminal_has_a_bar_that_goes_when_it_is_done(monkeypatch, capsys):

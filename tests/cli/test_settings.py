@@ -16,26 +16,43 @@ PAIRS = [["biceps", "brachialis"]]
 TABLES = {
     "contact": (options.ContactOptions, {"initial": "keep", "substep_angle": 4.0}),
     "sliding": (options.SlidingOptions, {"threshold": 1.5, "bones": True, "pairs": PAIRS}),
-    "detect.tunnelling": (options.TunnellingOptions, {"angle": 120.0, "action": "report", "swept": False}),
+    "detect.tunnelling": (
+        options.TunnellingOptions,
+        {"angle": 120.0, "action": "report", "swept": False},
+    ),
     "output": (options.OutputOptions, {"surfaces": False, "tendons": False, "report": False}),
 }
 MODELS = {
     "rbf": (
         RBFOptions,
         {
-            "centres": 60, "samples": 300, "iterations": 3, "nodes": 60, "resolution": 16, "kernel": "quintic",
-            "epsilon": 0.02, "slack": 1.3, "placement": "fitted", "surface": "marching", "fibre_ratio": 2.0,
-            "condition": 1e12, "rest_error": 0.4,
+            "centres": 60,
+            "samples": 300,
+            "iterations": 3,
+            "nodes": 60,
+            "resolution": 16,
+            "kernel": "quintic",
+            "epsilon": 0.02,
+            "slack": 1.3,
+            "placement": "fitted",
+            "surface": "marching",
+            "fibre_ratio": 2.0,
+            "condition": 1e12,
+            "rest_error": 0.4,
         },
     ),
     "pbd": (
         PBDOptions,
         {
-            "iterations": 2, "fibre_exponent": 1.0, "bending": 0.8, "edge_compliance": 0.1,
-            "bending_compliance": 0.1, "slack": 1.2,
+            "iterations": 2,
+            "fibre_exponent": 1.0,
+            "bending": 0.8,
+            "edge_compliance": 0.1,
+            "bending_compliance": 0.1,
+            "slack": 1.2,
         },
     ),
-}  # fmt: skip
+}
 # The name of the model decides it, so it is no key of the scene's.
 IMPLIED = {"method", "tolerance"}
 
@@ -59,7 +76,9 @@ def scene_file(tmp_path_factory):
 def run(capsys, scene_file, folder, *settings, model=None):
     """Facts in ``run.json`` after two frames; settings are (key, value)."""
     texts = [f"{key}={value if isinstance(value, str) else toml(value)}" for key, value in settings]
-    arguments = [part for text in texts for part in ("--set", text)] + (["--model", model] if model else [])
+    arguments = [part for text in texts for part in ("--set", text)] + (
+        ["--model", model] if model else []
+    )
     code, _, err = call(capsys, "run", scene_file, "-o", folder, "--frames", "0:2", *arguments)
     assert code == 0, err
     info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
@@ -73,7 +92,9 @@ def toml(value):
     return json.dumps(value)
 
 
-@pytest.mark.parametrize(("table", "values"), [*TABLES.values(), *MODELS.values()], ids=[*TABLES, *MODELS])
+@pytest.mark.parametrize(
+    ("table", "values"), [*TABLES.values(), *MODELS.values()], ids=[*TABLES, *MODELS]
+)
 def test_every_documented_key_has_a_value_here(table, values):
     fields = {name: field for name, field in table.model_fields.items() if name not in IMPLIED}
     assert set(values) == set(fields)
@@ -119,9 +140,21 @@ def test_a_whole_model_comes_before_its_settings_whatever_the_order(scene_file, 
 @pytest.mark.filterwarnings("ignore::rbfmuscle.validation.SceneWarning")
 def test_compare_takes_a_whole_model_as_the_file_would_give_it(scene_file, tmp_path, capsys):
     code, _, err = call(
-        capsys, "compare", scene_file, "-o", tmp_path, "--models", "pbd,xpbd", "--no-pictures", "--frames",
-        "0:2", "--set", 'model={name = "xpbd", iterations = 4}', "--set", "pbd:model.bending=0.8",
-    )  # fmt: skip
+        capsys,
+        "compare",
+        scene_file,
+        "-o",
+        tmp_path,
+        "--models",
+        "pbd,xpbd",
+        "--no-pictures",
+        "--frames",
+        "0:2",
+        "--set",
+        'model={name = "xpbd", iterations = 4}',
+        "--set",
+        "pbd:model.bending=0.8",
+    )
     assert code == 0, err
     for name, wanted in (("pbd", {"bending": 0.8}), ("xpbd", {"iterations": 4})):
         info = json.loads((tmp_path / name / "run.json").read_text(encoding="utf-8"))

@@ -32,14 +32,19 @@ def lacking(source, *, core=False):
         named = [*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg]
         said = [x.annotation for x in named if x is not None and x.arg not in ("self", "cls")]
         said.append(node.returns)
-        vague = core and any("Any" in re.findall(r"\w+", ast.unparse(part)) for part in said if part)
+        vague = core and any(
+            "Any" in re.findall(r"\w+", ast.unparse(part)) for part in said if part
+        )
         found += [name] if (public and None in said) or vague else []
     return found
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
 def test_public_functions_are_annotated(path):
-    assert lacking(path.read_text(encoding="utf-8"), core=path.relative_to(ROOT).parts[1] in CORE) == []
+    assert (
+        lacking(path.read_text(encoding="utf-8"), core=path.relative_to(ROOT).parts[1] in CORE)
+        == []
+    )
 
 
 def test_planted_faults_are_found():

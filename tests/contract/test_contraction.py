@@ -40,7 +40,9 @@ def test_activation_zero_changes_nothing_to_the_last_digit(model):
     active = rm.simulate(phantom, model=model)
     for one, other in zip(plain.frames, active.frames):
         assert np.array_equal(one.carried["extensor"][0], other.carried["extensor"][0])
-        assert np.array_equal(one.surfaces["extensor"].vertices, other.surfaces["extensor"].vertices)
+        assert np.array_equal(
+            one.surfaces["extensor"].vertices, other.surfaces["extensor"].vertices
+        )
 
 
 @pytest.mark.parametrize("model", SETTLED)
@@ -50,7 +52,9 @@ def test_shapes_do_not_depend_on_how_activation_gets_there(model):
         settings["model.slack"] = 1.0
     reached = []
     for count in (2, 10):
-        scene = spindle_scene(model=model, frames=2 * count, spacing=5.0, activation=[0, 1, 0], tendon=TENDON)
+        scene = spindle_scene(
+            model=model, frames=2 * count, spacing=5.0, activation=[0, 1, 0], tendon=TENDON
+        )
         run = rm.simulate(scene, settings=settings)
         reached.append(carried(run, count))
         back = np.linalg.norm(carried(run, -1) - carried(run, 0), axis=1).max()
@@ -62,7 +66,9 @@ def test_shapes_do_not_depend_on_how_activation_gets_there(model):
 def test_spindle_between_fixed_ends_thickens_and_keeps_its_volume(model):
     run = rm.simulate(spindle_scene(model=model, frames=2, spacing=4.0, tendon=TENDON))
     # Interleaved ARAP leaves a volume step undone by its last global step, as without activation.
-    assert np.abs(run.values(MUSCLE, "volume_error")).max() < (1e-6 if model == "arap-interleaved" else 1e-10)
+    assert np.abs(run.values(MUSCLE, "volume_error")).max() < (
+        1e-6 if model == "arap-interleaved" else 1e-10
+    )
     x = carried(run, 0)[:, 0]
     moved = carried(run, -1)[:, 0] - x
     junctions = [np.abs(x - side * 60.0) < 5.0 for side in (-1, 1)]
@@ -87,7 +93,8 @@ def test_free_bar_is_as_thick_as_its_volume_says(model, stretch):
 @pytest.mark.parametrize(
     ("model", "rms", "csa", "length"),
     [
-        # Limits of the issue but for those of sections and lengths, which are 0.05 there; see docs/contraction.md.
+        # Limits of the issue but for those of sections and lengths, which are 0.05 there; see
+        # docs/contraction.md.
         (settings("rbf"), 1.0, (0.0, 0.10), 0.06),
         ({"name": "rbf", "centres": 300, "nodes": 300}, 0.35, (-0.04, 0.04), 0.04),
     ],
@@ -109,7 +116,9 @@ def test_pennate_panel_turns_its_fibres_as_its_volume_says(model):
     scene = panel_scene(0.8, model=model)
     run = rm.simulate(scene, settings={"output.surfaces": False})
     rest, now = carried(run, 0), carried(run, -1)
-    between = np.abs(rest[:, 2] - 0.5 * HEIGHT) < 0.3 * HEIGHT  # away from the plates, which are rigid
+    between = (
+        np.abs(rest[:, 2] - 0.5 * HEIGHT) < 0.3 * HEIGHT
+    )  # away from the plates, which are rigid
     away = rest[between] - rest[between].mean(axis=0)
     gradient = np.linalg.lstsq(away, now[between] - now[between].mean(axis=0))[0]
     fibre = np.array([LEAN, 0.0, HEIGHT]) @ gradient

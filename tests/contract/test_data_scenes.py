@@ -1,4 +1,6 @@
-"""Every scene of the real hip and the whole leg: its meshes load, its settings hold, and its motion can be planned."""
+"""Every scene of the real hip and the whole leg: its meshes load, its settings hold, and its motion
+can be planned.
+"""
 
 import pytest
 
@@ -10,8 +12,18 @@ from rbfmuscle.simulation.plan import plan_scene
 # Muscles and bones of each scene.
 SCENES = {f"hip/{name}": (4, 3) for name in ("adduction", "apriori", "extension", "flexion")}
 SCENES |= {"hip/external_rotation": (4, 3), "hip/internal_rotation": (4, 3), "hip/gluteus": (1, 3)}
-SCENES |= {"leg/gait": (12, 15), "leg/hip_flexion": (8, 9), "leg/knee_flexion": (6, 10), "leg/leg": (38, 11)}
-SCENES |= {"leg/neighbours": (4, 7), "leg/quadriceps": (4, 6), "leg/slender": (4, 6), "leg/squat": (38, 21)}
+SCENES |= {
+    "leg/gait": (12, 15),
+    "leg/hip_flexion": (8, 9),
+    "leg/knee_flexion": (6, 10),
+    "leg/leg": (38, 11),
+}
+SCENES |= {
+    "leg/neighbours": (4, 7),
+    "leg/quadriceps": (4, 6),
+    "leg/slender": (4, 6),
+    "leg/squat": (38, 21),
+}
 
 
 @pytest.fixture(scope="module")
@@ -32,5 +44,7 @@ def test_scene_loads_and_is_planned(data, name):
     assert (len(scene.muscles), len(scene.bones)) == SCENES[name]
     plan = plan_scene(scene)
     assert plan["frames"] == len(scene.motion) > 1 and plan["substeps"] >= len(scene.motion) - 1
-    assert [muscle["name"] for muscle in plan["muscles"]] == [muscle.name for muscle in scene.muscles]
+    assert [muscle["name"] for muscle in plan["muscles"]] == [
+        muscle.name for muscle in scene.muscles
+    ]
     assert any(muscle["bones"] for muscle in plan["muscles"])

@@ -1,4 +1,6 @@
-"""Links in the pages lead somewhere, tables say what their files of evidence hold, and listed tests are there."""
+"""Links in the pages lead somewhere, tables say what their files of evidence hold, and listed tests
+are there.
+"""
 
 import json
 import re
@@ -20,7 +22,9 @@ def test_links_and_pictures_lead_to_files(page):
 
 @pytest.mark.parametrize("name", ["fast.txt", "nojit.txt"])
 def test_what_is_listed_is_there_and_named_once(name):
-    lines = re.findall(r"^[^#\n].*", (ROOT / "tests" / name).read_text(encoding="utf-8"), flags=re.M)
+    lines = re.findall(
+        r"^[^#\n].*", (ROOT / "tests" / name).read_text(encoding="utf-8"), flags=re.M
+    )
     assert len(set(lines)) == len(lines)
     for line in lines:
         path, *names = line.partition("[")[0].split("::")
@@ -40,8 +44,14 @@ def test_page_says_what_the_files_hold(page):
 )
 def test_file_is_shown_and_names_command_commit_and_machine(path):
     facts = json.loads(path.read_text(encoding="utf-8"))
-    assert all(isinstance(facts[key], str) and facts[key] for key in ("command", "commit", "machine"))
+    assert all(
+        isinstance(facts[key], str) and facts[key] for key in ("command", "commit", "machine")
+    )
     script = re.match(r"python (benchmarks/\w+\.py)", facts["command"]).group(1)
-    assert facts["rows"] and (ROOT / script).exists() and (ROOT / figures.COMMANDS[path.stem][0]).exists()
+    assert (
+        facts["rows"]
+        and (ROOT / script).exists()
+        and (ROOT / figures.COMMANDS[path.stem][0]).exists()
+    )
     shown = "".join(page.read_text(encoding="utf-8") for page in figures.page_files())
     assert f"<!-- evidence: {path.stem} -->" in shown

@@ -1,4 +1,6 @@
-"""Compiled loops on disk: loaded by a second process, never stale, whole or absent, and removed when unused."""
+"""Compiled loops on disk: loaded by a second process, never stale, whole or absent, and removed
+when unused.
+"""
 
 import os
 import subprocess
@@ -12,7 +14,8 @@ pytestmark = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is com
 SOURCES = {
     "__init__": "",
     "constants": "SHIFT = 0.5\n",
-    "fields": "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    a: float\n    b: float\n",
+    "fields": "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    a: float\n    "
+    "b: float\n",
     "inner": """
 from rbfmuscle.jit import compiled
 from loops.constants import SHIFT
@@ -42,12 +45,17 @@ MAIN = """
 from loops import fields, inner, outer
 print(outer.outer(1.0), inner.difference(fields.Pair(a=3.0, b=2.0)))
 """
-SAID = "rbfmuscle: compiling loops for this processor, once; a first run takes a minute or two longer\n"
+SAID = (
+    "rbfmuscle: compiling loops for this processor, once; a first run takes a minute or two "
+    "longer\n"
+)
 
 
 @pytest.fixture
 def place(tmp_path):
-    """A package whose loops call each other across files, and the name of a folder that is not there yet."""
+    """A package whose loops call each other across files, and the name of a folder that is not
+    there yet.
+    """
     (tmp_path / "loops").mkdir()
     for name, text in SOURCES.items():
         (tmp_path / "loops" / f"{name}.py").write_text(text)
@@ -81,7 +89,10 @@ def test_second_process_and_a_copy_of_the_sources_compile_nothing(place):
     assert len(kept) == 3  # the inlined loop has no code of its own
     (place / "copy").mkdir()
     (place / "loops").rename(place / "copy" / "loops")
-    assert run(place, PYTHONPATH=os.pathsep.join([str(place / "copy"), str(ROOT)])) == ([102.5, 1.0], "")
+    assert run(place, PYTHONPATH=os.pathsep.join([str(place / "copy"), str(ROOT)])) == (
+        [102.5, 1.0],
+        "",
+    )
     assert files(place) == kept
 
 

@@ -1,4 +1,6 @@
-"""Scenes, imports, pages, files and pictures of small inputs hold what they held, with times of a counting clock."""
+"""Scenes, imports, pages, files and pictures of small inputs hold what they held, with times of a
+counting clock.
+"""
 
 import inspect
 from itertools import pairwise
@@ -43,8 +45,12 @@ BOUNDS = ("gt", "ge", "lt", "le", "min_length", "max_length")
 
 
 def scene_facts(scene):
-    """A scene as run.json has it, its findings, plan, attachments, and what changes along its motion."""
-    told, frames, activations = scene.resolved(), scene.motion.frames, Activations(scene)
+    """A scene as run.json has it, its findings, plan, attachments, and what changes along its
+    motion.
+    """
+    told = scene.resolved()
+    frames = scene.motion.frames
+    activations = Activations(scene)
     for table in (told, *told["bones"], *told["muscles"]):
         table.pop("sha256" if "sha256" in table else "file")
     yield told, plan_scene(scene), scene.body, [(f.level, f.place) for f in scene.check()]
@@ -54,7 +60,9 @@ def scene_facts(scene):
     )
     yield [bone_poses(scene, frame).tendons for frame in frames]
     yield [held.vertices for muscle in scene.muscles for held in muscle.attachments]
-    yield [resolve_contraction(muscle) for muscle in scene.muscles if muscle.contraction is not None]
+    yield [
+        resolve_contraction(muscle) for muscle in scene.muscles if muscle.contraction is not None
+    ]
     yield [activations.at(k) for k in range(len(frames))], activations.refine(1, frames[:2])
 
 
@@ -97,8 +105,13 @@ def test_imported_model_is_what_is_kept(tmp_path, file, name):
     found = opensim.import_osim(tmp_path / f"{file}.osim")
     opensim.write_scene(found, tmp_path / "scene")
     facts = list(scene_facts(rm.Scene.load(tmp_path / "scene" / "scene.toml", skeleton=True)))
-    moved = [found.model.transforms(dict.fromkeys(found.model.coordinates(), 0.1 * k)) for k in range(-2, 3)]
-    muscles = [[found.model.muscles, [m.mesh for m in found.scene.muscles]]] if file == "muscles" else []
+    moved = [
+        found.model.transforms(dict.fromkeys(found.model.coordinates(), 0.1 * k))
+        for k in range(-2, 3)
+    ]
+    muscles = (
+        [[found.model.muscles, [m.mesh for m in found.scene.muscles]]] if file == "muscles" else []
+    )
     check_kept(name, [facts, found.places, found.notes, moved, *muscles])
 
 
@@ -119,9 +132,14 @@ def test_files_of_a_run_hold_what_is_kept(name, limb, tmp_path, monkeypatch, clo
         use_blend_model(monkeypatch)
     rm.simulate(arm_scene(end=60) if name == "blend" else limb).save(folder)
     info, facts = SavedRun(folder).info, {}
-    if name == "blend":  # the other's volume is the same in all frames: rounding decides where it is worst
+    if (
+        name == "blend"
+    ):  # the other's volume is the same in all frames: rounding decides where it is worst
         write_report(folder)
-        facts = {key: info[key] for key in ("muscles", "frames", "times", "frame_time", "limits", "verdict")}
+        facts = {
+            key: info[key]
+            for key in ("muscles", "frames", "times", "frame_time", "limits", "verdict")
+        }
     export_run(folder, ["obj", "pvd", "stl", "ply"], units="cm", frames=slice(1, 3))
     export_run(folder, ["glb", "animated-glb"], frames=slice(1, 3))
     draw_scene(limb, folder / "scene.png")
@@ -139,7 +157,9 @@ def numbers(values):
 
 
 def defaults_of(call):
-    """Defaults of a function, or of a class and its methods, and whether its options take several words."""
+    """Defaults of a function, or of a class and its methods, and whether its options take several
+    words.
+    """
     calls = [call, *(one for _, one in inspect.getmembers(call, inspect.isfunction))]
     given = [each.default for one in calls for each in inspect.signature(one).parameters.values()]
     hints = get_type_hints(call, include_extras=True).values() if "cli" in call.__module__ else ()
@@ -148,12 +168,22 @@ def defaults_of(call):
 
 
 def test_defaults_and_bounds_are_what_is_kept():
-    calls = [getattr(rm, name) for name in rm._HOME if name not in rm._ERRORS] + [*sum(GROUPS.values(), ())]
-    found, kinds = {call.__name__: defaults_of(call) for call in calls}, [Table, PBDOptions, RBFOptions]
+    calls = [getattr(rm, name) for name in rm._HOME if name not in rm._ERRORS] + [
+        *sum(GROUPS.values(), ())
+    ]
+    found, kinds = (
+        {call.__name__: defaults_of(call) for call in calls},
+        [Table, PBDOptions, RBFOptions],
+    )
     for kind in kinds:
         kinds += [new for new in kind.__subclasses__() if new not in kinds]
         fields = kind.model_fields.values()
-        bounds = [getattr(part, key, None) for field in fields for part in field.metadata for key in BOUNDS]
+        bounds = [
+            getattr(part, key, None)
+            for field in fields
+            for part in field.metadata
+            for key in BOUNDS
+        ]
         found[kind.__name__] = numbers([*bounds, *(field.default for field in fields)])
     check_kept("defaults", [found, numbers(MEASURES.values()), numbers(LIMITS.values())])
 
@@ -163,12 +193,17 @@ def test_looks_are_what_is_kept():
     names = {f"muscle {k}": str(k % 7) for k in range(30)}
     colours = map(appearance.rgb, appearance.muscle_colours(list(names), names).values())
     views = [appearance.view_axes(view, body) for view in appearance.VIEWS.values()]
-    turns = [[{"a": np.eye(4)}, {"a": turned(angle, axis)}] for angle in (0.03, 0.1) for axis in body]
+    turns = [
+        [{"a": np.eye(4)}, {"a": turned(angle, axis)}] for angle in (0.03, 0.1) for axis in body
+    ]
     seen = [appearance.motion_direction(poses, body) for poses in turns]
     scales = [one for one in COLOURINGS.values() if one is not None]
     shown = [(shades(one, 3.0 * shares, 0.3), text_facts(legend(one, "cm", 0.1))) for one in scales]
     lines, axes = [Track(name, "#cc6677", shares, shares**2) for name in names], ("x", "y")
-    plots = [line_plot("a", lines[:2], axes, limits=[2.0], zero=zero, legend=zero) for zero in (True, False)]
+    plots = [
+        line_plot("a", lines[:2], axes, limits=[2.0], zero=zero, legend=zero)
+        for zero in (True, False)
+    ]
     dots = [Point(1 + k % 7, 1 + k % 5, f"p{k}", str(k % 2), k == 4, k < 3) for k in range(9)]
     plots = list(map(text_facts, [*plots, front_plot(dots, axes)]))
     check_kept("looks", [list(colours), appearance.linear_rgb(shares), views, seen, shown, plots])
@@ -181,6 +216,13 @@ def test_live_pictures_are_what_is_kept(limb):
         for name, control in source.controls.items():
             figure.set(name, control.low + share * (control.high - control.low))
         pictures.append(figure.advance(coarse=coarse))
-    facts = source.controls, source.motion, source.body, source.millimetre, figure.pending, figure.near
+    facts = (
+        source.controls,
+        source.motion,
+        source.body,
+        source.millimetre,
+        figure.pending,
+        figure.near,
+    )
     coarse = LiveSource(rm.phantom_scene(end=0.0, spacing=2.5), "pbd").rest.surfaces
     check_kept("live", [facts, pictures, coarse])

@@ -1,4 +1,6 @@
-"""Parts of the library give for small seeded inputs what they gave; known answers and laws are in their own tests."""
+"""Parts of the library give for small seeded inputs what they gave; known answers and laws are in
+their own tests.
+"""
 
 import math
 
@@ -9,7 +11,16 @@ from kept import check_kept
 
 from rbfmuscle.bones.errors import measure_field
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry import bsplines, coarse, crossing, harmonic, rotations, surfaces, triangles, tubes
+from rbfmuscle.geometry import (
+    bsplines,
+    coarse,
+    crossing,
+    harmonic,
+    rotations,
+    surfaces,
+    triangles,
+    tubes,
+)
 from rbfmuscle.geometry.exact_distance import faces_across
 from rbfmuscle.geometry.rest_frame import BoneFrame, moved_box
 from rbfmuscle.geometry.winding import winding_loop
@@ -29,7 +40,10 @@ def ball(radii=(1.0, 1.0, 1.0), subdivisions=3, bumps=0.0):
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
     v = np.array(mesh.vertices)
     x, y, z = v.T
-    v *= 1.0 + bumps * (np.sin(3.0 * x + 0.3) * np.cos(2.0 * y - 0.4) + 0.5 * np.sin(4.0 * z))[:, None]
+    v *= (
+        1.0
+        + bumps * (np.sin(3.0 * x + 0.3) * np.cos(2.0 * y - 0.4) + 0.5 * np.sin(4.0 * z))[:, None]
+    )
     return v * radii, np.array(mesh.faces)
 
 
@@ -44,14 +58,19 @@ def _bones():
     opened = trimesh.creation.icosphere(subdivisions=3, radius=20.0)
     opened.update_faces(np.asarray(opened.triangles_center[:, 2] < 17.0))
     ring = trimesh.creation.torus(20.0, 6.0, major_sections=24, minor_sections=12)
-    boxes = [trimesh.creation.box((30, 20, 10)).apply_translation(t) for t in ([0, 0, 0], [9, 7, 4])]
+    boxes = [
+        trimesh.creation.box((30, 20, 10)).apply_translation(t) for t in ([0, 0, 0], [9, 7, 4])
+    ]
     meshes = {
-        "plate": trimesh.creation.box((60, 1.5, 40)), "open": opened,
+        "plate": trimesh.creation.box((60, 1.5, 40)),
+        "open": opened,
         "pointed": trimesh.creation.icosphere(subdivisions=0).apply_scale([15.0, 9.0, 4.0]),
-        "ring": trimesh.Trimesh(ring.vertices + np.sin(0.2 * ring.vertices[:, [1, 2, 0]]), ring.faces, process=False),
+        "ring": trimesh.Trimesh(
+            ring.vertices + np.sin(0.2 * ring.vertices[:, [1, 2, 0]]), ring.faces, process=False
+        ),
         "bumpy": trimesh.Trimesh(*ball((40, 22, 15), bumps=0.15), process=False),
         "crossing": trimesh.util.concatenate(boxes),
-    }  # fmt: skip
+    }
     options = {"plate": {"region": [[-10, -5, -5], [50, 9, 30]]}, "ring": {"memory_limit": 400_000}}
     for name, mesh in meshes.items():
         rng, pose = np.random.default_rng(3), turned(0.7)
@@ -60,19 +79,34 @@ def _bones():
         near += rng.normal(scale=0.2, size=near.shape)
         wide, far = rng.uniform(*(1.5 * mesh.bounds), (300, 3)), 200.0 * rng.normal(size=(40, 3))
         points = trimesh.transform_points(np.concatenate([wide, near, far]), pose)
-        yield name, {
-            "far": field.distance_and_gradient(points, pose), "reach": field.distance(points, pose, reach=2.0),
-            "about": {n: math.log(a.size + 1) for n, a in field.data._asdict().items()}, "spacing": field.spacing,
-            "error": field.error, "errors": measure_field(field, count=500), "closed": field.closed,
-            "notes": len(field.notes), "bounds": field.bounds, "exact": field.exact.signed_distance(points),
-        }  # fmt: skip
+        yield (
+            name,
+            {
+                "far": field.distance_and_gradient(points, pose),
+                "reach": field.distance(points, pose, reach=2.0),
+                "about": {n: math.log(a.size + 1) for n, a in field.data._asdict().items()},
+                "spacing": field.spacing,
+                "error": field.error,
+                "errors": measure_field(field, count=500),
+                "closed": field.closed,
+                "notes": len(field.notes),
+                "bounds": field.bounds,
+                "exact": field.exact.signed_distance(points),
+            },
+        )
 
 
 def _fields():
     vertices, faces = ball((3.0, 2.0, 1.2), bumps=0.1)
     points = np.random.default_rng(8).uniform(-4.0, 4.0, (100, 3))
-    distance, held_out = MeshDistance(vertices, faces).signed, spread_points(vertices, faces, 300, seed=1)
-    yield held_out, *(sample_surface(vertices, faces, 40, placement=name) for name in ("even", "adaptive"))
+    distance, held_out = (
+        MeshDistance(vertices, faces).signed,
+        spread_points(vertices, faces, 300, seed=1),
+    )
+    yield (
+        held_out,
+        *(sample_surface(vertices, faces, 40, placement=name) for name in ("even", "adaptive")),
+    )
     sample = sample_surface(vertices, faces, 40, placement="greedy")
     places = sample.points, sample.normals
     yield sample, spacing(sample.points), off_surface_points(*places)
@@ -106,26 +140,39 @@ def _surfaces():
         yield turns, plain
     weights = harmonic.harmonic_weights(vertices, faces, [[0], [7, 8, 9], [50], [100, 101]])
     yield weights, harmonic.surface_gradient(vertices, faces, noise[:, 0])
-    poses = np.stack([turned(angle, shift=3.0 * noise[k]) for k, angle in enumerate((0.0, 1e-7, 0.5, 3.1))])
+    poses = np.stack(
+        [turned(angle, shift=3.0 * noise[k]) for k, angle in enumerate((0.0, 1e-7, 0.5, 3.1))]
+    )
     for share in (weights, *np.eye(4)[:, None].repeat(len(vertices), 1)):
         yield harmonic.blended_motion(vertices, share, poses)
-    turns = np.array([rotations.matrix_quaternion(turned(angle)) for angle in np.linspace(-6.0, 6.0, 25)])
+    turns = np.array(
+        [rotations.matrix_quaternion(turned(angle)) for angle in np.linspace(-6.0, 6.0, 25)]
+    )
     for sizes in ((3.0, 1.0, 0.5), (1.0, 0.2, -0.1), (1.0, 1e-4, 0.0)):
         yield turns.copy()
         for q, m in zip(turns, map(np.linalg.svd, noise.reshape(-1, 3, 3))):
             rotations.rotation_loop(m[0] * sizes @ m[2], q)
-    yield [rotations.rotate(q, x) for q, x in zip(turns, noise)], rotations.rigid_fit(vertices, noise)
+    yield (
+        [rotations.rotate(q, x) for q, x in zip(turns, noise)],
+        rotations.rigid_fit(vertices, noise),
+    )
     yield rotations.turned_quaternions(turns, poses[2, :3, :3])
     moved = vertices @ poses[2, :3, :3] + noise
     yield rotations.smooth_displacement(vertices, moved, lambda beside: beside.sort(0))
     yield triangles.pseudonormals(vertices, few, faces_across(few))
-    near, steps, away, winding = np.empty((162, 3)), np.empty((2, 162)), np.empty(162), np.empty(162)
+    near = np.empty((162, 3))
+    steps = np.empty((2, 162))
+    away = np.empty(162)
+    winding = np.empty(162)
     for x, out in zip(3.0 * noise, near):
         triangles.nearest_weights(x, *np.diag([1.0, 2.0, 0.6]), out)
     surfaces.touching_balls(vertices, surfaces.vertex_normals(vertices, faces), steps, away)
     winding_loop(vertices, faces[:300], noise, winding)
     yield near, steps, away, winding, surfaces.volume_cubic(vertices, faces, noise)
-    yield surfaces.barycentric_weights(noise, vertices[faces[:162]]), surfaces.vertex_areas(vertices, faces)
+    yield (
+        surfaces.barycentric_weights(noise, vertices[faces[:162]]),
+        surfaces.vertex_areas(vertices, faces),
+    )
     line, places = np.cumsum(np.abs(noise[:9]), axis=0), np.linspace(-1.0, 9.0, 20)
     yield tubes.tube_mesh(line, np.linspace(1.0, 2.0, 9)), tubes.points_along(line, places)
     pinched = np.where(faces == 9, 0, faces)
@@ -136,7 +183,11 @@ def _surfaces():
     weight, slope = np.empty((2, 3, 4))
     for t, *one in zip((0.1, 0.5, 0.8), weight, slope):
         bsplines.bspline_weights(t, *one)
-    yield weight, slope, bsplines.bspline_sum(noise[:144].reshape(6, 8, 9), (1, 2, 3), weight, slope)
+    yield (
+        weight,
+        slope,
+        bsplines.bspline_sum(noise[:144].reshape(6, 8, 9), (1, 2, 3), weight, slope),
+    )
 
 
 def _lattice():

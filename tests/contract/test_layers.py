@@ -11,7 +11,13 @@ from conftest import ROOT
 NAMES = ("cache", "child", "geometry", "interruption", "jit", "progress", "validation")
 LEAVES = tuple(f"rbfmuscle.{name}" for name in NAMES)
 CORE = (*LEAVES, "rbfmuscle.bones", "rbfmuscle.scene", "rbfmuscle.simulation")
-MEASURED = (*CORE, "rbfmuscle.implicit", "rbfmuscle.metrics", "rbfmuscle.output", "rbfmuscle.experiments")
+MEASURED = (
+    *CORE,
+    "rbfmuscle.implicit",
+    "rbfmuscle.metrics",
+    "rbfmuscle.output",
+    "rbfmuscle.experiments",
+)
 ABOVE = (*MEASURED, "rbfmuscle.report", "rbfmuscle.__version__")
 # Which of our own modules (by prefix) a package may import; the first matching package counts.
 ALLOWED = {
@@ -39,10 +45,16 @@ ALLOWED = {
     "rbfmuscle.compare": (*ABOVE, "rbfmuscle.models", "rbfmuscle.run"),
     "rbfmuscle.paths": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models"),
     "rbfmuscle.cli": (
-        *ABOVE, "rbfmuscle.importers", "rbfmuscle.models", "rbfmuscle.run", "rbfmuscle.compare", "rbfmuscle.paths",
-        "rbfmuscle.viewer", "rbfmuscle.cli",
+        *ABOVE,
+        "rbfmuscle.importers",
+        "rbfmuscle.models",
+        "rbfmuscle.run",
+        "rbfmuscle.compare",
+        "rbfmuscle.paths",
+        "rbfmuscle.viewer",
+        "rbfmuscle.cli",
     ),
-}  # fmt: skip
+}
 ALLOWED["rbfmuscle.__main__"] = ("rbfmuscle.cli",)
 
 
@@ -66,7 +78,10 @@ def imported_modules(source, module, *, is_package=False):
             found.update(f"{base}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             text = node.value
-            if text.startswith(("rbfmuscle.", "pbd_baseline.")) and text.replace(".", "").isidentifier():
+            if (
+                text.startswith(("rbfmuscle.", "pbd_baseline."))
+                and text.replace(".", "").isidentifier()
+            ):
                 found.add(text)
     return {name for name in found if name.split(".")[0] in ("rbfmuscle", "pbd_baseline")}
 
@@ -81,8 +96,12 @@ def wrong_arrows(module, source, *, is_package=False):
     package = next((package for package in ALLOWED if starts_with(module, package)), None)
     allowed = ALLOWED[package] if package else ()
     names = imported_modules(source, module, is_package=is_package)
-    names = {name for name in names if name != "rbfmuscle"}  # `from rbfmuscle import x` names x itself too
-    return sorted(name for name in names if not any(starts_with(name, prefix) for prefix in allowed))
+    names = {
+        name for name in names if name != "rbfmuscle"
+    }  # `from rbfmuscle import x` names x itself too
+    return sorted(
+        name for name in names if not any(starts_with(name, prefix) for prefix in allowed)
+    )
 
 
 def sources(root):
@@ -101,11 +120,14 @@ def test_imports_only_what_its_package_may(path):
         ("rbfmuscle.implicit.field", "from rbfmuscle.scene.scene import Scene"),
         ("rbfmuscle.implicit.field", "from ..sim import scene"),
         ("rbfmuscle.bones.sdf", "def f():\n    import rbfmuscle.implicit.kernels.table"),
-        ("rbfmuscle.simulation.frame_loop", "import importlib\nimportlib.import_module('rbfmuscle.muscle.muscle')"),
+        (
+            "rbfmuscle.simulation.frame_loop",
+            "import importlib\nimportlib.import_module('rbfmuscle.muscle.muscle')",
+        ),
         ("pbd_baseline.muscle", "from rbfmuscle.implicit.field import RBFField"),
         ("rbfmuscle.validation", "from rbfmuscle.scene.scene import Scene"),
     ],
-)  # fmt: skip
+)
 def test_planted_wrong_arrow_is_found(module, source):
     assert wrong_arrows(module, source)
     assert wrong_arrows("rbfmuscle.report.report", "from rbfmuscle.scene.scene import Scene") == []
@@ -140,7 +162,11 @@ def test_no_module_imports_itself_by_others():
     ids=["in a function", "for types"],
 )
 def test_planted_cycle_is_found(tmp_path, late):
-    for name, text in {"a": late, "b": "from rbfmuscle.c import y", "c": "from rbfmuscle import a"}.items():
+    for name, text in {
+        "a": late,
+        "b": "from rbfmuscle.c import y",
+        "c": "from rbfmuscle import a",
+    }.items():
         (tmp_path / "rbfmuscle").mkdir(exist_ok=True)
         (tmp_path / "rbfmuscle" / f"{name}.py").write_text(text)
     assert cycle(all_arrows(tmp_path)) == ["rbfmuscle.a", "rbfmuscle.b", "rbfmuscle.c"]

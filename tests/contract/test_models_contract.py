@@ -23,7 +23,8 @@ def test_every_name_is_tested():
 
 
 def _scene(angles, *, units="mm", overlap=0.0):
-    """An elbow: a fixed ball that a strap runs over, and an arm that turns about the ball's middle."""
+    """An elbow: a fixed ball that a strap runs over, and an arm that turns about the ball's
+    middle."""
     k = {"mm": 1.0, "m": 1e-3}[units]
     scene = rm.Scene("elbow", units=units)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=15.0 * k)
@@ -62,7 +63,9 @@ def test_frames_are_closed_outward_finite_and_clear_of_bones(name):
         assert mesh.is_watertight
         assert np.isfinite(surface.vertices).all()
         # The two interleaved steps of this kind leave what each undoes of the other.
-        assert _volume(surface) == pytest.approx(volume, rel=0.05 if name == "arap-interleaved" else 1e-9)
+        assert _volume(surface) == pytest.approx(
+            volume, rel=0.05 if name == "arap-interleaved" else 1e-9
+        )
         assert ball.distance(surface.vertices, frame.poses["trunk"]).min() > -0.5
         assert surface.quantities["solver_penetration_max"] < 0.5
         assert frame.carried["strap0"][1].max() < len(frame.carried["strap0"][0])
@@ -84,7 +87,8 @@ def test_rest_is_a_rest_and_restore_brings_a_snapshot_back(name):
 
     rest = part.contact_points().copy()
     for _ in range(3):
-        # Where nothing moves, nothing may move; half a percent of the length for kinds that settle by sweeps.
+        # Where nothing moves, nothing may move; half a percent of the length for kinds that settle
+        # by sweeps.
         assert np.abs(go(stops[0], stops[0]) - rest).max() < 0.5
     go(stops[0], stops[1])
     state = part.snapshot()
@@ -126,10 +130,13 @@ def test_moving_the_whole_scene_moves_the_result_and_units_do_not_matter(name):
     scene.joints = [joint.moved(turn) for joint in scene.joints]
     moved, _ = _run(name, scene, surfaces=False)
     expected = plain[-1].carried["strap0"][0] @ turn[:3, :3].T + turn[:3, 3]
-    # The ball has no axes of its own, so the grid of its distance field lies in it in another way: 2 µm.
+    # The ball has no axes of its own, so the grid of its distance field lies in it in another way:
+    # 2 µm.
     assert np.abs(moved[-1].carried["strap0"][0] - expected).max() < 2e-3
     metres, _ = _run(name, _scene([0, 20], units="m"), surfaces=False)
-    assert np.abs(1e3 * metres[-1].carried["strap0"][0] - plain[-1].carried["strap0"][0]).max() < 0.05
+    assert (
+        np.abs(1e3 * metres[-1].carried["strap0"][0] - plain[-1].carried["strap0"][0]).max() < 0.05
+    )
 
 
 @pytest.mark.parametrize("name", ["rbf", "pbd"])
@@ -142,4 +149,6 @@ def test_one_big_step_and_overlap_at_rest_leave_no_point_in_a_bone(name, angles,
     assert "unresolved" not in actions and ("overlap_resolved" in actions) == (overlap > 0.0)
     free = part.contact_points()[part.contact_bone < 0]
     assert rm.BoneSDF.from_mesh(scene.bones[0].mesh).distance(free).min() > -0.1
-    assert _volume(frames[0].surfaces["strap0"]) == pytest.approx(scene.muscles[0].mesh.volume, rel=1e-3)
+    assert _volume(frames[0].surfaces["strap0"]) == pytest.approx(
+        scene.muscles[0].mesh.volume, rel=1e-3
+    )

@@ -1,4 +1,5 @@
-"""The Python interface as a user meets it: names, types, runs in memory and in folders, notebooks."""
+"""The Python interface as a user meets it: names, types, runs in memory and in folders,
+notebooks."""
 
 import ast
 import subprocess
@@ -38,7 +39,9 @@ def test_names_are_what_a_user_needs_and_types_know_them():
 
 def test_user_script_is_typed_and_runs(tmp_path):
     planted = tmp_path / "planted.py"
-    planted.write_text("import rbfmuscle as rm\nrm.simulate('phantom').mussels\nrm.Scene(units=3)\n")
+    planted.write_text(
+        "import rbfmuscle as rm\nrm.simulate('phantom').mussels\nrm.Scene(units=3)\n"
+    )
     words = ["--strict", "--config-file=", "--follow-imports=silent", f"--cache-dir={tmp_path}"]
     command = [sys.executable, "-m", "mypy", *words, str(SCRIPT), str(planted)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
@@ -55,7 +58,9 @@ def test_run_answers_as_a_container(run):
     assert "abductor" in run and "abducter" not in run
     assert run.muscles == [muscle.name for muscle in run] == ["abductor"]
     assert {"volume_error", "penetration_max", "length"} <= set(run.quantities)
-    with pytest.raises(rm.UsageError, match=r"unknown muscle 'abducter', did you mean 'abductor'\?"):
+    with pytest.raises(
+        rm.UsageError, match=r"unknown muscle 'abducter', did you mean 'abductor'\?"
+    ):
         run["abducter"]
     with pytest.raises(rm.UsageError, match="frame 3 is out of range, the run has 3 frames"):
         run["abductor"].surface(3)
@@ -70,7 +75,9 @@ def test_run_that_is_loaded_is_the_run_that_was_saved(run, loaded, tmp_path):
     found, wanted = (each["abductor"].surface().vertices for each in (loaded, run))
     np.testing.assert_array_equal(wanted, run.frames[-1].surfaces["abductor"].vertices)
     np.testing.assert_allclose(found, wanted, rtol=1e-6)
-    np.testing.assert_array_equal(loaded.values("abductor", "length"), run.values("abductor", "length"))
+    np.testing.assert_array_equal(
+        loaded.values("abductor", "length"), run.values("abductor", "length")
+    )
     assert "nope" not in loaded.frames[0].surfaces and loaded.save(loaded.saved.directory) is None
     assert run.info["times"]["wall"] == run.info["times"]["wall"]
     loaded.save(tmp_path / "copy")
@@ -83,7 +90,9 @@ def test_metrics_as_a_table_where_pandas_is_there(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(rm.MissingPartError, match="pip install pandas"):
         run.table()
-    fake = types.SimpleNamespace(DataFrame=lambda rows, columns: [dict(zip(columns, row)) for row in rows])
+    fake = types.SimpleNamespace(
+        DataFrame=lambda rows, columns: [dict(zip(columns, row)) for row in rows]
+    )
     monkeypatch.setitem(sys.modules, "pandas", fake)
     lengths = [row["value"] for row in run.table() if row["quantity"] == "length"]
     assert lengths == list(run.values("abductor", "length"))

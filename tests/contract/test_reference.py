@@ -1,4 +1,6 @@
-"""Every public name has an example that runs and gives what it shows; so have the rooms' own functions."""
+"""Every public name has an example that runs and gives what it shows; so have the rooms' own
+functions.
+"""
 
 import doctest
 import importlib
@@ -14,11 +16,17 @@ sys.path.insert(0, str(ROOT / "docs"))
 from gallery import TOPICS
 
 ERRORS = "Errors and warnings"
-NAMES = [name for topic, names in TOPICS.items() if topic != ERRORS for name in names] + ["RBFMuscleError"]
+NAMES = [name for topic, names in TOPICS.items() if topic != ERRORS for name in names] + [
+    "RBFMuscleError"
+]
 # Packages without which an example cannot run.
 NEEDED = {"show": "viser"}
 # Modules of which every example is run, not the public names' alone.
-MODULES = ("rbfmuscle.geometry.surfaces", "rbfmuscle.geometry.exact_distance", "rbfmuscle.validation")
+MODULES = (
+    "rbfmuscle.geometry.surfaces",
+    "rbfmuscle.geometry.exact_distance",
+    "rbfmuscle.validation",
+)
 
 
 def run_examples(tests):
@@ -50,6 +58,10 @@ def test_reference_documents_every_parameter(name):
     value = getattr(rbfmuscle, name)
     text = inspect.getdoc(value)
     section = text.split("Parameters\n----------\n")[1].split("\n\n")[0]
-    listed = {word.strip() for line in section.splitlines() if not line.startswith(" ")
-              for word in line.split(" : ")[0].split(",")}  # fmt: skip
+    listed = {
+        word.strip()
+        for line in section.splitlines()
+        if not line.startswith(" ")
+        for word in line.split(" : ")[0].split(",")
+    }
     assert set(inspect.signature(value).parameters) <= listed

@@ -1,4 +1,6 @@
-"""What a release consists of: one version everywhere, every package found, a distribution that installs and runs."""
+"""What a release consists of: one version everywhere, every package found, a distribution that
+installs and runs.
+"""
 
 import os
 import re
@@ -40,7 +42,9 @@ def test_typed_marker_templates_and_scripts_travel_with_the_packages():
 
 def run(*command, **options):
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=1800, env=clean, **options)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=1800, env=clean, **options
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return done.stdout
 
@@ -56,7 +60,9 @@ def test_distribution_installs_in_a_clean_environment_and_runs(kind, tmp_path):
     run(str(binary / "python"), "-m", "pip", "install", "--quiet", str(file))
     version = PROJECT["project"]["version"]
     assert version in run(str(binary / "rbfmuscle"), "--version", cwd=tmp_path)
-    where = run(str(binary / "python"), "-c", "import rbfmuscle; print(rbfmuscle.__file__)", cwd=tmp_path)
+    where = run(
+        str(binary / "python"), "-c", "import rbfmuscle; print(rbfmuscle.__file__)", cwd=tmp_path
+    )
     assert str(tmp_path / "env") in where
     out = tmp_path / "out"
     run(str(binary / "rbfmuscle"), "demo", "--model", "pbd", "-o", str(out), cwd=tmp_path)

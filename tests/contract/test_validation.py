@@ -1,4 +1,6 @@
-"""Checks that every public function shares: what passes is returned whole, what does not is told with its place."""
+"""Checks that every public function shares: what passes is returned whole, what does not is told
+with its place.
+"""
 
 import numpy as np
 import pytest
@@ -21,9 +23,14 @@ from rbfmuscle.validation import (
 )
 
 CODES = {
-    "RBFMuscleError": 1, "UsageError": 2, "SceneError": 3, "MeshError": 4, "SolveError": 5, "LimitExceededError": 6,
+    "RBFMuscleError": 1,
+    "UsageError": 2,
+    "SceneError": 3,
+    "MeshError": 4,
+    "SolveError": 5,
+    "LimitExceededError": 6,
     "MissingPartError": 7,
-}  # fmt: skip
+}
 NOT_FINITE = [np.insert(np.zeros((4, 3)), 3, value, axis=0) for value in (np.nan, np.inf, -np.inf)]
 TETRAHEDRON = np.vstack([np.zeros(3), np.eye(3)]), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
 
@@ -41,19 +48,35 @@ def test_what_passes_comes_back_as_contiguous_doubles():
     assert check_vectors(np.ones((2, 3)), 2).shape == (2, 3)
     assert check_values([1, 2], 2).tolist() == [1.0, 2.0] and check_positive("0.5", name="x") == 0.5
     vertices, faces = check_mesh(*TETRAHEDRON)
-    assert vertices.dtype == np.float64 and faces.dtype == np.int64 and faces.tolist() == TETRAHEDRON[1]
+    assert (
+        vertices.dtype == np.float64
+        and faces.dtype == np.int64
+        and faces.tolist() == TETRAHEDRON[1]
+    )
 
 
 @pytest.mark.parametrize(
     ("check", "words", "wrong"),
     [
-        (check_points, r"must have shape \(n, 3\)", [np.zeros(s) for s in ((3,), (2, 2), (1, 3, 3))]),
+        (
+            check_points,
+            r"must have shape \(n, 3\)",
+            [np.zeros(s) for s in ((3,), (2, 2), (1, 3, 3))],
+        ),
         (check_points, "points must be finite, row 3 is", NOT_FINITE),
         (lambda given: check_values(given[:, 1], 5), "values must be finite, row 3 is", NOT_FINITE),
         (lambda given: check_vectors(given, 3), r"one row a point \(3\), got 2", [np.ones((2, 3))]),
-        (lambda given: check_values(given, 2), r"must have shape \(2,\)", [[1.0], [[1.0, 2.0]], 1.0]),
+        (
+            lambda given: check_values(given, 2),
+            r"must have shape \(2,\)",
+            [[1.0], [[1.0, 2.0]], 1.0],
+        ),
         (lambda given: check_values(given, 2), "must be an array of numbers", [["a", "b"]]),
-        (lambda given: check_positive(given, name="x"), "x must be a positive", [0.0, -1.0, np.nan, np.inf]),
+        (
+            lambda given: check_positive(given, name="x"),
+            "x must be a positive",
+            [0.0, -1.0, np.nan, np.inf],
+        ),
     ],
 )
 def test_what_is_of_another_kind_is_refused(check, words, wrong):
@@ -88,8 +111,15 @@ def test_nearest_name_or_all_names():
 
 def test_messages_show_values_whole_up_to_a_length():
     assert shown("x" * 80) == "x" * 80 and shown("x" * 81) == f"{65 * 'x'} ... {10 * 'x'}"
-    assert shown_path("x" * 400) == "x" * 400 and len(shown_path("x" * 401)) == 400 and shown(2.5) == "2.5"
-    assert one_line("a\n b") == "a b" and [len(one_line(n * "x")) for n in (1000, 1001)] == [1000, 995]
+    assert (
+        shown_path("x" * 400) == "x" * 400
+        and len(shown_path("x" * 401)) == 400
+        and shown(2.5) == "2.5"
+    )
+    assert one_line("a\n b") == "a b" and [len(one_line(n * "x")) for n in (1000, 1001)] == [
+        1000,
+        995,
+    ]
     assert shown(10**5000) == "a int too long to show"
 
 

@@ -1,18 +1,22 @@
-"""Whole runs of small scenes give what they gave: what differs is a change of behaviour, and is reviewed as one."""
+"""Whole runs of small scenes give what they gave: what differs is a change of behaviour, and is
+reviewed as one.
+"""
 
 import numpy as np
 import pytest
 from kept import TOLERANCE, check_kept, differences, digest
 from whole_runs import SCENES, measure
 
-# An RBF muscle's solve ends where an iteration moves no node by more than 2e-5 of its size: a rounding error may take
-# or save one iteration.
+# An RBF muscle's solve ends where an iteration moves no node by more than 2e-5 of its size: a
+# rounding error may take or save one iteration.
 SETTLED = 1e-4
 
 
 @pytest.fixture(scope="module", autouse=True)
 def cold_cache(tmp_path_factory):
-    """What a cache keeps (fields, weights, numbers of centres) is found anew, so that its faults show."""
+    """What a cache keeps (fields, weights, numbers of centres) is found anew, so that its faults
+    show.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RBFMUSCLE_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield

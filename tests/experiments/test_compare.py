@@ -19,19 +19,34 @@ from rbfmuscle.validation import UsageError
 
 
 def test_what_does_not_count_is_a_tie():
-    found = {name: {"all": {"rest_error_rms": e}} for name, e in (("a", 0.0), ("b", 0.01), ("c", 0.5))}
+    found = {
+        name: {"all": {"rest_error_rms": e}} for name, e in (("a", 0.0), ("b", 0.01), ("c", 0.5))
+    }
     assert best_models(found, "rest_error_rms", "mm") == ["a", "b"]
     assert best_models(found, "rest_error_rms", "m") == ["a"]
-    found = {name: {"all": {"distance_rms": 1.0, "slack": s}} for name, s in (("a", 1.0), ("b", 0.9))}
-    assert best_models(found, "distance_rms", "mm") == best_models({"a": found["a"]}, "slack", "mm") == []
+    found = {
+        name: {"all": {"distance_rms": 1.0, "slack": s}} for name, s in (("a", 1.0), ("b", 0.9))
+    }
+    assert (
+        best_models(found, "distance_rms", "mm")
+        == best_models({"a": found["a"]}, "slack", "mm")
+        == []
+    )
     assert best_models(found, "slack", "mm") == ["a"]  # which is perfect at 1
     known = {"models": ["a"], "results": found}
     assert (_values(known, "slack"), _values(known, "flicker")) == ([1.0], [])
     table = {"measures": {name: {"unit": "mm"} for name in MEASURES}}
-    values = ("return_rms", 0.009), ("return_rms", 0.011), ("distance_rms", 0.4), ("distance_max", 0.4)
+    values = (
+        ("return_rms", 0.009),
+        ("return_rms", 0.011),
+        ("distance_rms", 0.4),
+        ("distance_max", 0.4),
+    )
     assert [shown(table, *value) for value in values] == ["0 mm", "0.011 mm", "0.4 mm", "0.4 mm"]
     for depth, verb in ((2e-4, "keeps out of"), (4e-4, "enters")):
-        assert f"A {verb} bones" in describe({"a": {"all": {"penetration_max": depth}}}, {"a": "A"}, "m")
+        assert f"A {verb} bones" in describe(
+            {"a": {"all": {"penetration_max": depth}}}, {"a": "A"}, "m"
+        )
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +54,9 @@ def compared(tmp_path_factory):
     """Two models on the phantom, four poses to 18 degrees."""
     folder = tmp_path_factory.mktemp("compare")
     scene = phantom_scene(step=6.0).with_options(frames="0:4")
-    table = compare_models(scene, folder, ["rbf", "pbd"], settings={"rbf:model.centres": 100}, pictures=False)
+    table = compare_models(
+        scene, folder, ["rbf", "pbd"], settings={"rbf:model.centres": 100}, pictures=False
+    )
     return folder, table
 
 
@@ -53,7 +70,9 @@ class TestComparison:
             for quantity in ("volume_error", "bone_penetration_max", "rest_error_rms"):
                 each = [saved.series(muscle, quantity)[1] for muscle in saved.muscles]
                 assert abs(found["all"][quantity]) == max(abs(values).max() for values in each)
-            walls = {name: saved.series(name, "time_frame")[1][1:] for name in ("all", *saved.muscles)}
+            walls = {
+                name: saved.series(name, "time_frame")[1][1:] for name in ("all", *saved.muscles)
+            }
             assert all(found[name]["time_frame"] == np.median(wall) for name, wall in walls.items())
             assert found["all"]["time_frame_p95"] == np.percentile(walls["all"], 95)
             assert set(MEASURES) - set(found["all"]) <= {"distance_rms", "distance_max", "flicker"}
@@ -79,7 +98,10 @@ class TestComparison:
         assert kept == json.loads(json.dumps(table))
         lines = (folder / "comparison.csv").read_text(encoding="utf-8").splitlines()
         for row in csv.DictReader(lines):
-            assert float(row["value"]) == table["results"][row["model"]][row["muscle"]][row["quantity"]]
+            assert (
+                float(row["value"])
+                == table["results"][row["model"]][row["muscle"]][row["quantity"]]
+            )
         text = (folder / "report.html").read_text(encoding="utf-8")
         assert table["answer"].startswith("RBF keeps out of bones") and table["answer"] in text
         assert text.index(table["answer"]) < text.index("<table")

@@ -56,7 +56,9 @@ def test_numbers_are_those_of_the_surface(study, ellipsoid):
         # The implicit form x^2/a^2 + ... = 1 is met where the row says so.
         radius = np.sqrt(((vertices / [40.0, 18.0, 12.0]) ** 2).sum(axis=1))
         assert np.abs(radius - 1.0).max() * 12.0 <= row["hausdorff"] + 0.2
-        if row["epsilon"]:  # the shape parameter is per spacing, about the root of the area of each centre
+        if row[
+            "epsilon"
+        ]:  # the shape parameter is per spacing, about the root of the area of each centre
             spacing = row["shape"] / row["epsilon"]
             assert 0.5 < spacing / np.sqrt(ellipsoid.area / row["centres"]) < 1.5
 
@@ -65,7 +67,10 @@ def test_lines_to_paste_give_the_row(study):
     row = next(row for row in study.rows if row["kernel"] == "matern_52")
     table = tomllib.loads(row_toml(row))["muscle"]["model"]
     assert table["kernel"] == "matern_52" and table["centres"] == row["centres"]
-    assert table["epsilon"] == pytest.approx(row["epsilon"], rel=1e-5) and table["placement"] == "fitted"
+    assert (
+        table["epsilon"] == pytest.approx(row["epsilon"], rel=1e-5)
+        and table["placement"] == "fitted"
+    )
     row = next(row for row in study.rows if row["kernel"] == "linear")
     assert 'placement = "greedy"' in row_toml(row)  # not C2: no Hermite fit to be fitted
     assert "condition = 1e+10" in row_toml(row | {"bound": 1e10})
@@ -74,14 +79,20 @@ def test_lines_to_paste_give_the_row(study):
 def test_a_study_on_several_threads_is_that_of_one():
     ball = trimesh.creation.icosphere(3, 10.0).apply_scale([2.0, 1.0, 1.0])
     asked = {"kernels": ["cubic", "quintic", "gaussian"], "centres": [30, 50], "resolution": 24}
-    rows, threads, filters = {}, numba.get_num_threads(), list(warnings.filters)
+    rows = {}
+    threads = numba.get_num_threads()
+    filters = list(warnings.filters)
     for count in (1, threads):
         numba.set_num_threads(count)
-        rows[count] = {(row["kernel"], row["centres"]): row for row in rm.study_kernels(ball, **asked).rows}
+        rows[count] = {
+            (row["kernel"], row["centres"]): row for row in rm.study_kernels(ball, **asked).rows
+        }
     assert warnings.filters == filters
     for key, row in rows[1].items():
         same = rows[threads][key]
-        assert row["unfit"] == same["unfit"] and row["epsilon"] == pytest.approx(same["epsilon"], rel=1e-9)
+        assert row["unfit"] == same["unfit"] and row["epsilon"] == pytest.approx(
+            same["epsilon"], rel=1e-9
+        )
         if not row["unfit"]:
             assert row["rms"] == pytest.approx(same["rms"], rel=1e-6)
             assert same["fit_time"] > 0.0 and same["evaluation_time"] > 0.0
@@ -89,15 +100,23 @@ def test_a_study_on_several_threads_is_that_of_one():
 
 def row(kernel, rms, milliseconds, *, condition=1e6, epsilon=0.0, unfit=""):
     return {
-        "kernel": kernel, "rms": rms, "fit_time": milliseconds * 1e-3, "evaluation_time": 0.0, "condition": condition,
-        "epsilon": epsilon, "unfit": unfit,
-    }  # fmt: skip
+        "kernel": kernel,
+        "rms": rms,
+        "fit_time": milliseconds * 1e-3,
+        "evaluation_time": 0.0,
+        "condition": condition,
+        "epsilon": epsilon,
+        "unfit": unfit,
+    }
 
 
 @pytest.mark.parametrize(
     ("rows", "wanted"),
     [
-        ([row("multiquadric", 0.1407, 20.0), row("cubic", 0.143, 2.0), row("linear", 0.4, 1.0)], "cubic"),
+        (
+            [row("multiquadric", 0.1407, 20.0), row("cubic", 0.143, 2.0), row("linear", 0.4, 1.0)],
+            "cubic",
+        ),
         ([row("quintic", 0.10, 20.0), row("cubic", 0.14, 2.0)], "quintic"),  # really better
         ([row("a", 0.14, 2.0, epsilon=0.2), row("b", 0.14, 2.2)], "b"),  # no parameter to choose
         ([row("a", 0.14, 2.0, epsilon=0.2), row("b", 0.14, 2.4)], "a"),  # quicker
@@ -115,7 +134,11 @@ def test_the_quickest_of_those_alike_is_recommended(rows, wanted):
 def test_pages_hold_what_is_kept(study, tmp_path):
     rows = sorted(map(dict, study.rows), key=row_name)
     for k, row in enumerate(rows):  # what was measured hangs on last digits
-        row |= {key: 0.01 * (k + 1) for key, value in row.items() if value is None or type(value) is float}
+        row |= {
+            key: 0.01 * (k + 1)
+            for key, value in row.items()
+            if value is None or type(value) is float
+        }
         row |= {"front": k % 2 == 0, "condition": 10.0**k, "unfit": "" if k < 10 else "9 sheets"}
     made = replace(study, rows=rows, recommended=rows[1])
     write_studies({"egg": made}, tmp_path / "one")
@@ -144,7 +167,15 @@ def test_wrong_requests_are_answered(ellipsoid):
 
 
 def test_command_ranks_and_prints(tmp_path, capsys):
-    words = ["phantom", "--muscle", "adductor_posterior", "--kernels", "cubic,quintic", "--centres", "60"]
+    words = [
+        "phantom",
+        "--muscle",
+        "adductor_posterior",
+        "--kernels",
+        "cubic,quintic",
+        "--centres",
+        "60",
+    ]
     code, out, _ = call(capsys, "kernels", *words, "--resolution", "40", "-o", tmp_path / "new/k")
     assert code == 0 and "use " in out.lower() and "[muscle.model]" in out
     rows = json.loads((tmp_path / "new/k/kernels.json").read_text(encoding="utf-8"))["rows"]
@@ -170,7 +201,10 @@ def test_slender_muscles_are_looked_at_with_finer_cells(ellipsoid):
 def egg(ellipsoid):
     """An ellipsoid of which no two parts are alike, so that rounding chooses nothing."""
     x, y, z = (ellipsoid.vertices / 20.0).T
-    shape = ellipsoid.vertices * (1.0 + 0.1 * np.sin(x + 2.0 * y + 0.4) + 0.05 * np.cos(3.0 * z - x))[:, None]
+    shape = (
+        ellipsoid.vertices
+        * (1.0 + 0.1 * np.sin(x + 2.0 * y + 0.4) + 0.05 * np.cos(3.0 * z - x))[:, None]
+    )
     return trimesh.Trimesh(shape, ellipsoid.faces, process=False)
 
 

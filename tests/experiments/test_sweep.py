@@ -37,12 +37,16 @@ CLOCKED = ("time_frame", "time_frame_p95", "time_extract", "seconds", "threads",
 
 
 def plan_of(texts=GRID, **options):
-    return plan_sweep({"arm": arm_scene(end=10, step=5)}, parse_grid(texts), frames=FRAMES, **options)
+    return plan_sweep(
+        {"arm": arm_scene(end=10, step=5)}, parse_grid(texts), frames=FRAMES, **options
+    )
 
 
 def sweep(folder, texts=GRID, runner=run_point, **options):
     points, scenes = plan_of(texts), {"arm": arm_scene(end=10, step=5)}
-    return points, run_sweep(runner, scenes, points, folder, frames=FRAMES, **{"jobs": 1, **options})
+    return points, run_sweep(
+        runner, scenes, points, folder, frames=FRAMES, **{"jobs": 1, **options}
+    )
 
 
 def rows_of(points, folder):
@@ -63,7 +67,11 @@ def finished(tmp_path_factory):
 
 class TestGrid:
     def test_values_are_read_as_toml_or_text(self):
-        texts = ["model.centres=100,200", "contact.substep_angle=0.5,2", "model.kernel=cubic,wendland_c2"]
+        texts = [
+            "model.centres=100,200",
+            "contact.substep_angle=0.5,2",
+            "model.kernel=cubic,wendland_c2",
+        ]
         assert list(parse_grid(texts).values()) == [[100, 200], [0.5, 2], ["cubic", "wendland_c2"]]
         assert parse_grid(["a=[1,2],[3],[1,2]"]) == {"a": [[1, 2], [3]]}
         for wrong in (["centres"], ["=1,2"], ["a="], ["motion.step=1,a"], ["a=1", "a=2"]):
@@ -92,9 +100,18 @@ class TestGrid:
 def row(error, time, role=""):
     label = role or f"{error:g} {time:g}"
     return {
-        "scene": "s", "status": "done", "role": role, "reference": "r", "units": "mm", "label": label, "key": label,
-        "settings": {}, "error_rms": error, "time_frame": time, "front": False,
-    }  # fmt: skip
+        "scene": "s",
+        "status": "done",
+        "role": role,
+        "reference": "r",
+        "units": "mm",
+        "label": label,
+        "key": label,
+        "settings": {},
+        "error_rms": error,
+        "time_frame": time,
+        "front": False,
+    }
 
 
 class TestFront:
@@ -106,7 +123,12 @@ class TestFront:
         [(1.0, 1.0, 1.0, True), (1.05, 1.08, 1.05, True), (2.0, 3.0, 2.0, False)],
     )
     def test_default_is_judged_by_the_factor_to_the_front(self, error, time, factor, near):
-        rows = [row(1.0, 1.0), row(5.0, 0.5), row(error, time, "default"), row(np.nan, 0.1, "reference")]
+        rows = [
+            row(1.0, 1.0),
+            row(5.0, 0.5),
+            row(error, time, "default"),
+            row(np.nan, 0.1, "reference"),
+        ]
         exact = mark_front([row(0.0, 1.0, "default"), row(0.0, 0.5)])[0]
         assert (exact["factor"], exact["faster"], exact["better"]) == (1.0, "0 0.5", None)
         (verdict,) = mark_front(rows)
@@ -137,7 +159,10 @@ class TestRun:
         write_page(table, tmp_path)
         # The page has three digits.
         check_kept("sweep_page", file_facts(tmp_path), tolerance=1e-2)
-        rows = [{key: value for key, value in row.items() if key not in CLOCKED} for row in table["rows"]]
+        rows = [
+            {key: value for key, value in row.items() if key not in CLOCKED}
+            for row in table["rows"]
+        ]
         check_kept("sweep_rows", rows, tolerance=1e-3)
 
     def test_what_is_done_is_not_done_twice(self, finished):
@@ -156,7 +181,9 @@ class TestRun:
         points, _ = sweep(tmp_path, ["model.centres=40,-3", "model.resolution=16,24"])
         rows = write_table(points, tmp_path, {"arm": "mm"})["rows"]
         failed = [r for r in rows if r["status"] == "failed"]
-        assert {r["settings"]["model.centres"] for r in failed} == {-3} and all(r["error"] for r in failed)
+        assert {r["settings"]["model.centres"] for r in failed} == {-3} and all(
+            r["error"] for r in failed
+        )
         assert sweep(tmp_path, ["model.centres=40,-3", "model.resolution=16,24"])[1] == len(failed)
 
 
@@ -244,8 +271,14 @@ class TestCommand:
 
 
 def test_rows_are_those_of_their_points_in_order():
-    points = [SweepPoint(f"k{n}", "s", {"a": n} if n else {}, "" if n else "default", "r") for n in range(3)]
-    done, failed = {"status": "done", "values": {"error_rms": 0.25}}, {"status": "failed", "error": "no"}
+    points = [
+        SweepPoint(f"k{n}", "s", {"a": n} if n else {}, "" if n else "default", "r")
+        for n in range(3)
+    ]
+    done, failed = (
+        {"status": "done", "values": {"error_rms": 0.25}},
+        {"status": "failed", "error": "no"},
+    )
     folder = SimpleNamespace(read=lambda key: {"k0": done, "k1": failed}.get(key, {}))
     rows = sweep_rows(points, folder, {"s": "cm"})
     assert [r["status"] for r in rows] == ["done", "failed", "missing"]

@@ -1,6 +1,7 @@
 """``make fuzz``: damaged scenes and meshes by the thousand, and a table of what became of them.
 
-``--only scene:17`` (or ``mesh:17``, ``frames:17``) runs one case in this process and shows its file and its trace.
+``--only scene:17`` (or ``mesh:17``, ``frames:17``) runs one case in this process and shows its file
+and its trace.
 """
 
 import argparse
@@ -43,7 +44,9 @@ class Cases:
         return read(path, may_be_open=bool(number % 4 == 3))
 
     def frames(self, rng, number):
-        """Three frames of a damaged scene, or of the whole one with a damaged muscle, with each model in turn."""
+        """Three frames of a damaged scene, or of the whole one with a damaged muscle, with each
+        model in turn.
+        """
         if number % 4 >= 2:
             scene = base_scene()
             mesh = write_damaged(self.folder / "case", self.forms, rng)
@@ -82,7 +85,9 @@ def load(path: Path) -> int:
     except RBFMuscleError as error:
         return harness.tell(error)
     for muscle in scene.muscles:
-        harness.check_volume(np.asarray(muscle.mesh.vertices), np.asarray(muscle.mesh.faces), muscle.name)
+        harness.check_volume(
+            np.asarray(muscle.mesh.vertices), np.asarray(muscle.mesh.faces), muscle.name
+        )
     for bone in scene.bones:
         harness.check_finite(bone.mesh.vertices, bone.name)
     return 0
@@ -122,12 +127,15 @@ def run(path: Path, output: Path, model: str | None) -> int:
                 harness.check_finite(saved.surface(muscle, frame)[0], f"{muscle} in frame {frame}")
         for row in saved.metrics:
             if row.quantity in FINITE:
-                harness.check_finite([row.value], f"{row.quantity} of {row.muscle} in frame {row.frame}")
+                harness.check_finite(
+                    [row.value], f"{row.quantity} of {row.muscle} in frame {row.frame}"
+                )
     return code
 
 
 def warm_up(cases, models):
-    """Load the program, and its compiled loops by a run with each model, before anything is forked."""
+    """Load the program, and its compiled loops by a run with each model, before anything is
+    forked."""
     path = cases.folder / "whole.toml"
     path.write_text(to_toml(base_scene()))
     (cases.folder / "case").mkdir(exist_ok=True)
@@ -158,7 +166,9 @@ def main() -> int:
     for kind in KINDS:
         table[kind] = Counter()
         for number in range(options.first, options.first + getattr(options, kind)):
-            outcome, said, seconds = harness.run_case(cases.action(kind, number), cases.folder / "case")
+            outcome, said, seconds = harness.run_case(
+                cases.action(kind, number), cases.folder / "case"
+            )
             table[kind][outcome] += 1
             if outcome == harness.CLEAN:
                 slowest = max(slowest, seconds)
@@ -166,8 +176,14 @@ def main() -> int:
                 words = " / ".join(said.strip().splitlines()[-4:])
                 print(f"{kind}:{number}: {outcome}: {words[:600]}", flush=True)
     for outcome in harness.OUTCOMES:
-        print(f"{outcome:50}" + "".join(f"{found[outcome]:>8} {kind}" for kind, found in table.items()))
-    print(f"{sum(map(Counter.total, table.values()))} cases; the slowest clean error took {slowest:.2f} s")
+        print(
+            f"{outcome:50}"
+            + "".join(f"{found[outcome]:>8} {kind}" for kind, found in table.items())
+        )
+    print(
+        f"{sum(map(Counter.total, table.values()))} cases; the slowest clean error took "
+        f"{slowest:.2f} s"
+    )
     return int(any(found[o] for found in table.values() for o in harness.OUTCOMES[2:]))
 
 

@@ -1,7 +1,7 @@
 """Runs cases, each in a process of its own, and says what became of it.
 
-One process loads the program once, runs the small scene once with each model, and is then forked for every case:
-what ends a case ends no other, and its memory and time are its own.
+One process loads the program once, runs the small scene once with each model, and is then forked
+for every case: what ends a case ends no other, and its memory and time are its own.
 """
 
 import math
@@ -21,18 +21,23 @@ import numpy as np
 
 CLEAN_CODES = (2, 3, 4, 5, 6, 7)
 FINE, CLEAN = "fine", "clean error"
-BUG, DEATH, TIMEOUT, MEMORY, NOISE, WRONG = (
-    "a bug told as such, or a traceback", "death of the process", "more than 20 s", "more than 2 GB",
-    "more than one line, or a library's own", "NaN or a wrong volume, and code 0",
-)  # fmt: skip
+BUG = "a bug told as such, or a traceback"
+DEATH = "death of the process"
+TIMEOUT = "more than 20 s"
+MEMORY = "more than 2 GB"
+NOISE = "more than one line, or a library's own"
+WRONG = "NaN or a wrong volume, and code 0"
 OUTCOMES = (CLEAN, FINE, BUG, DEATH, TIMEOUT, MEMORY, NOISE, WRONG)
 SECONDS = 20  # processor time of a case; a sleeping one ends by the wall clock after:
 HANG = 300
 MOST_MEMORY = 2_000_000  # KB
 LONGEST = 1200  # characters of a message
 WRONG_CODE = 99
-# Beside the one line of an error: warnings, frames, and, where it takes long, what goes on and since when.
-EXPECTED = re.compile(r"rbfmuscle: (warning: |compiling loops )|\w+: (frame \d+ of \d+|[a-z ]+) \(\d+ s\)$")
+# Beside the one line of an error: warnings, frames, and, where it takes long, what goes on and
+# since when.
+EXPECTED = re.compile(
+    r"rbfmuscle: (warning: |compiling loops )|\w+: (frame \d+ of \d+|[a-z ]+) \(\d+ s\)$"
+)
 
 
 class WrongResult(Exception):
@@ -40,7 +45,9 @@ class WrongResult(Exception):
 
 
 def run_case(action: Callable[[], int], folder: Path) -> tuple[str, str, float]:
-    """Run one case in a forked process; its outcome, what it said, and the processor time it took [s]."""
+    """Run one case in a forked process; its outcome, what it said, and the processor time it took
+    [s].
+    """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     said = folder / "said.txt"
@@ -78,7 +85,11 @@ def _limit(said, folder):
 
 def _judge(status, usage, text):
     if os.WIFSIGNALED(status):
-        return TIMEOUT if os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGALRM, signal.SIGKILL) else DEATH
+        return (
+            TIMEOUT
+            if os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGALRM, signal.SIGKILL)
+            else DEATH
+        )
     if usage.ru_maxrss > MOST_MEMORY:
         return MEMORY
     code = os.WEXITSTATUS(status)
@@ -117,7 +128,9 @@ def check_finite(values, name: str) -> None:
 
 
 def check_volume(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
-    """Raise WrongResult unless the divergence theorem agrees with winding numbers of places tried at random."""
+    """Raise WrongResult unless the divergence theorem agrees with winding numbers of places tried
+    at random.
+    """
     a, b, c = vertices[faces].transpose(1, 0, 2)
     volume = float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -126,7 +139,8 @@ def check_volume(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
         raise WrongResult(f"{name}: volume {volume} in a box of {box}")
     places = low + (high - low) * np.random.default_rng(0).random((600, 3))
     share = float((igl.winding_number(vertices, faces, places) > 0.5).mean())
-    # Four deviations of a share found from 600 places, and a tenth for surfaces that cross themselves a little.
+    # Four deviations of a share found from 600 places, and a tenth for surfaces that cross
+    # themselves a little.
     allowed = 0.1 * volume / box + 4 * math.sqrt(max(share * (1 - share), 1e-3) / 600)
     if abs(share - volume / box) > allowed:
         raise WrongResult(f"{name}: volume {volume:.4g}, but {share * box:.4g} inside the surface")

@@ -1,4 +1,6 @@
-"""The small scene that is damaged, its mesh files of every form, and damaged meshes: bytes, numbers and shapes."""
+"""The small scene that is damaged, its mesh files of every form, and damaged meshes: bytes, numbers
+and shapes.
+"""
 
 import re
 from pathlib import Path
@@ -8,10 +10,23 @@ import trimesh
 
 # Every form in which a mesh is written: suffix and how.
 FORMS = (
-    "stl", "stl-text", "obj", "ply", "ply-text", "vtk-text-42", "vtk-binary-42", "vtk-text-51", "vtk-binary-51",
-    "vtp-Ascii-None", "vtp-Binary-None", "vtp-Binary-ZLib", "vtp-Appended-None", "vtp-Appended-ZLib",
-    "vtp-Appended-LZ4", "vtp-Appended-LZMA",
-)  # fmt: skip
+    "stl",
+    "stl-text",
+    "obj",
+    "ply",
+    "ply-text",
+    "vtk-text-42",
+    "vtk-binary-42",
+    "vtk-text-51",
+    "vtk-binary-51",
+    "vtp-Ascii-None",
+    "vtp-Binary-None",
+    "vtp-Binary-ZLib",
+    "vtp-Appended-None",
+    "vtp-Appended-ZLib",
+    "vtp-Appended-LZ4",
+    "vtp-Appended-LZMA",
+)
 
 
 def muscle_mesh() -> trimesh.Trimesh:
@@ -23,7 +38,9 @@ def muscle_mesh() -> trimesh.Trimesh:
 
 def bone_meshes() -> dict[str, trimesh.Trimesh]:
     """A ball above the joint and a rod below it [mm]."""
-    upper = trimesh.creation.icosphere(subdivisions=2, radius=18.0).apply_translation([0.0, 0.0, 30.0])
+    upper = trimesh.creation.icosphere(subdivisions=2, radius=18.0).apply_translation(
+        [0.0, 0.0, 30.0]
+    )
     lower = trimesh.creation.capsule(height=80.0, radius=10.0, count=[10, 10])
     return {"upper": upper, "lower": lower.apply_translation([0.0, 0.0, -95.0])}
 
@@ -37,7 +54,9 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, form: str) -> Path:
     """Write a mesh in one of ``FORMS``."""
     kind, *how = form.split("-")
     if kind == "stl":
-        path.write_bytes(mesh.export(file_type="stl_ascii").encode() if how else mesh.export(file_type="stl"))
+        path.write_bytes(
+            mesh.export(file_type="stl_ascii").encode() if how else mesh.export(file_type="stl")
+        )
     elif kind == "ply":
         path.write_bytes(mesh.export(file_type="ply", encoding="ascii" if how else "binary"))
     elif kind == "obj":
@@ -90,7 +109,9 @@ def write_base(folder: Path) -> dict[str, bytes]:
     lines = [[[34.0, 0.0, 30.0], [34.0, 0.0, -10.0], [34.0, 0.0, -50.0]]]
     (folder / "fibres.json").write_text(f'{{"polylines": {lines}}}')
     rows = "\n".join(f"{k}\t{3 * k}" for k in range(4))
-    (folder / "flex.mot").write_text(f"flex\nversion=1\ninDegrees=yes\nendheader\ntime\tflexion\n{rows}\n")
+    (folder / "flex.mot").write_text(
+        f"flex\nversion=1\ninDegrees=yes\nendheader\ntime\tflexion\n{rows}\n"
+    )
     forms = {}
     for form in FORMS:
         path = write_mesh(folder / f"muscle-{form}{suffix_of(form)}", muscle_mesh(), form)
@@ -108,7 +129,9 @@ def base_scene() -> dict:
         "scene": {"format": 1, "name": "small", "units": "mm"},
         "defaults": {"model": "rbf"},
         "bone": [{"name": name, "mesh": f"{name}.ply"} | scale for name, scale in bones],
-        "joint": [{"name": "hip", "parent": "upper", "child": "lower", "centre": [0.0] * 3, "axes": axes}],
+        "joint": [
+            {"name": "hip", "parent": "upper", "child": "lower", "centre": [0.0] * 3, "axes": axes}
+        ],
         "motion": {"ramp": {"hip.flexion": {"from": 0.0, "to": 6.0, "step": 3.0}}},
         "muscle": [{"name": "muscle", "mesh": "muscle-ply.ply", "model": model, "attach": attach}],
         "contact": {"initial": "resolve", "substep_angle": 3.0},
@@ -123,9 +146,27 @@ def pick(rng, options):
 
 
 NUMBERS = (
-    b"0", b"-1", b"1", b"3", b"163", b"99999", b"4294967295", b"4294967296", b"9223372036854775807", b"9" * 30,
-    b"9" * 5000, b"nan", b"inf", b"1e308", b"-1e300", b"1e400", b"1.5", b"abc", b"", b"0x10",
-)  # fmt: skip
+    b"0",
+    b"-1",
+    b"1",
+    b"3",
+    b"163",
+    b"99999",
+    b"4294967295",
+    b"4294967296",
+    b"9223372036854775807",
+    b"9" * 30,
+    b"9" * 5000,
+    b"nan",
+    b"inf",
+    b"1e308",
+    b"-1e300",
+    b"1e400",
+    b"1.5",
+    b"abc",
+    b"",
+    b"0x10",
+)
 
 
 def write_damaged(folder: Path, forms: dict[str, bytes], rng: np.random.Generator) -> Path:
@@ -179,7 +220,9 @@ KINDS = 14
 
 
 def damaged_shape(rng: np.random.Generator, kind: int | None = None) -> trimesh.Trimesh:
-    """The muscle's mesh with vertices moved, joined or lost, or with triangles lost, turned or repeated."""
+    """The muscle's mesh with vertices moved, joined or lost, or with triangles lost, turned or
+    repeated.
+    """
     mesh = muscle_mesh()
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     few = rng.choice(len(faces), int(rng.integers(1, 12)), replace=False)
@@ -218,5 +261,7 @@ def damaged_shape(rng: np.random.Generator, kind: int | None = None) -> trimesh.
     elif kind == 12:
         faces = np.vstack([faces, faces[few], np.roll(faces[few], 1, axis=1)])
     else:
-        faces = faces[few[:1]] if rng.random() < 0.3 else rng.permutation(faces.ravel()).reshape(-1, 3)
+        faces = (
+            faces[few[:1]] if rng.random() < 0.3 else rng.permutation(faces.ravel()).reshape(-1, 3)
+        )
     return trimesh.Trimesh(vertices, faces, process=False)

@@ -1,4 +1,6 @@
-"""Damaged scene files: values that no key can mean, missing and foreign keys, broken text, endless motions."""
+"""Damaged scene files: values that no key can mean, missing and foreign keys, broken text, endless
+motions.
+"""
 
 import json
 from typing import Any
@@ -18,20 +20,90 @@ def nested(depth):
 
 # Values put in the place of any other.
 HOSTILE = (
-    0, -1, 1, 2, 1.5, -0.0, 1e-308, 1e308, -1e308, 1e12, 1e-12, 10**6, 2**31, 2**63, 10**20, Raw("9" * 5000),
-    float("inf"), float("-inf"), float("nan"), True, False, "", "x", "x" * 5000, "rbf", "pbd", "xpbd", "arap-pbd",
-    "../..", "/dev/zero", "/dev/null", "/proc/self/mem", "a/b", "a\nb", "\u2028", "muscle", "upper", "hip.flexion",
-    [], {}, [[]], [0, 0, 0], [1e308] * 3, [float("nan")] * 3, ["a"], [{}], [1, [2]], {"name": "rbf"}, {"name": 1},
-    {"name": "pbd", "iterations": 2}, Raw("1979-05-27T07:32:00Z"), Raw("0x10"), Raw("1_000"), Raw("1e400"),
-    nested(30), nested(1000), nested(100000), Raw("'''a'''"), Raw("{ a = 1, a = 2 }"), Raw("?"),
-)  # fmt: skip
+    0,
+    -1,
+    1,
+    2,
+    1.5,
+    -0.0,
+    1e-308,
+    1e308,
+    -1e308,
+    1e12,
+    1e-12,
+    10**6,
+    2**31,
+    2**63,
+    10**20,
+    Raw("9" * 5000),
+    float("inf"),
+    float("-inf"),
+    float("nan"),
+    True,
+    False,
+    "",
+    "x",
+    "x" * 5000,
+    "rbf",
+    "pbd",
+    "xpbd",
+    "arap-pbd",
+    "../..",
+    "/dev/zero",
+    "/dev/null",
+    "/proc/self/mem",
+    "a/b",
+    "a\nb",
+    "\u2028",
+    "muscle",
+    "upper",
+    "hip.flexion",
+    [],
+    {},
+    [[]],
+    [0, 0, 0],
+    [1e308] * 3,
+    [float("nan")] * 3,
+    ["a"],
+    [{}],
+    [1, [2]],
+    {"name": "rbf"},
+    {"name": 1},
+    {"name": "pbd", "iterations": 2},
+    Raw("1979-05-27T07:32:00Z"),
+    Raw("0x10"),
+    Raw("1_000"),
+    Raw("1e400"),
+    nested(30),
+    nested(1000),
+    nested(100000),
+    Raw("'''a'''"),
+    Raw("{ a = 1, a = 2 }"),
+    Raw("?"),
+)
 KEYS = (
-    "x", "name", "mesh", "model", "axes", "from", "step", "scale", "attach", "near", "type", "", "a.b", "😀", "\x07",
-)  # fmt: skip
+    "x",
+    "name",
+    "mesh",
+    "model",
+    "axes",
+    "from",
+    "step",
+    "scale",
+    "attach",
+    "near",
+    "type",
+    "",
+    "a.b",
+    "😀",
+    "\x07",
+)
 
 
 def scene_text(rng: np.random.Generator, *, deep: bool = False) -> str:
-    """A damaged scene file; ``deep`` asks for changes that many scenes survive, so that what follows is met too."""
+    """A damaged scene file; ``deep`` asks for changes that many scenes survive, so that what
+    follows is met too.
+    """
     scene = base_scene()
     changes = [_motion, _joint, _attach, _model, _tables]
     if not deep:
@@ -103,7 +175,10 @@ def _joint(scene, rng):
     changes = (
         {"centre": axis},
         {"axes": {"flexion": axis}},
-        {"child": pick(rng, ["upper", "lower", "muscle", ""]), "parent": pick(rng, ["upper", "lower"])},
+        {
+            "child": pick(rng, ["upper", "lower", "muscle", ""]),
+            "parent": pick(rng, ["upper", "lower"]),
+        },
         {"type": pick(rng, ["hinge", "slider", "free", "fixed", "custom", "ball", "bal", 3])},
     )
     _update(scene, rng, "joint", changes)
@@ -115,7 +190,11 @@ def _attach(scene, rng):
     number = pick(rng, [0, 5, -1, 161, 162, 10**9, 10**19, 2**62])
     places = (
         {"vertices": [number, 1, 2]},
-        {"vertices": pick(rng, ["upper.txt", "none.txt", "upper.ply", ".", "fibres.json", "/dev/zero"])},
+        {
+            "vertices": pick(
+                rng, ["upper.txt", "none.txt", "upper.ply", ".", "fibres.json", "/dev/zero"]
+            )
+        },
         {"near": _number(rng)},
         {"sphere": {"centre": [34.0, 0.0, _number(rng)], "radius": abs(_number(rng))}},
         {"vertices": []},
@@ -126,14 +205,53 @@ def _attach(scene, rng):
 
 
 OPTIONS = (
-    "centres", "samples", "iterations", "nodes", "slack", "fibre_ratio", "epsilon",
-    "placement", "kernel", "bending", "fibre_exponent",
-)  # fmt: skip
-# What an option may be set to: out of its range, or in it and quick. What is allowed and slow is not an error.
+    "centres",
+    "samples",
+    "iterations",
+    "nodes",
+    "slack",
+    "fibre_ratio",
+    "epsilon",
+    "placement",
+    "kernel",
+    "bending",
+    "fibre_exponent",
+)
+# What an option may be set to: out of its range, or in it and quick. What is allowed and slow is
+# not an error.
 SETTINGS = (
-    -1, 0, 1, 3, 4, 5, 0.5, 1.5, 50, 1e-9, 1e-3, 10**7, 10**18, 1e300, float("nan"), "x", "", "even", "adaptive",
-    "fitted", "normal", "all", "gaussian", "linear", "wendland_c2", "cubik", [], [0.5, 2.0], [2.0, 0.5], {}, True,
-)  # fmt: skip
+    -1,
+    0,
+    1,
+    3,
+    4,
+    5,
+    0.5,
+    1.5,
+    50,
+    1e-9,
+    1e-3,
+    10**7,
+    10**18,
+    1e300,
+    float("nan"),
+    "x",
+    "",
+    "even",
+    "adaptive",
+    "fitted",
+    "normal",
+    "all",
+    "gaussian",
+    "linear",
+    "wendland_c2",
+    "cubik",
+    [],
+    [0.5, 2.0],
+    [2.0, 0.5],
+    {},
+    True,
+)
 MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 
 
@@ -165,7 +283,10 @@ def _tables(scene, rng):
 
 
 def _meshes(scene, rng):
-    form, files = pick(rng, FORMS), ["upper.ply", "none.ply", ".", "fibres.json", "upper.txt", "/dev/zero"]
+    form, files = (
+        pick(rng, FORMS),
+        ["upper.ply", "none.ply", ".", "fibres.json", "upper.txt", "/dev/zero"],
+    )
     changes = (
         {"mesh": f"muscle-{form}{suffix_of(form)}"},
         {"mesh": pick(rng, files)},
@@ -183,7 +304,9 @@ def _change_text(text, rng):
         text[:at] + text[other:],
         text[:other] + text[at:],
         text[:at] + "".join(chr(c) for c in rng.integers(1, 0x2FF, 5)) + text[at:],
-        text[:at] + pick(rng, ["[", "]", "{", "}", '"', "=", "\n", "\x00", "#", "[[bone]]\n"]) + text[at:],
+        text[:at]
+        + pick(rng, ["[", "]", "{", "}", '"', "=", "\n", "\x00", "#", "[[bone]]\n"])
+        + text[at:],
     )[int(rng.integers(5))]
 
 
@@ -213,7 +336,9 @@ def _value(value):
     if isinstance(value, str):
         return json.dumps(value)
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items()) + " }"
+        return (
+            "{ " + ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items()) + " }"
+        )
     if isinstance(value, list):
         return "[" + ", ".join(map(_value, value)) + "]"
     return repr(value)

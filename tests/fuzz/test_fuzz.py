@@ -22,7 +22,13 @@ import os, sys
 from pathlib import Path
 from fuzz import harness
 clean = "rbfmuscle: a.toml: wrong"
-for case in (os.abort, lambda: 1 // 0, lambda: print("native: help") or 3, lambda: 0, lambda: print(clean) or 3):
+for case in (
+    os.abort,
+    lambda: 1 // 0,
+    lambda: print("native: help") or 3,
+    lambda: 0,
+    lambda: print(clean) or 3,
+):
     print(harness.run_case(case, Path(sys.argv[1]) / "case")[0])
 """
     env = {**os.environ, "PYTHONPATH": f"{ROOT / 'tests'}:{ROOT}", "NUMBA_NUM_THREADS": "1"}

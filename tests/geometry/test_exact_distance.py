@@ -21,15 +21,21 @@ SHAPES = {
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_distances_and_nearest_points_are_those_of_libigl(shape):
     rng = np.random.default_rng(0)
-    near = shape.vertices[rng.integers(len(shape.vertices), size=3000)] + rng.normal(0.0, 2.0, (3000, 3))
+    near = shape.vertices[rng.integers(len(shape.vertices), size=3000)] + rng.normal(
+        0.0, 2.0, (3000, 3)
+    )
     low, high = shape.bounds
     points = np.concatenate([near, rng.uniform(low - 20.0, high + 20.0, (3000, 3))])
     vertices, faces = np.array(shape.vertices), np.array(shape.faces)
-    expected = igl.signed_distance(points, vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)[0]
+    expected = igl.signed_distance(points, vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)[
+        0
+    ]
     exact = ExactDistance(shape.vertices, shape.faces)
     distance, closest, face, _ = exact.nearest(points)
     np.testing.assert_allclose(distance, expected, atol=1e-11)
-    np.testing.assert_allclose(np.linalg.norm(points - closest, axis=1), np.abs(expected), atol=1e-11)
+    np.testing.assert_allclose(
+        np.linalg.norm(points - closest, axis=1), np.abs(expected), atol=1e-11
+    )
     on_face = trimesh.triangles.closest_point(shape.triangles[face], points)
     np.testing.assert_allclose(closest, on_face, atol=1e-9)
     # Beyond reach the reach is returned.

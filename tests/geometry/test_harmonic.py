@@ -20,7 +20,9 @@ def cylinder(*, rows=40, around=24, shear=0.0):
     vertices = np.stack([RADIUS * np.cos(turn), RADIUS * np.sin(turn), along], axis=-1)
     i, j = np.meshgrid(np.arange(rows), np.arange(around), indexing="ij")
     a, b = (i * around + j).ravel(), (i * around + (j + 1) % around).ravel()
-    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
+    faces = np.concatenate(
+        [np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)]
+    )
     return vertices.reshape(-1, 3), faces, around
 
 
@@ -37,7 +39,9 @@ def moved(points, motion):
 
 
 def test_laplacian_knows_no_scale_and_takes_linear_functions_for_harmonic():
-    """Cotangents are of angles alone; in a plane what is linear has no curvature inside, whatever the triangles."""
+    """Cotangents are of angles alone; in a plane what is linear has no curvature inside, whatever
+    the triangles.
+    """
     rng = np.random.default_rng(5)
     across, up = np.meshgrid(np.arange(7.0), np.arange(7.0), indexing="ij")
     inside = (np.minimum(across, up) > 0) & (np.maximum(across, up) < 6)
@@ -53,7 +57,9 @@ def test_laplacian_knows_no_scale_and_takes_linear_functions_for_harmonic():
     gradient = harmonic.surface_gradient(points, faces, points @ [2.0, -3.0, 0.0] + 7)
     assert gradient == pytest.approx(np.broadcast_to([2.0, -3.0, 0.0], gradient.shape), abs=1e-9)
     third = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, np.sqrt(0.75), 0.0]])
-    assert cotangent_laplacian(third, np.array([[0, 1, 2]]))[0, 1] == pytest.approx(-0.5 / np.sqrt(3.0))
+    assert cotangent_laplacian(third, np.array([[0, 1, 2]]))[0, 1] == pytest.approx(
+        -0.5 / np.sqrt(3.0)
+    )
 
 
 class TestWeights:
@@ -62,14 +68,19 @@ class TestWeights:
         ends = [np.arange(around), np.arange(len(vertices) - around, len(vertices))]
         weights = harmonic_weights(vertices, faces, ends)
         expected = vertices[:, 2] / LENGTH
-        # Diagonals of the right-angled triangles have cotangent 0 and are raised to a small positive weight.
+        # Diagonals of the right-angled triangles have cotangent 0 and are raised to a small
+        # positive weight.
         assert weights[:, 1] == pytest.approx(expected, abs=1e-9)
         assert weights[:, 0] == pytest.approx(1 - expected, abs=1e-9)
 
     @pytest.mark.parametrize("shear", [0.0, 0.3, 0.8])
     def test_laws_hold_on_bad_triangles(self, shear):
         vertices, faces, around = cylinder(shear=shear)
-        groups = [np.arange(5), np.arange(300, 310), np.arange(len(vertices) - around, len(vertices))]
+        groups = [
+            np.arange(5),
+            np.arange(300, 310),
+            np.arange(len(vertices) - around, len(vertices)),
+        ]
         weights = harmonic_weights(vertices, faces, groups)
         assert weights.min() >= 0 and weights.max() <= 1
         assert weights.sum(axis=1) == pytest.approx(1, abs=1e-12)

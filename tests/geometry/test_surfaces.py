@@ -1,4 +1,6 @@
-"""Points, normals, edges, areas and crossings of triangle meshes: known answers, and laws under motion."""
+"""Points, normals, edges, areas and crossings of triangle meshes: known answers, and laws under
+motion.
+"""
 
 import igl
 import numpy as np
@@ -29,18 +31,28 @@ def test_area_vectors_are_the_sides_of_a_box_and_sum_to_nothing():
         assert area[area[:, axis] > 1e-9, axis].sum() == pytest.approx(side)
     middle = VERTICES[FACES].mean(axis=1)
     assert (np.einsum("ij,ij->i", area, middle) > 0.0).all()
-    assert np.einsum("ij,ij->", area, middle) / 3.0 == pytest.approx(24.0) == mesh_volume(VERTICES, FACES)
+    assert (
+        np.einsum("ij,ij->", area, middle) / 3.0
+        == pytest.approx(24.0)
+        == mesh_volume(VERTICES, FACES)
+    )
 
 
 def test_everything_turns_and_scales_with_the_mesh():
-    turn, scale, shift = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix(), 2.5, np.array([50.0, -20.0, 7.0])
+    turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+    scale = 2.5
+    shift = np.array([50.0, -20.0, 7.0])
     moved = scale * VERTICES @ turn.T + shift
-    area, normals, share = (call(VERTICES, FACES) for call in (face_normals, vertex_normals, vertex_areas))
+    area, normals, share = (
+        call(VERTICES, FACES) for call in (face_normals, vertex_normals, vertex_areas)
+    )
     np.testing.assert_allclose(face_normals(moved, FACES), scale**2 * area @ turn.T, atol=1e-11)
     np.testing.assert_allclose(vertex_normals(moved, FACES), normals @ turn.T, atol=1e-12)
     np.testing.assert_allclose(vertex_areas(moved, FACES), scale**2 * share, rtol=1e-10)
     edges = unique_edges(FACES)
-    np.testing.assert_allclose(edge_lengths(moved, edges), scale * edge_lengths(VERTICES, edges), rtol=1e-11)
+    np.testing.assert_allclose(
+        edge_lengths(moved, edges), scale * edge_lengths(VERTICES, edges), rtol=1e-11
+    )
     assert mesh_volume(moved, FACES) == pytest.approx(scale**3 * 24.0)
     assert mesh_volume(VERTICES, FACES[:, ::-1]) == pytest.approx(-24.0)
 
@@ -49,7 +61,8 @@ def test_everything_turns_and_scales_with_the_mesh():
 def test_rest_frame_turns_with_its_points_whichever_of_them_comes_first(seed):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(30, 3)) * [4.0, 2.0, 1.0]
-    # The first lies in the very middle, where it has no direction; the second on one line with the third.
+    # The first lies in the very middle, where it has no direction; the second on one line with the
+    # third.
     points[0] = points[1:].mean(axis=0)
     points[1] = 2.0 * points[2] - points[0]
     points[0] = points[1:].mean(axis=0)
@@ -69,8 +82,12 @@ def test_nearest_point_of_a_triangle_is_a_mean_of_its_corners_in_every_region():
         weights = np.full(3, np.nan)
         nearest_weights(p, a, b, c, weights)
         assert weights.min() >= 0.0 and weights.sum() == pytest.approx(1.0)
-        squared = igl.point_mesh_squared_distance(p[None], np.array([a, b, c]), np.array([[0, 1, 2]]))[0]
-        assert ((weights @ [a, b, c] - p) ** 2).sum() == pytest.approx(float(np.ravel(squared)[0]), rel=1e-9)
+        squared = igl.point_mesh_squared_distance(
+            p[None], np.array([a, b, c]), np.array([[0, 1, 2]])
+        )[0]
+        assert ((weights @ [a, b, c] - p) ** 2).sum() == pytest.approx(
+            float(np.ravel(squared)[0]), rel=1e-9
+        )
         seen.add(tuple(weights > 0.0))
     assert len(seen) == 7, "three corners, three edges, the inside"
 

@@ -1,4 +1,6 @@
-"""Fits of a bounded condition: the ridge is what it is said to be, the bound holds, and little is lost."""
+"""Fits of a bounded condition: the ridge is what it is said to be, the bound holds, and little is
+lost.
+"""
 
 import numpy as np
 import pytest
@@ -22,7 +24,9 @@ def plate():
     return sample.points, sample.normals, others.points
 
 
-@pytest.mark.parametrize(("kernel", "bound"), [("quintic", 1e6), ("cubic", 1e3), ("matern_52", 1e4)])
+@pytest.mark.parametrize(
+    ("kernel", "bound"), [("quintic", 1e6), ("cubic", 1e3), ("matern_52", 1e4)]
+)
 def test_what_is_left_is_one_ridge_in_units_of_the_spacing(plate, kernel, bound):
     points, normals, _ = plate
     basis, count = Basis(points, KERNELS[kernel], 0.1, hermite=True), len(points)
@@ -37,7 +41,9 @@ def test_what_is_left_is_one_ridge_in_units_of_the_spacing(plate, kernel, bound)
     assert (np.abs(polynomials @ weights) < 1e-9 * np.abs(weights).max()).all()
     null = np.linalg.qr((polynomials * unit).T, mode="complete")[0][:, len(basis.powers) :]
     values = linalg.eigvalsh(null.T @ (unit[:, None] * matrix * unit) @ null)
-    assert 0.7 * values[-1] / bound < ridge < 1.01 * values[-1] / bound  # six steps of power iteration
+    assert (
+        0.7 * values[-1] / bound < ridge < 1.01 * values[-1] / bound
+    )  # six steps of power iteration
     assert condition <= bound
     assert condition < 1.5 * (values[-1] + ridge) / (values[0] + ridge)
 

@@ -60,7 +60,10 @@ def muscle():
 def missed(field, vertices, reach):
     """RMS distance of vertices from the surface to first order, in units of the spacing."""
     value, gradient = field.value_and_gradient(vertices)
-    return np.sqrt((np.minimum(np.abs(value / np.linalg.norm(gradient, axis=1)), reach) ** 2).mean()) / reach
+    return (
+        np.sqrt((np.minimum(np.abs(value / np.linalg.norm(gradient, axis=1)), reach) ** 2).mean())
+        / reach
+    )
 
 
 @pytest.mark.parametrize("kernel", WITH_EPSILON)

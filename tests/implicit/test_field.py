@@ -56,7 +56,9 @@ def test_definite_solve_equals_the_augmented_indefinite_one(kernel, hermite):
     assert np.abs(np.append(weights, coefficients) - expected).max() < 100 * bound
 
 
-@pytest.mark.parametrize("kernel", ["cubic", "gaussian", "matern_72", "inverse_multiquadric", "wendland_c2"])
+@pytest.mark.parametrize(
+    "kernel", ["cubic", "gaussian", "matern_72", "inverse_multiquadric", "wendland_c2"]
+)
 def test_condition_estimate_is_within_a_factor_of_thirty(kernel):
     points = np.random.default_rng(4).uniform(-0.5, 0.5, (200, 3))
     kernel = get_kernel(kernel)
@@ -70,8 +72,12 @@ def test_condition_estimate_is_within_a_factor_of_thirty(kernel):
 
 @pytest.mark.parametrize("kernel", ["cubic", "quintic", "multiquadric", "matern_52", "wendland_c2"])
 def test_smoothed_fit_minimises_residual_and_energy(kernel):
-    """min |f - y|^2 + smoothing w^T A w over the weights with P w = 0, as one stacked least-squares problem."""
-    rng, kernel, smoothing = np.random.default_rng(0), get_kernel(kernel), 0.02
+    """min |f - y|^2 + smoothing w^T A w over the weights with P w = 0, as one stacked least-squares
+    problem.
+    """
+    rng = np.random.default_rng(0)
+    kernel = get_kernel(kernel)
+    smoothing = 0.02
     points, values = rng.uniform(-1, 1, (40, 3)), rng.normal(size=40)
     basis = Basis(points, kernel, 1.5)
     full, block = basis.full_matrix()[:40, :40], basis.polynomials[0]
@@ -79,7 +85,9 @@ def test_smoothed_fit_minimises_residual_and_energy(kernel):
     root = np.linalg.cholesky(null.T @ full @ null)
     energy = np.sqrt(smoothing) * np.hstack([root.T, np.zeros((len(root), len(block)))])
     fit = np.hstack([full @ null, block.T])
-    found = np.linalg.lstsq(np.vstack([fit, energy]), np.append(values, np.zeros(len(root))), rcond=None)[0]
+    found = np.linalg.lstsq(
+        np.vstack([fit, energy]), np.append(values, np.zeros(len(root))), rcond=None
+    )[0]
     field = RBFField.fit(points, values, kernel=kernel, epsilon=1.5, smoothing=smoothing)
     assert np.abs(field(points) - fit @ found).max() < 1e-10
 
@@ -114,7 +122,10 @@ def test_one_and_four_centres():
         ("did you mean 'gaussian'", {"kernel": "gausian"}),
         ("needs C2", {"kernel": "linear"}),
         *(("smoothing must be", {"smoothing": wrong}) for wrong in (-1.0, np.nan, np.inf)),
-        *(("condition must be at least 1", {"condition": wrong}) for wrong in (0.0, 0.5, -1e10, np.nan)),
+        *(
+            ("condition must be at least 1", {"condition": wrong})
+            for wrong in (0.0, 0.5, -1e10, np.nan)
+        ),
     ],
 )
 def test_wrong_arguments_are_refused(words, options):
@@ -162,20 +173,33 @@ def test_every_centre_is_well_inside_some_part():
 
 
 @pytest.mark.filterwarnings("ignore::rbfmuscle.validation.NumericalWarning")
-@pytest.mark.parametrize("kernel", ["cubic", "quintic", "gaussian", "wendland_c4", "linear", "matern_12"])
+@pytest.mark.parametrize(
+    "kernel", ["cubic", "quintic", "gaussian", "wendland_c4", "linear", "matern_12"]
+)
 def test_a_blended_field_is_nearly_that_of_one_fit_and_its_slope_is_its_derivative(kernel):
     points, normals = strip(300)
     fit = FieldFit(KERNELS[kernel], 1 / 20, 1e10 if KERNELS[kernel].has_epsilon else np.inf)
     parts, (others, _) = overlapping_parts(points), strip(777)
     straight, arc = (points, normals, others), (*bent(points, normals), bent(others, others)[0])
     for centres, turned, where in (straight, arc):
-        field, whole = fit.fit(centres, turned, parts), fit.fit(centres, turned, np.arange(300)[None])
+        field, whole = (
+            fit.fit(centres, turned, parts),
+            fit.fit(centres, turned, np.arange(300)[None]),
+        )
         # Centres are 10 apart: bent, a part that does not have one counts there a little.
         assert np.abs(field(centres)).max() < max(1e-2, 1.5 * np.abs(whole(centres)).max())
-        assert np.sqrt((field(where) ** 2).mean()) < 1.5 * np.sqrt((whole(where) ** 2).mean()) + 0.02
+        assert (
+            np.sqrt((field(where) ** 2).mean()) < 1.5 * np.sqrt((whole(where) ** 2).mean()) + 0.02
+        )
         assert field.condition < 20 * whole.condition
-        at = np.concatenate([where[::20] * 1.05, np.random.default_rng(5).uniform(-150, 150, (60, 3))])
-        value, gradient = field.value_and_gradient(at)  # also far outside, where the balls of all parts grow
-        ahead = np.array([(field(at + 1e-4 * way) - field(at - 1e-4 * way)) / 2e-4 for way in np.eye(3)]).T
+        at = np.concatenate(
+            [where[::20] * 1.05, np.random.default_rng(5).uniform(-150, 150, (60, 3))]
+        )
+        value, gradient = field.value_and_gradient(
+            at
+        )  # also far outside, where the balls of all parts grow
+        ahead = np.array(
+            [(field(at + 1e-4 * way) - field(at - 1e-4 * way)) / 2e-4 for way in np.eye(3)]
+        ).T
         off = np.abs(ahead - gradient) / (1e-3 * np.abs(value)[:, None] + np.abs(ahead) + 1.0)
         assert np.median(off) < 1e-6 and np.percentile(off, 95) < 1e-4

@@ -65,11 +65,16 @@ def test_radial_functions_against_fifty_digits(name, k):
     values = [kernel.phi, kernel.first, kernel.second][k](s)
     exact = np.array([float(literal_radial(name, x, k)) for x in s])
     size = np.abs(exact)
-    if name == "buhmann":  # the four terms cancel towards s = 1, so relative to the value at the centre
+    if (
+        name == "buhmann"
+    ):  # the four terms cancel towards s = 1, so relative to the value at the centre
         size = np.maximum(size, np.abs(kernel.table[k]).max())
     if name == "skala_cervenka":  # difference of two terms, zero near s = 1
         size = np.maximum(size, 2.0 * s ** (2.0 - 2 * k))
-    if name in ("thin_plate_spline", "polyharmonic_4"):  # sum of a logarithm and a constant, zero in between
+    if name in (
+        "thin_plate_spline",
+        "polyharmonic_4",
+    ):  # sum of a logarithm and a constant, zero in between
         size = np.maximum(size, np.abs(kernel.table[k]).max() * s ** float(kernel.table[k, 0]))
     # exp(-s^2): the rounding of s^2 alone costs s^2 eps
     bound = 1e-14 * np.maximum(1, s * s / 20 if name == "gaussian" else 1)

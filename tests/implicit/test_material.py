@@ -1,4 +1,6 @@
-"""A mesh of the material on level sets: known shapes, one topology, nothing that crosses, whatever the field does."""
+"""A mesh of the material on level sets: known shapes, one topology, nothing that crosses, whatever
+the field does.
+"""
 
 import numpy as np
 import pytest
@@ -75,7 +77,9 @@ def test_vertices_come_to_lie_on_the_level_that_gives_the_volume():
 
 def test_what_the_cut_takes_away_lies_on_it():
     cut = Bone(5.0, (5.5, 0.0, 0.0))
-    found = project_to_level_set(mesh_of(), np.asarray(BALL.vertices), Sphere(), cut=cut, volume=0.8 * VOLUME)
+    found = project_to_level_set(
+        mesh_of(), np.asarray(BALL.vertices), Sphere(), cut=cut, volume=0.8 * VOLUME
+    )
     assert cut(found.vertices).min() > -1e-5
     on_cut = np.abs(cut(found.vertices)) < 1e-4
     assert on_cut.sum() > 50
@@ -100,7 +104,9 @@ def test_sheets_that_met_do_not_pull_vertices_off_the_material():
     mesh = mesh_of()
     mesh.slope = np.ones(len(BALL.vertices))
     x = np.asarray(BALL.vertices)
-    carried = np.column_stack([1.9 * x[:, 0], x[:, 1] * (0.4 + x[:, 0] ** 2), x[:, 2] * (0.4 + x[:, 0] ** 2)])
+    carried = np.column_stack(
+        [1.9 * x[:, 0], x[:, 1] * (0.4 + x[:, 0] ** 2), x[:, 2] * (0.4 + x[:, 0] ** 2)]
+    )
     found = project_to_level_set(mesh, carried, Two(0.9), volume=mesh_volume(carried, mesh.faces))
     away = np.linalg.norm(found.vertices - carried, axis=1)
     assert away.max() <= 1.0 * mesh.edge(carried) + 1e-12
@@ -123,7 +129,9 @@ def test_tangled_triangles_are_smoothed_until_none_cross(radius, seed):
 @pytest.mark.parametrize("cut", [None, Bone(0.5, (1.3, 0.0, 0.0)), Bone(0.9, (0.0, 0.0, 0.9))])
 @pytest.mark.parametrize("noise", [0.0, 0.15])
 def test_a_carried_surface_keeps_volume_and_leaves_the_bone(cut, noise):
-    """Vertices that were smoothed stay when the level changes: with much noise nothing else was left to be blown up."""
+    """Vertices that were smoothed stay when the level changes: with much noise nothing else was
+    left to be blown up.
+    """
     carried = BALL.vertices + noise * np.random.default_rng(5).normal(size=BALL.vertices.shape)
     found = project_to_level_set(mesh_of(), carried, None, volume=VOLUME, cut=cut)
     assert found.left == len(BALL.vertices) and found.crossing == 0
@@ -171,7 +179,9 @@ def test_what_is_known_of_the_cut_changes_nothing(shift, monkeypatch):
     given, found = {"volume": VOLUME, "cut": cut, "obstacles": [(spike, np.eye(4))]}, []
     for _ in range(2):
         found.append(project_to_level_set(mesh_of(), carried, Sphere(), **given).vertices)
-        monkeypatch.setattr(CutBounds, "below", lambda _, places, rows=None: np.full(len(places), -np.inf))
+        monkeypatch.setattr(
+            CutBounds, "below", lambda _, places, rows=None: np.full(len(places), -np.inf)
+        )
     np.testing.assert_allclose(*found, rtol=0, atol=1e-12)
     assert np.abs(cut(found[0])).min() < 1e-3
 
@@ -179,7 +189,10 @@ def test_what_is_known_of_the_cut_changes_nothing(shift, monkeypatch):
 def test_points_near_triangles_are_those_found_one_by_one():
     rng = np.random.default_rng(0)
     ball = trimesh.creation.icosphere(2, radius=5.0)
-    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)[ball.triangles_center[:, 0] > 0.0]
+    vertices, faces = (
+        np.asarray(ball.vertices),
+        np.asarray(ball.faces)[ball.triangles_center[:, 0] > 0.0],
+    )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([-0.5, 0.4, 0.1]).as_matrix(), [0.3, 0.2, -0.1]
     points = rng.uniform(-8.0, 8.0, (700, 3))
@@ -214,7 +227,9 @@ def planted(seed, count=12):
     points, faces = np.array(BALL.vertices), np.array(BALL.faces)
     chosen = np.random.default_rng(seed).choice(len(faces), count, replace=False)
     for a, b, c in faces[chosen]:
-        points[a] = 0.45 * (points[b] + points[c]) + 0.02 * (points[b] - points[a]) - 0.05 * points[a]
+        points[a] = (
+            0.45 * (points[b] + points[c]) + 0.02 * (points[b] - points[a]) - 0.05 * points[a]
+        )
     return onto_ball(None, points), faces
 
 

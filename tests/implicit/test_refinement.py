@@ -21,7 +21,11 @@ def bean():
     mesh = trimesh.creation.icosphere(subdivisions=4).apply_scale([30.0, 18.0, 8.0])
     v = np.array(mesh.vertices)
     v[:, 2] += (v[:, 0] / 12.0) ** 2 + 0.6 * np.sin(v[:, 0] / 3.0) * np.sin(v[:, 1] / 3.0)
-    return v, np.asarray(mesh.faces), sample_surface(v, np.asarray(mesh.faces), 60, placement="adaptive")
+    return (
+        v,
+        np.asarray(mesh.faces),
+        sample_surface(v, np.asarray(mesh.faces), 60, placement="adaptive"),
+    )
 
 
 @pytest.mark.parametrize(
@@ -44,7 +48,10 @@ def test_fitted_centres_err_less_at_points_they_have_not_seen(bean, kernel, epsi
         return np.sqrt((field(unseen) ** 2).mean())
 
     assert error(fitted) < 0.8 * error(plain)
-    assert np.linalg.norm(fitted.points - plain.points, axis=1).max() < 0.25 * spacing(plain.points).mean()
+    assert (
+        np.linalg.norm(fitted.points - plain.points, axis=1).max()
+        < 0.25 * spacing(plain.points).mean()
+    )
     np.testing.assert_allclose(np.linalg.norm(fitted.normals, axis=1), 1.0, atol=1e-12)
     assert (fitted.control_faces == plain.control_faces).all()
 

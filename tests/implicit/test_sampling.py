@@ -29,7 +29,9 @@ def check_control(mesh, sample, count):
     assert len(np.unique(sample.control_faces)) == count == len(sample.points)
     # One fan of triangles at every vertex: as many faces as distinct neighbours.
     valence = np.bincount(control.edges_unique.ravel(), minlength=count)
-    np.testing.assert_array_equal(valence, np.bincount(sample.control_faces.ravel(), minlength=count))
+    np.testing.assert_array_equal(
+        valence, np.bincount(sample.control_faces.ravel(), minlength=count)
+    )
 
 
 @pytest.mark.parametrize(("count", "placement"), [(60, "even"), (300, "adaptive"), (100, "greedy")])
@@ -98,7 +100,9 @@ def test_what_cannot_be_sampled_is_refused(error, words, count, placement, dropp
 
 
 def test_off_surface_points_stay_nearest_to_their_own_point():
-    """Two sheets 0.8 apart: half the distance to the nearest point outside, a quarter of the gap inside."""
+    """Two sheets 0.8 apart: half the distance to the nearest point outside, a quarter of the gap
+    inside.
+    """
     sheet = np.stack(np.meshgrid(*[np.arange(5.0)] * 2), axis=-1).reshape(-1, 2)
     points = np.vstack([np.c_[sheet, np.zeros(25)], np.c_[sheet, np.full(25, 0.8)]])
     normals = np.repeat([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], 25, axis=0)

@@ -1,4 +1,5 @@
-"""Epsilon chosen on a surface: as good as a scan, closed, in one sheet; and how sheets are counted."""
+"""Epsilon chosen on a surface: as good as a scan, closed, in one sheet; and how sheets are
+counted."""
 
 import warnings
 from dataclasses import replace
@@ -44,7 +45,9 @@ def both_ways(plate, kernel, epsilon):
     return np.sqrt(0.5 * ((there**2).mean() + (distance.unsigned(found.vertices) ** 2).mean()))
 
 
-@pytest.mark.parametrize("kernel", ["inverse_quadratic", "multiquadric", "wendland_c4", "matern_12"])
+@pytest.mark.parametrize(
+    "kernel", ["inverse_quadratic", "multiquadric", "wendland_c4", "matern_12"]
+)
 def test_choice_is_within_a_tenth_of_the_best_of_a_scan(plate, kernel):
     _, _, distance, centres, held_out = plate
     given = centres.points, centres.normals, fit_of(kernel)
@@ -63,7 +66,9 @@ def test_a_zero_set_in_several_sheets_is_passed_over(plate, kernel):
     seen = choose_epsilon(*given, held_out=held_out, distance=distance.unsigned)
     assert seen.broken or np.isfinite(both_ways(plate, kernel, seen.epsilon))
     if not seen.broken:
-        assert both_ways(plate, kernel, seen.epsilon) <= 1.05 * both_ways(plate, kernel, blind.epsilon)
+        assert both_ways(plate, kernel, seen.epsilon) <= 1.05 * both_ways(
+            plate, kernel, blind.epsilon
+        )
 
 
 @pytest.mark.parametrize("size", [1e-6, 1e6])
@@ -94,7 +99,9 @@ def test_miss_is_the_distance_to_first_order_and_a_flat_field_misses(plate):
     exact = MeshDistance(found.vertices, found.faces).unsigned(held_out)
     assert surface_error(field, held_out, h) == pytest.approx(np.sqrt((exact**2).mean()), rel=0.1)
     with pytest.warns(NumericalWarning, match="does not reach"):
-        narrow = RBFField.fit_hermite(centres.points, centres.normals, kernel="wendland_c4", epsilon=8.0 / h)
+        narrow = RBFField.fit_hermite(
+            centres.points, centres.normals, kernel="wendland_c4", epsilon=8.0 / h
+        )
     assert np.sqrt((narrow(held_out) ** 2).mean()) < 0.1 * h  # 0 where it knows nothing
     assert surface_error(narrow, held_out, h) > 0.5 * h
 
@@ -121,7 +128,9 @@ def test_a_slender_bent_tube_is_sound_though_the_cells_cut_it():
 
 
 def test_stray_and_open_sheets_in_the_box_are_seen():
-    points = np.vstack([10.0 * trimesh.creation.icosphere(subdivisions=2).vertices, [[30.0, 0.0, 0.0]]])
+    points = np.vstack(
+        [10.0 * trimesh.creation.icosphere(subdivisions=2).vertices, [[30.0, 0.0, 0.0]]]
+    )
     two = Formula(lambda at: np.minimum(ball(at), ball(at, 22.0, 1.5)))
     assert find_sheets(Formula(ball), points, ball) == (0, False, True)
     assert find_sheets(two, points, ball) == (1, False, True)

@@ -11,13 +11,17 @@ from rbfmuscle.implicit.kernels.table import KERNELS
 
 def in_units_of_last_place(found, exact):
     with mpmath.workdps(40):
-        away = [abs(mpmath.mpf(f) - e) / mpmath.mpf(np.spacing(abs(f))) for f, e in zip(found, exact)]
+        away = [
+            abs(mpmath.mpf(f) - e) / mpmath.mpf(np.spacing(abs(f))) for f, e in zip(found, exact)
+        ]
         return float(max(away))
 
 
 def test_exponential_and_logarithm_are_right_to_two_units_in_the_last_place():
     rng = np.random.default_rng(0)
-    x = np.concatenate([rng.uniform(-700, 700, 1500), rng.uniform(-1, 1, 500), [0.0, -1e-300, 1e-17]])
+    x = np.concatenate(
+        [rng.uniform(-700, 700, 1500), rng.uniform(-1, 1, 500), [0.0, -1e-300, 1e-17]]
+    )
     out = np.empty_like(x)
     _exp_loop(1.0, x, out)
     assert in_units_of_last_place(out, [mpmath.exp(mpmath.mpf(v)) for v in x]) < 2
@@ -33,7 +37,9 @@ def test_exponential_and_logarithm_are_right_to_two_units_in_the_last_place():
 @pytest.mark.parametrize("dipoles", [False, True], ids=["values", "hermite"])
 def test_values_and_slopes_are_those_of_the_literal_sum(kernel, dipoles):
     rng = np.random.default_rng(3)
-    origin, scale, epsilon = np.array([3.0, -2.0, 1.0]), 2.5, 0.8
+    origin = np.array([3.0, -2.0, 1.0])
+    scale = 2.5
+    epsilon = 0.8
     centres, weights = rng.uniform(-1, 1, (3, 7)), rng.normal(size=(4, 7))
     weights[1:] *= dipoles
     coefficients, powers = np.array([0.3, -1.2, 0.7]), np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]])
@@ -68,4 +74,6 @@ def test_values_and_slopes_are_those_of_the_literal_sum(kernel, dipoles):
     for k in range(3):
         way = step * np.eye(3)[k]
         ahead, behind = found(points + way), found(points - way)
-        np.testing.assert_allclose(gradient[:, k], (ahead[0] - behind[0]) / (2 * step), atol=2e-7, rtol=2e-7)
+        np.testing.assert_allclose(
+            gradient[:, k], (ahead[0] - behind[0]) / (2 * step), atol=2e-7, rtol=2e-7
+        )

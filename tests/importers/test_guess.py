@@ -1,4 +1,6 @@
-"""Guessing a scene from meshes: what turns about what, and where muscles hold, against closed forms and a real leg."""
+"""Guessing a scene from meshes: what turns about what, and where muscles hold, against closed forms
+and a real leg.
+"""
 
 import json
 import shutil
@@ -33,7 +35,12 @@ from rbfmuscle.validation import UsageError
         ("Hüftbein_rechts", "bone", "pelvis", "r"),
         ("VHM_Left_Bone_Calcaneous_smooth", "bone", "calcaneus", "l"),
         ("biceps_femoris_short_head", "muscle", "biceps femoris brevis", ""),
-        ("VHM_Left_Muscle_ExtensorHallicusLongus_smooth", "muscle", "extensor hallucis longus", "l"),
+        (
+            "VHM_Left_Muscle_ExtensorHallicusLongus_smooth",
+            "muscle",
+            "extensor hallucis longus",
+            "l",
+        ),
         ("addmagDist_r", "muscle", "adductor magnus", "r"),
         ("VHM_Left_Cartilage_TibialMedial_smooth", "other", "", "l"),
         ("quadriceps_tendon", "other", "", ""),
@@ -50,7 +57,9 @@ def test_names_as_they_are_published(name, tissue, known, side):
 def test_misspelt_names_are_named_and_known_words_are_never_taken_for_others():
     assert "'illiacus' read as 'iliacus'" in name_facts("Illiacus").spelling
     assert not name_facts("obturator_externus").spelling
-    assert name_facts("femor").bone == "femur" and not name_facts("tals").bone  # four letters are too few
+    assert (
+        name_facts("femor").bone == "femur" and not name_facts("tals").bone
+    )  # four letters are too few
     assert name_facts("abductor_hallucis").muscle.name == "abductor hallucis"
 
 
@@ -121,11 +130,15 @@ def test_ends_of_a_bent_tube_are_its_tips():
 def test_muscles_without_the_bones_of_their_names_still_make_a_scene(tmp_path):
     for item in phantom_scene().bones:
         item.mesh.export(tmp_path / f"{'radius' if item.name == 'pelvis' else 'ulna'}.ply")
-    for item, name in zip(phantom_scene().muscles, ("soleus", "plantaris", "popliteus", "sartorius")):
+    for item, name in zip(
+        phantom_scene().muscles, ("soleus", "plantaris", "popliteus", "sartorius")
+    ):
         item.mesh.export(tmp_path / f"{name}.ply")
     guess = guess_scene(tmp_path, "mm", tmp_path)
     assert len(write_scene(guess, tmp_path / "scene.toml").muscles) == 4
-    assert all(muscle.confidence <= 0.2 and "are not here" in muscle.reasons[0] for muscle in guess.muscles)
+    assert all(
+        muscle.confidence <= 0.2 and "are not here" in muscle.reasons[0] for muscle in guess.muscles
+    )
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +178,9 @@ LYING = {
 
 @pytest.mark.parametrize("how", LYING)
 def test_joints_of_the_leg_however_it_lies(leg, how):
-    """Limits of the issue [mm, degree]; signs and sides follow the bones, whatever the axes of the files."""
+    """Limits of the issue [mm, degree]; signs and sides follow the bones, whatever the axes of the
+    files.
+    """
     transform = LYING[how]
     bones, true = _leg_bones(leg, transform)
     millimetre = 1e-3 if how == "metres" else 1.0
@@ -197,13 +212,18 @@ def test_a_condyle_larger_than_anatomy_has_is_refused_and_named(leg, millimetre)
         bones, _ = _leg_bones(leg, np.diag([*3 * [scale * millimetre], 1.0]))
         find_orientation(bones)
         fit = fit_condyles(bones[1], bones[1].frame, millimetre)
-        said = f"radius {fit.radii[0] / millimetre:.3g} mm, anatomy has {CONDYLE[0]:g} to {CONDYLE[1]:g}"
+        said = (
+            f"radius {fit.radii[0] / millimetre:.3g} mm, anatomy has {CONDYLE[0]:g} to "
+            f"{CONDYLE[1]:g}"
+        )
         assert fit.wrong == ("" if scale == 1.0 else f"a condyle of {said}")
 
 
 def test_patella_follows_the_table_that_was_computed_for_the_leg(leg):
     bones, true = _leg_bones(leg, np.eye(4))
-    joint = next(j for j in guess_joints(bones, 1.0, find_orientation(bones))[1] if j.name == "patella")
+    joint = next(
+        j for j in guess_joints(bones, 1.0, find_orientation(bones))[1] if j.name == "patella"
+    )
     table, points = true["patella"]["table"], joint.child.points
     assert joint.kind == "custom" and joint.follows == "knee.flexion"
     made = JointTable(**joint.row()).joint()
@@ -220,11 +240,20 @@ def test_bones_and_muscles_of_the_leg_hang_on_the_right_bones_at_the_right_place
     guess, facts, folder = leg_guess
     found = {joint.child.name: joint.parent.name for joint in guess.joints}
     true = {joint["child"]: joint["parent"] for joint in facts["joints"].values()}
-    assert guess.root.name == "pelvis" and found == {**true, "sacrum": "pelvis"} and guess.parts.units == "mm"
+    assert (
+        guess.root.name == "pelvis"
+        and found == {**true, "sacrum": "pelvis"}
+        and guess.parts.units == "mm"
+    )
     right, away = 0, []
     for muscle in guess.muscles:
-        true = {a["bone"]: a["centroid_mm"] for a in facts["muscles"][muscle.muscle.name]["attachments"]}
-        mine = {hold.bone.name: muscle.muscle.points[hold.vertices].mean(axis=0) for hold in muscle.holds}
+        true = {
+            a["bone"]: a["centroid_mm"] for a in facts["muscles"][muscle.muscle.name]["attachments"]
+        }
+        mine = {
+            hold.bone.name: muscle.muscle.points[hold.vertices].mean(axis=0)
+            for hold in muscle.holds
+        }
         right += set(mine) == set(true)
         away += [np.linalg.norm(mine[bone] - true[bone]) for bone in true if bone in mine]
     assert right == 38
@@ -232,7 +261,9 @@ def test_bones_and_muscles_of_the_leg_hang_on_the_right_bones_at_the_right_place
     scene = write_scene(guess, folder / "scene.toml")
     assert len(scene.muscles) == 38 and scene.superior is not None
     last, first = scene.motion.frames[-1], scene.motion.frames[0]
-    assert {name for name in last if last[name] != first[name]} == {"hip.flexion"} and not scene.motion.notes
+    assert {name for name in last if last[name] != first[name]} == {
+        "hip.flexion"
+    } and not scene.motion.notes
 
 
 def test_guess_of_the_leg_is_what_is_kept(leg_guess):
@@ -243,20 +274,31 @@ def test_guess_of_the_leg_is_what_is_kept(leg_guess):
         for hold in m.holds
     ]
     sure = [(muscle.confidence, muscle.reasons, muscle.wrong) for muscle in guess.muscles]
-    facts = [holds, sure, [joint.row() for joint in guess.joints], guess.doubts(), guess.orientation]
+    facts = [
+        holds,
+        sure,
+        [joint.row() for joint in guess.joints],
+        guess.doubts(),
+        guess.orientation,
+    ]
     check_kept("leg_guess", facts, tolerance=1e-6)
 
 
 def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess):
-    """Beside the ends that carriers hold in data/leg; the quadriceps' goes on from the patella to the tibia."""
+    """Beside the ends that carriers hold in data/leg; the quadriceps' goes on from the patella to
+    the tibia.
+    """
     guess, facts, _ = leg_guess
     holds = [(m.muscle, hold) for m in guess.muscles for hold in m.holds if hold.tendon is not None]
     gaps = {(muscle.name, hold.bone.name): hold.gap for muscle, hold in holds}
     for carrier in facts["tendon_carriers"].values():
         for name, bone in carrier["muscles"].items() if isinstance(carrier, dict) else ():
-            gap = next(a["gap_mm"] for a in facts["muscles"][name]["attachments"] if a["bone"] == bone)
+            gap = next(
+                a["gap_mm"] for a in facts["muscles"][name]["attachments"] if a["bone"] == bone
+            )
             if gap["least"] > 50.0:
-                # The patches were chosen by other rules, so their nearest vertices differ by some millimetres.
+                # The patches were chosen by other rules, so their nearest vertices differ by some
+                # millimetres.
                 assert gaps[name, bone] == pytest.approx(gap["least"], abs=8.0), name
     for muscle, hold in holds:  # straight to the nearest place of the bone
         if not hold.tendon.via:
@@ -271,7 +313,10 @@ def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess):
 
 def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_path):
     _phantom_meshes(tmp_path)
-    two = [trimesh.creation.icosphere(radius=6.0).apply_translation([x, 80.0, 0.0]) for x in (0.0, 20.0)]
+    two = [
+        trimesh.creation.icosphere(radius=6.0).apply_translation([x, 80.0, 0.0])
+        for x in (0.0, 20.0)
+    ]
     trimesh.util.concatenate(two).export(tmp_path / "Segment_99.ply")
     open_mesh = phantom_scene().muscles[0].mesh.copy()
     open_mesh.update_faces(open_mesh.triangles_center[:, 2] < open_mesh.bounds[:, 2].mean())
@@ -310,7 +355,9 @@ def test_nothing_is_left_behind_that_does_not_load(tmp_path):
     assert not file.exists()
 
 
-def test_meshes_in_metres_make_a_scene_that_runs_and_an_unused_bone_is_in_the_verdict(tmp_path, capsys):
+def test_meshes_in_metres_make_a_scene_that_runs_and_an_unused_bone_is_in_the_verdict(
+    tmp_path, capsys
+):
     meshes, out = phantom_scene(spacing=6.0), tmp_path / "out"
     for item in meshes.bones + meshes.muscles[:2]:
         item.mesh.copy().apply_scale(0.001).export(tmp_path / f"{item.name}.ply")
@@ -327,7 +374,9 @@ def test_meshes_in_metres_make_a_scene_that_runs_and_an_unused_bone_is_in_the_ve
     verdict = json.loads((out / "run.json").read_text(encoding="utf-8"))["verdict"]
     assert code == 0 and f"verdict: {verdict}" in printed and len(SavedRun(out).frames) == 5
     assert "the bones, bones left out (sacrum) 1 at frame 0 (limit 0)" in verdict
-    code, _, err = call(capsys, *run, "--set", "output.surfaces=false", "--fail-on", "bones_left_out")
+    code, _, err = call(
+        capsys, *run, "--set", "output.surfaces=false", "--fail-on", "bones_left_out"
+    )
     assert code == 6 and "bones_left_out = 1 > 0" in err and not SavedRun(out).has_surfaces()
 
 
@@ -336,7 +385,9 @@ def test_header_counts_and_bones_against_it_are_named(leg):
     found = find_orientation(bones, HEADER)
     assert (found.anterior == [0, 1, 0]).all()
     assert any("anterior by the bones" in doubt for doubt in found.doubts)
-    shank = find_orientation([bone for bone in bones if bone.kind in ("tibia", "foot")])  # no femur shows it
+    shank = find_orientation(
+        [bone for bone in bones if bone.kind in ("tibia", "foot")]
+    )  # no femur shows it
     assert shank.superior @ [0, 0, 1] > 0.95 and shank.anterior @ [0, -1, 0] > 0.95
     bones[1].side = "l"
     assert any("is it mirrored" in doubt for doubt in find_orientation(bones).doubts)

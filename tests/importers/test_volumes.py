@@ -1,4 +1,6 @@
-"""Label volumes: positions, names, surfaces without steps, neighbours that share a face, and files that are broken."""
+"""Label volumes: positions, names, surfaces without steps, neighbours that share a face, and files
+that are broken.
+"""
 
 import gzip
 import json
@@ -26,7 +28,9 @@ RADIUS = 20.0
 def ball_labels(spacing=(1.0, 1.0, 1.0), centre=(24.3, 25.1, 24.7), split=None):
     """Voxels of a ball of 20 mm; with a plane, its two halves are two labels."""
     counts = [round(50 / s) for s in spacing]
-    grid = np.stack(np.meshgrid(*[np.arange(n) * s for n, s in zip(counts, spacing)], indexing="ij"), axis=-1)
+    grid = np.stack(
+        np.meshgrid(*[np.arange(n) * s for n, s in zip(counts, spacing)], indexing="ij"), axis=-1
+    )
     inside = np.linalg.norm(grid - centre, axis=-1) < RADIUS
     labels = inside.astype(np.int32)
     if split is not None:
@@ -48,7 +52,8 @@ def test_surface_of_a_ball_is_the_ball(spacing):
     surface = label_surface(volume, 1)
     mesh = surface.mesh
     radius = np.linalg.norm(mesh.vertices - (24.3, 25.1, 24.7), axis=1)
-    # A quarter of a millimetre is wanted of the leg at voxels of 1; the voxels themselves are 0.3 RMS off.
+    # A quarter of a millimetre is wanted of the leg at voxels of 1; the voxels themselves are 0.3
+    # RMS off.
     assert np.sqrt(np.mean((radius - RADIUS) ** 2)) < 0.2
     assert mesh.is_watertight and mesh.euler_number == 2 and mesh.volume > 0
     assert mesh.volume == pytest.approx(surface.volume, rel=5e-3)
@@ -56,7 +61,9 @@ def test_surface_of_a_ball_is_the_ball(spacing):
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     off = np.degrees(np.arccos(np.clip((mesh.face_normals * outward).sum(axis=1), -1, 1)))
     # Without steps: those of voxels are 31 degrees off RMS and up to 55.
-    assert np.sqrt(np.average(off**2, weights=mesh.area_faces)) < 7.0 and np.percentile(off, 99) < 22.0
+    assert (
+        np.sqrt(np.average(off**2, weights=mesh.area_faces)) < 7.0 and np.percentile(off, 99) < 22.0
+    )
 
 
 def test_neighbours_that_share_a_face_neither_overlap_nor_gape():
@@ -67,11 +74,15 @@ def test_neighbours_that_share_a_face_neither_overlap_nor_gape():
     for label in (1, 2):
         mesh = label_surface(volume, label).mesh
         place = mesh.vertices - centre
-        inner = np.linalg.norm(place - np.outer(place @ direction, direction), axis=1) < 0.7 * RADIUS
+        inner = (
+            np.linalg.norm(place - np.outer(place @ direction, direction), axis=1) < 0.7 * RADIUS
+        )
         flat = inner & (np.abs(place @ direction) < 3.0)
         assert flat.sum() > 50
         heights.append(place[flat] @ direction)
-    assert np.abs(np.concatenate(heights)).max() < 1.0 / 3.0  # of a voxel, on either side of the plane
+    assert (
+        np.abs(np.concatenate(heights)).max() < 1.0 / 3.0
+    )  # of a voxel, on either side of the plane
 
 
 OBLIQUE = Rotation.from_rotvec([0.3, -0.5, 0.4]).as_matrix()
@@ -79,7 +90,9 @@ OBLIQUE = Rotation.from_rotvec([0.3, -0.5, 0.4]).as_matrix()
 
 def test_surfaces_of_labels_are_what_is_kept():
     labels, affine = ball_labels((0.8, 0.8, 1.5), split=np.array([0.6, 0.64, 0.48])), np.eye(4)
-    labels[1:5, 1:5, 1:6], labels[2:4, 55:57, 2:4], labels[30:33, 28:31, 15:17] = 2, 1, 0
+    labels[1:5, 1:5, 1:6] = 2
+    labels[2:4, 55:57, 2:4] = 1
+    labels[30:33, 28:31, 15:17] = 0
     affine[:3] = np.column_stack([OBLIQUE * [0.8, 0.8, 1.5], [5.0, 7.0, -3.0]])
     volume, found = LabelVolume(labels, affine, {1: "left"}, "x.nii"), []
     for label in (1, 2):
@@ -99,7 +112,11 @@ def test_directions_and_units_are_honoured(tmp_path, turn):
     metres = affine.copy()
     metres[:3] *= 1e-3
     files.append(write_nifti(tmp_path / "b.nii", labels, metres, unit="meter"))
-    spaces = {"left-posterior-superior": [-1, -1, 1], "left-anterior-superior": [-1, 1, 1], "RAS": [1, 1, 1]}
+    spaces = {
+        "left-posterior-superior": [-1, -1, 1],
+        "left-anterior-superior": [-1, 1, 1],
+        "RAS": [1, 1, 1],
+    }
     for space, signs in spaces.items():
         there = np.diag(signs) @ affine[:3]
         header = {"space": space, "space directions": there[:, :3].T, "space origin": there[:, 3]}
@@ -109,7 +126,9 @@ def test_directions_and_units_are_honoured(tmp_path, turn):
         volume = read_labels(file)
         meshes = [label_surface(volume, label).mesh for label in (1, 2)]
         assert all(mesh.volume > 0 for mesh in meshes)
-        both = sum(mesh.center_mass * mesh.volume for mesh in meshes) / sum(mesh.volume for mesh in meshes)
+        both = sum(mesh.center_mass * mesh.volume for mesh in meshes) / sum(
+            mesh.volume for mesh in meshes
+        )
         assert both == pytest.approx(centre, abs=0.05)  # voxels of a ball are not quite symmetric
         above = (meshes[1].center_mass - meshes[0].center_mass) @ affine[:3, 2]
         assert above > 10.0
@@ -134,7 +153,9 @@ def test_islands_and_holes_are_left_out_and_told():
     labels[1:3, 1:3, 1:3], labels[22:26, 22:26, 22:26] = 1, 0
     surface = label_surface(LabelVolume(labels, np.eye(4), {}, "x.nii"), 1)
     island, hole = surface.notes
-    assert "1 islands of 8 voxels" in island and "64 voxels" in hole and surface.mesh.euler_number == 2
+    assert (
+        "1 islands of 8 voxels" in island and "64 voxels" in hole and surface.mesh.euler_number == 2
+    )
 
 
 def test_names_from_files_header_and_tables(tmp_path):
@@ -143,7 +164,11 @@ def test_names_from_files_header_and_tables(tmp_path):
         write_nifti(tmp_path / f"{name}.nii.gz", (labels == value).astype(np.uint8), np.eye(4))
     volume = read_labels(tmp_path)
     assert sorted(volume.names.values()) == ["soleus", "tibia"] and len(volume.values()) == 2
-    header = {"space": "left-posterior-superior", "space directions": np.eye(3), "space origin": np.zeros(3)}
+    header = {
+        "space": "left-posterior-superior",
+        "space directions": np.eye(3),
+        "space origin": np.zeros(3),
+    }
     header |= {"Segment0_Name": "femur", "Segment0_LabelValue": "2"}
     header |= {"Segment1_Name": "soleus", "Segment1_LabelValue": "1"}
     nrrd.write(str(tmp_path / "s.seg.nrrd"), labels, header)
@@ -186,7 +211,10 @@ def test_hostile_volumes_end_in_one_line_and_code_4(tmp_path, capsys):
     for path, words in _hostile(tmp_path):
         code, out, err = call(capsys, "new", path, "-o", tmp_path / "out" / "scene.toml")
         assert code == 4 and out == "", (path.name, err)
-        assert len(err.strip().splitlines()) == 1 and path.name in err and words in err, (path.name, err)
+        assert len(err.strip().splitlines()) == 1 and path.name in err and words in err, (
+            path.name,
+            err,
+        )
 
 
 def test_a_volume_larger_than_the_limit_is_refused_unread(tmp_path):
@@ -200,7 +228,10 @@ def test_a_volume_larger_than_the_limit_is_refused_unread(tmp_path):
 
 
 def test_scene_of_a_segmentation_lies_beside_it_and_is_in_its_unit(tmp_path, capsys):
-    file, other = write_nifti(tmp_path / "a.nii.gz", np.ones((3, 3, 3), np.int16), np.eye(4)), tmp_path / "o"
+    file, other = (
+        write_nifti(tmp_path / "a.nii.gz", np.ones((3, 3, 3), np.int16), np.eye(4)),
+        tmp_path / "o",
+    )
     given = ((file, None), (tmp_path, None), (file, other), (file, other / "x.toml"))
     found = [_beside(*pair) for pair in given]
     assert found == [tmp_path / "a_scene", tmp_path / "scene", other, other]

@@ -46,12 +46,20 @@ def test_a_belly_looked_at_from_the_other_end_is_the_same():
     bulge = 1.0 + 0.5 * np.exp(-((vertices[:, 0] - 10.0) ** 2) / 40.0)
     vertices = vertices * np.column_stack([np.ones(len(vertices)), bulge, bulge])
     ends = np.array([-25.0, 0.0, 0.0]), np.array([35.0, 0.0, 0.0])
-    one, other = belly_measures(vertices, faces, *ends), belly_measures(vertices, faces, *ends[::-1])
+    one, other = (
+        belly_measures(vertices, faces, *ends),
+        belly_measures(vertices, faces, *ends[::-1]),
+    )
     assert one["csa_max"] == pytest.approx(other["csa_max"], rel=1e-9)
     assert one["csa_place"] == pytest.approx(1.0 - other["csa_place"], abs=1e-9)
     assert one["belly_thickness"] == pytest.approx(other["belly_thickness"], rel=1e-9)
     x = np.linspace(-30.0, 30.0, 6001)
-    area = np.pi * 24.0 * (1.0 - (x / 30.0) ** 2) * (1.0 + 0.5 * np.exp(-((x - 10.0) ** 2) / 40.0)) ** 2
+    area = (
+        np.pi
+        * 24.0
+        * (1.0 - (x / 30.0) ** 2)
+        * (1.0 + 0.5 * np.exp(-((x - 10.0) ** 2) / 40.0)) ** 2
+    )
     # Triangles within the surface, and a parabola through three stations: 1 % together.
     assert one["csa_max"] == pytest.approx(area.max(), rel=0.02)
     assert one["csa_place"] == pytest.approx((x[area.argmax()] + 25.0) / 60.0, abs=0.01)

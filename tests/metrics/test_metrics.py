@@ -9,7 +9,13 @@ import trimesh
 
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.metrics.centreline import Centreline, split_ends
-from rbfmuscle.metrics.mesh_distance import BoneProbe, Columns, MeshDistance, bone_depth, surface_depth
+from rbfmuscle.metrics.mesh_distance import (
+    BoneProbe,
+    Columns,
+    MeshDistance,
+    bone_depth,
+    surface_depth,
+)
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
 from rbfmuscle.metrics.rows import moment_arms
 from rbfmuscle.run import simulate
@@ -33,14 +39,18 @@ def blob():
     """A bumpy closed surface, so that nothing is symmetric by chance."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=10.0)
     v = np.array(mesh.vertices)
-    bump = 1 + 0.2 * np.sin(0.7 * v[:, 0]) * np.cos(0.5 * v[:, 1] + 0.3) + 0.1 * np.sin(0.9 * v[:, 2])
+    bump = (
+        1 + 0.2 * np.sin(0.7 * v[:, 0]) * np.cos(0.5 * v[:, 1] + 0.3) + 0.1 * np.sin(0.9 * v[:, 2])
+    )
     return trimesh.Trimesh(v * bump[:, None] * [1.6, 1.0, 0.7], mesh.faces, process=False)
 
 
 class TestColumns:
     @pytest.mark.parametrize("turn", [0.0, 0.4, 2.0])
     @pytest.mark.parametrize("scale", [1.0, 2.0**-10])
-    def test_inside_is_where_the_winding_number_says_so_in_any_pose_and_unit(self, blob, turn, scale):
+    def test_inside_is_where_the_winding_number_says_so_in_any_pose_and_unit(
+        self, blob, turn, scale
+    ):
         vertices, faces = arrays(blob)
         pose = turned(turn, (1, 2, 3), (1, 2, 3))
         points = np.random.default_rng(1).uniform(*(1.4 * blob.bounds), size=(4000, 3))
@@ -52,7 +62,9 @@ class TestColumns:
 
     def test_lines_through_edges_and_corners_are_counted_once(self):
         box = trimesh.creation.box((2, 2, 2)).subdivide().subdivide()
-        axis = np.linspace(-1.5, 1.5, 7)  # every line runs through a corner or an edge of the triangles
+        axis = np.linspace(
+            -1.5, 1.5, 7
+        )  # every line runs through a corner or an edge of the triangles
         points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         away = np.abs(np.abs(points).max(axis=1) - 1.0) > 1e-9
         found = Columns(*arrays(box)).inside(points, EYE)
@@ -71,7 +83,9 @@ class TestMeshDistance:
     def test_equals_libigl(self, blob, spread):
         noise = np.random.default_rng(3).normal(scale=spread, size=blob.vertices.shape)
         points = np.array(blob.vertices) + noise
-        expected = igl.signed_distance(points, *arrays(blob))[0]  # near zero both round a squared distance
+        expected = igl.signed_distance(points, *arrays(blob))[
+            0
+        ]  # near zero both round a squared distance
         np.testing.assert_allclose(MeshDistance(*arrays(blob)).signed(points), expected, atol=1e-9)
 
     def test_triangles_near_from_the_frame_before_change_no_distance(self, blob):
@@ -85,12 +99,17 @@ class TestMeshDistance:
         np.testing.assert_array_equal(later.unsigned(points, near=near), anew)
 
     def test_deepest_point_is_not_believed_at_a_fold(self):
-        # A flap folded flat onto the outside: the layers above it look like the inside from one face.
+        # A flap folded flat onto the outside: the layers above it look like the inside from one
+        # face.
         box = trimesh.creation.box((2, 2, 2))
         vertices, faces = arrays(box)
         top = np.flatnonzero((vertices[faces][:, :, 2] > 0).all(axis=1))[0]
         a, b, c = faces[top]
-        extra = np.array([[0.3, 0.3, 1.0], [-0.3, 0.3, 1.0]]) + vertices[[a, b, c]].mean(axis=0) * [1, 1, 0]
+        extra = np.array([[0.3, 0.3, 1.0], [-0.3, 0.3, 1.0]]) + vertices[[a, b, c]].mean(axis=0) * [
+            1,
+            1,
+            0,
+        ]
         vertices = np.vstack([vertices, extra])
         p, q = len(vertices) - 2, len(vertices) - 1
         folded = [[a, b, p], [b, q, p], [b, c, q], [c, p, q], [c, a, p]]
@@ -103,7 +122,9 @@ class TestMeshDistance:
         hole = sphere.triangles_center[:, 2] > 0.97
         vertices, faces = np.array(sphere.vertices), np.array(sphere.faces)[~hole]
         distance = MeshDistance(vertices, faces, closed=False)
-        assert distance.signed([[0, 0, -0.5]])[0] == pytest.approx(-0.5, abs=5e-3)  # polyhedron, not sphere
+        assert distance.signed([[0, 0, -0.5]])[0] == pytest.approx(
+            -0.5, abs=5e-3
+        )  # polyhedron, not sphere
         assert distance.signed([[0, 0, -1.5]])[0] == pytest.approx(0.5, abs=5e-3)
 
 
@@ -124,7 +145,9 @@ class TestMeshMeasures:
     def test_form_is_looked_for_again_where_it_can_have_changed(self):
         ball = trimesh.creation.icosphere(subdivisions=2)
         one = ModelSurface(np.array(ball.vertices), np.array(ball.faces))
-        folded = ModelSurface(one.vertices * np.where(one.vertices[:, :1] > 0.3, -1.0, 1.0), one.faces)
+        folded = ModelSurface(
+            one.vertices * np.where(one.vertices[:, :1] > 0.3, -1.0, 1.0), one.faces
+        )
         torus = trimesh.creation.torus(3.0, 1.0)
         other = ModelSurface(np.array(torus.vertices), np.array(torus.faces))
         moved = ModelSurface(folded.vertices + 5.0, one.faces, origin=(folded, np.eye(4)))
@@ -148,7 +171,9 @@ def rod(length=100.0, radius=8.0, rings=60, around=24):
 def rod_muscle(mesh, length=100.0):
     ends = [("trunk", mesh.vertices[:, 0] == 0), ("limb", mesh.vertices[:, 0] == length)]
     attachments = [Attachment(bone, np.flatnonzero(where)) for bone, where in ends]
-    return SimpleNamespace(name="rod", mesh=mesh, attachments=attachments, contraction=None, tendons=[])
+    return SimpleNamespace(
+        name="rod", mesh=mesh, attachments=attachments, contraction=None, tendons=[]
+    )
 
 
 BEND = {"bend": Coordinate()}
@@ -161,7 +186,9 @@ class TestLength:
         line = Centreline(rod_muscle(mesh), JOINTS, *arrays(mesh))
         v = np.array(mesh.vertices)
         angle = v[:, 0] / radius
-        bent = np.stack([(radius + v[:, 1]) * np.sin(angle), (radius + v[:, 1]) * np.cos(angle), v[:, 2]], 1)
+        bent = np.stack(
+            [(radius + v[:, 1]) * np.sin(angle), (radius + v[:, 1]) * np.cos(angle), v[:, 2]], 1
+        )
         pose = turned(-100 / radius, (0, 0, 1))
         pose[:3, 3] = [radius * np.sin(100 / radius), radius * np.cos(100 / radius), 0]
         pose[:3, 3] -= pose[:3, :3] @ [100, 0, 0]
@@ -171,15 +198,22 @@ class TestLength:
         assert line.length(bent, {"trunk": start, "limb": pose}) == pytest.approx(100, rel=3e-3)
 
     def test_bones_whose_joint_rests_are_one_end(self):
-        rows = [("tibiofibular", "tibia", "fibula"), ("ankle", "tibia", "talus"), ("knee", "femur", "tibia")]
+        rows = [
+            ("tibiofibular", "tibia", "fibula"),
+            ("ankle", "tibia", "talus"),
+            ("knee", "femur", "tibia"),
+        ]
         joints = [SimpleNamespace(name=n, parent=p, child=c, coordinates=BEND) for n, p, c in rows]
-        soleus = SimpleNamespace(attachments=[SimpleNamespace(bone=b) for b in ("fibula", "tibia", "talus")])
+        soleus = SimpleNamespace(
+            attachments=[SimpleNamespace(bone=b) for b in ("fibula", "tibia", "talus")]
+        )
 
         def ends(moving):
             return [[a.bone for a in group] for group in split_ends(soleus, joints, moving)]
 
         assert ends({"ankle"}) == ends({"ankle", "knee"}) == [["fibula", "tibia"], ["talus"]]
-        # Where nothing moves its ends against each other, they are those of joints that all might move.
+        # Where nothing moves its ends against each other, they are those of joints that all might
+        # move.
         assert ends({"knee"}) == ends(None) == [["fibula"], ["tibia", "talus"]]
 
 
@@ -187,13 +221,17 @@ class TestMomentArm:
     def arms(self, angles, lengths, name="joint.bend"):
         return [found.get(name) for found in moment_arms([{name: a} for a in angles], lengths)]
 
-    def test_string_over_a_pulley_has_its_radius_and_a_parabola_its_slope_however_the_steps_are(self):
+    def test_string_over_a_pulley_has_its_radius_and_a_parabola_its_slope_however_the_steps_are(
+        self,
+    ):
         angles = np.radians([0, 5, 10, 20, 40])
         assert self.arms(angles, 200 + 23.5 * angles) == pytest.approx([-23.5] * 5)
         angles = np.array([0.1, 0.2, 0.5])
         assert self.arms(angles, 3 * angles**2 - angles)[1] == pytest.approx(-(6 * 0.2 - 1))
         angles = np.cumsum(np.radians([0.0, 1.0, 0.3, 2.0, 0.7, 1.1, 0.2, 3.0, 1.0]))
-        assert self.arms(angles, 3 * angles**2 - angles) == pytest.approx(-(6 * angles - 1), rel=1e-6)
+        assert self.arms(angles, 3 * angles**2 - angles) == pytest.approx(
+            -(6 * angles - 1), rel=1e-6
+        )
 
     def test_ripple_of_lengths_is_smoothed_where_frames_are_near(self):
         angles = np.radians(np.arange(41.0))
@@ -220,7 +258,10 @@ class TestRows:
         mesh = rod()
         block = trimesh.creation.box((10, 10, 10))
         block.apply_translation([50, 0, -12])
-        bones = [SimpleNamespace(name="trunk", mesh=block), SimpleNamespace(name="limb", mesh=block.copy())]
+        bones = [
+            SimpleNamespace(name="trunk", mesh=block),
+            SimpleNamespace(name="limb", mesh=block.copy()),
+        ]
         bones[1].mesh.apply_translation([500, 0, 0])
         frames = [{"joint.bend": a} for a in (0.0, 0.1, 0.2)]
         parts = {"bones": bones, "couplings": [], "joints": JOINTS, "muscles": [rod_muscle(mesh)]}
@@ -290,7 +331,9 @@ def test_crossings_are_those_of_a_literal_search():
 
 
 def test_moment_arms_of_the_real_hip_have_the_right_signs_and_sum(hip_scene):
-    """Gluteus maximus and medius extend, the iliacus flexes; the adductor brevis flexes first, then extends."""
+    """Gluteus maximus and medius extend, the iliacus flexes; the adductor brevis flexes first, then
+    extends.
+    """
     wanted = dict.fromkeys(("gluteus_maximus", "gluteus_medius"), (-1, -1))
     wanted |= {"iliacus": (1, 1), "adductor_brevis": (1, -1)}
     made = simulate(hip_scene, settings={"output.surfaces": False}, frames="0:46:3")

@@ -1,4 +1,6 @@
-"""The finite-element solid against known answers, and the models against the reference that it gave."""
+"""The finite-element solid against known answers, and the models against the reference that it
+gave.
+"""
 
 from importlib import import_module
 
@@ -32,17 +34,24 @@ def prism(cells=(2, 2, 5)):
 
 
 def side_stretch(stretch, solid):
-    """Side stretch of a block pulled by ``stretch`` with free sides: no stress across, in closed form."""
+    """Side stretch of a block pulled by ``stretch`` with free sides: no stress across, in closed
+    form.
+    """
 
     def across(side):
         j = stretch * side**2
         trace = stretch**2 + 2 * side**2
-        return solid.shear * j ** (-2 / 3) * (side - trace / 3 / side) + solid.bulk * (j - 1) * j / side
+        return (
+            solid.shear * j ** (-2 / 3) * (side - trace / 3 / side)
+            + solid.bulk * (j - 1) * j / side
+        )
 
     return brentq(across, 0.3, 1.5, xtol=1e-14)
 
 
-@pytest.mark.parametrize(("kind", "stretch"), [(block, 0.8), (block, 1.6), (prism, 0.8), (prism, 1.4)])
+@pytest.mark.parametrize(
+    ("kind", "stretch"), [(block, 0.8), (block, 1.6), (prism, 0.8), (prism, 1.4)]
+)
 def test_uniaxial_stretch_is_the_closed_form(kind, stretch):
     solid = kind()
     x = solid.rest

@@ -1,4 +1,6 @@
-"""Scenes with answers in closed form, the measures of their errors, and what the models make of them."""
+"""Scenes with answers in closed form, the measures of their errors, and what the models make of
+them.
+"""
 
 from importlib import import_module
 
@@ -7,7 +9,8 @@ import pytest
 
 study = import_module("known_answers")  # the script in benchmarks
 
-# What the page of accuracy promises: shares of the closed form, at a refinement that runs in a second.
+# What the page of accuracy promises: shares of the closed form, at a refinement that runs in a
+# second.
 FINE_RBF = {"name": "rbf", "centres": 600, "nodes": 300}
 
 
@@ -16,12 +19,15 @@ class TestStretchedBar:
         ("model", "stretch", "spacing", "radius", "path"),
         [
             ({**FINE_RBF, "slack": 1.0}, 0.8, 1.5, 0.01, 0.003),
-            # A slack bar that is pushed shortens more where its held ends do not keep it from thickening.
+            # A slack bar that is pushed shortens more where its held ends do not keep it from
+            # thickening.
             ({**FINE_RBF, "slack": 1.6}, 1.2, 1.5, 0.01, 0.003),
             ({"name": "arap-volume"}, 1.2, 2.0, np.inf, 0.001),
         ],
     )
-    def test_radius_and_path_are_those_of_an_even_stretch(self, model, stretch, spacing, radius, path):
+    def test_radius_and_path_are_those_of_an_even_stretch(
+        self, model, stretch, spacing, radius, path
+    ):
         found = study.stretched(stretch, model, spacing)
         assert abs(found["radius_ends"]) < 0.01
         assert abs(found["radius"]) < radius

@@ -31,12 +31,16 @@ from rbfmuscle.validation import NumericalWarning, SceneError, SolveError
 
 
 def _distances(points, vertices, faces):
-    squares = igl.point_mesh_squared_distance(np.array(points), np.array(vertices), np.array(faces))[0]
+    squares = igl.point_mesh_squared_distance(
+        np.array(points), np.array(vertices), np.array(faces)
+    )[0]
     return np.sqrt(squares)
 
 
 def _surface(turn=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0), scale=1.0, units="mm"):
-    """One muscle of the phantom, flexed, in a scene that was moved and written in another unit, and its size."""
+    """One muscle of the phantom, flexed, in a scene that was moved and written in another unit, and
+    its size.
+    """
     scene = phantom_scene()
     scene.units, scene.muscles = units, scene.muscles[:1]
     scene.muscles[0].fibres = None
@@ -60,7 +64,9 @@ def plain():
     ("turn", "scale", "units"),
     [([0.0, 0.0, 0.0], 1e-3, "m"), ([0.7, -1.9, 0.4], 1.0, "mm"), ([2.0, 0.3, 1.1], 0.1, "cm")],
 )
-def test_a_scene_that_is_moved_and_in_another_unit_gives_the_same_surface(plain, turn, scale, units):
+def test_a_scene_that_is_moved_and_in_another_unit_gives_the_same_surface(
+    plain, turn, scale, units
+):
     shift = scale * np.array([1e4, -4e3, 2e3])  # 10 m
     (surface, size), (moved, _) = plain, _surface(turn, shift, scale, units)
     back = (moved - shift) @ Rotation.from_rotvec(turn).as_matrix() / scale
@@ -90,7 +96,9 @@ def test_any_kernel_drives_a_muscle(kernel):
     assert np.sqrt((near**2).mean()) < 0.8
 
 
-def test_centres_are_added_until_the_wanted_error_is_met_and_fitted_ones_err_less(monkeypatch, tmp_path):
+def test_centres_are_added_until_the_wanted_error_is_met_and_fitted_ones_err_less(
+    monkeypatch, tmp_path
+):
     monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path))  # keeps the number of centres
     scene = phantom_scene()
     muscle = scene.muscle("abductor")
@@ -135,7 +143,9 @@ def test_where_no_level_set_can_be_shown_the_material_is_and_an_event_says_so():
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_surface_makes_room_for_neighbours_and_keeps_its_volume(side):
-    """On one side of the muscle vertices yield by a millimetre; where all have to, the volume comes first."""
+    """On one side of the muscle vertices yield by a millimetre; where all have to, the volume comes
+    first.
+    """
     scene = phantom_scene()
     scene.muscles = [scene.muscle("adductor_posterior")]
     middle, shown = scene.muscles[0].mesh.vertices[:, 0].mean(), []
@@ -151,12 +161,21 @@ def test_surface_makes_room_for_neighbours_and_keeps_its_volume(side):
     yielded = side * (shown[0].vertices[:, 0] - middle) > 0.0
     inwards = np.einsum("nd,nd->n", shown[0].vertices - shown[1].vertices, shown[0].vertex_normals)
     # What crossed itself is smoothed, what lies in a bone is lifted.
-    assert np.median(inwards[yielded]) == pytest.approx(1.0, abs=0.02) and np.median(inwards[~yielded]) < -0.2
+    assert (
+        np.median(inwards[yielded]) == pytest.approx(1.0, abs=0.02)
+        and np.median(inwards[~yielded]) < -0.2
+    )
     assert np.abs(shown[2].vertices - shown[0].vertices).max() < 1.0
 
 
 def test_a_chosen_epsilon_never_gives_a_broken_field():
-    narrow = {"kernel": "gaussian", "centres": 60, "samples": 300, "epsilon": 3.0, "condition": 1000.0}
+    narrow = {
+        "kernel": "gaussian",
+        "centres": 60,
+        "samples": 300,
+        "epsilon": 3.0,
+        "condition": 1000.0,
+    }
     scene = phantom_scene().with_options({f"model.{key}": value for key, value in narrow.items()})
     scene.muscles = [scene.muscle("adductor_posterior")]
     with warnings.catch_warnings():
@@ -181,7 +200,9 @@ def test_a_tangle_of_the_material_is_shown_as_a_sound_surface():
     now = Configuration(model.points, model.normals(), model.contact_points(), tangled)
     surface = model.drawer.draw(Mock(side_effect=ValueError("no field")), now, contacts)
     assert not crossing_faces(surface.vertices, np.asarray(surface.faces)).any()
-    assert mesh_volume(surface.vertices, np.asarray(surface.faces)) == pytest.approx(volume, rel=1e-10)
+    assert mesh_volume(surface.vertices, np.asarray(surface.faces)) == pytest.approx(
+        volume, rel=1e-10
+    )
     assert contacts.nearest(surface.vertices)[0].min() > -0.05
     assert surface.quantities["unfitted_fraction"] == 1.0
     # Far from the tangle it is where the material is.
@@ -201,8 +222,9 @@ def ramp(*ends, step):
     [
         ("extensor", (60, -18, 15), 0.5),
         ("adductor_posterior", (60, -18, 15), 0.5),
-        # 22 of 61 frames of such motions had a handle by marching cubes of 48 cells, rims flickered by 6 mm. Steps are
-        # four times as long as those of the page on reliability, where it is 0.1 mm.
+        # 22 of 61 frames of such motions had a handle by marching cubes of 48 cells, rims flickered
+        # by 6 mm. Steps are four times as long as those of the page on reliability, where it is 0.1
+        # mm.
         ("gluteus_maximus", (72, -20, 16), 1.5),
     ],
 )
@@ -222,7 +244,9 @@ def test_promises_hold_in_each_frame_of_a_combined_motion(muscle, ends, flicker,
 
 @pytest.mark.filterwarnings("ignore:.*drives the bones into each other")
 def test_what_folds_does_not_flicker():
-    """Fold of a rim at the end of flexion, abduction and rotation, which leapt by 3.1 mm in a frame."""
+    """Fold of a rim at the end of flexion, abduction and rotation, which leapt by 3.1 mm in a
+    frame.
+    """
     scene = phantom_scene()
     scene.muscles = [scene.muscle("abductor")]
     scene.set_motion(ramp=ramp(90, -25, 20, step=1.5))
@@ -232,7 +256,9 @@ def test_what_folds_does_not_flicker():
 
 
 def test_shown_mesh_has_three_edges_through_its_thickness():
-    muscle = SimpleNamespace(mesh=trimesh.creation.cylinder(5.0, 250.0, sections=64))  # mean thickness 5
+    muscle = SimpleNamespace(
+        mesh=trimesh.creation.cylinder(5.0, 250.0, sections=64)
+    )  # mean thickness 5
     for resolution, edge in ((0, 5.0 / 3.0), (100, 2.5)):
         wanted = 1.15 * muscle.mesh.area / edge**2
         assert display_vertices(muscle, resolution) == pytest.approx(wanted, rel=0.06)

@@ -1,4 +1,6 @@
-"""The elastic solid of an RBF muscle: quadrature, energy, equilibrium, slack, squeezed material, finite elements."""
+"""The elastic solid of an RBF muscle: quadrature, energy, equilibrium, slack, squeezed material,
+finite elements.
+"""
 
 from importlib import import_module
 
@@ -32,13 +34,23 @@ def bar(iterations=100):
     lattice = Lattice(frame.local, np.asarray(block.faces), 150)
     held = np.flatnonzero(owner >= 0)
     return EmbeddedSolid(
-        lattice, frame, points, owner, held, count=len(points), free=np.flatnonzero(owner < 0),
-        area=float(block.area) / len(points), iterations=iterations, bones={},
-    )  # fmt: skip
+        lattice,
+        frame,
+        points,
+        owner,
+        held,
+        count=len(points),
+        free=np.flatnonzero(owner < 0),
+        area=float(block.area) / len(points),
+        iterations=iterations,
+        bones={},
+    )
 
 
 def with_fibres(solid, along, ratio=1.0, slack=1.0):
-    """Give the solid fibres along a direction, stiffer by a ratio of Young's moduli, slack down to 1 / slack."""
+    """Give the solid fibres along a direction, stiffer by a ratio of Young's moduli, slack down to
+    1 / slack.
+    """
     count = len(solid.weights)
     direction = np.tile(np.asarray(along, dtype=float), (count, 1))
     stiff, lower = np.full(count, 1.5 * (ratio - 1.0)), np.full(count, 1.0 / slack)
@@ -94,7 +106,9 @@ def test_shape_functions_reproduce_linear_maps():
     found = lattice.embed(inside)
     turn = rng.normal(size=(3, 3))
     there = lattice.rest @ turn.T
-    assert np.allclose(np.einsum("nk,nka->na", found.weights, there[found.indices]), inside @ turn.T)
+    assert np.allclose(
+        np.einsum("nk,nka->na", found.weights, there[found.indices]), inside @ turn.T
+    )
     slopes = np.einsum("nka,nkb->nab", there[found.indices], found.slopes)
     assert np.allclose(slopes, turn)
     # What carries empty cells resists no linear map.
@@ -117,7 +131,9 @@ def test_right_side_is_the_derivative_of_the_energy(slack):
     solid = with_fibres(bar(), [0.8, 0.6, 0.0], ratio=4.0, slack=slack)
     solid.tension, rng = 0.3 * (slack - 1.0), np.random.default_rng(1)
     base = solid.rest * [0.8, 1.1, 1.1] + rng.normal(0, 0.3, solid.rest.shape)
-    way, h, found = rng.normal(size=base.shape), 1e-4, []
+    way = rng.normal(size=base.shape)
+    h = 1e-4
+    found = []
     for step in (h, -h, 0.0):
         solid.y = base + step * way
         for _ in range(30):  # rotations and stretches are found over the iterations
@@ -200,7 +216,9 @@ def test_fibres_make_the_bar_stiffer_along_them():
 
 
 def test_slack_fibres_shorten_along_themselves_almost_without_resistance():
-    stiff, loose, aside = moved(-6.0, ALONG), moved(-6.0, ALONG, slack=1.6), moved(-6.0, ACROSS, slack=1.6)
+    stiff = moved(-6.0, ALONG)
+    loose = moved(-6.0, ALONG, slack=1.6)
+    aside = moved(-6.0, ACROSS, slack=1.6)
     # The bar's ends are held, so some of the shortening is sheared; the rest costs nothing.
     assert loose.energy() < 0.15 * stiff.energy()
     # Shortened across its fibres the bar is as stiff as without them.
@@ -242,7 +260,9 @@ def test_one_pose_has_one_shape(name):
     assert max(np.sqrt(((a - b) ** 2).sum(axis=1).mean()) for a in found for b in found) < 0.1
 
 
-@pytest.mark.parametrize("stretches", [(1.0, 1.0, 0.1), (1.2, 0.6, 0.05), (1.0, 0.9, -0.4), (1.3, 0.9, 0.8)])
+@pytest.mark.parametrize(
+    "stretches", [(1.0, 1.0, 0.1), (1.2, 0.6, 0.05), (1.0, 0.9, -0.4), (1.3, 0.9, 0.8)]
+)
 def test_nearest_deformation_has_the_least_volume_and_none_is_nearer(stretches):
     one, two = Rotation.random(2, random_state=3).as_matrix()
     f, goal = one @ np.diag(stretches) @ two, np.empty((3, 3))
@@ -263,7 +283,9 @@ def test_force_of_squeezed_points_is_the_derivative_of_their_energy():
     solid = with_fibres(bar(), [1.0, 0.0, 0.0], ratio=1.0, slack=1.0)
     rng = np.random.default_rng(1)
     base = solid.rest * [0.5, 0.8, 0.8] + rng.normal(0, 0.05, solid.rest.shape)
-    way, h, found = rng.normal(size=base.shape), 1e-4, []
+    way = rng.normal(size=base.shape)
+    h = 1e-4
+    found = []
     for step in (h, -h, 0.0):
         solid.y = base + step * way
         solid.localise()

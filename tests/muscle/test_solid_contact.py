@@ -1,4 +1,6 @@
-"""Bones with rounded facets, on which the solid of a muscle settles, and contact points outside of the bones."""
+"""Bones with rounded facets, on which the solid of a muscle settles, and contact points outside of
+the bones.
+"""
 
 import numpy as np
 import pytest
@@ -27,7 +29,9 @@ def ball():
     exact.move({"ball": pose})
 
     def rounded(points):
-        found = RoundedContacts(bones, exact, len(points)).half_spaces(points, np.full(len(points), 1e3))
+        found = RoundedContacts(bones, exact, len(points)).half_spaces(
+            points, np.full(len(points), 1e3)
+        )
         assert np.array_equal(found.index, np.arange(len(points)))
         return found.gap, found.normal
 
@@ -48,7 +52,9 @@ def test_rounded_distance_is_near_the_exact_one_and_its_direction_nearer_to_the_
     distance, direction = rounded(points)
     assert np.abs(distance - exact).max() < 0.3  # facets stand off the ball by 0.5
     assert np.linalg.norm(direction, axis=1) == pytest.approx(np.ones(len(points)))
-    turned = [np.degrees(np.arccos(np.clip((n * way).sum(axis=1), -1, 1))) for n in (normal, direction)]
+    turned = [
+        np.degrees(np.arccos(np.clip((n * way).sum(axis=1), -1, 1))) for n in (normal, direction)
+    ]
     assert np.sqrt((turned[1] ** 2).mean()) < 0.6 * np.sqrt((turned[0] ** 2).mean())
 
 

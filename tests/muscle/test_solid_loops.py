@@ -1,4 +1,5 @@
-"""Laws of the solid's loops on systems of a few nodes: contact, transposes, volumes, acceleration."""
+"""Laws of the solid's loops on systems of a few nodes: contact, transposes, volumes,
+acceleration."""
 
 import numpy as np
 import pytest
@@ -29,7 +30,9 @@ def rng():
 
 
 class System:
-    """An elastic matrix of a few centres, points that hang on them, and half-spaces that some violate."""
+    """An elastic matrix of a few centres, points that hang on them, and half-spaces that some
+    violate.
+    """
 
     def __init__(self, rng):
         root = rng.normal(size=(CENTRES, CENTRES))
@@ -66,7 +69,9 @@ def test_one_contact_takes_its_share_up_to_the_greatest_force():
 
 def test_contact_forces_and_gaps_are_complementary(rng):
     root = rng.normal(size=(6, 6))
-    gram, need, force = root @ root.T + 3.0 * np.eye(6), rng.normal(size=6), np.zeros(6)
+    gram = root @ root.T + 3.0 * np.eye(6)
+    need = rng.normal(size=6)
+    force = np.zeros(6)
     solve_contact_forces(gram, need, force, 1000, 1e-12, np.full(6, np.inf))
     slack = gram @ force - need
     assert slack.min() > -1e-10 and force.min() >= 0.0 and abs(slack @ force) < 1e-10
@@ -81,7 +86,8 @@ def test_the_deepest_contacts_come_first_and_of_equals_the_first(rng):
 
 @pytest.mark.parametrize("measured", [12, 9])
 def test_acceleration_solves_a_linear_map_in_few_steps(rng, measured):
-    """x -> M x + b with four different eigenvalues: four differences are enough (Walker & Ni 2011)."""
+    """x -> M x + b with four different eigenvalues: four differences are enough (Walker & Ni
+    2011)."""
     basis = np.linalg.qr(rng.normal(size=(12, 12)))[0]
     m = basis @ np.diag(np.repeat([0.9, 0.5, -0.4, 0.1], 3)) @ basis.T
     b = rng.normal(size=12)
@@ -111,10 +117,14 @@ class Cells:
         self.slot = np.arange(8).reshape(2, 4)
 
     def turn(self, y):
-        q, f, target = np.tile([1.0, 0, 0, 0], (2, 1)), np.empty((2, 3, 3)), np.empty((2, 3, 3))
+        q = np.tile([1.0, 0, 0, 0], (2, 1))
+        f = np.empty((2, 3, 3))
+        target = np.empty((2, 3, 3))
         one = np.ones(2)
         for _ in range(20):
-            target_loop(y, self.columns, self.slopes, self.fibre, one, 0.05, q, one.copy(), f, target)
+            target_loop(
+                y, self.columns, self.slopes, self.fibre, one, 0.05, q, one.copy(), f, target
+            )
         return q, f, target
 
     def stress(self, y):
@@ -122,7 +132,9 @@ class Cells:
         _, f, target = self.turn(y)
         zero, one = np.zeros(2), np.ones(2)
         fibres = Fibres(self.fibre, zero, zero, one, one, one)
-        out, gradient, volume = np.empty((5, 3)), np.empty((8, 3)), np.empty(2)
+        out = np.empty((5, 3))
+        gradient = np.empty((8, 3))
+        volume = np.empty(2)
         given = self.weights, self.columns, self.slopes, self.region, self.slot
         stress_loop(f, target, fibres, *given, out, gradient, volume)
         return f, gradient, volume
@@ -147,11 +159,15 @@ def test_volumes_are_determinants_and_their_gradients_differences(rng, cells):
 def test_responses_are_those_of_the_inverse_and_their_gram_is_symmetric(rng, cells):
     root = rng.normal(size=(5, 5))
     inverse, gradient = np.linalg.inv(root @ root.T + np.eye(5)), rng.normal(size=(8, 3))
-    white, factor, yielding = np.empty((2, 3, 5)), np.zeros((2, 2)), np.array([0.3, 2.0])
+    white = np.empty((2, 3, 5))
+    factor = np.zeros((2, 2))
+    yielding = np.array([0.3, 2.0])
     assert respond_loop((cells.start, cells.node, gradient), inverse, yielding, white, factor)
     response, gram = np.einsum("ro,oan->ran", factor, white), factor @ factor.T - np.diag(yielding)
     for r in range(2):
-        force, swollen, motion = np.zeros((5, 3)), np.empty(2), rng.normal(size=(5, 3))
+        force = np.zeros((5, 3))
+        swollen = np.empty(2)
+        motion = rng.normal(size=(5, 3))
         press_loop(np.eye(2)[r], cells.start, cells.node, gradient, force)
         np.testing.assert_allclose(response[r].T, inverse @ force, atol=1e-12)
         swell_loop(np.ascontiguousarray(response[r].T), cells.start, cells.node, gradient, swollen)
@@ -159,7 +175,11 @@ def test_responses_are_those_of_the_inverse_and_their_gram_is_symmetric(rng, cel
         # Pressing and swelling are transposes.
         swell_loop(motion, cells.start, cells.node, gradient, swollen)
         assert np.vdot(force, motion) == pytest.approx(swollen[r])
-    twice = np.array([0, 4, 8]), np.tile(cells.node[:4], 2), np.tile(gradient[:4], (2, 1))  # no factor
+    twice = (
+        np.array([0, 4, 8]),
+        np.tile(cells.node[:4], 2),
+        np.tile(gradient[:4], (2, 1)),
+    )  # no factor
     assert not respond_loop(twice, inverse, np.array([0.0, -1e-3]), white, factor)
 
 
@@ -177,7 +197,9 @@ def test_embedded_points_and_their_mobility(rng, system):
 @pytest.mark.parametrize("yielding", [0.0, 0.03])
 @pytest.mark.parametrize("batch", [1, 10])
 def test_contact_meets_the_laws_and_keeps_every_region(rng, system, batch, yielding):
-    """Complementarity of gaps and forces, two regions, pressures whitened: responses have the identity as gram."""
+    """Complementarity of gaps and forces, two regions, pressures whitened: responses have the
+    identity as gram.
+    """
     pulls = rng.normal(size=(2, CENTRES, 3))
     answers = np.einsum("ij,rja->ria", system.inverse, pulls)
     gram = np.einsum("ria,sia->rs", pulls, answers)
@@ -188,9 +210,21 @@ def test_contact_meets_the_laws_and_keeps_every_region(rng, system, batch, yield
     push, taken = np.empty((CENTRES, 3)), np.empty(2)
     for _ in range(2):  # from nothing, and from the forces of the first time
         contact_loop(
-            s.index, s.gap, s.normal, s.source, system.motion, system.inverse, system.columns, system.shares,
-            response, table, (batch, 12, 400, 1e-10), (soft, np.full(len(s.index), np.inf)), push, taken,
-        )  # fmt: skip
+            s.index,
+            s.gap,
+            s.normal,
+            s.source,
+            system.motion,
+            system.inverse,
+            system.columns,
+            system.shares,
+            response,
+            table,
+            (batch, 12, 400, 1e-10),
+            (soft, np.full(len(s.index), np.inf)),
+            push,
+            taken,
+        )
         force = table[s.index, s.source]
         # A contact gives way by its force; the matrix carries 1e-7 of its diagonal.
         gaps = system.gaps(push) + soft * force

@@ -56,7 +56,9 @@ class TestUsd:
         from pxr import Usd
 
         stage = Usd.Stage.Open(str(path))
-        return stage, {prim.GetName(): prim for prim in stage.Traverse() if prim.GetTypeName() == "Mesh"}
+        return stage, {
+            prim.GetName(): prim for prim in stage.Traverse() if prim.GetTypeName() == "Mesh"
+        }
 
     def world(self, stage, prim, code):
         from pxr import UsdGeom
@@ -90,7 +92,9 @@ class TestUsd:
         directory, vertices, faces = changing
         (path,) = export_run(directory, "usd", output=tmp_path)
         stage, meshes = self.read(path)
-        np.testing.assert_allclose(self.world(stage, meshes["biceps"], 6), vertices * 1e-3, atol=TOLERANCE)
+        np.testing.assert_allclose(
+            self.world(stage, meshes["biceps"], 6), vertices * 1e-3, atol=TOLERANCE
+        )
         numbers = UsdGeom.Mesh(meshes["biceps"]).GetFaceVertexIndicesAttr()
         np.testing.assert_array_equal(np.array(numbers.Get(6)).reshape(-1, 3), faces)
         assert len(numbers.Get(1)) != len(numbers.Get(6))
@@ -106,7 +110,9 @@ def test_usd_without_its_package_is_one_line(folder, tmp_path, monkeypatch):
 
 
 def read_glb(path):
-    """JSON tree of a binary glTF file, and a function that gives the numbers of an accessor, as its standard says."""
+    """JSON tree of a binary glTF file, and a function that gives the numbers of an accessor, as its
+    standard says.
+    """
     data = Path(path).read_bytes()
     magic, version, size, length, kind = struct.unpack("<4sIII4s", data[:20])
     assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON")
@@ -141,20 +147,30 @@ def morphed(tree, numbers, name, frame):
     number = next(k for k, node in enumerate(tree["nodes"]) if node["name"] == name)
     node, animation = tree["nodes"][number], tree["animations"][0]
     primitive = tree["meshes"][node["mesh"]]["primitives"][0]
-    moved = {key: numbers(primitive["attributes"][key]).astype(float) for key in ("POSITION", "NORMAL")}
+    moved = {
+        key: numbers(primitive["attributes"][key]).astype(float) for key in ("POSITION", "NORMAL")
+    }
     found = dict(node)
     for channel in animation["channels"]:
         if channel["target"]["node"] == number:
             sampler = animation["samplers"][channel["sampler"]]
             times = numbers(sampler["input"])[:, 0]
-            found[channel["target"]["path"]] = numbers(sampler["output"]).reshape(len(times), -1)[frame]
+            found[channel["target"]["path"]] = numbers(sampler["output"]).reshape(len(times), -1)[
+                frame
+            ]
     for target, weight in zip(primitive.get("targets", ()), found.get("weights", ())):
         for key in moved:
             moved[key] += weight * numbers(target[key])
     turn = Rotation.from_quat(found.get("rotation", [0, 0, 0, 1]))
-    root = Rotation.from_quat(tree["nodes"][tree["scenes"][0]["nodes"][0]].get("rotation", [0, 0, 0, 1]))
+    root = Rotation.from_quat(
+        tree["nodes"][tree["scenes"][0]["nodes"][0]].get("rotation", [0, 0, 0, 1])
+    )
     vertices = root.apply(turn.apply(moved["POSITION"]) + found.get("translation", np.zeros(3)))
-    return vertices, root.apply(turn.apply(moved["NORMAL"])), numbers(primitive["indices"]).reshape(-1, 3)
+    return (
+        vertices,
+        root.apply(turn.apply(moved["NORMAL"])),
+        numbers(primitive["indices"]).reshape(-1, 3),
+    )
 
 
 class TestAnimatedGlb:
@@ -180,7 +196,9 @@ def test_files_with_y_up_or_z_up_stand_upright_whatever_the_data(folder, truth, 
     tree, numbers = read_glb(path)
     x, y, z = truth["biceps", 1].T
     upright = np.column_stack([y, x, -z])
-    np.testing.assert_allclose(morphed(tree, numbers, "biceps", 1)[0], upright, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(
+        morphed(tree, numbers, "biceps", 1)[0], upright, rtol=0, atol=TOLERANCE
+    )
     pytest.importorskip("pxr.UsdGeom")
     (path,) = export_run(copy, "usd", output=tmp_path)
     stage, meshes = TestUsd().read(path)
@@ -215,16 +233,25 @@ CAPTIONS = ["frame 0: knee 0°", "frame 1: knee 10°", "frame 2: knee 20°", "fr
 
 @pytest.fixture(scope="module")
 def moving():
-    """Two muscles over four frames, one with other triangles in the last two; a bone that turns and one that stands."""
-    ball, box = trimesh.creation.icosphere(subdivisions=2, radius=100), trimesh.creation.box((50, 50, 300))
+    """Two muscles over four frames, one with other triangles in the last two; a bone that turns and
+    one that stands.
+    """
+    ball, box = (
+        trimesh.creation.icosphere(subdivisions=2, radius=100),
+        trimesh.creation.box((50, 50, 300)),
+    )
     points, faces = np.array(ball.vertices), np.array(ball.faces)
-    shapes = [points * [1.0, 1.0 + 0.1 * k, 1.0 - 0.05 * k] + [0.0, 20.0 * k, 0.0] for k in range(4)]
+    shapes = [
+        points * [1.0, 1.0 + 0.1 * k, 1.0 - 0.05 * k] + [0.0, 20.0 * k, 0.0] for k in range(4)
+    ]
     cube = trimesh.creation.box((80, 80, 80))
     other = [*shapes[:2], np.array(cube.vertices), np.array(cube.vertices) + 5.0]
     kinds = [faces, faces, np.array(cube.faces), np.array(cube.faces)]
     kinds[1], kinds[3] = kinds[0], kinds[2]
     poses = np.tile(np.eye(4), (4, 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(np.radians([[10.0 * k, 0, 0] for k in range(4)])).as_matrix()
+    poses[:, :3, :3] = Rotation.from_rotvec(
+        np.radians([[10.0 * k, 0, 0] for k in range(4)])
+    ).as_matrix()
     poses[:, :3, 3] = [[0.0, 10.0 * k, 0.0] for k in range(4)]
     corners, sides = np.array(box.vertices), [np.array(box.faces)]
     bones = [
@@ -255,7 +282,9 @@ def test_no_name_ends_the_script_that_holds_it(written):
 @pytest.mark.skipif(shutil.which("node") is None, reason="no Node.js here")
 def test_every_vertex_and_triangle_of_every_frame_is_unpacked(written, moving):
     script = Path(__file__).with_name("page_in_node.js")
-    ran = subprocess.run(["node", script, written], capture_output=True, text=True, timeout=120, check=False)
+    ran = subprocess.run(
+        ["node", script, written], capture_output=True, text=True, timeout=120, check=False
+    )
     assert ran.returncode == 0, ran.stderr
     found = json.loads(ran.stdout)
     assert found["captions"] == CAPTIONS and found["panels"] == [""]

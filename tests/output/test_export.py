@@ -36,7 +36,9 @@ class TestVtp:
         np.testing.assert_array_equal(faces, data.regular_faces)
         np.testing.assert_array_equal(faces, mesh[1])
         # Single precision is kept.
-        np.testing.assert_allclose(data.points, vertices, rtol=ROUNDING if kind is np.float64 else 0, atol=0)
+        np.testing.assert_allclose(
+            data.points, vertices, rtol=ROUNDING if kind is np.float64 else 0, atol=0
+        )
         volume = mesh_volume(np.asarray(points, dtype=float), mesh[1])
         assert volume == pytest.approx(mesh_volume(vertices.astype(float), mesh[1]), rel=1e-10)
 
@@ -86,9 +88,14 @@ class TestExport:
     @pytest.mark.parametrize("name", ["pvd", "vtp", "ply", "obj"])
     def test_vertices_and_faces_come_back_in_their_order(self, arm_run, tmp_path, name):
         made, folder = arm_run
-        written = [p for p in export_run(folder, name, output=tmp_path) if p.stem.startswith("biceps_")]
+        written = [
+            p for p in export_run(folder, name, output=tmp_path) if p.stem.startswith("biceps_")
+        ]
         for path, frame in zip(sorted(written), made.frames, strict=True):
-            data, surface = pyvista.read(path), frame.surfaces["biceps"]  # by readers that are not ours
+            data, surface = (
+                pyvista.read(path),
+                frame.surfaces["biceps"],
+            )  # by readers that are not ours
             np.testing.assert_allclose(data.points, surface.vertices, rtol=1e-6, atol=1e-5)
             np.testing.assert_array_equal(data.regular_faces, surface.faces)
 

@@ -1,4 +1,6 @@
-"""Runs in memory and to a folder: the same numbers, and what an interrupt, a failure or a limit leaves."""
+"""Runs in memory and to a folder: the same numbers, and what an interrupt, a failure or a limit
+leaves.
+"""
 
 import pytest
 import trimesh
@@ -38,7 +40,9 @@ class TestSimulate:
         big = simulate(arm_scene(units="mm"))
         rows = simulate(arm_scene(units="m")).metrics
         assert {r.unit for r in rows if r.quantity == "length"} == {"m"}
-        for a, b in zip(*([r for r in found if r.muscle == "biceps"] for found in (big.metrics, rows))):
+        for a, b in zip(
+            *([r for r in found if r.muscle == "biceps"] for found in (big.metrics, rows))
+        ):
             if not a.quantity.startswith("time"):
                 assert a.value == pytest.approx(b.value)
 
@@ -56,7 +60,9 @@ class TestStream:
         names = files_in(tmp_path / "streamed")
         assert names == files_in(tmp_path / "saved") and "surfaces.pvd" in names
         for name in names:
-            assert timeless(tmp_path / "streamed" / name) == timeless(tmp_path / "saved" / name), name
+            assert timeless(tmp_path / "streamed" / name) == timeless(tmp_path / "saved" / name), (
+                name
+            )
         assert ",bones_overlap" in (tmp_path / "saved" / "events.csv").read_text(encoding="utf-8")
 
     def test_failure_is_written_down(self, tmp_path, monkeypatch):

@@ -45,7 +45,10 @@ def test_constraints_of_one_colour_share_no_vertex(body):
 def test_a_sweep_over_a_mesh_is_one_edge_after_another(rng):
     vertices, faces = ellipsoid(1)
     topology = Topology.from_mesh(vertices, faces)
-    given, mass = vertices + 0.1 * rng.normal(size=vertices.shape), rng.uniform(0.5, 2.0, len(vertices))
+    given, mass = (
+        vertices + 0.1 * rng.normal(size=vertices.shape),
+        rng.uniform(0.5, 2.0, len(vertices)),
+    )
     for family, extra in ((EdgeConstraint, ()), (BendingConstraint, (topology.wings,))):
         whole = family(vertices, topology.edges, *extra, stiffness=0.7)
         swept, stepped = given.copy(), given.copy()
@@ -87,7 +90,9 @@ def test_an_edge_without_stiffness_is_hard_beyond_its_limits():
         points = ends * 0.5 * length
         edge = EdgeConstraint(ends, np.array([[0, 1]]), stiffness=0.0, limits=(0.8, 1.2))
         edge.project(points, np.array([1.0, 3.0]))
-        assert points[:, 0] == pytest.approx([0.25 * (length - kept), 0.25 * (length - kept) + kept])
+        assert points[:, 0] == pytest.approx(
+            [0.25 * (length - kept), 0.25 * (length - kept) + kept]
+        )
 
 
 def test_volume_gradient_agrees_with_differences_and_sums_to_nothing(body, rng):
@@ -131,7 +136,10 @@ def test_a_vertex_in_two_bones_moves_by_both_ways_or_by_the_longest_alone():
 def test_even_weights_stretch_less_than_harmonic_ones(body):
     vertices, faces, topology = body
     groups = [np.flatnonzero(vertices[:, 0] < -2.9), np.flatnonzero(vertices[:, 0] > 2.9)]
-    even, harmonic = even_weights(vertices, faces, groups), harmonic_weights(vertices, faces, groups)
+    even, harmonic = (
+        even_weights(vertices, faces, groups),
+        harmonic_weights(vertices, faces, groups),
+    )
     i, j = topology.edges.T
     length = np.linalg.norm(vertices[i] - vertices[j], axis=1)
     steepest = [np.abs((w[i, 0] - w[j, 0]) / length).max() for w in (even, harmonic)]
@@ -152,5 +160,6 @@ def test_weights_on_collapsed_triangles_are_finite_and_near_those_of_sound_ones(
             vertices[faces[face, 0]] = vertices[faces[face, 1:]].mean(axis=0)
     found = even_weights(vertices, faces, groups)
     np.testing.assert_allclose(found.sum(axis=1), 1.0)
-    # A few of 642 vertices were moved by up to an edge, which is a fifteenth of the distance between the groups.
+    # A few of 642 vertices were moved by up to an edge, which is a fifteenth of the distance
+    # between the groups.
     assert np.abs(found - sound).max() < 0.15

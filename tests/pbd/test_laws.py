@@ -13,7 +13,9 @@ from pbd_baseline.topology import Topology
 
 
 def energy(arap, points):
-    """E(x) = 1/4 sum of w_ij (|e_ij - R_i E_ij|² + |e_ij - R_j E_ij|²) over the edges, with the present rotations."""
+    """E(x) = 1/4 sum of w_ij (|e_ij - R_i E_ij|² + |e_ij - R_j E_ij|²) over the edges, with the
+    present rotations.
+    """
     i, j = arap.topology.edges.T
     turns = Rotation.from_quat(arap.quaternions[:, [1, 2, 3, 0]])
     apart = points[i] - points[j]
@@ -60,7 +62,10 @@ def test_rotations_of_a_turned_shape_are_its_turn_and_leave_no_energy(rest):
 def test_arap_gradient_with_frozen_rotations_is_the_whole_gradient(rest):
     vertices, topology = rest
     arap, rng = ARAP(vertices, topology), np.random.default_rng(2)
-    points, direction = vertices + 0.1 * rng.normal(size=vertices.shape), rng.normal(size=vertices.shape)
+    points, direction = (
+        vertices + 0.1 * rng.normal(size=vertices.shape),
+        rng.normal(size=vertices.shape),
+    )
     energies, step = [], 6e-6
     for sign in (1, -1, 0):
         arap.fit_rotations(points + sign * step * direction)
@@ -89,7 +94,9 @@ BETWEEN = st.floats(-1.0, 1.0)
 @settings(deadline=None, derandomize=True)
 @given(st.floats(-2.0, 2.0), st.floats(0.2, 3.0), st.sampled_from([-1.0, 1.0]), BETWEEN, BETWEEN)
 def test_step_to_a_volume_meets_it_or_is_none(error, slope, sign, bend, turn):
-    """c0 + c1 s + c2 s² + c3 s³ = wanted: the root that continues zero, or no step where there is none near."""
+    """c0 + c1 s + c2 s² + c3 s³ = wanted: the root that continues zero, or no step where there is
+    none near.
+    """
     cubic = (1.0 + error, sign * slope, bend, turn)
     s = _cubic_step(cubic, 1.0, 1e-13)
     value = cubic[0] + s * (cubic[1] + s * (cubic[2] + s * cubic[3]))

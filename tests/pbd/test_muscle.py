@@ -74,7 +74,8 @@ def test_sweeps_go_on_until_no_vertex_moves_by_more_than_the_tolerance(method):
     points, still = rig.model.points, rig.model.still
     before, rig.model.still = points.copy(), 1e-300
     assert 3 < found < 2000
-    # the last solve ended with contact and volume, so another sweep may move a little more than its own last one
+    # the last solve ended with contact and volume, so another sweep may move a little more than its
+    # own last one
     assert rig.model._sweep() < 3.0 * still
     assert np.linalg.norm(rig.model.points - before, axis=1).max() < 3.0 * still
 
@@ -84,7 +85,9 @@ def test_part_of_a_mesh_that_no_bone_holds_is_refused_by_name_with_a_remedy():
     muscle = scene.muscles[0]
     ball = trimesh.creation.icosphere(subdivisions=1).apply_translation(muscle.mesh.bounds[1] + 5.0)
     muscle.mesh, muscle.source = trimesh.util.concatenate([muscle.mesh, ball]), "spindle.ply"
-    with pytest.raises(MeshError, match=rf"{muscle.name}.*spindle\.ply.*remesh it, and attach each part"):
+    with pytest.raises(
+        MeshError, match=rf"{muscle.name}.*spindle\.ply.*remesh it, and attach each part"
+    ):
         PBDMuscle(muscle, scene)
 
 
@@ -102,5 +105,6 @@ def test_hip_flexes_within_the_promised_figures(hip_scene):
             assert model.penetration <= 0.5, model.name
             assert abs(model.volume() / model.rest.volume.rest - 1) <= 1e-3, model.name
             low, high = np.quantile(edge_lengths(model) / lengths, [0.01, 0.99])
-            # Slack fibres shorten to 1 / 1.6 of their length, and edges to 0.6 of that before they are hard.
+            # Slack fibres shorten to 1 / 1.6 of their length, and edges to 0.6 of that before they
+            # are hard.
             assert low >= 0.375 and high <= 2.5, (model.name, low, high)

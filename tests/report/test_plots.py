@@ -1,4 +1,5 @@
-"""Plots: each line holds the values of the quantity that its title names, in the unit of its axis."""
+"""Plots: each line holds the values of the quantity that its title names, in the unit of its
+axis."""
 
 import re
 from types import SimpleNamespace
@@ -14,24 +15,35 @@ def ticks(svg, anchor):
     """Places of the ticks whose numbers have this anchor, and the numbers."""
     text = rf"text-anchor: {anchor}[^>]*>([−\d.]+)<"
     pattern = rf'<use [^>]*x="([\d.]+)" y="([\d.]+)"[^<]*(?:<(?!use)[^<]*)*?{text}'
-    return np.array([[float(x.replace("−", "-")) for x in found] for found in re.findall(pattern, svg)])
+    return np.array(
+        [[float(x.replace("−", "-")) for x in found] for found in re.findall(pattern, svg)]
+    )
 
 
 def drawn(svg, line):
     """Values of a line that a pattern finds, read back by the ticks of the axes."""
     x, y = ticks(svg, "middle"), ticks(svg, "end")
     across, up = np.polyfit(x[:, 0], x[:, 2], 1), np.polyfit(y[:, 1], y[:, 2], 1)
-    points = np.array(re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", re.search(line, svg, re.S)[1]), dtype=float)
+    points = np.array(
+        re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", re.search(line, svg, re.S)[1]), dtype=float
+    )
     return np.polyval(across, points[:, 0]), np.polyval(up, points[:, 1])
 
 
 def test_lines_lie_where_the_numbers_at_the_axes_say():
     x, y = np.arange(0.0, 90.0, 10.0), np.sin(np.arange(9)) * 30.0 + 7.0
     svg = line_plot("a <title>", [Track("strap", "#cc6677", x, y)], ("angle", "mm"), limits=[50.0])
-    np.testing.assert_allclose(drawn(svg, r'<g data-muscle="strap">.*?<path d="([^"]*)"'), [x, y], atol=1e-4)
+    np.testing.assert_allclose(
+        drawn(svg, r'<g data-muscle="strap">.*?<path d="([^"]*)"'), [x, y], atol=1e-4
+    )
     limit = drawn(svg, r'<path d="([^"]*)"[^>]*stroke-dasharray')[1]
     np.testing.assert_allclose(limit, 50.0, atol=1e-4)
-    assert "a &lt;title&gt;" in svg and "http" not in svg and ">angle</text>" in svg and ">mm</text>" in svg
+    assert (
+        "a &lt;title&gt;" in svg
+        and "http" not in svg
+        and ">angle</text>" in svg
+        and ">mm</text>" in svg
+    )
     y[4] = np.nan  # where the line is broken
     svg = line_plot("a", [Track("strap", "#cc6677", x, y)], ("angle", "mm"))
     path = re.search(r'<g data-muscle="strap">.*?<path d="([^"]*)"', svg, re.S)[1]
@@ -41,7 +53,9 @@ def test_lines_lie_where_the_numbers_at_the_axes_say():
 def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
     rng = np.random.default_rng(1)
     places = np.exp(rng.normal(size=(40, 2)))
-    points = [Point(x, y, f"point {k}", "one", k == 0, k % 2 == 0) for k, (x, y) in enumerate(places)]
+    points = [
+        Point(x, y, f"point {k}", "one", k == 0, k % 2 == 0) for k, (x, y) in enumerate(places)
+    ]
     svg = front_plot(points, ("ms", "mm"))
     labels = re.findall(r"x=\"[\d.]+\" y=\"([\d.]+)\"[^>]*>point (\d+)</text>", svg)
     heights, numbers = zip(*((float(y), int(number)) for y, number in labels))
@@ -52,7 +66,9 @@ def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
     front = re.search(rf'<path d="([^"]*)"[^>]*stroke: {colour}', svg)[1]
     x = np.array(re.findall(r"[ML] ([-\d.]+)", front), dtype=float)
     wanted = np.sort([np.log(point.x) for point in points if point.front])
-    np.testing.assert_allclose((x - x[0]) / np.ptp(x), (wanted - wanted[0]) / np.ptp(wanted), atol=1e-6)
+    np.testing.assert_allclose(
+        (x - x[0]) / np.ptp(x), (wanted - wanted[0]) / np.ptp(wanted), atol=1e-6
+    )
     assert front_plot([Point(1.0, 0.0, "exact", "one")], ("ms", "mm")) == ""
 
 
@@ -67,8 +83,15 @@ def test_plots_do_not_depend_on_the_users_settings_and_take_any_name():
 
 
 def test_the_worst_of_neighbours_over_the_frames_is_kept():
-    one, other, neighbours = ("a", "b"), ("a", "c"), Neighbours()
-    frames = {0: {one: (0.1, 0.0)}, 2: {one: (0.4, 0.2), other: (0.5, 0.0)}, 4: {one: (0.3, 0.7)}, 6: {}}
+    one = ("a", "b")
+    other = ("a", "c")
+    neighbours = Neighbours()
+    frames = {
+        0: {one: (0.1, 0.0)},
+        2: {one: (0.4, 0.2), other: (0.5, 0.0)},
+        4: {one: (0.3, 0.7)},
+        6: {},
+    }
     for index, pairs in frames.items():
         neighbours.add(SimpleNamespace(index=index, neighbours=pairs))
     found = [[*row.pop("muscles"), *row.values()] for row in neighbours.table()]

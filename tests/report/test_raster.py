@@ -1,4 +1,6 @@
-"""Pictures from the depth buffer: what is where, what hides what, and that the whole subject is in the picture."""
+"""Pictures from the depth buffer: what is where, what hides what, and that the whole subject is in
+the picture.
+"""
 
 import numpy as np
 import pytest
@@ -43,13 +45,19 @@ def test_veil_lets_a_solid_behind_it_show_and_not_one_before_it():
     camera = aim(FRONT, plain[0], (80, 80))
     through = draw_solids([Solid(*plain, BLUE), Solid(*veil, RED, 0.4)], camera)[40, 40].astype(int)
     assert min(through[0], through[2]) > 40
-    behind = draw_solids([Solid(*plain, BLUE), Solid(veil[0] + [0, 60, 0], veil[1], RED, 0.4)], camera)
+    behind = draw_solids(
+        [Solid(*plain, BLUE), Solid(veil[0] + [0, 60, 0], veil[1], RED, 0.4)], camera
+    )
     np.testing.assert_array_equal(behind, draw_solids([Solid(*plain, BLUE)], camera))
 
 
 @pytest.mark.parametrize("direction", [(0, -1, 0.12), (-1, -0.12, 0.12), (0.6, 0.8, 0.0)])
 def test_subject_is_whole_upright_and_fills_the_picture(direction):
-    points = np.random.default_rng(3).normal(size=(400, 3)) * [10.0, 30.0, 80.0] + [300.0, -50.0, 7.0]
+    points = np.random.default_rng(3).normal(size=(400, 3)) * [10.0, 30.0, 80.0] + [
+        300.0,
+        -50.0,
+        7.0,
+    ]
     axes = view_axes(direction, np.eye(3))
     size = fitted_size(axes, points, 40_000)
     camera = aim(axes, points, size)
@@ -85,15 +93,26 @@ def turned_scene(turn):
 def test_every_view_shows_the_head_of_the_femur_above_its_condyles(name):
     turn = AXES[name]
     scene = orient_scene(turned_scene(turn))
-    np.testing.assert_allclose(scene.body, turn.T, atol=1e-12)  # scans lie along axes, which are taken
-    femur, plain = scene.bone("femur").mesh.vertices, phantom_scene(spacing=6.0).bone("femur").mesh.vertices
+    np.testing.assert_allclose(
+        scene.body, turn.T, atol=1e-12
+    )  # scans lie along axes, which are taken
+    femur, plain = (
+        scene.bone("femur").mesh.vertices,
+        phantom_scene(spacing=6.0).bone("femur").mesh.vertices,
+    )
     head, condyles = femur[plain[:, 2].argmax()], femur[plain[:, 2].argmin()]
     for view in ("front", "back", "left", "right"):
         camera = aim(view_axes(VIEWS[view], scene.body), np.asarray(femur), (300, 400))
         (_, above, _), (_, below, _) = camera.project(np.stack([head, condyles]))
         assert above < 60 and below > 340  # pixels count downwards
     left, posterior, superior = turn.T
-    towards = {"front": -posterior, "back": posterior, "left": left, "right": -left, "top": superior}
+    towards = {
+        "front": -posterior,
+        "back": posterior,
+        "left": left,
+        "right": -left,
+        "top": superior,
+    }
     for view, direction in towards.items():
         axes = view_axes(VIEWS[view], scene.body)
         assert axes[2] @ direction > 0.98

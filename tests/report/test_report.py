@@ -1,4 +1,6 @@
-"""The report: answer, moving scene and rows with limits first, whole, self-contained, honest about limits."""
+"""The report: answer, moving scene and rows with limits first, whole, self-contained, honest about
+limits.
+"""
 
 import shutil
 
@@ -28,14 +30,19 @@ def test_preview_shows_bone_and_muscle_move(folder):
     write_report(folder)
     with Image.open(folder / "preview.webp") as preview:
         first = colours_of(preview)
-        assert (preview.n_frames, preview.info["duration"]) == (7, 4000 // 7)  # milliseconds of each
+        assert (preview.n_frames, preview.info["duration"]) == (
+            7,
+            4000 // 7,
+        )  # milliseconds of each
         preview.seek(6)
         last = colours_of(preview)
     for pixels in (first, last):
         rose = pixels[:, 0] > pixels[:, 1] + 50
         ivory = (pixels.min(axis=1) > 90) & (pixels[:, 0] - pixels[:, 2] > 12) & ~rose
         assert rose.mean() > 0.02 and ivory.mean() > 0.02
-    assert (np.abs(first - last).max(axis=1) > 60).mean() > 0.03  # the forearm has risen by 60 degrees
+    assert (
+        np.abs(first - last).max(axis=1) > 60
+    ).mean() > 0.03  # the forearm has risen by 60 degrees
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.gif", "a.webp"])
@@ -52,12 +59,19 @@ def test_render_refuses_wrong_words(folder, tmp_path, wrong):
 
 
 def test_muscles_are_grouped_by_the_joints_that_they_cross():
-    chain = {"hip": "pelvis femur", "knee": "femur tibia", "ankle": "tibia foot", "cap": "femur patella"}
+    chain = {
+        "hip": "pelvis femur",
+        "knee": "femur tibia",
+        "ankle": "tibia foot",
+        "cap": "femur patella",
+    }
     joints = [{"name": n, **dict(zip(("parent", "child"), b.split()))} for n, b in chain.items()]
     groups = {
-        "pelvis femur": "across hip", "pelvis tibia": "across hip, knee", "femur patella": "along femur",
+        "pelvis femur": "across hip",
+        "pelvis tibia": "across hip, knee",
+        "femur patella": "along femur",
         "femur foot": "across knee",
-    }  # fmt: skip
+    }
     for bones, group in groups.items():
         muscle = {"name": "one", "attach": [{"bone": bone} for bone in bones.split()]}
         assert muscle_groups({"scene": {"joints": joints, "muscles": [muscle]}}) == {"one": group}
@@ -65,10 +79,20 @@ def test_muscles_are_grouped_by_the_joints_that_they_cross():
 
 @pytest.mark.parametrize(
     ("value", "unit", "text"),
-    [(0.0234, "s", "23.4 ms"), (2.34, "s", "2.34 s"), (0.003, "mm", "< 0.01 mm"), (0.0, "mm", "0 mm"),
-     (1.234, "mm", "1.23 mm"), (-41.27, "mm", "-41.3 mm"), (-7.1e-15, "1", "< 1e-12"), (3.0, "1", "3"),
-     (None, "mm", "–"), (12345.6, "", "12346"), (float("nan"), "1", "–")],
-)  # fmt: skip
+    [
+        (0.0234, "s", "23.4 ms"),
+        (2.34, "s", "2.34 s"),
+        (0.003, "mm", "< 0.01 mm"),
+        (0.0, "mm", "0 mm"),
+        (1.234, "mm", "1.23 mm"),
+        (-41.27, "mm", "-41.3 mm"),
+        (-7.1e-15, "1", "< 1e-12"),
+        (3.0, "1", "3"),
+        (None, "mm", "–"),
+        (12345.6, "", "12346"),
+        (float("nan"), "1", "–"),
+    ],
+)
 def test_numbers_have_the_digits_that_say_something(value, unit, text):
     assert shown_number(value, unit) == text
 

@@ -21,9 +21,13 @@ def test_fibres_of_a_mesh_are_slack_pull_or_yield_by_the_law():
     rows = (0.0, (0.8, 1.0), 0.0), (0.5, (0.6, 0.7), 0.025), (1.0, (0.4, 0.4), 0.05)
     for activation, (low, high), strain in rows:
         fibres.activate(activation)
-        assert fibres.lower[belly] == pytest.approx(low) and fibres.upper[belly] == pytest.approx(high)
+        assert fibres.lower[belly] == pytest.approx(low) and fibres.upper[belly] == pytest.approx(
+            high
+        )
         assert (fibres.active[belly] == activation).all() and (fibres.active[~belly] == 0.0).all()
-        assert (fibres.lower[~belly] == 1.0).all() and fibres.upper[~belly] == pytest.approx(1.0 + strain)
+        assert (fibres.lower[~belly] == 1.0).all() and fibres.upper[~belly] == pytest.approx(
+            1.0 + strain
+        )
 
 
 def test_sub_steps_follow_activation_and_settle_where_bones_stand_still():

@@ -1,4 +1,6 @@
-"""Scenes and meshes made to break the program: each ends in one line with its code, before anything grows."""
+"""Scenes and meshes made to break the program: each ends in one line with its code, before anything
+grows.
+"""
 
 import numpy as np
 import pytest
@@ -59,7 +61,10 @@ class TestNumbers:
             (put("muscle", 0, "attach", 0, "vertices", [10**19]), "2\\^53"),
             (put("muscle", 0, "attach", 0, "vertices", [2**52]), "out of range"),
             (put("joint", 0, "centre", nested(1000)), "nested"),
-            (put("defaults", "model", float("inf")), "defaults.model: must be a finite number, got inf"),
+            (
+                put("defaults", "model", float("inf")),
+                "defaults.model: must be a finite number, got inf",
+            ),
             (put("contact", "substep_angle", float("nan")), "finite"),
             (put("muscle", 0, "mesh", "/dev/zero"), "not a mesh|no such"),
         ],
@@ -74,7 +79,9 @@ class TestNumbers:
         (folder / "huge.txt").write_text("1 2 99999999999999999999")
         refused(folder, put("muscle", 0, "attach", 0, "vertices", "huge.txt"), "out of range")
         (folder / "long.txt").write_text("9" * 5000)
-        refused(folder, put("muscle", 0, "attach", 0, "vertices", "long.txt"), "not a vertex number")
+        refused(
+            folder, put("muscle", 0, "attach", 0, "vertices", "long.txt"), "not a vertex number"
+        )
         (folder / "deep.json").write_text("[" * 100_000)
         refused(folder, put("muscle", 0, "fibres", "deep.json"), "not JSON")
         for lines in ("[[[1e400, 0, 0], [1, 0, 0]]]", '[["a"]]', "[[1]]", "[[[0, 0, 1]]]"):
@@ -89,9 +96,15 @@ class TestMotions:
     @pytest.mark.parametrize(
         ("change", "words"),
         [
-            (put("motion", {"ramp": {"hip.flexion": {"to": 1e6, "step": 100.0}}}), "takes about|frames"),
+            (
+                put("motion", {"ramp": {"hip.flexion": {"to": 1e6, "step": 100.0}}}),
+                "takes about|frames",
+            ),
             (put("joint", 0, "centre", [1e12, 0.0, 0.0]), r"1e\+12 mm away from all bones"),
-            (put("joint", 0, "centre", [1e5, 0.0, 0.0]), "more than 1000.*far from the joint's centre"),
+            (
+                put("joint", 0, "centre", [1e5, 0.0, 0.0]),
+                "more than 1000.*far from the joint's centre",
+            ),
             (put("contact", "substep_angle", 1e-9), "substep_angle = 1e-09 is small"),
             (put("motion", {"waypoints": STOPS, "step": 1e-300}), "more than 100000"),
             # No pair of stops is too far apart by itself.
@@ -116,7 +129,9 @@ MESH = muscle_mesh()
 class TestMeshes:
     @pytest.mark.parametrize("kind", range(KINDS))
     @pytest.mark.parametrize("seed", range(3))
-    def test_damaged_mesh_is_mended_with_its_volume_or_refused_in_one_line(self, kind, seed, tmp_path):
+    def test_damaged_mesh_is_mended_with_its_volume_or_refused_in_one_line(
+        self, kind, seed, tmp_path
+    ):
         path = tmp_path / "a.stl"
         damaged_shape(np.random.default_rng(seed), kind).export(path)
         try:
@@ -132,7 +147,9 @@ class TestMeshes:
         folded = np.where(z > -10, -20 - z, z)
         for columns in ((34.0 + 0 * x, y, z), (34.0 + 0 * x, 34.0 + 0 * x, z), (x, y, folded)):
             with pytest.raises(MeshError, match="passes through itself"):
-                prepare_mesh(np.column_stack(columns), np.array(MESH.faces), place="a.ply", name="a")
+                prepare_mesh(
+                    np.column_stack(columns), np.array(MESH.faces), place="a.ply", name="a"
+                )
 
     @pytest.mark.parametrize("value", [1e300, -1e38, np.nan, np.inf])
     def test_vertex_beyond_all_lengths(self, value):

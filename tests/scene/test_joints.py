@@ -1,4 +1,6 @@
-"""Joints of every kind: functions, the table of kinds, rest poses, couplings, and the way to files and back."""
+"""Joints of every kind: functions, the table of kinds, rest poses, couplings, and the way to files
+and back.
+"""
 
 import itertools
 import math
@@ -27,7 +29,10 @@ SPLINE = {"x": [-120, -60, 0, 10], "y": [3, 9, 5, 4]}
 
 def turning(*more, **function):
     """A custom joint that turns by one function of q and further coordinates."""
-    return {"type": "custom", "rotations": [{"axis": [1, 0, 0], "coordinates": ["q", *more], **function}]}
+    return {
+        "type": "custom",
+        "rotations": [{"axis": [1, 0, 0], "coordinates": ["q", *more], **function}],
+    }
 
 
 def pair(units="mm", **row):
@@ -86,7 +91,9 @@ class TestKinds:
         for k, axis in enumerate(directions):
             pose = bone_poses(scene, {f"j.q{k}": 0.4})["b"]
             if k < len(facts.rotations):
-                assert pose[:3, :3] == pytest.approx(Rotation.from_rotvec(0.4 * np.array(axis)).as_matrix())
+                assert pose[:3, :3] == pytest.approx(
+                    Rotation.from_rotvec(0.4 * np.array(axis)).as_matrix()
+                )
                 assert pose[:3, :3] @ centre + pose[:3, 3] == pytest.approx(centre)
             else:
                 assert pose[:3] == pytest.approx(np.column_stack([np.eye(3), 0.4 * np.array(axis)]))
@@ -95,25 +102,39 @@ class TestKinds:
         scene = pair(type="free", coordinates={name: {} for name in "abcxyz"})
         q = {"j.a": 0.3, "j.b": -0.5, "j.c": 0.9, "j.x": 1.0, "j.y": 2.0, "j.z": 3.0}
         pose, centre = bone_poses(scene, q)["b"], np.array([3.0, -2.0, 5.0])
-        assert pose[:3, :3] == pytest.approx(Rotation.from_euler("XYZ", [0.3, -0.5, 0.9]).as_matrix())
+        assert pose[:3, :3] == pytest.approx(
+            Rotation.from_euler("XYZ", [0.3, -0.5, 0.9]).as_matrix()
+        )
         assert pose[:3, :3] @ centre + pose[:3, 3] == pytest.approx(centre + [1, 2, 3])
 
     @pytest.mark.parametrize(
         ("row", "message"),
         [
-            ({"type": "hinge", "axes": {"p": (1, 0, 0), "q": (0, 1, 0)}}, "a hinge joint has 1 coordinates, 2"),
-            ({"type": "custom", "axes": {"q": (1, 0, 0)}}, "rotations and translations instead of axes"),
+            (
+                {"type": "hinge", "axes": {"p": (1, 0, 0), "q": (0, 1, 0)}},
+                "a hinge joint has 1 coordinates, 2",
+            ),
+            (
+                {"type": "custom", "axes": {"q": (1, 0, 0)}},
+                "rotations and translations instead of axes",
+            ),
             (turning(linear=[1.0]), "linear needs a slope"),
             ({**Q, "coordinates": {"q": {"range": [3, 1]}}}, "range must go upwards"),
-            ({**Q, "coordinates": {"q": {"motion": "translation"}}}, "'q' is a rotation here, not a translation"),
+            (
+                {**Q, "coordinates": {"q": {"motion": "translation"}}},
+                "'q' is a rotation here, not a translation",
+            ),
             ({**Q, "coordinates": {"p": {}}}, "coordinate 'p' moves nothing"),
             ({**Q, "coordinates": {"q": {"clamped": True}}}, "clamped needs a range"),
             (turning(spline={"x": [0, 1, 1], "y": [0, 1, 2]}), "x must increase"),
             (turning(piecewise={"x": [0, 1, 2], "y": [0, 1]}), "x has 3 values and y 2"),
-            (turning(polynomial=[1, 2], constant=3), "give one function, not constant and polynomial"),
+            (
+                turning(polynomial=[1, 2], constant=3),
+                "give one function, not constant and polynomial",
+            ),
             (turning("p", polynomial=[1, 2]), "polynomial is of 1 coordinate, 2 are given"),
         ],
-    )  # fmt: skip
+    )
     def test_wrong_tables_are_named(self, row, message):
         with pytest.raises(SceneError, match=message):
             pair(**row)
@@ -121,7 +142,9 @@ class TestKinds:
 
 class TestCoordinates:
     def test_rest_pose_may_be_any_pose(self):
-        """Meshes scanned at 40 degrees: the motion from there is that of meshes moved there by a scene at 0."""
+        """Meshes scanned at 40 degrees: the motion from there is that of meshes moved there by a
+        scene at 0.
+        """
         zero, scanned = knee(), knee(rest=-40.0)
         assert np.array_equal(bone_poses(scanned, {})["b"], np.eye(4))
         assert np.array_equal(bone_poses(scanned, {"j.q": -40 * DEG})["b"], np.eye(4))
@@ -137,15 +160,21 @@ class TestCoordinates:
         assert moved == pytest.approx(bone_poses(scene, {"j.p": 20 * DEG})["b"])
 
     def test_couplings_follow_each_other_in_any_order(self):
-        scene = Scene("s").add_bone("a", BOX).add_bone("b", BOX).add_bone("c", BOX).add_bone("d", BOX)
+        scene = (
+            Scene("s").add_bone("a", BOX).add_bone("b", BOX).add_bone("c", BOX).add_bone("d", BOX)
+        )
         for name, bone in zip("xyz", "bcd"):
             scene.add_joint(name, "a", bone, (0, 0, 0), {name: (0, 0, 1)})
         scene.add_coupling("z", ["y"], linear=[2.0, 1.0])
         scene.add_coupling("y", ["x"], polynomial=[0.005, 0.0, 0.0])
         poses = bone_poses(scene, {"x.x": 20 * DEG})
         assert turned_angle(poses["c"][:3, :3]) == pytest.approx(2.0 * DEG)
-        assert turned_angle(poses["d"][:3, :3]) == pytest.approx(4.0 * DEG)  # 5, of which 1 is at rest
-        assert resolve({}, all_coordinates(scene.joints), scene.couplings)["z.z"] == pytest.approx(1.0 * DEG)
+        assert turned_angle(poses["d"][:3, :3]) == pytest.approx(
+            4.0 * DEG
+        )  # 5, of which 1 is at rest
+        assert resolve({}, all_coordinates(scene.joints), scene.couplings)["z.z"] == pytest.approx(
+            1.0 * DEG
+        )
         with pytest.raises(SceneError, match="follows itself"):
             scene.add_coupling("x", ["z"])
         with pytest.raises(SceneError, match="follows other coordinates"):
@@ -172,7 +201,9 @@ class TestCoordinates:
             q = {f"j.{name}": 0.1 * (k + 1) for k, name in enumerate(names)}
             assert bone_poses(other, q)["b"] == pytest.approx(bone_poses(scene, q)["b"], abs=1e-13)
             given = scene.joints[0].coordinates
-            assert [c.rest for c in names.values()] == pytest.approx([c.rest for c in given.values()])
+            assert [c.rest for c in names.values()] == pytest.approx(
+                [c.rest for c in given.values()]
+            )
 
     def test_a_pure_shift_is_cut_into_steps_and_reached(self):
         mesh = trimesh.creation.icosphere(subdivisions=2).apply_scale([30, 4, 4])
@@ -182,7 +213,10 @@ class TestCoordinates:
         scene.motion = Motion([{"j.s": 0.0}, {"j.s": 40.0}])
         stops = SubSteps(scene).split({"j.s": 0.0}, {"j.s": 40.0})
         values = [0.0, *(stop["j.s"] for stop in stops)]
-        assert values[-1] == 40.0 and max(b - a for a, b in itertools.pairwise(values)) < 60 / 27 * 1.01
+        assert (
+            values[-1] == 40.0
+            and max(b - a for a, b in itertools.pairwise(values)) < 60 / 27 * 1.01
+        )
         box = find_contact_pairs(scene)["m", "b"]
         assert box[0, 0] <= -70.0 + 1e-9  # seen from b, the muscle's other end is 40 further away
 

@@ -22,7 +22,13 @@ class TestFormats:
     @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".vtk", ".vtp"])
     def test_every_format_gives_the_same_surface(self, tmp_path, suffix):
         mesh = ball()
-        form = "vtp-Binary-ZLib" if suffix == ".vtp" else "vtk-binary-51" if suffix == ".vtk" else suffix[1:]
+        form = (
+            "vtp-Binary-ZLib"
+            if suffix == ".vtp"
+            else "vtk-binary-51"
+            if suffix == ".vtk"
+            else suffix[1:]
+        )
         read = read_mesh(write_mesh(tmp_path / f"ball{suffix}", mesh, form))
         assert read.closed
         assert len(read.mesh.vertices) == len(mesh.vertices)
@@ -33,7 +39,14 @@ class TestFormats:
     def test_obj_keeps_the_order_of_vertices_with_texture_and_quads(self, tmp_path):
         path = tmp_path / "box.obj"
         corners = [(x, y, z) for x in (0, 9) for y in (0, 9) for z in (0, 9)]
-        quads = ["1/1 2/2 4/3 3/4", "5 7 8 6", "1 5 6 2", "3//1 4//1 8//1 7//1", "1 3 7 5", "-7 -3 -1 -5"]
+        quads = [
+            "1/1 2/2 4/3 3/4",
+            "5 7 8 6",
+            "1 5 6 2",
+            "3//1 4//1 8//1 7//1",
+            "1 3 7 5",
+            "-7 -3 -1 -5",
+        ]
         lines = [*(f"v {x} {y} {z}" for x, y, z in corners), "vt 0 0", *(f"f {q}" for q in quads)]
         path.write_text("\n".join(lines))
         read = read_mesh(path)
@@ -43,7 +56,9 @@ class TestFormats:
     def test_counting_back_from_where_a_face_stands_is_counting_on(self, tmp_path):
         path = tmp_path / "m.obj"
         on = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 3 2 1\nf 1 2 4\nf 4 3 1\nf 2 3 4\n"
-        back = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\nv 0 0 1\nf -4 -3 -1\nf -1 -2 -4\nf -3 -2 -1\n"
+        back = (
+            "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\nv 0 0 1\nf -4 -3 -1\nf -1 -2 -4\nf -3 -2 -1\n"
+        )
         read = [path.write_text(text) and read_mesh(path).mesh for text in (on, back)]
         assert read[0].volume == pytest.approx(1.0 / 6.0)
         np.testing.assert_array_equal(read[0].vertices, read[1].vertices)
@@ -51,7 +66,9 @@ class TestFormats:
 
 
 class TestMending:
-    @pytest.mark.parametrize("kind", ["inward", "wrong way", "1 small holes", "1 dangling", "1 loose parts"])
+    @pytest.mark.parametrize(
+        "kind", ["inward", "wrong way", "1 small holes", "1 dangling", "1 loose parts"]
+    )
     def test_what_is_mended_is_noted_and_the_ball_is_whole(self, tmp_path, kind):
         mesh = ball()
         vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
@@ -65,7 +82,9 @@ class TestMending:
             vertices = np.vstack([vertices, [[0, 0, 60.0]]])
             faces = np.vstack([faces, [[*faces[0, :2], len(mesh.vertices)]]])
         else:
-            crumb = trimesh.creation.icosphere(subdivisions=0, radius=0.5).apply_translation([50, 0, 0])
+            crumb = trimesh.creation.icosphere(subdivisions=0, radius=0.5).apply_translation(
+                [50, 0, 0]
+            )
             faces = np.vstack([faces, crumb.faces + len(vertices)])
             vertices = np.vstack([vertices, crumb.vertices])
         read = read_mesh(write(tmp_path / "a.ply", vertices, faces))
@@ -77,7 +96,9 @@ class TestMending:
         mesh = ball()
         cut = mesh.faces[mesh.triangles_center[:, 2] < 8]
         path = write(tmp_path / "large.ply", mesh.vertices, cut)
-        with pytest.raises(MeshError, match=r"large\.ply.*open.*boundary edges, one at \(.*\); close"):
+        with pytest.raises(
+            MeshError, match=r"large\.ply.*open.*boundary edges, one at \(.*\); close"
+        ):
             read_mesh(path)
         assert not read_mesh(path, may_be_open=True).closed
 
@@ -94,7 +115,9 @@ class TestMending:
         vertices = np.vstack([mesh.vertices[:5], [[0, 0, 60.0]], mesh.vertices[5:]])
         faces = mesh.faces + (mesh.faces >= 5)
         a, b, _ = faces[0]
-        read = read_mesh(write(tmp_path / "a.ply", vertices, np.vstack([faces, faces[3:4], [[a, a, b]]])))
+        read = read_mesh(
+            write(tmp_path / "a.ply", vertices, np.vstack([faces, faces[3:4], [[a, a, b]]]))
+        )
         assert read.closed and len(read.mesh.vertices) == len(mesh.vertices)
         assert read.vertex_map[5] == -1 and read.vertex_map[6] == 5
         assert any("2 degenerate or repeated" in note for note in read.notes)
@@ -127,10 +150,15 @@ class TestMending:
             read_mesh(write(tmp_path / "pair.ply", both.vertices, both.faces))
 
     def test_one_sided_surface_is_refused(self, tmp_path):
-        strip, angle = np.array([-8.0, 8.0]), np.repeat(np.linspace(0, 2 * np.pi, 40, endpoint=False), 2)
+        strip, angle = (
+            np.array([-8.0, 8.0]),
+            np.repeat(np.linspace(0, 2 * np.pi, 40, endpoint=False), 2),
+        )
         width = np.tile(strip, 40)
         away = 30 + width * np.cos(angle / 2)
-        rim = np.column_stack([away * np.cos(angle), away * np.sin(angle), width * np.sin(angle / 2)])
+        rim = np.column_stack(
+            [away * np.cos(angle), away * np.sin(angle), width * np.sin(angle / 2)]
+        )
         faces = [face for k in range(0, 78, 2) for face in ([k, k + 1, k + 3], [k, k + 3, k + 2])]
         path = write(tmp_path / "moebius.ply", rim, [*faces, [78, 79, 0], [78, 0, 1]])
         with pytest.raises(MeshError, match="one side only"):

@@ -55,7 +55,10 @@ class TestFrames:
 
 
 class TestOpenSimFile:
-    TEXT = "motion\nnRows=2\nnColumns=3\ninDegrees={flag}\nendheader\ntime\tbend\t/jointset/one/turn/value\n"
+    TEXT = (
+        "motion\nnRows=2\nnColumns=3\ninDegrees={flag}\nendheader\n"
+        "time\tbend\t/jointset/one/turn/value\n"
+    )
 
     def write(self, tmp_path, rows, flag="yes"):
         path = tmp_path / "walk.mot"
@@ -81,7 +84,9 @@ class TestOpenSimFile:
 def test_child_follows_its_parent_and_a_loose_bone_is_fixed():
     assert all(np.array_equal(pose, np.eye(4)) for pose in bone_poses(chain(), {}).values())
     poses = bone_poses(chain(), {"one.turn": 0.3, "one.roll": -0.8, "two.bend": 1.1})
-    parent = rotation_about((0, 0, 1), 0.3, (10, 0, 0)) @ rotation_about((1, 0, 0), -0.8, (10, 0, 0))
+    parent = rotation_about((0, 0, 1), 0.3, (10, 0, 0)) @ rotation_about(
+        (1, 0, 0), -0.8, (10, 0, 0)
+    )
     assert poses["b"] == pytest.approx(parent)
     assert poses["c"] == pytest.approx(parent @ rotation_about((0, 1, 0), 1.1, (20, 0, 0)))
     assert np.array_equal(poses["d"], np.eye(4))
@@ -108,4 +113,6 @@ class TestTube:
             assert mesh.is_watertight and mesh.euler_number == 2
             errors.append(1 - mesh.volume / tube.volume)
         assert 0 < errors[2] < 0.005  # an inscribed polyhedron, edges of 1.5 mm
-        assert errors[0] / errors[1] > 3 and errors[1] / errors[2] > 3  # second order, 4 in the limit
+        assert (
+            errors[0] / errors[1] > 3 and errors[1] / errors[2] > 3
+        )  # second order, 4 in the limit

@@ -1,4 +1,6 @@
-"""VTK and VTP files: read as VTK reads them where they are whole, refused in one line where they are not."""
+"""VTK and VTP files: read as VTK reads them where they are whole, refused in one line where they
+are not.
+"""
 
 import os
 import re
@@ -34,7 +36,9 @@ def assert_refused(path, capfd):
 
 
 class TestWholeFiles:
-    @pytest.mark.parametrize("form", [*(f for f in FORMS if "vt" in f), "vtp-Binary-ZLib-UInt64", ENCODED])
+    @pytest.mark.parametrize(
+        "form", [*(f for f in FORMS if "vt" in f), "vtp-Binary-ZLib-UInt64", ENCODED]
+    )
     def test_file_holds_what_vtk_wrote(self, tmp_path, form):
         assert_is_ball(write_mesh(tmp_path / f"ball{suffix_of(form)}", BALL, form))
 
@@ -55,7 +59,9 @@ class TestDamagedFiles:
     )
     def test_file_cut_anywhere_is_refused_in_one_line(self, tmp_path, form, capfd):
         whole = write_mesh(tmp_path / "whole", BALL, form).read_bytes()
-        end = 0.9 * len(whole) if form[:3] == "vtp" else len(whole) - 6  # within a text's last number
+        end = (
+            0.9 * len(whole) if form[:3] == "vtp" else len(whole) - 6
+        )  # within a text's last number
         path = tmp_path / f"cut{suffix_of(form)}"
         for cut in np.linspace(1, end, 25).astype(int):
             path.write_bytes(whole[:cut])
@@ -101,12 +107,17 @@ class TestReader:
     def test_file_that_unpacks_without_end_is_refused(self, tmp_path, capfd):
         size = 24 * 10**9
         block = zlib.compress(bytes(10**6), 9)
-        header = np.array([size // 10**6, 10**6, 0, *[len(block)] * (size // 10**6)], dtype="<u4").tobytes()
+        header = np.array(
+            [size // 10**6, 10**6, 0, *[len(block)] * (size // 10**6)], dtype="<u4"
+        ).tobytes()
         path = tmp_path / "bomb.vtp"
         path.write_bytes(
-            b'<?xml version="1.0"?><VTKFile type="PolyData" byte_order="LittleEndian" header_type="UInt32" '
-            b'compressor="vtkZLibDataCompressor"><PolyData><Piece NumberOfPoints="%d" NumberOfPolys="0">'
-            b'<Points><DataArray type="Float64" NumberOfComponents="3" format="appended" offset="0"/></Points>'
+            b'<?xml version="1.0"?><VTKFile type="PolyData" byte_order="LittleEndian" '
+            b'header_type="UInt32" '
+            b'compressor="vtkZLibDataCompressor"><PolyData><Piece NumberOfPoints="%d" '
+            b'NumberOfPolys="0">'
+            b'<Points><DataArray type="Float64" NumberOfComponents="3" format="appended" '
+            b'offset="0"/></Points>'
             b'</Piece></PolyData><AppendedData encoding="raw">_%s</AppendedData></VTKFile>'
             % (size // 24, header + block * (size // 10**6))
         )

@@ -1,4 +1,5 @@
-"""Scenes from files and from code; each mistake gives one line that names the place and the remedy."""
+"""Scenes from files and from code; each mistake gives one line that names the place and the
+remedy."""
 
 import json
 import pickle
@@ -57,9 +58,13 @@ def built():
 class TestLoading:
     def test_units_and_scale_give_the_same_shape(self, folder):
         scaled = [(f'"{n}.ply"', f'"{n}.ply"\nscale = 0.001') for n in ("upper", "lower", "biceps")]
-        metres = load(folder, ('units = "mm"', 'units = "m"'), ("near = 4", "near = 0.004"), *scaled)
+        metres = load(
+            folder, ('units = "mm"', 'units = "m"'), ("near = 4", "near = 0.004"), *scaled
+        )
         assert metres.length(4) == pytest.approx(0.004)
-        assert metres.muscles[0].mesh.volume * 1e9 == pytest.approx(load(folder).muscles[0].mesh.volume)
+        assert metres.muscles[0].mesh.volume * 1e9 == pytest.approx(
+            load(folder).muscles[0].mesh.volume
+        )
         held = [scene.muscles[0].attachments[0].vertices for scene in (metres, load(folder))]
         assert np.array_equal(*held)
 
@@ -71,7 +76,11 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("old", "new", "message"),
         [
-            ("centre = [0, 0, 0]", "center = [0, 0, 0]", r"'elbow': unknown key 'center', did you mean 'cen"),
+            (
+                "centre = [0, 0, 0]",
+                "center = [0, 0, 0]",
+                r"'elbow': unknown key 'center', did you mean 'cen",
+            ),
             ('child = "lower"', 'child = "lowr"', r"joint 'elbow': .*'lowr', did you mean 'lower'"),
             ('{ bone = "upper"', '{ bone = "uper"', r"attach 1: .*'uper', did you mean 'upper'"),
             ("elbow.flexion", "elbo.flexion", r"'elbo.flexion', did you mean 'elbow"),
@@ -79,15 +88,27 @@ class TestMistakes:
             ("near = 4", f"near = 4, {BALL}", r"one of vertices, near and sphere, got near and"),
             ("near = 4", "near = 0.001", r"reaches no vertex .*, the nearest is .* away"),
             ('"lower.txt"', '"nowhere.txt"', r"nowhere.txt: cannot read it"),
-            ("near = 4", "near = 75", r"vertices \(first: \d+\) are attached to both 'upper' and 'lower'"),
+            (
+                "near = 4",
+                "near = 75",
+                r"vertices \(first: \d+\) are attached to both 'upper' and 'lower'",
+            ),
             ('name = "lower"', 'name = "upper"', r"bone 'upper' is given twice"),
             ('name = "biceps"', 'name = "../x"', r"muscle name '../x' may hold letters"),
             ("[scene]", "[scene", r"not valid TOML.*line 1"),
             ('"report"', '"reprot"', r"\[detect\] tunnelling action: .*'reprot'"),
-            ("[defaults]", '[defaults]\nattach = [ { bone = "arm", x = 1 } ]', r"\[defaults\] attach 1: unknown"),
-            ("near = 4", BALL.replace(" }", ", x = 1 }"), r"\[\[muscle\]\] 'biceps' attach 1 sphere: unknown"),
+            (
+                "[defaults]",
+                '[defaults]\nattach = [ { bone = "arm", x = 1 } ]',
+                r"\[defaults\] attach 1: unknown",
+            ),
+            (
+                "near = 4",
+                BALL.replace(" }", ", x = 1 }"),
+                r"\[\[muscle\]\] 'biceps' attach 1 sphere: unknown",
+            ),
         ],
-    )  # fmt: skip
+    )
     def test_one_line_names_file_place_and_remedy(self, folder, old, new, message):
         with pytest.raises(SceneError, match=message) as caught:
             load(folder, (old, new))
@@ -99,12 +120,21 @@ class TestMistakes:
         muscle = TEXT[TEXT.index("[[muscle]]") : TEXT.index("[contact]")]
         for act, words in (
             (lambda: load(folder, (both, "")), "muscle 'biceps' has no attachment"),
-            (lambda: load(folder, (', { bone = "lower", vertices = "lower.txt" }', "")), "to 'upper' only"),
+            (
+                lambda: load(folder, (', { bone = "lower", vertices = "lower.txt" }', "")),
+                "to 'upper' only",
+            ),
             (lambda: load(folder, (muscle, "")), r"has no muscles, add a \[\[muscle\]\]$"),
             (Scene("bare").validate, r"has no bones, add a \[\[bone\]\]$"),
             (lambda: Scene.load(folder), "is a folder"),
-            (lambda: built().add_joint("again", "upper", "lower", (0, 0, 0), axes), "already the child"),
-            (lambda: built().add_joint("loop", "lower", "upper", (0, 0, 0), axes), "hang on itself"),
+            (
+                lambda: built().add_joint("again", "upper", "lower", (0, 0, 0), axes),
+                "already the child",
+            ),
+            (
+                lambda: built().add_joint("loop", "lower", "upper", (0, 0, 0), axes),
+                "hang on itself",
+            ),
         ):
             with pytest.raises(SceneError, match=words):
                 act()
@@ -125,7 +155,9 @@ class TestOptions:
         assert len(other.motion) == 2 and len(scene.motion) == 4
 
     def test_another_model_drops_the_options_and_a_table_without_a_name_adds_to_them(self, folder):
-        scene = load(folder, ('mesh = "biceps.ply"', 'mesh = "biceps.ply"\nmodel = { kernel = "cubic" }'))
+        scene = load(
+            folder, ('mesh = "biceps.ply"', 'mesh = "biceps.ply"\nmodel = { kernel = "cubic" }')
+        )
         assert scene.muscles[0].options == {"centres": 60, "kernel": "cubic"}
         scene = load(folder)
         assert scene.with_options(model="pbd").muscles[0].options == {}
@@ -149,7 +181,13 @@ class TestOptions:
             built().with_options({key: 1})
 
     def test_settings_from_text(self):
-        texts = ["a=1", "model.centres=200", "contact.initial=keep", "model={name='rbf', a=[1, 2]}", "a = 2"]
+        texts = [
+            "a=1",
+            "model.centres=200",
+            "contact.initial=keep",
+            "model={name='rbf', a=[1, 2]}",
+            "a = 2",
+        ]
         found, model = parse_settings(texts), {"name": "rbf", "a": [1, 2]}
         assert found == {"a": 2, "model.centres": 200, "contact.initial": "keep", "model": model}
         assert parse_slice("2:8:3") == slice(2, 8, 3) and parse_slice("-1") == slice(-1, None)
@@ -172,7 +210,9 @@ class TestOptions:
 class TestCheck:
     def test_muscle_that_starts_inside_a_bone(self):
         scene = built()
-        scene.muscles[0].mesh.apply_translation([0, 0, -4])  # 1 mm into the bones in the middle of each
+        scene.muscles[0].mesh.apply_translation(
+            [0, 0, -4]
+        )  # 1 mm into the bones in the middle of each
         (note, *_) = [f for f in scene.check() if "start inside" in f.message]
         # The free ones over the lower arm, whose top and end are at z = 10 and x = 10.
         x, _, z = scene.muscles[0].mesh.vertices.T

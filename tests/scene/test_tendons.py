@@ -1,4 +1,5 @@
-"""Tendons against known answers: straight, around a pulley, of kept length, the same by every path."""
+"""Tendons against known answers: straight, around a pulley, of kept length, the same by every
+path."""
 
 import math
 from types import SimpleNamespace
@@ -27,7 +28,9 @@ def arm(model="pbd", **keys):
         scene.add_bone(name, mesh.apply_translation([0.0, 0.0, middle]))
     axes = {"bend": [-1, 0, 0], "turn": [0, 0, 1]}
     scene.add_joint("elbow", "trunk", "limb", type="universal", centre=[0, 0, 0], axes=axes)
-    belly = trimesh.creation.capsule(70.0, 9.0, count=[16, 16]).apply_translation([0.0, -20.0, 15.0])
+    belly = trimesh.creation.capsule(70.0, 9.0, count=[16, 16]).apply_translation(
+        [0.0, -20.0, 15.0]
+    )
     z = belly.vertices[:, 2]
     attach = held(trunk=z > z.max() - 6.0, limb=z < z.min() + 6.0)
     attach[1]["tendon"] = {"to": [0.0, -8.0, -70.0], **keys}
@@ -66,12 +69,15 @@ def test_a_pulled_tendon_takes_its_share_of_the_stretch_and_never_more_than_its_
         line, _ = end.place({"trunk": np.eye(4), "limb": pulled})
         strain = line_length(line.points) / end.length - 1.0
         springs = longer * STIFFNESS_RATIO / (belly + STIFFNESS_RATIO * end.length)
-        # The end lies 5 mm beside the string, whose length at rest is therefore not quite belly and tendon.
+        # The end lies 5 mm beside the string, whose length at rest is therefore not quite belly and
+        # tendon.
         assert strain == pytest.approx(min(max(springs, 0.0), TENDON_STRAIN), rel=0.01, abs=1e-9)
 
 
 def test_a_taut_line_around_a_cylinder_is_two_tangents_and_an_arc():
-    radius, far, height = 20.0, 60.0, 10.0
+    radius = 20.0
+    far = 60.0
+    height = 10.0
     angles = np.linspace(0.0, 2.0 * np.pi, 721)[:-1]
     ring = radius * np.stack([np.cos(angles), 0.0 * angles, np.sin(angles)], axis=1)
     points = np.concatenate([ring + [0.0, y, 0.0] for y in np.linspace(-9, 9, 19)])
@@ -83,7 +89,9 @@ def test_a_taut_line_around_a_cylinder_is_two_tangents_and_an_arc():
     # A ring of 720 points: its arc is short by 3e-6 of itself.
     assert line_length(line) == pytest.approx(2.0 * tangent + radius * turned, rel=1e-5)
     assert np.linalg.norm(line[:, [0, 2]], axis=1).min() > radius - 1e-3
-    straight = taut_line(*ends, np.array([0.0, 0.0, -1.0]), [(np.eye(4), points + [0, 0, 50.0])], 5.0)
+    straight = taut_line(
+        *ends, np.array([0.0, 0.0, -1.0]), [(np.eye(4), points + [0, 0, 50.0])], 5.0
+    )
     np.testing.assert_array_equal(straight, ends)
 
 
@@ -110,7 +118,11 @@ def test_a_motion_of_all_bones_together_moves_the_end_with_them():
     poses = bone_poses(scene, {"elbow.bend": -0.6, "elbow.turn": 0.4})
     motion = trimesh.transformations.rotation_matrix(1.1, [1.0, 2.0, 0.5], [30.0, -5.0, 7.0])
     motion[:3, 3] += [5.0, 6.0, -7.0]
-    moved = scene.muscles[0].tendons[0].place({name: motion @ poses[name] for name in ("trunk", "limb")})[1]
+    moved = (
+        scene.muscles[0]
+        .tendons[0]
+        .place({name: motion @ poses[name] for name in ("trunk", "limb")})[1]
+    )
     np.testing.assert_allclose(moved, motion @ poses[END], atol=1e-9)
 
 
@@ -128,7 +140,9 @@ def test_a_twist_of_the_limb_turns_the_end_by_its_place_along_the_string():
     assert found == pytest.approx(share * turn, rel=0.02)
     # A via point of the trunk lets no twist of the limb through.
     led = arm(via=[{"bone": "trunk", "point": [0.0, -14.0, -45.0]}]).muscles[0].tendons[0]
-    assert np.allclose(led.place({"trunk": np.eye(4), "limb": twisted})[1][:3, :3], np.eye(3), atol=1e-9)
+    assert np.allclose(
+        led.place({"trunk": np.eye(4), "limb": twisted})[1][:3, :3], np.eye(3), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("model", ["pbd", "rbf"])
@@ -142,7 +156,9 @@ def test_both_models_carry_the_end_and_measure_the_tendon(model):
         pose = frame.poses[END]
         patch = vertices @ pose[:3, :3].T + pose[:3, 3]
         shown = frame.surfaces["strap"]
-        away = trimesh.proximity.signed_distance(trimesh.Trimesh(shown.vertices, shown.faces), patch)
+        away = trimesh.proximity.signed_distance(
+            trimesh.Trimesh(shown.vertices, shown.faces), patch
+        )
         # The surface of 60 centres is fitted to the patch, that of the mesh is the patch.
         assert np.abs(away).max() < (1.5 if model == "rbf" else 1e-6)
     np.testing.assert_allclose(run.frames[-1].poses[END], run.frames[0].poses[END], atol=1e-12)

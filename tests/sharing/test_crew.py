@@ -1,4 +1,6 @@
-"""Muscles dealt out to processes: what comes together is what one process finds, whatever ends the run."""
+"""Muscles dealt out to processes: what comes together is what one process finds, whatever ends the
+run.
+"""
 
 import io
 import logging
@@ -47,7 +49,9 @@ def crews(monkeypatch):
 
 
 def small_scene(mixed=0, **settings):
-    """The phantom's four muscles through four frames; fields for the first so many, meshes for the others."""
+    """The phantom's four muscles through four frames; fields for the first so many, meshes for the
+    others.
+    """
     scene = phantom_scene(spacing=6.0)
     scene.motion = Motion([{"hip.flexion": np.radians(angle)} for angle in (0.0, 6.0, 12.0, 9.0)])
     for muscle in scene.muscles[mixed:]:
@@ -137,10 +141,15 @@ def test_errors_of_a_helper_are_reported_as_they_are(raised, expected):
 @pytest.mark.parametrize(
     ("muscles", "frames", "together", "cores", "wanted"),
     [
-        (4, 1000, None, 4, 1), (38, 5, None, 4, 1), (38, 37, object(), 4, 1), (38, 37, None, 1, 1),
-        (38, 37, None, 8, 4), (10, 40, None, 4, 2), (38, 37, None, 2, 2),
+        (4, 1000, None, 4, 1),
+        (38, 5, None, 4, 1),
+        (38, 37, object(), 4, 1),
+        (38, 37, None, 1, 1),
+        (38, 37, None, 8, 4),
+        (10, 40, None, 4, 2),
+        (38, 37, None, 2, 2),
     ],
-)  # fmt: skip
+)
 def test_helpers_are_as_many_as_bring_more_than_they_cost(muscles, frames, together, cores, wanted):
     motion = SimpleNamespace(frames=range(frames))
     for sliding, contraction in ((together, None), (None, together)):
@@ -177,11 +186,16 @@ def test_helpers_divide_the_threads(monkeypatch, threads, share):
 
 def test_warnings_and_log_records_of_several_helpers_are_repeated_once(caplog):
     def helper(*messages):
-        return SimpleNamespace(stdout=io.BytesIO(b"".join(pickle.dumps(message) for message in messages)))
+        return SimpleNamespace(
+            stdout=io.BytesIO(b"".join(pickle.dumps(message) for message in messages))
+        )
 
     pool = WorkerPool.__new__(WorkerPool)
     pool.times, pool._repeated = {}, set()
-    warning, line = SceneWarning("bones meet"), ("rbfmuscle.bones", logging.WARNING, "bone: is open")
+    warning, line = (
+        SceneWarning("bones meet"),
+        ("rbfmuscle.bones", logging.WARNING, "bone: is open"),
+    )
     one = helper(("warned", warning), ("logged", line), ("done", (1, {"simulate": 0.5})))
     other = helper(
         ("logged", line), ("warned", SceneWarning("bones meet")), ("done", (2, {"simulate": 0.25}))

@@ -70,7 +70,9 @@ def test_planes_of_neighbours_are_those_of_a_subset_of_the_points_too():
 def test_nearest_is_the_smallest_over_bones_and_infinite_without():
     contacts, poses = _pair()
     points = _points()
-    expected = np.min([f.distance(points, poses[n]) for f, n in zip(contacts.fields, contacts.names)], axis=0)
+    expected = np.min(
+        [f.distance(points, poses[n]) for f, n in zip(contacts.fields, contacts.names)], axis=0
+    )
     assert np.isinf(BoneContacts(["a"], [None]).nearest(points)[0]).all()
     distance, gradient = contacts.nearest(points)
     assert np.allclose(distance, expected)
@@ -88,11 +90,14 @@ def test_boxes_are_apart_by_no_more_than_what_is_in_them():
     rng = np.random.default_rng(3)
     apart = []
     for _ in range(200):
-        fixed, bounds = np.sort(rng.uniform(-3, 3, (2, 2, 3)), axis=1) + rng.uniform(-8, 8, (2, 1, 3))
+        fixed, bounds = np.sort(rng.uniform(-3, 3, (2, 2, 3)), axis=1) + rng.uniform(
+            -8, 8, (2, 1, 3)
+        )
         pose = rotation_about(rng.normal(size=3), rng.uniform(0, 3), rng.uniform(-2, 2, 3))
         corners = np.array(list(product(*bounds.T))) @ pose[:3, :3].T + pose[:3, 3]
         assert np.allclose(moved_box(bounds, pose), [corners.min(axis=0), corners.max(axis=0)])
-        # Of a corner the nearest place of the other box is the corner itself, kept within its sides.
+        # Of a corner the nearest place of the other box is the corner itself, kept within its
+        # sides.
         least = np.linalg.norm(corners - np.clip(corners, *fixed), axis=1).min()
         apart.append(boxes_apart(fixed, pose, bounds))
         assert apart[-1] <= least + 1e-9
@@ -105,7 +110,9 @@ def test_boxes_are_apart_by_no_more_than_what_is_in_them():
 def test_point_with_no_direction_still_gets_one():
     flat = sphere(2.0)
     flat.formula = lambda p: (np.full(len(p), -1.0), np.zeros_like(p))
-    distance, direction = BoneContacts(["x"], [flat]).distance_and_direction(np.array([[0.5, 0, 0]]), 0)
+    distance, direction = BoneContacts(["x"], [flat]).distance_and_direction(
+        np.array([[0.5, 0, 0]]), 0
+    )
     assert np.allclose(direction, [[1, 0, 0]])
     assert distance[0] == -1.0
 
@@ -113,7 +120,10 @@ def test_point_with_no_direction_still_gets_one():
 def test_kept_overlap_is_no_contact_and_deeper_is():
     fields = {"plate": box((6, 6, 2), (0, 0, -4.0)), "far": box((1, 1, 1), (60, 0, 0))}
     mesh = ellipsoid((30, 4, 4), subdivisions=3)
-    ends = [attach(mesh, "plate", lambda v: v[:, 0] < -24), attach(mesh, "far", lambda v: v[:, 0] > 24)]
+    ends = [
+        attach(mesh, "plate", lambda v: v[:, 0] < -24),
+        attach(mesh, "far", lambda v: v[:, 0] > 24),
+    ]
     made = scene(fields, [], [muscle("belly", mesh, ends)], [{}], initial="keep")
     model = ToyMuscle(made.muscles[0], made)
     contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=model.contact_bone)

@@ -48,7 +48,10 @@ def test_sub_steps_end_at_the_same_angles_however_frames_are_spaced():
 
 def test_bones_out_of_reach_of_the_motion_are_left_out():
     made, _ = hinged_scene([0, 90])
-    made.bones += [bone("post", box((2, 2, 2), (0, -30, 0))), bone("far", box((2, 2, 2), (500, 0, 0)))]
+    made.bones += [
+        bone("post", box((2, 2, 2), (0, -30, 0))),
+        bone("far", box((2, 2, 2), (500, 0, 0))),
+    ]
     assert ("strap", "post") in find_contact_pairs(made)
     assert ("strap", "far") not in find_contact_pairs(made)
     assert len(sampled_poses(made)) > 9
@@ -117,5 +120,7 @@ def test_frames_that_are_skipped_leave_the_muscle_where_shown_ones_would():
     assert last.times["strap"]["time_solve"] > 0.0
     back = loop.advance({"hinge.bend": 0.0})
     # The toy's target does not depend on the path; only contact does.
-    assert np.allclose(back.surfaces["strap"].vertices, frames[0].surfaces["strap"].vertices, atol=0.05)
+    assert np.allclose(
+        back.surfaces["strap"].vertices, frames[0].surfaces["strap"].vertices, atol=0.05
+    )
     assert loop.here == {"hinge.bend": 0.0}

@@ -41,7 +41,9 @@ class TestPlaces:
     def test_what_lies_too_far_from_the_bones_is_refused(self, what, axis, sign, share):
         scene = Scene("cubes", units="mm")
         for name, x in (("a", 110.0), ("b", 170.0)):
-            scene.add_bone(name, trimesh.creation.box((20.0, 20.0, 20.0)).apply_translation([x, -40.0, 30.0]))
+            scene.add_bone(
+                name, trimesh.creation.box((20.0, 20.0, 20.0)).apply_translation([x, -40.0, 30.0])
+            )
         low, high = np.array([100.0, -50.0, 20.0]), np.array([180.0, -30.0, 40.0])
         muscle = "muscle" in what
         away = share * (FAR_AWAY if muscle else FARTHEST_CENTRE) * np.linalg.norm(high - low)

@@ -1,4 +1,6 @@
-"""`check` looks ahead: held ends driven into bones, attachments taken apart or brought together too far."""
+"""`check` looks ahead: held ends driven into bones, attachments taken apart or brought together too
+far.
+"""
 
 import numpy as np
 import pytest
@@ -10,7 +12,9 @@ from rbfmuscle.simulation.motion_check import check_motion, motion_findings
 
 
 def _scene(angles):
-    """A post that stands still and an arm that turns about z past it, a strap from a far block to the arm."""
+    """A post that stands still and an arm that turns about z past it, a strap from a far block to
+    the arm.
+    """
     scene = rm.Scene("post", units="mm")
     scene.add_bone("block", box_mesh([-60, -4, -4], [-50, 4, 4]))
     scene.add_bone("post", box_mesh([-4, 18, -10], [4, 26, 10]))
@@ -24,14 +28,17 @@ def _scene(angles):
 
 
 def test_end_driven_into_a_bone_is_found_with_depth_and_frame():
-    # The held end sits at radius 22 about z: at 90 degrees in the middle of the post, which spans 18 to 26.
+    # The held end sits at radius 22 about z: at 90 degrees in the middle of the post, which spans
+    # 18 to 26.
     scene = _scene(range(0, 91, 5))
     (one,) = (fault for fault in check_motion(scene) if not fault.rest)
     assert (one.muscle, *one.bones, one.frame) == ("strap", "arm", "post", 18)
     held = scene.muscles[0].mesh.vertices[scene.muscles[0].attachments[1].vertices]
     turned = held[:, [1, 0, 2]] * [-1, 1, 1]
     deepest = -min(rm.BoneSDF.from_mesh(scene.bones[1].mesh).distance(turned))
-    assert one.value == pytest.approx(deepest, abs=0.2)  # the field's own error, and thinned vertices
+    assert one.value == pytest.approx(
+        deepest, abs=0.2
+    )  # the field's own error, and thinned vertices
     assert 14 <= one.first <= 18
     text = str(motion_findings(scene)[0])
     assert "strap" in text and "'post'" in text and "give it a tendon" in text

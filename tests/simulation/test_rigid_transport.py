@@ -1,4 +1,5 @@
-"""A muscle whose bones move as one is carried, not solved; what is solved comes out as it ever did."""
+"""A muscle whose bones move as one is carried, not solved; what is solved comes out as it
+ever did."""
 
 import numpy as np
 import pytest
@@ -23,20 +24,28 @@ def _arm(angles, muscles=("brachialis",)):
     scene.add_bone("trunk", box_mesh([-40, -3, -3], [-1, 3, 3]))
     scene.add_bone("upper", box_mesh([1, -3, -3], [49, 3, 3]))
     scene.add_bone("fore", box_mesh([51, -3, -3], [100, 3, 3]))
-    scene.add_joint("shoulder", "trunk", "upper", (0, 0, 0), {"flexion": (0, -1, 0), "twist": (1, 0, 0)})
+    scene.add_joint(
+        "shoulder", "trunk", "upper", (0, 0, 0), {"flexion": (0, -1, 0), "twist": (1, 0, 0)}
+    )
     scene.add_joint("elbow", "upper", "fore", (50, 0, 0), {"flexion": (0, -1, 0)})
     spans = {"brachialis": (20, 75, "upper", "fore"), "deltoid": (-30, 25, "trunk", "upper")}
     for name in muscles:
         start, end, one, other = spans[name]
-        mesh = ellipsoid((0.5 * (end - start), 5.0, 5.0), (0.5 * (start + end), 0.0, 9.5), subdivisions=3)
+        mesh = ellipsoid(
+            (0.5 * (end - start), 5.0, 5.0), (0.5 * (start + end), 0.0, 9.5), subdivisions=3
+        )
         x = mesh.vertices[:, 0]
         scene.add_muscle(name, mesh, attach=held(**{one: x < start + 8, other: x > end - 8}))
-    scene.motion = Motion([{"shoulder.flexion": a * DEG, "elbow.flexion": b * DEG} for a, b in angles])
+    scene.motion = Motion(
+        [{"shoulder.flexion": a * DEG, "elbow.flexion": b * DEG} for a, b in angles]
+    )
     return scene
 
 
 def _run(scene, name, **options):
-    return list(simulate_frames(scene, [build_model(m, scene, name) for m in scene.muscles], **options))
+    return list(
+        simulate_frames(scene, [build_model(m, scene, name) for m in scene.muscles], **options)
+    )
 
 
 def _in_frame(frame, name, bone):
@@ -71,7 +80,8 @@ def test_muscle_goes_on_after_it_was_carried_as_if_the_world_had_turned(name):
 
 def test_bone_that_comes_near_makes_a_muscle_solved():
     scene = _arm([(0, 0), (4, 0), (8, 0)])
-    # A bar of the trunk over the upper arm, which the rising arm drives into the belly of the muscle.
+    # A bar of the trunk over the upper arm, which the rising arm drives into the belly of the
+    # muscle.
     bar = box_mesh([44, -10, 18], [52, 10, 22])
     scene.bones[0].mesh = trimesh.util.concatenate([scene.bones[0].mesh, bar])
     frames = _run(scene, "rbf")
@@ -100,7 +110,9 @@ def test_muscles_side_by_side_in_any_order_are_what_they_are_alone():
     for order in (muscles, muscles[::-1]):
         together = _run(_arm(path, muscles=order), "rbf")[-1]
         for name, one in alone.items():
-            np.testing.assert_array_equal(one.surfaces[name].vertices, together.surfaces[name].vertices)
+            np.testing.assert_array_equal(
+                one.surfaces[name].vertices, together.surfaces[name].vertices
+            )
             assert one.work[name] == together.work[name]
 
 
@@ -122,7 +134,9 @@ POSE = {"hip.flexion": np.radians(24.0), "hip.adduction": np.radians(-10.0)}
 OTHER = {"hip.flexion": np.radians(30.0)}
 
 
-@pytest.mark.parametrize("model", ["pbd", {"name": "rbf", "centres": 80, "samples": 300, "resolution": 16}])
+@pytest.mark.parametrize(
+    "model", ["pbd", {"name": "rbf", "centres": 80, "samples": 300, "resolution": 16}]
+)
 def test_a_pose_is_the_same_whatever_was_solved_before(model):
     scene = rm.phantom_scene(model=model, spacing=6.0)
     scene.muscles = [scene.muscle("extensor")]

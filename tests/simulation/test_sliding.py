@@ -1,4 +1,5 @@
-"""Neighbouring muscles that slide: surfaces, virtual edges, and what the frame loop makes of them."""
+"""Neighbouring muscles that slide: surfaces, virtual edges, and what the frame loop makes of
+them."""
 
 from types import SimpleNamespace
 
@@ -23,9 +24,11 @@ def _model(mesh):
     """The part of a model that a surface reads."""
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     return SimpleNamespace(
-        vertices=vertices, contact_bone=np.full(len(vertices), -1),
-        contact_points=lambda: vertices, material_mesh=lambda: (vertices, faces),
-    )  # fmt: skip
+        vertices=vertices,
+        contact_bone=np.full(len(vertices), -1),
+        contact_points=lambda: vertices,
+        material_mesh=lambda: (vertices, faces),
+    )
 
 
 @pytest.mark.parametrize(
@@ -45,13 +48,18 @@ def test_distances_are_those_of_the_triangles(scale, subdivisions, reach, share)
     exact, way = exact[index], (points - foot)[index] * np.sign(exact[index])[:, None]
     assert np.array_equal(distance < 0.0, exact < 0.0) and (exact < 0.0).any()
     # What is left is nearer to another ring of triangles than the one looked at.
-    assert (np.abs(distance - exact) < 1e-9).mean() >= share and np.allclose(distance, exact, atol=0.2)
+    assert (np.abs(distance - exact) < 1e-9).mean() >= share and np.allclose(
+        distance, exact, atol=0.2
+    )
     if share == 1.0:  # a ball
         outward = points[index] / np.linalg.norm(points[index], axis=1, keepdims=True)
         assert np.einsum("ij,ij->i", normal, outward).min() > 0.99
     far = exact > 1.0
     assert (np.einsum("ij,ij->i", normal[far], way[far]) > 0.0).all()
-    assert np.linalg.norm(surface.vertices[nearest] - points[index], axis=1).max() < reach + 2 * surface.edge
+    assert (
+        np.linalg.norm(surface.vertices[nearest] - points[index], axis=1).max()
+        < reach + 2 * surface.edge
+    )
 
 
 def test_surface_follows_the_model_and_asks_only_what_it_is_asked():
@@ -129,7 +137,8 @@ def test_linked_points_keep_near_their_neighbour(monkeypatch):
     lift = [{"lift": a} for a in (0, 2, 4, 6)]
     frames, _ = _run(lift, SlidingOptions())
     apart, _ = _run(lift, SlidingOptions(threshold=1e-3))
-    # Free to 0.5 mm beyond the gap at rest; curved surfaces and one linearisation a sub-step leave some tenths.
+    # Free to 0.5 mm beyond the gap at rest; curved surfaces and one linearisation a sub-step leave
+    # some tenths.
     assert frames[-1].neighbours["lower", "upper"][1] < 1.0
     assert ("lower", "upper") not in apart[-1].neighbours
     held, loose = (f[-1].surfaces["upper"].vertices[:, 2].mean() for f in (frames, apart))
@@ -144,7 +153,10 @@ def test_what_is_pulled_away_hard_is_let_go(monkeypatch):
     _, alone = _run(lift, None)
     monkeypatch.setattr(links, "RELEASE", 50.0)
     _, held = _run(lift, SlidingOptions())
-    away = [np.sqrt(np.square(one["upper"].x - alone["upper"].x).sum(axis=1).mean()) for one in (parts, held)]
+    away = [
+        np.sqrt(np.square(one["upper"].x - alone["upper"].x).sum(axis=1).mean())
+        for one in (parts, held)
+    ]
     # Those near the hinge, which move little, stay linked.
     assert away[0] < 0.7 * away[1]
 
@@ -203,12 +215,16 @@ def test_points_near_a_bone_may_be_held_there(monkeypatch):
     monkeypatch.setattr(links, "RELEASE", 50.0)
     fields = {"plate": toy.box((20, 20, 1), (0, 0, -6.0)), "arm": toy.box((1, 1, 1), (60, 0, 20))}
     mesh = toy.ellipsoid((25, 4, 4), subdivisions=3)
-    ends = [toy.attach(mesh, b, lambda v, k=k: k * v[:, 0] > 20) for b, k in (("plate", -1), ("arm", 1))]
+    ends = [
+        toy.attach(mesh, b, lambda v, k=k: k * v[:, 0] > 20) for b, k in (("plate", -1), ("arm", 1))
+    ]
 
     def lifted(sliding):
         hinge = toy.joint("hinge", "plate", "arm", (-25, 0, 0), lift=(0, -1, 0))
         frames = [{"hinge.lift": np.radians(a)} for a in (0, 6)]
-        made = toy.scene(fields, [hinge], [toy.muscle("strap", mesh, ends)], frames, sliding=sliding)
+        made = toy.scene(
+            fields, [hinge], [toy.muscle("strap", mesh, ends)], frames, sliding=sliding
+        )
         part = toy.ToyMuscle(made.muscles[0], made)
         near = fields["plate"].distance(part.rest) < 2.0
         list(simulate_frames(made, [part], fields=fields))

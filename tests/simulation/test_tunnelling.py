@@ -25,7 +25,9 @@ def random_segments(step, count=60_000, seed=3, across=False):
 def least_radius(start, end, axes):
     """Exact smallest distance of each segment to the origin, in the coordinates ``axes`` only."""
     a, d = start[:, axes], end[:, axes] - start[:, axes]
-    t = np.clip(-np.einsum("ij,ij->i", a, d) / np.maximum(np.einsum("ij,ij->i", d, d), 1e-300), 0, 1)
+    t = np.clip(
+        -np.einsum("ij,ij->i", a, d) / np.maximum(np.einsum("ij,ij->i", d, d), 1e-300), 0, 1
+    )
     return np.linalg.norm(a + t[:, None] * d, axis=1)
 
 
@@ -61,15 +63,23 @@ def test_swept_test_sees_every_point_that_passes_a_thin_plate(step, thickness):
 
 @pytest.mark.parametrize(
     ("shape", "step", "recall"),
-    [("cylinder", 2.05, 0.097), ("cylinder", 6.0, 0.90), ("sphere", 3.0, 0.24), ("sphere", 6.0, 0.83)],
+    [
+        ("cylinder", 2.05, 0.097),
+        ("cylinder", 6.0, 0.90),
+        ("sphere", 3.0, 0.24),
+        ("sphere", 6.0, 0.83),
+    ],
 )
 def test_angle_test_has_the_known_recall(shape, step, recall):
     field, axes = SHAPES[shape]
     start, end = random_segments(step, count=400_000, across=shape == "cylinder")
-    outside = (np.linalg.norm(start[:, axes], axis=1) > 1) & (np.linalg.norm(end[:, axes], axis=1) > 1)
+    outside = (np.linalg.norm(start[:, axes], axis=1) > 1) & (
+        np.linalg.norm(end[:, axes], axis=1) > 1
+    )
     crossing = outside & (least_radius(start, end, axes) < 1.0)
     sweep = sweep_paths(field, start[crossing], end[crossing], tolerance=TOLERANCE)
-    # The published figures have two digits and an unnamed sampling; the count here gives 1 % at worst.
+    # The published figures have two digits and an unnamed sampling; the count here gives 1 % at
+    # worst.
     assert sweep.flagged.sum() / crossing.sum() == pytest.approx(recall, abs=0.03)
 
 
@@ -115,7 +125,9 @@ def _moving_plate(turn):
 @pytest.mark.parametrize("angle", [0.0, 1.0])
 @pytest.mark.parametrize("count", [1, 3])
 def test_paths_are_relative_to_the_bone(angle, count):
-    """The last two points stay clear. Where the first ends alone, no box of the bone is near it: the bone has moved."""
+    """The last two points stay clear. Where the first ends alone, no box of the bone is near it:
+    the bone has moved.
+    """
     turn = rotation_about([1, 2, 3], angle, np.array([4.0, 5, 6]))
     contacts, points, poses = _moving_plate(turn)
     points = points[:count]
@@ -127,7 +139,8 @@ def test_paths_are_relative_to_the_bone(angle, count):
 
 
 def _swing(action):
-    """A bag hung on a turning frame is swung against a fixed thin plate by 40 degrees in one step."""
+    """A bag hung on a turning frame is swung against a fixed thin plate by 40 degrees in one
+    step."""
     fields = {"plate": box((12, 0.3, 40), (20, 0, 0)), "frame": box((1, 1, 1), (60, 0, 0))}
     mesh = ellipsoid((2.5, 2.5, 12), (20, 0, 0), subdivisions=3)
     mesh.apply_transform(rotation_about([0, 0, 1], np.radians(-20), np.zeros(3)))
@@ -185,15 +198,24 @@ def test_steps_are_not_halved_again_while_points_stay_across_a_bone(monkeypatch)
     stepper.step({"hinge.turn": np.radians(40)}, {"hinge.turn": 0.0})
     _, events, second = stepper.collect()
     actions = {event.action for event in events}
-    assert "unresolved" in actions and "halved" not in actions and (first.substeps, second.substeps) == (3, 1)
+    assert (
+        "unresolved" in actions
+        and "halved" not in actions
+        and (first.substeps, second.substeps) == (3, 1)
+    )
 
 
 @pytest.mark.parametrize("thickness, touched", [(0.15, True), (0.25, False), (3.0, False)])
 def test_only_a_path_that_the_triangles_call_shallow_has_grazed(thickness, touched):
-    """Straight through a plate: half its thickness is how deep a path was. What the field says plays no part."""
+    """Straight through a plate: half its thickness is how deep a path was. What the field says
+    plays no part.
+    """
     mesh = trimesh.creation.box((9.0, 9.0, thickness))
     turn = rotation_about([1, 2, 0], 0.7, np.zeros(3))
-    start, end = np.array([[9.0, 9.0, 9.0], [0.3, 0.1, 2.0]]), np.array([[9.0, 9.0, 9.0], [0.3, 0.1, -2.0]])
+    start, end = (
+        np.array([[9.0, 9.0, 9.0], [0.3, 0.1, 2.0]]),
+        np.array([[9.0, 9.0, 9.0], [0.3, 0.1, -2.0]]),
+    )
     crossing = Crossing(0, np.array([1]), 0)
     paths = start, end @ turn[:3, :3].T
     assert only_grazed(crossing, mesh, paths, np.eye(4), turn, 0.1) is touched

@@ -137,7 +137,9 @@ def test_second_model_follows_the_same_slider(page, tab):
         wait_for(lambda side=side: abs(degrees(page, side) - 6.0) < 1e-6, SLOW)
     wait_for(lambda: len(page.panel._history) > 2, SLOW)
     assert 0.0 < max(page.panel._history[-1]) < 5.0
-    page.panel.models[1].value, page.panel.colour.value, page.panel.quantity.value = "none", "group", "none"
+    page.panel.models[1].value = "none"
+    page.panel.colour.value = "group"
+    page.panel.quantity.value = "none"
     wait_for(lambda: page.sides[1].figure is None, SLOW)
 
 
@@ -184,10 +186,13 @@ def test_page_is_given_for_the_token_and_the_own_host_name_alone(page):
 @pytest.mark.parametrize(
     ("origin", "path", "opens"),
     [
-        ("own", "right", True), ("own", "wrong", False), ("http://evil.example", "right", False),
-        ("null", "right", False), (None, "right", False),
+        ("own", "right", True),
+        ("own", "wrong", False),
+        ("http://evil.example", "right", False),
+        ("null", "right", False),
+        (None, "right", False),
     ],
-)  # fmt: skip
+)
 def test_websocket_opens_for_the_own_page_alone(page, origin, path, opens):
     import viser
 
@@ -201,7 +206,9 @@ def test_websocket_opens_for_the_own_page_alone(page, origin, path, opens):
         assert socket.recv(timeout=20)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems have one loopback address")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="other systems have one loopback address"
+)
 def test_server_listens_on_one_address(page):
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", urlsplit(page.address).port), timeout=5)
@@ -209,12 +216,16 @@ def test_server_listens_on_one_address(page):
 
 def test_page_of_a_run_draws_what_is_kept(run_folder):
     source, found = SavedSource({"run": SavedRun(run_folder)}), {}
-    source.muscles |= {"extensor": (1.1 * source.muscles["extensor"][0], source.muscles["extensor"][1])}
+    source.muscles |= {
+        "extensor": (1.1 * source.muscles["extensor"][0], source.muscles["extensor"][1])
+    }
     page = Page(source, at={"frame": 1.0})
     page._closed = True  # ends its thread, so that nothing is drawn but what is asked for
     page._wake.set()
     page._thread.join()
-    panel, side, camera = page.panel, page.sides[0], page.server.initial_camera
+    panel = page.panel
+    side = page.sides[0]
+    camera = page.server.initial_camera
     panel.eyes["abductor"].value = False
     values = (
         ("colour", "stretch"),
@@ -227,14 +238,22 @@ def test_page_of_a_run_draws_what_is_kept(run_folder):
     for name, value in (("quantity", "volume error [%]"), *values):
         getattr(panel, name).value = value
         more = page._turn(), panel.frame.value, camera.position, camera.look_at, camera.fov
-        nodes = {key: (n.vertices, n.faces, n.position, n.wxyz, n.visible) for key, n in side._nodes.items()}
+        nodes = {
+            key: (n.vertices, n.faces, n.position, n.wxyz, n.visible)
+            for key, n in side._nodes.items()
+        }
         text = text_facts(panel._numbers.content.rpartition("<br>")[0])
         found[f"{name} {value}"] = nodes, side.numbers, more, text, panel._history
     panel.models[1].value = "run"
     for name, view in VIEWS.items():
         page._turn()
         page._aim(view, camera)
-        found[name] = np.array(page.sides[1].frame.position), camera.position, camera.look_at, camera.up
+        found[name] = (
+            np.array(page.sides[1].frame.position),
+            camera.position,
+            camera.look_at,
+            camera.up,
+        )
     page.close()
     check_kept("page", found, tolerance=1e-6)
 
@@ -244,7 +263,9 @@ def test_notebook_shows_a_scene_and_a_run():
     try:
         assert f'<iframe src="{shown.address}"' in shown._repr_html_()
         names = {muscle.name for muscle in rm.phantom_scene().muscles}
-        assert set(shown.sides[0].picture.surfaces) == names  # at rest: the models are not built yet
+        assert (
+            set(shown.sides[0].picture.surfaces) == names
+        )  # at rest: the models are not built yet
         wait_for(lambda: set(shown.sides[0].numbers) == names, SLOW)
     finally:
         shown.close()

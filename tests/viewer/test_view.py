@@ -37,7 +37,9 @@ def test_picture_is_of_the_frame_asked_for(run_folder, tmp_path, capsys, graphic
 def test_picture_of_a_scene_is_of_the_pose_asked_for(tmp_path, capsys, graphics):
     common = ("view", "phantom", "--model", "pbd", "--screenshot")
     for name, degrees in (("rest", 0), ("bent", 10)):
-        code, _, err = call(capsys, *common, tmp_path / f"{name}.png", "--at", f"hip.flexion={degrees}")
+        code, _, err = call(
+            capsys, *common, tmp_path / f"{name}.png", "--at", f"hip.flexion={degrees}"
+        )
         assert code == 0, err
     assert (image(tmp_path / "rest.png") != image(tmp_path / "bent.png")).any(axis=2).mean() > 0.01
 
@@ -67,8 +69,10 @@ def test_address_is_printed_and_answers_until_interrupted(run_folder):
     pytest.importorskip("viser")
     with subprocess.Popen(
         [sys.executable, "-m", "rbfmuscle", "view", run_folder, "--no-browser"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
         address = process.stdout.readline().split()[0]
         with urllib.request.urlopen(address) as answer:
             assert b"<html" in answer.read()

@@ -1,7 +1,9 @@
-"""A closed triangulation that goes with the material, and the triangles of it mended that are slivers or look inwards.
+"""A closed triangulation that goes with the material, and the triangles of it mended that are
+slivers or look inwards.
 
-One that was contracted from a muscle's own and then brought onto a level set has a few of them on the folds of its
-rims. The material carries them through all frames, so they are mended once, at rest: edges flipped, vertices moved.
+One that was contracted from a muscle's own and then brought onto a level set has a few of them on
+the folds of its rims. The material carries them through all frames, so they are mended once, at
+rest: edges flipped, vertices moved.
 """
 
 from collections.abc import Callable
@@ -13,15 +15,18 @@ from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.jit import compiled
 
-# Triangles with a smaller angle [degree] are slivers; rounds of mending, and rounds without gain that end it.
-LEAST_ANGLE, ROUNDS, PATIENCE = 15.0, 8, 3
+# Triangles with a smaller angle [degree] are slivers; rounds of mending, and rounds without gain
+# that end it.
+LEAST_ANGLE = 15.0
+ROUNDS = 8
+PATIENCE = 3
 
 
 class MaterialMesh:
     """A closed triangulation of fixed topology: vertices (n, 3) at rest, outward faces (m, 3).
 
-    ``start`` and ``other`` are CSR lists of neighbours. ``slope`` (n,) is the field's at the vertices at rest, if
-    known; where it sinks, sheets have met and the field is not to be trusted.
+    ``start`` and ``other`` are CSR lists of neighbours. ``slope`` (n,) is the field's at the
+    vertices at rest, if known; where it sinks, sheets have met and the field is not to be trusted.
     """
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
@@ -75,7 +80,9 @@ def _edges_loop(vertices, faces):
 def _smooth_loop(vertices, rows, start, other):
     """Half the way to the mean of the neighbours, one vertex after the other."""
     for v in rows:
-        x, y, z = 0.0, 0.0, 0.0
+        x = 0.0
+        y = 0.0
+        z = 0.0
         for n in range(start[v], start[v + 1]):
             x += vertices[other[n], 0]
             y += vertices[other[n], 1]
@@ -89,13 +96,16 @@ def _smooth_loop(vertices, rows, start, other):
 def mend_slivers(
     mesh: MaterialMesh, vertices: Floats, onto: Callable[[MaterialMesh, Floats], Floats]
 ) -> tuple[MaterialMesh, Floats]:
-    """A mesh of the same vertices and genus with fewer slivers and triangles that look inwards, none if possible.
+    """A mesh of the same vertices and genus with fewer slivers and triangles that look inwards,
+    none if possible.
 
-    ``vertices`` (n, 3) lie on the surface [scene unit]; ``onto`` brings vertices (n, 3) of a mesh back onto it. The
-    mesh is another one where edges were flipped.
+    ``vertices`` (n, 3) lie on the surface [scene unit]; ``onto`` brings vertices (n, 3) of a mesh
+    back onto it. The mesh is another one where edges were flipped.
     """
     quality = triangle_quality(vertices, mesh.faces, vertex_normals(vertices, mesh.faces))
-    best, least, waited = (mesh, vertices), _faults(quality), 0
+    best = (mesh, vertices)
+    least = _faults(quality)
+    waited = 0
     for _ in range(ROUNDS):
         if least == (0, 0) or waited == PATIENCE:
             break
@@ -112,15 +122,21 @@ def mend_slivers(
         now = _faults(triangle_quality(vertices, mesh.faces, vertex_normals(vertices, mesh.faces)))
         waited += 1
         if now < least:
-            best, least, waited = (mesh, vertices), now, 0
+            best = (mesh, vertices)
+            least = now
+            waited = 0
     return best
 
 
 def triangle_quality(vertices: Floats, faces: Integers, normals: Floats) -> Floats:
-    """Smallest angle (m,) of each triangle [degree], negative where it looks away from its corners' normals (n, 3)."""
+    """Smallest angle (m,) of each triangle [degree], negative where it looks away from its corners'
+    normals (n, 3).
+    """
     corners = vertices[faces]
     sides = np.roll(corners, -1, axis=1) - corners
-    inwards = (np.einsum("mkd,md->mk", normals[faces], np.cross(sides[:, 0], sides[:, 1])) < 0.0).all(axis=1)
+    inwards = (
+        np.einsum("mkd,md->mk", normals[faces], np.cross(sides[:, 0], sides[:, 1])) < 0.0
+    ).all(axis=1)
     sides /= np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), np.finfo(float).tiny)
     cosines = -np.einsum("mkd,mkd->mk", sides, np.roll(sides, 1, axis=1))
     angle = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).min(axis=1)
@@ -133,7 +149,9 @@ def _faults(quality: Floats) -> tuple[int, int]:
 
 
 def flip_edges(vertices: Floats, faces: Integers) -> Integers:
-    """Faces (m, 3) of a closed mesh, an edge of each bad one flipped where that helps; the same array if none is."""
+    """Faces (m, 3) of a closed mesh, an edge of each bad one flipped where that helps; the same
+    array if none is.
+    """
     normals, count = vertex_normals(vertices, faces), len(vertices)
     bad = np.flatnonzero(triangle_quality(vertices, faces, normals) < LEAST_ANGLE)
     sides = faces.astype(np.int64) * count + np.roll(faces, -1, axis=1)

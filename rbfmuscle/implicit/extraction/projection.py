@@ -1,11 +1,18 @@
-"""Vertices of an extracted mesh moved onto the surface itself, and with its level to a wanted volume."""
+"""Vertices of an extracted mesh moved onto the surface itself, and with its level to a wanted
+volume.
+"""
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
 from rbfmuscle.geometry.surfaces import volume_cubic
-from rbfmuscle.implicit.extraction.obstacles import MARGIN, Obstacles, near_triangles, push_off_points
+from rbfmuscle.implicit.extraction.obstacles import (
+    MARGIN,
+    Obstacles,
+    near_triangles,
+    push_off_points,
+)
 from rbfmuscle.jit import compiled
 
 # What is no deeper in the cut than this share of a cell counts as out of it.
@@ -13,7 +20,9 @@ OUT = 1e-5
 
 
 class CutBounds:
-    """Values (n,) of a cut, or lower bounds, at places (n, 3) where vertices were: bounds where those are now."""
+    """Values (n,) of a cut, or lower bounds, at places (n, 3) where vertices were: bounds where
+    those are now.
+    """
 
     def __init__(self, places: Floats, values: Floats) -> None:
         self.places, self.values = places.copy(), values.copy()
@@ -28,25 +37,36 @@ class CutBounds:
 class Projector:
     """Vertices (n, 3) on their way to the zero set of max(f - level, -d).
 
-    ``near_cut`` (n,) marks those that may lie on or come to the cut; ``spacing`` is the length of edges or cells.
+    ``near_cut`` (n,) marks those that may lie on or come to the cut; ``spacing`` is the length of
+    edges or cells.
     """
 
     def __init__(
-        self, field: Field | None, cut: ClipDistance | None, vertices: Floats, spacing: float, near_cut: Booleans
-    ) -> None:  # fmt: skip
+        self,
+        field: Field | None,
+        cut: ClipDistance | None,
+        vertices: Floats,
+        spacing: float,
+        near_cut: Booleans,
+    ) -> None:
         self.vertices, self.spacing = vertices, spacing
-        self._field, self._cut, self._near_cut = field, cut, near_cut
-        # What is known before the first step: the field with its gradient, and the cut by values or lower bounds.
+        self._field = field
+        self._cut = cut
+        self._near_cut = near_cut
+        # What is known before the first step: the field with its gradient, and the cut by values or
+        # lower bounds.
         self.known: tuple[Floats, Floats] | None = None
         self.bounds: CutBounds | None = None
-        # Distance (n,) from the cut at which vertices that fall into it end, and steepness (n,) of the field below
-        # which steps are shortened, not lengthened by a gradient that fades.
+        # Distance (n,) from the cut at which vertices that fall into it end, and steepness (n,) of
+        # the field below which steps are shortened, not lengthened by a gradient that fades.
         self.clearance, self.least, self.slope = np.zeros((3, len(vertices)))
         self.on_field = np.ones(len(vertices), dtype=bool)
         self._direction = np.zeros_like(vertices)
 
     def project(self, level: float, rows: Integers | None = None, *, rounds: int = 6) -> None:
-        """Newton steps of all vertices, or those numbered ``rows``, until they are shorter than 1e-4 of a cell."""
+        """Newton steps of all vertices, or those numbered ``rows``, until they are shorter than
+        1e-4 of a cell.
+        """
         if self._field is None:
             raise ValueError("there is no field to project onto")
         todo = np.arange(len(self.vertices)) if rows is None else rows
@@ -55,7 +75,9 @@ class Projector:
             x = self.vertices[todo]
             f, gradient = self._field.value_and_gradient(x) if self.known is None else self.known
             self.known = None
-            step, slope, gradient = np.empty_like(x), np.empty(len(x)), np.ascontiguousarray(gradient)
+            step = np.empty_like(x)
+            slope = np.empty(len(x))
+            gradient = np.ascontiguousarray(gradient)
             _newton_loop(f, gradient, level, self.least[todo], todo, step, slope, self._direction)
             self.slope[todo] = slope
             if self._cut is not None:
@@ -70,10 +92,16 @@ class Projector:
         if rows is None:
             self.on_field = on_field
 
-    def _turn_to_cut(self, todo: Integers, height: Floats, step: Floats, on_field: Booleans) -> None:
-        """Replace the steps of vertices that lie on the cut; marks which lie on the field's own surface."""
+    def _turn_to_cut(
+        self, todo: Integers, height: Floats, step: Floats, on_field: Booleans
+    ) -> None:
+        """Replace the steps of vertices that lie on the cut; marks which lie on the field's own
+        surface.
+        """
         rows = np.flatnonzero(self._near_cut[todo])
-        found, distance, outward = self._ask_cut(todo[rows], self.clearance[todo[rows]] - height[rows])
+        found, distance, outward = self._ask_cut(
+            todo[rows], self.clearance[todo[rows]] - height[rows]
+        )
         rows = rows[found]
         distance = distance - self.clearance[todo[rows]]
         on_cut = height[rows] < -distance
@@ -81,7 +109,9 @@ class Projector:
         step[rows[on_cut]] = _way_out(distance[on_cut], outward[on_cut])
 
     def _ask_cut(self, rows: Integers, limit: Floats) -> tuple[Booleans, Floats, Floats]:
-        """Which of some vertices may lie below their limit (k,), and the cut's distances and gradients there."""
+        """Which of some vertices may lie below their limit (k,), and the cut's distances and
+        gradients there.
+        """
         near = np.ones(len(rows), dtype=np.bool_)
         if self.bounds is not None:
             near = self.bounds.below(self.vertices[rows], rows) <= limit
@@ -104,7 +134,9 @@ class Projector:
         self.slope[:] = np.linalg.norm(direction, axis=1)
 
     def lift(self, rows: Integers | None = None) -> int:
-        """Move vertices, or those numbered ``rows``, that lie in the cut onto it, where they stay: how many."""
+        """Move vertices, or those numbered ``rows``, that lie in the cut onto it, where they stay:
+        how many.
+        """
         moved = 0
         rows = np.flatnonzero(self._near_cut) if rows is None else rows[self._near_cut[rows]]
         for _ in range(2):
@@ -116,7 +148,9 @@ class Projector:
         return moved
 
     def _move_out(self, rows: Integers, limit: Floats, slack: float) -> Integers:
-        """Move those of some vertices that are nearer to the cut than a limit, by more than a slack, there: which."""
+        """Move those of some vertices that are nearer to the cut than a limit, by more than a
+        slack, there: which.
+        """
         near, distance, outward = self._ask_cut(rows, limit)
         distance = distance - limit[near]
         inside = distance < -slack
@@ -125,7 +159,9 @@ class Projector:
         return rows
 
     def volume_step(self, faces: Integers, target: float, steps: int = 1) -> float:
-        """Change of level that brings the mesh to a volume, a cubic polynomial of the change, by Newton steps."""
+        """Change of level that brings the mesh to a volume, a cubic polynomial of the change, by
+        Newton steps.
+        """
         c0, c1, c2, c3 = volume_cubic(self.vertices, faces, self._direction)
         change = 0.0
         for _ in range(steps):
@@ -134,12 +170,18 @@ class Projector:
                 break
             rate = c1 + change * (2.0 * c2 + change * 3.0 * c3)
             if not rate > 0:
-                raise ValueError(f"no level gives a volume of {target:g}: the cut leaves no surface")
+                raise ValueError(
+                    f"no level gives a volume of {target:g}: the cut leaves no surface"
+                )
             change += lack / rate
         return change
 
-    def push_off(self, faces: Integers, obstacles: Obstacles, spacing: float, tolerance: float) -> Booleans:
-        """Move vertices around points that came through faces (m, 3); a mask (n,) of these, which leave the level."""
+    def push_off(
+        self, faces: Integers, obstacles: Obstacles, spacing: float, tolerance: float
+    ) -> Booleans:
+        """Move vertices around points that came through faces (m, 3); a mask (n,) of these, which
+        leave the level.
+        """
         pushed = np.zeros(len(self.vertices), dtype=np.bool_)
         near = near_triangles(obstacles, self.vertices, faces, MARGIN * spacing)
         for _ in range(2):
@@ -165,9 +207,11 @@ def _way_out(distance: Floats, outward: Floats) -> Floats:
 
 @compiled(error_model="numpy")
 def _newton_loop(f, gradient, level, least, rows, step, slope, direction):
-    """Newton steps onto f = level, 1 / |g|, and the vertices' motions g / |g|^2 for a change of level.
+    """Newton steps onto f = level, 1 / |g|, and the vertices' motions g / |g|^2 for a change of
+    level.
 
-    |g| counts as no less than ``least``: what falls on a fold of the field would else leap, elsewhere in each frame.
+    |g| counts as no less than ``least``: what falls on a fold of the field would else leap,
+    elsewhere in each frame.
     """
     for n in range(len(rows)):
         square = gradient[n, 0] ** 2 + gradient[n, 1] ** 2 + gradient[n, 2] ** 2

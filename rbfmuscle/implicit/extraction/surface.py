@@ -1,7 +1,8 @@
 """From a field to a closed triangle mesh of wanted volume, cut by bones.
 
-The surface is the zero set of F = max(f - s, -d): f the field (negative inside), s the level, d the distance to the
-bones (negative inside them). Marching cubes give its topology, and Newton steps put each vertex onto the zero set.
+The surface is the zero set of F = max(f - s, -d): f the field (negative inside), s the level, d the
+distance to the bones (negative inside them). Marching cubes give its topology, and Newton steps put
+each vertex onto the zero set.
 """
 
 from collections.abc import Callable
@@ -21,9 +22,11 @@ from rbfmuscle.validation import check_finite, check_points, check_positive
 
 # More nodes than this are refused; so many are evaluated at a time.
 MAX_NODES, SLAB = 50_000_000, 500_000
-# Values nearer to zero than this share of their mean are moved away from it: no vertex then lies on a node.
+# Values nearer to zero than this share of their mean are moved away from it: no vertex then lies on
+# a node.
 LEAST_VALUE = 1e-6
-# Cells along the longest side of the points when stray sheets are looked for, and the share of it added on every side.
+# Cells along the longest side of the points when stray sheets are looked for, and the share of it
+# added on every side.
 SEARCHED, MARGIN = 64, 0.075
 # A vertex farther than this from the cut, in cells, stays clear of it.
 NEAR_CUT = 1.2
@@ -33,8 +36,9 @@ NEAR_CUT = 1.2
 class Grid:
     """A regular grid of cubic cells.
 
-    ``origin`` (3,) is the position of node (0, 0, 0), ``spacing`` the edge of a cell [scene unit], ``shape`` the number
-    of nodes along each axis. Rows of ``axes`` (3, 3) are the grid's unit axes in world coordinates.
+    ``origin`` (3,) is the position of node (0, 0, 0), ``spacing`` the edge of a cell [scene unit],
+    ``shape`` the number of nodes along each axis. Rows of ``axes`` (3, 3) are the grid's unit axes
+    in world coordinates.
     """
 
     origin: np.ndarray
@@ -44,19 +48,27 @@ class Grid:
 
     @classmethod
     def around(
-        cls, points: ArrayLike, *, resolution: int = 48, padding: int = 3, axes: ArrayLike | None = None
+        cls,
+        points: ArrayLike,
+        *,
+        resolution: int = 48,
+        padding: int = 3,
+        axes: ArrayLike | None = None,
     ) -> "Grid":
         """Grid around points (n, 3), with so many cells (at least 4) along their longest side.
 
-        ``padding`` cells, at least 1, are added on each side. Rows of ``axes`` (3, 3), a rotation, are the grid's axes;
-        those of the world by default. ValueError on no or coinciding points, numbers out of range, or too many nodes.
+        ``padding`` cells, at least 1, are added on each side. Rows of ``axes`` (3, 3), a rotation,
+        are the grid's axes; those of the world by default. ValueError on no or coinciding points,
+        numbers out of range, or too many nodes.
         """
         points = check_points(points)
         axes = np.eye(3) if axes is None else np.asarray(axes, dtype=np.float64)
         if axes.shape != (3, 3) or not np.abs(axes @ axes.T - np.eye(3)).max() < 1e-5:
             raise ValueError("axes must be a (3, 3) rotation")
         if int(resolution) < 4 or int(padding) < 1:
-            raise ValueError(f"resolution must be >= 4 and padding >= 1, got {resolution} and {padding}")
+            raise ValueError(
+                f"resolution must be >= 4 and padding >= 1, got {resolution} and {padding}"
+            )
         if len(points) == 0:
             raise ValueError("points must hold at least one point on the surface")
         along = points @ axes.T
@@ -75,7 +87,9 @@ class Grid:
         return coordinates @ (self.spacing * self.axes) + self.origin
 
     def evaluate(self, function: Callable[[Floats], Floats]) -> NDArray[np.float32]:
-        """Values of a function of points (n, 3) at the nodes, in single precision as marching cubes has them."""
+        """Values of a function of points (n, 3) at the nodes, in single precision as marching cubes
+        has them.
+        """
         values = np.empty(int(np.prod(self.shape)), dtype=np.float32)
         for low in range(0, len(values), SLAB):
             nodes = np.arange(low, min(low + SLAB, len(values)))
@@ -83,20 +97,28 @@ class Grid:
             values[nodes] = function(points)
             if np.isnan(values[nodes]).any():
                 where = points[np.argmax(np.isnan(values[nodes]))]
-                raise ValueError(f"field or cut is NaN at {where}; check the fit and the bone fields")
+                raise ValueError(
+                    f"field or cut is NaN at {where}; check the fit and the bone fields"
+                )
         return values.reshape(self.shape)
 
 
 class LevelSet:
-    """Triangles of the zero set of max(field - level, -cut) on a grid; the field is negative inside."""
+    """Triangles of the zero set of max(field - level, -cut) on a grid; the field is negative
+    inside.
+    """
 
     def __init__(self, grid: Grid, field: Field, cut: ClipDistance | None = None) -> None:
-        self.grid, self.field, self.cut = grid, field, cut
+        self.grid = grid
+        self.field = field
+        self.cut = cut
         self._f = grid.evaluate(field)
         self._c = None if cut is None else grid.evaluate(cut)
 
     def march(self, level: float) -> tuple[Floats, Integers]:
-        """Vertices (n, 3) in grid coordinates and outward triangles (m, 3), if any, closed but on the grid's border."""
+        """Vertices (n, 3) in grid coordinates and outward triangles (m, 3), if any, closed but on
+        the grid's border.
+        """
         from skimage.measure import marching_cubes
 
         value = self._f - np.float32(level)
@@ -112,14 +134,17 @@ class LevelSet:
 
     def on_border(self, coordinates: Floats) -> Booleans:
         """Mask (n,) of the vertices on the border of the grid, where a surface leaves it."""
-        return np.any((coordinates <= 0.0) | (coordinates >= np.array(self.grid.shape) - 1.0), axis=1)
+        return np.any(
+            (coordinates <= 0.0) | (coordinates >= np.array(self.grid.shape) - 1.0), axis=1
+        )
 
 
 class Sheets(NamedTuple):
     """Sheets of a level set beside a surface.
 
-    ``stray`` counts those, beside the one nearest to most points, that stand off the surface by more than a cell;
-    ``is_open`` says whether a sheet leaves the box, ``found`` whether there is any.
+    ``stray`` counts those, beside the one nearest to most points, that stand off the surface by
+    more than a cell; ``is_open`` says whether a sheet leaves the box, ``found`` whether there is
+    any.
     """
 
     stray: int
@@ -132,11 +157,12 @@ class Sheets(NamedTuple):
 
 
 def find_sheets(field: Field, points: Floats, distance: Callable[[Floats], Floats]) -> Sheets:
-    """Sheets of a field's zero set (negative inside) in a box around a surface, 7.5 % larger than it on every side.
+    """Sheets of a field's zero set (negative inside) in a box around a surface, 7.5 % larger than
+    it on every side.
 
-    Points (n, 3) of the surface give the box [length]; ``distance`` maps points (n, 3) to their distances (n,) from the
-    surface, signed or not. Where a muscle is thinner than a cell, its own sheet falls into pieces on the grid: these
-    lie within a cell of it and do not count.
+    Points (n, 3) of the surface give the box [length]; ``distance`` maps points (n, 3) to their
+    distances (n,) from the surface, signed or not. Where a muscle is thinner than a cell, its own
+    sheet falls into pieces on the grid: these lie within a cell of it and do not count.
     """
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     grid = Grid.around(points, resolution=SEARCHED, padding=round(MARGIN * SEARCHED), axes=axes)
@@ -153,17 +179,21 @@ def find_sheets(field: Field, points: Floats, distance: Callable[[Floats], Float
 
 
 def nearest_sheet(vertices: Floats, faces: Integers, points: Floats) -> tuple[int, Integers, int]:
-    """Number of connected sheets, the sheet (n,) of each vertex, and the sheet that lies nearest to most points."""
+    """Number of connected sheets, the sheet (n,) of each vertex, and the sheet that lies nearest to
+    most points.
+    """
     number, label = label_sheets(faces, len(vertices))
     return number, label, int(np.bincount(label[cKDTree(vertices).query(points)[1]]).argmax())
 
 
 @dataclass(frozen=True)
 class ExtractedSurface:
-    """A closed outward mesh: vertices (n, 3) in the world [scene unit], faces (m, 3), and the volume that it holds.
+    """A closed outward mesh: vertices (n, 3) in the world [scene unit], faces (m, 3), and the
+    volume that it holds.
 
-    ``level`` is that of the field that was extracted, ``components`` the number of sheets in the box, of which all but
-    the one nearest to the points are left out, ``spacing`` the edge of a grid cell [scene unit].
+    ``level`` is that of the field that was extracted, ``components`` the number of sheets in the
+    box, of which all but the one nearest to the points are left out, ``spacing`` the edge of a grid
+    cell [scene unit].
     """
 
     vertices: np.ndarray
@@ -185,18 +215,20 @@ def extract_surface(
     axes: ArrayLike | None = None,
     obstacles: Obstacles | None = None,
 ) -> ExtractedSurface:
-    """Extract the zero set of max(field - level, -cut) as a closed mesh; the field is negative inside.
+    """Extract the zero set of max(field - level, -cut) as a closed mesh; the field is negative
+    inside.
 
-    Predicted surface ``points`` (n, 3) [scene unit] give the grid, with ``resolution`` cells along the longest side of
-    their box, and which sheet is the surface's. ``cut`` gives distances, negative inside what is to be cut away; beyond
-    1.2 cells a lower bound of more than that will do. The level is moved from ``level`` until the mesh has the
-    ``volume``, if one is wanted, to 1e-9. Rows of ``axes`` (3, 3), a rotation, are the grid's axes: in a frame that
-    moves with the scene the mesh does too. ``obstacles`` are vertices of the bones behind ``cut``, each in its own
-    coordinates with its pose: triangles whose chords cut across a convex bone are moved until no vertex is inside the
-    mesh by more than 1 % of a cell.
+    Predicted surface ``points`` (n, 3) [scene unit] give the grid, with ``resolution`` cells along
+    the longest side of their box, and which sheet is the surface's. ``cut`` gives distances,
+    negative inside what is to be cut away; beyond 1.2 cells a lower bound of more than that will
+    do. The level is moved from ``level`` until the mesh has the ``volume``, if one is wanted, to
+    1e-9. Rows of ``axes`` (3, 3), a rotation, are the grid's axes: in a frame that moves with the
+    scene the mesh does too. ``obstacles`` are vertices of the bones behind ``cut``, each in its own
+    coordinates with its pose: triangles whose chords cut across a convex bone are moved until no
+    vertex is inside the mesh by more than 1 % of a cell.
 
-    ValueError on bad arguments, NaN in field or cut, an empty level set, or one that is not closed within twice the box
-    of the points; on a volume that no level reaches.
+    ValueError on bad arguments, NaN in field or cut, an empty level set, or one that is not closed
+    within twice the box of the points; on a volume that no level reaches.
     """
     points = check_points(points)
     level = float(level)
@@ -226,7 +258,9 @@ def _reach_volume(
         if found is None:
             return None
         vertices, faces, components = found
-        near_cut = np.zeros(len(vertices), dtype=np.bool_)  # what a shift by a cell may bring to the cut
+        near_cut = np.zeros(
+            len(vertices), dtype=np.bool_
+        )  # what a shift by a cell may bring to the cut
         if level_set.cut is not None:
             near_cut = np.asarray(level_set.cut(vertices) < NEAR_CUT * spacing)
         projector = Projector(level_set.field, level_set.cut, vertices, spacing, near_cut)
@@ -245,11 +279,18 @@ def _reach_volume(
             step = projector.volume_step(faces, target)
         largest = np.abs(projector.slope).max()
         level += float(np.clip(step, -spacing / largest, spacing / largest))
-    raise ValueError(f"no level gives a volume of {target:g}; is it the volume of the surface fitted?")
+    raise ValueError(
+        f"no level gives a volume of {target:g}; is it the volume of the surface fitted?"
+    )
 
 
 def _finish(
-    projector: Projector, faces: Integers, target: float | None, level: float, sheets: int, bones: Obstacles
+    projector: Projector,
+    faces: Integers,
+    target: float | None,
+    level: float,
+    sheets: int,
+    bones: Obstacles,
 ) -> ExtractedSurface:
     spacing = projector.spacing
     projector.push_off(faces, bones, spacing, 0.01 * spacing)
@@ -262,12 +303,17 @@ def _finish(
     return ExtractedSurface(vertices, faces, level, mesh_volume(vertices, faces), sheets, spacing)
 
 
-def _sheet_at(level_set: LevelSet, points: Floats, level: float) -> tuple[Floats, Integers, int] | None:
-    """The sheet that lies nearest to most points: vertices, faces, and the number of sheets; None where it is open."""
+def _sheet_at(
+    level_set: LevelSet, points: Floats, level: float
+) -> tuple[Floats, Integers, int] | None:
+    """The sheet that lies nearest to most points: vertices, faces, and the number of sheets; None
+    where it is open.
+    """
     coordinates, faces = level_set.march(level)
     if len(faces) == 0:
         raise ValueError(
-            f"the level set is empty: field - {level:g} has one sign in the whole box of the points; "
+            f"the level set is empty: field - {level:g} has one sign in the whole box of the "
+            "points; "
             "check the points' place, the sign of the field, the level and the volume"
         )
     vertices = level_set.grid.positions(coordinates)

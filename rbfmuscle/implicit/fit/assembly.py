@@ -1,7 +1,7 @@
 """Systems of RBF fits: the coordinates that they are scaled to, their matrices and polynomials.
 
-Unknowns of a Hermite fit are grouped: all values, then all x-, y- and z-derivatives, so that every row of every block
-is one contiguous run.
+Unknowns of a Hermite fit are grouped: all values, then all x-, y- and z-derivatives, so that every
+row of every block is one contiguous run.
 """
 
 import numpy as np
@@ -22,21 +22,32 @@ def exponents(degree: int) -> Integers:
 
 
 class Basis:
-    """Centres, kernel and polynomials of P fits of n centres each, every one in coordinates scaled to order one.
+    """Centres, kernel and polynomials of P fits of n centres each, every one in coordinates scaled
+    to order one.
 
-    Of the caller's ``centres`` (K, 3), of which ``parts`` (P, n) says which each fit has, and epsilon [1 / length]:
-    ``points`` (P, 3, n) are (x - ``origin``) / ``scale``, in the unit ball, and ``epsilon`` (P,) goes with them. The
-    unknowns of a fit, ``size`` of them, are values at its centres, for a ``hermite`` one also all derivatives.
-    ``polynomials`` (P, q, size) are the monomials of ``powers`` (q, 3) and their derivatives. LinAlgError for fewer
-    values than polynomial terms.
+    Of the caller's ``centres`` (K, 3), of which ``parts`` (P, n) says which each fit has, and
+    epsilon [1 / length]: ``points`` (P, 3, n) are (x - ``origin``) / ``scale``, in the unit ball,
+    and ``epsilon`` (P,) goes with them. The unknowns of a fit, ``size`` of them, are values at its
+    centres, for a ``hermite`` one also all derivatives. ``polynomials`` (P, q, size) are the
+    monomials of ``powers`` (q, 3) and their derivatives. LinAlgError for fewer values than
+    polynomial terms.
     """
 
     def __init__(
-        self, centres: Floats, kernel: Kernel, epsilon: float, *, hermite: bool = False, parts: Integers | None = None
-    ) -> None:  # fmt: skip
+        self,
+        centres: Floats,
+        kernel: Kernel,
+        epsilon: float,
+        *,
+        hermite: bool = False,
+        parts: Integers | None = None,
+    ) -> None:
         if not len(centres):
             raise UsageError("a fit needs at least one point, got none")
-        self.centres, self.parts = centres, np.arange(len(centres))[None] if parts is None else parts
+        self.centres, self.parts = (
+            centres,
+            np.arange(len(centres))[None] if parts is None else parts,
+        )
         points, (fits, count) = centres[self.parts], self.parts.shape
         self.origin = 0.5 * (points.min(axis=1) + points.max(axis=1))
         away = points - self.origin[:, None]
@@ -48,7 +59,8 @@ class Basis:
         self.powers = exponents(kernel.degree)
         if not hermite and len(self.powers) > count:
             raise np.linalg.LinAlgError(
-                f"degree {kernel.degree} of kernel '{kernel.name}' has {len(self.powers)} polynomial terms, more than "
+                f"degree {kernel.degree} of kernel '{kernel.name}' has {len(self.powers)} "
+                "polynomial terms, more than "
                 f"the {count} points; degree too high: use a kernel of lower order or add points"
             )
         self.size = 4 * count if hermite else count
@@ -102,7 +114,10 @@ def _monomial_loop(x, powers, axis, out):
 def _matrices_loop(points, epsilon, form, hermite, start, out):
     """Matrices of fits from start on, of points (P, 3, n), for any kernel."""
     n = points.shape[2]
-    d, u, work, radial = np.empty((3, n)), np.empty(n), np.empty((3, n)), np.empty((3, n))
+    d = np.empty((3, n))
+    u = np.empty(n)
+    work = np.empty((3, n))
+    radial = np.empty((3, n))
     for p in range(len(out)):
         x, e2 = points[start + p], epsilon[start + p] ** 2
         for j in range(n):
@@ -116,9 +131,13 @@ def _matrices_loop(points, epsilon, form, hermite, start, out):
 
 @compiled(error_model="numpy")
 def _cubic_matrices_loop(points, epsilon, start, out):
-    """As `_matrices_loop` for the kernel s^3, which muscles use and which should not wait for others."""
+    """As `_matrices_loop` for the kernel s^3, which muscles use and which should not wait for
+    others.
+    """
     n = points.shape[2]
-    d, u, radial = np.empty((3, n)), np.empty(n), np.empty((3, n))
+    d = np.empty((3, n))
+    u = np.empty(n)
+    radial = np.empty((3, n))
     for p in range(len(out)):
         x, e2 = points[start + p], epsilon[start + p] ** 2
         for j in range(n):
@@ -133,7 +152,8 @@ def _cubic_matrices_loop(points, epsilon, start, out):
 
 @compiled(error_model="numpy")
 def _derivatives_loop(j, e2, d, radial, out):
-    """Derivatives in the four rows of centre j, from the offsets of all centres and the radial functions there.
+    """Derivatives in the four rows of centre j, from the offsets of all centres and the radial
+    functions there.
 
     Blocks: (value, d/dx_c) first * d_c, as the other way round by the sign of d;
     (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).

@@ -1,15 +1,16 @@
 """Solving RBF systems: one Cholesky factorisation, and what to do and say when it fails.
 
-A conditionally positive definite matrix A with polynomial block P (q rows) is definite on the weights with
-P w = 0. With Q an orthonormal basis of the rows of P (P^T = Q R) the augmented system
+A conditionally positive definite matrix A with polynomial block P (q rows) is definite on the
+weights with P w = 0. With Q an orthonormal basis of the rows of P (P^T = Q R) the augmented system
 
     [A  P^T] [w]   [y]
     [P   0 ] [b] = [0]
 
-has w = M^-1 (I - Q Q^T) y with M = (I - Q Q^T) A (I - Q Q^T) + gamma Q Q^T, definite for any gamma > 0, and
-R b = Q^T (y - A w). The condition of M is that of A on those weights, as gamma is the mean of the other eigenvalues;
-adding a multiple of P^T P to A instead costs two digits at 2,000 centres. Where polynomials are dependent on the
-centres of a fit, as the second degree is on those of a flat part, the rows of P that add nothing are left out.
+has w = M^-1 (I - Q Q^T) y with M = (I - Q Q^T) A (I - Q Q^T) + gamma Q Q^T, definite for any gamma
+> 0, and R b = Q^T (y - A w). The condition of M is that of A on those weights, as gamma is the mean
+of the other eigenvalues; adding a multiple of P^T P to A instead costs two digits at 2,000 centres.
+Where polynomials are dependent on the centres of a fit, as the second degree is on those of a flat
+part, the rows of P that add nothing are left out.
 """
 
 import math
@@ -38,8 +39,8 @@ _CHUNK = 7
 class Fits(NamedTuple):
     """Solutions of P fits.
 
-    ``weights`` (P, size), ``coefficients`` (P, q) of the polynomials, and for each fit the ``condition`` and the
-    ``ridge`` (P,) on the diagonal, in units of the unknowns.
+    ``weights`` (P, size), ``coefficients`` (P, q) of the polynomials, and for each fit the
+    ``condition`` and the ``ridge`` (P,) on the diagonal, in units of the unknowns.
     """
 
     weights: np.ndarray
@@ -51,16 +52,18 @@ class Fits(NamedTuple):
 def solve(
     basis: Basis, right: Floats, *, smoothing: float = 0.0, condition: float = math.inf
 ) -> tuple[Floats, Floats, float]:
-    """Weights (P, size) and polynomial coefficients (P, q) for right sides (P, size), and the worst fit's condition.
+    """Weights (P, size) and polynomial coefficients (P, q) for right sides (P, size), and the worst
+    fit's condition.
 
-    ``smoothing`` is added to the diagonal (scaled coordinates). ``condition`` is a bound [1]: a ridge of the largest
-    eigenvalue over it, with derivatives in units of the centres' spacing, keeps it; the conditions of the fit are then
-    met to about one part in so many.
+    ``smoothing`` is added to the diagonal (scaled coordinates). ``condition`` is a bound [1]: a
+    ridge of the largest eigenvalue over it, with derivatives in units of the centres' spacing,
+    keeps it; the conditions of the fit are then met to about one part in so many.
 
-    The condition is an estimate for the matrix on the weights that annihilate polynomials, 2-norm, from below and
-    usually within 10. With a bound, of the matrix with its ridge in units of the spacing. Without one, where it is
-    beyond `DOUBTFUL` that number, and a ridge keeps it at `KEPT`, with a NumericalWarning. LinAlgError if the system
-    is singular (the message names the likely cause), or the bound is more than floating-point numbers hold.
+    The condition is an estimate for the matrix on the weights that annihilate polynomials, 2-norm,
+    from below and usually within 10. With a bound, of the matrix with its ridge in units of the
+    spacing. Without one, where it is beyond `DOUBTFUL` that number, and a ridge keeps it at `KEPT`,
+    with a NumericalWarning. LinAlgError if the system is singular (the message names the likely
+    cause), or the bound is more than floating-point numbers hold.
     """
     if math.isfinite(condition):
         found = _solve_bounded(basis, right, smoothing, condition)
@@ -85,7 +88,9 @@ def _solve_bounded(basis: Basis, right: Floats, smoothing: float, bound: float) 
     found = _solve_all(basis, right, smoothing, bound)
     if found is None:
         _raise_if_singular(basis)
-        message = f"no Cholesky factor with a condition of {bound:g}; lower the bound or raise epsilon"
+        message = (
+            f"no Cholesky factor with a condition of {bound:g}; lower the bound or raise epsilon"
+        )
         raise np.linalg.LinAlgError(message)
     return found
 
@@ -93,7 +98,8 @@ def _solve_bounded(basis: Basis, right: Floats, smoothing: float, bound: float) 
 def _solve_all(basis: Basis, right: Floats, smoothing: float, bound: float) -> Fits | None:
     """Solve with a ridge for this bound of the condition, infinity for none.
 
-    None where a matrix is not definite in floating-point numbers, or the polynomials of a single fit are dependent.
+    None where a matrix is not definite in floating-point numbers, or the polynomials of a single
+    fit are dependent.
     """
     fits, q, size = basis.polynomials.shape
     units = _units(basis, bound)
@@ -122,7 +128,9 @@ def _solve_all(basis: Basis, right: Floats, smoothing: float, bound: float) -> F
 
 
 def _units(basis: Basis, bound: float) -> Floats:
-    """Units (size,) of the unknowns: with a bound, derivatives count in that of the spacing of the centres."""
+    """Units (size,) of the unknowns: with a bound, derivatives count in that of the spacing of the
+    centres.
+    """
     units, count = np.ones(basis.size), basis.points.shape[2]
     if math.isfinite(bound):
         # About the spacing of so many centres in the unit ball; a factor of three changes little.
@@ -131,7 +139,8 @@ def _units(basis: Basis, bound: float) -> Floats:
 
 
 def _orthonormal(polynomials: Floats) -> tuple[Floats, Floats, bool]:
-    """Q (P, size, q) and the inverse of R (P, q, q) for polynomials (P, q, size), and whether none are dependent.
+    """Q (P, size, q) and the inverse of R (P, q, q) for polynomials (P, q, size), and whether none
+    are dependent.
 
     The columns of Q for those that are dependent on others are zero.
     """
@@ -152,7 +161,9 @@ def _orthonormal(polynomials: Floats) -> tuple[Floats, Floats, bool]:
 def _solve_some(
     a: Floats, directions: Floats, inverse: Floats, right: Floats, bound: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """The parts of `Fits` for matrices (m, size, size), which are overwritten; letters as in the head of this file."""
+    """The parts of `Fits` for matrices (m, size, size), which are overwritten; letters as in the
+    head of this file.
+    """
     size, q = directions.shape[1:]
     turned, products = np.swapaxes(directions, 1, 2), a @ directions
     if q:
@@ -185,7 +196,9 @@ def _solve_some(
 
 
 def _cholesky(a: Floats) -> Floats:
-    """Lower factors of matrices (m, size, size), upper triangles anything; a single one is factored in its place."""
+    """Lower factors of matrices (m, size, size), upper triangles anything; a single one is factored
+    in its place.
+    """
     if len(a) > 1:
         return np.asarray(np.linalg.cholesky(a))
     _, failed = lapack.dpotrf(a[0].T, lower=0, overwrite_a=1, clean=0)
@@ -199,7 +212,9 @@ def _trace(matrices: Floats) -> Floats:
 
 
 def _largest(matrices: Floats, vectors: Floats, steps: int) -> Floats:
-    """Largest eigenvalues (m,) of symmetric matrices by power iteration from vectors (m, size), lower bounds."""
+    """Largest eigenvalues (m,) of symmetric matrices by power iteration from vectors (m, size),
+    lower bounds.
+    """
     for _ in range(steps):
         size = np.linalg.norm(vectors, axis=1, keepdims=True)
         vectors = (matrices @ (vectors / np.where(size > 0.0, size, 1.0))[:, :, None])[:, :, 0]
@@ -207,7 +222,9 @@ def _largest(matrices: Floats, vectors: Floats, steps: int) -> Floats:
 
 
 def _probe(pivots: Floats) -> Floats:
-    """Vectors (m, size) of random signs and the smallest pivot's unit vector: some of the weakest direction each."""
+    """Vectors (m, size) of random signs and the smallest pivot's unit vector: some of the weakest
+    direction each.
+    """
     count, size = pivots.shape
     signs = np.where((np.arange(size) * 0x9E3779B1) >> 7 & 1, 1.0, -1.0) / math.sqrt(2 * size)
     found, weakest = np.tile(signs, (count, 1)), np.argmin(pivots, axis=1)
@@ -221,7 +238,9 @@ def _substitute_loop(lower, both):
     for p in range(len(lower)):
         x, y = both[p, 0], both[p, 1]
         for j in range(len(x)):
-            row, sx, sy = lower[p, j], 0.0, 0.0
+            row = lower[p, j]
+            sx = 0.0
+            sy = 0.0
             for i in range(j):
                 sx += row[i] * x[i]
                 sy += row[i] * y[i]
@@ -244,7 +263,8 @@ def _warn(basis: Basis) -> None:
     first, second, apart = _nearest_pair(basis.scaled())
     pair = f"; centres {first} and {second} are only {apart:.1e} of the extent apart"
     warnings.warn(
-        f"fit with kernel '{basis.kernel.name}' has a condition beyond {DOUBTFUL:g}: a ridge keeps it at {KEPT:g} and "
+        f"fit with kernel '{basis.kernel.name}' has a condition beyond {DOUBTFUL:g}: a ridge "
+        f"keeps it at {KEPT:g} and "
         f"its conditions are met to a few digits only{pair if apart < 1e-5 else ''}; {remedy}",
         NumericalWarning,
         stacklevel=4,
@@ -270,7 +290,11 @@ def _raise_if_singular(basis: Basis) -> None:
         pair = f"centres {first} and {second} coincide"
         raise np.linalg.LinAlgError(f"singular fit: {pair}; remove duplicates (or use smoothing)")
     tolerance = _DEPENDENT * math.sqrt(basis.size)
-    if q and len(basis.parts) == 1 and np.linalg.matrix_rank(basis.polynomials[0], tol=tolerance) < q:
+    if (
+        q
+        and len(basis.parts) == 1
+        and np.linalg.matrix_rank(basis.polynomials[0], tol=tolerance) < q
+    ):
         degree = int(basis.powers.sum(axis=1).max())
         flat = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         shape = "special (they lie on one surface of that degree)"
@@ -279,6 +303,8 @@ def _raise_if_singular(basis: Basis) -> None:
         elif flat[2] < 1e-9 * flat[0]:
             shape = "coplanar"
         raise np.linalg.LinAlgError(
-            f"singular fit: the {len(points)} centres are {shape}, so a polynomial of degree {degree} "
-            f"({q} terms) is not determined; degree too high: lower it or use a kernel of lower order"
+            f"singular fit: the {len(points)} centres are {shape}, so a polynomial of degree "
+            f"{degree} "
+            f"({q} terms) is not determined; degree too high: lower it or use a kernel of "
+            "lower order"
         )

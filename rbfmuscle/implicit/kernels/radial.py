@@ -1,7 +1,8 @@
 """Loops that fill the radial functions of any kernel for a block of squared distances.
 
-The kernel is chosen once a block, outside the inner loops, which are short enough to become vector code.
-exp and log are written out here because calls into the C library keep a loop from being vectorised.
+The kernel is chosen once a block, outside the inner loops, which are short enough to become vector
+code. exp and log are written out here because calls into the C library keep a loop from being
+vectorised.
 """
 
 from typing import NamedTuple
@@ -15,7 +16,9 @@ ONE, EXP, GAUSS, BINOMIAL, CUT, LOG, POWER = range(7)
 
 
 class Form(NamedTuple):
-    """A kernel as the loops read it: base, its own exponent, whether it ends at s = 1, rows of the table."""
+    """A kernel as the loops read it: base, its own exponent, whether it ends at s = 1, rows of the
+    table.
+    """
 
     base: int
     parameter: float
@@ -32,7 +35,9 @@ _TINY = 2.2250738585072014e-308
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def _exp(x):
-    """exp(x), relative error below 3e-16; 0 where x < -708: x = n log 2 + r, n goes into the exponent's bits."""
+    """exp(x), relative error below 3e-16; 0 where x < -708: x = n log 2 + r, n goes into the
+    exponent's bits.
+    """
     t = min(max(x, -708.0), 709.0)
     whole = np.float64(t * _LOG2E + _SHIFTER)
     n = whole - _SHIFTER
@@ -48,7 +53,9 @@ def _exp(x):
 def _log(x):
     """log(x) for x > 0, relative error below 4e-16; 0 is taken as the smallest normal number."""
     bits = np.float64(max(x, _TINY)).view(np.int64)
-    exponent = np.int64((bits - np.int64(4604544271217802189)) >> np.int64(52))  # mantissa in [0.707, 1.414)
+    exponent = np.int64(
+        (bits - np.int64(4604544271217802189)) >> np.int64(52)
+    )  # mantissa in [0.707, 1.414)
     m = np.int64(bits - (exponent << np.int64(52))).view(np.float64)
     f = m - 1.0
     s = f / (m + 1.0)
@@ -120,7 +127,11 @@ def _binomial_loop(beta, u, b):
 @compiled(error_model="numpy", fastmath={"contract"})
 def _inner_loop(base, row, u, s, b, out):
     """out = base * A(s)."""
-    a0, a1, a2, a3, a4 = row[2], row[3], row[4], row[5], row[6]
+    a0 = row[2]
+    a1 = row[3]
+    a2 = row[4]
+    a3 = row[5]
+    a4 = row[6]
     if base == ONE or (a0 == 0.0 and a1 == 0.0 and a2 == 0.0 and a3 == 0.0 and a4 == 0.0):
         for i in range(u.size):
             out[i] = 0.0
@@ -150,12 +161,16 @@ def _inner_loop(base, row, u, s, b, out):
 
 @compiled(error_model="numpy")
 def _radial_loop(form, wanted, u, work, out):
-    """Fill out[k] (3, n) with the k-th radial function of u = s**2 for each bit k of wanted; work (3, n) is scratch.
+    """Fill out[k] (3, n) with the k-th radial function of u = s**2 for each bit k of wanted; work
+    (3, n) is scratch.
 
-    Where a function is infinite at u = 0 a finite value stands in: it is only ever multiplied by zero vectors.
+    Where a function is infinite at u = 0 a finite value stands in: it is only ever multiplied by
+    zero vectors.
     """
     base, parameter, compact, table = form
-    s, b, more = work[0][: u.size], work[1][: u.size], work[2][: u.size]
+    s = work[0][: u.size]
+    b = work[1][: u.size]
+    more = work[2][: u.size]
     _base_loop(base, parameter, u, s, b, more)
     for k in range(3):
         if not (wanted >> k) & 1:
@@ -163,7 +178,11 @@ def _radial_loop(form, wanted, u, work, out):
         row = table[k]
         values = out[k][: u.size]
         _inner_loop(base, row, u, s, b, values)
-        c0, c1, c2, c3, c4 = row[7], row[8], row[9], row[10], row[11]
+        c0 = row[7]
+        c1 = row[8]
+        c2 = row[9]
+        c3 = row[10]
+        c4 = row[11]
         if c1 != 0.0 or c2 != 0.0 or c3 != 0.0 or c4 != 0.0:
             for i in range(u.size):
                 values[i] += c0 + s[i] * (c1 + s[i] * (c2 + s[i] * (c3 + s[i] * c4)))

@@ -1,18 +1,20 @@
 """The radial kernels: one table row holds every fact about one kernel.
 
-Every kernel is a function of ``s = epsilon * r``. With ``u = s**2`` the radial functions that gradients
-and Hermite fits need are ``2**k d^k phi / du^k``::
+Every kernel is a function of ``s = epsilon * r``. With ``u = s**2`` the radial functions that
+gradients and Hermite fits need are ``2**k d^k phi / du^k``::
 
     k = 0   phi
     k = 1   first   phi'/r
     k = 2   second  (phi'' - phi'/r) / r**2
 
-All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A and B of degree four
-at most. A row lists j, A and B of phi, the others follow; the loops in ``radial.py`` know the bases and no kernel.
+All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A
+and B of degree four at most. A row lists j, A and B of phi, the others follow; the loops in
+``radial.py`` know the bases and no kernel.
 
-Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann (2000);
-SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: the formula r^2 (r^a - 1)
-was not checked against the original of 2019, and neither was the default exponent.
+Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann
+(2000); SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: the
+formula r^2 (r^a - 1) was not checked against the original of 2019, and neither was the default
+exponent.
 """
 
 import math
@@ -34,10 +36,11 @@ _TERMS = 5
 class Kernel:
     """One row of the kernel table.
 
-    ``order`` m is that of conditional positive definiteness: polynomials of degree m - 1 must be added. Phi is C^k at
-    the origin for k = ``smoothness``, 99 for infinitely often; if ``compact`` it vanishes for r >= 1/epsilon.
-    ``has_epsilon`` is False where epsilon only rescales the weights (polyharmonic kernels). ``parameter`` is the
-    kernel's own exponent (beta, a), 0 where it has none.
+    ``order`` m is that of conditional positive definiteness: polynomials of degree m - 1 must be
+    added. Phi is C^k at the origin for k = ``smoothness``, 99 for infinitely often; if ``compact``
+    it vanishes for r >= 1/epsilon. ``has_epsilon`` is False where epsilon only rescales the weights
+    (polyharmonic kernels). ``parameter`` is the kernel's own exponent (beta, a), 0 where it has
+    none.
     """
 
     name: str
@@ -67,7 +70,9 @@ class Kernel:
     @property
     def plain_cube(self) -> bool:
         """Whether phi is s^3, for which the loops have a shorter way."""
-        return bool(self.base == radial.ONE and self.table[0, 0] == 3.0 and self.table[0, 2 + _TERMS] == 1.0)
+        return bool(
+            self.base == radial.ONE and self.table[0, 0] == 3.0 and self.table[0, 2 + _TERMS] == 1.0
+        )
 
     def phi(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """Kernel at distances r (any shape), shape parameter epsilon [1/length]."""
@@ -93,7 +98,9 @@ class Kernel:
 
     def _limit(self, k: int) -> float:
         """Value of the k-th radial function at s = 0."""
-        power, inner, outer = self.table[k, 0], self.table[k, 2 : 2 + _TERMS], self.table[k, 2 + _TERMS :]
+        power = self.table[k, 0]
+        inner = self.table[k, 2 : 2 + _TERMS]
+        outer = self.table[k, 2 + _TERMS :]
         limit = outer[0]
         if self.base == radial.LOG:
             limit = -math.inf * inner[0] if inner[0] else limit
@@ -106,12 +113,19 @@ class Kernel:
         return limit if power == 0 or limit == 0 else math.copysign(math.inf, limit)
 
 
-_E, _U, _T, _L = radial.EXP, radial.GAUSS, radial.CUT, radial.LOG
-_1, _Q, _P = radial.ONE, radial.BINOMIAL, radial.POWER
+_E = radial.EXP
+_U = radial.GAUSS
+_T = radial.CUT
+_L = radial.LOG
+_1 = radial.ONE
+_Q = radial.BINOMIAL
+_P = radial.POWER
 
 
 class _Phi(NamedTuple):
-    """s**power (base * inner + outer), coefficients from the constant up; extra is the base's own exponent."""
+    """s**power (base * inner + outer), coefficients from the constant up; extra is the base's own
+    exponent.
+    """
 
     power: int
     inner: tuple[float | Fraction, ...] = ()
@@ -148,16 +162,24 @@ _ROWS = [
 
 
 def _radial_rows(base: int, parameter: float, phi: _Phi) -> Floats:
-    """Rows (3, 2 + 2 `_TERMS`): j, the base's own exponent, A, B; each (1/s) d/ds of the last, in exact fractions."""
-    rows, exponent, size = np.zeros((3, 2 + 2 * _TERMS)), Fraction(parameter), _TERMS + 2
+    """Rows (3, 2 + 2 `_TERMS`): j, the base's own exponent, A, B; each (1/s) d/ds of the last, in
+    exact fractions.
+    """
+    rows = np.zeros((3, 2 + 2 * _TERMS))
+    exponent = Fraction(parameter)
+    size = _TERMS + 2
     power, inner, outer, extra = phi
     if base == radial.ONE and any(inner):
         raise ValueError(f"a kernel with the base 1 has no A, got {inner}: write it as B")
     a, b = (np.array([Fraction(c) for c in (*part, *[0] * size)][:size]) for part in (inner, outer))
     for row in rows:
         lowest = int(np.flatnonzero((a != 0) | (b != 0))[0])
-        power, a, b = power + lowest, np.roll(a, -lowest), np.roll(b, -lowest)
-        row[:2], row[2 : 2 + _TERMS], row[2 + _TERMS :] = (power, extra), a[:_TERMS], b[:_TERMS]
+        power = power + lowest
+        a = np.roll(a, -lowest)
+        b = np.roll(b, -lowest)
+        row[:2] = (power, extra)
+        row[2 : 2 + _TERMS] = a[:_TERMS]
+        row[2 + _TERMS :] = b[:_TERMS]
         slope, b = (power + np.arange(size)) * a, (power + np.arange(size)) * b
         if base == radial.EXP:
             slope = slope - np.roll(a, 1)
@@ -183,7 +205,9 @@ KERNELS = {
 
 
 def get_kernel(name: Kernel | str) -> Kernel:
-    """Look a kernel up by name; a Kernel is handed back. UsageError names the nearest right one for an unknown name."""
+    """Look a kernel up by name; a Kernel is handed back. UsageError names the nearest right one for
+    an unknown name.
+    """
     if isinstance(name, Kernel):
         return name
     if name not in KERNELS:

@@ -1,8 +1,10 @@
-"""Cells of equal size on a closed mesh: long edges split, farthest points, clustering, and the triangulation over them.
+"""Cells of equal size on a closed mesh: long edges split, farthest points, clustering, and the
+triangulation over them.
 
-For that a mesh is contracted to one vertex for each cluster: edges inside each are contracted where that keeps the
-manifold (link condition: the ends of the edge share exactly two neighbours; Dey et al. 1999); what cannot be contracted
-goes to a neighbouring cluster. The result is closed, 2-manifold and of the input's genus for any clustering.
+For that a mesh is contracted to one vertex for each cluster: edges inside each are contracted where
+that keeps the manifold (link condition: the ends of the edge share exactly two neighbours; Dey et
+al. 1999); what cannot be contracted goes to a neighbouring cluster. The result is closed,
+2-manifold and of the input's genus for any clustering.
 """
 
 import heapq
@@ -35,7 +37,9 @@ def refine_mesh(vertices: Floats, faces: Integers, count: int) -> FineMesh:
     area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum()
     limit = np.sqrt(2 / np.sqrt(3) * area / count) / FINENESS
     while True:
-        sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+        sides = np.sort(
+            np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1
+        )
         long = np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1) > limit
         if not long.any():
             return FineMesh(vertices, faces)
@@ -59,9 +63,9 @@ def _split_edges(
         one = (number == 1) & (ab >= 0)
         two = (number == 2) & (ca < 0)
         # Of the two ways to halve the quadrilateral left over, the shorter diagonal.
-        short = np.linalg.norm(0.5 * (vertices[b] + vertices[c]) - vertices[a], axis=1) < np.linalg.norm(
-            0.5 * (vertices[a] + vertices[b]) - vertices[c], axis=1
-        )
+        short = np.linalg.norm(
+            0.5 * (vertices[b] + vertices[c]) - vertices[a], axis=1
+        ) < np.linalg.norm(0.5 * (vertices[a] + vertices[b]) - vertices[c], axis=1)
         for rows, triangles in (
             (one, ((a, ab, c), (ab, b, c))),
             (two & short, ((ab, b, bc), (a, ab, bc), (a, bc, c))),
@@ -69,11 +73,16 @@ def _split_edges(
         ):
             pieces += [np.column_stack(t)[rows] for t in triangles]
     (a, b, c), (ab, bc, ca) = faces.T, middle.T
-    pieces += [np.column_stack(t)[number == 3] for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    pieces += [
+        np.column_stack(t)[number == 3]
+        for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    ]
     return np.vstack([vertices, vertices[ends].mean(axis=1)]), np.vstack(pieces)
 
 
-def cluster_mesh(fine: FineMesh, density: Floats, count: int, seed: int) -> tuple[Integers, Integers]:
+def cluster_mesh(
+    fine: FineMesh, density: Floats, count: int, seed: int
+) -> tuple[Integers, Integers]:
     """Cells of equal ``density`` times area, and the triangulation dual to them."""
     area = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1)
     weight = np.bincount(fine.faces.ravel(), np.repeat(area / 3, 3), len(fine.vertices)) * density
@@ -123,7 +132,9 @@ def _farthest_loop(start, other, length, first, count, labels):
 
 @compiled
 def _cell_energy(moment, mass, k, sign, x, w):
-    """Inertia of cell k but for a constant, with a vertex added (sign 1), taken away (-1) or neither."""
+    """Inertia of cell k but for a constant, with a vertex added (sign 1), taken away (-1) or
+    neither.
+    """
     m = mass[k] + sign * w
     if m <= 0:
         return 0.0
@@ -155,8 +166,12 @@ def _equalise_loop(vertices, weight, edges, labels, count):
                 if old == k or members[old] == 1:
                     continue
                 x, w = vertices[v], weight[v]
-                before = _cell_energy(moment, mass, old, 0.0, x, w) + _cell_energy(moment, mass, k, 0.0, x, w)
-                after = _cell_energy(moment, mass, old, -1.0, x, w) + _cell_energy(moment, mass, k, 1.0, x, w)
+                before = _cell_energy(moment, mass, old, 0.0, x, w) + _cell_energy(
+                    moment, mass, k, 0.0, x, w
+                )
+                after = _cell_energy(moment, mass, old, -1.0, x, w) + _cell_energy(
+                    moment, mass, k, 1.0, x, w
+                )
                 if after < before - 1e-12 * abs(before):
                     moved += 1
                     labels[v] = k
@@ -171,10 +186,14 @@ def _equalise_loop(vertices, weight, edges, labels, count):
             break
 
 
-def _mark_loose(tail: Integers, other: Integers, weight: Floats, labels: Integers, count: int) -> None:
+def _mark_loose(
+    tail: Integers, other: Integers, weight: Floats, labels: Integers, count: int
+) -> None:
     """Label all but the heaviest connected piece of each cell with -2."""
     same = labels[tail] == labels[other]
-    links = coo_matrix((np.ones(same.sum()), (tail[same], other[same])), shape=(len(labels), len(labels)))
+    links = coo_matrix(
+        (np.ones(same.sum()), (tail[same], other[same])), shape=(len(labels), len(labels))
+    )
     _, piece = connected_components(links, directed=False)
     heaviest = np.full(count, -1)
     ordered = np.argsort(np.bincount(piece, weight))
@@ -201,12 +220,14 @@ def _join_loop(start, other, labels):
 def contract_clusters(
     faces: Integers, labels: Integers, weights: Floats, count: int
 ) -> tuple[Integers, Integers]:
-    """Contract a closed, oriented 2-manifold to ``count`` vertices, as a clustering says where the topology allows it.
+    """Contract a closed, oriented 2-manifold to ``count`` vertices, as a clustering says where the
+    topology allows it.
 
-    ``labels`` (n,) are the clusters of the vertices, 0 .. count - 1, ``weights`` (n,) their areas: the heaviest piece
-    of a cluster that falls apart keeps its name. ``count`` is at least 4 a connected component, more for handles.
-    Returns the final labels (n,), equal to those given but for pieces that had to change, and triangles (k, 3) over the
-    clusters, oriented like ``faces`` (m, 3). MeshError if no contraction to so few vertices keeps the topology.
+    ``labels`` (n,) are the clusters of the vertices, 0 .. count - 1, ``weights`` (n,) their areas:
+    the heaviest piece of a cluster that falls apart keeps its name. ``count`` is at least 4 a
+    connected component, more for handles. Returns the final labels (n,), equal to those given but
+    for pieces that had to change, and triangles (k, 3) over the clusters, oriented like ``faces``
+    (m, 3). MeshError if no contraction to so few vertices keeps the topology.
     """
     twin = opposite_half_edges(faces)
     tail = faces.ravel().copy()
@@ -218,7 +239,8 @@ def contract_clusters(
     live = _contract_loop(tail, twin, out, parent, label, weight, int(used.sum()), count)
     if live != count:
         raise MeshError(
-            f"mesh cannot be contracted to {count} points without changing its topology ({live} remain); "
+            f"mesh cannot be contracted to {count} points without changing its topology ({live} "
+            "remain); "
             "ask for more points, or remove small components and handles"
         )
     roots = np.flatnonzero(used & (parent == np.arange(len(parent))))
@@ -290,7 +312,9 @@ def _contract(h, tail, twin, out, parent, weight):
 
 @compiled
 def _contract_one(tail, twin, out, parent, label, weight, mark, main):
-    """Contract the lightest left-over piece into a neighbour; any light pair where no such piece can be."""
+    """Contract the lightest left-over piece into a neighbour; any light pair where no such piece
+    can be.
+    """
     best, best_cost = -1, np.inf
     for h in range(len(tail)):
         if tail[h] < 0:
@@ -306,7 +330,9 @@ def _contract_one(tail, twin, out, parent, label, weight, mark, main):
 
 @compiled
 def _contract_loop(tail, twin, out, parent, label, weight, live, count):
-    """Contract edges inside clusters, then left-over pieces one by one; return the number of vertices left."""
+    """Contract edges inside clusters, then left-over pieces one by one; return the number of
+    vertices left.
+    """
     mark = np.full(len(parent), -1)
     main = np.full(label.max() + 1, -1)
     while True:
@@ -326,7 +352,11 @@ def _contract_loop(tail, twin, out, parent, label, weight, live, count):
             return live
         main[:] = -1
         for v in range(len(parent)):
-            if parent[v] == v and out[v] >= 0 and (main[label[v]] < 0 or weight[v] > weight[main[label[v]]]):
+            if (
+                parent[v] == v
+                and out[v] >= 0
+                and (main[label[v]] < 0 or weight[v] > weight[main[label[v]]])
+            ):
                 main[label[v]] = v
         if not _contract_one(tail, twin, out, parent, label, weight, mark, main):
             return live

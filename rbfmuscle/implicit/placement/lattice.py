@@ -1,7 +1,9 @@
-"""A lattice through a muscle's volume: shape functions, quadrature of the material in each cell, regions.
+"""A lattice through a muscle's volume: shape functions, quadrature of the material in each cell,
+regions.
 
-The lattice belongs to the muscle's shape alone, not to its centres, so what is integrated over it resists alike
-however many centres there are. Where material is, the signed distance to the rest mesh tells.
+The lattice belongs to the muscle's shape alone, not to its centres, so what is integrated over it
+resists alike however many centres there are. Where material is, the signed distance to the rest
+mesh tells.
 """
 
 from dataclasses import dataclass
@@ -22,7 +24,9 @@ LEAST_REGION = 0.3  # of the mean volume of the regions
 
 @dataclass(frozen=True)
 class Embedding:
-    """Shape functions at n points: 27 nodes of each, their values, their gradients (n, 27, 3) by rest coordinates."""
+    """Shape functions at n points: 27 nodes of each, their values, their gradients (n, 27, 3) by
+    rest coordinates.
+    """
 
     indices: np.ndarray
     weights: np.ndarray
@@ -32,10 +36,11 @@ class Embedding:
 class Lattice:
     """Cells of a box along a mesh's principal axes that hold some of its volume, and their nodes.
 
-    Of vertices (n, 3) and faces (m, 3) of the rest mesh; ``nodes`` says about how many are wanted. Shape functions are
-    quadratic B-splines along each axis, which reproduce linear functions from the nodes at rest, ``rest`` (N, 3).
-    ``points`` (Q, 3) and ``weights`` (Q,) [volume of the mesh's unit] are the quadrature of the material, ``cell`` (Q,)
-    the cell of each point; ``spacing`` (3,) holds the sides of a cell.
+    Of vertices (n, 3) and faces (m, 3) of the rest mesh; ``nodes`` says about how many are wanted.
+    Shape functions are quadratic B-splines along each axis, which reproduce linear functions from
+    the nodes at rest, ``rest`` (N, 3). ``points`` (Q, 3) and ``weights`` (Q,) [volume of the mesh's
+    unit] are the quadrature of the material, ``cell`` (Q,) the cell of each point; ``spacing`` (3,)
+    holds the sides of a cell.
     """
 
     def __init__(self, vertices: Floats, faces: Integers, nodes: int) -> None:
@@ -66,7 +71,9 @@ class Lattice:
         depth = self.distance(middle @ self.axes)
         half = 0.5 * float(np.linalg.norm(self.spacing))
         used = depth < 0.0
-        touched = self._key(np.clip(((surface - self.low) / self.spacing).astype(int), 0, self.count - 1))
+        touched = self._key(
+            np.clip(((surface - self.low) / self.spacing).astype(int), 0, self.count - 1)
+        )
         used[np.unique(touched)] = True
         self.full = (depth < -half)[used]
         self.cells = every[used]
@@ -98,23 +105,29 @@ class Lattice:
         value, slope = _basis(s)
         weights = np.einsum("na,nb,nc->nabc", value[:, 0], value[:, 1], value[:, 2])
         parts = [
-            np.einsum("na,nb,nc->nabc", *(slope[:, k] if k == axis else value[:, k] for k in range(3)))
+            np.einsum(
+                "na,nb,nc->nabc", *(slope[:, k] if k == axis else value[:, k] for k in range(3))
+            )
             / self.spacing[axis]
             for axis in range(3)
         ]
         count = len(s)
         slopes = np.stack(parts, -1).reshape(count, -1, 3) @ self.axes
         return Embedding(
-            np.ascontiguousarray(self.nodes[cell]), np.ascontiguousarray(weights.reshape(count, -1)),
+            np.ascontiguousarray(self.nodes[cell]),
+            np.ascontiguousarray(weights.reshape(count, -1)),
             np.ascontiguousarray(slopes),
-        )  # fmt: skip
+        )
 
     def _integrate(self) -> None:
         """Eight points a cell with the volume, the middle and the spread of the material in it."""
         fine = (np.indices((FINE, FINE, FINE)).reshape(3, -1).T + 0.5) / FINE
         # Those of a full cell are Gauss's.
         whole = _split(fine)
-        points, weights, cells, local = [], [], [], []
+        points = []
+        weights = []
+        cells = []
+        local = []
         mixed = np.flatnonzero(~self.full)
         where = self.low + (self.cells[mixed][:, None, :] + fine) * self.spacing
         inside = self.distance(where.reshape(-1, 3) @ self.axes).reshape(len(mixed), -1) < 0.0
@@ -137,9 +150,11 @@ class Lattice:
         self.quadrature = self._at(self.cell, np.concatenate(local))
 
     def regions(self, count: int) -> Integers:
-        """Region of each quadrature point: whole cells, halved by volume until there are ``count`` regions.
+        """Region of each quadrature point: whole cells, halved by volume until there are ``count``
+        regions.
 
-        A group of which no part is large enough stays whole: the pressure of a sliver would grow without bounds.
+        A group of which no part is large enough stays whole: the pressure of a sliver would grow
+        without bounds.
         """
         volume = np.bincount(self.cell, self.weights, minlength=len(self.cells))
         least = LEAST_REGION * volume.sum() / count
@@ -163,7 +178,8 @@ class Lattice:
         return out[self.cell]
 
     def second_differences(self) -> Floats:
-        """Σ over axes of the squared second differences of the nodes along them, (N, N), zero for every linear map.
+        """Σ over axes of the squared second differences of the nodes along them, (N, N), zero for
+        every linear map.
 
         It carries nodes whose support holds hardly any material along with their neighbours.
         """
@@ -181,7 +197,9 @@ class Lattice:
 
 
 def _axes(points: Floats) -> Floats:
-    """Right-handed principal axes as rows, signs by the points' skewness; the identity where they are not clear."""
+    """Right-handed principal axes as rows, signs by the points' skewness; the identity where they
+    are not clear.
+    """
     offset = points - points.mean(axis=0)
     _, sizes, axes = np.linalg.svd(offset, full_matrices=False)
     if np.diff(sizes).max() > -0.02 * sizes[0]:
@@ -199,7 +217,9 @@ def _basis(s: Floats) -> tuple[Floats, Floats]:
 
 
 def _split(points: Floats) -> tuple[Floats, Floats]:
-    """Eight points with the middle and the spread of many: halved along each axis, then moved apart."""
+    """Eight points with the middle and the spread of many: halved along each axis, then moved
+    apart.
+    """
     groups = [points]
     for axis in range(3):
         halves = []

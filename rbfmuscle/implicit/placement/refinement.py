@@ -1,8 +1,9 @@
-"""Centres and normals that fit the whole surface in the least-squares sense, not only where the centres lie.
+"""Centres and normals that fit the whole surface in the least-squares sense, not only where the
+centres lie.
 
-A Hermite field is linear in the values v_j and gradients g_j asked for at its centres. Here these are what makes the
-field smallest at many points of the surface; a centre of value v_j then moves by -v_j along its normal, so that the
-field is still one of zeros and unit normals.
+A Hermite field is linear in the values v_j and gradients g_j asked for at its centres. Here these
+are what makes the field smallest at many points of the surface; a centre of value v_j then moves by
+-v_j along its normal, so that the field is still one of zeros and unit normals.
 """
 
 import math
@@ -24,8 +25,9 @@ from rbfmuscle.validation import UsageError
 
 # Name of this placement of centres beside those of `sampling.PLACEMENTS`.
 FITTED = "fitted"
-# What moving a centre counts beside a miss of the same size at a sample, each on average over its kind; turning a
-# normal by one counts as moving by the spacing. Half of it lets thin rims swell, more of it gives accuracy away.
+# What moving a centre counts beside a miss of the same size at a sample, each on average over its
+# kind; turning a normal by one counts as moving by the spacing. Half of it lets thin rims swell,
+# more of it gives accuracy away.
 STIFFNESS = 0.1
 ROUNDS = 3
 SAMPLES = 4000
@@ -35,12 +37,14 @@ _CHUNK = 1000
 def fit_sample(
     sample: SurfaceSample, vertices: ArrayLike, faces: ArrayLike, *, fit: FieldFit, seed: int = 0
 ) -> SurfaceSample:
-    """Centres moved along their normals, and normals turned, so that the field is small on the whole mesh.
+    """Centres moved along their normals, and normals turned, so that the field is small on the
+    whole mesh.
 
-    ``sample`` is one of the mesh (vertices (n, 3), faces (m, 3)) with unit normals, ``fit`` that of the field that will
-    be fitted to it; ``seed`` is that of points of the mesh. The least-squares problem is that of
-    the given centres; what their moves leave is met by further rounds of it. Returns the sample of the round, the given
-    one included, whose field misses the mesh least. UsageError for a kernel that is not smooth enough.
+    ``sample`` is one of the mesh (vertices (n, 3), faces (m, 3)) with unit normals, ``fit`` that of
+    the field that will be fitted to it; ``seed`` is that of points of the mesh. The least-squares
+    problem is that of the given centres; what their moves leave is met by further rounds of it.
+    Returns the sample of the round, the given one included, whose field misses the mesh least.
+    UsageError for a kernel that is not smooth enough.
     """
     if not fit.kernel.hermite:
         raise UsageError(f"kernel '{fit.kernel.name}' has no Hermite fit: take greedy centres")
@@ -63,14 +67,20 @@ def fit_sample(
 
 
 class _Problem(NamedTuple):
-    """Linear least squares for values and gradients at the centres; they change too little for another matrix."""
+    """Linear least squares for values and gradients at the centres; they change too little for
+    another matrix.
+    """
 
-    cardinal: np.ndarray  # (4K, n), values at the samples for unit values and gradients: of order one
+    cardinal: (
+        np.ndarray
+    )  # (4K, n), values at the samples for unit values and gradients: of order one
     factor: tuple[np.ndarray, bool]  # of its normal matrix
     scale: float
 
 
-def _problem(points: Floats, normals: Floats, samples: Floats, fit: FieldFit, reach: float) -> _Problem:
+def _problem(
+    points: Floats, normals: Floats, samples: Floats, fit: FieldFit, reach: float
+) -> _Problem:
     """The problem of some centres."""
     count = len(points)
     basis = Basis(points, fit.kernel, fit.epsilon, hermite=True)
@@ -88,10 +98,14 @@ def _problem(points: Floats, normals: Floats, samples: Floats, fit: FieldFit, re
     weight = np.full(basis.size, STIFFNESS)
     weight[count:] *= reach / scale  # derivatives are by scaled coordinates
     matrix[np.diag_indices(basis.size)] += weight**2 * len(samples) / count
-    return _Problem(cardinal, linalg.cho_factor(matrix, overwrite_a=True, check_finite=False), scale)
+    return _Problem(
+        cardinal, linalg.cho_factor(matrix, overwrite_a=True, check_finite=False), scale
+    )
 
 
-def _step(points: Floats, normals: Floats, value: Floats, problem: _Problem) -> tuple[Floats, Floats]:
+def _step(
+    points: Floats, normals: Floats, value: Floats, problem: _Problem
+) -> tuple[Floats, Floats]:
     """Centres and normals after the change that undoes most of the values (n,) at the samples."""
     count = len(points)
     change = linalg.cho_solve(problem.factor, problem.cardinal @ -value, check_finite=False)
@@ -103,7 +117,9 @@ def _step(points: Floats, normals: Floats, value: Floats, problem: _Problem) -> 
 
 def _rows(basis: Basis, at: Floats) -> Floats:
     """Rows (n, size + q) of the field at scaled points: for the weights a, B and the polynomial."""
-    kernel, points, epsilon = basis.kernel, basis.points[0].T, float(basis.epsilon[0])
+    kernel = basis.kernel
+    points = basis.points[0].T
+    epsilon = float(basis.epsilon[0])
     offset, r = at[:, None, :] - points, cdist(at, points)
     first = kernel.first(r, epsilon)
     parts = [kernel.phi(r, epsilon), *(-first * offset[:, :, k] for k in range(3))]

@@ -1,4 +1,6 @@
-"""Parents of bones; hip, knee and ankle with methods, names, signs and ranges of anatomy; a joint as guessed."""
+"""Parents of bones; hip, knee and ankle with methods, names, signs and ranges of anatomy; a joint
+as guessed.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -6,7 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.importers.guess.landmarks import Fit, across, fit_condyles, fit_dome, sole_direction, unit
+from rbfmuscle.importers.guess.landmarks import (
+    Fit,
+    across,
+    fit_condyles,
+    fit_dome,
+    sole_direction,
+    unit,
+)
 from rbfmuscle.importers.guess.orientation import Orientation, shank_up
 from rbfmuscle.importers.guess.parts import Part
 
@@ -34,9 +43,12 @@ PARENTS = {
 }
 ROOTS = ("pelvis", "ilium", "sacrum", "scapula", "rib", "vertebra", "femur", "humerus", "tibia")
 # Class of the child: name of its joint with one of its parents above.
-JOINTS = dict(femur="hip", tibia="knee", talus="ankle", patella="patella", humerus="shoulder", ulna="elbow")
-# Joint: coordinates and ranges [degree] (American Academy of Orthopaedic Surgeons 1965, Joint Motion). Positive as the
-# International Society of Biomechanics has it (Wu et al. 2002): flexion, adduction, internal rotation, dorsiflexion.
+JOINTS = dict(
+    femur="hip", tibia="knee", talus="ankle", patella="patella", humerus="shoulder", ulna="elbow"
+)
+# Joint: coordinates and ranges [degree] (American Academy of Orthopaedic Surgeons 1965, Joint
+# Motion). Positive as the International Society of Biomechanics has it (Wu et al. 2002): flexion,
+# adduction, internal rotation, dorsiflexion.
 COORDINATES = {
     "hip": {"flexion": (-30.0, 120.0), "adduction": (-45.0, 30.0), "rotation": (-45.0, 45.0)},
     "knee": {"flexion": (-10.0, 135.0)},
@@ -54,14 +66,20 @@ class JointGuess:
     kind: str  # "ball", "hinge", "custom" (the patella) or "fixed"
     centre: np.ndarray  # (3,) [scene unit]
     axes: dict[str, np.ndarray]  # (3,) by coordinate
-    confidence: float  # 0 to 1: where something was fitted, one minus half the misfit over its limit
+    confidence: (
+        float  # 0 to 1: where something was fitted, one minus half the misfit over its limit
+    )
     reason: str
     name: str = ""
     ranges: dict[str, tuple] = field(default_factory=dict)  # of coordinates [degree]
     rest: float = 0.0  # value of the first coordinate in the pose of the meshes [degree]
-    tables: dict[str, list] = field(default_factory=dict)  # rotations and translations of a custom joint
+    tables: dict[str, list] = field(
+        default_factory=dict
+    )  # rotations and translations of a custom joint
     follows: str = ""  # full name of the coordinate that the first one follows
-    ligament: np.ndarray | None = None  # ends (2, 3) of a patella's, on it and on the tibia, at rest
+    ligament: np.ndarray | None = (
+        None  # ends (2, 3) of a patella's, on it and on the tibia, at rest
+    )
 
     @property
     def axis(self) -> np.ndarray:
@@ -75,16 +93,24 @@ class JointGuess:
 
     def row(self) -> dict[str, Any]:
         """The joint's table in the scene file [degree, scene unit]."""
-        row: dict[str, Any] = {"name": self.name, "parent": self.parent.name, "child": self.child.name}
+        row: dict[str, Any] = {
+            "name": self.name,
+            "parent": self.parent.name,
+            "child": self.child.name,
+        }
         row["type"] = self.kind
         if self.kind == "fixed":
             return row
         row["centre"] = rounded(self.centre, 6)
         if not self.tables:
             row["axes"] = {name: rounded(axis, 6) for name, axis in self.axes.items()}
-        facts: dict[str, dict] = {name: {"range": rounded(ends, 1)} for name, ends in self.ranges.items()}
+        facts: dict[str, dict] = {
+            name: {"range": rounded(ends, 1)} for name, ends in self.ranges.items()
+        }
         first = facts.setdefault(next(iter(self.axes)), {})
-        first |= ({"rest": self.rest} if self.rest else {}) | ({"motion": "rotation"} if self.tables else {})
+        first |= ({"rest": self.rest} if self.rest else {}) | (
+            {"motion": "rotation"} if self.tables else {}
+        )
         return row | self.tables | ({"coordinates": facts} if first else {})
 
 
@@ -100,7 +126,9 @@ def make_anatomical(
     orientation: Orientation,
     millimetre: float,
 ) -> None:
-    """Give a joint the method and the coordinates that anatomy has for it; ``joints`` are those before it."""
+    """Give a joint the method and the coordinates that anatomy has for it; ``joints`` are those
+    before it.
+    """
     pair, right = (joint.parent.kind, joint.child.kind), orientation.right
     if pair[1] == "femur" and joint.kind == "ball":
         lowest = joint.child.points[np.argmin(joint.child.points @ orientation.superior)]
@@ -120,7 +148,9 @@ def make_anatomical(
         joint.axes = {"angle": joint.axis * (-1.0 if joint.axis @ right < 0.0 else 1.0)}
 
 
-def _take(joint: JointGuess, fit: Fit | None, method: str, name: str, direction: np.ndarray) -> None:
+def _take(
+    joint: JointGuess, fit: Fit | None, method: str, name: str, direction: np.ndarray
+) -> None:
     """Take a fitted axis, in about a direction (3,), for a hinge."""
     joint.kind, joint.ranges = "hinge", COORDINATES[name]
     coordinate = next(iter(joint.ranges))
@@ -130,15 +160,22 @@ def _take(joint: JointGuess, fit: Fit | None, method: str, name: str, direction:
         return
     radii = " and ".join(f"{radius:.4g}" for radius in fit.radii)
     joint.reason = f"{method}, radii {radii}, misfit {fit.misfit:.2g}"
-    joint.centre, joint.axes = fit.centre, {coordinate: fit.axis * np.copysign(1.0, fit.axis @ direction)}
+    joint.centre, joint.axes = (
+        fit.centre,
+        {coordinate: fit.axis * np.copysign(1.0, fit.axis @ direction)},
+    )
     joint.confidence = max(1.0 - 0.5 * fit.misfit / (MISFIT * min(fit.radii)), 0.1)
-    joint.confidence -= 0.2 * (len(fit.radii) < 2)  # one surface alone shows the direction less well
+    joint.confidence -= 0.2 * (
+        len(fit.radii) < 2
+    )  # one surface alone shows the direction less well
     if fit.wrong:
         joint.reason, joint.confidence = f"{joint.reason}; {fit.wrong}: refused, correct it", 0.1
 
 
 def set_rest(joints: list[JointGuess], bones: list[Part]) -> None:
-    """Set the knee flexion and ankle dorsiflexion of the meshes: by axes of the bones and the sole of the foot."""
+    """Set the knee flexion and ankle dorsiflexion of the meshes: by axes of the bones and the sole
+    of the foot.
+    """
     for joint in joints:
         if joint.child.kind == "tibia" and "flexion" in joint.axes:
             thigh, shank = joint.parent.frame.superior, shank_up(joint.child, bones)
@@ -149,13 +186,18 @@ def set_rest(joints: list[JointGuess], bones: list[Part]) -> None:
                     shank = joint.centre - other.centre
             joint.rest = _angle_about(joint.axis, thigh, shank)
         elif "dorsiflexion" in joint.axes:
-            feet = [b.points for b in bones if b.kind in ("foot", "calcaneus") and b.side == joint.child.side]
+            feet = [
+                b.points
+                for b in bones
+                if b.kind in ("foot", "calcaneus") and b.side == joint.child.side
+            ]
             up = shank_up(joint.parent, bones)
             if feet:
                 sole = sole_direction(np.vstack(feet), joint.axis, up)
                 joint.rest = _angle_about(joint.axis, np.cross(up, joint.axis), sole)
         joint.ranges = {
-            name: (min(low, joint.rest), max(high, joint.rest)) for name, (low, high) in joint.ranges.items()
+            name: (min(low, joint.rest), max(high, joint.rest))
+            for name, (low, high) in joint.ranges.items()
         }
 
 

@@ -1,9 +1,9 @@
 """Where a muscle holds: at its ends, and where it lies on a bone that anatomy names.
 
-A muscle's length is measured along its surface. Where an end lies on a bone, the patch is what touches it; where
-the belly stops short of its bone, the patch is the cap of the end that points there, and a tendon goes straight to the
-nearest place of the bone. At a patella that follows its knee, the tendon goes on along the patellar ligament to the
-tibia.
+A muscle's length is measured along its surface. Where an end lies on a bone, the patch is what
+touches it; where the belly stops short of its bone, the patch is the cap of the end that points
+there, and a tendon goes straight to the nearest place of the bone. At a patella that follows its
+knee, the tendon goes on along the patellar ligament to the tibia.
 """
 
 from __future__ import annotations
@@ -27,17 +27,22 @@ if TYPE_CHECKING:
 # A bone nearer than this [mm] is touched; the patch is what lies within TOUCH of the nearest.
 NEAR, TOUCH = 6.0, 3.0
 MAYBE = 4.0  # a bone that only may hold a muscle does so where it is nearer than this [mm]
-# Length [mm] of the cap that is held where an end stops short of its bone, and as a share of the muscle.
+# Length [mm] of the cap that is held where an end stops short of its bone, and as a share of the
+# muscle.
 CAP, CAP_SHARE = 8.0, 0.12
 # Fewest vertices of a patch, and the greatest share of the muscle that all patches may hold.
 FEWEST, LARGEST = 8, 0.6
-REACH = 0.75  # how far along the muscle a patch at one end may reach (0 at that end, 1 at the other)
+REACH = (
+    0.75  # how far along the muscle a patch at one end may reach (0 at that end, 1 at the other)
+)
 ASIDE = 60.0  # how much farther a bone counts that an end does not point to
 FAR = 25.0  # an end farther than this [mm] from its bone gets a tendon
 
 
 class TendonGuess(NamedTuple):
-    """Bone and place (3,) of a tendon's insertion; (bone, place) of its via points from the muscle on [scene unit]."""
+    """Bone and place (3,) of a tendon's insertion; (bone, place) of its via points from the muscle
+    on [scene unit].
+    """
 
     bone: Part
     to: np.ndarray
@@ -46,7 +51,9 @@ class TendonGuess(NamedTuple):
 
 @dataclass
 class AttachmentGuess:
-    """Vertices of a muscle's mended mesh that a bone holds, their least distance to it [mm], and why."""
+    """Vertices of a muscle's mended mesh that a bone holds, their least distance to it [mm], and
+    why.
+    """
 
     bone: Part
     vertices: np.ndarray
@@ -75,7 +82,9 @@ class MuscleGuess:
 
 
 class Skeleton(NamedTuple):
-    """What muscles are held by; ``bodies`` gives of bones that move as one the one that stands for all."""
+    """What muscles are held by; ``bodies`` gives of bones that move as one the one that stands for
+    all.
+    """
 
     bones: dict[Part, Bone]
     bodies: dict[Part, Part]
@@ -88,7 +97,9 @@ class Ends:
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         count = len(mesh.vertices)
-        graph = coo_matrix((mesh.edges_unique_length, mesh.edges_unique.T), shape=(count, count)).tocsr()
+        graph = coo_matrix(
+            (mesh.edges_unique_length, mesh.edges_unique.T), shape=(count, count)
+        ).tocsr()
 
         def away_from(vertex):
             distance = dijkstra(graph, directed=False, indices=vertex)
@@ -105,9 +116,13 @@ class Ends:
 
 
 def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -> MuscleGuess:
-    """Find the bones that hold a muscle, by its name where ``named``, else the nearest, and the vertices they hold."""
+    """Find the bones that hold a muscle, by its name where ``named``, else the nearest, and the
+    vertices they hold.
+    """
     ends, millimetre = Ends(muscle.mesh), skeleton.millimetre
-    distances = {b: bone.distances(muscle.points) / millimetre for b, bone in skeleton.bones.items()}
+    distances = {
+        b: bone.distances(muscle.points) / millimetre for b, bone in skeleton.bones.items()
+    }
     guess = MuscleGuess(muscle, [], 1.0)
     places = _named_places(guess, distances, ends) if named and muscle.facts is not None else []
     by_name = bool(places)
@@ -132,7 +147,9 @@ def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -
 
 
 def _compare(guess, bodies, distances):
-    """Name what names and distances say differently: a patch that touches another bone than that of its name."""
+    """Name what names and distances say differently: a patch that touches another bone than that of
+    its name.
+    """
     named = {bodies[hold.bone] for hold in guess.holds}
     for hold in guess.holds:
         near = {bone: float(distance[hold.vertices].min()) for bone, distance in distances.items()}
@@ -157,7 +174,9 @@ def _named_places(guess, distances, ends):
 
     def cost(first):
         tips = ends.tips[first], ends.tips[1 - first]
-        return sum(max(distances[bone][tip], 0.0) for group, tip in zip(groups, tips) for bone in group)
+        return sum(
+            max(distances[bone][tip], 0.0) for group, tip in zip(groups, tips) for bone in group
+        )
 
     first = min((0, 1), key=cost)
     insertions = [(bone, 1 - first) for bone in groups[1] if bone not in groups[0]]
@@ -168,21 +187,27 @@ def _best_of(kinds, muscle, distances):
     """The bone to hold at: of the first class that is there, on the muscle's side, the nearest."""
     for kind in kinds:
         here = [bone for bone in distances if bone.kind == kind]
-        fitting = [bone for bone in here if not bone.side or not muscle.side or bone.side == muscle.side]
+        fitting = [
+            bone for bone in here if not bone.side or not muscle.side or bone.side == muscle.side
+        ]
         if fitting:
             return min(fitting, key=lambda bone: distances[bone].min())
     return None
 
 
 def _nearest_places(muscle, bodies, distances, ends):
-    """(bone, end) without names: what an end touches, else what it points to; not twice the same body."""
+    """(bone, end) without names: what an end touches, else what it points to; not twice the same
+    body.
+    """
     places, wishes = [], []
     for end in (0, 1):
         cap = ends.along(end) < CAP_SHARE
         score = {}
         for bone, distance in distances.items():
             near = distance[cap].min()
-            score[bone] = near / NEAR - 1.0 if near < NEAR else _aim(muscle.points, ends.along(end), bone)
+            score[bone] = (
+                near / NEAR - 1.0 if near < NEAR else _aim(muscle.points, ends.along(end), bone)
+            )
         order = sorted(score, key=score.__getitem__)
         wishes.append((score[order[0]], end, order))
     for _, end, order in sorted(wishes, key=lambda wish: wish[0]):
@@ -192,7 +217,9 @@ def _nearest_places(muscle, bodies, distances, ends):
 
 
 def _aim(points, along, bone):
-    """How far an end is from a bone in the direction that it points to; what lies aside counts as farther."""
+    """How far an end is from a bone in the direction that it points to; what lies aside counts as
+    farther.
+    """
     tip = points[along < 0.03].mean(axis=0)
     direction = unit(tip - points[(along > 0.1) & (along < 0.25)].mean(axis=0))
     away = bone.points - tip
@@ -213,7 +240,9 @@ def _hold(bone, distance, ends, end, millimetre):
     if len(chosen) < FEWEST:
         chosen = np.sort(np.argsort(ends.away[end], kind="stable")[:FEWEST])
     gap = float(distance[chosen].min())
-    return AttachmentGuess(bone, chosen, gap, f"at the end that points to the bone, {gap:.3g} mm from it")
+    return AttachmentGuess(
+        bone, chosen, gap, f"at the end that points to the bone, {gap:.3g} mm from it"
+    )
 
 
 def _tendon(hold, muscle, joints):

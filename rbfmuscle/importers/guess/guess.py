@@ -1,4 +1,6 @@
-"""A scene guessed from a folder of meshes: bones, joints, attachments, each with a confidence and its reason."""
+"""A scene guessed from a folder of meshes: bones, joints, attachments, each with a confidence and
+its reason.
+"""
 
 import re
 from dataclasses import dataclass, field
@@ -39,9 +41,15 @@ class SceneGuess:
     def doubts(self) -> list[str]:
         """One line for each guess that wants a look, the least sure first."""
         rows = [(0.3, f"bone {bone.name}: {bone.doubt}") for bone in self.parts.bones if bone.doubt]
-        rows += [(0.0, f"{file} cannot be used: {reason}") for file, reason in self.parts.unusable.items()]
+        rows += [
+            (0.0, f"{file} cannot be used: {reason}")
+            for file, reason in self.parts.unusable.items()
+        ]
         rows += [(0.1, doubt) for doubt in (self.orientation.doubts if self.orientation else ())]
-        rows += [(joint.confidence, f"joint of {joint.child.name}: {joint.reason}") for joint in self.joints]
+        rows += [
+            (joint.confidence, f"joint of {joint.child.name}: {joint.reason}")
+            for joint in self.joints
+        ]
         for muscle in self.muscles:
             reasons = "; ".join(filter(None, [muscle.wrong, *muscle.reasons]))
             rows.append((muscle.confidence, f"muscle {muscle.muscle.name}: {reasons}"))
@@ -53,9 +61,9 @@ def guess_scene(
 ) -> SceneGuess:
     """Guess a scene from the meshes of a folder, or of folders ``bones`` and ``muscles`` in it.
 
-    ``units`` are ``"mm"``, ``"cm"`` or ``"m"``, by the size of the bones where None; the scene's paths are relative to
-    ``base``; a ``header`` holds anatomical directions where they are known. UsageError if the folder is missing, holds
-    no bone or no muscle, or is of no known unit.
+    ``units`` are ``"mm"``, ``"cm"`` or ``"m"``, by the size of the bones where None; the scene's
+    paths are relative to ``base``; a ``header`` holds anatomical directions where they are known.
+    UsageError if the folder is missing, holds no bone or no muscle, or is of no known unit.
     """
     parts = read_parts(folder, units, base)
     bones, millimetre = parts.bones, parts.millimetre
@@ -66,11 +74,15 @@ def guess_scene(
     for joint in joints:  # parents come before their children
         if joint.kind == "fixed":
             bodies[joint.child] = bodies[joint.parent]
-    skeleton = Skeleton({bone: Bone(bone.name, bone.mesh) for bone in bones}, bodies, joints, millimetre)
+    skeleton = Skeleton(
+        {bone: Bone(bone.name, bone.mesh) for bone in bones}, bodies, joints, millimetre
+    )
     guess.muscles = [guess_attachments(muscle, skeleton) for muscle in parts.muscles]
     # Where the bones that names ask for are not here, what is there is taken.
     if all(muscle.wrong for muscle in guess.muscles):
-        guess.muscles = [guess_attachments(muscle, skeleton, named=False) for muscle in parts.muscles]
+        guess.muscles = [
+            guess_attachments(muscle, skeleton, named=False) for muscle in parts.muscles
+        ]
     order = [root, *(joint.child for joint in joints)]
     for muscle in guess.muscles:  # from the bone that stands still outwards
         muscle.holds.sort(key=lambda hold: order.index(hold.bone) if hold.bone in order else 0)
@@ -78,7 +90,8 @@ def guess_scene(
 
 
 def write_scene(guess: SceneGuess, path: Path) -> Scene:
-    """Write the scene file and, beside it, ``attachments/``, and return the scene as loaded from there.
+    """Write the scene file and, beside it, ``attachments/``, and return the scene as loaded from
+    there.
 
     What cannot be loaded is commented out, with the reason. UsageError if no muscle can be held.
     """
@@ -116,7 +129,9 @@ def _check_runs(guess, path):
 
 
 def _leave_out(guess, error):
-    """Mark the muscle that an error names, or whose file it names, as wrong; an error that names none is raised."""
+    """Mark the muscle that an error names, or whose file it names, as wrong; an error that names
+    none is raised.
+    """
     text, usable = str(error), [muscle for muscle in guess.muscles if not muscle.wrong]
     found = [muscle for muscle in usable if repr(muscle.muscle.name) in text]
     # A file's name may be the end of another's.
@@ -153,7 +168,9 @@ def _head(guess):
     comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
     if parts.left_out:
         row["left_out"] = parts.left_out
-        comments["left_out"] = "bones whose meshes cannot be used; every run counts them as beyond its limits"
+        comments["left_out"] = (
+            "bones whose meshes cannot be used; every run counts them as beyond its limits"
+        )
     for word in ("superior", "anterior") if guess.orientation is not None else ():
         row[word] = rounded(getattr(guess.orientation, word), 5)
         comments[word] = f"by {guess.orientation.source}"
@@ -166,7 +183,9 @@ def _joint(joint: JointGuess) -> str:
     comments = {"axes": "angles follow the right-hand rule"}
     if not joint.ranges:
         comments["axes"] += "; GUESS: rename and turn them where angles should have the other sign"
-    text = table_text(f"[[joint]]   # GUESS {joint.confidence:.1f}: {joint.reason}", joint.row(), comments)
+    text = table_text(
+        f"[[joint]]   # GUESS {joint.confidence:.1f}: {joint.reason}", joint.row(), comments
+    )
     if joint.follows:
         row = {"coordinate": joint.coordinate, "of": [joint.follows], "linear": [1, 0]}
         text += "\n" + table_text("[[coupling]]", row)

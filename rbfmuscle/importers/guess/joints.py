@@ -1,9 +1,10 @@
 """The tree of the bones and their joints, from the parts of their surfaces that face each other.
 
-A joint is where two bones face each other closely. The bones' tree is the one with the greatest facing area.
-A ball fits where the normals of the convex face meet in one point; a hinge where they meet one line, found as
-the axis of the cylinder that fits the dome of the face. Both follow from the face's slippable motions (Gelfand
-and Guibas 2004, Shape segmentation using local slippage analysis). Knee, ankle and patella have methods of their own.
+A joint is where two bones face each other closely. The bones' tree is the one with the greatest
+facing area. A ball fits where the normals of the convex face meet in one point; a hinge where they
+meet one line, found as the axis of the cylinder that fits the dome of the face. Both follow from
+the face's slippable motions (Gelfand and Guibas 2004, Shape segmentation using local slippage
+analysis). Knee, ankle and patella have methods of their own.
 """
 
 from itertools import combinations
@@ -11,26 +12,37 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.importers.guess.anatomy import JOINTS, PARENTS, ROOTS, JointGuess, make_anatomical, set_rest
+from rbfmuscle.importers.guess.anatomy import (
+    JOINTS,
+    PARENTS,
+    ROOTS,
+    JointGuess,
+    make_anatomical,
+    set_rest,
+)
 from rbfmuscle.importers.guess.landmarks import HEAD, Fit, fit_coaxial, fit_sphere
 from rbfmuscle.importers.guess.orientation import Orientation
 from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.importers.guess.patella import place_patellae
 
 BAND = 8.0  # width [mm] beyond the least gap within which faces face each other
-# Least cosine between a face's normal and the direction to the other bone, and between the two opposed normals.
+# Least cosine between a face's normal and the direction to the other bone, and between the two
+# opposed normals.
 LOOK, OPPOSED = 0.3, 0.0
 FARTHEST = 25.0  # faces farther apart than this [mm] are no joint
 BOUND = 1.5  # closer than this [mm] all along: grown together or bound, no cartilage in between
 # A ball: misfit against radius, and the least share of the hemisphere that its face covers.
 BALL_MISFIT, BALL_COVER = 0.05, 0.3
 HINGE_MISFIT = 0.15  # a hinge: misfit of the cylinder against its radius
-# Cosine of the cone of normals about their mean that is the dome of a hinge, without the cheeks beside it.
+# Cosine of the cone of normals about their mean that is the dome of a hinge, without the cheeks
+# beside it.
 DOME = 0.8
 
 
 class Face(NamedTuple):
-    """Triangles of a bone that face another: middles (n, 3), normals (n, 3), areas (n,), and the least gap [mm]."""
+    """Triangles of a bone that face another: middles (n, 3), normals (n, 3), areas (n,), and the
+    least gap [mm].
+    """
 
     points: np.ndarray
     normals: np.ndarray
@@ -39,13 +51,17 @@ class Face(NamedTuple):
 
 
 def find_face(first: Part, second: Part, millimetre: float, band: float = BAND) -> Face | None:
-    """Triangles of a bone that face another within a band [mm] beyond the least gap, None if it is far away."""
+    """Triangles of a bone that face another within a band [mm] beyond the least gap, None if it is
+    far away.
+    """
     reach = (FARTHEST + band) * millimetre
     points, normals, areas = first.faces
     low, high = np.asarray(second.mesh.bounds)
     close = np.flatnonzero(((points > low - reach) & (points < high + reach)).all(axis=1))
     distance, nearest = second.tree.query(points[close], distance_upper_bound=reach)
-    close, distance, nearest = (values[np.isfinite(distance)] for values in (close, distance, nearest))
+    close, distance, nearest = (
+        values[np.isfinite(distance)] for values in (close, distance, nearest)
+    )
     if len(close) == 0:
         return None
     away = (second.faces[0][nearest] - points[close]) / np.maximum(distance, 1e-12)[:, None]
@@ -61,7 +77,8 @@ def guess_joints(
 ) -> tuple[Part, list[JointGuess]]:
     """The bone that stands still, and a joint for every other bone that has one.
 
-    Without an orientation there are balls and hinges of any sign. ``millimetre`` is the length of one in scene units.
+    Without an orientation there are balls and hinges of any sign. ``millimetre`` is the length of
+    one in scene units.
     """
     areas: dict[tuple[Part, Part], float] = {}
     for first, second in combinations(bones, 2):
@@ -73,7 +90,9 @@ def guess_joints(
     placed, joints = [root], []
     while len(placed) < len(bones):
         waiting = [bone for bone in bones if bone not in placed]
-        links = [(parent, child) for parent in placed for child in waiting if (parent, child) in areas]
+        links = [
+            (parent, child) for parent in placed for child in waiting if (parent, child) in areas
+        ]
         if not links:  # nothing faces what is placed: it stands by itself
             placed.append(_root(waiting))
             continue
@@ -122,12 +141,16 @@ def _fit(parent, child, millimetre, area):
     named = dict(PARENTS.get(child.kind, ())).get(parent.kind, "")
     pairs = ((parent, child), (child, parent))
     faces = [find_face(*pair, millimetre) for pair in pairs]
-    ball = min((fit_ball(face) for face in faces), key=lambda fit: fit.misfit / max(fit.radii[0], 1e-300))
+    ball = min(
+        (fit_ball(face) for face in faces), key=lambda fit: fit.misfit / max(fit.radii[0], 1e-300)
+    )
     low, high = HEAD if child.kind == "femur" else (0.0, np.inf)
     allowed = low <= ball.radii[0] / millimetre <= high
     fits_ball = ball.misfit < BALL_MISFIT * ball.radii[0] and ball.cover > BALL_COVER and allowed
     band = max(BAND, 0.5 * np.sqrt(area))
-    hinges = [fit for pair in pairs if (fit := fit_hinge(find_face(*pair, millimetre, band))) is not None]
+    hinges = [
+        fit for pair in pairs if (fit := fit_hinge(find_face(*pair, millimetre, band))) is not None
+    ]
     # What rolls has the smaller radius, not its socket.
     hinges.sort(key=lambda fit: (fit.misfit > HINGE_MISFIT * fit.radii[0], fit.radii[0]))
     hinge = next(iter(hinges), None)
@@ -137,19 +160,27 @@ def _fit(parent, child, millimetre, area):
     if kind == "ball":
         sure = 1.0 - 0.5 * ball.misfit / (BALL_MISFIT * ball.radii[0]) if fits_ball else 0.1
         share = 100 * min(ball.cover, 1.0)
-        why = f"sphere of radius {ball.radii[0] / millimetre:.4g} mm, misfit {ball.misfit / millimetre:.2g} mm, "
+        why = (
+            f"sphere of radius {ball.radii[0] / millimetre:.4g} mm, misfit "
+            f"{ball.misfit / millimetre:.2g} mm, "
+        )
         why += f"on {share:.0f} % of a hemisphere"
         why += "" if allowed else f"; anatomy has {low:g} to {high:g} mm"
         axes = {f"rotation_{word}": axis for word, axis in zip("xyz", np.eye(3))}
         return JointGuess(parent, child, "ball", ball.centre, axes, sure, why)
     if kind == "hinge" and hinge is not None:
         sure = 0.6 * max(1.0 - 0.5 * hinge.misfit / (HINGE_MISFIT * hinge.radii[0]), 0.0)
-        why = f"cylinder of radius {hinge.radii[0]:.4g}, misfit {hinge.misfit:.2g}, about the dome where they face"
+        why = (
+            f"cylinder of radius {hinge.radii[0]:.4g}, misfit {hinge.misfit:.2g}, about the "
+            "dome where they face"
+        )
         return JointGuess(parent, child, "hinge", hinge.centre, {"angle": hinge.axis}, sure, why)
     middle = faces[1].points.mean(axis=0) if len(faces[1].points) else child.points.mean(axis=0)
     why = f"they are {gap:.2g} mm apart, "
     why += "bound all over" if gap < BOUND else "neither ball nor hinge fits"
-    return JointGuess(parent, child, "fixed", middle, {}, 0.8 if gap < BOUND else 0.6 if named else 0.4, why)
+    return JointGuess(
+        parent, child, "fixed", middle, {}, 0.8 if gap < BOUND else 0.6 if named else 0.4, why
+    )
 
 
 def fit_ball(face: Face) -> Fit:
@@ -164,10 +195,14 @@ def fit_ball(face: Face) -> Fit:
 
 
 def fit_hinge(face: Face) -> Fit | None:
-    """The cylinder that fits the dome of a face, where its normals lie about their mean; None of too few triangles."""
+    """The cylinder that fits the dome of a face, where its normals lie about their mean; None of
+    too few triangles.
+    """
     mean = face.areas @ face.normals
     dome = face.normals @ mean > DOME * np.linalg.norm(mean)
-    points, normals, areas = face.points[dome], face.normals[dome], face.areas[dome]
+    points = face.points[dome]
+    normals = face.normals[dome]
+    areas = face.areas[dome]
     if len(points) < 20:
         return None
     axis, *plane = np.linalg.eigh((normals * areas[:, None]).T @ normals)[1].T  # across the normals

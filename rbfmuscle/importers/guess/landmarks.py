@@ -1,8 +1,9 @@
 """Directions of bones, and axes of the knee and of the ankle, from the shapes of the bones.
 
-Knee: the line through the centres of spheres fitted to the posterior part of both condyles (Kurosawa et al. 1985;
-Iwaki et al. 2000; the cylindrical axis of Eckhoff et al. 2005). Ankle: the cylinder of the talar dome, fitted with the
-tibial plafond above it, each with its own radius (Singh et al. 1992; Siegler et al. 2014).
+Knee: the line through the centres of spheres fitted to the posterior part of both condyles
+(Kurosawa et al. 1985; Iwaki et al. 2000; the cylindrical axis of Eckhoff et al. 2005). Ankle: the
+cylinder of the talar dome, fitted with the tibial plafond above it, each with its own radius (Singh
+et al. 1992; Siegler et al. 2014).
 """
 
 from dataclasses import dataclass, field
@@ -13,20 +14,30 @@ from scipy.spatial import ConvexHull
 
 from rbfmuscle.importers.guess.parts import Part
 
-# Radii that anatomy allows [mm]: head of the femur, posterior condyle, talar dome, all from child to large adult.
-HEAD, CONDYLE, DOME = (12.0, 35.0), (11.0, 30.0), (11.0, 27.0)
+# Radii that anatomy allows [mm]: head of the femur, posterior condyle, talar dome, all from child
+# to large adult.
+HEAD = (12.0, 35.0)
+CONDYLE = (11.0, 30.0)
+DOME = (11.0, 27.0)
 END, CONDYLES = 0.12, 0.16  # share of the femur's length that holds an end, and its condyles
-# Normals of a condyle that count: from above (-) to below the backward direction [degree], greatest cosine sideways.
+# Normals of a condyle that count: from above (-) to below the backward direction [degree], greatest
+# cosine sideways.
 POSTERIOR, SIDEWAYS = (-30.0, 60.0), 0.5
-# Of the dome: half its arc [degree], band beyond the least gap [mm], least cosine of a normal and its radius.
-ARC, BAND, RADIAL = 45.0, 8.0, 0.95
-# Greatest space between dome and plafond [mm]: 4.3 on the leg of the Visible Human Female, cartilage included.
+# Of the dome: half its arc [degree], band beyond the least gap [mm], least cosine of a normal and
+# its radius.
+ARC = 45.0
+BAND = 8.0
+RADIAL = 0.95
+# Greatest space between dome and plafond [mm]: 4.3 on the leg of the Visible Human Female,
+# cartilage included.
 SPACE = 6.0
 
 
 @dataclass
 class Frame:
-    """Directions of a body or of a long bone, unit (3,); the side, ``"l"`` or ``"r"``, that the bone's shape is of."""
+    """Directions of a body or of a long bone, unit (3,); the side, ``"l"`` or ``"r"``, that the
+    bone's shape is of.
+    """
 
     superior: np.ndarray
     anterior: np.ndarray
@@ -40,9 +51,11 @@ class Frame:
 
 @dataclass
 class Fit:
-    """A sphere, or spheres or cylinders on an axis: centre (3,), radii, misfit (RMS) [scene unit], unit axis (3,).
+    """A sphere, or spheres or cylinders on an axis: centre (3,), radii, misfit (RMS) [scene unit],
+    unit axis (3,).
 
-    ``cover`` is the share of a hemisphere that was fitted; ``wrong`` says why a fit is refused, empty where it is not.
+    ``cover`` is the share of a hemisphere that was fitted; ``wrong`` says why a fit is refused,
+    empty where it is not.
     """
 
     centre: np.ndarray
@@ -71,7 +84,9 @@ def main_axes(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def long_axis(bone: Part, below: list[Part], above: list[Part]) -> np.ndarray:
-    """Direction (3,) up a long bone: from the bones ``below`` to those ``above``, else from its broad end."""
+    """Direction (3,) up a long bone: from the bones ``below`` to those ``above``, else from its
+    broad end.
+    """
     points, _, areas = bone.faces
     middle, axes = main_axes(points, areas)
     up = axes[:, 2]
@@ -84,11 +99,15 @@ def long_axis(bone: Part, below: list[Part], above: list[Part]) -> np.ndarray:
 
 
 def femur_frame(femur: Part, below: list[Part], above: list[Part]) -> Frame:
-    """Directions of a femur by its own shape: shaft; breadth of the condyles, which lie behind it; head inwards."""
+    """Directions of a femur by its own shape: shaft; breadth of the condyles, which lie behind it;
+    head inwards.
+    """
     points, _, areas = femur.faces
     up = long_axis(femur, below, above)
     share = (points @ up - (points @ up).min()) / np.ptp(points @ up)
-    shaft, end, top = (share > 0.3) & (share < 0.7), share < 0.1, share > 1.0 - END
+    shaft = (share > 0.3) & (share < 0.7)
+    end = share < 0.1
+    top = share > 1.0 - END
     middle, axes = main_axes(points[shaft], areas[shaft])
     up = axes[:, 2] * np.copysign(1.0, axes[:, 2] @ up)
     behind, axes = main_axes(across(points[end] - middle, up), areas[end])
@@ -100,7 +119,9 @@ def femur_frame(femur: Part, below: list[Part], above: list[Part]) -> Frame:
 
 
 def sole_direction(points: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Direction (3,) forwards on the sole of a foot: the longest side below its outline, seen from the side."""
+    """Direction (3,) forwards on the sole of a foot: the longest side below its outline, seen from
+    the side.
+    """
     top = unit(across(up, right))
     plane = np.stack([np.cross(top, right), top])
     flat = points @ plane.T
@@ -110,7 +131,9 @@ def sole_direction(points: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.
 
 
 def fit_sphere(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre and radius of the sphere, or circle, that fits weighted points: algebraic least squares."""
+    """Centre and radius of the sphere, or circle, that fits weighted points: algebraic least
+    squares.
+    """
     middle, root = np.average(points, axis=0, weights=weights), np.sqrt(weights)
     local = points - middle
     matrix = np.column_stack([2.0 * local, np.ones(len(local))]) * root[:, None]
@@ -127,7 +150,9 @@ def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> Fit | None:
     for _ in range(12):
         anterior = unit(np.cross(frame.superior, right))
         angle = np.degrees(np.arctan2(-normals @ np.cross(right, anterior), -normals @ anterior))
-        chosen = (np.abs(normals @ right) < SIDEWAYS) & (angle > POSTERIOR[0]) & (angle < POSTERIOR[1])
+        chosen = (
+            (np.abs(normals @ right) < SIDEWAYS) & (angle > POSTERIOR[0]) & (angle < POSTERIOR[1])
+        )
         if chosen.sum() < 24:
             return None
         place = points @ right
@@ -140,7 +165,10 @@ def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> Fit | None:
         if right @ before > 1.0 - 1e-9:
             break
     centres, radii, misfits = (np.array(values) for values in zip(*fits))
-    misfit, wrong = float(np.sqrt(np.mean(misfits**2))), _refused("condyle", radii, CONDYLE, millimetre)
+    misfit, wrong = (
+        float(np.sqrt(np.mean(misfits**2))),
+        _refused("condyle", radii, CONDYLE, millimetre),
+    )
     return Fit(centres.mean(axis=0), radii, misfit, right, wrong=wrong)
 
 
@@ -162,7 +190,9 @@ def _refused(what, radii, allowed, millimetre):
     return f"a {what} of radius {bad[0]:.3g} mm, anatomy has {low:g} to {high:g}" if bad else ""
 
 
-def fit_dome(talus: Part, tibia: Part, up: np.ndarray, right: np.ndarray, millimetre: float) -> Fit | None:
+def fit_dome(
+    talus: Part, tibia: Part, up: np.ndarray, right: np.ndarray, millimetre: float
+) -> Fit | None:
     """The ankle's axis; None where talus and tibia show no dome.
 
     ``up`` (3,) is the direction along the tibia, ``right`` (3,) about that of the axis.
@@ -181,16 +211,22 @@ def fit_dome(talus: Part, tibia: Part, up: np.ndarray, right: np.ndarray, millim
     radii, before = np.array([20.0, 23.0]) * millimetre, np.empty(0)
     centre = np.average(points[top], axis=0, weights=areas[top]) - radii[0] * up
     for _ in range(40):
-        chosen = [_on_cylinder(*patch[:2], centre, right, up, r) for patch, r in zip(patches, radii)]
+        chosen = [
+            _on_cylinder(*patch[:2], centre, right, up, r) for patch, r in zip(patches, radii)
+        ]
         if chosen[-1].sum() < 8 and len(chosen) == 2:  # no plafond: the dome alone
-            patches, radii, chosen = patches[:1], radii[:1], chosen[:1]
+            patches = patches[:1]
+            radii = radii[:1]
+            chosen = chosen[:1]
         if chosen[0].sum() < 8:
             return None
         if np.array_equal(before, before := np.concatenate(chosen)):
             break
         used = [(patch[0][c], patch[2][c]) for patch, c in zip(patches, chosen)]
         fit = fit_coaxial(used, centre, right, radii, 0.5 * millimetre)
-        centre, right, radii = fit.centre, fit.axis, fit.radii
+        centre = fit.centre
+        right = fit.axis
+        radii = fit.radii
     fit.centre = centre + ((used[0][0] - centre) @ right).mean() * right
     fit.wrong = _refused("talar dome", radii[:1], DOME, millimetre)
     space = np.ptp(radii) / millimetre
@@ -218,7 +254,8 @@ def fit_coaxial(
 ) -> Fit:
     """Cylinders with one axis, from a start on.
 
-    ``patches`` holds points and weights of each cylinder; from the distance ``soft`` on a point loses its weight.
+    ``patches`` holds points and weights of each cylinder; from the distance ``soft`` on a point
+    loses its weight.
     """
     plane, size = np.linalg.svd(axis[None])[2][1:], float(radii[0])
     roots = [np.sqrt(weights / weights.mean() / len(patches)) for _, weights in patches]
@@ -229,7 +266,9 @@ def fit_coaxial(
     def residual(x):
         turned, at = line(x)
         rows = [np.linalg.norm(across(points - at, turned), axis=1) / size for points, _ in patches]
-        return np.concatenate([root * (row - radius) for root, row, radius in zip(roots, rows, x[4:])])
+        return np.concatenate(
+            [root * (row - radius) for root, row, radius in zip(roots, rows, x[4:])]
+        )
 
     start = np.r_[np.zeros(4), radii / size]
     x = least_squares(residual, start, loss="soft_l1", f_scale=soft / size, max_nfev=200).x

@@ -1,7 +1,7 @@
 """What names of meshes and labels mean: bone, muscle or other tissue, which one, and of which side.
 
-A name is split at capitals, digits and signs; words are brought to one form, those written together are taken apart,
-and unknown ones may be misspelt. The table is ``names.toml``, with its sources.
+A name is split at capitals, digits and signs; words are brought to one form, those written together
+are taken apart, and unknown ones may be misspelt. The table is ``names.toml``, with its sources.
 """
 
 import re
@@ -12,18 +12,21 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-# Fewest letters of a word that may be misspelt, and how much of it must agree with a known one (`difflib`'s ratio).
+# Fewest letters of a word that may be misspelt, and how much of it must agree with a known one
+# (`difflib`'s ratio).
 FEWEST, LIKE = 5, 0.8
 MIDLINE = ("sacrum", "vertebra", "sternum", "skull", "mandible")
-_SIGNS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "é": "e", "è": "e", "ô": "o", "â": "a"})
+_SIGNS = str.maketrans(
+    {"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "é": "e", "è": "e", "ô": "o", "â": "a"}
+)
 
 
 @dataclass(frozen=True)
 class MuscleFacts:
     """What a muscle's name says: its name as the table has it, and where it is held.
 
-    ``origin`` and ``insertion`` list attachments: classes of bone that may stand for one, the best first, and whether
-    the muscle must be held there.
+    ``origin`` and ``insertion`` list attachments: classes of bone that may stand for one, the best
+    first, and whether the muscle must be held there.
     """
 
     name: str
@@ -47,7 +50,9 @@ class NameFacts:
 
 
 class _Table(NamedTuple):
-    """The file, as sets of words: sides and forms by word, names of bones and muscles as tuples of words."""
+    """The file, as sets of words: sides and forms by word, names of bones and muscles as tuples of
+    words.
+    """
 
     sides: dict[str, str]
     forms: dict[str, str]
@@ -98,20 +103,27 @@ def name_facts(name: str) -> NameFacts:
     tissue = "muscle" if muscle or says_muscle else "bone" if bone or says_bone else ""
     kind = table.bones[bone] if bone is not None and tissue == "bone" else ""
     used = muscle or bone or ()
-    shown = ", ".join(f"{wrong!r} read as {right!r}" for wrong, right in spelling.items() if right in used)
+    shown = ", ".join(
+        f"{wrong!r} read as {right!r}" for wrong, right in spelling.items() if right in used
+    )
     side = "" if kind in MIDLINE else side
     return NameFacts(tissue, kind, table.muscles[muscle] if muscle else None, side, shown)
 
 
 def _longest(words, table):
-    """The entry whose words all occur; of several the one with most words, then with the longest."""
+    """The entry whose words all occur; of several the one with most words, then with the
+    longest.
+    """
     fitting = [key for key in table if set(words).issuperset(key)]
     return max(fitting, key=lambda key: (len(key), sum(map(len, key))), default=None)
 
 
 def _read_words(name):
     """Words in their one form, the side, and what misspelt words were taken for."""
-    table, words, sides, spelling = _table(), [], set(), {}
+    table = _table()
+    words = []
+    sides = set()
+    spelling = {}
     text = re.sub(r"([LTCS])\d{1,2}(?![0-9])", " ", name)  # vertebrae are no sides
     text = re.sub(r"(?<=[a-zäöüß])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
     for word in re.split(r"[^a-z]+", text.lower().translate(_SIGNS)):
@@ -129,7 +141,9 @@ def _read_words(name):
 
 
 def _taken_apart(word):
-    """Known words that a word is written together of, none where it is not; the fewest, of three letters or more."""
+    """Known words that a word is written together of, none where it is not; the fewest, of three
+    letters or more.
+    """
     known = _table().known | set(_table().sides)
     if word in known:
         return [word]

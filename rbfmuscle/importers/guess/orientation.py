@@ -13,7 +13,8 @@ from rbfmuscle.scene.objects import SceneData
 S = TypeVar("S", bound=SceneData)
 
 AGREE = 45.0  # directions of bones and header that differ by more than this [degree] are named
-# Scans are saved along the body: an axis of the coordinates within this [degree] of what a thigh shows is taken.
+# Scans are saved along the body: an axis of the coordinates within this [degree] of what a thigh
+# shows is taken.
 ALONG = 25.0
 LEAST_TRIANGLES = 100  # of fewer triangles the shape of a bone says nothing
 _ABOVE = {"femur": ("pelvis", "ilium", "sacrum"), "tibia": ("femur", "patella")}
@@ -32,23 +33,30 @@ class Orientation(Frame):
 
 
 # The axes of NIfTI: x to the right, y forwards, z up.
-HEADER = Orientation(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), source="the volume's header")
+HEADER = Orientation(
+    np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), source="the volume's header"
+)
 
 
 def find_orientation(bones: list[Part], header: Orientation | None = None) -> Orientation | None:
-    """Anatomical directions, None where no bone shows them; femora get their ``frame``, and a side if they have none.
+    """Anatomical directions, None where no bone shows them; femora get their ``frame``, and a side
+    if they have none.
 
     Directions of a ``header`` count; the bones are held against them.
     """
     femora = [bone for bone in bones if bone.kind == "femur"]
     doubts = []
     for bone in femora:
-        bone.frame = femur_frame(bone, neighbours(bone, bones, _BELOW), neighbours(bone, bones, _ABOVE))
+        bone.frame = femur_frame(
+            bone, neighbours(bone, bones, _BELOW), neighbours(bone, bones, _ABOVE)
+        )
         bone.side = bone.side or bone.frame.side
         if bone.side != bone.frame.side:
             words = {"l": "left", "r": "right"}
             said, shape = words[bone.side], words[bone.frame.side]
-            doubts.append(f"{bone.name}: named {said}, its shape is that of the {shape} one; is it mirrored?")
+            doubts.append(
+                f"{bone.name}: named {said}, its shape is that of the {shape} one; is it mirrored?"
+            )
     shanks = (_shank_frame(bone, bones) for bone in bones) if not femora else ()
     frames = [bone.frame for bone in femora] + [frame for frame in shanks if frame is not None]
     if not frames:
@@ -64,12 +72,16 @@ def find_orientation(bones: list[Part], header: Orientation | None = None) -> Or
     for word, seen in {"superior": superior, "anterior": anterior}.items():
         angle = np.degrees(np.arccos(np.clip(seen @ getattr(header, word), -1.0, 1.0)))
         if angle > AGREE:
-            doubts.append(f"{word} by the bones is {angle:.0f} degrees off {header.source}, which counts")
+            doubts.append(
+                f"{word} by the bones is {angle:.0f} degrees off {header.source}, which counts"
+            )
     return Orientation(header.superior, header.anterior, source=header.source, doubts=doubts)
 
 
 def orient_scene(scene: S) -> S:
-    """Give a scene the directions that its bones show, by their names and shapes, where its file has none."""
+    """Give a scene the directions that its bones show, by their names and shapes, where its file
+    has none.
+    """
     if scene.superior is None or scene.anterior is None:
         shapes = [bone for bone in scene.bones if len(bone.mesh.faces) >= LEAST_TRIANGLES]
         found = find_orientation([Part(b.name, "", b, name_facts(b.name).bone) for b in shapes])
@@ -81,7 +93,9 @@ def orient_scene(scene: S) -> S:
 def neighbours(bone: Part, bones: list[Part], table: dict[str, tuple[str, ...]]) -> list[Part]:
     """The bones of the classes that a table lists for a bone, on its side."""
     kinds = table.get(bone.kind, ())
-    return [b for b in bones if b.kind in kinds and (not b.side or not bone.side or b.side == bone.side)]
+    return [
+        b for b in bones if b.kind in kinds and (not b.side or not bone.side or b.side == bone.side)
+    ]
 
 
 def shank_up(tibia: Part, bones: list[Part]) -> np.ndarray:

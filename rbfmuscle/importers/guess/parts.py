@@ -20,7 +20,8 @@ from rbfmuscle.validation import MeshError, UsageError
 FOLDERS = {"bones": "bone", "bone": "bone", "knochen": "bone", "os": "bone"}
 FOLDERS |= {"muscles": "muscle", "muscle": "muscle", "muskeln": "muscle"}
 MILLIMETRE = {"mm": 1.0, "cm": 0.1, "m": 0.001}
-# Length of a bone [mm] by its class, and of the largest one where none is known, from child to large adult.
+# Length of a bone [mm] by its class, and of the largest one where none is known, from child to
+# large adult.
 LENGTHS = {"femur": (200, 600), "tibia": (150, 500), "humerus": (120, 420), "pelvis": (100, 450)}
 LARGEST_BONE = (90, 900)
 # Meshes of more triangles are made coarser, to about as many; fits take their points from no fewer.
@@ -62,7 +63,11 @@ class Part:
         mesh = self.mesh
         while len(mesh.faces) < FEWEST:
             mesh = mesh.subdivide()
-        return np.array(mesh.triangles_center), np.array(mesh.face_normals), np.array(mesh.area_faces)
+        return (
+            np.array(mesh.triangles_center),
+            np.array(mesh.face_normals),
+            np.array(mesh.area_faces),
+        )
 
     @cached_property
     def tree(self) -> Any:
@@ -92,11 +97,15 @@ class Parts:
 
 
 def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
-    """Bones and muscles of a folder, and of its folders ``bones`` and ``muscles``; files relative to ``base``.
+    """Bones and muscles of a folder, and of its folders ``bones`` and ``muscles``; files relative
+    to ``base``.
 
     Where no unit is given it is the one in which the bones have the size that they have in people.
     """
-    found, unknown, names, other = Parts(), [], set(), []
+    found = Parts()
+    unknown = []
+    names = set()
+    other = []
     for path in _find_meshes(folder):
         facts = name_facts(path.stem)
         if facts.tissue == "other":
@@ -117,10 +126,14 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
     _sort_unknown(found, unknown)
     if not found.bones or not found.muscles:
         kind, rest = ("bone", "muscles") if not found.bones else ("muscle", "bones")
-        listed = ", ".join([part.file for part in found.bones or found.muscles] + list(found.unusable))
+        listed = ", ".join(
+            [part.file for part in found.bones or found.muscles] + list(found.unusable)
+        )
         raise UsageError(
-            f"{folder} holds no {kind} (by names or sizes all are {rest}, or cannot be used: {listed or 'no files'}); "
-            f"name files ({' '.join(MESH_SUFFIXES)}) after what they are, or sort them into folders bones and muscles"
+            f"{folder} holds no {kind} (by names or sizes all are {rest}, or cannot be used: "
+            f"{listed or 'no files'}); "
+            f"name files ({' '.join(MESH_SUFFIXES)}) after what they are, or sort them into "
+            "folders bones and muscles"
         )
     found.units = units or _guess_units(found)
     _leave_out_wrong_sizes(found)
@@ -128,7 +141,9 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
 
 
 def _sort_unknown(found, unknown):
-    """Of names that are not known: the largest are bones until there are two, the others muscles if they can be."""
+    """Of names that are not known: the largest are bones until there are two, the others muscles if
+    they can be.
+    """
     for part in sorted(unknown, key=lambda part: -part.size):
         is_bone = len(found.bones) < 2 or not _can_be_muscle(part)
         part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
@@ -148,7 +163,9 @@ def _find_meshes(folder):
     """Mesh files of a folder and of its folders for bones and muscles, in order."""
     if not folder.is_dir():
         raise UsageError(f"{folder} is no folder; give the folder of the meshes")
-    inner = [path for path in sorted(folder.iterdir()) if path.name.lower() in FOLDERS and path.is_dir()]
+    inner = [
+        path for path in sorted(folder.iterdir()) if path.name.lower() in FOLDERS and path.is_dir()
+    ]
     files = [path for place in [folder, *inner] for path in sorted(place.iterdir())]
     return [path for path in files if path.suffix.lower() in MESH_SUFFIXES]
 
@@ -169,7 +186,9 @@ def _read_part(path, base, names, facts, notes, *, closed):
 
 
 def _guess_units(found):
-    """The unit in which a bone has the size that it has in people, a note why; a UsageError where none fits."""
+    """The unit in which a bone has the size that it has in people, a note why; a UsageError where
+    none fits.
+    """
     known = [bone for bone in found.bones if bone.kind in LENGTHS]
     bone = max(known or found.bones, key=lambda bone: bone.size)
     low, high = LENGTHS.get(bone.kind, LARGEST_BONE)
@@ -177,11 +196,15 @@ def _guess_units(found):
         if low <= bone.size / millimetre <= high:
             found.notes.append(f"units are {units}: {bone.name} is {bone.size:.4g} {units} long")
             return units
-    raise UsageError(f"{bone.file} is {bone.size:.4g} across, which is no bone in mm, cm or m; give --units")
+    raise UsageError(
+        f"{bone.file} is {bone.size:.4g} across, which is no bone in mm, cm or m; give --units"
+    )
 
 
 def _leave_out_wrong_sizes(found):
-    """Bones that a scene would refuse for their size cannot be used; a UsageError where that is all of them."""
+    """Bones that a scene would refuse for their size cannot be used; a UsageError where that is all
+    of them.
+    """
     for bone in list(found.bones):
         if not SMALLEST_MM <= bone.size / found.millimetre <= LARGEST_MM:
             words = f"it is {bone.size:.4g} {found.units} across"

@@ -1,9 +1,11 @@
-"""The patella against the femur while the knee bends: in its groove, its ligament as long as at rest.
+"""The patella against the femur while the knee bends: in its groove, its ligament as long as at
+rest.
 
-In the plane of knee flexion the patella turns by 0.7 of the knee's angle (Amis et al. 2006), keeps its distance from
-the middle of its groove (a circle through the outline of the trochlea about the knee's axis), and lies where the
-ligament from its apex to the tibial tuberosity has its length at rest (as in the model of Yamaguchi and Zajac 1989).
-Points of the plane are complex numbers about the knee's axis: forwards, and i times downwards.
+In the plane of knee flexion the patella turns by 0.7 of the knee's angle (Amis et al. 2006), keeps
+its distance from the middle of its groove (a circle through the outline of the trochlea about the
+knee's axis), and lies where the ligament from its apex to the tibial tuberosity has its length at
+rest (as in the model of Yamaguchi and Zajac 1989). Points of the plane are complex numbers about
+the knee's axis: forwards, and i times downwards.
 """
 
 import numpy as np
@@ -11,29 +13,43 @@ import numpy as np
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
 from rbfmuscle.importers.guess.landmarks import across, fit_sphere, unit
 
-FLEXIONS = tuple(range(0, 131, 10))  # knee flexion from the rest pose [degree] at which the path is taken
+FLEXIONS = tuple(
+    range(0, 131, 10)
+)  # knee flexion from the rest pose [degree] at which the path is taken
 TURN = 0.7
-# Half the breadth beside the patella's middle that counts as its groove, and its part of the tibia [mm].
+# Half the breadth beside the patella's middle that counts as its groove, and its part of the tibia
+# [mm].
 GROOVE, TUBEROSITY = 10.0, 15.0
 LIGAMENT = (25.0, 80.0)  # length of the ligament that anatomy allows [mm]
-# Angles about the knee's axis that the outline covers, its steps [degree], and the fewest points of it.
-OUTLINE, STEP, FEWEST = (-30.0, 90.0), 5.0, 6
+# Angles about the knee's axis that the outline covers, its steps [degree], and the fewest points of
+# it.
+OUTLINE = (-30.0, 90.0)
+STEP = 5.0
+FEWEST = 6
 
 
 def place_patellae(joints: list[JointGuess], millimetre: float) -> None:
-    """Patellae glide in their grooves as the knee bends; about its axis where no groove is found."""
+    """Patellae glide in their grooves as the knee bends; about its axis where no groove is
+    found.
+    """
     for joint in joints:
-        knee = next((j for j in joints if j.child.kind == "tibia" and j.parent is joint.parent), None)
+        knee = next(
+            (j for j in joints if j.child.kind == "tibia" and j.parent is joint.parent), None
+        )
         if joint.child.kind != "patella" or knee is None or knee.kind != "hinge":
             continue
         joint.axes, joint.rest = {"flexion": knee.axis}, knee.rest
         if not _put_in_groove(joint, knee, millimetre):
-            joint.kind, joint.centre, joint.confidence = "hinge", knee.centre, 0.2
+            joint.kind = "hinge"
+            joint.centre = knee.centre
+            joint.confidence = 0.2
             joint.reason = "no groove or no ligament was found: it turns about the knee's axis"
 
 
 def _put_in_groove(joint, knee, millimetre):
-    """Make a patella's joint the custom one of its path; False where its groove or its ligament is not found."""
+    """Make a patella's joint the custom one of its path; False where its groove or its ligament is
+    not found.
+    """
     femur, axis = joint.parent, knee.axis
     down = unit(across(-femur.frame.superior, axis))
     front = np.cross(down, axis)
@@ -65,7 +81,9 @@ def _put_in_groove(joint, knee, millimetre):
 
     joint.tables["rotations"] = [table(axis, TURN * flexions)]
     joint.tables["translations"] = [table(front, shifts.real), table(down, shifts.imag)]
-    joint.kind, joint.centre, joint.confidence = "custom", place(middle), 0.6
+    joint.kind = "custom"
+    joint.centre = place(middle)
+    joint.confidence = 0.6
     joint.follows, joint.ligament = knee.coordinate, np.stack([place(apex), place(tuberosity)])
     length = abs(apex - tuberosity) / millimetre
     joint.reason = f"in its groove, on a ligament of {length:.3g} mm, to {FLEXIONS[-1]} degrees"
@@ -83,8 +101,12 @@ def _outline(points):
 
 
 def _follow(centre, middle, apex, tuberosity):
-    """Shifts of the patella: at each flexion the place about the groove's centre, from the one before on."""
-    length, angle, shifts = abs(apex - tuberosity), 0.0, []
+    """Shifts of the patella: at each flexion the place about the groove's centre, from the one
+    before on.
+    """
+    length = abs(apex - tuberosity)
+    angle = 0.0
+    shifts = []
     for flexion in FLEXIONS:
         end, tip = tuberosity * _turn(flexion), (apex - middle) * _turn(TURN * flexion)
         tried = np.arange(angle, angle + 20.0, 0.5) if flexion else np.zeros(1)

@@ -1,9 +1,10 @@
 """From labels to smooth closed surfaces, without the steps of their voxels.
 
-The mask of a label, 1/2 inside and -1/2 outside, is smoothed by I - (I - G)^4, G a Gaussian of 1.3 voxels:
-flat to fourth order in the pass band, so that curved surfaces are not drawn in as they are by G alone. Where two
-labels share a face, the fields are each other's negative there and their zero sets are the same. The surface is
-then shifted to the label's volume, by a few hundredths of a voxel.
+The mask of a label, 1/2 inside and -1/2 outside, is smoothed by I - (I - G)^4, G a Gaussian of 1.3
+voxels: flat to fourth order in the pass band, so that curved surfaces are not drawn in as they are
+by G alone. Where two labels share a face, the fields are each other's negative there and their zero
+sets are the same. The surface is then shifted to the label's volume, by a few hundredths of a
+voxel.
 """
 
 from dataclasses import dataclass
@@ -18,16 +19,22 @@ from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normal
 from rbfmuscle.importers.labels.read import LabelVolume
 from rbfmuscle.validation import MeshError
 
-SMOOTHING, PASSES = 1.3, 4  # deviation of the Gaussian [voxels], and how often what it lost is smoothed again
+SMOOTHING, PASSES = (
+    1.3,
+    4,
+)  # deviation of the Gaussian [voxels], and how often what it lost is smoothed again
 MARGIN = 6  # voxels kept around a label, beyond which the filter sees nothing
 PIECE = 0.01  # share of the largest piece from which on a piece belongs to a bone of several parts
-# Edge of the surface's triangles [voxels], and rounds in which triangles that cross are drawn apart.
+# Edge of the surface's triangles [voxels], and rounds in which triangles that cross are drawn
+# apart.
 EDGE, UNTANGLE = 2.2, 20
 
 
 @dataclass
 class LabelSurface:
-    """A label's surface, closed and outward [mm], the volume of its voxels [mm3], and what was left out or filled."""
+    """A label's surface, closed and outward [mm], the volume of its voxels [mm3], and what was left
+    out or filled.
+    """
 
     name: str
     mesh: Any
@@ -38,7 +45,8 @@ class LabelSurface:
 def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> LabelSurface:
     """Smooth surface of a label, or MeshError where it has too few voxels for one.
 
-    With ``pieces`` (bones of several parts) every piece of a hundredth or more is kept, not the largest alone.
+    With ``pieces`` (bones of several parts) every piece of a hundredth or more is kept, not the
+    largest alone.
     """
     import igl
     import trimesh
@@ -50,16 +58,20 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     mask = _without_islands(mask, notes, PIECE if pieces else 1.0)
     count = int(mask.sum())
     if count < 27:
-        raise MeshError(f"{volume.source}: label {name!r} has {count} voxels, too few for a surface")
+        raise MeshError(
+            f"{volume.source}: label {name!r} has {count} voxels, too few for a surface"
+        )
     smooth = smooth_mask(mask)
     vertices, faces, _, _ = marching_cubes(-smooth, 0.0, allow_degenerate=False)
     vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
-    # Fewer triangles by quadric edge collapse (Garland and Heckbert 1997), of about the edge that is wanted.
+    # Fewer triangles by quadric edge collapse (Garland and Heckbert 1997), of about the edge that
+    # is wanted.
     target = max(200, int(vertex_areas(vertices, faces).sum() / (np.sqrt(3.0) / 4.0 * EDGE**2)))
     if target < len(faces):
         vertices, faces = (np.asarray(part) for part in igl.qslim(vertices, faces, target)[:2])
     faces = faces.astype(np.int64)
-    # Edges that collapse on either side of a thin wall fold it, or bring its sides through each other.
+    # Edges that collapse on either side of a thin wall fold it, or bring its sides through each
+    # other.
     vertices = _to_volume(_untangled(vertices, faces, smooth), faces, count)
     corner = np.array([part.start for part in box]) - MARGIN
     world = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
@@ -81,7 +93,9 @@ def smooth_mask(mask: np.ndarray) -> np.ndarray:
 
 
 def _without_islands(mask, notes, least):
-    """The pieces of at least a share of the largest, their inner holes filled; what was left out goes to ``notes``."""
+    """The pieces of at least a share of the largest, their inner holes filled; what was left out
+    goes to ``notes``.
+    """
     pieces, count = connected(mask)
     if count > 1:
         sizes = np.bincount(pieces.ravel())
@@ -90,7 +104,9 @@ def _without_islands(mask, notes, least):
         rest = int(sizes[~kept].sum())
         if rest:
             share = 100 * rest / sizes.sum()
-            notes.append(f"{int((~kept).sum()) - 1} islands of {rest} voxels left out ({share:.2g} %)")
+            notes.append(
+                f"{int((~kept).sum()) - 1} islands of {rest} voxels left out ({share:.2g} %)"
+            )
         mask = kept[pieces]
     filled = binary_fill_holes(mask)
     hollow = int((filled & ~mask).sum())
@@ -100,7 +116,9 @@ def _without_islands(mask, notes, least):
 
 
 def _untangled(vertices, faces, smooth):
-    """Vertices where no triangle goes through another: beside such places evened out, and put back on the zero set."""
+    """Vertices where no triangle goes through another: beside such places evened out, and put back
+    on the zero set.
+    """
     heads, tails = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     degree = np.bincount(heads, minlength=len(vertices))
     least, best = np.inf, vertices
@@ -113,14 +131,18 @@ def _untangled(vertices, faces, smooth):
         near = np.zeros(len(vertices), dtype=bool)
         near[faces[crossing]] = True
         near[faces[near[faces].any(axis=1)]] = True  # and their neighbours
-        means = np.stack([np.bincount(heads, vertices[tails, k]) / degree for k in range(3)], axis=1)
+        means = np.stack(
+            [np.bincount(heads, vertices[tails, k]) / degree for k in range(3)], axis=1
+        )
         vertices = vertices.copy()
         vertices[near] = _on_zero_set(0.5 * (vertices[near] + means[near]), smooth)
     return best
 
 
 def _on_zero_set(points, smooth):
-    """Points moved along the gradient of a field on a grid to where it is zero, by a voxel at most."""
+    """Points moved along the gradient of a field on a grid to where it is zero, by a voxel at
+    most.
+    """
 
     def value(at):
         return map_coordinates(smooth, at.T, order=1, mode="nearest")
@@ -134,7 +156,9 @@ def _on_zero_set(points, smooth):
 
 
 def _to_volume(vertices, faces, wanted):
-    """Vertices moved along their normals, all by the same distance, until the mesh holds the wanted volume."""
+    """Vertices moved along their normals, all by the same distance, until the mesh holds the wanted
+    volume.
+    """
     for _ in range(2):
         volume = mesh_volume(vertices, faces)
         normals, area = vertex_normals(vertices, faces), vertex_areas(vertices, faces).sum()

@@ -11,7 +11,14 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.importers.opensim.xml import Node, plain_name
-from rbfmuscle.scene.joints.functions import Function, Linear, PiecewiseLinear, Polynomial, Spline, scaled
+from rbfmuscle.scene.joints.functions import (
+    Function,
+    Linear,
+    PiecewiseLinear,
+    Polynomial,
+    Spline,
+    scaled,
+)
 from rbfmuscle.validation import SceneError
 
 _DEEPEST = 50
@@ -29,13 +36,17 @@ class Frames:
         self.offsets = {node.path: node for node in found}
 
     def place(self, name: str, *, inside: str = "/") -> tuple[str, np.ndarray]:
-        """Body and frame in it (4, 4) of a name, absolute or relative to the component ``inside``."""
+        """Body and frame in it (4, 4) of a name, absolute or relative to the component
+        ``inside``.
+        """
         transform, path = np.eye(4), self._find(name, inside)
         for _ in range(_DEEPEST):
             if path in self.bodies:
                 return self.bodies[path], transform
             frame = self.offsets[path]
-            transform = frame_at(frame.vector("translation"), frame.vector("orientation")) @ transform
+            transform = (
+                frame_at(frame.vector("translation"), frame.vector("orientation")) @ transform
+            )
             path = self._find(socket(frame, "parent") or "..", path)
         raise SceneError(f"frame {path!r} is offset from itself; correct its parent")
 
@@ -64,10 +75,14 @@ def socket(node: Node, name: str) -> str:
 
 
 def read_function(node: Node | None) -> Function | None:
-    """The function in an element, directly or in its child ``function``; None where there is none."""
+    """The function in an element, directly or in its child ``function``; None where there is
+    none.
+    """
     holder = node.child("function") if node is not None else None
     inside = node if holder is None else holder
-    found = [inner for inner in inside.nodes() if inner.tag not in BESIDE] if inside is not None else []
+    found = (
+        [inner for inner in inside.nodes() if inner.tag not in BESIDE] if inside is not None else []
+    )
     return _read(found[0]) if found else None
 
 
@@ -83,7 +98,9 @@ def _read(node):
         inner, scale = read_function(node), node.number("scale", 1.0)
         if inner is None:
             raise node.owner.error("a MultiplierFunction without a function; give it one")
-        if isinstance(inner, Linear) and len(inner.slopes) == 1:  # OpenSim takes only a plain one for linear
+        if (
+            isinstance(inner, Linear) and len(inner.slopes) == 1
+        ):  # OpenSim takes only a plain one for linear
             return Polynomial((scale * inner.slopes[0], scale * inner.constant))
         return scaled(inner, scale)
     if node.tag == "PiecewiseLinearFunction" or node.tag in SPLINES:

@@ -1,4 +1,6 @@
-"""An OpenSim model as read: bodies, joints, couplings, meshes and muscles, in metres and radians."""
+"""An OpenSim model as read: bodies, joints, couplings, meshes and muscles, in metres and
+radians.
+"""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -15,7 +17,8 @@ GROUND = "ground"
 
 @dataclass
 class ModelJoint(Joint):
-    """A joint between two bodies: ``X_child = X_parent P J(q) C^-1``, with P and C the joint's frames (4, 4) in them.
+    """A joint between two bodies: ``X_child = X_parent P J(q) C^-1``, with P and C the joint's
+    frames (4, 4) in them.
 
     Its own centre is the origin.
     """
@@ -26,7 +29,9 @@ class ModelJoint(Joint):
 
 @dataclass
 class ModelMesh:
-    """A mesh that a body shows: scaled by three factors, then moved by ``transform`` (4, 4) into the body."""
+    """A mesh that a body shows: scaled by three factors, then moved by ``transform`` (4, 4) into
+    the body.
+    """
 
     file: str
     body: str
@@ -36,7 +41,9 @@ class ModelMesh:
 
 @dataclass
 class WrapShape:
-    """A cylinder (z), ellipsoid or sphere that a path goes around, in a frame (4, 4) of a body [metre]."""
+    """A cylinder (z), ellipsoid or sphere that a path goes around, in a frame (4, 4) of a body
+    [metre].
+    """
 
     body: str
     frame: np.ndarray
@@ -47,7 +54,9 @@ class WrapShape:
 
 @dataclass
 class ModelMuscle:
-    """A muscle of the model: points by body in their frames [metre], shapes it wraps around, volume [m3]."""
+    """A muscle of the model: points by body in their frames [metre], shapes it wraps around, volume
+    [m3].
+    """
 
     name: str
     points: list[tuple[str, np.ndarray]]
@@ -77,19 +86,24 @@ class OsimModel:
         return {name: facts for joint in self.joints for name, facts in joint.coordinates.items()}
 
     def tree(self) -> Iterator[tuple[ModelJoint, bool]]:
-        """Joints from the ground outwards; the flag says that the joint is walked from its child to its parent.
+        """Joints from the ground outwards; the flag says that the joint is walked from its child to
+        its parent.
 
         A joint between two bodies that are both reached already closes a loop and is left out.
         """
         reached, waiting = {GROUND}, list(self.joints)
-        while ready := next((j for j in waiting if (j.parent in reached) != (j.child in reached)), None):
+        while ready := next(
+            (j for j in waiting if (j.parent in reached) != (j.child in reached)), None
+        ):
             waiting.remove(ready)
             backward = ready.child in reached
             reached |= {ready.parent, ready.child}
             yield ready, backward
 
     def transforms(self, values: dict[str, float] | None = None) -> dict[str, np.ndarray]:
-        """The (4, 4) transform from every body to the ground [metre], at values of coordinates by bare names."""
+        """The (4, 4) transform from every body to the ground [metre], at values of coordinates by
+        bare names.
+        """
         resolved = resolve(values or {}, self.coordinates(), self.couplings)
         found = {body: np.eye(4) for body in self.bodies}
         for joint, backward in self.tree():
@@ -104,7 +118,9 @@ class OsimModel:
 
 
 def finish(model: OsimModel) -> OsimModel:
-    """The model, what is not connected noted; SceneError if names are shared, or if one names what is not there."""
+    """The model, what is not connected noted; SceneError if names are shared, or if one names what
+    is not there.
+    """
     coordinates = [name for joint in model.joints for name in joint.coordinates]
     joints = [joint.name for joint in model.joints]
     for what, names in (("bodies", model.bodies), ("joints", joints), ("coordinates", coordinates)):
@@ -114,19 +130,27 @@ def finish(model: OsimModel) -> OsimModel:
     for joint in model.joints:
         for body in (joint.parent, joint.child):
             if body not in model.bodies:
-                raise SceneError(f"joint {joint.name!r}: there is no body {body!r}; correct its frames")
+                raise SceneError(
+                    f"joint {joint.name!r}: there is no body {body!r}; correct its frames"
+                )
     for coupling in model.couplings:
         for name in (coupling.coordinate, *coupling.of):
             if name not in coordinates:
-                raise SceneError(f"a coupling names coordinate {name!r}, which no joint has; correct it")
+                raise SceneError(
+                    f"a coupling names coordinate {name!r}, which no joint has; correct it"
+                )
     model.couplings = ordered(model.couplings)
     used = [joint.name for joint, _ in model.tree()]
     for joint in model.joints:
         if joint.name not in used:
             ends = f"({joint.parent} to {joint.child})"
-            model.notes.append(f"joint {joint.name!r} {ends} closes a loop or is not connected: not taken")
+            model.notes.append(
+                f"joint {joint.name!r} {ends} closes a loop or is not connected: not taken"
+            )
     held = {GROUND} | {b for j in model.joints if j.name in used for b in (j.parent, j.child)}
     for body in model.bodies:
         if body not in held:
-            model.notes.append(f"body {body!r} has no joint to the ground: it stays where its file puts it")
+            model.notes.append(
+                f"body {body!r} has no joint to the ground: it stays where its file puts it"
+            )
     return model

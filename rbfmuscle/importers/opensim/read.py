@@ -20,14 +20,18 @@ from rbfmuscle.scene.joints.joint import KINDS, Coordinate, Coupling, TransformA
 from rbfmuscle.validation import SceneError
 
 SOCKETS = 40000  # from this version on joints stand in a set of their own and name their frames
-# What OpenSim calls otherwise than our table of joints; where both have one, its coordinates are in the same order.
+# What OpenSim calls otherwise than our table of joints; where both have one, its coordinates are in
+# the same order.
 RENAMED = {"weld": "fixed", "pin": "hinge", "gimbal": "ball"}
-# Force per area of muscle [N/m2] (Arnold et al. 2010, Ann Biomed Eng 38: 269; Rajagopal et al. 2016 have 60 N/cm2).
+# Force per area of muscle [N/m2] (Arnold et al. 2010, Ann Biomed Eng 38: 269; Rajagopal et al. 2016
+# have 60 N/cm2).
 SPECIFIC_TENSION = 61e4
 
 
 def read_osim(path: Path | str) -> OsimModel:
-    """An OpenSim model of version 2 to 4; a SceneError names the object that cannot be taken, and the remedy."""
+    """An OpenSim model of version 2 to 4; a SceneError names the object that cannot be taken, and
+    the remedy.
+    """
     path = Path(path)
     root = read_xml(path)
     try:
@@ -43,7 +47,9 @@ def _read_model(root, path):
     try:
         version = int(root.get("Version", "0"))
     except ValueError:
-        raise SceneError(f"version {root.get('Version', '')[:20]!r} is no number; correct it") from None
+        raise SceneError(
+            f"version {root.get('Version', '')[:20]!r} is no number; correct it"
+        ) from None
     for defaults in node.findall("defaults"):
         node.remove(defaults)
     bodies = [body for body in node.objects("BodySet") if body.tag == "Body"]
@@ -96,11 +102,17 @@ def _read_nested(model, bodies):
         for joint in body.objects("Joint"):
             ends = []
             for name, where, turn in (
-                (plain_name(joint.word("parent_body")), "location_in_parent", "orientation_in_parent"),
+                (
+                    plain_name(joint.word("parent_body")),
+                    "location_in_parent",
+                    "orientation_in_parent",
+                ),
                 (body.name, "location", "orientation"),
             ):
                 # Six digits: so OpenSim 4 rounds these when it reads an older file.
-                six = [[float(f"{value:.6g}") for value in joint.vector(tag)] for tag in (where, turn)]
+                six = [
+                    [float(f"{value:.6g}") for value in joint.vector(tag)] for tag in (where, turn)
+                ]
                 ends.append((name, frame_at(np.array(six[0]), six[1])))
             if joint.truth("reverse"):
                 ends.reverse()
@@ -112,9 +124,17 @@ def _read_nested(model, bodies):
         for file in visible.word("geometry_files").split():
             _add_mesh(model, file, body.name, whole, np.eye(4), True)
         for shape in visible.objects("GeometrySet"):
-            six, file = shape.numbers("transform", "0 0 0 0 0 0", count=6), shape.word("geometry_file")
-            scale, shown = whole * shape.vector("scale_factors", "1 1 1"), shape.word("display_preference")
-            _add_mesh(model, file, body.name, scale, frame_at(np.array(six[3:]), six[:3]), shown != "0")
+            six, file = (
+                shape.numbers("transform", "0 0 0 0 0 0", count=6),
+                shape.word("geometry_file"),
+            )
+            scale, shown = (
+                whole * shape.vector("scale_factors", "1 1 1"),
+                shape.word("display_preference"),
+            )
+            _add_mesh(
+                model, file, body.name, scale, frame_at(np.array(six[3:]), six[:3]), shown != "0"
+            )
 
 
 def _add_mesh(model, file, body, scale, transform, shown):
@@ -128,13 +148,17 @@ def _add_mesh(model, file, body, scale, transform, shown):
 
 
 def _joint(node, ends, holder, model):
-    """One joint from its element, its ends as (body, frame), and the tag of what holds its coordinates."""
+    """One joint from its element, its ends as (body, frame), and the tag of what holds its
+    coordinates.
+    """
     (parent, first), (child, second) = ends
     kind = node.tag.removesuffix("Joint").lower()
     kind = RENAMED.get(kind, kind)
     if kind not in KINDS:
         why = f"is not in the table of joints, so body {child!r} cannot be placed"
-        raise node.error(f"{parent} to {child}: its kind {why}; replace it by a CustomJoint in OpenSim")
+        raise node.error(
+            f"{parent} to {child}: its kind {why}; replace it by a CustomJoint in OpenSim"
+        )
     found = [inner for inner in node.objects(holder) if inner.tag == "Coordinate"]
     names, (turns, shifts) = [inner.name for inner in found], KINDS[kind][:2]
     if kind == "custom":
@@ -145,7 +169,9 @@ def _joint(node, ends, holder, model):
             raise node.error(f"a {node.tag} has {needed} coordinates, {len(names)} are given")
         axes = {
             "rotation": tuple(TransformAxis(axis, (name,)) for axis, name in zip(turns, names)),
-            "translation": tuple(TransformAxis(a, (n,)) for a, n in zip(shifts, names[len(turns) :])),
+            "translation": tuple(
+                TransformAxis(a, (n,)) for a, n in zip(shifts, names[len(turns) :])
+            ),
         }
     slopes = [
         (sort, axis.coordinates, next(iter(getattr(axis.function, "slopes", ())), 0.0))
@@ -157,11 +183,21 @@ def _joint(node, ends, holder, model):
         f"coordinate {name!r} moves nothing: it is left out" for name in names if name not in used
     ]
     kept = [inner for inner in found if inner.name in used]
-    coordinates = {inner.name: _coordinate(inner, motion_of(inner.name, slopes), model) for inner in kept}
+    coordinates = {
+        inner.name: _coordinate(inner, motion_of(inner.name, slopes), model) for inner in kept
+    }
     return ModelJoint(
-        node.name, parent, child, np.zeros(3), coordinates, axes["rotation"], axes["translation"], kind,
-        parent_frame=first, child_frame=second,
-    )  # fmt: skip
+        node.name,
+        parent,
+        child,
+        np.zeros(3),
+        coordinates,
+        axes["rotation"],
+        axes["translation"],
+        kind,
+        parent_frame=first,
+        child_frame=second,
+    )
 
 
 def _custom_axes(node, names):
@@ -183,9 +219,13 @@ def _custom_axes(node, names):
             if name not in names:
                 raise axis.error(f"follows {name!r}, which is no coordinate of this joint")
         _check_count(function, len(of), axis)
-        axes[axis.name] = TransformAxis(tuple((direction / np.linalg.norm(direction)).tolist()), of, function)
+        axes[axis.name] = TransformAxis(
+            tuple((direction / np.linalg.norm(direction)).tolist()), of, function
+        )
     slots = ("rotation", "translation")
-    return {slot: tuple(axes[f"{slot}{k}"] for k in (1, 2, 3) if f"{slot}{k}" in axes) for slot in slots}
+    return {
+        slot: tuple(axes[f"{slot}{k}"] for k in (1, 2, 3) if f"{slot}{k}" in axes) for slot in slots
+    }
 
 
 def _check_count(function, count, node):
@@ -226,13 +266,17 @@ def _read_couplings(model, node):
             raise constraint.error("names no coordinates; give it some")
         _check_count(function, len(of), constraint)
         factor = constraint.number("scale_factor", 1.0)
-        model.couplings.append(Coupling(target, of, scaled(function, factor) if factor != 1.0 else function))
+        model.couplings.append(
+            Coupling(target, of, scaled(function, factor) if factor != 1.0 else function)
+        )
         if target in coordinates and coordinates[target].locked:
             model.notes.append(f"coordinate {target!r} is locked and follows others: it follows")
 
 
 def _read_muscles(model, node, frames):
-    """The muscles of a model that have a path, a maximum isometric force and an optimal fibre length."""
+    """The muscles of a model that have a path, a maximum isometric force and an optimal fibre
+    length.
+    """
     ground = node.child("Ground")
     shapes = {}
     for body in [*([ground] if ground is not None else []), *node.objects("BodySet")]:
@@ -241,10 +285,16 @@ def _read_muscles(model, node, frames):
             if radii is None:
                 model.notes.append(f"wrapping object {shape.name!r} ({shape.tag}) is not taken")
             elif shape.truth("active", True) and min(radii) > 0:
-                frame = frame_at(shape.vector("translation"), shape.vector("xyz_body_rotation").tolist())
-                quadrant = shape.word("quadrant", "all").lower().removeprefix("+").replace("all", "")
+                frame = frame_at(
+                    shape.vector("translation"), shape.vector("xyz_body_rotation").tolist()
+                )
+                quadrant = (
+                    shape.word("quadrant", "all").lower().removeprefix("+").replace("all", "")
+                )
                 body_name = body.name or GROUND
-                shapes[shape.name] = WrapShape(body_name, frame, np.array(radii), shape.tag, quadrant)
+                shapes[shape.name] = WrapShape(
+                    body_name, frame, np.array(radii), shape.tag, quadrant
+                )
     muscles, resting = [], {name: facts.rest for name, facts in model.coordinates().items()}
     for force in node.objects("ForceSet"):
         path = force.child("GeometryPath")
@@ -252,7 +302,11 @@ def _read_muscles(model, node, frames):
             continue
         points = [_path_point(point, frames, resting) for point in path.objects("PathPointSet")]
         names = [plain_name(wrap.word("wrap_object")) for wrap in path.objects("PathWrapSet")]
-        volume = force.number("max_isometric_force") * force.number("optimal_fiber_length") / SPECIFIC_TENSION
+        volume = (
+            force.number("max_isometric_force")
+            * force.number("optimal_fiber_length")
+            / SPECIFIC_TENSION
+        )
         wraps = [shapes[name] for name in names if name in shapes]
         muscles.append(ModelMuscle(force.name, [p for p in points if p is not None], wraps, volume))
     return muscles
@@ -267,11 +321,15 @@ def _radii(shape):
 
 
 def _path_point(point, frames, resting):
-    """Body and place in it of a path point where coordinates are at their defaults; None where it is not active."""
+    """Body and place in it of a path point where coordinates are at their defaults; None where it
+    is not active.
+    """
     body, frame = frames.place(point.word("socket_parent_frame") or point.word("body"))
 
     def value_of(tag):
-        return resting.get(plain_name(point.word(f"socket_{tag}") or point.word(tag)).split("/")[-1], 0.0)
+        return resting.get(
+            plain_name(point.word(f"socket_{tag}") or point.word(tag)).split("/")[-1], 0.0
+        )
 
     if point.tag == "ConditionalPathPoint":
         low, high = point.numbers("range", "-1e9 1e9", count=2)

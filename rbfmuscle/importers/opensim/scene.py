@@ -1,4 +1,6 @@
-"""A scene from an OpenSim model: bodies as bones where the default pose puts them, joints as they are; its files."""
+"""A scene from an OpenSim model: bodies as bones where the default pose puts them, joints as they
+are; its files.
+"""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,8 +27,8 @@ NARROWEST = 0.002
 class Imported:
     """A scene made from a model.
 
-    ``places`` are (4, 4) from every body of the model to the scene, rest pose [metre]; ``notes`` say what was not
-    taken, or taken otherwise than one may expect.
+    ``places`` are (4, 4) from every body of the model to the scene, rest pose [metre]; ``notes``
+    say what was not taken, or taken otherwise than one may expect.
     """
 
     scene: Scene
@@ -35,12 +37,16 @@ class Imported:
     notes: list[str] = field(default_factory=list)
 
 
-def import_osim(path: Path | str, *, geometry: list[Path] | None = None, muscles: bool = True) -> Imported:
-    """Make a scene of an OpenSim model (``.osim``), in metres as it is, with a tube for each of its ``muscles``.
+def import_osim(
+    path: Path | str, *, geometry: list[Path] | None = None, muscles: bool = True
+) -> Imported:
+    """Make a scene of an OpenSim model (``.osim``), in metres as it is, with a tube for each of its
+    ``muscles``.
 
-    Meshes stand where the model's default pose puts them, which is then the rest pose of the scene. A body without a
-    mesh becomes a bone without one. Meshes are looked for in the model's folder, its ``Geometry``, then in
-    ``geometry``. SceneError if the model cannot be read, or has a joint that the table of joints lacks.
+    Meshes stand where the model's default pose puts them, which is then the rest pose of the scene.
+    A body without a mesh becomes a bone without one. Meshes are looked for in the model's folder,
+    its ``Geometry``, then in ``geometry``. SceneError if the model cannot be read, or has a joint
+    that the table of joints lacks.
     """
     model = read_osim(path)
     scene, places = Scene(model.name, units="m"), model.transforms()
@@ -77,14 +83,18 @@ def _add_muscles(found):
     for muscle in found.model.muscles:
         try:
             tube = make_tube(muscle, found.places, bones)
-            attach: Any = [{"bone": body, "vertices": held.tolist()} for body, held in tube.held.items()]
+            attach: Any = [
+                {"bone": body, "vertices": held.tolist()} for body, held in tube.held.items()
+            ]
             scene.add_muscle(muscle.name, (tube.vertices, tube.faces), attach=attach)
         except (SceneError, MeshError) as error:
             found.notes.append(f"muscle {muscle.name!r} is not taken: {error}")
 
 
 def _find_mesh(name: str, folders: list[Path]) -> Path | None:
-    """Return the first file of that name in some folders, or None; exact names before others in case or suffix."""
+    """Return the first file of that name in some folders, or None; exact names before others in
+    case or suffix.
+    """
     plain = name.replace("\\", "/")
     for folder in folders:
         if (folder / plain).is_file():
@@ -101,9 +111,13 @@ def _find_mesh(name: str, folders: list[Path]) -> Path | None:
 def _body_meshes(
     model: OsimModel, places: dict[str, np.ndarray], geometry: list[Path]
 ) -> tuple[dict[str, ReadMesh], list[str]]:
-    """One mesh for each body that shows any, in the scene's coordinates [metre], and what could not be taken."""
+    """One mesh for each body that shows any, in the scene's coordinates [metre], and what could not
+    be taken.
+    """
     folders = [model.path.parent, model.path.parent / "Geometry", *geometry]
-    parts, meshes, notes = {}, {}, []
+    parts = {}
+    meshes = {}
+    notes = []
     for mesh in model.meshes:
         try:
             file, vertices, faces = _placed(mesh, places[mesh.body], folders)
@@ -127,7 +141,9 @@ def _body_meshes(
     return meshes, notes
 
 
-def _placed(mesh: ModelMesh, place: np.ndarray, folders: list[Path]) -> tuple[Path, np.ndarray, np.ndarray]:
+def _placed(
+    mesh: ModelMesh, place: np.ndarray, folders: list[Path]
+) -> tuple[Path, np.ndarray, np.ndarray]:
     """File, vertices [metre, ground] and triangles of a mesh."""
     file = _find_mesh(mesh.file, folders)
     if file is None:
@@ -150,10 +166,14 @@ def write_scene(found: Imported, directory: Path) -> Path:
     directory.mkdir(parents=True, exist_ok=True)
     facts |= {"left_out": scene.left_out} if scene.left_out else {}
     facts |= {"superior": scene.superior, "anterior": scene.anterior}
-    bones = [{"name": bone.name, "mesh": _write_mesh(directory, "bones", bone)} for bone in scene.bones]
+    bones = [
+        {"name": bone.name, "mesh": _write_mesh(directory, "bones", bone)} for bone in scene.bones
+    ]
     parts = [_head(found), table_text("[scene]", facts)]
     parts += [table_text("[[bone]]", row) for row in bones]
-    parts += [table_text("[[bone]]   # no mesh: joints only", {"name": name}) for name in scene.links]
+    parts += [
+        table_text("[[bone]]   # no mesh: joints only", {"name": name}) for name in scene.links
+    ]
     parts += [table_text("[[joint]]", joint_row(joint)) for joint in scene.joints]
     parts += [table_text("[[coupling]]", coupling_row(c, scene.joints)) for c in scene.couplings]
     parts += [_muscle_text(directory, muscle) for muscle in scene.muscles]
@@ -167,7 +187,8 @@ def _head(found):
     lines = [
         f"Scene from the OpenSim model {model.path.name} (version {model.version}).",
         "Its meshes, authors and licence are the model's: see its <credits>.",
-        "Meshes stand in the model's default pose; angles are degrees. All keys: docs/scene_file.md.",
+        "Meshes stand in the model's default pose; angles are degrees. All keys: "
+        "docs/scene_file.md.",
         *(f"note: {note}" for note in found.notes),
     ]
     return "\n".join("# " + " ".join(line.split()) for line in lines) + "\n"
@@ -181,7 +202,10 @@ def _muscle_text(directory, muscle):
         file = f"attachments/{muscle.name}_{held.bone}.txt"
         np.savetxt(directory / file, held.vertices, fmt="%d")
         row["attach"].append({"bone": held.bone, "vertices": file})
-    head = "[[muscle]]   # a tube along the model's path, of its fibres' volume; put a mesh of your own here"
+    head = (
+        "[[muscle]]   # a tube along the model's path, of its fibres' volume; put a mesh of "
+        "your own here"
+    )
     return table_text(head, row)
 
 

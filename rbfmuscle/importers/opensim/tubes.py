@@ -1,7 +1,8 @@
 """Muscles without meshes: tapered tubes along the paths of a model.
 
-A tube has the volume of its fibres: maximum isometric force times optimal fibre length over the specific tension. Its
-middle line is the model's path in its default pose, over its wrapping objects, kept out of the bones.
+A tube has the volume of its fibres: maximum isometric force times optimal fibre length over the
+specific tension. Its middle line is the model's path in its default pose, over its wrapping
+objects, kept out of the bones.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,9 @@ from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.validation import SceneError
 
 # Sections along a tube; radius at the ends against the middle; share of the length held at an end.
-SECTIONS, END_RADIUS, HELD = 28, 0.3, 0.06
+SECTIONS = 28
+END_RADIUS = 0.3
+HELD = 0.06
 ROUNDS = 60  # rounds in which the middle line is drawn straight and put out of what is in its way
 
 
@@ -29,7 +32,9 @@ class Tube:
     held: dict[str, np.ndarray]
 
 
-def make_tube(muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[str, ExactDistance]) -> Tube:
+def make_tube(
+    muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[str, ExactDistance]
+) -> Tube:
     """The tube of a muscle in the scene, or SceneError where no two bodies with a mesh hold it.
 
     ``places`` are (4, 4) from every body of the model to the scene [metre], ``bones`` their meshes.
@@ -40,7 +45,9 @@ def make_tube(muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[st
     for body in (bodies[0], bodies[-1]):
         if body not in bones:
             raise SceneError(f"muscle {muscle.name!r}: body {body!r} has no mesh to hold it")
-    points = np.array([places[body][:3, :3] @ at + places[body][:3, 3] for body, at in muscle.points])
+    points = np.array(
+        [places[body][:3, :3] @ at + places[body][:3, 3] for body, at in muscle.points]
+    )
     along = distance_along(points)
     line = points_along(points, np.linspace(0.0, along[-1], SECTIONS))
     # The path's points in the line.
@@ -50,13 +57,17 @@ def make_tube(muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[st
     radius = share * np.sqrt(muscle.volume / (np.pi * length * np.mean(share**2)))
     wraps = [(wrap, places[wrap.body] @ wrap.frame) for wrap in muscle.wraps]
     line = _clear_line(line, fixed, radius, wraps, list(bones.values()))
-    found = mesh_volume(*tube_mesh(line, radius))  # as its square, but for where sections run into each other
+    found = mesh_volume(
+        *tube_mesh(line, radius)
+    )  # as its square, but for where sections run into each other
     vertices, faces = tube_mesh(line, radius * np.sqrt(muscle.volume / found))
     return Tube(vertices, faces, _held(bodies, fixed, bones))
 
 
 def _clear_line(line, fixed, radius, wraps, bones):
-    """The line drawn straight between its points, out of wrapping shapes and, by its radius, out of bones."""
+    """The line drawn straight between its points, out of wrapping shapes and, by its radius, out of
+    bones.
+    """
     line, start = line.copy(), line.copy()
     middle = np.arange(3, len(line) - 3)
     for number in range(ROUNDS):
@@ -74,7 +85,9 @@ def _clear_line(line, fixed, radius, wraps, bones):
 
 
 def _out_of_shape(wrap: WrapShape, points: Any) -> Any:
-    """Points (n, 3) in a shape's frame [metre], those inside moved to its surface, in its quadrant."""
+    """Points (n, 3) in a shape's frame [metre], those inside moved to its surface, in its
+    quadrant.
+    """
     count = 2 if wrap.kind == "WrapCylinder" else 3
     unit = points[:, :count] / wrap.radii[:count]
     inside = np.linalg.norm(unit, axis=1) < 1.0
@@ -92,20 +105,26 @@ def _out_of_shape(wrap: WrapShape, points: Any) -> Any:
 
 
 def _out_of_bone(bone, points, reach):
-    """Points (n, 3) no nearer to a bone than ``reach`` (n,), those deeper in it left where they are."""
+    """Points (n, 3) no nearer to a bone than ``reach`` (n,), those deeper in it left where they
+    are.
+    """
     distance, closest, *_ = bone.nearest(points, reach=float(reach.max()))
     away = (points - closest) / np.where(distance == 0.0, 1.0, distance)[:, None]
     return np.where((distance < reach)[:, None], closest + away * reach[:, None], points)
 
 
 def _held(bodies, fixed, bones):
-    """Vertices by bone: both ends with the points that follow on their body, a section at each point on another."""
+    """Vertices by bone: both ends with the points that follow on their body, a section at each
+    point on another.
+    """
     few = max(1, round(HELD * SECTIONS))
     first = next(k for k, body in enumerate(bodies) if body != bodies[0])
     last = len(bodies) - next(k for k, body in enumerate(reversed(bodies)) if body != bodies[-1])
     start = min(max(few, fixed[first - 1]), SECTIONS // 3)
     end = max(min(SECTIONS - 1 - few, fixed[last]), SECTIONS - 1 - SECTIONS // 3)
-    sections = dict.fromkeys(range(start + 1), bodies[0]) | dict.fromkeys(range(end, SECTIONS), bodies[-1])
+    sections = dict.fromkeys(range(start + 1), bodies[0]) | dict.fromkeys(
+        range(end, SECTIONS), bodies[-1]
+    )
     for place, body in zip(fixed[first:last].tolist(), bodies[first:last]):
         if body in bones:
             sections.setdefault(place, body)

@@ -1,4 +1,6 @@
-"""A reader of XML for files of any origin: no entities, no outside files, bounded depth and size."""
+"""A reader of XML for files of any origin: no entities, no outside files, bounded depth and
+size.
+"""
 
 from __future__ import annotations
 
@@ -66,13 +68,17 @@ class Node(ElementTree.Element):
         return next((node for node in self.nodes() if node.tag == tag), None)
 
     def objects(self, tag: str) -> list[Node]:
-        """What a set holds: children of ``<tag><objects>``, or of ``<tag>`` itself where there is no such level."""
+        """What a set holds: children of ``<tag><objects>``, or of ``<tag>`` itself where there is
+        no such level.
+        """
         node = self.child(tag)
         inner = node.child("objects") if node is not None else None
         return inner.nodes() if inner is not None else node.nodes() if node is not None else []
 
     def word(self, tag: str, default: str = "") -> str:
-        """Text of the child of that tag, without white space around it; the default where it is missing or empty."""
+        """Text of the child of that tag, without white space around it; the default where it is
+        missing or empty.
+        """
         return (self.findtext(tag) or "").strip() or default
 
     def names(self, tag: str) -> tuple[str, ...]:
@@ -106,7 +112,9 @@ class Node(ElementTree.Element):
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """Stops at a document type, before any entity is read, and at elements that are nested too deep."""
+    """Stops at a document type, before any entity is read, and at elements that are nested too
+    deep.
+    """
 
     def __init__(self) -> None:
         super().__init__(element_factory=Node)
@@ -129,7 +137,9 @@ class _Builder(ElementTree.TreeBuilder):
 
 
 def _as_utf8(data):
-    """The bytes of a file that says UTF-8, or nothing, and is in Latin-1 as UTF-8: OpenSim reads these too."""
+    """The bytes of a file that says UTF-8, or nothing, and is in Latin-1 as UTF-8: OpenSim reads
+    these too.
+    """
     try:
         data.decode("utf-8")
     except UnicodeDecodeError:
@@ -139,7 +149,8 @@ def _as_utf8(data):
 
 
 def read_xml(path: Path) -> Node:
-    """The root element of an XML file; two colons in a name, which XML forbids, become two underscores.
+    """The root element of an XML file; two colons in a name, which XML forbids, become two
+    underscores.
 
     SceneError if the file is missing, unreadable, no XML, or beyond the limits of this module.
     """
@@ -155,6 +166,10 @@ def read_xml(path: Path) -> Node:
         reason = f"cannot read the model: {error.strerror}"
     except SceneError as error:
         reason = str(error)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the latter of an unknown encoding
+    except (
+        ElementTree.ParseError,
+        ValueError,
+        LookupError,
+    ) as error:  # the latter of an unknown encoding
         reason = f"not well-formed XML: {' '.join(str(error).split())[:100]}"
     raise SceneError(f"{path}: {reason}") from None

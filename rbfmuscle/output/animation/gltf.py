@@ -1,7 +1,8 @@
-"""A moving run as one animated binary glTF file: bones are nodes that turn, muscles are meshes with morph targets.
+"""A moving run as one animated binary glTF file: bones are nodes that turn, muscles are meshes with
+morph targets.
 
-glTF is in metres with y up, and knows no other animation of vertices than morph targets: one a frame, whose weights
-go from 0 to 1 and back one after the other.
+glTF is in metres with y up, and knows no other animation of vertices than morph targets: one a
+frame, whose weights go from 0 to 1 and back one after the other.
 """
 
 import json
@@ -22,11 +23,14 @@ _VERTICES, _INDICES = 34962, 34963  # what a view is bound as
 
 
 def animated_glb(run: MovingRun) -> bytes:
-    """The content of an animated ``.glb``; UsageError if a muscle's surface has other vertices in other frames."""
+    """The content of an animated ``.glb``; UsageError if a muscle's surface has other vertices in
+    other frames.
+    """
     changing = [muscle.name for muscle in run.muscles if not muscle.keeps_vertices]
     if changing:
         raise UsageError(
-            f"animated-glb needs surfaces that keep their vertices, those of {changing[0]!r} do not; "
+            f"animated-glb needs surfaces that keep their vertices, those of {changing[0]!r} "
+            "do not; "
             "run with surface = 'material', or export to usd, pvd or glb"
         )
     file = _File()
@@ -40,7 +44,9 @@ def animated_glb(run: MovingRun) -> bytes:
 
 
 def _add_part(file: "_File", part: MovingPart) -> int:
-    """Number of a new node: a muscle has a morph target for each frame but the first, a bone a pose for each."""
+    """Number of a new node: a muscle has a morph target for each frame but the first, a bone a pose
+    for each.
+    """
     base, faces = part.vertices[0], part.faces[0]
     normals, targets = vertex_normals(base, faces), []
     for vertices in part.vertices[1:]:
@@ -89,9 +95,16 @@ class _File:
         return len(self.lists[key]) - 1
 
     def add(
-        self, values: Floats | Integers, shape: str, *, target: int | None = None, bounds: bool = False
+        self,
+        values: Floats | Integers,
+        shape: str,
+        *,
+        target: int | None = None,
+        bounds: bool = False,
     ) -> int:
-        """Number of a new accessor of these rows: whole numbers as indices, others in single precision."""
+        """Number of a new accessor of these rows: whole numbers as indices, others in single
+        precision.
+        """
         whole = np.issubdtype(values.dtype, np.integer)
         rows = np.ascontiguousarray(values, dtype="<u4" if whole else "<f4")
         view = {"buffer": 0, "byteOffset": self.size, "byteLength": rows.nbytes}
@@ -110,7 +123,10 @@ class _File:
         look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}
         position = self.add(part.vertices[0], "VEC3", target=_VERTICES, bounds=True)
         primitive = {
-            "attributes": {"POSITION": position, "NORMAL": self.add(normals, "VEC3", target=_VERTICES)},
+            "attributes": {
+                "POSITION": position,
+                "NORMAL": self.add(normals, "VEC3", target=_VERTICES),
+            },
             "indices": self.add(part.faces[0].reshape(-1, 1), "SCALAR", target=_INDICES),
             "material": self.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
         }
@@ -124,7 +140,9 @@ class _File:
     def animate(self, node: int, path: str, values: int) -> None:
         """Let an accessor move a node's ``path`` over the times."""
         self.samplers.append({"input": self.times, "output": values, "interpolation": "LINEAR"})
-        self.channels.append({"sampler": len(self.samplers) - 1, "target": {"node": node, "path": path}})
+        self.channels.append(
+            {"sampler": len(self.samplers) - 1, "target": {"node": node, "path": path}}
+        )
 
     def content(self, scene: dict[str, Any]) -> bytes:
         """The whole file."""
@@ -132,7 +150,9 @@ class _File:
         tree: dict[str, Any] = {"asset": asset, "scene": 0, "scenes": [scene], **self.lists}
         tree["buffers"] = [{"byteLength": self.size}]
         if self.channels:
-            tree["animations"] = [{"name": "motion", "samplers": self.samplers, "channels": self.channels}]
+            tree["animations"] = [
+                {"name": "motion", "samplers": self.samplers, "channels": self.channels}
+            ]
         text = json.dumps(tree, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + self.size, len(text), b"JSON")

@@ -1,7 +1,8 @@
 """Moving runs as data that a script in a page turns, scrubs and switches on and off; no network.
 
-Positions are whole numbers of a step, kept as second differences along the frames and first differences along
-the vertices; all arrays follow each other in one deflated stream, their bytes sorted by place, as base64.
+Positions are whole numbers of a step, kept as second differences along the frames and first
+differences along the vertices; all arrays follow each other in one deflated stream, their bytes
+sorted by place, as base64.
 """
 
 import base64
@@ -28,16 +29,27 @@ def scene_file(name: str) -> str:
 
 
 def pack_runs(runs: Mapping[str, MovingRun]) -> str:
-    """JSON of runs of the same frames and bones, side by side, by what stands above each, for ``scene.js``."""
+    """JSON of runs of the same frames and bones, side by side, by what stands above each, for
+    ``scene.js``.
+    """
     first = next(iter(runs.values()))
     packer = _Packer(runs)
-    parts = [packer.part(muscle, k) for k, run in enumerate(runs.values()) for muscle in run.muscles]
+    parts = [
+        packer.part(muscle, k) for k, run in enumerate(runs.values()) for muscle in run.muscles
+    ]
     parts += [packer.part(bone, -1) for bone in first.bones]
     facts = {
-        "panels": list(runs), "captions": first.captions, "parts": parts, "step": packer.step,
-        "views": VIEWS, "body": first.body.tolist(), "direction": first.direction.tolist(),
-        "origin": packer.origin.tolist(), "rate": FRAMES_A_SECOND / 2.0, "bytes": packer.text(),
-    }  # fmt: skip
+        "panels": list(runs),
+        "captions": first.captions,
+        "parts": parts,
+        "step": packer.step,
+        "views": VIEWS,
+        "body": first.body.tolist(),
+        "direction": first.direction.tolist(),
+        "origin": packer.origin.tolist(),
+        "rate": FRAMES_A_SECOND / 2.0,
+        "bytes": packer.text(),
+    }
     # No name may end the script that holds it.
     return json.dumps(facts, separators=(",", ":")).replace("<", "\\u003c")
 
@@ -53,7 +65,9 @@ class _Packer:
         self.parts: list[bytes] = []
 
     def part(self, part: MovingPart, panel: int) -> dict[str, Any]:
-        """Take in a muscle or bone, in pieces: frames that follow each other and have the same triangles."""
+        """Take in a muscle or bone, in pieces: frames that follow each other and have the same
+        triangles.
+        """
         pieces: list[dict[str, int]] = []
         for _, group in groupby(range(len(part.faces)), key=lambda k: id(part.faces[k])):
             frames = list(group)

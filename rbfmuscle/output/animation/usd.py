@@ -1,4 +1,6 @@
-"""A moving run as one USD file (.usdc): meshes whose points are sampled over time, bones that move as rigid bodies."""
+"""A moving run as one USD file (.usdc): meshes whose points are sampled over time, bones that move
+as rigid bodies.
+"""
 
 from itertools import count
 from pathlib import Path
@@ -25,9 +27,9 @@ def check_usd() -> None:
 def write_usd(path: Path, run: MovingRun) -> None:
     """Write a run as one ``.usdc`` file; usd-core must be there (`check_usd`).
 
-    Time codes count 24 a second. A surface that keeps its vertices has its topology once and its points at every time;
-    another one has both at every time. Lengths stay in the run's unit, named by ``metersPerUnit``; the root brings
-    superior to z.
+    Time codes count 24 a second. A surface that keeps its vertices has its topology once and its
+    points at every time; another one has both at every time. Lengths stay in the run's unit, named
+    by ``metersPerUnit``; the root brings superior to z.
     """
     from pxr import Gf, Usd, UsdGeom
 
@@ -57,7 +59,9 @@ def write_usd(path: Path, run: MovingRun) -> None:
 
 
 def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
-    """A muscle gets its points at each time, and its faces where they change; a bone its points once and its poses."""
+    """A muscle gets its points at each time, and its faces where they change; a bone its points
+    once and its poses.
+    """
     from pxr import Gf, UsdGeom, Vt
 
     for k, (vertices, faces) in enumerate(zip(part.vertices, part.faces)):
@@ -73,7 +77,9 @@ def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
         mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), *at)
     if part.poses is not None:
         # Without normals a surface that is no subdivision surface is drawn facet by facet.
-        normals = np.ascontiguousarray(vertex_normals(part.vertices[0], part.faces[0]), dtype=np.float32)
+        normals = np.ascontiguousarray(
+            vertex_normals(part.vertices[0], part.faces[0]), dtype=np.float32
+        )
         mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         place = mesh.AddTransformOp()

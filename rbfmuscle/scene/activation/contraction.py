@@ -1,4 +1,6 @@
-"""Muscles that contract: their slack length and tendon on the mesh, their activation along a motion."""
+"""Muscles that contract: their slack length and tendon on the mesh, their activation along a
+motion.
+"""
 
 import itertools
 import math
@@ -9,16 +11,21 @@ from scipy.sparse.csgraph import dijkstra
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.scene.activation.keys import TENDON_STRAIN, Contraction, ContractionTable, TendonTable
+from rbfmuscle.scene.activation.keys import (
+    TENDON_STRAIN,
+    Contraction,
+    ContractionTable,
+    TendonTable,
+)
 from rbfmuscle.scene.motion import interpolate
 from rbfmuscle.scene.objects import Motion, Muscle, SceneData
 from rbfmuscle.validation import SceneError, did_you_mean
 
-# A fibre that lies farther outside than this share of the muscle's diagonal is one of another muscle or frame:
-# lines that run on to the bone, beyond the mesh of the muscle, stay below.
+# A fibre that lies farther outside than this share of the muscle's diagonal is one of another
+# muscle or frame: lines that run on to the bone, beyond the mesh of the muscle, stay below.
 OUTSIDE = 0.1
-# No activation changes by more in one sub-step; smaller steps change the shapes that are reached by less than
-# 0.1 mm (tests/contract/test_contraction.py).
+# No activation changes by more in one sub-step; smaller steps change the shapes that are reached by
+# less than 0.1 mm (tests/contract/test_contraction.py).
 STEP = 0.1
 SETTLING = 4  # further solves after activation has changed while no bone moved
 
@@ -44,7 +51,8 @@ def _check_fibres(muscle):
         outside = float(distance.signed_distance(np.asarray(line, dtype=float)).max())
         if outside > limit:
             raise SceneError(
-                f"muscle {muscle.name!r} fibres: polyline {number} leaves the muscle, by {outside:.4g} at worst "
+                f"muscle {muscle.name!r} fibres: polyline {number} leaves the muscle, by "
+                f"{outside:.4g} at worst "
                 f"({limit:.4g} is allowed); check its unit and frame"
             )
 
@@ -69,8 +77,11 @@ def _tendon(muscle: Muscle, given: TendonTable | None) -> Booleans:
 
 
 def _along_surface(mesh, start):
-    """Length (n,) of the shortest path over the surface from the vertices ``start``, some per cent too long."""
-    # Along edges, and across them to the corner on the other side: along edges alone up to 15 % too long.
+    """Length (n,) of the shortest path over the surface from the vertices ``start``, some per cent
+    too long.
+    """
+    # Along edges, and across them to the corner on the other side: along edges alone up to 15 % too
+    # long.
     ends = np.concatenate([mesh.edges_unique, mesh.face_adjacency_unshared])
     ends = np.unique(np.sort(ends, axis=1), axis=0)
     lengths = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
@@ -88,13 +99,15 @@ def activation_curve(muscle: Muscle, motion: Motion) -> Floats:
 class Activations:
     """Activations of the muscles that contract in the frame loop, and the sub-steps that they need.
 
-    ``here`` is that of each muscle now, 0 before the first frame; ``target``, set by hand as a window does, overrides
-    the scene's own curves.
+    ``here`` is that of each muscle now, 0 before the first frame; ``target``, set by hand as a
+    window does, overrides the scene's own curves.
     """
 
     def __init__(self, scene: SceneData) -> None:
         contracting = [muscle for muscle in scene.muscles if muscle.contraction is not None]
-        self.curves = {muscle.name: activation_curve(muscle, scene.motion) for muscle in contracting}
+        self.curves = {
+            muscle.name: activation_curve(muscle, scene.motion) for muscle in contracting
+        }
         self.here = dict.fromkeys(self.curves, 0.0)
         self.target: dict[str, float] = {}
 
@@ -110,8 +123,9 @@ class Activations:
     ) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
         """Sub-steps short enough in activation too.
 
-        ``stops`` are coordinates: where the bones are, then the ends of the sub-steps that they need. Returned are
-        these with further ones between them, and for each but the first the activation by muscle.
+        ``stops`` are coordinates: where the bones are, then the ends of the sub-steps that they
+        need. Returned are these with further ones between them, and for each but the first the
+        activation by muscle.
         """
         if not self.curves:
             return stops, []

@@ -15,8 +15,8 @@ TENDON_STRAIN = 0.033
 class TendonTable(Table):
     """``tendon``: where the tendon is, and its strain at full activation.
 
-    ``length`` from every attachment, or from the bone ``at`` alone. The strain of 0.033 at the greatest isometric force
-    is Zajac's (Critical Reviews in Biomedical Engineering 17, 1989).
+    ``length`` from every attachment, or from the bone ``at`` alone. The strain of 0.033 at the
+    greatest isometric force is Zajac's (Critical Reviews in Biomedical Engineering 17, 1989).
     """
 
     length: Positive
@@ -27,7 +27,11 @@ class TendonTable(Table):
 def _check_activation(value: Any) -> Any:
     """One message in place of one for each of the forms that it may take."""
     for number in value if isinstance(value, list) and value else [value]:
-        if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0.0 <= number <= 1.0:
+        if (
+            isinstance(number, bool)
+            or not isinstance(number, (int, float))
+            or not 0.0 <= number <= 1.0
+        ):
             raise ValueError("must be a number from 0 to 1, or a list of them over the motion")
     return value
 
@@ -43,7 +47,9 @@ class ContractionTable(Table):
 
 
 def contraction_keys(given: Mapping[str, Any], *, muscle: str) -> ContractionTable | None:
-    """The checked keys of one muscle, or None where it has none; a value None counts as not given."""
+    """The checked keys of one muscle, or None where it has none; a value None counts as not
+    given.
+    """
     found = {key: value for key, value in given.items() if value is not None}
     return ContractionTable.build(found, place=f"muscle {muscle!r} ") if found else None
 
@@ -54,9 +60,13 @@ class Contraction(NamedTuple):
     stretch_at_rest: float
     tendon: Booleans  # vertices (n,) of the muscle's mesh that are tendon
     tendon_strain: float = TENDON_STRAIN  # at full activation
-    slack: bool = False  # the scene says where passive fibres are slack, in place of the model's slack band
+    slack: bool = (
+        False  # the scene says where passive fibres are slack, in place of the model's slack band
+    )
 
     @property
     def shortest(self) -> float:
-        """Stretch against the scan at which a fully active fibre has no tension: half its slack length (Zajac 1989)."""
+        """Stretch against the scan at which a fully active fibre has no tension: half its slack
+        length (Zajac 1989).
+        """
         return 0.5 / self.stretch_at_rest

@@ -1,7 +1,8 @@
 """Functions of joint coordinates: linear, polynomial, piecewise linear, splines.
 
-Each takes the values of its coordinates in order and returns one number; those of one variable take the first.
-``rescaled`` gives the function in other units, ``g(f_k q_k) = output * self(q)``, f the ``inputs``.
+Each takes the values of its coordinates in order and returns one number; those of one variable take
+the first. ``rescaled`` gives the function in other units, ``g(f_k q_k) = output * self(q)``, f the
+``inputs``.
 """
 
 import bisect
@@ -43,12 +44,16 @@ class Polynomial:
     def rescaled(self, inputs: list[float], output: float) -> "Polynomial":
         """Return the function in other units."""
         top = len(self.coefficients) - 1
-        return Polynomial(tuple(c * output / inputs[0] ** (top - k) for k, c in enumerate(self.coefficients)))
+        return Polynomial(
+            tuple(c * output / inputs[0] ** (top - k) for k, c in enumerate(self.coefficients))
+        )
 
 
 @dataclass(frozen=True)
 class PiecewiseLinear:
-    """Through points (x, y), straight between them; the first and the last piece go on beyond them."""
+    """Through points (x, y), straight between them; the first and the last piece go on beyond
+    them.
+    """
 
     x: tuple[float, ...]
     y: tuple[float, ...]
@@ -57,14 +62,19 @@ class PiecewiseLinear:
 
     @cached_property
     def _pieces(self) -> list[list[float]]:
-        """Four coefficients of each piece, highest power first: before, between and beyond the points."""
+        """Four coefficients of each piece, highest power first: before, between and beyond the
+        points.
+        """
         from scipy.interpolate import make_interp_spline
 
         x, y = np.array(self.x), np.array(self.y)
         if self.degree == 1 or len(x) < 3:
             curve = make_interp_spline(x, y, k=min(1, len(x) - 1))
         else:  # three points: one parabola
-            ends = ([(3, 6.0 * _third(x[s], y[s]) if len(x) > 3 else 0.0)] for s in (np.s_[:4], np.s_[-4:]))
+            ends = (
+                [(3, 6.0 * _third(x[s], y[s]) if len(x) > 3 else 0.0)]
+                for s in (np.s_[:4], np.s_[-4:])
+            )
             curve = make_interp_spline(x, y, k=3, bc_type=tuple(ends))
         pieces = np.stack([curve(x, nu=n) / math.factorial(n) for n in (3, 2, 1, 0)], axis=1)
         straight = pieces * [0.0, 0.0, 1.0, 1.0]
@@ -79,14 +89,17 @@ class PiecewiseLinear:
 
     def rescaled(self, inputs: list[float], output: float) -> Self:
         """Return the function in other units."""
-        return replace(self, x=tuple(v * inputs[0] for v in self.x), y=tuple(v * output for v in self.y))
+        return replace(
+            self, x=tuple(v * inputs[0] for v in self.x), y=tuple(v * output for v in self.y)
+        )
 
 
 class Spline(PiecewiseLinear):
     """Cubic spline through points; beyond them it goes on straight.
 
-    It is the spline of Forsythe, Malcolm and Moler (1977), which OpenSim calls SimmSpline: the third derivative of the
-    first and of the last piece is that of the cubic through the four points there.
+    It is the spline of Forsythe, Malcolm and Moler (1977), which OpenSim calls SimmSpline: the
+    third derivative of the first and of the last piece is that of the cubic through the four points
+    there.
     """
 
     degree = 3

@@ -1,8 +1,10 @@
-"""Joints: coordinates that move one bone against another, the table of their kinds, and poses of bones.
+"""Joints: coordinates that move one bone against another, the table of their kinds, and poses of
+bones.
 
-Every kind is rotations about axes that are carried along by those before them, and a shift along axes that are not
-turned by them (Seth et al. 2010, the custom joint of Simbody); what a kind fixes is how many there are, and that each
-follows one coordinate. Couplings, locks and ranges come first, then joint after joint from the root.
+Every kind is rotations about axes that are carried along by those before them, and a shift along
+axes that are not turned by them (Seth et al. 2010, the custom joint of Simbody); what a kind fixes
+is how many there are, and that each follows one coordinate. Couplings, locks and ranges come first,
+then joint after joint from the root.
 """
 
 import math
@@ -18,7 +20,9 @@ from rbfmuscle.scene.joints.functions import Function, Linear
 from rbfmuscle.validation import SceneError
 
 MotionKind: TypeAlias = Literal["rotation", "translation", "coupled"]
-X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+X = (1.0, 0.0, 0.0)
+Y = (0.0, 1.0, 0.0)
+Z = (0.0, 0.0, 1.0)
 
 
 class Kind(NamedTuple):
@@ -50,11 +54,15 @@ IDENTITY = Linear((1.0,))
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One number that moves a joint: an angle [radian], a length [scene unit], or one with no unit."""
+    """One number that moves a joint: an angle [radian], a length [scene unit], or one with no
+    unit.
+    """
 
     # What the number is; a coupled one drives several axes by functions and has no unit of its own.
     motion: MotionKind = "rotation"
-    rest: float = 0.0  # in the pose in which the meshes are, and in a motion that does not mention it
+    rest: float = (
+        0.0  # in the pose in which the meshes are, and in a motion that does not mention it
+    )
     range: tuple[float, float] | None = None
     clamped: bool = False  # cut to the range; others may leave it, which is reported
     locked: bool = False  # stays at rest whatever is asked of it
@@ -83,7 +91,9 @@ class TransformAxis:
 
 @dataclass
 class Joint:
-    """Moves ``child`` (and all that hangs on it) against ``parent``; all is in the scene's coordinates at rest."""
+    """Moves ``child`` (and all that hangs on it) against ``parent``; all is in the scene's
+    coordinates at rest.
+    """
 
     name: str
     parent: str
@@ -96,9 +106,11 @@ class Joint:
     backward: bool = False  # written from child to parent: its motion is inverted
 
     def motion(self, values: dict[str, float], rest: dict[str, float]) -> np.ndarray:
-        """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity at rest.
+        """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity
+        at rest.
 
-        ``values`` and ``rest`` hold every coordinate of the joint by its bare name, now and in the rest pose.
+        ``values`` and ``rest`` hold every coordinate of the joint by its bare name, now and in the
+        rest pose.
         """
         if values == rest:
             return np.eye(4)
@@ -108,7 +120,10 @@ class Joint:
     def moved(self, pose: np.ndarray) -> Self:
         """Return the joint where a pose (4, 4) takes it."""
         turns, shifts = (
-            tuple(replace(axis, direction=tuple((pose[:3, :3] @ axis.direction).tolist())) for axis in axes)
+            tuple(
+                replace(axis, direction=tuple((pose[:3, :3] @ axis.direction).tolist()))
+                for axis in axes
+            )
             for axes in (self.rotations, self.translations)
         )
         centre = pose[:3, :3] @ self.centre + pose[:3, 3]
@@ -127,7 +142,9 @@ class Joint:
 
 @dataclass(frozen=True)
 class Coupling:
-    """A coordinate that follows others: ``coordinate = function(*of)``, full names, radian and scene units."""
+    """A coordinate that follows others: ``coordinate = function(*of)``, full names, radian and
+    scene units.
+    """
 
     coordinate: str
     of: tuple[str, ...]
@@ -137,9 +154,9 @@ class Coupling:
 def motion_of(name: str, axes: Iterable[tuple[MotionKind, Sequence[str], float]]) -> MotionKind:
     """What a coordinate of a custom joint is, by OpenSim's rule.
 
-    It is an angle or a length where it alone drives an axis of that sort with a slope of 1 or -1, the last such axis
-    deciding; else it is coupled. ``axes`` are the sort of each, its coordinates, and the first slope of its function
-    where that is linear, else 0.
+    It is an angle or a length where it alone drives an axis of that sort with a slope of 1 or -1,
+    the last such axis deciding; else it is coupled. ``axes`` are the sort of each, its coordinates,
+    and the first slope of its function where that is linear, else 0.
     """
     found: MotionKind = "coupled"
     for sort, coordinates, slope in axes:
@@ -149,7 +166,9 @@ def motion_of(name: str, axes: Iterable[tuple[MotionKind, Sequence[str], float]]
 
 
 def rotation_about(axis: ArrayLike, angle: float, centre: np.ndarray) -> np.ndarray:
-    """Return the (4, 4) rotation by ``angle`` [radian] about an axis through ``centre`` (Rodrigues)."""
+    """Return the (4, 4) rotation by ``angle`` [radian] about an axis through ``centre``
+    (Rodrigues).
+    """
     x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     pose = np.eye(4)
@@ -160,40 +179,57 @@ def rotation_about(axis: ArrayLike, angle: float, centre: np.ndarray) -> np.ndar
 
 def all_coordinates(joints: list[Joint]) -> dict[str, Coordinate]:
     """Return every coordinate by its full name "joint.coordinate", in order."""
-    return {f"{joint.name}.{name}": facts for joint in joints for name, facts in joint.coordinates.items()}
+    return {
+        f"{joint.name}.{name}": facts
+        for joint in joints
+        for name, facts in joint.coordinates.items()
+    }
 
 
 def resolve(
     asked: dict[str, float], coordinates: dict[str, Coordinate], couplings: list[Coupling]
 ) -> dict[str, float]:
-    """Return the value that every coordinate takes when some are asked for, by the same names [radian or scene unit].
+    """Return the value that every coordinate takes when some are asked for, by the same names
+    [radian or scene unit].
 
-    Locked ones stay, clamped ones are cut to their range, those that follow others follow; absent ones are at rest.
+    Locked ones stay, clamped ones are cut to their range, those that follow others follow; absent
+    ones are at rest.
     """
-    values = {n: facts.honoured(asked[n]) if n in asked else facts.rest for n, facts in coordinates.items()}
+    values = {
+        n: facts.honoured(asked[n]) if n in asked else facts.rest
+        for n, facts in coordinates.items()
+    }
     for coupling in couplings:  # in an order in which what they follow is known
         values[coupling.coordinate] = coupling.function(*(values[name] for name in coupling.of))
     return values
 
 
 def ordered(couplings: list[Coupling]) -> list[Coupling]:
-    """Return the couplings in an order in which each follows what is known by then, or raise SceneError."""
+    """Return the couplings in an order in which each follows what is known by then, or raise
+    SceneError.
+    """
     by_name: dict[str, Coupling] = {}
     for coupling in couplings:
         if by_name.setdefault(coupling.coordinate, coupling) is not coupling:
             raise SceneError(f"coupling of {coupling.coordinate!r} is given twice")
     try:
-        order = list(TopologicalSorter({name: one.of for name, one in by_name.items()}).static_order())
+        order = list(
+            TopologicalSorter({name: one.of for name, one in by_name.items()}).static_order()
+        )
     except CycleError as error:
         ring = error.args[1]
-        raise SceneError(f"coupling of {ring[0]!r} follows itself; leave one of the ring out") from None
+        raise SceneError(
+            f"coupling of {ring[0]!r} follows itself; leave one of the ring out"
+        ) from None
     return [by_name[name] for name in order if name in by_name]
 
 
 def joint_poses(
     bones: list[str], joints: list[Joint], couplings: list[Coupling], coordinates: dict[str, float]
 ) -> dict[str, np.ndarray]:
-    """Return the (4, 4) pose of every bone, rest coordinates to world; a bone without a joint is fixed."""
+    """Return the (4, 4) pose of every bone, rest coordinates to world; a bone without a joint is
+    fixed.
+    """
     now = joint_values(joints, couplings, coordinates)
     rest = joint_values(joints, couplings, {})
     joint_of = {joint.child: joint for joint in joints}
@@ -220,7 +256,10 @@ def bones_between(joints: list[Joint], bones: list[str]) -> set[str]:
         chains.append(chain)
     common = set(chains[0]).intersection(*chains)
     root = next((bone for bone in chains[0] if bone in common), None)
-    return {bone for chain in chains for bone in chain if bone not in common} | {root or bones[0], *bones}
+    return {bone for chain in chains for bone in chain if bone not in common} | {
+        root or bones[0],
+        *bones,
+    }
 
 
 def joint_values(
@@ -229,5 +268,6 @@ def joint_values(
     """Return the values that `resolve` gives, by joint and bare name."""
     values = resolve(coordinates, all_coordinates(joints), couplings)
     return {
-        joint.name: {name: values[f"{joint.name}.{name}"] for name in joint.coordinates} for joint in joints
+        joint.name: {name: values[f"{joint.name}.{name}"] for name in joint.coordinates}
+        for joint in joints
     }

@@ -54,7 +54,9 @@ class FunctionTable(Table):
     spline: PointsTable | None = None
 
     def function(self, inputs: list[str], output: str, *, place: str) -> Function:
-        """Return the function in inner units; ``inputs`` and ``output`` are kinds of motion, keys of `FACTORS`."""
+        """Return the function in inner units; ``inputs`` and ``output`` are kinds of motion, keys
+        of `FACTORS`.
+        """
         given = [name for name in FUNCTIONS if getattr(self, name) is not None]
         count, points = len(inputs), self.piecewise or self.spline
         if len(given) > 1:
@@ -120,7 +122,9 @@ class JointTable(Table):
     name: str
     parent: str
     child: str
-    type: Literal["fixed", "hinge", "slider", "universal", "ball", "planar", "free", "custom"] = "ball"
+    type: Literal["fixed", "hinge", "slider", "universal", "ball", "planar", "free", "custom"] = (
+        "ball"
+    )
     centre: Vector | None = None
     axes: dict[str, Axis] | None = None
     coordinates: dict[str, CoordinateTable] = Field(default_factory=dict)
@@ -133,11 +137,16 @@ class JointTable(Table):
         place = f"joint {self.name!r}"
         if self.centre is None and self.type != "fixed":
             raise SceneError(f"{place}: centre is missing, give the joint's place at rest")
-        groups: dict[Any, list[AxisTable]] = {"rotation": self.rotations, "translation": self.translations}
+        groups: dict[Any, list[AxisTable]] = {
+            "rotation": self.rotations,
+            "translation": self.translations,
+        }
         if self.type != "custom":
             groups = self._axes_of_kind(place)
         elif self.axes:
-            raise SceneError(f"{place}: a custom joint has rotations and translations instead of axes")
+            raise SceneError(
+                f"{place}: a custom joint has rotations and translations instead of axes"
+            )
         tables = [(sort, table) for sort, group in groups.items() for table in group]
         named = dict.fromkeys(name for _, table in tables for name in table.coordinates)
         for name in self.coordinates:
@@ -163,13 +172,19 @@ class JointTable(Table):
         )
         centre = np.array(self.centre or (0.0, 0.0, 0.0))
         bones = self.parent, self.child
-        return Joint(self.name, *bones, centre, coordinates, turns, shifts, self.type, self.backward)
+        return Joint(
+            self.name, *bones, centre, coordinates, turns, shifts, self.type, self.backward
+        )
 
     def _axes_of_kind(self, place):
-        """Tables of the rotations and of the translations that the kind has, each of one coordinate."""
+        """Tables of the rotations and of the translations that the kind has, each of one
+        coordinate.
+        """
         kind = KINDS[self.type]
         if self.rotations or self.translations:
-            raise SceneError(f"{place}: rotations and translations belong to type 'custom', give axes")
+            raise SceneError(
+                f"{place}: rotations and translations belong to type 'custom', give axes"
+            )
         axes = self.axes or dict(zip(self.coordinates, [*kind.rotations, *kind.translations]))
         count = len(axes) or len(self.coordinates)
         if not kind.least <= count <= kind.most:
@@ -257,7 +272,9 @@ def _coordinate_row(facts, kind):
 
 
 def _axis_row(axis, coordinates, output):
-    function = _function_row(axis.function, [coordinates[name].motion for name in axis.coordinates], output)
+    function = _function_row(
+        axis.function, [coordinates[name].motion for name in axis.coordinates], output
+    )
     names = {"coordinates": list(axis.coordinates)} if axis.coordinates else {}
     return {"axis": list(axis.direction), **names, **function}
 
@@ -265,7 +282,9 @@ def _axis_row(axis, coordinates, output):
 def _function_row(function: Function, inputs: Sequence[str], output: str) -> dict[str, Any]:
     if function == IDENTITY and inputs == [output]:
         return {}
-    function = function.rescaled([1.0 / FACTORS[motion] for motion in inputs], 1.0 / FACTORS[output])
+    function = function.rescaled(
+        [1.0 / FACTORS[motion] for motion in inputs], 1.0 / FACTORS[output]
+    )
     if isinstance(function, Linear) and not function.slopes:
         return {"constant": function.constant}
     if isinstance(function, Linear):

@@ -16,12 +16,16 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError
 
 PATIENCE = 120.0  # Time after which a file that is not read is refused [s].
-MEMORY = 2 << 30  # Address space of the process that reads [bytes]: a small file may unpack to anything.
+MEMORY = (
+    2 << 30
+)  # Address space of the process that reads [bytes]: a small file may unpack to anything.
 _LOCK = threading.Lock()
 
 
 def read_polydata(path: str | Path) -> tuple[Floats, Integers]:
-    """Return points (n, 3) and triangles (m, 3) of a ``.vtk`` or ``.vtp`` file; polygons and strips split."""
+    """Return points (n, 3) and triangles (m, 3) of a ``.vtk`` or ``.vtp`` file; polygons and strips
+    split.
+    """
     with _LOCK:
         child = _child(os.getpid())
         assert child.stdout is not None  # start_child asks for a pipe
@@ -35,7 +39,9 @@ def read_polydata(path: str | Path) -> tuple[Floats, Integers]:
             _child.cache_clear()
             found = "VTK ends, or does not end, at it"
     if isinstance(found, str):
-        raise MeshError(f"{path}: not a readable file of VTK PolyData ({found}); export the mesh again")
+        raise MeshError(
+            f"{path}: not a readable file of VTK PolyData ({found}); export the mesh again"
+        )
     return found
 
 
@@ -73,7 +79,9 @@ def _read(path: str) -> tuple[Floats, Integers]:
         if "Error reading" in said.GetOutput():  # a warning, and numbers from unused memory
             raise ValueError("it holds fewer numbers than it declares")
         if not isinstance(data, pyvista.PolyData) or not data.n_points:
-            raise ValueError("no points" if isinstance(data, pyvista.PolyData) else type(data).__name__)
+            raise ValueError(
+                "no points" if isinstance(data, pyvista.PolyData) else type(data).__name__
+            )
         sides, numbers = _cells(data.GetPolys(), data.n_points)
         if data.n_strips or (np.diff(sides) != 3).any():
             sides, numbers = _cells(data.triangulate().GetPolys(), data.n_points)
@@ -87,7 +95,9 @@ def _cells(cells, points):
     parts = cells.GetOffsetsArray(), cells.GetConnectivityArray()
     ends, numbers = (convert_array(part).astype(np.int64) for part in parts)
     if len(numbers) and (numbers.min() < 0 or numbers.max() >= points):
-        raise ValueError(f"a cell names points {numbers.min()} to {numbers.max()}, there are {points}")
+        raise ValueError(
+            f"a cell names points {numbers.min()} to {numbers.max()}, there are {points}"
+        )
     if len(numbers) and (ends[0] != 0 or (np.diff(ends) < 0).any() or ends[-1] != len(numbers)):
         raise ValueError(f"the cells do not fit their {len(numbers)} point numbers")
     return ends, numbers

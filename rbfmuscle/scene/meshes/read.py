@@ -1,6 +1,8 @@
-"""Reading surface meshes: STL, OBJ, PLY, VTK and VTP PolyData, mended where that is safe; fibres from JSON.
+"""Reading surface meshes: STL, OBJ, PLY, VTK and VTP PolyData, mended where that is safe; fibres
+from JSON.
 
-Vertex numbers in files stay usable: a read mesh knows which of its vertices each vertex of the file became.
+Vertex numbers in files stay usable: a read mesh knows which of its vertices each vertex of the file
+became.
 """
 
 import io
@@ -36,17 +38,21 @@ MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
 def read_mesh(
     path: str | Path, *, name: str | None = None, scale: float = 1.0, may_be_open: bool = False
 ) -> ReadMesh:
-    """Read a surface mesh (``.stl``, ``.obj``, ``.ply``, ``.vtk``, ``.vtp``) and mend what is safe to mend.
+    """Read a surface mesh (``.stl``, ``.obj``, ``.ply``, ``.vtk``, ``.vtp``) and mend what is safe
+    to mend.
 
-    ``name`` is what messages call it, the file's stem by default; ``scale`` takes the file's unit to the scene's.
-    Holes that cannot be closed safely are kept, with a note, where it ``may_be_open`` (bones). MeshError if the file is
-    missing, unreadable or empty, or the surface cannot be made closed and manifold.
+    ``name`` is what messages call it, the file's stem by default; ``scale`` takes the file's unit
+    to the scene's. Holes that cannot be closed safely are kept, with a note, where it
+    ``may_be_open`` (bones). MeshError if the file is missing, unreadable or empty, or the surface
+    cannot be made closed and manifold.
     """
     path = Path(path)
     vertices, faces = read_arrays(path)
     with np.errstate(over="ignore", invalid="ignore"):
         vertices = vertices * scale
-    read = prepare_mesh(vertices, faces, place=str(path), name=name or path.stem, may_be_open=may_be_open)
+    read = prepare_mesh(
+        vertices, faces, place=str(path), name=name or path.stem, may_be_open=may_be_open
+    )
     read.source = str(path)
     return read
 
@@ -54,7 +60,9 @@ def read_mesh(
 def as_mesh(
     mesh: str | Path | ReadMesh | MeshLike, name: str, scale: float, *, may_be_open: bool
 ) -> ReadMesh:
-    """Return the ReadMesh of a path, a trimesh.Trimesh, (vertices, faces) or of what is read already."""
+    """Return the ReadMesh of a path, a trimesh.Trimesh, (vertices, faces) or of what is read
+    already.
+    """
     if isinstance(mesh, ReadMesh):
         return mesh
     try:
@@ -66,7 +74,9 @@ def as_mesh(
     vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
     vertices = np.asarray(vertices, dtype=np.float64) * scale
     place = f"mesh {name!r}"
-    return prepare_mesh(vertices, np.asarray(faces), place=place, name=name, may_be_open=may_be_open)
+    return prepare_mesh(
+        vertices, np.asarray(faces), place=place, name=name, may_be_open=may_be_open
+    )
 
 
 def prepare_mesh(
@@ -75,7 +85,9 @@ def prepare_mesh(
     """Return the ReadMesh of given arrays, mended like a file's; ``place`` begins each message."""
     vertices, faces = np.asarray(vertices), np.asarray(faces)
     if not len(vertices) or not len(faces):
-        raise MeshError(f"{place}: the mesh is empty ({len(vertices)} vertices, {len(faces)} triangles)")
+        raise MeshError(
+            f"{place}: the mesh is empty ({len(vertices)} vertices, {len(faces)} triangles)"
+        )
     used = np.zeros(len(vertices), dtype=bool)
     used[faces[(faces >= 0) & (faces < len(vertices))]] = True
     vertices = np.where(used[:, None], vertices, 0.0)
@@ -97,10 +109,14 @@ def prepare_mesh(
 
 
 def read_arrays(path: Path) -> tuple[Floats, Integers]:
-    """Return vertices (n, 3) and triangles (m, 3) of a mesh file as they stand, or raise MeshError."""
+    """Return vertices (n, 3) and triangles (m, 3) of a mesh file as they stand, or raise
+    MeshError.
+    """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        words = f"{shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
+        words = (
+            f"{shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
+        )
         raise MeshError(f"{shown_path(path)}: {words}")
     if not os.path.isfile(path):
         raise MeshError(f"{shown_path(path)}: no such mesh file{_neighbours(path)}")
@@ -139,8 +155,13 @@ def _read_trimesh(content, kind):
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
         # Vertices are not split where textures meet.
         options = {"fix_texture": False, "skip_materials": True} if kind == "ply" else {}
-        mesh = trimesh.load(io.BytesIO(content), file_type=kind, process=False, force="mesh", **options)
-    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(getattr(mesh, "faces", ()), np.int64)
+        mesh = trimesh.load(
+            io.BytesIO(content), file_type=kind, process=False, force="mesh", **options
+        )
+    vertices, faces = (
+        np.asarray(mesh.vertices, np.float64),
+        np.asarray(getattr(mesh, "faces", ()), np.int64),
+    )
     if kind == "stl":  # each triangle has its own vertices: merged in order of first use
         # Bytes sort faster than rows; 0.0 is -0.0.
         rows = np.ascontiguousarray(vertices + 0.0).view("V24").ravel()
@@ -151,7 +172,9 @@ def _read_trimesh(content, kind):
 
 
 def _read_obj(content):
-    """Vertices and triangles of an OBJ file; numbers of textures and normals do not split vertices."""
+    """Vertices and triangles of an OBJ file; numbers of textures and normals do not split
+    vertices.
+    """
     vertices, faces = [], []
     for line in content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines():
         key, *words = line.partition(b"#")[0].split() or [b""]
@@ -166,7 +189,8 @@ def _read_obj(content):
 
 
 def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Floats]:
-    """Return fibres as a list of (k, 3) arrays in scene units, ``scale`` from the unit of a file or of given arrays.
+    """Return fibres as a list of (k, 3) arrays in scene units, ``scale`` from the unit of a file or
+    of given arrays.
 
     A JSON file holds ``{"polylines": [[[x, y, z], ...], ...]}`` or that list alone.
     """

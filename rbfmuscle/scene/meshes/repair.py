@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     import trimesh
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
-HOLE_LIMIT = 0.1  # of the diagonal: a longer rim (of more than four edges) is not closed by guesswork
+HOLE_LIMIT = (
+    0.1  # of the diagonal: a longer rim (of more than four edges) is not closed by guesswork
+)
 TWISTED_NOTED = 0.005  # of the area
 MOST_TWISTED = 0.3  # of the area: of more it cannot be said what is inside
 WINDING_SAMPLES = 1500  # triangles asked, before and behind them by a small share of their size:
@@ -46,9 +48,11 @@ class ReadMesh:
 
 
 def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool = False) -> ReadMesh:
-    """Return the mesh closed, manifold and outward, with notes of what was done; ``place`` begins each message.
+    """Return the mesh closed, manifold and outward, with notes of what was done; ``place`` begins
+    each message.
 
-    Holes and several parts are kept where it ``may_be_open`` (bones), and refused by a MeshError elsewhere.
+    Holes and several parts are kept where it ``may_be_open`` (bones), and refused by a MeshError
+    elsewhere.
     """
     bad = _repeated(faces)
     state = ReadMesh(vertices, faces[~bad], np.arange(len(vertices)))
@@ -78,7 +82,10 @@ def _check_closed(state, place, may_be_open):
     state.closed = len(border) == 0
     if not state.closed:
         x, y, z = state.vertices[border[0, 0]]
-        words = f"the surface is open ({len(border)} boundary edges, one at ({x:.4g}, {y:.4g}, {z:.4g}))"
+        words = (
+            f"the surface is open ({len(border)} boundary edges, one at ({x:.4g}, {y:.4g}, "
+            f"{z:.4g}))"
+        )
         if not may_be_open:
             raise MeshError(f"{place}: {words}; close its holes")
         state.notes.append(words)
@@ -87,25 +94,34 @@ def _check_closed(state, place, may_be_open):
         if len(sizes) > 1:
             raise MeshError(
                 f"{place}: the surface has {len(sizes)} separate parts (triangles: "
-                f"{', '.join(map(str, sizes[:5]))}); a muscle is one closed surface, split or join them"
+                f"{', '.join(map(str, sizes[:5]))}); a muscle is one closed surface, split or "
+                "join them"
             )
         _check_inside(state, place)
 
 
 def _check_inside(state, place):
-    """Refuse or note a surface that is closed and has no inside: flat or twisted, judged over all of its area."""
+    """Refuse or note a surface that is closed and has no inside: flat or twisted, judged over all
+    of its area.
+    """
     wrong, volume = _twisted_share(state.mesh), float(_cones(state.vertices, state.faces).sum())
     if wrong > MOST_TWISTED:
         raise MeshError(
-            f"{place}: the surface is flat or passes through itself, {100 * wrong:.0f} % of it does not bound its "
-            f"inside, so its volume ({volume:.4g}) means nothing; repair it, for instance by remeshing"
+            f"{place}: the surface is flat or passes through itself, {100 * wrong:.0f} % of it "
+            "does not bound its "
+            f"inside, so its volume ({volume:.4g}) means nothing; repair it, for instance by "
+            "remeshing"
         )
     if wrong > TWISTED_NOTED:
-        state.notes.append(f"the surface passes through itself over {100 * wrong:.2g} % of its area")
+        state.notes.append(
+            f"the surface passes through itself over {100 * wrong:.2g} % of its area"
+        )
 
 
 def _twisted_share(mesh):
-    """Share of the area with another winding number than 1 just behind it and 0 just before it, large faces asked."""
+    """Share of the area with another winding number than 1 just behind it and 0 just before it,
+    large faces asked.
+    """
     chosen = np.argsort(-mesh.area_faces, kind="stable")[:WINDING_SAMPLES]
     chosen = chosen[mesh.area_faces[chosen] > 0]
     area, middle = mesh.area_faces[chosen], mesh.triangles_center[chosen]
@@ -137,7 +153,9 @@ def _is_closed(faces):
 
 def _parts(faces: Integers) -> Integers:
     """Number of the connected part that each face belongs to."""
-    return np.unique(igl.vertex_components(np.ascontiguousarray(faces))[faces[:, 0]], return_inverse=True)[1]
+    return np.unique(
+        igl.vertex_components(np.ascontiguousarray(faces))[faces[:, 0]], return_inverse=True
+    )[1]
 
 
 def _repeated(faces):
@@ -151,7 +169,9 @@ def _repeated(faces):
 
 
 def _merge_equal(state):
-    """Merge vertices that are one point; a closed surface only by contracting edges, so that it stays closed."""
+    """Merge vertices that are one point; a closed surface only by contracting edges, so that it
+    stays closed.
+    """
     vertices, faces = state.vertices, state.faces
     size = max(MERGE_TOLERANCE * np.linalg.norm(np.ptp(vertices, axis=0)), 1e-300)
     keys = np.round((vertices - vertices.min(axis=0)) / size).astype(np.int64)
@@ -164,7 +184,11 @@ def _merge_equal(state):
     new = new[~_repeated(new)]
     if _is_closed(faces) and not (_is_closed(new) and _euler(new) == _euler(faces)):
         return
-    lost = f", {len(faces) - len(new)} triangles without extent dropped" if len(new) < len(faces) else ""
+    lost = (
+        f", {len(faces) - len(new)} triangles without extent dropped"
+        if len(new) < len(faces)
+        else ""
+    )
     state.notes.append(f"{count} repeated vertices merged{lost}")
     state.faces, state.vertex_map = new, merged[state.vertex_map]
 
@@ -193,24 +217,32 @@ def _drop_crumbs(state, *, keep_parts):
     large = area >= CRUMB_LIMIT * area.max()
     if not large.all():
         state.faces = state.faces[large[part]]
-        state.notes.append(f"{int((~large).sum())} loose parts of less than 1 % of the surface dropped")
+        state.notes.append(
+            f"{int((~large).sum())} loose parts of less than 1 % of the surface dropped"
+        )
     if keep_parts and large.sum() > 1:
         state.notes.append(f"the surface has {int(large.sum())} parts")
 
 
 def _fill_holes(state, place):
-    """Close each hole whose rim is short, or of one or two missing triangles, by a fan about its centre."""
+    """Close each hole whose rim is short, or of one or two missing triangles, by a fan about its
+    centre.
+    """
     edges, count, _ = _edges(state.faces)
     bad = edges[count > 2]
     if len(bad):
         raise MeshError(
-            f"{place}: {len(bad)} edges belong to more than two triangles (first: vertices {bad[0, 0]} and "
+            f"{place}: {len(bad)} edges belong to more than two triangles (first: vertices "
+            f"{bad[0, 0]} and "
             f"{bad[0, 1]}); make the surface manifold, for instance by remeshing"
         )
     limit, filled = HOLE_LIMIT * np.linalg.norm(np.ptp(state.vertices, axis=0)), 0
     for rim in _rims(state.faces):
         points = state.vertices[rim]
-        if len(rim) > 4 and np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum() > limit:
+        if (
+            len(rim) > 4
+            and np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum() > limit
+        ):
             continue
         if len(rim) == 3:
             fan = rim[None, ::-1]
@@ -224,12 +256,16 @@ def _fill_holes(state, place):
 
 
 def _drop_crowded(state):
-    """Drop triangles of a bone at edges of more than two where they are few; its inside is then found by winding."""
+    """Drop triangles of a bone at edges of more than two where they are few; its inside is then
+    found by winding.
+    """
     _, count, used = _edges(state.faces)
     wrong = (count[used] > 2).any(axis=1)
     if wrong.any() and wrong.mean() < MOST_WRONG:
         state.faces = state.faces[~wrong]
-        state.notes.append(f"{int(wrong.sum())} triangles at edges of more than two triangles dropped")
+        state.notes.append(
+            f"{int(wrong.sum())} triangles at edges of more than two triangles dropped"
+        )
 
 
 def _rims(faces: Integers) -> list[Integers]:
@@ -257,14 +293,18 @@ def _agree(faces):
 
 
 def _orient(state, place):
-    """Make neighbouring faces agree, then turn what was mended, or the whole, outward; consistent cavities stay."""
+    """Make neighbouring faces agree, then turn what was mended, or the whole, outward; consistent
+    cavities stay.
+    """
     faces = np.ascontiguousarray(state.faces)
     oriented, part = faces, np.zeros(len(faces), dtype=int)
     # Most meshes agree, and bfs_orient, which would leave these as they are, takes long.
     if not _agree(faces):
         oriented, part = igl.bfs_orient(faces)
         if not _agree(oriented):
-            raise MeshError(f"{place}: the surface has one side only (no consistent orientation); remesh it")
+            raise MeshError(
+                f"{place}: the surface has one side only (no consistent orientation); remesh it"
+            )
     turned = (oriented != faces).any(axis=1)
     turned ^= (np.bincount(part, weights=turned) * 2 > np.bincount(part))[part]
     mended = np.bincount(part, weights=turned) > 0

@@ -52,8 +52,13 @@ def test_file_is_in_metres_with_terms_in_the_order_of_opensim(tmp_path):
     root = ElementTree.parse(tmp_path / "p.xml").getroot()
     item = root.find(".//FunctionBasedPath")
     assert item.get("name") == "/forceset/soleus"
-    assert item.find("coordinate_paths").text.split() == ["/jointset/ankle/angle", "/jointset/rail/s"]
-    assert [float(x) for x in root.find(".//coefficients").text.split()] == pytest.approx([0.3, 2.0, -0.04])
+    assert item.find("coordinate_paths").text.split() == [
+        "/jointset/ankle/angle",
+        "/jointset/rail/s",
+    ]
+    assert [float(x) for x in root.find(".//coefficients").text.split()] == pytest.approx(
+        [0.3, 2.0, -0.04]
+    )
 
 
 def test_opensim_loads_the_file_and_gives_the_same_numbers(tmp_path):
@@ -100,7 +105,11 @@ def scene():
     return found
 
 
-RANGES = {"hip.flexion": (0.0, 0.4), "hip.adduction": (-0.1, 0.1), "hip.internal_rotation": (-0.1, 0.1)}
+RANGES = {
+    "hip.flexion": (0.0, 0.4),
+    "hip.adduction": (-0.1, 0.1),
+    "hip.internal_rotation": (-0.1, 0.1),
+}
 
 
 def test_sampled_muscle_and_its_fit_are_what_is_kept(scene, tmp_path):

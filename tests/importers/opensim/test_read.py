@@ -1,4 +1,6 @@
-"""Models as OpenSim reads them: reference transforms of every model given, and a small one with known answers."""
+"""Models as OpenSim reads them: reference transforms of every model given, and a small one with
+known answers.
+"""
 
 import json
 
@@ -13,9 +15,18 @@ from rbfmuscle.scene.joints.joint import all_coordinates, resolve, rotation_abou
 from rbfmuscle.scene.motion import bone_poses
 
 MODELS = (
-    "arm26", "arm26_v20303", "bouncing_block", "gait10dof18musc", "gait10dof18musc_v30000", "Tug_of_War",
-    "gait2392_thelen2003muscle", "leg6dof9musc", "subject01", "subject01_simbody_adjusted", "synthetic",
-)  # fmt: skip
+    "arm26",
+    "arm26_v20303",
+    "bouncing_block",
+    "gait10dof18musc",
+    "gait10dof18musc_v30000",
+    "Tug_of_War",
+    "gait2392_thelen2003muscle",
+    "leg6dof9musc",
+    "subject01",
+    "subject01_simbody_adjusted",
+    "synthetic",
+)
 KINDS = {"rotational": "rotation", "translational": "translation", "coupled": "coupled"}
 
 
@@ -90,9 +101,12 @@ class TestSmall:
     def test_joint_that_closes_a_loop_is_left_out_and_named(self, small):
         joint = """<PinJoint name="strut"><socket_parent_frame>/ground</socket_parent_frame>
             <socket_child_frame>shank</socket_child_frame>
-            <coordinates><Coordinate name="strut_angle"><range>-1 1</range></Coordinate></coordinates></PinJoint>"""
+            <coordinates><Coordinate name="strut_angle"><range>-1 1</range></Coordinate></coordinates>
+            </PinJoint>"""
         assert not any("closes a loop" in note for note in read_osim(small).notes)
-        small.write_text(small.read_text(encoding="utf-8").replace("<SliderJoint", joint + "<SliderJoint"))
+        small.write_text(
+            small.read_text(encoding="utf-8").replace("<SliderJoint", joint + "<SliderJoint")
+        )
         (note,) = [note for note in read_osim(small).notes if "closes a loop" in note]
         assert "joint 'strut' (ground to shank)" in note
 

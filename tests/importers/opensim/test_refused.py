@@ -29,19 +29,43 @@ WRONG = [
     ('Version="40000"', 'Version="four"', "version 'four' is no number"),
     ("OpenSimDocument", "OtherDocument", "no OpenSim model"),
     (KNEE_FRAME, "", "CustomJoint 'knee': names no parent frame"),
-    ("<socket_parent>/bodyset/thigh<", "<socket_parent>../offset<", "/knee/offset' is offset from itself"),
+    (
+        "<socket_parent>/bodyset/thigh<",
+        "<socket_parent>../offset<",
+        "/knee/offset' is offset from itself",
+    ),
     ("/bodyset/shank", "/bodyset/shnk", "no frame '/bodyset/shnk'"),
-    ("PinJoint", "EllipsoidJoint", "EllipsoidJoint 'hip': ground to thigh: its kind is not in the table"),
-    (f"{AXIS}0 0 2", "<coordinates>slide</coordinates><axis>0 0 2", "'rotation1': follows 'slide', which"),
+    (
+        "PinJoint",
+        "EllipsoidJoint",
+        "EllipsoidJoint 'hip': ground to thigh: its kind is not in the table",
+    ),
+    (
+        f"{AXIS}0 0 2",
+        "<coordinates>slide</coordinates><axis>0 0 2",
+        "'rotation1': follows 'slide', which",
+    ),
     (f"{AXIS}0 0 2", f"{AXIS}0 0 0", "TransformAxis 'rotation1': its direction is zero"),
     (LINEAR, "", "'rotation1': follows knee_angle by no function"),
     (ONE, "<coefficients>1 2 0</coefficients>", "a linear function of 2 coordinates, 1 are named"),
     (f"{AXIS}1 0 0", "<coordinates/><axis>1 0 0", "a function of a coordinate, and none is named"),
     (f"<function>{POLYNOMIAL}\n      </function>", "", "a MultiplierFunction without a function"),
-    ("PolynomialFunction", "GCVSpline", "TransformAxis 'translation1': a function 'GCVSpline' is not"),
+    (
+        "PolynomialFunction",
+        "GCVSpline",
+        "TransformAxis 'translation1': a function 'GCVSpline' is not",
+    ),
     (HIP_ANGLE, "", "a PinJoint has 1 coordinates, 0 are given"),
-    ("<range>-1 1</range>", "<range>-1</range>", "Coordinate 'hip_angle': range: 2 numbers are needed"),
-    ("<range>-2 0.2<", "<range>2 0.2<", "Coordinate 'knee_angle': its range '2 0.2' goes downwards"),
+    (
+        "<range>-1 1</range>",
+        "<range>-1</range>",
+        "Coordinate 'hip_angle': range: 2 numbers are needed",
+    ),
+    (
+        "<range>-2 0.2<",
+        "<range>2 0.2<",
+        "Coordinate 'knee_angle': its range '2 0.2' goes downwards",
+    ),
     ("0 -0.4 0", "0 x 0", "is no list of numbers"),
     ("0 -0.4 0", "0 nan 0", "is not finite"),
     ("<scale_factors>1 1 -2<", "<scale_factors>1 1<", "Body 'thigh': Mesh 'm': scale_factors"),
@@ -79,18 +103,31 @@ def test_what_is_not_taken_is_noted_once(small):
             small,
             ("<scale_factors>1 1 -2</scale_factors>", "<scale_factors>1 0 1</scale_factors>"),
             ("<length_units>meters", "<length_units>furlongs"),
-            ('<Coordinate name="slide"/>', '<Coordinate name="slide"><locked>true</locked></Coordinate>'),
-            ("<range>-1 1</range>", "<prescribed>true</prescribed><default_value>0.25</default_value>"),
+            (
+                '<Coordinate name="slide"/>',
+                '<Coordinate name="slide"><locked>true</locked></Coordinate>',
+            ),
+            (
+                "<range>-1 1</range>",
+                "<prescribed>true</prescribed><default_value>0.25</default_value>",
+            ),
             ('<Mesh name="n">', '<Sphere name="ball"/><Mesh name="n">'),
         )
     )
-    for words in ("is scaled to nothing", "'furlongs'", "'slide' is locked", "'hip_angle' is prescribed"):
+    for words in (
+        "is scaled to nothing",
+        "'furlongs'",
+        "'slide' is locked",
+        "'hip_angle' is prescribed",
+    ):
         assert text.count(words) == 1, words
     for words in ("'ball' is a Sphere", "mesh 'wedge.obj' is hidden", "constraint 'rail'"):
         assert text.count(words) == 1, words
 
 
-@pytest.mark.parametrize("switch", ["<isEnforced>false</isEnforced>", "<isDisabled>true</isDisabled>"])
+@pytest.mark.parametrize(
+    "switch", ["<isEnforced>false</isEnforced>", "<isDisabled>true</isDisabled>"]
+)
 def test_coupler_that_is_switched_off_couples_nothing(small, switch):
     assert [c.coordinate for c in read_osim(small).couplings] == ["slide"]
     assert not read_osim(changed(small, (FUNCTION, switch + FUNCTION))).couplings

@@ -11,7 +11,9 @@ import pytest
 from rbfmuscle.importers.opensim.xml import read_xml
 from rbfmuscle.validation import SceneError
 
-NESTED = "".join(f'<!ENTITY {b} "&{a};&{a};">' for a, b in itertools.pairwise(string.ascii_lowercase[:21]))
+NESTED = "".join(
+    f'<!ENTITY {b} "&{a};&{a};">' for a, b in itertools.pairwise(string.ascii_lowercase[:21])
+)
 LAUGHS = f'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "ha">{NESTED}'
 UNKNOWN = '<?xml version="1.0" encoding="x-no"?><a/>'
 
@@ -42,14 +44,21 @@ def test_outside_entities_are_refused(tmp_path):
 
 def test_a_gigabyte_from_a_pipe_is_refused_in_bounded_memory():
     code = (
-        "import sys; from pathlib import Path; from rbfmuscle.importers.opensim.xml import read_xml\n"
+        "import sys; from pathlib import Path; from rbfmuscle.importers.opensim.xml import "
+        "read_xml\n"
         "from rbfmuscle.validation import SceneError\n"
         "try: read_xml(Path('/dev/stdin'))\n"
         "except SceneError as e: print(e)\n"
-        "print([int(row.split()[1]) for row in open('/proc/self/status') if row.startswith('VmHWM')][0])"
+        "print([int(row.split()[1]) for row in open('/proc/self/status') if "
+        "row.startswith('VmHWM')][0])"
     )
-    feed = "import sys\nb = b'<a>' + b'x' * (1 << 20)\nfor _ in range(1024): sys.stdout.buffer.write(b)"
-    first = subprocess.Popen([sys.executable, "-c", feed], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    feed = (
+        "import sys\nb = b'<a>' + b'x' * (1 << 20)\nfor _ in range(1024): "
+        "sys.stdout.buffer.write(b)"
+    )
+    first = subprocess.Popen(
+        [sys.executable, "-c", feed], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    )
     words = [sys.executable, "-c", code]
     reader = subprocess.Popen(words, stdin=first.stdout, stdout=subprocess.PIPE, text=True)
     first.stdout.close()
