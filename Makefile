@@ -8,7 +8,7 @@ DEV := $(VENV)/.installed-dev
 # are compiled when they are first imported: most never are.
 INSTALL := $(BIN)/python -m pip install --quiet --quiet --no-compile --config-settings editable_mode=compat
 
-.PHONY: demo test portability fuzz test-fast test-nojit coverage mutants references check bench figures docs release-check clean
+.PHONY: demo test portability fuzz test-fast test-nojit coverage check bench figures docs release-check clean
 
 $(STAMP): pyproject.toml
 	@echo "Installing into $(VENV), about half a minute."
@@ -60,19 +60,6 @@ portability: $(DEV)
 # Damaged scenes and meshes by the thousand; ends with a table of what became of them.
 fuzz: $(DEV)
 	PYTHONPATH=tests $(BIN)/python -m fuzz --scene 10000 --mesh 2000 --frames 250
-
-# Faults planted one at a time, a seeded sample of every room, each against the tests that reach its line: ten minutes a
-# share, from where the last one ended (MINUTES=600 for the whole). The first time, which tests reach what is recorded.
-MINUTES ?= 10
-SEED ?= 24
-mutants: $(DEV)
-	test -f .mutants/compiled.json || $(BIN)/python benchmarks/mutants.py record
-	$(BIN)/python benchmarks/mutants.py run --minutes $(MINUTES) --seed $(SEED)
-
-# Results that tests compare with, written anew; what differs is reviewed as part of the change.
-references: $(DEV)
-	RBFMUSCLE_WRITE_REFERENCES=1 $(PYTEST) -q -k what_is_kept
-	git --no-pager diff --stat -- tests/data/references
 
 check: $(DEV)
 	$(BIN)/ruff check .

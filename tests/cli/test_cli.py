@@ -11,7 +11,6 @@ import pytest
 import trimesh
 from blend_model import arm_files
 from command_line import call
-from kept import check_kept, text_facts
 
 import rbfmuscle as rm
 from rbfmuscle.cli.app import GROUPS
@@ -207,21 +206,6 @@ class TestOtherCommands:
             "error": one_line(err).removeprefix("rbfmuscle: "),
             "exit_code": code,
         }
-
-    def test_numbers_that_are_printed_are_what_is_kept(self, folder, tmp_path, capsys, monkeypatch):
-        monkeypatch.setenv(
-            "RBFMUSCLE_CACHE", str(tmp_path)
-        )  # which may know how many centres are wanted
-        arm, found = folder / "arm.toml", {}
-        for words in (
-            ["check", arm, "--fields"],
-            ["check", "phantom"],
-            ["plan", arm],
-            ["plan", arm, "--json"],
-        ):
-            found[" ".join([words[0], *words[2:]])] = text_facts(call(capsys, *words)[1])
-        # Fields are built to three digits.
-        check_kept("printed", found, tolerance=1e-2)
 
     def test_expected_time_goes_on_from_two_frames_after_the_first(self, monkeypatch, clock):
         frames = [SimpleNamespace(wall=wall) for wall in (9.0, 0.002, 0.006)]

@@ -3,23 +3,20 @@
 import json
 import tomllib
 import warnings
-from dataclasses import replace
 
 import numba
 import numpy as np
 import pytest
 import trimesh
 from command_line import call
-from kept import check_kept, file_facts
 
 import rbfmuscle as rm
 from rbfmuscle.experiments import kernel_study, wanted_error
-from rbfmuscle.experiments.kernel_study import ReferenceSurface, recommend, row_name, row_toml
+from rbfmuscle.experiments.kernel_study import ReferenceSurface, recommend, row_toml
 from rbfmuscle.experiments.wanted_error import STEP, reach_error
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.metrics.mesh_distance import MeshDistance
-from rbfmuscle.report.kernel_page import write_studies
 from rbfmuscle.validation import MeshError, UsageError
 
 
@@ -129,30 +126,6 @@ def row(kernel, rms, milliseconds, *, condition=1e6, epsilon=0.0, unfit=""):
 def test_the_quickest_of_those_alike_is_recommended(rows, wanted):
     found = recommend(rows)
     assert (found and found["kernel"]) == wanted
-
-
-def test_pages_hold_what_is_kept(study, tmp_path):
-    rows = sorted(map(dict, study.rows), key=row_name)
-    for k, row in enumerate(rows):  # what was measured hangs on last digits
-        row |= {
-            key: 0.01 * (k + 1)
-            for key, value in row.items()
-            if value is None or type(value) is float
-        }
-        row |= {"front": k % 2 == 0, "condition": 10.0**k, "unfit": "" if k < 10 else "9 sheets"}
-    made = replace(study, rows=rows, recommended=rows[1])
-    write_studies({"egg": made}, tmp_path / "one")
-    write_studies({"egg": made, "other": made}, tmp_path / "two")
-    check_kept("kernel_pages", file_facts(tmp_path))
-
-
-def test_rows_are_what_is_kept(egg, found):
-    asked = {"kernels": ["linear", "cubic", "quintic"], "centres": [30], "resolution": 24}
-    rows = {row["kernel"]: dict(row) for row in rm.study_kernels(egg, **asked).rows}
-    for row in rows.values():
-        row |= dict.fromkeys(("fit_time", "evaluation_time", "front"), 0.0)
-        row["condition"] = np.log10(row["condition"])
-    check_kept("study", [rows, found.tried], tolerance=1e-4)
 
 
 def test_wrong_requests_are_answered(ellipsoid):

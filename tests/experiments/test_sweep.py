@@ -13,7 +13,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from blend_model import arm_files, arm_scene, use_blend_model
-from kept import check_kept, file_facts
 
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.study import _names, run_point
@@ -150,20 +149,6 @@ class TestRun:
         assert 0 < fine["error_rms"] < coarse["error_rms"] < 1
         (reference,) = [r for r in rows.values() if r["role"] == "reference"]
         assert np.isnan(reference["error_rms"]) and not reference["front"]
-
-    def test_page_holds_what_is_kept(self, finished, tmp_path):
-        table = write_table(*finished, {"arm": "mm"})
-        for k, row in enumerate(table["rows"]):
-            row |= {"time_frame": 0.004 * (k % 3 + 1), "front": False}
-        table["verdicts"] = mark_front(table["rows"])
-        write_page(table, tmp_path)
-        # The page has three digits.
-        check_kept("sweep_page", file_facts(tmp_path), tolerance=1e-2)
-        rows = [
-            {key: value for key, value in row.items() if key not in CLOCKED}
-            for row in table["rows"]
-        ]
-        check_kept("sweep_rows", rows, tolerance=1e-3)
 
     def test_what_is_done_is_not_done_twice(self, finished):
         before = {path: path.stat().st_mtime_ns for path in (finished[1] / "points").iterdir()}

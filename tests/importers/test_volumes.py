@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from command_line import call
 from conftest import ROOT
-from kept import check_kept
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.cli.new import _beside, _write_surfaces
@@ -86,20 +85,6 @@ def test_neighbours_that_share_a_face_neither_overlap_nor_gape():
 
 
 OBLIQUE = Rotation.from_rotvec([0.3, -0.5, 0.4]).as_matrix()
-
-
-def test_surfaces_of_labels_are_what_is_kept():
-    labels, affine = ball_labels((0.8, 0.8, 1.5), split=np.array([0.6, 0.64, 0.48])), np.eye(4)
-    labels[1:5, 1:5, 1:6] = 2
-    labels[2:4, 55:57, 2:4] = 1
-    labels[30:33, 28:31, 15:17] = 0
-    affine[:3] = np.column_stack([OBLIQUE * [0.8, 0.8, 1.5], [5.0, 7.0, -3.0]])
-    volume, found = LabelVolume(labels, affine, {1: "left"}, "x.nii"), []
-    for label in (1, 2):
-        part = label_surface(volume, label, pieces=True)
-        found += [part.name, part.volume, part.notes, {"about": len(part.mesh.vertices)}]
-        found += [part.mesh.area, part.mesh.moment_inertia, part.mesh.centroid]
-    check_kept("labels", found, tolerance=1e-3)
 
 
 @pytest.mark.parametrize("turn", [np.eye(3), OBLIQUE, OBLIQUE @ np.diag([-1.0, 1, 1])])

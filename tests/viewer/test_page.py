@@ -13,17 +13,14 @@ import numpy as np
 import pytest
 
 import rbfmuscle as rm
-from rbfmuscle.output.saved import SavedRun
 
 pytest.importorskip("viser")
 from browser import Browser, wait_for
-from kept import check_kept, text_facts
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from rbfmuscle.output.appearance import VIEWS
 from rbfmuscle.viewer.page import Page
-from rbfmuscle.viewer.sources import LiveSource, SavedSource
+from rbfmuscle.viewer.sources import LiveSource
 
 FRAME, FLEXION = 0, 1  # sliders in their order
 STEADY = "?fixedDpr=1"  # otherwise the page lowers its resolution where drawing is slow
@@ -212,50 +209,6 @@ def test_websocket_opens_for_the_own_page_alone(page, origin, path, opens):
 def test_server_listens_on_one_address(page):
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", urlsplit(page.address).port), timeout=5)
-
-
-def test_page_of_a_run_draws_what_is_kept(run_folder):
-    source, found = SavedSource({"run": SavedRun(run_folder)}), {}
-    source.muscles |= {
-        "extensor": (1.1 * source.muscles["extensor"][0], source.muscles["extensor"][1])
-    }
-    page = Page(source, at={"frame": 1.0})
-    page._closed = True  # ends its thread, so that nothing is drawn but what is asked for
-    page._wake.set()
-    page._thread.join()
-    panel = page.panel
-    side = page.sides[0]
-    camera = page.server.initial_camera
-    panel.eyes["abductor"].value = False
-    values = (
-        ("colour", "stretch"),
-        ("colour", "penetration"),
-        ("cut", "x"),
-        ("place", 0.3),
-        ("play", True),
-        ("play", False),
-    )
-    for name, value in (("quantity", "volume error [%]"), *values):
-        getattr(panel, name).value = value
-        more = page._turn(), panel.frame.value, camera.position, camera.look_at, camera.fov
-        nodes = {
-            key: (n.vertices, n.faces, n.position, n.wxyz, n.visible)
-            for key, n in side._nodes.items()
-        }
-        text = text_facts(panel._numbers.content.rpartition("<br>")[0])
-        found[f"{name} {value}"] = nodes, side.numbers, more, text, panel._history
-    panel.models[1].value = "run"
-    for name, view in VIEWS.items():
-        page._turn()
-        page._aim(view, camera)
-        found[name] = (
-            np.array(page.sides[1].frame.position),
-            camera.position,
-            camera.look_at,
-            camera.up,
-        )
-    page.close()
-    check_kept("page", found, tolerance=1e-6)
 
 
 def test_notebook_shows_a_scene_and_a_run():

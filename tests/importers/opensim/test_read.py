@@ -101,7 +101,9 @@ class TestSmall:
     def test_joint_that_closes_a_loop_is_left_out_and_named(self, small):
         joint = """<PinJoint name="strut"><socket_parent_frame>/ground</socket_parent_frame>
             <socket_child_frame>shank</socket_child_frame>
-            <coordinates><Coordinate name="strut_angle"><range>-1 1</range></Coordinate></coordinates>
+            <coordinates>
+            <Coordinate name="strut_angle"><range>-1 1</range></Coordinate>
+            </coordinates>
             </PinJoint>"""
         assert not any("closes a loop" in note for note in read_osim(small).notes)
         small.write_text(
