@@ -91,6 +91,19 @@ class BoneSDF:
         """Bytes that queries read."""
         return sum(array.nbytes for array in self.data)
 
+    @property
+    def unit(self) -> float:
+        """Length of a unit of the frame that ``data`` is in [unit of the mesh]."""
+        return self._frame.size
+
+    @property
+    def local_to_bone(self) -> Floats:
+        """Transform (4, 4) from the frame that ``data`` is in to bone coordinates."""
+        out = np.eye(4)
+        out[:3, :3] = self._frame.axes.T * self._frame.size
+        out[:3, 3] = self._frame.origin
+        return out
+
     @cached_property
     def exact(self) -> ExactDistance:
         """The exact distance to the mesh (:class:`ExactDistance`), built when first asked for."""

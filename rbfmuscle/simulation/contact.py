@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.scene.tendons import AtRest
-from rbfmuscle.simulation.broad_phase import (
+from rbfmuscle.bones.broad_phase import (
     answer_loop,
     apart_loop,
     closer_loop,

@@ -8,7 +8,7 @@ from toy_scene import ToyMuscle, attach, box, ellipsoid, muscle, scene, sphere
 
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.joints.joint import rotation_about
-from rbfmuscle.simulation.broad_phase import boxes_apart
+from rbfmuscle.bones.broad_phase import boxes_apart
 from rbfmuscle.simulation.contact import BoneContacts, Planes
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.overlap import resolve_initial_overlap

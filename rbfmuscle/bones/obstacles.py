@@ -1,0 +1,136 @@
+"""The distance fields of several bones as flat arrays, for compiled loops that ask any of them.
+
+A `BoneSDF` answers from Python. Here the arrays of all bones stand one behind the other, so that
+one NamedTuple of one type holds any number of bones, and a loop takes the part of a bone as views.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, direction_loop
+from rbfmuscle.bones.query import FieldData, query_loop
+from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.jit import compiled
+
+
+class Bones(NamedTuple):
+    """Constant arrays of b bones: those of `FieldData`, one bone behind the other, and their frames.
+
+    ``start`` (b + 1, 10) says where the part of a bone begins in ``blocks``, ``cells``, ``lists``,
+    ``corners``, ``far``, ``records``, ``edge_normals``, ``vertex_normals``, ``vertices`` and
+    ``across``; ``shape`` (b, 3) is that of its blocks.
+    """
+
+    boxes: np.ndarray  # (b, 2, 3) in bone coordinates
+    frames: np.ndarray  # (b, 4, 4) from local units to bone coordinates
+    sizes: np.ndarray  # (b,) length of a local unit [scene unit]
+    grid: np.ndarray
+    shape: np.ndarray
+    start: np.ndarray
+    blocks: np.ndarray
+    cells: np.ndarray
+    lists: np.ndarray
+    corners: np.ndarray
+    far: np.ndarray
+    records: np.ndarray
+    edge_normals: np.ndarray
+    vertex_normals: np.ndarray
+    vertices: np.ndarray
+    across: np.ndarray
+
+
+def stack_bones(fields: Sequence[BoneSDF]) -> Bones:
+    """The fields of some bones, at least one, as one set of arrays."""
+    data = [field.data for field in fields]
+    parts = [[one.blocks.ravel(), *one[2:]] for one in data]
+    sizes = np.array([[len(part) for part in row] for row in parts], dtype=np.int64)
+    start = np.concatenate([np.zeros((1, sizes.shape[1]), np.int64), np.cumsum(sizes, axis=0)])
+    return Bones(
+        np.array([field.bounds for field in fields]),
+        np.array([field.local_to_bone for field in fields]),
+        np.array([field.unit for field in fields]),
+        np.array([one.grid for one in data]),
+        np.array([one.blocks.shape for one in data], dtype=np.int64),
+        start,
+        *(np.ascontiguousarray(np.concatenate(column)) for column in zip(*parts)),
+    )
+
+
+@compiled(error_model="numpy")
+def field_of(bones, b):
+    """The field of bone b: views into the arrays of all."""
+    first, end = bones.start[b], bones.start[b + 1]
+    shape = bones.shape[b]
+    return FieldData(
+        bones.grid[b],
+        bones.blocks[first[0] : end[0]].reshape((shape[0], shape[1], shape[2])),
+        bones.cells[first[1] : end[1]],
+        bones.lists[first[2] : end[2]],
+        bones.corners[first[3] : end[3]],
+        bones.far[first[4] : end[4]],
+        bones.records[first[5] : end[5]],
+        bones.edge_normals[first[6] : end[6]],
+        bones.vertex_normals[first[7] : end[7]],
+        bones.vertices[first[8] : end[8]],
+        bones.across[first[9] : end[9]],
+    )
+
+
+@compiled(error_model="numpy")
+def query_bone(bones, b, pose, points, reach, distance, gradient):
+    """Signed distances (n,) to bone b in a pose (4, 4) of points (n, 3) in the world.
+
+    Negative inside. Gradients (n, 3) are unit vectors in world axes, away from the middle of the
+    bone where the field has none; ``gradient`` may be (0, 3). Where the bone is farther than ``reach`` (n,) only a lower
+    bound beyond it is given, and the gradient there means nothing.
+    """
+    placed = np.zeros((4, 4))
+    frame = bones.frames[b]
+    for a in range(3):
+        placed[a, 3] = pose[a, 3]
+        for k in range(3):
+            placed[a, 3] += pose[a, k] * frame[k, 3]
+            # The query takes the transpose for the inverse, so columns are over the square of a unit.
+            for m in range(3):
+                placed[a, k] += pose[a, m] * frame[m, k] / bones.sizes[b] ** 2
+    query_loop(points, placed, reach, bones.sizes[b], distance, gradient, field_of(bones, b))
+    if len(gradient) > 0:
+        direction_loop(points, gradient, pose, bones.boxes[b])
+
+
+@compiled(error_model="numpy")
+def nearest_bone(bones, poses, points, reach, distance, gradient, which):
+    """Distance (n,) to the nearest bone in poses (b, 4, 4), its gradient (n, 3) and number (n,).
+
+    Where all bones are farther than ``reach`` (n,) it is a lower bound beyond that, infinity where
+    no bone is there at all, the gradient zero and the number -1.
+    """
+    distance[:] = np.inf
+    gradient[:] = 0.0
+    which[:] = -1
+    box = np.empty((2, 3))
+    box_loop(points, np.ones(len(points), np.bool_), box)
+    farthest = 0.0
+    for i in range(len(reach)):
+        farthest = max(farthest, reach[i])
+    one, way, limit = np.empty(len(points)), np.empty((len(points), 3)), np.empty(len(points))
+    for b in range(len(poses)):
+        apart = boxes_apart(box, poses[b], bones.boxes[b])
+        if apart > farthest:
+            for i in range(len(points)):
+                if apart < distance[i]:
+                    distance[i] = apart
+            continue
+        for i in range(len(points)):
+            # No farther than what was found: elsewhere a lower bound will do.
+            limit[i] = min(distance[i], reach[i])
+        query_bone(bones, b, poses[b], points, limit, one, way)
+        for i in range(len(points)):
+            if one[i] < distance[i]:
+                distance[i] = one[i]
+                inside = one[i] <= reach[i]
+                which[i] = b if inside else -1
+                for a in range(3):
+                    gradient[i, a] = way[i, a] if inside else 0.0
