@@ -11,12 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, lower_bound, note_query
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.jit import compiled
-from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, lower_bound, note_query
 from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
 from rbfmuscle.validation import check_points
 

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.scene.tendons import AtRest
 from rbfmuscle.bones.broad_phase import (
     answer_loop,
     apart_loop,
@@ -25,6 +23,8 @@ from rbfmuscle.bones.broad_phase import (
     path_loop,
     take_contacts_loop,
 )
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.scene.tendons import AtRest
 from rbfmuscle.validation import check_points
 
 NONE_ALLOWED: Floats = np.zeros(0)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from toy_scene import ToyMuscle, attach, box, ellipsoid, muscle, scene, sphere
 
+from rbfmuscle.bones.broad_phase import boxes_apart
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.joints.joint import rotation_about
-from rbfmuscle.bones.broad_phase import boxes_apart
 from rbfmuscle.simulation.contact import BoneContacts, Planes
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.overlap import resolve_initial_overlap
