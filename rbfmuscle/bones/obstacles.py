@@ -16,7 +16,7 @@ from rbfmuscle.jit import compiled
 
 
 class Bones(NamedTuple):
-    """Constant arrays of b bones: those of `FieldData`, one bone behind the other, and their frames.
+    """Constant arrays of b bones: those of `FieldData`, one bone behind the other, and frames.
 
     ``start`` (b + 1, 10) says where the part of a bone begins in ``blocks``, ``cells``, ``lists``,
     ``corners``, ``far``, ``records``, ``edge_normals``, ``vertex_normals``, ``vertices`` and
@@ -83,8 +83,8 @@ def query_bone(bones, b, pose, points, reach, distance, gradient):
     """Signed distances (n,) to bone b in a pose (4, 4) of points (n, 3) in the world.
 
     Negative inside. Gradients (n, 3) are unit vectors in world axes, away from the middle of the
-    bone where the field has none; ``gradient`` may be (0, 3). Where the bone is farther than ``reach`` (n,) only a lower
-    bound beyond it is given, and the gradient there means nothing.
+    bone where the field has none; ``gradient`` may be (0, 3). Where the bone is farther than
+    ``reach`` (n,) only a lower bound beyond it is given, and the gradient there means nothing.
     """
     placed = np.zeros((4, 4))
     frame = bones.frames[b]
@@ -92,7 +92,7 @@ def query_bone(bones, b, pose, points, reach, distance, gradient):
         placed[a, 3] = pose[a, 3]
         for k in range(3):
             placed[a, 3] += pose[a, k] * frame[k, 3]
-            # The query takes the transpose for the inverse, so columns are over the square of a unit.
+            # The query takes the transpose for the inverse: columns are over a unit squared.
             for m in range(3):
                 placed[a, k] += pose[a, m] * frame[m, k] / bones.sizes[b] ** 2
     query_loop(points, placed, reach, bones.sizes[b], distance, gradient, field_of(bones, b))
