@@ -18,7 +18,7 @@ from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
+from rbfmuscle.simulation.frame import Mesh, ModelSurface
 
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
@@ -150,13 +150,15 @@ class PBDMuscle:
         vertices[self.rest.order] = self.points
         return vertices, self.rest.order[self.rest.topology.faces]
 
-    def drawing(self, contacts: BoneContacts) -> FinishedDrawing:
-        """What gives the mesh as it is now."""
-        return FinishedDrawing(
-            ModelSurface(
-                *self.material_mesh(),
-                {"solver_penetration_max": self.penetration, "sweeps": float(self.swept)},
-            )
+    def carried_mesh(self) -> Mesh:
+        """That of the material."""
+        return self.material_mesh()
+
+    def surface(self, contacts: BoneContacts) -> ModelSurface:
+        """The mesh as it is now."""
+        return ModelSurface(
+            *self.material_mesh(),
+            {"solver_penetration_max": self.penetration, "sweeps": float(self.swept)},
         )
 
     def volume(self) -> float:

@@ -11,7 +11,7 @@ from toy_scene import ToyMuscle, ellipsoid, held
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.scene.options import OutputOptions
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface
+from rbfmuscle.simulation.frame import ModelSurface
 from rbfmuscle.validation import SolveError
 
 
@@ -34,9 +34,9 @@ class BlendMuscle(ToyMuscle):
         if self.solves == self.fail_at:
             raise SolveError(f"muscle {self.name!r}: planted failure")
 
-    def drawing(self, contacts):
+    def surface(self, contacts):
         quantities = {"solver_penetration_max": 0.0, "time_extract": 0.001}
-        return FinishedDrawing(ModelSurface(self.x.copy(), self.faces, quantities))
+        return ModelSurface(self.x.copy(), self.faces, quantities)
 
 
 def arm_scene(*, end=20, step=10, units="mm"):

@@ -9,7 +9,7 @@ from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.tables import JointTable
 from rbfmuscle.scene.objects import Attachment, Motion, Muscle, SceneData
 from rbfmuscle.scene.options import ContactOptions, DetectOptions
-from rbfmuscle.simulation.frame import FinishedDrawing, ModelSurface, MuscleModel
+from rbfmuscle.simulation.frame import ModelSurface, MuscleModel
 
 
 class Formula:
@@ -188,10 +188,10 @@ class ToyMuscle(MuscleModel):
     def material_mesh(self):
         return self.x.copy(), self.faces
 
-    def drawing(self, contacts):
-        return FinishedDrawing(
-            ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0})
-        )
+    carried_mesh = material_mesh
+
+    def surface(self, contacts):
+        return ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0})
 
 
 def ellipsoid(half, centre=(0, 0, 0), *, subdivisions=2):

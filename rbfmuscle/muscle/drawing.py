@@ -21,7 +21,7 @@ from rbfmuscle.muscle.rest import RestState
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame import Mesh, ModelSurface
+from rbfmuscle.simulation.frame import ModelSurface
 from rbfmuscle.validation import SolveError
 
 # Cells along the longest side where marching cubes is asked for and no resolution.
@@ -39,13 +39,13 @@ SUNKEN = 0.01
 LOST = 1e-10
 
 
-class Configuration(NamedTuple):
-    """Where a muscle's points are at one moment."""
+class Placement(NamedTuple):
+    """Where a muscle's points are now."""
 
     centres: np.ndarray  # (K, 3)
     normals: np.ndarray  # (K, 3)
     points: np.ndarray  # (K + S, 3), contact points
-    carried: np.ndarray | None  # (n, 3) vertices of the shown mesh where the material takes them
+    carried: np.ndarray  # (n, 3) vertices of the shown mesh where the material takes them
 
 
 class _Surroundings(TypedDict):
@@ -54,6 +54,26 @@ class _Surroundings(TypedDict):
     cut: ClipDistance | None
     obstacles: Obstacles
     excess: Callable[[Floats], Floats] | None
+
+
+class TimedFit:
+    """Fits the field of a muscle when it is asked for, once; ``condition`` is infinite before, and
+    ``seconds`` the time spent.
+    """
+
+    def __init__(self, rest: RestState, now: Placement) -> None:
+        self._rest, self._now = rest, now
+        self.condition, self.seconds = np.inf, 0.0
+
+    def __call__(self) -> RBFField:
+        """The field."""
+        started = time.perf_counter()
+        try:
+            fitted = self._rest.field(self._now.centres, self._now.normals)
+        finally:
+            self.seconds = time.perf_counter() - started
+        self.condition = fitted.condition
+        return fitted
 
 
 class SurfaceBuilder:
@@ -72,18 +92,18 @@ class SurfaceBuilder:
         self.level = 0.0
         self.shown = DisplayMesh(muscle, rest, options) if options.surface == "material" else None
 
-    def draw(
-        self, fit: Callable[[], RBFField], now: Configuration, contacts: BoneContacts
-    ) -> ModelSurface:
-        """The closed surface at the rest volume, of the field that ``fit`` gives, cut by the
+    def draw(self, now: Placement, contacts: BoneContacts) -> ModelSurface:
+        """The closed surface at the rest volume of the field through the centres, cut by the
         contacts.
 
         Raises SolveError if marching cubes find no closed surface.
         """
+        started = time.perf_counter()
+        fit = TimedFit(self.rest, now)
         notes: list[tuple[str, int, str]] = []
-        if self.shown is None or now.carried is None:
+        left = 0.0
+        if self.shown is None:
             result: ExtractedSurface = self._march(fit, now, contacts)
-            left = 0.0
         else:
             result = self._of_material(fit, now.carried, contacts)
             left = result.left / len(now.carried)
@@ -94,11 +114,17 @@ class SurfaceBuilder:
             "components": result.components,
             "level": self.level,
             "unfitted_fraction": left,
+            "condition": fit.condition,
+            "time_fit": fit.seconds,
+            "time_extract": time.perf_counter() - started - fit.seconds,
+            "solver_penetration_max": max(
+                (float(depth.max()) for depth in contacts.depths(now.points).values()), default=0.0
+            ),
         }
         return ModelSurface(result.vertices, result.faces, quantities, notes)
 
     def _of_material(
-        self, fit: Callable[[], RBFField], carried: np.ndarray, contacts: BoneContacts
+        self, fit: TimedFit, carried: np.ndarray, contacts: BoneContacts
     ) -> FittedMesh:
         """The material's mesh on the level set, or where the material is if there is no fit."""
         mesh, volume = self.shown.mesh, self.rest.mesh_volume
@@ -161,9 +187,7 @@ class SurfaceBuilder:
             "in its mesh, and check where its attachments lie and what the motion drives into it"
         ) from reason
 
-    def _march(
-        self, fit: Callable[[], RBFField], now: Configuration, contacts: BoneContacts
-    ) -> ExtractedSurface:
+    def _march(self, fit: TimedFit, now: Placement, contacts: BoneContacts) -> ExtractedSurface:
         axes, resolution = self._axes(contacts), self.options.resolution or MARCHING_CELLS
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
         reach = 1.25 * float(np.ptp(now.points @ axes.T, axis=0).max()) / resolution
@@ -195,7 +219,7 @@ class SurfaceBuilder:
         """Points of bones, which faces have to leave outside."""
         return [(self._bones[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
 
-    def _cause(self, now: Configuration, contacts: BoneContacts) -> tuple[str, str]:
+    def _cause(self, now: Placement, contacts: BoneContacts) -> tuple[str, str]:
         """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or
         sheets that met.
         """
@@ -223,49 +247,6 @@ def _faults(result: FittedMesh, cut: ClipDistance | None, volume: float) -> floa
     return (
         result.crossing + (0.0 if deep <= SUNKEN else deep) + (0.0 if lost <= LOST else 1e3 * lost)
     )
-
-
-class RBFDrawing:
-    """An RBF muscle as it was at one moment; its field is fitted when it is first asked for."""
-
-    def __init__(self, drawer: SurfaceBuilder, now: Configuration, contacts: BoneContacts) -> None:
-        self._drawer, self._now = drawer, now
-        depths = contacts.depths(now.points).values()
-        self._depth = max((float(depth.max()) for depth in depths), default=0.0)
-        self._contacts = contacts.frozen()
-        self._fitted: RBFField | None = None
-        self._time_fit = 0.0
-
-    def carried(self) -> Mesh | None:
-        """The shown mesh where the material takes it; None where marching cubes show the
-        surface.
-        """
-        shown = self._drawer.shown
-        return (
-            None
-            if shown is None or self._now.carried is None
-            else (self._now.carried, shown.mesh.faces)
-        )
-
-    def surface(self) -> ModelSurface:
-        """The closed surface at the rest volume, cut by what lay in the way."""
-        started = time.perf_counter()
-        before = self._time_fit
-        surface = self._drawer.draw(self._fit, self._now, self._contacts)
-        surface.quantities.update(
-            condition=np.inf if self._fitted is None else self._fitted.condition,
-            time_fit=self._time_fit,
-            time_extract=time.perf_counter() - started - (self._time_fit - before),
-            solver_penetration_max=self._depth,
-        )
-        return surface
-
-    def _fit(self) -> RBFField:
-        if self._fitted is None:
-            started = time.perf_counter()
-            self._fitted = self._drawer.rest.field(self._now.centres, self._now.normals)
-            self._time_fit = time.perf_counter() - started
-        return self._fitted
 
 
 class _BoneCut:

@@ -8,7 +8,7 @@ from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.muscle.activation import FibrePull
-from rbfmuscle.muscle.drawing import Configuration, RBFDrawing, SurfaceBuilder
+from rbfmuscle.muscle.drawing import Placement, SurfaceBuilder
 from rbfmuscle.muscle.fibres import fibre_directions, rise
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
@@ -16,6 +16,7 @@ from rbfmuscle.muscle.solid import EmbeddedSolid, SolidState
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.frame import Mesh, ModelSurface
 
 # Neighbours meet a muscle at contact points so far apart, of the side of a lattice cell, which has
 # three nodes on it.
@@ -84,7 +85,7 @@ class RBFMuscle:
             self._placed = self.points, self.solid.shown, points
         return self._placed[2].copy()
 
-    def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
+    def material_mesh(self) -> Mesh:
         """The samples and their triangulation: a material surface of constant topology."""
         return self.contact_points()[len(self.points) :], self.rest.sample_faces
 
@@ -148,12 +149,20 @@ class RBFMuscle:
         """The RBF field through the present centres."""
         return self.rest.field(self.points, self.normals())
 
-    def drawing(self, contacts: BoneContacts) -> RBFDrawing:
-        """The muscle as it is now, for its surface."""
+    def carried_mesh(self) -> Mesh:
+        """The shown mesh where the solid carries it; the samples where marching cubes show the
+        surface.
+        """
         shown = self.drawer.shown
-        carried = None if shown is None else self.solid.follow(shown.rest)
-        now = Configuration(self.points.copy(), self.normals(), self.contact_points(), carried)
-        return RBFDrawing(self.drawer, now, contacts)
+        if shown is None:
+            return self.material_mesh()
+        return self.solid.follow(shown.rest), shown.mesh.faces
+
+    def surface(self, contacts: BoneContacts) -> ModelSurface:
+        """The closed surface at the rest volume, cut by what lies in the way."""
+        carried, _ = self.carried_mesh()
+        now = Placement(self.points, self.normals(), self.contact_points(), carried)
+        return self.drawer.draw(now, contacts)
 
 
 def _build_solid(

@@ -47,6 +47,15 @@ class ModelSurface:
     # else None.
     origin: Any = field(default=None, repr=False)
 
+    def moved(self, motion: np.ndarray) -> "ModelSurface":
+        """The surface after a rigid motion (4, 4), which took no time."""
+        vertices = self.vertices @ motion[:3, :3].T + motion[:3, 3]
+        quantities = {
+            name: 0.0 if name.startswith("time_") else value
+            for name, value in self.quantities.items()
+        }
+        return ModelSurface(vertices, self.faces, quantities, list(self.notes), (self, motion))
+
 
 @dataclass
 class Frame:
@@ -72,34 +81,6 @@ class Frame:
     neighbours: dict = field(default_factory=dict)
     # TendonLine by the end that each holds; the poses have these too
     tendons: dict = field(default_factory=dict)
-
-
-class Drawing(Protocol):
-    """A copy of a model's state, from which its surface is computed, maybe while the model
-    continues.
-    """
-
-    def carried(self) -> Mesh | None:
-        """Vertices and faces of the shown mesh, where the material takes them; None where that is
-        the material's.
-        """
-
-    def surface(self) -> ModelSurface:
-        """The surface, closed and outward; called once."""
-
-
-@dataclass(frozen=True)
-class FinishedDrawing:
-    """The drawing of a model whose surface is known."""
-
-    finished: ModelSurface
-
-    def carried(self) -> None:
-        """None: the surface is the material's."""
-
-    def surface(self) -> ModelSurface:
-        """The surface."""
-        return self.finished
 
 
 class MuscleModel(Protocol):
@@ -140,8 +121,11 @@ class MuscleModel(Protocol):
     def activate(self, activation: float) -> None:
         """Set the activation, 0 to 1, for the next :meth:`solve`; for muscles that contract."""
 
-    def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
+    def material_mesh(self) -> Mesh:
         """Vertices and faces of a surface of constant topology that moves with the material."""
 
-    def drawing(self, contacts: BoneContacts) -> Drawing:
-        """A copy of the state, from which the surface is computed."""
+    def carried_mesh(self) -> Mesh:
+        """Vertices and faces of the mesh that is shown, where the material takes it."""
+
+    def surface(self, contacts: BoneContacts) -> ModelSurface:
+        """The closed, outward surface as the muscle is now."""

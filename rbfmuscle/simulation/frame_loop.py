@@ -17,7 +17,7 @@ from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
 from rbfmuscle.simulation.overlap import resolve_initial_overlap
 from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.sliding import Sliding
-from rbfmuscle.simulation.stepper import MuscleStepper, TimedDrawing
+from rbfmuscle.simulation.stepper import MuscleStepper
 from rbfmuscle.simulation.substeps import PoseCache
 
 Path = tuple[list[dict[str, float]], list[dict[str, float]]]
@@ -103,14 +103,14 @@ class FrameLoop:
             if self.surfaces and self._sliding is None:
                 # No muscle waits for another: each thread takes one through all its sub-steps.
                 drawn = each(
-                    lambda stepper: stepper.go(*paths[stepper.name]).drawing().draw(), self.steppers
+                    lambda stepper: stepper.go(*paths[stepper.name]).surface(), self.steppers
                 )
             else:
                 self._solve(paths)
-                drawings = (
-                    self._sliding.drawings() if self.surfaces and self._sliding is not None else []
-                )
-                drawn = each(TimedDrawing.draw, drawings)
+                drawn = []
+                if self.surfaces and self._sliding is not None:
+                    self._sliding.finish_frame()
+                    drawn = each(MuscleStepper.surface, self.steppers)
             frame = self._frame(drawn)
         frame.wall, self._wall = self._wall, 0.0
         return frame
@@ -161,25 +161,20 @@ class FrameLoop:
         elif self.steppers:
             self._sliding.go(*paths[self.steppers[0].name])
 
-    def _frame(self, drawn: list[tuple[ModelSurface, float]]) -> Frame:
-        """The present frame, with surfaces and the seconds that each took."""
+    def _frame(self, drawn: list[ModelSurface]) -> Frame:
+        """The present frame, with its surfaces, if any were drawn."""
         carried = {stepper.name: stepper.model.material_mesh() for stepper in self.steppers}
         found = [stepper.collect() for stepper in self.steppers]
         times = dict(zip(carried, (times for times, _, _ in found)))
         poses = self._poses(self.here)
         for end in (end for name in carried for end in self.scene.muscle(name).tendons):
             poses[end.name]  # the pose of an end is computed, and kept, when it is first asked for
-        index, surfaces = (
-            self._next_index - 1,
-            dict(zip(carried, (surface for surface, _ in drawn))),
-        )
+        index = self._next_index - 1
+        surfaces = dict(zip(carried, drawn))
         events = [event for _, events, _ in found for event in events]
         events += [
             Event(index, name, *note) for name, shown in surfaces.items() for note in shown.notes
         ]
-        for name, (_, seconds) in zip(carried, drawn):
-            for key in ("time_surface", "time_frame"):
-                times[name][key] = times[name].get(key, 0.0) + seconds
         return Frame(
             index,
             dict(self.here),

@@ -194,13 +194,9 @@ class NeighbourSurface(MovingSurface):
         self._correction: list[Floats] = []
         self.refresh()
 
-    def show(self, mesh: Mesh | None) -> None:
-        """Take the vertices and faces of the mesh that is shown; None where that is the
-        material's.
-        """
-        if mesh is None:
-            self.shown = self
-        elif self.shown is self:
+    def show(self, mesh: Mesh) -> None:
+        """Take the vertices and faces of the mesh that is shown."""
+        if self.shown is self:
             self.shown = MovingSurface(*mesh, self.reach)
         else:
             self.shown.move(mesh[0])

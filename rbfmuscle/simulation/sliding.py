@@ -21,7 +21,7 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
 from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
 from rbfmuscle.simulation.sliding_pair import BoneLink, SlidingLimits, SlidingPair
-from rbfmuscle.simulation.stepper import MuscleStepper, TimedDrawing
+from rbfmuscle.simulation.stepper import MuscleStepper
 from rbfmuscle.validation import SceneError
 
 Coordinates = dict[str, float]
@@ -30,8 +30,8 @@ Coordinates = dict[str, float]
 class Sliding:
     """Muscles, in their rest state, that exchange their surfaces in all sliding pairs of a scene.
 
-    ``pairs`` has, for each that met by the last drawings, the overlap, and the RMS gap opened where
-    they touched at rest. Raises SceneError if the scene's ``pairs`` name an unknown muscle.
+    ``pairs`` has, for each that met in the last finished frame, the overlap, and the RMS gap opened
+    where they touched at rest. Raises SceneError if the scene's ``pairs`` name an unknown muscle.
     """
 
     def __init__(self, scene: Scene, steppers: list[MuscleStepper]) -> None:
@@ -144,8 +144,10 @@ class Sliding:
             with stepper.timed("sliding"):
                 self.surfaces[stepper.name].refresh(*path)
 
-    def drawings(self) -> list[TimedDrawing]:
-        """Drawings of all muscles in their present state; updates ``pairs``."""
+    def finish_frame(self) -> None:
+        """Make room where the solved muscles overlap, so that surfaces can be drawn; updates
+        ``pairs``.
+        """
         each(self.refresh, self.steppers)
         solved = [
             stepper for stepper in self.steppers if stepper.solves and self.links[stepper.name]
@@ -164,11 +166,9 @@ class Sliding:
             )
             if any(touching) or any(overlap)
         }
-        drawings = [stepper.drawing() for stepper in self.steppers]
-        for drawing in drawings:
-            if self.links[drawing.stepper.name]:
-                self.surfaces[drawing.stepper.name].show(drawing.drawing.carried())
-        return drawings
+        for stepper in self.steppers:
+            if self.links[stepper.name]:
+                self.surfaces[stepper.name].show(stepper.model.carried_mesh())
 
     def _make_room(self, stepper):
         with stepper.timed("sliding"):

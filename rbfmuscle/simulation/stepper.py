@@ -7,17 +7,15 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.motion import interpolate, shown_value, step_angle, unit_sign
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame import Drawing, Event, ModelSurface, MuscleModel
+from rbfmuscle.simulation.frame import Event, ModelSurface, MuscleModel
 from rbfmuscle.simulation.rigid_transport import MuscleStatus, RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 from rbfmuscle.simulation.tunnelling import (
@@ -35,45 +33,6 @@ TOUCH = 0.1
 FENCES = 4
 # Sub-steps are not halved below this angle [radian].
 SMALLEST_STEP = math.radians(0.1)
-
-
-class TimedDrawing:
-    """A muscle's drawing, whose surface is computed once."""
-
-    def __init__(self, stepper: MuscleStepper, drawing: Drawing) -> None:
-        self.stepper, self.drawing = stepper, drawing
-        self._finished: ModelSurface | None = None
-
-    def surface(self) -> ModelSurface:
-        """The surface."""
-        if self._finished is None:
-            self._finished = self.drawing.surface()
-        return self._finished
-
-    def draw(self) -> tuple[ModelSurface, float]:
-        """The surface, and the time that it took [s]."""
-        start = time.perf_counter()
-        return self.surface(), time.perf_counter() - start
-
-
-@dataclass(frozen=True)
-class CarriedDrawing:
-    """An earlier drawing, and the rigid motion (4, 4) since."""
-
-    before: TimedDrawing
-    motion: Floats
-
-    def carried(self) -> None:
-        """None: muscles that move rigidly do not slide."""
-
-    def surface(self) -> ModelSurface:
-        """The earlier surface, moved."""
-        then, motion = self.before.surface(), self.motion
-        vertices = then.vertices @ motion[:3, :3].T + motion[:3, 3]
-        quantities = {
-            name: 0.0 if name.startswith("time_") else v for name, v in then.quantities.items()
-        }
-        return ModelSurface(vertices, then.faces, quantities, list(then.notes), (then, motion))
 
 
 class MuscleStepper:
@@ -107,7 +66,8 @@ class MuscleStepper:
         self.carrier: RigidTransport | None = None
         self._path: Any = None
         self._saved: Any = None
-        self._shown: TimedDrawing | None = None
+        # The surface since the last solve, where later ones are that one moved rigidly.
+        self._shown: ModelSurface | None = None
         # Whether points crossed a bone in this frame or the last that no step resolved: halving is
         # not tried again.
         self._unresolved = False
@@ -188,13 +148,15 @@ class MuscleStepper:
                 "substep_angle in [contact]"
             ) from error
 
-    def drawing(self) -> TimedDrawing:
-        """The drawing of the present state."""
+    def surface(self) -> ModelSurface:
+        """The surface of the present state; the earlier one, moved, where the muscle moved rigidly
+        since.
+        """
         carrier = self.carrier
-        if self._shown is not None and carrier is not None:
-            return TimedDrawing(self, CarriedDrawing(self._shown, carrier.since))
         with self.timed("surface"):
-            shown = TimedDrawing(self, self.model.drawing(self.contacts))
+            if self._shown is not None and carrier is not None:
+                return self._shown.moved(carrier.since)
+            shown = self.model.surface(self.contacts)
         if carrier is not None:
             self._shown, carrier.since = shown, np.eye(4)
         return shown

@@ -20,7 +20,6 @@ from rbfmuscle.implicit.extraction.material import project_to_level_set
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.models import build_model
 from rbfmuscle.muscle.display_mesh import display_vertices
-from rbfmuscle.muscle.drawing import Configuration
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene.objects import Motion
@@ -187,7 +186,7 @@ def test_a_chosen_epsilon_never_gives_a_broken_field():
         assert model.rest.fit.condition == 1e6  # without a shape parameter a ridge keeps the bound
 
 
-def test_a_tangle_of_the_material_is_shown_as_a_sound_surface():
+def test_a_tangle_of_the_material_is_shown_as_a_sound_surface(monkeypatch):
     scene = build_scene()
     model = RBFMuscle(scene.muscles[0], scene)
     fields = {bone.name: BoneSDF.from_mesh(bone.mesh, cache=False) for bone in scene.bones}
@@ -197,8 +196,9 @@ def test_a_tangle_of_the_material_is_shown_as_a_sound_surface():
     tangled[tangled[:, 2] < 0.0] *= [-1.0, 1.0, 1.0]  # the lower half inside out
     alone = project_to_level_set(shown.mesh, tangled, None, volume=volume)
     assert crossing_faces(alone.vertices, alone.faces).sum() > 20
-    now = Configuration(model.points, model.normals(), model.contact_points(), tangled)
-    surface = model.drawer.draw(Mock(side_effect=ValueError("no field")), now, contacts)
+    monkeypatch.setattr(type(model.rest), "field", Mock(side_effect=ValueError("no field")))
+    monkeypatch.setattr(model, "carried_mesh", lambda: (tangled, shown.mesh.faces))
+    surface = model.surface(contacts)
     assert not crossing_faces(surface.vertices, np.asarray(surface.faces)).any()
     assert mesh_volume(surface.vertices, np.asarray(surface.faces)) == pytest.approx(
         volume, rel=1e-10

@@ -70,7 +70,7 @@ def test_xpbd_does_not_depend_on_the_number_of_iterations():
 def test_sweeps_go_on_until_no_vertex_moves_by_more_than_the_tolerance(method):
     rig = Rig(method=method, tolerance=1e-5)
     rig.go(*range(2, 22, 2))
-    found = rig.model.drawing(rig.contacts).surface().quantities["sweeps"]
+    found = rig.model.surface(rig.contacts).quantities["sweeps"]
     points, still = rig.model.points, rig.model.still
     before, rig.model.still = points.copy(), 1e-300
     assert 3 < found < 2000

@@ -186,10 +186,10 @@ def test_drawn_surfaces_yield_by_half_of_their_overlap():
     for part in [toy.ToyMuscle(m, made) for m in made.muscles]:
         contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=part.contact_bone)
         steppers.append(MuscleStepper(part, contacts, made))
-    Sliding(made, steppers).drawings()
+    Sliding(made, steppers).finish_frame()
     for stepper, other in (steppers, steppers[::-1]):
         points = stepper.model.x
-        found = stepper.contacts.frozen().excess(points)
+        found = stepper.contacts.excess(points)
         depth = -igl.signed_distance(points, other.model.x, other.model.faces)[0]
         assert np.allclose(found, np.maximum(0.5 * (links.CLEAR + depth), 0.0), atol=0.02)
         assert found.max() > 0.3 and (found == 0.0).any()
