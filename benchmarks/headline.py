@@ -32,7 +32,7 @@ WORST = (
     "rest_error_rms",
     "rest_error_max",
     "flicker",
-    "slack",
+    "bowing",
     "self_crossings",
 )
 

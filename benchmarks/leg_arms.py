@@ -98,9 +98,9 @@ def our_arms(scene, joint, model):
     angles = np.array([frame.coordinates[JOINTS[joint][0]] for frame in run.frames])
     found = {}
     for muscle in scene.muscles:
-        lengths, slack = run.values(muscle.name, "length"), run.values(muscle.name, "slack")
+        lengths, bowing = run.values(muscle.name, "length"), run.values(muscle.name, "bowing")
         tendons = sum(end.length for end in muscle.tendons)
-        shortest = tendons + (lengths - tendons) / slack
+        shortest = tendons + (lengths - tendons) / bowing
         found[muscle.name] = tuple(
             -np.diff(values) / np.diff(angles) for values in (lengths, shortest)
         )

@@ -79,7 +79,7 @@ def headline_table(facts):
         ),
         ("distance from the input mesh at rest, RMS (mm)", lambda r: bound(r["rest_error_rms"], 2)),
         ("flicker in steps of 2 degrees (mm); a mesh model has none", flicker),
-        ("length of the centreline / shortest path over the bones", lambda r: f"{r['slack']:.2f}"),
+        ("bowing: length of the centreline / shortest path", lambda r: f"{r['bowing']:.2f}"),
         ("self-crossing triangles", lambda r: f"{r['self_crossings']:.0f}"),
         ("last pose, reached in steps of 2, 5, 10 and 30 degrees: difference, RMS (mm)", steps),
         ("first pose, before and after the motion there and back: difference, RMS (mm)", back),

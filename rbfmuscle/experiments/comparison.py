@@ -51,7 +51,7 @@ MEASURES = {
     "initial_overlap": Measure(
         "overlap left at rest", "length", LAW, 0.02, "of muscle and bones at first"
     ),
-    "slack": Measure("bowing", "1", LAW, 0.005, "centreline over shortest path", 1.0),
+    "bowing": Measure("bowing", "1", LAW, 0.005, "centreline over shortest path", 1.0),
     "components": Measure(
         "pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"
     ),

@@ -3,8 +3,8 @@
 The length is that of a line through the slices of a harmonic field between origin and insertion.
 The path is a taut string of `NODES` nodes that starts along it: the nodes take the places where the
 sum of the segments' squared lengths is least while each is on the outer side of the plane that
-touches the nearest bone there. Planes are taken again until the nodes are where they were one or
-two rounds before.
+touches the nearest bone there, as far from it as the muscle's half thickness at rest. Planes are
+taken again until the nodes are where they were one or two rounds before.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -19,7 +19,7 @@ from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.jit import compiled
-from rbfmuscle.metrics.mesh_distance import BoneProbe, bones_about, inverse_pose
+from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bones_about
 from rbfmuscle.scene.joints.joint import Joint, all_coordinates
 from rbfmuscle.scene.objects import Attachment, Muscle
 from rbfmuscle.scene.scene import Scene
@@ -78,9 +78,21 @@ class Centreline:
         along = distance_along(fine @ vertices)
         even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
         self.operator = slice_operator(vertices, faces, field, even)
+        self.clearance = self._half_thickness(vertices, faces)
         self._pulled: Floats | None = (
             None  # from the points along the line to the last shortest path
         )
+
+    def _half_thickness(self, vertices: Floats, faces: Integers) -> Floats:
+        """Distance (`NODES`,) from the line at rest to the surface, at even distances along it; 0
+        at both attachments.
+        """
+        line = np.vstack([_rest_middle(self.ends[0]), self.operator @ vertices])
+        line = np.vstack([line, _rest_middle(self.ends[1])])
+        distance = MeshDistance(vertices, faces).unsigned(line)
+        distance[[0, -1]] = 0.0
+        along = distance_along(line)
+        return np.interp(np.linspace(0.0, along[-1], NODES), along, distance)
 
     def points(self, vertices: Floats, poses: Mapping[str, Floats]) -> Floats:
         """The line now, (k, 3), from the carried mesh (n, 3) and the poses (4, 4) of the bones."""
@@ -98,7 +110,7 @@ class Centreline:
         the last frame.
         """
         line = self.points(vertices, poses)
-        path = shortest_path(line, probes, poses, offset=self._pulled)
+        path = shortest_path(line, probes, poses, clearance=self.clearance, offset=self._pulled)
         self._pulled = path - resampled(line, NODES - 1) if len(path) == NODES else None
         length, shortest = float(distance_along(line)[-1]), float(distance_along(path)[-1])
         return length, length / shortest if shortest > 0.0 else np.nan
@@ -233,6 +245,11 @@ def _sides(muscle, ends, vertices):
     return [np.setdiff1d(sides[0], sides[1]), sides[1]]
 
 
+def _rest_middle(end: End) -> Floats:
+    """Middle (3,) of an end's patches at rest."""
+    return _carried_middle(end, {holder: np.eye(4) for holder, _, _ in end})
+
+
 def _carried_middle(end: End, poses: Mapping[str, Floats]) -> Floats:
     """Middle (3,) of an end's patches where its bones (their poses (4, 4)) carry them."""
     placed = [(poses[bone], points, areas) for bone, points, areas in end]
@@ -285,25 +302,31 @@ def _thickness(points: Floats, axis: Floats) -> float:
 
 
 def shortest_path(
-    line: Floats, probes: list[BoneProbe], poses: dict[str, Floats], *, offset: Floats | None = None
+    line: Floats,
+    probes: list[BoneProbe],
+    poses: dict[str, Floats],
+    *,
+    clearance: Floats,
+    offset: Floats | None = None,
 ) -> Floats:
     """Nodes (`NODES`, 3) of the shortest path over the bones between the ends of a line, beside
     which it begins.
 
     ``line`` (n, 3) says which side of the bones the path takes; the bones have poses (4, 4) by
-    name. ``offset`` (`NODES`, 3) leads from the points at even distances along the line to where
-    the string begins: what it did in the frame before. Two nodes only where nothing lies between
-    the ends.
+    name. Each node keeps its ``clearance`` (`NODES`,) [scene unit] from them. ``offset`` (`NODES`,
+    3) leads from the points at even distances along the line to where the string begins: what it
+    did in the frame before. Two nodes only where no bone is near.
     """
-    chord = np.linspace(line[0], line[-1], NODES)
-    near = bones_about(line, probes, poses)
-    inner = chord[1:-1]
-    if not any(probe.inside(inner, pose=inverse_pose(poses[probe.name])).any() for probe in near):
-        return chord[[0, -1]]
+    size = float(distance_along(line)[-1])
+    widest = clearance.max()
+    near = bones_about(np.vstack([line - widest, line + widest]), probes, poses)
+    if not near:
+        return line[[0, -1]]
     string = resampled(line, NODES - 1) + (0.0 if offset is None else offset)
-    size, earlier = float(distance_along(line)[-1]), [string]
+    earlier = [string]
     gap, normal = _planes(string, near, poses, TOUCHING * size)
-    taken, offsets = string.copy(), np.einsum("ij,ij->i", normal, string) - gap
+    taken = string.copy()
+    offsets = np.einsum("ij,ij->i", normal, string) - gap + clearance
     for _ in range(ROUNDS):
         string = string.copy()
         _tighten_loop(string, normal, offsets, SWEEPS, OVER_RELAXATION)
@@ -314,7 +337,8 @@ def shortest_path(
         renewed = np.abs(string - taken).max(axis=1) > RENEWED * np.abs(gap)
         gap[renewed], normal[renewed] = _planes(string[renewed], near, poses, TOUCHING * size)
         taken[renewed] = string[renewed]
-        offsets[renewed] = np.einsum("ij,ij->i", normal, string)[renewed] - gap[renewed]
+        touching = np.einsum("ij,ij->i", normal, string) - gap
+        offsets[renewed] = (touching + clearance)[renewed]
     return string
 
 

@@ -92,7 +92,7 @@ class _Tracker:
         stretch = np.sqrt(np.einsum("ij,ij->i", edges, edges))
         found["edge_strain_rms"] = math.sqrt(np.mean((stretch - 1.0) ** 2))
         if self.line is not None:
-            belly, found["slack"] = self.line.measure(carried, frame.poses, probes)
+            belly, found["bowing"] = self.line.measure(carried, frame.poses, probes)
             found["length"] = belly + self.line.tendon_length(frame.tendons)
         if self.contracts:
             found["activation"] = frame.activations[self.name]

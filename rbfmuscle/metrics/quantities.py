@@ -47,10 +47,10 @@ QUANTITIES = {
     "edge_strain_rms": ("1", "relative change of edge lengths of the material mesh"),
     "condition": ("1", "condition estimate of the fit"),
     "length": ("length", "centreline from origin to insertion, with its tendons"),
-    "slack": (
+    "bowing": (
         "1",
-        "length of the centreline without tendons / that of the shortest path over the bones "
-        "between its ends",
+        "length of the centreline without tendons / that of the shortest path between its ends "
+        "that keeps off the bones by the muscle's half thickness at rest",
     ),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
     "activation": ("1", "activation, 0 to 1; this and the next three for muscles that contract"),

@@ -52,7 +52,7 @@ LIMITS = {
         0.999, "surface shown without a fit", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"
     ),
     "flicker": Limit(0.5, "flicker", f"take frames closer together, or {_SMALLER_STEPS}"),
-    "slack": Limit(1.03, "centreline over shortest path", _LOOK),
+    "bowing": Limit(1.03, "centreline over shortest path", _LOOK),
     "tunnelled": Limit(0.0, "points beyond a bone", _SMALLER_STEPS),
     "rest_error_rms": Limit(0.6, "rest error", _MORE_CENTRES),
     "end_gap": Limit(25.0, "end away from its bone", "correct the attachment, or give it a tendon"),
@@ -65,8 +65,8 @@ LEAST = {"euler"}
 COUNTS = ("components", "euler", "self_crossings", "tunnelled")
 # A muscle thinner than this [mm] may have this rest error [mm].
 THIN, THIN_REST_ERROR = 10.0, 1.0
-# A muscle that is slack at rest may be so by this much more.
-MORE_SLACK = 0.03
+# A muscle that bows at rest may do so by this much more.
+MORE_BOWING = 0.03
 MOST_NAMED = 6  # exceeded limits that a verdict names
 
 
@@ -184,8 +184,8 @@ def _in_unit(value, quantity, unit):
 
 
 def muscle_limit(quantity: str, limit: float, found: Mapping[str, Mapping[str, Any]]) -> float:
-    """Limit of one muscle: thin ones and those slack at rest have their own, by its facts, in place
-    of the default.
+    """Limit of one muscle: thin ones and those that bow at rest have their own, by its facts, in
+    place of the default.
     """
     unit = found[quantity]["unit"]
     if quantity not in LIMITS or limit != _in_unit(LIMITS[quantity].value, quantity, unit):
@@ -194,7 +194,7 @@ def muscle_limit(quantity: str, limit: float, found: Mapping[str, Mapping[str, A
         thin = found["thickness"]["first"] < _in_unit(THIN, "thickness", unit)
         return _in_unit(THIN_REST_ERROR, quantity, unit) if thin else limit
     first = found[quantity]["first"]
-    return max(limit, first + MORE_SLACK) if quantity == "slack" and first is not None else limit
+    return max(limit, first + MORE_BOWING) if quantity == "bowing" and first is not None else limit
 
 
 def within(quantity: str, worst: float, limit: float) -> bool:

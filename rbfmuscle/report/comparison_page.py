@@ -18,7 +18,7 @@ from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, 
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.report import packed_scene
 
-LIGHTS = ("penetration_max", "bone_penetration_max", "slack", "return_rms", "time_frame")
+LIGHTS = ("penetration_max", "bone_penetration_max", "bowing", "return_rms", "time_frame")
 _READING = """All models ran through the same frames and sub-steps, with the same bone fields and
 number of threads. The time per frame leaves out the first, which loads and compiles. The
 distance to the first model is no error. A mesh model keeps the overlap with bones that its mesh
@@ -42,9 +42,9 @@ def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
     first = next(iter(runs.values()))
     failed = [f"{name} did not finish: {reason}" for name, reason in found["failed"].items()]
     counts = {"muscles": len(first.muscles), "frames": found["frames"], **found["machine"]}
-    # Of the slack each muscle has a limit of its own.
+    # Of the bowing each muscle has a limit of its own.
     limits, terms = (
-        first.info["limits"] | {"slack": None},
+        first.info["limits"] | {"bowing": None},
         [(m.title, m.meaning) for m in MEASURES.values()],
     )
     return Page(

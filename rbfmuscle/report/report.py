@@ -48,7 +48,7 @@ LIGHTS = {
     ),
     "Is the scanned shape at rest": ("rest_error_rms",),
     "Is one closed piece": ("components", "euler", "self_crossings", "unfitted_fraction"),
-    "Moves without jumps or bowing": ("flicker", "slack"),
+    "Moves without jumps or bowing": ("flicker", "bowing"),
 }
 # Title, quantity, factor, unit (None: the scene's).
 PANELS = (

@@ -24,16 +24,16 @@ def test_what_does_not_count_is_a_tie():
     assert best_models(found, "rest_error_rms", "mm") == ["a", "b"]
     assert best_models(found, "rest_error_rms", "m") == ["a"]
     found = {
-        name: {"all": {"distance_rms": 1.0, "slack": s}} for name, s in (("a", 1.0), ("b", 0.9))
+        name: {"all": {"distance_rms": 1.0, "bowing": s}} for name, s in (("a", 1.0), ("b", 0.9))
     }
     assert (
         best_models(found, "distance_rms", "mm")
-        == best_models({"a": found["a"]}, "slack", "mm")
+        == best_models({"a": found["a"]}, "bowing", "mm")
         == []
     )
-    assert best_models(found, "slack", "mm") == ["a"]  # which is perfect at 1
+    assert best_models(found, "bowing", "mm") == ["a"]  # which is perfect at 1
     known = {"models": ["a"], "results": found}
-    assert (_values(known, "slack"), _values(known, "flicker")) == ([1.0], [])
+    assert (_values(known, "bowing"), _values(known, "flicker")) == ([1.0], [])
     table = {"measures": {name: {"unit": "mm"} for name in MEASURES}}
     values = (
         ("return_rms", 0.009),

@@ -1,4 +1,6 @@
-"""The shortest path over bones between a muscle's ends, against closed forms."""
+"""The shortest path over bones between a muscle's ends, and bowing, against closed forms."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -6,8 +8,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.tubes import line_length
-from rbfmuscle.metrics.centreline import shortest_path
+from rbfmuscle.metrics.centreline import NODES, Centreline, shortest_path
 from rbfmuscle.metrics.mesh_distance import BoneProbe
+from rbfmuscle.scene.objects import Attachment
 
 RADIUS, FAR = 10.0, 25.0
 
@@ -16,28 +19,115 @@ def ball():
     return BoneProbe("ball", trimesh.creation.icosphere(5, RADIUS))
 
 
+def pulley():
+    return BoneProbe("ball", trimesh.creation.cylinder(RADIUS, 80.0, sections=256))
+
+
 def over_the_ball(height):
     """Points from one side of the ball to the other, over it for a positive height."""
     x = np.linspace(-FAR, FAR, 20)
     return np.stack([x, np.zeros(20), height * (1 - (x / FAR) ** 2)], axis=1)
 
 
-@pytest.mark.parametrize("height", [20.0, -20.0, 12.0])
-def test_string_over_a_ball_is_two_tangents_and_an_arc(height):
+@pytest.mark.parametrize("clearance", [0.0, 4.0])
+@pytest.mark.parametrize("height", [20.0, -20.0, 14.5])
+def test_string_over_a_ball_is_two_tangents_and_an_arc(height, clearance):
     motion = np.eye(4)  # of the whole scene
     motion[:3, :3] = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
     motion[:3, 3] = 3.0, -7.0, 11.0
     line = trimesh.transform_points(over_the_ball(height), motion)
-    path = shortest_path(line, [ball()], {"ball": motion})
+    kept_off = np.full(NODES, clearance)
+    path = shortest_path(line, [ball()], {"ball": motion}, clearance=kept_off)
     path = trimesh.transform_points(path, np.linalg.inv(motion))
-    tangent = np.sqrt(FAR**2 - RADIUS**2)
-    wrapped = 2 * tangent + RADIUS * (np.pi - 2 * np.arctan2(tangent, RADIUS))
+    radius = RADIUS + clearance
+    tangent = np.sqrt(FAR**2 - radius**2)
+    wrapped = 2 * tangent + radius * (np.pi - 2 * np.arctan2(tangent, radius))
     # 33 nodes cut the arc's corners, and the ball has facets: a thousandth of the length.
     assert line_length(path) == pytest.approx(wrapped, rel=1e-3)
     assert np.sign(path[len(path) // 2, 2]) == np.sign(height)
-    assert np.linalg.norm(path[1:-1], axis=1).min() > 0.995 * RADIUS
+    assert np.linalg.norm(path[1:-1], axis=1).min() > 0.995 * radius
     away = np.eye(4)  # with nothing between it is straight
     away[:3, 3] = 0.0, 40.0, 0.0
     for probes, poses in (([], {}), ([ball()], {"ball": away})):
-        path = shortest_path(over_the_ball(height), probes, poses)
-        assert line_length(path) == pytest.approx(2 * FAR, rel=1e-12)
+        path = shortest_path(over_the_ball(height), probes, poses, clearance=kept_off)
+        assert line_length(path) == pytest.approx(2 * FAR, rel=1e-6)
+
+
+LENGTH, HALF, STRAIGHT = 90.0, 4.0, 25.0  # of a strip, its half thickness, and of its free ends
+
+
+def strip():
+    """A bar along x, thick along y, with its two ends as attachments, as the metric takes it."""
+    mesh = trimesh.creation.box((LENGTH, 2 * HALF, 2 * HALF))
+    while mesh.edges_unique_length.max() > 4.0:
+        mesh = mesh.subdivide()
+    x = mesh.vertices[:, 0]
+    ends = [
+        Attachment("trunk", np.flatnonzero(x == x.min())),
+        Attachment("limb", np.flatnonzero(x == x.max())),
+    ]
+    muscle = SimpleNamespace(name="strip", mesh=mesh, attachments=ends)
+    joint = SimpleNamespace(name="joint", parent="trunk", child="limb", coordinates={})
+    return Centreline(muscle, [joint], np.array(mesh.vertices), np.array(mesh.faces)), mesh
+
+
+def wrapped(points, radius):
+    """Points (n, 3) of the strip with its middle bent about z on a circle between straight ends."""
+    x = points[:, 0]
+    bent = 0.5 * LENGTH - STRAIGHT
+    angle = np.clip(x, -bent, bent) / radius
+    beyond = x - np.clip(x, -bent, bent)
+    r = radius + points[:, 1]
+    return np.stack(
+        [
+            r * np.sin(angle) + beyond * np.cos(angle),
+            r * np.cos(angle) - beyond * np.sin(angle),
+            points[:, 2],
+        ],
+        axis=1,
+    )
+
+
+def end_pose(line, k, radius):
+    """The rigid motion (4, 4) that takes an end of the straight strip to where it is wrapped."""
+    middle = sum(areas @ points for _, points, areas in line.ends[k])
+    middle /= sum(areas.sum() for *_, areas in line.ends[k])
+    frame = np.vstack([middle, middle + np.eye(3)])
+    placed = wrapped(frame, radius)
+    pose = np.eye(4)
+    pose[:3, :3] = (placed[1:] - placed[0]).T
+    # Along x the strip is cut off at its end, so the direction is taken across it.
+    pose[:3, 0] = np.cross(pose[:3, 1], pose[:3, 2])
+    pose[:3, 3] = placed[0] - pose[:3, :3] @ middle
+    return pose
+
+
+def bowing(bone, radius):
+    line, mesh = strip()
+    poses = {"trunk": end_pose(line, 0, radius), "limb": end_pose(line, 1, radius)}
+    vertices = wrapped(np.array(mesh.vertices), radius)
+    return line.measure(vertices, {**poses, "ball": np.eye(4)}, [bone] if bone else [])[1]
+
+
+@pytest.mark.parametrize("bone", [pulley, ball], ids=["cylinder", "sphere"])
+def test_thick_strip_on_a_bone_does_not_bow_and_one_that_stands_off_does(bone):
+    # Wrapped by 160 degrees, so that the straight line between its ends meets no bone. Sixteen
+    # slices cut the corners of the arc by 0.003 of the length, 33 nodes by 0.001.
+    assert bowing(bone(), RADIUS + HALF) == pytest.approx(1.0, abs=4e-3)
+    # Off the bone by 4 mm more.
+    radius = RADIUS + HALF + 4.0
+    end = wrapped(np.array([[0.5 * LENGTH, 0.0, 0.0]]), radius)[0]
+    far = np.hypot(end[0], end[1])
+    apart = 2 * np.arctan2(end[0], end[1])
+    tangent = np.sqrt(far**2 - (RADIUS + HALF) ** 2)
+    arc = apart - 2 * np.arctan2(tangent, RADIUS + HALF)
+    shortest = 2 * tangent + arc * (RADIUS + HALF)
+    assert bowing(bone(), radius) == pytest.approx(LENGTH / shortest, abs=4e-3)
+    assert LENGTH / shortest > 1.03  # the limit
+
+
+def test_straight_strip_whose_ends_approach_bows_by_arc_over_chord():
+    radius = 40.0
+    end = wrapped(np.array([[0.5 * LENGTH, 0.0, 0.0]]), radius)[0]
+    assert bowing(None, radius) == pytest.approx(LENGTH / (2 * end[0]), abs=2e-3)  # of the slices
+    assert bowing(None, 1e6) == pytest.approx(1.0, abs=1e-6)
