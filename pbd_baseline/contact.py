@@ -14,12 +14,11 @@ class ContactConstraint:
     """Keeps vertices out of bones: C = gap + n . (x - x_0) >= 0, linearised where the contacts were
     asked.
 
-    They are looked for within ``reach`` [scene unit]. With ``nearest_only`` a vertex in several
-    bones moves by the longest of its ways out alone, as in the authors' papers, not by their sum.
+    They are looked for within ``reach`` [scene unit].
     """
 
-    def __init__(self, *, reach: float, nearest_only: bool) -> None:
-        self.reach, self.nearest_only = float(reach), nearest_only
+    def __init__(self, *, reach: float) -> None:
+        self.reach = float(reach)
         self.index, self.gap = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.normal = self.anchor = np.zeros((0, 3))
 
@@ -32,17 +31,13 @@ class ContactConstraint:
 
     def depth(self, points: Floats) -> float:
         """Greatest depth of the vertices in the half-spaces found last."""
-        return float(self._depths(points).max(initial=0.0))
+        return float(self.depths(points).max(initial=0.0))
 
     def project(self, points: Floats) -> None:
         """Push vertices out of the half-spaces, in place."""
-        depth = self._depths(points)
+        depth = self.depths(points)
         if depth.max(initial=0.0) <= TOUCHING * self.reach:
             return
-        if self.nearest_only:
-            deepest = np.zeros(len(points))
-            np.maximum.at(deepest, self.index, depth)
-            depth[depth < deepest[self.index]] = 0.0
         np.add.at(points, self.index, depth[:, None] * self.normal)
 
     def clear_way(self, points: Floats, direction: Floats, step: float) -> bool:
@@ -53,7 +48,8 @@ class ContactConstraint:
             return False
         return _clear_loop(points, self.index, self.gap, self.normal, self.anchor, direction, step)
 
-    def _depths(self, points):
+    def depths(self, points: Floats) -> Floats:
+        """Depth (c,) of the points (n, 3) in each half-space found last, 0 outside."""
         way = np.einsum("cd,cd->c", points[self.index] - self.anchor, self.normal)
         return np.maximum(0.0, -self.gap - way)
 

@@ -12,7 +12,7 @@ from pbd_baseline.contact import ContactConstraint
 from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import RestState
-from pbd_baseline.shapes import METHODS
+from pbd_baseline.shapes import METHODS, Method
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.scene.objects import Muscle
@@ -30,8 +30,6 @@ MOST_SWEEPS = 2000
 # Rounds of contact and volume after the last sweep, and the depth [mm] that ends them.
 FINISHING_ROUNDS = 4
 DEPTH = 0.05
-# Share of its velocity that a vertex of `pbd-paper` keeps.
-DAMPING = 0.99
 # Motion that makes the time of one XPBD step [radian].
 STEP_ANGLE = math.radians(2.0)
 
@@ -44,13 +42,18 @@ class PBDMuscle:
     consistently oriented surface.
     """
 
-    def __init__(self, muscle: Muscle, scene: Scene, options: PBDOptions | None = None) -> None:
+    def __init__(
+        self,
+        muscle: Muscle,
+        scene: Scene,
+        options: PBDOptions | None = None,
+        *,
+        method: Method = METHODS["pbd"],
+    ) -> None:
         self.name = muscle.name
         self.options = options or PBDOptions()
         self.rest = RestState.from_muscle(muscle, scene, self.options)
-        method = METHODS[self.options.method]
-        self.as_printed = method.as_printed
-        slack = 1.0 if self.as_printed else self.options.slack
+        slack = self.options.slack
         contracts = muscle.contraction is not None
         self.fibres = (
             MeshFibres(muscle, self.rest, slack=slack) if contracts or slack > 1.0 else None
@@ -61,16 +64,15 @@ class PBDMuscle:
         self.shape = method.shape(self.rest, self.options, stiffer)
         self.sweeps = self.options.iterations or method.sweeps
         self.most_sweeps, self.swept = self.sweeps, 0
-        if self.options.tolerance > 0.0:
+        if method.tolerance > 0.0:
             self.sweeps = method.sweeps
             self.most_sweeps = self.options.iterations or MOST_SWEEPS
-        self.still = self.options.tolerance * diameter(self.rest.vertices)
+        self.still = method.tolerance * diameter(self.rest.vertices)
         self.detail = 0.0
         self.contact_bone = _bone_numbers(self.rest, scene.holders(muscle))
-        self.contact = ContactConstraint(reach=scene.length(REACH), nearest_only=self.as_printed)
+        self.contact = ContactConstraint(reach=scene.length(REACH))
         self.finishing_reach, self.depth = scene.length(FINISHING_REACH), scene.length(DEPTH)
         self.points = self.rest.vertices.copy()
-        self.before = self.points.copy()
         self.time = 1.0
         self.penetration = 0.0
 
@@ -82,17 +84,17 @@ class PBDMuscle:
         """Go along with the bones; held vertices arrive exactly."""
         motions = np.array([_relative(before[bone], after[bone]) for bone in self.rest.bones])
         self.time = max(1.0, _largest_angle(motions) / STEP_ANGLE)
-        if self.as_printed:
-            velocity = self.points - self.before
-            self.before = self.points.copy()
-            self.points += DAMPING * velocity
-        elif not np.array_equal(motions, np.tile(np.eye(4), (len(motions), 1, 1))):
-            self.points[:] = blended_motion(self.points, self.rest.weights, motions)
+        self._move_free(motions)
         for b, bone in enumerate(self.rest.bones):
             held = self.rest.attached_bone == b
             self.points[held] = (
                 self.rest.vertices[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
             )
+
+    def _move_free(self, motions: np.ndarray) -> None:
+        """Predict the free vertices from the motions (b, 4, 4) of the bones."""
+        if not np.array_equal(motions, np.tile(np.eye(4), (len(motions), 1, 1))):
+            self.points[:] = blended_motion(self.points, self.rest.weights, motions)
 
     def solve(self, contacts: BoneContacts) -> None:
         """Sweep the shape, contacts inside the iteration and last, the volume on what is not in
@@ -124,24 +126,17 @@ class PBDMuscle:
 
     def transform(self, motion: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4), as the muscle is."""
-        for points in (self.points, self.before):
-            points[:] = points @ motion[:3, :3].T + motion[:3, 3]
+        self.points[:] = self.points @ motion[:3, :3].T + motion[:3, 3]
         self.shape.transform(motion)
 
     def snapshot(self) -> Any:
         """Everything that :meth:`restore` needs."""
-        return (
-            self.points.copy(),
-            self.before.copy(),
-            self.shape.snapshot(),
-            self.time,
-            self.penetration,
-        )
+        return self.points.copy(), self.shape.snapshot(), self.time, self.penetration
 
     def restore(self, state: Any) -> None:
         """Go back to a snapshot."""
-        points, before, shape, self.time, self.penetration = state
-        self.points[:], self.before = points, before.copy()
+        points, shape, self.time, self.penetration = state
+        self.points[:] = points
         self.shape.restore(shape)
 
     def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:

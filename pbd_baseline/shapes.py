@@ -106,15 +106,6 @@ class PBDShape(Shape):
         self.edges.project(points, self.inverse_mass)
 
 
-class PaperShape(PBDShape):
-    """PBD as Cervenka et al. print it (GRAPP 2023): stiffness does not fall with an edge's length,
-    limits are wide.
-    """
-
-    soft_length = np.inf
-    limits = 0.01, 100.0
-
-
 class XPBDShape(Shape):
     """The same constraints with compliances, one iteration in each of many small steps (Macklin
     2019).
@@ -237,32 +228,23 @@ class GlobalARAPShape(RotatingShape):
         return direction
 
 
-class InterleavedARAPShape(GlobalARAPShape):
-    """The same with the rough volume step of the paper's figure 8: each of the two undoes what the
-    other did.
-    """
-
-    def restore_volume(self, points: np.ndarray, contact: ContactConstraint) -> None:
-        """One projection along the plain gradient, in place, whatever lies in the way."""
-        self.volume.project(points, self.inverse_mass)
-
-
 class Method(NamedTuple):
-    """One method: its shape and its number of sweeps per solve."""
+    """One method: its shape and its number of sweeps per solve.
+
+    With a ``tolerance`` above 0 sweeps go on until none moves a vertex by more than this share of
+    the muscle's size.
+    """
 
     shape: type[Shape]
     sweeps: int  # the authors' three for PBD; sub-steps of one sweep for XPBD
-    # As the paper prints it: vertices keep their velocity and answer to the deepest bone alone.
-    as_printed: bool = False
+    tolerance: float = 0.0
 
 
 METHODS = {
     "pbd": Method(PBDShape, 3),
-    "pbd-paper": Method(PaperShape, 3, as_printed=True),
     "xpbd": Method(XPBDShape, 10),
     "arap-pbd": Method(ARAPShape, 10),
     "arap-volume": Method(GlobalARAPShape, 6),
-    "arap-interleaved": Method(InterleavedARAPShape, 6),
 }
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.experiments.comparison import add_distances, measure_run, write_tables
-from rbfmuscle.models import COMPARED, build_models, check_model_name, configure_scene, model_title
+from rbfmuscle.models import COMPARED, build_models, configure_scene, model_kind, model_title
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.writer import check_writable
 from rbfmuscle.progress import stage
@@ -106,7 +106,7 @@ def _variants(scene, models, settings, frames):
     if len(models) < 2 or len(set(models)) < len(models):
         raise UsageError(f"give two or more different models, got {', '.join(models) or 'none'}")
     for name in models:
-        check_model_name(name)
+        model_kind(name)
     for key in settings:
         model = key.rpartition(":")[0]
         if model and model not in models:

@@ -1,8 +1,8 @@
-"""Model names and their classes, loaded on demand; the only module that knows both models."""
+"""Model names and what builds them; the only module that knows both models."""
 
-import importlib
-from collections.abc import Collection, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Collection, Mapping
+from functools import cache
+from typing import NamedTuple
 
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.objects import Muscle
@@ -12,74 +12,129 @@ from rbfmuscle.scene.settings import HEADS
 from rbfmuscle.simulation.frame import MuscleModel
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean, shown
 
-
-class _Home(NamedTuple):
-    """A model's package, the names in it, and the options that its name implies."""
-
-    package: str
-    muscle: str
-    options: str
-    implied: dict
-
-
-_PBD = "pbd_baseline", "PBDMuscle", "PBDOptions"
 # Sweeps of the converged mesh models go on until none moves a vertex by more than this share of the
 # muscle's size.
-CONVERGED, _SUFFIX = 5e-6, "-converged"
-_METHODS = ("pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
-_HOME = {"rbf": _Home("rbfmuscle.muscle", "RBFMuscle", "RBFOptions", {})}
-_HOME |= {name: _Home(*_PBD, {"method": name, "tolerance": 0.0}) for name in _METHODS}
-for _name in ("pbd", "xpbd", "arap-pbd", "arap-volume"):
-    _HOME[f"{_name}{_SUFFIX}"] = _Home(*_PBD, {"method": _name, "tolerance": CONVERGED})
+CONVERGED = 5e-6
 
-MODEL_NAMES = tuple(_HOME)
-# The default of `compare`: all but the historical model, and PBD converged.
-COMPARED = ("rbf", "pbd", "pbd-converged", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
-# What models are called where it is not their name.
-_TITLES = {"rbf": "RBF", "pbd": "PBD", "pbd-paper": "PBD of the paper", "xpbd": "XPBD"}
-_SWEEPS = {"pbd": 3}  # where the settings name none
+
+class ModelKind(NamedTuple):
+    """What a model's name stands for.
+
+    ``build`` makes the model of a muscle of a scene from the checked table of its settings,
+    ``options`` is that table's class, ``points`` says in words what the model solves for, building
+    nothing. ``title`` is its name in tables and pictures, with ``{}`` for its number of sweeps, ``sweeps``.
+    """
+
+    # Both take the options' own class, which a type of a function cannot say.
+    build: Callable[..., MuscleModel]
+    options: type[Table]
+    points: Callable[..., str]
+    title: str
+    sweeps: int = 0
+
+
+def _rbf() -> ModelKind:
+    from rbfmuscle.muscle.muscle import RBFMuscle
+    from rbfmuscle.muscle.options import RBFOptions
+    from rbfmuscle.muscle.rest import solved_points
+
+    return ModelKind(RBFMuscle, RBFOptions, solved_points, "RBF")
+
+
+def _mesh(method: str, title: str, tolerance: float = 0.0) -> ModelKind:
+    from pbd_baseline.muscle import PBDMuscle
+    from pbd_baseline.options import PBDOptions
+    from pbd_baseline.rest import solved_points
+    from pbd_baseline.shapes import METHODS
+
+    chosen = METHODS[method]._replace(tolerance=tolerance)
+
+    def build(muscle: Muscle, scene: Scene, options: PBDOptions) -> MuscleModel:
+        return PBDMuscle(muscle, scene, options, method=chosen)
+
+    return ModelKind(build, PBDOptions, solved_points, title, 0 if tolerance else chosen.sweeps)
+
+
+# What loads a kind, by name: a model's package is imported when it is first asked for.
+_KINDS: dict[str, Callable[[], ModelKind]] = {
+    "rbf": _rbf,
+    "pbd": lambda: _mesh("pbd", "PBD, {} sweeps"),
+    "xpbd": lambda: _mesh("xpbd", "XPBD, {} sweeps"),
+    "arap-pbd": lambda: _mesh("arap-pbd", "arap-pbd, {} sweeps"),
+    "arap-volume": lambda: _mesh("arap-volume", "arap-volume, {} sweeps"),
+    "pbd-converged": lambda: _mesh("pbd", "PBD, converged", CONVERGED),
+    "xpbd-converged": lambda: _mesh("xpbd", "XPBD, converged", CONVERGED),
+    "arap-pbd-converged": lambda: _mesh("arap-pbd", "arap-pbd, converged", CONVERGED),
+    "arap-volume-converged": lambda: _mesh("arap-volume", "arap-volume, converged", CONVERGED),
+}
+# The default of `compare`.
+COMPARED = ("rbf", "pbd", "pbd-converged", "xpbd", "arap-pbd", "arap-volume")
+
+
+def register_model(name: str, kind: ModelKind) -> None:
+    """Add a model under a name of its own, for scenes, `simulate` and `compare_models`.
+
+    Raises UsageError if the name is taken.
+
+    Examples
+    --------
+    >>> from rbfmuscle.models import model_kind, register_model
+    >>> register_model("my-pbd", model_kind("pbd")._replace(title="PBD of mine"))
+    >>> model_kind("my-pbd").title
+    'PBD of mine'
+    """
+    if name in _KINDS:
+        raise UsageError(f"model {shown(repr(name))} is known already, choose another name")
+    _KINDS[name] = lambda: kind
+
+
+def model_names() -> tuple[str, ...]:
+    """Names of all models, those registered last."""
+    return tuple(_KINDS)
+
+
+@cache
+def _loaded(load: Callable[[], ModelKind]) -> ModelKind:
+    return load()
+
+
+def model_kind(name: str) -> ModelKind:
+    """What a model's name stands for; UsageError with the nearest right name on an unknown one."""
+    if name not in _KINDS:
+        hint = did_you_mean(str(name).lower()[:100].replace("_", "-"), model_names())
+        raise UsageError(f"unknown model {shown(repr(name))}, {hint}")
+    return _loaded(_KINDS[name])
 
 
 def model_title(muscle: Muscle) -> str:
-    """What the model of a muscle is called in tables and pictures, with its sweeps where they are
-    known.
+    """Name of a muscle's model in tables and pictures, with its number of sweeps where it has
+    one.
     """
-    base = muscle.model.removesuffix(_SUFFIX)
-    title, sweeps = (
-        _TITLES.get(base, base),
-        muscle.options.get("iterations", 0) or _SWEEPS.get(base, 0),
-    )
-    if base != muscle.model:
-        return f"{title}, converged"
-    return f"{title}, {sweeps} sweeps" if sweeps and base != "rbf" else title
+    kind = model_kind(muscle.model)
+    return kind.title.format(muscle.options.get("iterations", 0) or kind.sweeps)
 
 
 def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> MuscleModel:
-    """Return the model of one muscle of a scene, of a name in ``MODEL_NAMES``, the scene's own
-    choice where not given.
+    """Return the model of one muscle of a scene; the scene's own choice where no name is given.
 
-    The options of the scene's model table are for the class of models that it names, and are left
-    out for another. UsageError on an unknown name, with the nearest right one; SceneError if a
-    setting is unknown or impossible.
+    The options of the scene's model table are for models with the same settings, and are left out
+    for another. UsageError on an unknown name, with the nearest right one; SceneError if a setting
+    is unknown or impossible.
     """
-    name = muscle.model if name is None else name
-    home = _HOME[check_model_name(name)]
-    same_class = _HOME[check_model_name(muscle.model)].muscle == home.muscle
-    options = _read_options(muscle, home, muscle.options if same_class else {})
-    return _part(home, "muscle", home.muscle)(muscle, scene, options)
+    kind, own = model_kind(muscle.model if name is None else name), model_kind(muscle.model)
+    given = muscle.options if own.options is kind.options else {}
+    return kind.build(muscle, scene, _read_options(muscle, kind, given))
 
 
 def solved_points(muscle: Muscle, scene: Scene) -> str:
     """The points that the model of a muscle solves for, in words; nothing is built."""
-    home = _HOME[check_model_name(muscle.model)]
-    options = _read_options(muscle, home, muscle.options)
-    return _part(home, "rest", "solved_points")(muscle, scene, options)
+    kind = model_kind(muscle.model)
+    return kind.points(muscle, scene, _read_options(muscle, kind, muscle.options))
 
 
 def kernel_names(scene: Scene) -> dict[str, str]:
     """Kernel of each muscle whose model has one, by the muscle's name; nothing is built."""
-    homes = {muscle.name: _HOME[check_model_name(muscle.model)] for muscle in scene.muscles}
-    options = {m.name: _read_options(m, homes[m.name], m.options) for m in scene.muscles}
+    options = {m.name: _read_options(m, model_kind(m.model), m.options) for m in scene.muscles}
     return {name: found.kernel for name, found in options.items() if hasattr(found, "kernel")}
 
 
@@ -96,9 +151,9 @@ def build_models(scene: Scene, names: Collection[str] | None = None) -> list[Mus
 
 def configure_scene(
     scene: Scene,
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, object] | None = None,
     *,
-    model: str | dict | None = None,
+    model: str | dict[str, object] | None = None,
     frames: slice | str | None = None,
 ) -> Scene:
     """Return a scene with other settings, checked to the last key of every muscle's model; nothing
@@ -109,7 +164,7 @@ def configure_scene(
     """
     check_models(scene)
     for key in settings or ():
-        schemas = (_part(home, "options", home.options) for home in _HOME.values())
+        schemas = (model_kind(name).options for name in model_names())
         if key.partition(".")[0] not in HEADS and any(
             key in schema.model_fields for schema in schemas
         ):
@@ -138,27 +193,10 @@ def check_models(scene: Scene) -> None:
             raise SceneError(f"{root}{error}") from None
 
 
-def check_model_name(name: str) -> str:
-    """Return a model's name, or raise UsageError with the nearest right one."""
-    if name in _HOME:
-        return name
-    hint = did_you_mean(str(name).lower()[:100].replace("_", "-"), MODEL_NAMES)
-    raise UsageError(f"unknown model {shown(repr(name))}, {hint}")
+def _check_muscle(muscle: Muscle) -> None:
+    _read_options(muscle, model_kind(muscle.model), muscle.options)
 
 
-def _check_muscle(muscle):
-    _read_options(muscle, _HOME[check_model_name(muscle.model)], muscle.options)
-
-
-def _read_options(muscle: Muscle, home: _Home, table: Mapping[str, Any]) -> Table:
+def _read_options(muscle: Muscle, kind: ModelKind, table: Mapping[str, object]) -> Table:
     """The checked settings of a muscle's model."""
-    for key in home.implied:
-        if key in table:
-            words = f"{key} follows from the model's name; known: {', '.join(MODEL_NAMES)}"
-            raise SceneError(f"muscle {muscle.name!r}: model: {words}")
-    schema = _part(home, "options", home.options)
-    return schema.build({**table, **home.implied}, place=f"muscle {muscle.name!r}: model: ")
-
-
-def _part(home, file, name):
-    return getattr(importlib.import_module(f"{home.package}.{file}"), name)
+    return kind.options.build(table, place=f"muscle {muscle.name!r}: model: ")

@@ -37,7 +37,7 @@ def compare(
     ----------
     models
         Models, separated by commas, for instance rbf,pbd; distances are measured to the first. By
-        default rbf, the mesh models but pbd-paper, and pbd-converged, which takes long: it sweeps
+        default rbf, the mesh models and pbd-converged, which takes long: it sweeps
         until no vertex moves.
     pictures
         Draw pictures and the animation.

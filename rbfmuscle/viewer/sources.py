@@ -11,7 +11,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
-from rbfmuscle.models import MODEL_NAMES, build_models, configure_scene
+from rbfmuscle.models import build_models, configure_scene, model_names
 from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh, tendon_name
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.activation.contraction import STEP
@@ -66,7 +66,7 @@ class LiveSource:
         self.millimetre = scene.length(1.0)
         self.body = scene.body
         first = scene.muscles[0].model
-        self.choices = [first, *(name for name in MODEL_NAMES if name != first)]
+        self.choices = [first, *(name for name in model_names() if name != first)]
         self.bones, self.muscles = (
             {
                 item.name: (np.asarray(item.mesh.vertices), np.asarray(item.mesh.faces))

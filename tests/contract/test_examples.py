@@ -16,7 +16,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 from gallery import EXAMPLES, find_example, read_example, run_example
 
 # Scripts that are no pages of the gallery.
-OTHERS = {"pictures", "paper_experiments", "contact_pictures"}
+OTHERS = {"pictures", "contact_pictures"}
 
 
 def test_every_script_and_notebook_is_a_page_of_the_gallery():
@@ -66,7 +66,7 @@ def test_python_of_the_readme_runs_as_it_stands(tmp_path):
 
 
 def test_the_papers_experiments_run(hip_data, monkeypatch, capsys):
-    script = str(ROOT / "examples" / "paper_experiments.py")
+    script = str(ROOT / "benchmarks" / "paper_experiments.py")
     monkeypatch.setattr(sys, "argv", [script, "--muscle", "gluteus_medius"])
     runpy.run_path(script, run_name="__main__")
     assert capsys.readouterr().out.count("flexion by 2") == 4

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
+from peers import paper_models
 from toy_scene import held
 
 import rbfmuscle as rm
-from rbfmuscle.models import MODEL_NAMES, build_model
+from rbfmuscle.models import build_model, model_names
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Motion
@@ -14,12 +15,13 @@ from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame_loop import simulate_frames
 
-MODELS = ("rbf", "pbd", "pbd-paper", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+paper_models.register()
+MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", *paper_models.KINDS)
 
 
 def test_every_name_is_tested():
     # The converged models are those of the same name with more sweeps.
-    assert set(MODELS) == {name.removesuffix("-converged") for name in MODEL_NAMES}
+    assert set(MODELS) == {name.removesuffix("-converged") for name in model_names()}
 
 
 def _scene(angles, *, units="mm", overlap=0.0):

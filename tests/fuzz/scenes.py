@@ -252,7 +252,7 @@ SETTINGS = (
     {},
     True,
 )
-MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
+MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume")
 
 
 def _model(scene, rng):

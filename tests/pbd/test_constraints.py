@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from peers.paper_models import DeepestContact
 
 from pbd_baseline.bending import BendingConstraint
 from pbd_baseline.constraints import EdgeConstraint, VolumeConstraint
@@ -126,8 +127,11 @@ def test_volume_is_met_quadratically_and_by_restoring_in_one_step(rng):
 def test_a_vertex_in_two_bones_moves_by_both_ways_or_by_the_longest_alone():
     spaces = HalfSpaces(np.zeros(2, int), np.array([-0.2, -0.5]), np.eye(3)[:2], np.arange(2))
     contacts = SimpleNamespace(half_spaces=lambda *given: spaces)
-    for alone, wanted in ((False, [0.2, 0.5, 0.0]), (True, [0.0, 0.5, 0.0])):
-        constraint, points = ContactConstraint(reach=1.0, nearest_only=alone), np.zeros((1, 3))
+    for kind, wanted in (
+        (ContactConstraint, [0.2, 0.5, 0.0]),
+        (DeepestContact, [0.0, 0.5, 0.0]),
+    ):
+        constraint, points = kind(reach=1.0), np.zeros((1, 3))
         assert constraint.find(contacts, points) == constraint.depth(points) == 0.5
         constraint.project(points)
         np.testing.assert_allclose(points, [wanted], atol=1e-15)

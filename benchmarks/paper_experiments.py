@@ -7,9 +7,10 @@ degrees; nothing is corrected afterwards, so that what the model itself can do s
 plain PBD as printed: vertices keep their velocity, all edges are alike, the response is to one
 bone.
 
-    python examples/paper_experiments.py                      two motions, two models (half a
-    minute) python examples/paper_experiments.py --all [-o FILE.md]   every motion, every model (ten
-    minutes)
+    python benchmarks/paper_experiments.py           two motions, two models (half a minute)
+    python benchmarks/paper_experiments.py --all     every motion, every model (ten minutes)
+
+With ``-o FILE.md`` the table is written to a file too.
 
 It needs the hip (RBFMUSCLE_DATA, the folder that holds hip/); without it the embedded phantom is
 taken.
@@ -21,10 +22,10 @@ import time
 from pathlib import Path
 
 import numpy as np
+from peers import paper_models
 
-from pbd_baseline.muscle import PBDMuscle
-from pbd_baseline.options import PBDOptions
 from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bone_depth, surface_depth
+from rbfmuscle.models import build_model
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.scene.phantom import phantom_scene
@@ -34,6 +35,7 @@ from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.substeps import SubSteps
 from rbfmuscle.simulation.tunnelling import find_crossings
 
+paper_models.register()
 MODELS = ("pbd-paper", "pbd", "xpbd", "arap-pbd", "arap-volume", "arap-interleaved")
 # Coordinate, end and step [degree].
 MOTIONS = {
@@ -97,7 +99,7 @@ class Experiment:
 
     def run(self, method, substeps):
         """Angles of the first penetration and tunnelling, and the worst of everything else."""
-        model = PBDMuscle(self.scene.muscles[0], self.scene, PBDOptions(method=method))
+        model = build_model(self.scene.muscles[0], self.scene, method)
         contacts = BoneContacts(self.names, self.fields, contact_bone=model.contact_bone)
         record = Record(model, self.probes)
         here = {self.coordinate: 0.0}

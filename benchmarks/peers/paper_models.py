@@ -1,0 +1,97 @@
+"""Two mesh models that stand in the paper and are no choice for users, added from outside.
+
+Cervenka, Havlicek, Kohout and Váša (GRAPP 2023). ``register()`` makes them known by the names
+``pbd-paper`` and ``arap-interleaved``, as any model of a user's own would be.
+"""
+
+import numpy as np
+
+from pbd_baseline.contact import TOUCHING, ContactConstraint
+from pbd_baseline.muscle import PBDMuscle
+from pbd_baseline.options import PBDOptions
+from pbd_baseline.rest import solved_points
+from pbd_baseline.shapes import GlobalARAPShape, Method, PBDShape
+from rbfmuscle.models import ModelKind, model_names, register_model
+
+# Share of its velocity that a vertex keeps.
+DAMPING = 0.99
+
+
+class PaperShape(PBDShape):
+    """PBD as printed: stiffness does not fall with an edge's length, limits are wide."""
+
+    soft_length = np.inf
+    limits = 0.01, 100.0
+
+
+class InterleavedARAPShape(GlobalARAPShape):
+    """ARAP with the rough volume step of figure 8: each of the two undoes what the other did."""
+
+    def restore_volume(self, points, contact):
+        """One projection along the plain gradient, in place, whatever lies in the way."""
+        self.volume.project(points, self.inverse_mass)
+
+
+class DeepestContact(ContactConstraint):
+    """A vertex in several bones moves by the longest of its ways out alone, not by their sum."""
+
+    def project(self, points):
+        """Push vertices out of the half-spaces, in place."""
+        depth = self.depths(points)
+        if depth.max(initial=0.0) <= TOUCHING * self.reach:
+            return
+        deepest = np.zeros(len(points))
+        np.maximum.at(deepest, self.index, depth)
+        depth[depth < deepest[self.index]] = 0.0
+        np.add.at(points, self.index, depth[:, None] * self.normal)
+
+
+class PaperMuscle(PBDMuscle):
+    """Plain PBD as printed: vertices keep their velocity, fibres have no slack."""
+
+    def __init__(self, muscle, scene, options):
+        options = options.model_copy(update={"slack": 1.0})
+        super().__init__(muscle, scene, options, method=Method(PaperShape, 3))
+        self.contact = DeepestContact(reach=self.contact.reach)
+        self.before = self.points.copy()
+
+    def _move_free(self, motions):
+        velocity = self.points - self.before
+        self.before = self.points.copy()
+        self.points += DAMPING * velocity
+
+    def transform(self, motion):
+        """Go along with a rigid motion (4, 4), as the muscle is."""
+        super().transform(motion)
+        self.before = self.before @ motion[:3, :3].T + motion[:3, 3]
+
+    def snapshot(self):
+        """Everything that :meth:`restore` needs."""
+        return super().snapshot(), self.before.copy()
+
+    def restore(self, state):
+        """Go back to a snapshot."""
+        inner, before = state
+        super().restore(inner)
+        self.before = before.copy()
+
+
+def _interleaved(muscle, scene, options):
+    return PBDMuscle(muscle, scene, options, method=Method(InterleavedARAPShape, 6))
+
+
+KINDS = {
+    "pbd-paper": ModelKind(
+        PaperMuscle, PBDOptions, solved_points, "PBD of the paper, {} sweeps", 3
+    ),
+    "arap-interleaved": ModelKind(
+        _interleaved, PBDOptions, solved_points, "arap-interleaved, {} sweeps", 6
+    ),
+}
+
+
+def register():
+    """Make both models known to this process."""
+    for name, kind in KINDS.items():
+        if name not in model_names():
+            register_model(name, kind)
