@@ -171,8 +171,8 @@ def model_fibres(points):
     scene = phantom_scene(end=0.0, spacing=SPACING)
     scene.muscles = [scene.muscle(MUSCLE)]
     options = RBFOptions(nodes=FIBRE_NODES, fibre_ratio=2.0)
-    solid = RBFMuscle(scene.muscles[0], scene, options).solid
-    return solid.fibres.direction[cKDTree(solid.quad_points).query(points)[1]]
+    solid = RBFMuscle(scene.muscles[0], scene, options).model
+    return solid.fibres.direction[cKDTree(solid.cells.points).query(points)[1]]
 
 
 def carried(course, displacement):

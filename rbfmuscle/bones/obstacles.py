@@ -18,9 +18,9 @@ from rbfmuscle.jit import compiled
 class Bones(NamedTuple):
     """Constant arrays of b bones: those of `FieldData`, one bone behind the other, and frames.
 
-    ``start`` (b + 1, 10) says where the part of a bone begins in ``blocks``, ``cells``, ``lists``,
-    ``corners``, ``far``, ``records``, ``edge_normals``, ``vertex_normals``, ``vertices`` and
-    ``across``; ``shape`` (b, 3) is that of its blocks.
+    ``span`` (b, 2, 10) says where the part of a bone begins and ends in ``blocks``, ``cells``,
+    ``lists``, ``corners``, ``far``, ``records``, ``edge_normals``, ``vertex_normals``, ``vertices``
+    and ``across``; ``shape`` (b, 3) is that of its blocks.
     """
 
     boxes: np.ndarray  # (b, 2, 3) in bone coordinates
@@ -28,7 +28,7 @@ class Bones(NamedTuple):
     sizes: np.ndarray  # (b,) length of a local unit [scene unit]
     grid: np.ndarray
     shape: np.ndarray
-    start: np.ndarray
+    span: np.ndarray
     blocks: np.ndarray
     cells: np.ndarray
     lists: np.ndarray
@@ -41,27 +41,50 @@ class Bones(NamedTuple):
     across: np.ndarray
 
 
+# The arrays of no bone.
+NOTHING = [
+    np.zeros(0, np.int32),
+    np.zeros((0, 64), np.int32),
+    np.zeros(0, np.int32),
+    np.zeros((0, 12), np.float32),
+    np.zeros(0, np.int32),
+    np.zeros((0, 16), np.float32),
+    np.zeros((0, 3, 3), np.float32),
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 3), np.int32),
+    np.zeros((0, 3), np.int32),
+]
+
+
 def stack_bones(fields: Sequence[BoneSDF]) -> Bones:
-    """The fields of some bones, at least one, as one set of arrays."""
+    """The fields of some bones, which may be none, as one set of arrays."""
     data = [field.data for field in fields]
-    parts = [[one.blocks.ravel(), *one[2:]] for one in data]
+    parts = [NOTHING, *([one.blocks.ravel(), *one[2:]] for one in data)]
     sizes = np.array([[len(part) for part in row] for row in parts], dtype=np.int64)
-    start = np.concatenate([np.zeros((1, sizes.shape[1]), np.int64), np.cumsum(sizes, axis=0)])
+    ends = np.cumsum(sizes, axis=0)
     return Bones(
-        np.array([field.bounds for field in fields]),
-        np.array([field.local_to_bone for field in fields]),
+        np.array([field.bounds for field in fields]).reshape(-1, 2, 3),
+        np.array([field.local_to_bone for field in fields]).reshape(-1, 4, 4),
         np.array([field.unit for field in fields]),
-        np.array([one.grid for one in data]),
-        np.array([one.blocks.shape for one in data], dtype=np.int64),
-        start,
+        np.array([one.grid for one in data]).reshape(-1, 5),
+        np.array([one.blocks.shape for one in data], dtype=np.int64).reshape(-1, 3),
+        np.stack([ends[:-1], ends[1:]], axis=1),
         *(np.ascontiguousarray(np.concatenate(column)) for column in zip(*parts)),
     )
+
+
+def pick_bones(bones: Bones, rows: Sequence[int]) -> Bones:
+    """Some of the bones; the large arrays are shared."""
+    some = np.array(rows, dtype=np.int64)
+    few = {name: getattr(bones, name)[some] for name in Bones._fields[:6]}
+    return bones._replace(**few)
 
 
 @compiled(error_model="numpy")
 def field_of(bones, b):
     """The field of bone b: views into the arrays of all."""
-    first, end = bones.start[b], bones.start[b + 1]
+    first = bones.span[b, 0]
+    end = bones.span[b, 1]
     shape = bones.shape[b]
     return FieldData(
         bones.grid[b],

@@ -102,13 +102,13 @@ def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
     gives that bone's motion exactly.
     """
     twists, out = np.empty((len(motions), 6)), np.empty((len(points), 3))
-    _logarithm_loop(motions, twists)
-    _exponential_loop(np.asarray(points, dtype=np.float64), weights @ twists, out)
+    logarithm_loop(motions, twists)
+    exponential_loop(np.asarray(points, dtype=np.float64), weights @ twists, out)
     return out
 
 
 @compiled(error_model="numpy")
-def _exponential_loop(points, twists, out):
+def exponential_loop(points, twists, out):
     """Move each point by the exponential of its twist (omega, velocity)."""
     for n in range(len(points)):
         x = points[n, 0]
@@ -142,7 +142,7 @@ def _exponential_loop(points, twists, out):
 
 
 @compiled(error_model="numpy")
-def _logarithm_loop(motions, twists):
+def logarithm_loop(motions, twists):
     """Twists (omega, velocity) of rigid motions (b, 4, 4)."""
     for n in range(len(motions)):
         w, a, b, c = matrix_quaternion(motions[n])

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.muscle.solid import HOLD, EmbeddedSolid
+from rbfmuscle.muscle.model import SolidModel
 
 # Pieces of polyline that speak for one place.
 NEAREST = 3
@@ -42,22 +42,22 @@ def fibre_directions(
     return along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
-def rise(solid: EmbeddedSolid) -> Floats:
+def rise(model: SolidModel) -> Floats:
     """Unit directions at the quadrature points from the muscle's first bone to its last, (Q, 3)."""
-    slope = _gradient(solid, solid.motion_weights @ np.arange(len(solid.bones)))
+    slope = _gradient(model, model.motion_weights @ np.arange(model.motion_weights.shape[1]))
     return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
 
 
-def flux(solid: EmbeddedSolid) -> Floats:
+def flux(model: SolidModel) -> Floats:
     """Gradient (Q, 3) of a potential whose flux from the first bone's held points to the others' is
     one.
     """
-    first = solid.owner[solid.held] == solid.bones[0]
+    first = model.held_bone == model.held_bone.min()
     source = np.where(first, -1.0 / max(first.sum(), 1), 1.0 / max((~first).sum(), 1))
-    right = solid.spring @ source / (HOLD * solid.side)
-    return _gradient(solid, np.linalg.lstsq(solid.without_springs, right, rcond=None)[0])
+    right = model.springs @ source / model.spring
+    return _gradient(model, np.linalg.lstsq(model.matrix, right, rcond=None)[0])
 
 
-def _gradient(solid: EmbeddedSolid, values: Floats) -> Floats:
+def _gradient(model: SolidModel, values: Floats) -> Floats:
     """Gradient (Q, 3) at the quadrature points of values (N,) at the nodes."""
-    return np.asarray(np.einsum("qk,qka->qa", values[solid.quad_columns], solid.slopes))
+    return np.asarray(np.einsum("qk,qka->qa", values[model.cells.columns], model.cells.slopes))

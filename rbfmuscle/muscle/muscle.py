@@ -7,12 +7,24 @@ import numpy as np
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.lattice import Lattice
-from rbfmuscle.muscle.activation import FibrePull
+from rbfmuscle.muscle.activation import contracting_fibres
 from rbfmuscle.muscle.drawing import Placement, SurfaceBuilder
 from rbfmuscle.muscle.fibres import fibre_directions, rise
+from rbfmuscle.muscle.model import (
+    SolidModel,
+    attached_owner,
+    build_solid,
+    carry,
+    embed,
+    lattice_slopes,
+    stiffness,
+    turned_normals,
+)
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
-from rbfmuscle.muscle.solid import EmbeddedSolid, SolidState
+from rbfmuscle.muscle.rounded_bones import RoundedBones, grown, round_bones
+from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, make_room, settle
+from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform, turn
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
@@ -37,13 +49,10 @@ class RBFMuscle:
 
     Attributes
     ----------
-    points : (K, 3) ndarray
-        The centres now.
     rest : RestState
-    solid : EmbeddedSolid
-        The elastic solid that carries the free centres.
-    law : FibrePull or None
-        Of a muscle that contracts.
+    model : SolidModel
+        Of the elastic solid that carries the centres.
+    state : SolidState
 
     Raises
     ------
@@ -63,87 +72,114 @@ class RBFMuscle:
         self.name = muscle.name
         self.options = options or RBFOptions()
         self.rest = RestState.from_muscle(muscle, scene, self.options)
-        self.solid, self.law = _build_solid(muscle, scene, self.rest, self.options)
         self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options)
+        self.frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
+        lattice = Lattice(self.frame.local, np.asarray(muscle.mesh.faces), self.options.nodes)
+        self.model = _build_solid(muscle, lattice, self.frame, self.rest, self.options)
+        self.state = rest_state(self.model)
+        self._stiffness = stiffness(self.model, 0.0)
+        shown = self.drawer.shown
+        self._shown = None if shown is None else embed(lattice, self.frame, shown.rest)
+        self._normals_at = lattice_slopes(lattice, self.frame, self.rest.centres)
         names = scene.holders(muscle)
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
-        self.detail = DETAIL * self.solid.side
-        self.contact_bone = np.where(self.solid.owner < 0, -1, numbers[self.solid.owner])
-        self.points = self.rest.centres.copy()
-        # Contact points, and the centres and nodes that they belong to.
-        self._placed: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        owner = attached_owner(self.model)
+        self.detail = DETAIL * self.model.side
+        self.contact_bone = np.where(owner < 0, -1, numbers[owner])
+        self._meshes = {
+            bone.name: (np.asarray(bone.mesh.vertices), np.asarray(bone.mesh.faces))
+            for bone in scene.bones
+        }
+        self._rounded: tuple[BoneContacts, RoundedBones] | None = None
+        #: Of the solves since the surface was drawn last: greatest residual, greatest error of a
+        #: volume, caps that were hit.
+        self.worst = (0.0, 0.0, 0)
+
+    @property
+    def points(self) -> np.ndarray:
+        """The centres now, (K, 3)."""
+        return self.state.points[: len(self.rest.centres)]
 
     def contact_points(self) -> np.ndarray:
-        """Centres, then surface samples, (K + S, 3)."""
-        if (
-            self._placed is None
-            or self._placed[0] is not self.points
-            or self._placed[1] is not self.solid.shown
-        ):
-            points = self.solid.carry()
-            points[: len(self.points)] = self.points
-            self._placed = self.points, self.solid.shown, points
-        return self._placed[2].copy()
+        """Centres, then surface samples, (K + S, 3); never changed in place."""
+        return self.state.points
 
-    def material_mesh(self) -> Mesh:
+    def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """The samples and their triangulation: a material surface of constant topology."""
-        return self.contact_points()[len(self.points) :], self.rest.sample_faces
+        return self.state.points[len(self.rest.centres) :], self.rest.sample_faces
 
     def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
         """Go along with the bones; held centres arrive exactly."""
-        rest = self.rest
-        motions = np.array([after[bone] @ np.linalg.inv(before[bone]) for bone in rest.bones])
-        points = self.points.copy()
-        for b, bone in enumerate(rest.bones):
-            held = rest.held[rest.attached_bone[rest.held] == b]
-            points[held] = rest.centres[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
-        self.solid.move(motions, [after[bone] for bone in rest.bones])
-        self.points = self.solid.centres(points)
+        old = np.array([before[bone] for bone in self.rest.bones])
+        new = np.array([after[bone] for bone in self.rest.bones])
+        self.state = predict(self.model, self.state, old, new)
 
     def solve(self, contacts: BoneContacts) -> None:
         """Solve for the equilibrium under elasticity, volume and contact at the bones' present
         poses.
         """
-        self.solid.settle(contacts)
-        self.points = self.solid.centres(self.points)
+        obstacles = contacts.obstacles(len(self.state.points))
+        rounded = self._round(contacts)
+        while True:
+            state, report = settle(self.model, self._stiffness, self.state, obstacles, rounded)
+            if report.status != NO_ROOM:
+                break
+            rounded = grown(rounded)
+            self._rounded = contacts, rounded
+        if report.status == DIVERGED:
+            raise FloatingPointError("the solid does not settle")
+        self.state = state
+        residual, volume, caps = self.worst
+        self.worst = (
+            max(residual, report.residual),
+            max(volume, report.volume_error),
+            caps + report.caps,
+        )
+
+    def _round(self, contacts: BoneContacts) -> RoundedBones:
+        """The bones in reach, rounded."""
+        if self._rounded is None or self._rounded[0] is not contacts:
+            spacing = float(np.sqrt(self.model.area))
+            self._rounded = contacts, round_bones(contacts, self.frame, spacing, self._meshes)
+        return self._rounded[1]
 
     def make_room(self, contacts: BoneContacts) -> None:
         """Move what is shown out of the planes of neighbours."""
-        self.solid.make_room(contacts)
-        self.points = self.solid.centres(self.points)
+        obstacles = contacts.obstacles(len(self.state.points))
+        rounded = self._round(contacts)
+        self.state = make_room(self.model, self._stiffness, self.state, obstacles, rounded)
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
-        if self.law is not None:
-            self.law.activate(activation)
+        if activation != self.state.activation[0]:
+            self.restore(self.state._replace(activation=np.array([activation])))
 
     def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
-        """Move the centres that carry contact points marked in a bool mask by a (4, 4) transform;
+        """Move the nodes that carry contact points marked in a bool mask by a (4, 4) transform;
         held ones stay.
         """
-        self.solid.turn(which, transform)
-        self.points = self.solid.centres(self.points)
+        self.state = turn(self.model, self.state, which, transform)
 
     def transform(self, motion: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4), as the muscle is."""
-        self.points = self.points @ motion[:3, :3].T + motion[:3, 3]
-        self.solid.transform(motion)
+        self.state = transform(self.state, motion)
 
-    def snapshot(self) -> tuple[np.ndarray, SolidState]:
+    def snapshot(self) -> SolidState:
         """Everything that :meth:`restore` needs."""
-        return self.points.copy(), self.solid.snapshot()
+        return self.state
 
-    def restore(self, state: tuple[np.ndarray, SolidState]) -> None:
+    def restore(self, state: SolidState) -> None:
         """Go back to a snapshot."""
-        points, solid = state
-        self.points = points.copy()
-        self.solid.restore(solid)
+        if state.activation[0] != self.state.activation[0]:
+            self._stiffness = stiffness(self.model, float(state.activation[0]))
+        self.state = state
 
     def normals(self) -> np.ndarray:
         """Unit normals at the centres, turned with the local deformation by its cofactor, (K,
         3).
         """
-        return self.solid.turned_normals(self.rest.normals)
+        columns = self.model.embedding.columns
+        return turned_normals(self.state.shown, columns, self._normals_at, self.rest.normals)
 
     def field(self) -> RBFField:
         """The RBF field through the present centres."""
@@ -156,23 +192,25 @@ class RBFMuscle:
         shown = self.drawer.shown
         if shown is None:
             return self.material_mesh()
-        return self.solid.follow(shown.rest), shown.mesh.faces
+        return carry(self._shown, self.state.shown), shown.mesh.faces
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lies in the way."""
         carried, _ = self.carried_mesh()
         now = Placement(self.points, self.normals(), self.contact_points(), carried)
-        return self.drawer.draw(now, contacts)
+        drawn = self.drawer.draw(now, contacts)
+        residual, volume, caps = self.worst
+        drawn.quantities.update(solver_residual=residual, solid_volume_error=volume)
+        if caps:
+            drawn.notes.append(("", caps, "iteration_cap"))
+        self.worst = (0.0, 0.0, 0)
+        return drawn
 
 
 def _build_solid(
-    muscle: Muscle, scene: Scene, rest: RestState, options: RBFOptions
-) -> tuple[EmbeddedSolid, FibrePull | None]:
-    """The solid that carries the centres, and the law of its fibres where the muscle contracts."""
-    frame, faces = (
-        RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)),
-        np.asarray(muscle.mesh.faces),
-    )
+    muscle: Muscle, lattice: Lattice, frame: RestFrame, rest: RestState, options: RBFOptions
+) -> SolidModel:
+    """The solid that carries the centres, with its fibres."""
     points = rest.contact_points()
     centres = len(rest.centres)
     owner = rest.attached_bone
@@ -180,31 +218,25 @@ def _build_solid(
     for bone in range(len(rest.bones)):
         if (owner[held] == bone).sum() < LEAST_ATTACHED:
             held = np.concatenate([held, np.flatnonzero(owner[:centres] == bone)])
-    solid = EmbeddedSolid(
-        Lattice(frame.local, faces, options.nodes),
+    model = build_solid(
+        lattice,
         frame,
         points,
-        owner.copy(),
+        owner,
         held,
-        free=rest.free,
-        count=centres,
+        fixed=rest.held,
         area=float(muscle.mesh.area) / len(rest.samples),
         iterations=options.iterations,
-        bones={
-            bone.name: (np.asarray(bone.mesh.vertices), np.asarray(bone.mesh.faces))
-            for bone in scene.bones
-        },
     )
     axis = points[held].mean(axis=0) - points.mean(axis=0)
-    along = fibre_directions(solid.quad_points, rise(solid), muscle.fibres, fallback=axis)
+    along = fibre_directions(model.cells.points, rise(model), muscle.fibres, fallback=axis)
     count = len(along)
-    solid.take_fibres(
-        solid.fibres._replace(
-            direction=np.ascontiguousarray(along),
-            passive=np.full(count, 1.5 * (options.fibre_ratio - 1.0)),
-            lower=np.full(count, 1.0 / options.slack),
-        )
+    fibres = model.fibres._replace(
+        direction=np.ascontiguousarray(along),
+        passive=np.full(count, 1.5 * (options.fibre_ratio - 1.0)),
+        lower=np.full(count, 1.0 / options.slack),
     )
-    solid.attach_immobile()
-    law = FibrePull(solid, muscle) if muscle.contraction is not None else None
-    return solid, law
+    model = model._replace(fibres=fibres)
+    if muscle.contraction is None:
+        return model
+    return model._replace(fibres=contracting_fibres(model, muscle))

@@ -7,125 +7,85 @@ cell (a kernel of a standard deviation of 0.58 cells), its gradient turns steadi
 the lattice that are asked for are ever filled.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, lower_bound, note_query
+from rbfmuscle.bones.obstacles import query_bone
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.jit import compiled
-from rbfmuscle.simulation.contact import BoneContacts, HalfSpaces
-from rbfmuscle.validation import check_points
+from rbfmuscle.simulation.contact import BoneContacts
 
 SIDE = 4  # cells along a block
 WIDE = SIDE + 3  # nodes along it, those of the splines that reach into it too
 MOST = 1 << 20  # blocks along an axis in either direction: beyond any bone
-SHIFTS = np.array([42, 21, 0])  # bits of a block's three numbers in its key
+BITS = 21  # of each of a block's three numbers in its key
 PROBES, STEPS_IN = 300, 12  # paths into a bone that tell how thick it is, and places along each
 LEAST_SLOPE = 0.3  # where the distance's slope is less, inside a thin bone, the exact one answers
+FIRST_ROOM = 256  # blocks that there is room for at first
+FULLEST = 0.6  # share of the room that may be filled
+# Edge of the cells that a bone is rounded over, relative to the spacing of the samples. With 0.7 to
+# 1.0 one pose of the phantom's extensor has shapes 0.6 to 1.6 mm RMS apart, from 1.5 to 2 at most
+# 0.06.
+ROUNDING = 1.7
+LEAST_ROUNDING = 0.1  # of that
 
 
-class RoundedBones:
+class RoundedBones(NamedTuple):
     """The rounded distances to some bones, in place of their exact fields where a muscle settles.
 
-    ``frame`` gives the axes and the origin of their lattices, which are then those of the muscle
-    wherever the scene lies; ``edges`` (r,) are those of their cells [scene unit]. The blocks of
-    bone b are those from ``start[b]`` on, by their sorted ``keys``, each with its ``nodes``.
+    Their lattices have the origin and the axes of the muscle, wherever the scene lies. Filled
+    blocks stand in a table with open addressing.
     """
 
-    def __init__(self, fields: Sequence[BoneField], frame: RestFrame, edges: Floats) -> None:
-        self.fields = list(fields)
-        self.frame = frame
-        self.edges = edges
-        self.start: Integers = np.zeros(len(self.fields) + 1, dtype=np.int64)
-        self.keys: Integers = np.zeros(0, dtype=np.int64)
-        self.nodes: Floats = np.zeros((0, WIDE, WIDE, WIDE))
-
-    def fill(self, rows: Integers, keys: Integers) -> None:
-        """Find the distances of blocks (n,) that are lacking, given by bones' rows and blocks'
-        keys.
-        """
-        grid = np.stack(np.meshgrid(*[np.arange(WIDE) - 1] * 3, indexing="ij"), -1).reshape(-1, 3)
-        owner = [np.repeat(np.arange(len(self.fields)), np.diff(self.start))]
-        key, nodes = [self.keys], [self.nodes]
-        for b in np.unique(rows):
-            new = np.unique(keys[rows == b])
-            block = (new[:, None] >> SHIFTS & 2 * MOST - 1) - MOST
-            place = (block[:, None, :] * SIDE + grid).reshape(-1, 3) * self.edges[b]
-            found = (
-                self.fields[b].distance(self.frame.origin + place @ self.frame.axes) / self.edges[b]
-            )
-            owner.append(np.full(len(new), b))
-            key.append(new)
-            nodes.append(found.reshape(-1, WIDE, WIDE, WIDE))
-        order = np.lexsort((np.concatenate(key), np.concatenate(owner)))
-        self.keys, self.nodes = np.concatenate(key)[order], np.concatenate(nodes)[order]
-        self.start = np.searchsorted(np.concatenate(owner)[order], np.arange(len(self.fields) + 1))
+    edges: np.ndarray  # (b,) of the cells of each bone's lattice [scene unit]
+    origin: np.ndarray  # (3,)
+    axes: np.ndarray  # (3, 3) rows
+    keys: np.ndarray  # (room, 2) bone and place of each block, -1 where there is none
+    nodes: np.ndarray  # (room, WIDE, WIDE, WIDE) distances, in cells
+    filled: np.ndarray  # (1,) blocks that are filled
 
 
-class RoundedContacts:
-    """The obstacles of ``count`` contact points in one pose of the bones, which are rounded;
-    ``exact`` as they are.
+def round_bones(
+    contacts: BoneContacts,
+    frame: RestFrame,
+    spacing: float,
+    meshes: Mapping[str, tuple[Floats, Integers]],
+) -> RoundedBones:
+    """The bones that a muscle can reach, rounded, without any block.
+
+    A bone of ``meshes`` (vertices, faces) is rounded over cells no larger than it is thick, or a
+    thin plate would vanish; ``spacing`` is that of the muscle's contact points.
     """
+    edge = ROUNDING * spacing
+    edges = []
+    for b in contacts.reached:
+        name, thickness = contacts.names[b], edge
+        if name in meshes:
+            thickness = bone_thickness(contacts.fields[b], *meshes[name], edge)
+        edges.append(max(thickness, LEAST_ROUNDING * edge))
+    return _with_room(np.array(edges, dtype=np.float64), frame.origin, frame.axes, FIRST_ROOM)
 
-    def __init__(self, bones: RoundedBones, exact: BoneContacts, count: int) -> None:
-        self.bones = bones
-        self.exact = exact
-        rows = len(exact.reached)
-        turns, origin = exact.placed[:, :3, :3], bones.frame.origin
-        axes = np.ascontiguousarray(bones.frame.axes @ turns.transpose(0, 2, 1))
-        self._lattice = axes, turns @ origin + exact.placed[:, :3, 3], bones.edges
-        self._known = np.zeros((rows, count, 3)), np.full((rows, count), -np.inf)
-        self._free, self._allowed = exact.free(count), np.zeros((rows, count))
-        for row, b in enumerate(exact.reached):
-            self._allowed[row] = exact.allowed.get(b, 0.0)
 
-    def half_spaces(self, points: Floats, reach: Floats) -> HalfSpaces:
-        """As `BoneContacts.half_spaces`, of all the contact points (n, 3), nearer than ``reach``
-        (n,).
-        """
-        exact = self.exact
-        bones = self.bones
-        points = check_points(points)
-        room = self._allowed.size
-        index, row = np.empty((2, room), dtype=np.int64)
-        gap, normal = np.empty(room), np.empty((room, 3))
-        while True:
-            count, lacking, flat = _contacts_loop(
-                points,
-                self._free,
-                reach,
-                (exact.placed, exact.boxes, self._allowed),
-                self._known,
-                self._lattice,
-                (bones.start, bones.keys, bones.nodes),
-                (index, gap, normal, row),
-            )
-            if not lacking:
-                break
-            bones.fill(row[:lacking], index[:lacking])
-        index = index[:count]
-        gap = gap[:count]
-        normal = normal[:count]
-        row = row[:count]
-        if flat:
-            for k in np.unique(row[np.isnan(gap)]):
-                some = np.flatnonzero(np.isnan(gap) & (row == k))
-                at = index[some]
-                distance, normal[some] = exact.distance_and_direction(
-                    points[at], exact.reached[k], reach[at]
-                )
-                gap[some] = distance + self._allowed[k, at]
-            near = gap < reach[index]
-            index = index[near]
-            gap = gap[near]
-            normal = normal[near]
-            row = row[near]
-        source = np.array(exact.reached, dtype=np.int64)[row]
-        return exact.with_planes(HalfSpaces(index, gap, normal, source), points, reach)
+def _with_room(edges: Floats, origin: Floats, axes: Floats, room: int) -> RoundedBones:
+    keys = np.full((room, 2), -1, dtype=np.int64)
+    return RoundedBones(
+        edges, origin, axes, keys, np.empty((room, WIDE, WIDE, WIDE)), np.zeros(1, dtype=np.int64)
+    )
+
+
+def grown(rounded: RoundedBones) -> RoundedBones:
+    """The same with room for twice as many blocks."""
+    more = _with_room(*rounded[:3], 2 * len(rounded.keys))
+    for old in np.flatnonzero(rounded.keys[:, 0] >= 0):
+        new = find_slot(more.keys, *rounded.keys[old])
+        more.keys[new], more.nodes[new] = rounded.keys[old], rounded.nodes[old]
+    more.filled[:] = rounded.filled
+    return more
 
 
 def bone_thickness(field: BoneField, vertices: Floats, faces: Integers, most: float) -> float:
@@ -149,80 +109,87 @@ def bone_thickness(field: BoneField, vertices: Floats, faces: Integers, most: fl
     return min(2.0 * float(np.quantile(depth, 0.1)), most)
 
 
-@compiled(error_model="numpy", inline="always")
-def _place(point, axis, origin, edge):
-    """Place of a point along an axis of the lattice, in cells."""
-    place = 0.0
-    for b in range(3):
-        place += (point[b] - origin[b]) * axis[b]
-    return place / edge
+@compiled(error_model="numpy")
+def find_slot(keys, b, key):
+    """Where a block of bone b stands in the table, or would stand."""
+    room = len(keys)
+    # Neighbouring blocks should lie apart: multiply by an odd number and take high bits (Knuth).
+    slot = ((key * np.int64(0x9E3779B97F4A7C1) >> 20) + b) % room
+    while keys[slot, 0] >= 0 and (keys[slot, 0] != b or keys[slot, 1] != key):
+        slot = (slot + 1) % room
+    return slot
 
 
 @compiled(error_model="numpy")
-def _contacts_loop(points, free, reach, obstacles, known, lattice, blocks, found):
-    """Fill the contacts ``found`` of all bones: how many, how many blocks are lacking, whether
-    splines are flat.
-
-    The bones' rows and the keys of lacking blocks are put into ``found`` instead; the gap is NaN
-    where a spline is flat. ``known`` has the places of the last queries in bone coordinates and
-    lower bounds of the distances there.
-    """
-    poses, boxes, allowed = obstacles
-    anchor, bound = known
-    axes, origin, edge = lattice
-    start, keys, nodes = blocks
-    index, gap, normal, row = found
-    box = np.empty((2, 3))
-    weight = np.empty((3, 4))
-    lean = np.empty((3, 4))
-    place, first = np.empty(3), np.empty(3, np.int64)
-    box_loop(points, free, box)
-    farthest = -np.inf
-    count = 0
-    lacking = 0
-    flat = False
-    for i in range(len(points)):
-        if free[i]:
-            farthest = max(farthest, reach[i])
-    for b in range(len(poses)):
-        if boxes_apart(box, poses[b], boxes[b]) > farthest:
-            continue
-        known_keys = keys[start[b] : start[b + 1]]
-        for i in range(len(points)):
-            if (
-                not free[i]
-                or lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) > reach[i]
-            ):
-                continue
-            key = 0
-            for a in range(3):
-                place[a] = _place(points[i], axes[b, a], origin[b], edge[b])
-                key += (np.int64(np.floor(place[a] / SIDE)) + MOST) << SHIFTS[a]
-            k = np.searchsorted(known_keys, key)
-            if k == len(known_keys) or known_keys[k] != key:
-                row[lacking], index[lacking] = b, key
-                lacking += 1
-            if lacking > 0:
-                continue
-            for a in range(3):
-                cell = np.int64(np.floor(place[a]))
-                bspline_weights(place[a] - cell, weight[a], lean[a])
-                first[a] = cell - SIDE * np.int64(np.floor(place[a] / SIDE))
-            value, x, y, z = bspline_sum(nodes[start[b] + k], first, weight, lean)
-            steep, here = np.sqrt(x * x + y * y + z * z), np.nan
-            if steep > LEAST_SLOPE:
-                here = value / steep * edge[b]
-                note_query(points, i, poses[b], here, anchor[b], bound[b])
-                here += allowed[b, i]
+def _fill_block(rounded, bones, b, key, slot):
+    """Find the distances at the nodes of a block of bone b."""
+    edge, place, first = rounded.edges[b], np.empty(3), np.empty(3)
+    for a in range(3):
+        block = (key >> (BITS * (2 - a)) & (2 * MOST - 1)) - MOST
+        first[a] = block * SIDE - 1
+    points, n = np.empty((WIDE**3, 3)), 0
+    for i in range(WIDE):
+        for j in range(WIDE):
+            for k in range(WIDE):
+                place[0] = (first[0] + i) * edge
+                place[1] = (first[1] + j) * edge
+                place[2] = (first[2] + k) * edge
                 for a in range(3):
-                    normal[count, a] = (
-                        x * axes[b, 0, a] + y * axes[b, 1, a] + z * axes[b, 2, a]
-                    ) / steep
-            else:
-                flat = True
-            if not here >= reach[i]:
-                index[count] = i
-                gap[count] = here
-                row[count] = b
-                count += 1
-    return count, lacking, flat
+                    points[n, a] = rounded.origin[a]
+                    for m in range(3):
+                        points[n, a] += place[m] * rounded.axes[m, a]
+                n += 1
+    distance = np.empty(n)
+    query_bone(bones, b, np.eye(4), points, np.full(n, np.inf), distance, np.empty((0, 3)))
+    n = 0
+    for i in range(WIDE):
+        for j in range(WIDE):
+            for k in range(WIDE):
+                rounded.nodes[slot, i, j, k] = distance[n] / edge
+                n += 1
+    rounded.keys[slot, 0] = b
+    rounded.keys[slot, 1] = key
+    rounded.filled[0] += 1
+
+
+@compiled(error_model="numpy")
+def rounded_distance(rounded, bones, b, pose, point, normal):
+    """Distance of a point to bone b, rounded, and its unit gradient ``normal`` (3,) in the world.
+
+    Infinite where there is no room for the block; NaN where the spline is flat.
+    """
+    edge, local, place = rounded.edges[b], np.empty(3), np.empty(3)
+    cell, first = np.empty(3, np.int64), np.empty(3, np.int64)
+    for a in range(3):
+        local[a] = -rounded.origin[a]
+        for k in range(3):
+            local[a] += pose[k, a] * (point[k] - pose[k, 3])
+    key = np.int64(0)
+    for a in range(3):
+        place[a] = 0.0
+        for k in range(3):
+            place[a] += local[k] * rounded.axes[a, k]
+        place[a] /= edge
+        cell[a] = np.int64(np.floor(place[a]))
+        block = np.int64(np.floor(place[a] / SIDE))
+        first[a] = cell[a] - SIDE * block
+        key += (block + MOST) << (BITS * (2 - a))
+    slot = find_slot(rounded.keys, b, key)
+    if rounded.keys[slot, 0] < 0:
+        if rounded.filled[0] >= FULLEST * len(rounded.keys):
+            return np.inf
+        _fill_block(rounded, bones, b, key, slot)
+    weight, lean, slope = np.empty((3, 4)), np.empty((3, 4)), np.empty(3)
+    for a in range(3):
+        bspline_weights(place[a] - cell[a], weight[a], lean[a])
+    value, x, y, z = bspline_sum(rounded.nodes[slot], first, weight, lean)
+    steep = np.sqrt(x * x + y * y + z * z)
+    if not steep > LEAST_SLOPE:
+        return np.nan
+    for a in range(3):
+        slope[a] = (
+            x * rounded.axes[0, a] + y * rounded.axes[1, a] + z * rounded.axes[2, a]
+        ) / steep
+    for a in range(3):
+        normal[a] = pose[a, 0] * slope[0] + pose[a, 1] * slope[1] + pose[a, 2] * slope[2]
+    return value / steep * edge

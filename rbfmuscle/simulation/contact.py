@@ -8,8 +8,10 @@ represented.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +25,7 @@ from rbfmuscle.bones.broad_phase import (
     path_loop,
     take_contacts_loop,
 )
+from rbfmuscle.bones.obstacles import Bones, stack_bones
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.scene.tendons import AtRest
 from rbfmuscle.validation import check_points
@@ -66,38 +69,49 @@ class Planes:
         self.anchor = anchor
 
 
-@dataclass(frozen=True)
-class _PlaneStack:
-    """The planes of all kinds, one below the other; ``source`` as in `HalfSpaces`."""
+class PlaneStack(NamedTuple):
+    """Planes of several kinds, one below the other."""
 
-    index: Integers
-    gap: Floats
-    normal: Floats
-    anchor: Floats
-    source: Integers
+    point: np.ndarray  # (p,) contact point
+    gap: np.ndarray  # (p,) distance of the anchor [scene unit]
+    normal: np.ndarray  # (p, 3)
+    anchor: np.ndarray  # (p, 3)
+    kind: np.ndarray  # (p,)
+    softness: np.ndarray  # (kinds,)
 
-    def near(self, points: Floats, reach: float) -> tuple[Integers, Floats, Floats, Integers]:
-        """``(index, gap, normal, source)`` of the planes nearer than ``reach`` to the contact
-        points now.
-        """
-        gap = self.gap + np.einsum("ij,ij->i", self.normal, points[self.index] - self.anchor)
-        near = gap < reach
-        return self.index[near], gap[near], self.normal[near], self.source[near]
-
-    def only(self, index: Integers) -> _PlaneStack:
-        """Those at a sorted subset ``index`` of the contact points, which are numbered anew."""
-        found = self.where(np.isin(self.index, index))
-        return replace(found, index=np.searchsorted(index, found.index))
-
-    def where(self, kept: Booleans) -> _PlaneStack:
-        """Those of a mask."""
-        return _PlaneStack(
-            self.index[kept],
-            self.gap[kept],
-            self.normal[kept],
-            self.anchor[kept],
-            self.source[kept],
+    @classmethod
+    def of(cls, kinds: Sequence[Planes]) -> PlaneStack:
+        """The planes of some kinds, which may be none."""
+        none = Planes()
+        some = [none, *kinds]
+        return cls(
+            np.concatenate([planes.index for planes in some]),
+            np.concatenate([planes.gap for planes in some]),
+            np.concatenate([planes.normal for planes in some]),
+            np.concatenate([planes.anchor for planes in some]),
+            np.repeat(np.arange(len(kinds)), [len(planes.index) for planes in kinds]),
+            np.array([planes.softness for planes in kinds], dtype=np.float64),
         )
+
+
+class Known(NamedTuple):
+    """Where points were when they were last asked about bones, and what bounds the distances
+    there.
+    """
+
+    anchor: np.ndarray  # (b, n, 3) in bone coordinates
+    bound: np.ndarray  # (b, n), -infinity where nothing is known
+
+
+class Obstacles(NamedTuple):
+    """What a muscle's contact points meet, for compiled loops."""
+
+    bones: Bones  # the b bones in reach
+    poses: np.ndarray  # (b, 4, 4)
+    free: np.ndarray  # (n,) whether no bone holds a contact point
+    allowed: np.ndarray  # (b, n) how deep a contact point may be in a bone [scene unit]
+    known: Known  # changed in place
+    planes: PlaneStack
 
 
 class BoneContacts:
@@ -129,12 +143,9 @@ class BoneContacts:
         self.allowed: dict[int, Floats] = {}
         #: Planes of sliding neighbours, and those that hold points on their side of a bone.
         self.neighbours: list[Planes] = []
-        self._stack: _PlaneStack | None = None  # of a copy for a subset of the contact points
         self.beside: list[Any] = []  # sliding pairs, for the muscle's surface
-        self._known: tuple[Floats, ...] = (
-            np.zeros((len(self.reached), 0, 3)),
-            np.zeros((len(self.reached), 0)),
-        )
+        self._allowed: Floats | None = None
+        self._known = Known(np.zeros((len(self.reached), 0, 3)), np.zeros((len(self.reached), 0)))
 
     def move(self, poses: dict[str, Floats]) -> None:
         """Take the bones' poses, a dict of bone name to (4, 4) rest-to-world transform."""
@@ -146,29 +157,24 @@ class BoneContacts:
     def frozen(self) -> BoneContacts:
         """A copy in the present poses, for queries from another thread while the bones move."""
         other = copy.copy(self)
-        other.beside, other._known = list(self.beside), tuple(part[:, :0] for part in self._known)
+        other.beside, other._known = list(self.beside), Known(*(p[:, :0] for p in self._known))
         return other
 
-    def only(self, index: Integers) -> BoneContacts:
-        """A copy for a subset ``index`` of the contact points."""
-        other = self.frozen()
-        if self.contact_bone is not None:
-            other.contact_bone = self.contact_bone[index]
-        other.allowed = {bone: depth[index] for bone, depth in self.allowed.items()}
-        if self.neighbours:
-            other._stack = self._planes().only(index)
-        if self._known[1].shape[1]:
-            other._known = tuple(np.take(part, index, axis=1) for part in self._known)
-        return other
+    @cached_property
+    def bones(self) -> Bones:
+        """The fields of the bones in reach, for compiled loops."""
+        return stack_bones([self.fields[b] for b in self.reached])
 
-    def unyielding(self) -> BoneContacts:
-        """The same obstacles without the planes that yield more than a bone."""
-        if not self.neighbours:
-            return self
-        other, stack = copy.copy(self), self._planes()
-        soft = np.array([planes.softness > 1.0 for planes in self.neighbours])
-        other._stack = stack.where(~soft[-1 - stack.source])
-        return other
+    def obstacles(self, count: int) -> Obstacles:
+        """What ``count`` contact points meet in the present poses."""
+        if self._allowed is None or self._allowed.shape[1] != count:
+            self._allowed = np.zeros((len(self.reached), count))
+            for row, b in enumerate(self.reached):
+                self._allowed[row] = self.allowed.get(b, 0.0)
+        planes = PlaneStack.of(self.neighbours)
+        return Obstacles(
+            self.bones, self.placed, self.free(count), self._allowed, self._bounds(count), planes
+        )
 
     def allow(self, bone_index: int, depth: Floats) -> None:
         """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it
@@ -178,6 +184,7 @@ class BoneContacts:
             self.allowed[bone_index] = np.array(depth, dtype=np.float64)
         else:
             self.allowed.pop(bone_index, None)
+        self._allowed = None
 
     def distance_and_direction(
         self, points: Floats, bone_index: int, reach: Floats | float = np.inf
@@ -268,9 +275,14 @@ class BoneContacts:
         """
         if not self.neighbours:
             return spaces
+        planes = PlaneStack.of(self.neighbours)
+        gap = planes.gap + np.einsum(
+            "ij,ij->i", planes.normal, points[planes.point] - planes.anchor
+        )
+        near = gap < float(reach.max(initial=0.0))
+        found = planes.point[near], gap[near], planes.normal[near], -1 - planes.kind[near]
         bones = spaces.index, spaces.gap, spaces.normal, spaces.source
-        planes = self._planes().near(points, float(reach.max(initial=0.0)))
-        return HalfSpaces(*map(np.concatenate, zip(bones, planes)))
+        return HalfSpaces(*map(np.concatenate, zip(bones, found)))
 
     def near(self, points: Floats, reach: Floats) -> list[tuple[int, Integers]]:
         """Bones in reach, each with the free contact points (n, 3) that may be nearer to it than
@@ -310,19 +322,6 @@ class BoneContacts:
             )
         return self.contact_bone < 0
 
-    def _planes(self) -> _PlaneStack:
-        """The neighbours' planes; there is a neighbour."""
-        if self._stack is not None:
-            return self._stack
-        kinds = self.neighbours
-        return _PlaneStack(
-            np.concatenate([planes.index for planes in kinds]),
-            np.concatenate([planes.gap for planes in kinds]),
-            np.concatenate([planes.normal for planes in kinds]),
-            np.concatenate([planes.anchor for planes in kinds]),
-            -1 - np.repeat(np.arange(len(kinds)), [len(planes.index) for planes in kinds]),
-        )
-
     def _stacked(self, poses):
         """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""
         return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)
@@ -333,7 +332,7 @@ class BoneContacts:
         """
         if self._known[1].shape[1] != count:
             rows = len(self.reached)
-            self._known = np.zeros((rows, count, 3)), np.full((rows, count), -np.inf)
+            self._known = Known(np.zeros((rows, count, 3)), np.full((rows, count), -np.inf))
         return self._known
 
     def _ask(self, points, near, b, reach):

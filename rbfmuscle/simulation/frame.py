@@ -21,9 +21,10 @@ class Event:
     ``"unresolved"`` (crossed all the same), ``"carried_stretched"``, ``"carried_held_end"`` or
     ``"carried_sheets"`` (no level set could be shown, so the surface is where the material is: it
     is stretched too far, an end is held inside the bone named, or sheets have met),
-    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame), or, with no
-    muscle, ``"bones_overlap"`` (the motion drives two bones into each other) or ``"joint_opens"``
-    (those of a joint apart).
+    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame),
+    ``"iteration_cap"`` (``count`` times a solve ended at a greatest number of steps, without a
+    bone), or, with no muscle, ``"bones_overlap"`` (the motion drives two bones into each other) or
+    ``"joint_opens"`` (those of a joint apart).
     """
 
     frame: int

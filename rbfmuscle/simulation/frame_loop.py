@@ -6,6 +6,8 @@ from contextlib import contextmanager
 
 from threadpoolctl import ThreadpoolController
 
+from rbfmuscle.bones.obstacles import pick_bones, stack_bones
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.activation.contraction import Activations
@@ -246,8 +248,15 @@ def _obstacles(scene, models, fields):
         met = {bone for muscle, bone in regions if muscle in here}
         fields = build_fields(scene, {pair: box for pair, box in regions.items() if pair[1] in met})
     names = [bone.name for bone in scene.bones]
+    # One set of arrays, of which each muscle takes its bones.
+    order = [name for name in names if isinstance(fields.get(name), BoneSDF)]
+    stack = stack_bones([fields[name] for name in order])
     for model in models:
         reached = [
             fields.get(n) if regions is None or (model.name, n) in regions else None for n in names
         ]
-        yield BoneContacts(names, reached, contact_bone=model.contact_bone)
+        contacts = BoneContacts(names, reached, contact_bone=model.contact_bone)
+        met = [names[b] for b in contacts.reached]
+        if set(met) <= set(order):
+            contacts.bones = pick_bones(stack, [order.index(name) for name in met])
+        yield contacts

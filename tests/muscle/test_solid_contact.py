@@ -9,7 +9,13 @@ import trimesh
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.models import build_models
-from rbfmuscle.muscle.rounded_bones import RoundedBones, RoundedContacts
+from rbfmuscle.muscle.rounded_bones import (
+    FULLEST,
+    ROUNDING,
+    grown,
+    round_bones,
+    rounded_distance,
+)
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.contact import BoneContacts
@@ -24,16 +30,15 @@ def ball():
     mesh = trimesh.creation.icosphere(2, RADIUS)
     field = BoneSDF.from_mesh(mesh, cache=False)
     pose = rotation_about([1, 2, 3], 0.7, np.array([5.0, -2.0, 1.0]))
-    bones = RoundedBones([field], RestFrame(np.asarray(mesh.vertices)), np.array([EDGE]))
-    exact = BoneContacts(["ball"], [field])
-    exact.move({"ball": pose})
+    contacts = BoneContacts(["ball"], [field])
+    frame = RestFrame(np.asarray(mesh.vertices))
 
     def rounded(points):
-        found = RoundedContacts(bones, exact, len(points)).half_spaces(
-            points, np.full(len(points), 1e3)
-        )
-        assert np.array_equal(found.index, np.arange(len(points)))
-        return found.gap, found.normal
+        bones = grown(grown(round_bones(contacts, frame, EDGE / ROUNDING, {})))
+        normal, gap = np.empty_like(points), np.empty(len(points))
+        for i, point in enumerate(points):
+            gap[i] = rounded_distance(bones, contacts.bones, 0, pose, point, normal[i])
+        return gap, normal
 
     return field, rounded, pose
 
@@ -58,12 +63,31 @@ def test_rounded_distance_is_near_the_exact_one_and_its_direction_nearer_to_the_
     assert np.sqrt((turned[1] ** 2).mean()) < 0.6 * np.sqrt((turned[0] ** 2).mean())
 
 
-def test_where_the_rounded_distance_is_flat_the_exact_field_answers(ball):
+def test_where_the_rounded_distance_is_flat_it_says_so(ball):
     field, rounded, pose = ball
     middle = trimesh.transform_points(field.bounds.mean(axis=0)[None], pose)
-    exact = field.distance_and_gradient(middle, pose)
-    for found, wanted in zip(rounded(middle), exact):
-        assert found == pytest.approx(wanted, abs=1e-6)
+    assert np.isnan(rounded(middle)[0])
+
+
+def test_blocks_are_filled_once_kept_when_the_table_grows_and_refused_when_it_is_full(ball):
+    field, _, pose = ball
+    contacts = BoneContacts(["ball"], [field])
+    frame = RestFrame(np.asarray(trimesh.creation.icosphere(2, RADIUS).vertices))
+    bones, normal = round_bones(contacts, frame, 0.2 / ROUNDING, {}), np.empty(3)
+    points, _ = around(pose)
+
+    def ask(table):
+        return [rounded_distance(table, contacts.bones, 0, pose, p, normal) for p in points]
+
+    few = np.array(ask(bones))
+    full = int(np.ceil(FULLEST * len(bones.keys)))
+    assert bones.filled[0] == full and full <= np.isfinite(few).sum() < len(points)
+    assert not np.isnan(few).any()
+    more = grown(grown(bones))
+    assert more.filled[0] == full
+    every = np.array(ask(more))
+    known = np.isfinite(few)
+    assert np.isfinite(every).all() and np.array_equal(every[known], few[known])
 
 
 def test_direction_is_the_slope_of_the_distance(ball):

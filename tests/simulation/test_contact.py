@@ -53,18 +53,19 @@ def test_half_spaces_are_all_pairs_nearer_than_reach(reach):
         points = points + rng.normal(size=points.shape) * 0.4
 
 
-def test_planes_of_neighbours_are_those_of_a_subset_of_the_points_too():
+def test_planes_of_neighbours_come_behind_those_of_bones():
     contacts, _ = _pair(contact_bone=np.full(400, -1))
     points, rng = _points(), np.random.default_rng(4)
+    bones = len(contacts.half_spaces(points, 0.5).index)
     contacts.neighbours = [Planes(), Planes(3.0)]
-    for planes in contacts.neighbours:
-        at = rng.permutation(400)[:60]
-        planes.set(at, rng.normal(size=60), rng.normal(size=(60, 3)), points[at] + 0.1)
-    every, index = contacts.half_spaces(points, 0.5), np.arange(0, 400, 3)
-    found = contacts.only(index).half_spaces(points[index], 0.5)
-    rows = {(index[i], source, gap) for i, source, gap in zip(found.index, found.source, found.gap)}
-    assert {-1, -2} <= {source for _, source, _ in rows}
-    assert rows == {row for row in zip(every.index, every.source, every.gap) if row[0] in index}
+    wanted = []
+    for kind, planes in enumerate(contacts.neighbours):
+        at, gap = rng.permutation(400)[:60], rng.normal(size=60)
+        planes.set(at, gap, rng.normal(size=(60, 3)), points[at])
+        wanted += [(i, -1 - kind, g) for i, g in zip(at, gap) if g < 0.5]
+    found = contacts.half_spaces(points, 0.5)
+    rows = list(zip(found.index[bones:], found.source[bones:], found.gap[bones:]))
+    assert rows == wanted and (found.source[:bones] >= 0).all()
 
 
 def test_nearest_is_the_smallest_over_bones_and_infinite_without():

@@ -1,0 +1,254 @@
+"""Contact forces of a muscle's solid: a linear complementarity problem in the metric of a solve.
+
+A unit force at near point i along n_i moves near point j along n_j, with the volumes of the regions
+kept, by
+
+    G_ij = (n_i · n_j) w_i A⁻¹ w_j - ρ_i · ρ_j,    ρ_i = Σ_k w_ik n_i · (L⁻¹ A⁻¹ g)_k,
+
+the Schur complement of the volumes (`global_step.py`), w_i the shape functions of point i. Contact
+forces λ, 0 <= λ_i <= λ_max, give every contact the motion that it needs, G λ >= need, where they
+are not at λ_max, and none where there is more room than that. A contact that yields adds to G_ii.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.jit import compiled
+
+# Contacts that join the working set in one round, rounds, sweeps in each.
+BATCH = 24
+ROUNDS = 10
+SWEEPS = 400
+
+
+class Answers(NamedTuple):
+    """What is kept through a solve of the points that have had a force; they have numbers in
+    order.
+    """
+
+    number: np.ndarray  # (m,) of each near point, -1 for none yet
+    used: np.ndarray  # (1,) how many have one
+    motion: np.ndarray  # (room, N) w_i A⁻¹
+    pairs: np.ndarray  # (room, room) w_i A⁻¹ w_j
+    response: np.ndarray  # (room, M, 3) Σ_k w_ik (L⁻¹ A⁻¹ g)_k
+
+
+class Law(NamedTuple):
+    """How contacts yield, for each contact."""
+
+    yielding: np.ndarray  # (c,) motion for a unit force
+    most: np.ndarray  # (c,) greatest force
+
+
+class Push(NamedTuple):
+    """What contact forces do."""
+
+    nodes: np.ndarray  # (N, 3) motion of the nodes
+    taken: np.ndarray  # (M,) what it takes from the whitened pressures
+    capped: bool  # whether rounds or sweeps ended before the forces were found
+
+
+@compiled(error_model="numpy")
+def no_answers(near, metric):
+    """Room for the answers of all near points."""
+    count = len(near.which)
+    return Answers(
+        np.full(count, -1, np.int64),
+        np.zeros(1, np.int64),
+        np.empty((count, len(metric.inverse))),
+        np.empty((count, count)),
+        np.empty((count, len(metric.factor), 3)),
+    )
+
+
+@compiled(error_model="numpy")
+def _answer(i, near, metric, answers):
+    """Number of near point i; its answers are found when it is first asked for."""
+    if answers.number[i] >= 0:
+        return answers.number[i]
+    number = answers.used[0]
+    answers.number[i] = number
+    answers.used[0] += 1
+    motion = answers.motion[number]
+    motion[:] = 0.0
+    answers.response[number] = 0.0
+    for k in range(near.columns.shape[1]):
+        j, share = near.columns[i, k], near.shares[i, k]
+        row = metric.inverse[j]
+        for n in range(len(row)):
+            motion[n] += share * row[n]
+        for r in range(len(metric.factor)):
+            for a in range(3):
+                answers.response[number, r, a] += share * metric.response[r, a, j]
+    for other in range(len(near.which)):
+        d = answers.number[other]
+        if d < 0:
+            continue
+        value = 0.0
+        for k in range(near.columns.shape[1]):
+            value += near.shares[other, k] * motion[near.columns[other, k]]
+        answers.pairs[number, d] = value
+        answers.pairs[d, number] = value
+    return number
+
+
+@compiled(error_model="numpy")
+def _schur(start, numbers, normal, answers, rows, gram, own):
+    """Rows ρ and entries of G of the contacts from ``start`` on; ``own`` is its diagonal."""
+    for c in range(start, len(numbers)):
+        n = normal[c]
+        for r in range(rows.shape[1]):
+            some = answers.response[numbers[c], r]
+            rows[c, r] = n[0] * some[0] + n[1] * some[1] + n[2] * some[2]
+        for d in range(c + 1):
+            value = answers.pairs[numbers[c], numbers[d]]
+            value *= n[0] * normal[d, 0] + n[1] * normal[d, 1] + n[2] * normal[d, 2]
+            for r in range(rows.shape[1]):
+                value -= rows[c, r] * rows[d, r]
+            gram[c, d] = value
+            gram[d, c] = value
+        own[c] = gram[c, c]
+
+
+@compiled(error_model="numpy")
+def solve_forces(gram, need, force, sweeps, tolerance, most):
+    """Contact forces with 0 <= force <= most and gram · force >= need where force < most.
+
+    By projected Gauss-Seidel from a first guess, in place, until no gap moves by more than the
+    tolerance; returns whether it came to that. ``gram`` (c, c) is the motion at contact i for a
+    unit force at contact j, ``need`` (c,) the motion that each asks for.
+    """
+    lacking = need.copy()
+    for c in range(len(need)):
+        if force[c] != 0.0:
+            for d in range(len(need)):
+                lacking[d] -= gram[c, d] * force[c]
+    for _ in range(sweeps):
+        largest = 0.0
+        for c in range(len(need)):
+            change = min(max(0.0, force[c] + lacking[c] / gram[c, c]), most[c]) - force[c]
+            if change != 0.0:
+                force[c] += change
+                largest = max(largest, abs(change) * gram[c, c])
+                for d in range(len(need)):
+                    lacking[d] -= gram[c, d] * change
+        if largest < tolerance:
+            return True
+    return False
+
+
+@compiled(error_model="numpy")
+def deepest(lacking, is_chosen, tolerance, most):
+    """Contacts, not yet chosen, that lack the most motion, deepest first; of equals the first."""
+    found = np.empty(most, np.int64)
+    count = 0
+    for c in range(len(lacking)):
+        if not lacking[c] > tolerance or is_chosen[c]:
+            continue
+        if count == most and lacking[c] <= lacking[found[count - 1]]:
+            continue
+        count = min(count + 1, most)
+        place = count - 1
+        while place > 0 and lacking[found[place - 1]] < lacking[c]:
+            found[place] = found[place - 1]
+            place -= 1
+        found[place] = c
+    return found[:count]
+
+
+@compiled(error_model="numpy")
+def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
+    """Motion of the nodes by contact forces, and what these take from the whitened pressures."""
+    push[:] = 0.0
+    taken[:] = 0.0
+    for c in range(len(strength)):
+        if strength[c] == 0.0:
+            continue
+        motion = answers.motion[numbers[c]]
+        for j in range(len(push)):
+            for a in range(3):
+                push[j, a] += motion[j] * strength[c] * normal[c, a]
+        for r in range(len(taken)):
+            taken[r] += strength[c] * rows[c, r]
+    for r in range(len(taken)):
+        for j in range(len(push)):
+            for a in range(3):
+                push[j, a] -= taken[r] * metric.response[r, a, j]
+
+
+@compiled(error_model="numpy")
+def _find_lacking(touch, need, near, push, lacking):
+    """Motion that each contact still needs after a push of the nodes."""
+    for c in range(len(need)):
+        i, value, normal = touch.point[c], need[c], touch.normal[c]
+        for k in range(near.columns.shape[1]):
+            j = near.columns[i, k]
+            value -= near.shares[i, k] * (
+                normal[0] * push[j, 0] + normal[1] * push[j, 1] + normal[2] * push[j, 2]
+            )
+        lacking[c] = value
+
+
+@compiled(error_model="numpy")
+def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
+    """What contact forces do when the near points move by ``motion`` (m, 3); fills ``forces`` (m,
+    obstacles), which hold the first guess.
+
+    The working set starts from the contacts that pushed before and takes in the deepest violations
+    until none is left; forces solve the complementarity problem on it.
+    """
+    count = len(touch.point)
+    need, force, lacking = np.empty(count), np.empty(count), np.empty(count)
+    is_chosen, total = np.zeros(count, np.bool_), 0
+    for c in range(count):
+        i = touch.point[c]
+        need[c] = -touch.gap[c]
+        for a in range(3):
+            need[c] -= touch.normal[c, a] * motion[i, a]
+        lacking[c] = need[c]
+        force[c] = forces[i, touch.source[c]]
+        is_chosen[c] = force[c] > 0.0
+        total += is_chosen[c]
+    forces[:] = 0.0
+    push, taken = np.zeros((len(metric.inverse), 3)), np.zeros(len(metric.factor))
+    room, done, capped = min(count, total + ROUNDS * BATCH), 0, False
+    # The working set: its contacts, their numbers among the answers, and rows of the problem.
+    chosen, numbers = np.empty(room, np.int64), np.empty(room, np.int64)
+    chosen[:total] = np.flatnonzero(is_chosen)
+    normal, wants, strength = np.empty((room, 3)), np.empty(room), np.empty(room)
+    rows, gram, own = np.empty((room, len(taken))), np.empty((room, room)), np.empty(room)
+    most = np.empty(room)
+    for turn in range(ROUNDS):
+        added = deepest(lacking, is_chosen, tolerance, BATCH)
+        for c in added:
+            is_chosen[c] = True
+            chosen[total] = c
+            total += 1
+        if total == 0:
+            break
+        for k in range(done, total):
+            c = chosen[k]
+            numbers[k] = _answer(touch.point[c], near, metric, answers)
+            normal[k] = touch.normal[c]
+            wants[k] = need[c]
+            strength[k] = force[c]
+            most[k] = law.most[c]
+        some, ways = numbers[:total], normal[:total]
+        _schur(done, some, ways, answers, rows, gram, own)
+        done, least = total, 0.0
+        for k in range(done):
+            least = max(least, 1e-7 * abs(own[k]))
+        for k in range(done):
+            gram[k, k] = own[k] + least + law.yielding[chosen[k]]
+        found = strength[:total]
+        settled = solve_forces(gram, wants[:total], found, SWEEPS, 0.1 * tolerance, most)
+        _push_nodes(ways, found, some, rows, answers, metric, push, taken)
+        capped = not settled
+        if len(added) == 0:
+            break
+        _find_lacking(touch, need, near, push, lacking)
+        capped |= turn == ROUNDS - 1 and lacking.max() > tolerance
+    for k in range(total):
+        forces[touch.point[chosen[k]], touch.source[chosen[k]]] = strength[k]
+    return Push(push, taken, capped)

@@ -1,0 +1,352 @@
+"""The elastic solid that carries an RBF muscle: everything about it that never changes.
+
+With y the nodes of a `Lattice` and F = Σ_k y_k ∇N_k the deformation gradient at its quadrature
+points q, the nodes minimise
+
+    E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² - 2 τ (1 - t))
+         + μ Σ_q w_q (c (|F_q a| - s_q)² + a_q (|F_q a| - l)²),
+    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    s_q = |F_q a| kept within
+    1 / slack and 1,    τ = min(TONE (1 - d / d₀), MOST_TONE) >= 0,
+
+subject to the volumes of the regions r of the lattice, V_r(y) = Σ_{q in r} w_q det F_q, and to the
+contacts. R is a rotation, a the fibre direction. Between 1 / slack and 1 a fibre shortens without
+resistance while the section thickens, and bears a small tension, 2 μ τ, which keeps a slack muscle
+straight. It grows as the muscle's ends approach, from their distance d₀ at rest to d, and depends
+on the bones alone: a tension that grew with the fibres' shortening would be a negative stiffness.
+c = 3/2 (fibre_ratio - 1) stiffens fibres that are longer or shorter than the band; a_q and l are
+those of active fibres (`activation.py`). For small stretches beyond the slack band and more and
+more nodes this is the incompressible solid of shear modulus μ, Young's modulus 3 μ across and
+3 μ · fibre_ratio along the fibres.
+"""
+
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.implicit.placement.lattice import Embedding as LatticePoints
+from rbfmuscle.implicit.placement.lattice import Lattice
+from rbfmuscle.jit import compiled
+
+HOLD = 25.0  # stiffness of the spring at a held point, relative to that of a cell
+# Stiffness of second differences, relative to a cell: for nodes that hold hardly any material.
+GHOST = 1e-3
+NODES_PER_REGION = 8
+# Points that move by less than this fraction of the median for a unit force count as attached.
+MOBILE = 0.02
+# Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.82 of their distance at rest,
+# and for shorter ones, it is 0.03 of that at full activation.
+TONE, MOST_TONE = 2.5, 0.45
+# Greatest pressure that a contact takes, over 2 μ. With 5 the gluteus maximus is pressed 6.6 mm
+# into the femur in 90 degrees of flexion.
+MOST_CONTACT_PRESSURE = 40.0
+
+
+class Fibres(NamedTuple):
+    """Springs along the fibres at the quadrature points, stiffnesses over twice the shear
+    modulus.
+    """
+
+    direction: np.ndarray  # (Q, 3) at rest, unit
+    passive: np.ndarray  # (Q,) stiffness of a spring that is slack from lower to upper
+    active: np.ndarray  # (Q,) at full activation, of a spring whose target stretch is ``content``
+    lower: np.ndarray  # (Q,) stretch against rest
+    upper: np.ndarray  # (Q,)
+    content: np.ndarray  # (Q,)
+
+
+class Cells(NamedTuple):
+    """Quadrature points of the lattice, and the regions whose volumes are kept."""
+
+    columns: np.ndarray  # (Q, 27) nodes of a point
+    slopes: np.ndarray  # (Q, 27, 3) gradients of their shape functions [1 / scene unit]
+    weights: np.ndarray  # (Q,) volume of a point [scene unit cubed]
+    points: np.ndarray  # (Q, 3) at rest
+    region: np.ndarray  # (Q,) its region
+    slot: np.ndarray  # (Q, 27) row of its nodes in a gradient of the regions' volumes
+    start: np.ndarray  # (M + 1,) first row of each region
+    node: np.ndarray  # (S,) node of each row
+    volumes: np.ndarray  # (M,) of the regions at rest [scene unit cubed]
+
+
+class Embedding(NamedTuple):
+    """Points of the muscle as sums of its nodes; those of a lattice cell have the same 27.
+
+    ``order`` lists them cell by cell, cell c from ``start[c]`` on; ``by_cell`` (27, n) has the
+    shape functions in that order, so that loops over them read memory in its order.
+    """
+
+    columns: np.ndarray  # (n, 27)
+    shares: np.ndarray  # (n, 27) shape functions
+    nodes: np.ndarray  # (cells, 27)
+    start: np.ndarray  # (cells + 1,)
+    order: np.ndarray  # (n,)
+    by_cell: np.ndarray  # (27, n)
+
+
+class SolidModel(NamedTuple):
+    """An elastic solid of N nodes, Q quadrature points, M regions and n contact points."""
+
+    rest: np.ndarray  # (N, 3) nodes at rest
+    cells: Cells
+    fibres: Fibres
+    points: np.ndarray  # (n, 3) contact points at rest
+    embedding: Embedding  # of the contact points
+    owner: np.ndarray  # (n,) row of the bone that holds a contact point, -1 where it is free
+    fixed: np.ndarray  # (f,) contact points that go exactly with their bone
+    fixed_bone: np.ndarray  # (f,) its row
+    held: np.ndarray  # (h,) contact points by which the bones hold the solid
+    held_bone: np.ndarray  # (h,) row of the bone
+    end: np.ndarray  # (h,) 0 or 1 for held points of the two farthest bones, else -1
+    end_distance: float  # between the middles of these at rest
+    springs: np.ndarray  # (N, h) from held points to nodes
+    spring: float  # stiffness of each, over 2 μ
+    matrix: np.ndarray  # (N, N) second derivative of E / 2 μ without springs and fibres
+    motion_weights: np.ndarray  # (N, b) how much of each bone's motion a node takes
+    size: float  # diameter of the muscle [scene unit]
+    side: float  # of a lattice cell [scene unit]
+    area: float  # of the surface, for each contact point [scene unit squared]
+    iterations: int  # of a solve, at most
+
+
+class Stiffness(NamedTuple):
+    """What follows from the model and an activation."""
+
+    matrix: np.ndarray  # (N, N) second derivative of E / 2 μ
+    inverse: np.ndarray  # (N, N)
+    most: np.ndarray  # (n,) greatest contact force, over 2 μ
+
+
+def build_solid(
+    lattice: Lattice,
+    frame: RestFrame,
+    points: Floats,
+    owner: Integers,
+    held: Integers,
+    *,
+    fixed: Integers,
+    area: float,
+    iterations: int,
+) -> SolidModel:
+    """The solid on a lattice through a muscle, its fibres slack along no direction.
+
+    ``points`` (n, 3) at rest are its contact points, each of which stands for an ``area``;
+    ``owner`` (n,) is the row of the bone that holds each, -1 where it is free. The bones hold it by
+    the points ``held``; those ``fixed`` go exactly with their bone.
+    """
+    side = float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
+    rest = frame.points(lattice.rest)
+    cells = _number_regions(lattice, frame)
+    embedding = embed(lattice, frame, points)
+    hangs = np.zeros((len(rest), len(held)))
+    spots = embedding.columns[held].T, np.arange(len(held))
+    np.add.at(hangs, spots, embedding.shares[held].T)
+    one = np.ones(len(cells.weights))
+    axis = np.tile([1.0, 0.0, 0.0], (len(one), 1))
+    end, distance = _farthest_ends(points[held], owner[held])
+    model = SolidModel(
+        rest=rest,
+        cells=cells,
+        fibres=Fibres(axis, 0.0 * one, 0.0 * one, one, one, one),
+        points=points,
+        embedding=embedding,
+        owner=owner.astype(np.int64),
+        fixed=fixed.astype(np.int64),
+        fixed_bone=owner[fixed].astype(np.int64),
+        held=held.astype(np.int64),
+        held_bone=owner[held].astype(np.int64),
+        end=end,
+        end_distance=distance,
+        springs=HOLD * side * hangs,
+        spring=HOLD * side,
+        matrix=GHOST * side * lattice.second_differences() + _gram(cells, len(rest)),
+        motion_weights=np.empty((0, 0)),
+        size=diameter(points),
+        side=side,
+        area=area,
+        iterations=iterations,
+    )
+    return model._replace(motion_weights=_motion_weights(model))
+
+
+def embed(lattice: Lattice, frame: RestFrame, points: Floats) -> Embedding:
+    """Points (n, 3) of the muscle at rest as sums of the lattice's nodes."""
+    found = _embedded(lattice, frame, points)
+    nodes, cell = np.unique(found.indices, axis=0, return_inverse=True)
+    cell = cell.ravel()
+    order = np.argsort(cell, kind="stable")
+    start = np.searchsorted(cell[order], np.arange(len(nodes) + 1))
+    by_cell = np.ascontiguousarray(found.weights[order].T)
+    return Embedding(found.indices, found.weights, nodes, start, order, by_cell)
+
+
+def lattice_slopes(lattice: Lattice, frame: RestFrame, points: Floats) -> Floats:
+    """Gradients (n, 27, 3) of the shape functions at points (n, 3) of the muscle at rest."""
+    return np.ascontiguousarray(_embedded(lattice, frame, points).slopes @ frame.axes / frame.size)
+
+
+def _embedded(lattice: Lattice, frame: RestFrame, points: Floats) -> LatticePoints:
+    return lattice.embed((points - frame.origin) @ frame.axes.T / frame.size)
+
+
+def _number_regions(lattice: Lattice, frame: RestFrame) -> Cells:
+    """The quadrature, and regions of about `NODES_PER_REGION` nodes."""
+    columns, size = lattice.quadrature.indices, len(lattice.rest)
+    region = lattice.regions(max(1, size // NODES_PER_REGION))
+    weights = lattice.weights * frame.size**3
+    known, slot = np.unique(region[:, None] * size + columns, return_inverse=True)
+    count = int(region.max()) + 1
+    return Cells(
+        columns,
+        np.ascontiguousarray(lattice.quadrature.slopes @ frame.axes / frame.size),
+        weights,
+        frame.points(lattice.points),
+        region,
+        slot.reshape(columns.shape).astype(np.int64),
+        np.searchsorted(known // size, np.arange(count + 1)).astype(np.int64),
+        (known % size).astype(np.int64),
+        np.bincount(region, weights, minlength=count),
+    )
+
+
+def _gram(cells: Cells, nodes: int) -> Floats:
+    """Matrix (N, N) of Σ w |F|²."""
+    found, rows = np.zeros((nodes, nodes)), np.arange(len(cells.weights))[:, None]
+    for axis in range(3):
+        full = np.zeros((len(cells.weights), nodes))
+        np.add.at(full, (rows, cells.columns), cells.slopes[:, :, axis])
+        found += (full * cells.weights[:, None]).T @ full
+    return found
+
+
+def _motion_weights(model: SolidModel) -> Floats:
+    """How much (N, b) of each bone's motion a node takes: where springs to that bone alone move
+    it.
+    """
+    inverse = _inverted(_hung(model))
+    bones = range(int(model.held_bone.max()) + 1)
+    pulls = [model.springs[:, model.held_bone == b].sum(axis=1) for b in bones]
+    weights = inverse @ np.stack(pulls, 1)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
+def _hung(model: SolidModel) -> Floats:
+    """The model's matrix with the springs at its held points."""
+    return np.asarray(model.matrix + model.springs @ (model.springs / model.spring).T)
+
+
+def _inverted(matrix: Floats) -> Floats:
+    inverse = np.linalg.inv(matrix)
+    return np.ascontiguousarray(0.5 * (inverse + inverse.T))
+
+
+def stiffness(model: SolidModel, activation: float) -> Stiffness:
+    """The matrix with springs and fibres, its inverse, and the greatest contact forces.
+
+    What a bone that is driven into an attachment would need to lift the points beside it bends the
+    whole muscle: a point that moves less than the median for a unit force bears less.
+    """
+    matrix, cells, fibres = _hung(model), model.cells, model.fibres
+    stiff = fibres.passive + activation * fibres.active
+    if stiff.any():
+        along = np.zeros((len(cells.weights), len(model.rest)))
+        slopes = np.einsum("qka,qa->qk", cells.slopes, fibres.direction)
+        np.add.at(along, (np.arange(len(cells.weights))[:, None], cells.columns), slopes)
+        matrix = matrix + (along * (stiff * cells.weights)[:, None]).T @ along
+    inverse = _inverted(matrix)
+    move = mobility(model.embedding.columns, model.embedding.shares, inverse)
+    share = np.minimum(1.0, move / np.median(move[model.owner < 0]))
+    return Stiffness(matrix, inverse, MOST_CONTACT_PRESSURE * model.area * share)
+
+
+def attached_owner(model: SolidModel) -> Integers:
+    """Row (n,) of the bone that holds each contact point, -1 where none does; free points that a
+    force hardly moves count to the bone of the nearest held one.
+    """
+    move = mobility(model.embedding.columns, model.embedding.shares, stiffness(model, 0.0).inverse)
+    owner = model.owner.copy()
+    free, attached = owner < 0, np.flatnonzero(owner >= 0)
+    for point in np.flatnonzero(free & (move < MOBILE * np.median(move[free]))):
+        away = ((model.points[attached] - model.points[point]) ** 2).sum(axis=1)
+        owner[point] = owner[attached[np.argmin(away)]]
+    return owner
+
+
+def _farthest_ends(held: Floats, own: Integers) -> tuple[Integers, float]:
+    """Which held points (h,) are those of the two bones that hold the muscle farthest apart, and
+    how far.
+    """
+    end, most = np.full(len(held), -1), 0.0
+    for first, second in combinations([own == bone for bone in np.unique(own)], 2):
+        away = float(np.linalg.norm(held[first].mean(axis=0) - held[second].mean(axis=0)))
+        if away > most:
+            end, most = np.where(first, 0, np.where(second, 1, -1)), away
+    return end.astype(np.int64), most
+
+
+@compiled(error_model="numpy")
+def mobility(columns, shares, inverse):
+    """Motion (n,) of each embedded point for a unit force at it: w A⁻¹ w."""
+    out = np.zeros(len(columns))
+    for s in range(len(columns)):
+        for k in range(columns.shape[1]):
+            for m in range(columns.shape[1]):
+                out[s] += shares[s, k] * shares[s, m] * inverse[columns[s, k], columns[s, m]]
+    return out
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def carry(embedding, y):
+    """Places (n, 3) of embedded points, Σ_k share_k y_k, for nodes y (N, 3); cell by cell."""
+    nodes, start, order, shares = (
+        embedding.nodes,
+        embedding.start,
+        embedding.order,
+        embedding.by_cell,
+    )
+    most = 0
+    for c in range(len(nodes)):
+        most = max(most, start[c + 1] - start[c])
+    out, sums = np.empty((len(order), 3)), np.empty((3, most))
+    for c in range(len(nodes)):
+        first, count = start[c], start[c + 1] - start[c]
+        sums[:, :count] = 0.0
+        for k in range(nodes.shape[1]):
+            some, j = shares[k, first : first + count], nodes[c, k]
+            for a in range(3):
+                total, node = sums[a], y[j, a]
+                for s in range(count):
+                    total[s] += some[s] * node
+        for s in range(count):
+            for a in range(3):
+                out[order[first + s], a] = sums[a, s]
+    return out
+
+
+@compiled(error_model="numpy")
+def turned_normals(y, columns, slopes, normals):
+    """Unit normals of the deformed surface at embedded points: the cofactor of the deformation
+    gradient times those at rest.
+    """
+    out, f = np.empty_like(normals), np.empty((3, 3))
+    for s in range(len(normals)):
+        f[:] = 0.0
+        for k in range(columns.shape[1]):
+            j = columns[s, k]
+            for a in range(3):
+                for b in range(3):
+                    f[a, b] += y[j, a] * slopes[s, k, b]
+        square = 0.0
+        for a in range(3):
+            p, q = (a + 1) % 3, (a + 2) % 3
+            value = 0.0
+            for b in range(3):
+                u, v = (b + 1) % 3, (b + 2) % 3
+                value += (f[p, u] * f[q, v] - f[p, v] * f[q, u]) * normals[s, b]
+            out[s, a] = value
+            square += value * value
+        for a in range(3):
+            out[s, a] /= np.sqrt(square)
+    return out

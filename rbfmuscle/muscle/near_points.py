@@ -1,0 +1,244 @@
+"""Contact points near bones and neighbours, and the half-spaces that they meet there."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, lower_bound, note_query
+from rbfmuscle.bones.obstacles import query_bone
+from rbfmuscle.jit import compiled
+from rbfmuscle.muscle.rounded_bones import rounded_distance
+from rbfmuscle.simulation.contact import Known
+
+
+class Near(NamedTuple):
+    """The m contact points near an obstacle when nodes were at ``y``."""
+
+    which: np.ndarray  # (m,) among the contact points
+    columns: np.ndarray  # (m, 27) their nodes
+    shares: np.ndarray  # (m, 27) shape functions
+    free: np.ndarray  # (m,) whether no bone holds it
+    most: np.ndarray  # (m,) greatest force on each, over 2 μ
+    forces: np.ndarray  # (m, obstacles), changed in place
+    allowed: np.ndarray  # (b, m) how deep each may be in a bone [scene unit]
+    exact: Known
+    rounded: Known
+    y: np.ndarray  # (N, 3)
+
+
+class Touch(NamedTuple):
+    """Half-spaces: a motion of a ``point`` by d is admissible where gap + normal · d >= 0."""
+
+    point: np.ndarray  # (c,) among the near points
+    gap: np.ndarray  # (c,) [scene unit]
+    normal: np.ndarray  # (c, 3) unit
+    source: np.ndarray  # (c,) obstacle: the bones in reach, then kinds of planes
+
+
+@compiled(error_model="numpy")
+def find_near(points, obstacles, reach):
+    """Mask (n,) of the contact points nearer than ``reach`` to an obstacle."""
+    bones, free, known = obstacles.bones, obstacles.free, obstacles.known
+    found, box = np.zeros(len(points), np.bool_), np.empty((2, 3))
+    box_loop(points, free, box)
+    some = np.empty(len(points), np.int64)
+    for b in range(len(obstacles.poses)):
+        pose, bounds = obstacles.poses[b], bones.boxes[b]
+        if boxes_apart(box, pose, bounds) > reach:
+            continue
+        count = 0
+        for i in range(len(points)):
+            if (
+                free[i]
+                and lower_bound(points, i, pose, bounds, known.anchor[b], known.bound[b]) <= reach
+            ):
+                some[count] = i
+                count += 1
+        at, distance = np.empty((count, 3)), np.empty(count)
+        for k in range(count):
+            for a in range(3):
+                at[k, a] = points[some[k], a]
+        query_bone(bones, b, pose, at, np.full(count, reach), distance, np.empty((0, 3)))
+        for k in range(count):
+            i = some[k]
+            note_query(points, i, pose, distance[k], known.anchor[b], known.bound[b])
+            found[i] |= distance[k] + obstacles.allowed[b, i] < reach
+    planes = obstacles.planes
+    for p in range(len(planes.point)):
+        found[planes.point[p]] |= plane_gap(planes, p, points[planes.point[p]]) < reach
+    return found
+
+
+@compiled(error_model="numpy")
+def plane_gap(planes, p, point):
+    """Signed distance of a point from plane p."""
+    value = planes.gap[p]
+    for a in range(3):
+        value += planes.normal[p, a] * (point[a] - planes.anchor[p, a])
+    return value
+
+
+@compiled(error_model="numpy")
+def take_near(found, model, stiffness, obstacles, forces, y):
+    """The contact points of a mask (n,), with the ``forces`` (n, obstacles) on them."""
+    which = np.flatnonzero(found)
+    count, bones = len(which), len(obstacles.poses)
+    embedding = model.embedding
+    near = Near(
+        which,
+        np.empty((count, embedding.columns.shape[1]), np.int64),
+        np.empty((count, embedding.columns.shape[1])),
+        np.empty(count, np.bool_),
+        np.empty(count),
+        np.empty((count, forces.shape[1])),
+        np.empty((bones, count)),
+        Known(np.empty((bones, count, 3)), np.empty((bones, count))),
+        Known(np.zeros((bones, count, 3)), np.full((bones, count), -np.inf)),
+        y.copy(),
+    )
+    for k in range(count):
+        i = which[k]
+        near.columns[k] = embedding.columns[i]
+        near.shares[k] = embedding.shares[i]
+        near.free[k] = obstacles.free[i]
+        near.most[k] = stiffness.most[i]
+        near.forces[k] = forces[i]
+        for b in range(bones):
+            near.allowed[b, k] = obstacles.allowed[b, i]
+            near.exact.bound[b, k] = obstacles.known.bound[b, i]
+            near.exact.anchor[b, k] = obstacles.known.anchor[b, i]
+    return near
+
+
+@compiled(error_model="numpy")
+def find_touch(near, here, reach, obstacles, rounded):
+    """Half-spaces that near points ``here`` (m, 3) meet within ``reach`` (m,), bones rounded.
+
+    Also whether there was room for all blocks of the rounded bones.
+    """
+    bones, planes = obstacles.bones, obstacles.planes
+    touch = _no_touch(len(obstacles.poses) * len(here) + len(planes.point))
+    normal, box = np.empty(3), np.empty((2, 3))
+    farthest = _farthest(here, near.free, reach, box)
+    count, room = 0, True
+    for b in range(len(obstacles.poses)):
+        pose, bounds = obstacles.poses[b], bones.boxes[b]
+        anchor, bound = near.rounded.anchor[b], near.rounded.bound[b]
+        if boxes_apart(box, pose, bounds) > farthest:
+            continue
+        for i in range(len(here)):
+            if not near.free[i] or lower_bound(here, i, pose, bounds, anchor, bound) > reach[i]:
+                continue
+            distance = rounded_distance(rounded, bones, b, pose, here[i], normal)
+            if np.isnan(distance):
+                distance = _exact_distance(bones, b, pose, here[i], normal)
+            elif distance == np.inf:
+                room = False
+            else:
+                note_query(here, i, pose, distance, anchor, bound)
+            if distance + near.allowed[b, i] < reach[i]:
+                _add_touch(touch, count, i, distance + near.allowed[b, i], normal, b)
+                count += 1
+    count = _add_planes(touch, count, near, here, _greatest(reach), obstacles, np.inf)
+    return _first(touch, count), room
+
+
+@compiled(error_model="numpy")
+def find_exact_touch(near, here, reach, obstacles, softest):
+    """The same with bones as they are, and without planes softer than ``softest``; ``reach`` is a
+    number.
+    """
+    bones, planes = obstacles.bones, obstacles.planes
+    touch = _no_touch(len(obstacles.poses) * len(here) + len(planes.point))
+    limits, box = np.full(len(here), reach), np.empty((2, 3))
+    farthest = _farthest(here, near.free, limits, box)
+    some, count = np.empty(len(here), np.int64), 0
+    for b in range(len(obstacles.poses)):
+        pose, bounds = obstacles.poses[b], bones.boxes[b]
+        anchor, bound = near.exact.anchor[b], near.exact.bound[b]
+        if boxes_apart(box, pose, bounds) > farthest:
+            continue
+        asked = 0
+        for i in range(len(here)):
+            if near.free[i] and lower_bound(here, i, pose, bounds, anchor, bound) <= reach:
+                some[asked] = i
+                asked += 1
+        at, distance, normal = np.empty((asked, 3)), np.empty(asked), np.empty((asked, 3))
+        for k in range(asked):
+            at[k] = here[some[k]]
+        query_bone(bones, b, pose, at, limits[:asked], distance, normal)
+        for k in range(asked):
+            i = some[k]
+            note_query(here, i, pose, distance[k], anchor, bound)
+            if distance[k] + near.allowed[b, i] < reach:
+                _add_touch(touch, count, i, distance[k] + near.allowed[b, i], normal[k], b)
+                count += 1
+    return _first(touch, _add_planes(touch, count, near, here, reach, obstacles, softest))
+
+
+@compiled(error_model="numpy")
+def _farthest(here, free, reach, box):
+    """Greatest reach of the free points, and the box about these."""
+    box_loop(here, free, box)
+    farthest = -np.inf
+    for i in range(len(here)):
+        if free[i]:
+            farthest = max(farthest, reach[i])
+    return farthest
+
+
+@compiled(error_model="numpy")
+def _greatest(reach):
+    greatest = 0.0
+    for i in range(len(reach)):
+        greatest = max(greatest, reach[i])
+    return greatest
+
+
+@compiled(error_model="numpy")
+def _exact_distance(bones, b, pose, point, normal):
+    """Distance of one point to a bone as it is, and its gradient."""
+    at, distance, gradient = point.reshape((1, 3)), np.empty(1), np.empty((1, 3))
+    query_bone(bones, b, pose, at, np.full(1, np.inf), distance, gradient)
+    normal[:] = gradient[0]
+    return distance[0]
+
+
+@compiled(error_model="numpy")
+def _no_touch(room):
+    return Touch(
+        np.empty(room, np.int64), np.empty(room), np.empty((room, 3)), np.empty(room, np.int64)
+    )
+
+
+@compiled(error_model="numpy")
+def _first(touch, count):
+    return Touch(touch.point[:count], touch.gap[:count], touch.normal[:count], touch.source[:count])
+
+
+@compiled(error_model="numpy")
+def _add_touch(touch, count, i, gap, normal, source):
+    touch.point[count] = i
+    touch.gap[count] = gap
+    touch.source[count] = source
+    for a in range(3):
+        touch.normal[count, a] = normal[a]
+
+
+@compiled(error_model="numpy")
+def _add_planes(touch, count, near, here, reach, obstacles, softest):
+    """Add the planes nearer than ``reach`` to near points; returns how many half-spaces there
+    are.
+    """
+    planes, bones = obstacles.planes, len(obstacles.poses)
+    for p in range(len(planes.point)):
+        if planes.softness[planes.kind[p]] > softest:
+            continue
+        i = np.searchsorted(near.which, planes.point[p])
+        if i == len(near.which) or near.which[i] != planes.point[p]:
+            continue
+        gap = plane_gap(planes, p, here[i])
+        if gap < reach:
+            _add_touch(touch, count, i, gap, planes.normal[p], bones + planes.kind[p])
+            count += 1
+    return count

@@ -1,0 +1,414 @@
+"""Bringing an RBF muscle's solid to equilibrium, in one compiled call that needs no lock.
+
+Each iteration finds rotations and stretches (`local_step.py`), then the nodes for these with a
+matrix that never changes and pressures that keep the volumes (`global_step.py`), and contacts in
+the same metric (`contact_forces.py`). Pressures are kept from iteration to iteration, so that the
+fixed point of the iteration is the equilibrium; Anderson acceleration gets there sooner.
+
+A surface of points on a bone of flat facets has many equilibria, because each point has to be
+lifted over each edge. A muscle on a bone has not. So the solid settles with contacts that yield a
+little, on bones whose facets are rounded (`rounded_bones.py`): one shape for each pose. What is
+then left in a bone is lifted out of it in the metric of the energy, volumes kept. The next sub-step
+starts from the settled shape, not from the lifted one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.jit import compiled
+from rbfmuscle.muscle.anderson import mix, no_memory
+from rbfmuscle.muscle.contact_forces import Law, contact_push, no_answers
+from rbfmuscle.muscle.global_step import (
+    calm_share,
+    corrected_pressures,
+    find_metric,
+    global_step,
+)
+from rbfmuscle.muscle.inversion import STIFFNESS
+from rbfmuscle.muscle.local_step import gradient_rows, local_step, start_local
+from rbfmuscle.muscle.model import SolidModel, Stiffness, carry
+from rbfmuscle.muscle.near_points import find_exact_touch, find_near, find_touch, take_near
+from rbfmuscle.muscle.rounded_bones import RoundedBones
+from rbfmuscle.muscle.state import SolidState, place_points, tension
+from rbfmuscle.simulation.contact import Obstacles
+
+# All lengths are relative to the muscle's size.
+SETTLED = 2e-5  # an iteration that moves no node farther was the last one
+SETTLED_BESIDE = 1e-4  # the same beside neighbours, whose planes are not known better
+# The same where the bones stand still and only the activation changes, and how many times the
+# iterations it may take.
+SETTLED_STILL, ROUNDS_STILL = 1e-7, 10
+LONGEST = 0.2  # a longer step is shortened to it
+GROWTH = 2.0  # a motion beyond this multiple of the least so far restarts the acceleration
+MEMORY = 5  # steps that Anderson acceleration combines
+TOLERANCE = 2e-5  # violation of a contact that is left
+MARGIN = 0.003  # obstacles are looked for beyond where a point goes by this
+NEAR = 0.03  # contact points nearer to an obstacle take part in a solve
+STALE = 0.4  # share of NEAR by which a node moves before they are chosen again
+YIELDING = 1e-4  # how far a contact yields under a pressure of 2 μ
+# Share of YIELDING by which obstacles yield where room is made in what is shown.
+SHOWN_YIELDING = 0.1
+LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
+
+DONE, NO_ROOM, DIVERGED = 0, 1, 2
+
+
+class Report(NamedTuple):
+    """How a solve ended.
+
+    ``status`` is `DONE`, `NO_ROOM` (the table of rounded bones is full: grow it and solve again)
+    or `DIVERGED`. The ``residual`` is
+    the greatest motion that an unshortened step would still make, of the muscle's size;
+    ``volume_error`` the greatest relative error of a region's volume. ``caps`` counts what ended at
+    its greatest number: the iteration, its last contact forces, lifting.
+    """
+
+    status: int
+    iterations: int
+    residual: float
+    volume_error: float
+    caps: int
+
+
+class Problem(NamedTuple):
+    """What is given through a solve."""
+
+    model: SolidModel
+    stiffness: Stiffness
+    obstacles: Obstacles
+    rounded: RoundedBones
+    springs: np.ndarray  # (N, 3) forces of the springs at held points on nodes at the origin
+    activation: float
+    tension: float  # of slack fibres
+
+
+class Step(NamedTuple):
+    """One step of the iteration."""
+
+    nodes: np.ndarray  # (N, 3)
+    pressures: np.ndarray  # (M,)
+    push: np.ndarray  # (N, 3) motion of the nodes by contact
+    moved: float  # greatest motion of a node [scene unit]
+    residual: float  # what that is without shortening
+    capped: bool  # whether contact forces are those of a capped solve
+    room: bool  # whether the table of rounded bones had room
+
+
+@compiled(error_model="numpy")
+def settle(model, stiffness, state, obstacles, rounded):
+    """The state in equilibrium under elasticity, pressures and contacts, and a `Report`."""
+    springs = np.dot(model.springs, state.anchors)
+    pull = tension(model, state.anchors)
+    given = Problem(model, stiffness, obstacles, rounded, springs, state.activation[0], pull)
+    y, pressure, local = state.nodes.copy(), state.pressures.copy(), start_local(model, state)
+    joined = local_step(model, y, given.activation, pull, local)[0]
+    metric, sound = _new_metric(given, local, joined)
+    forces = _start_forces(state.forces, obstacles)
+    near = _choose_near(given, forces, y)
+    answers, push = no_answers(near, metric), np.zeros_like(y)
+    memory = no_memory(MEMORY, y.size + len(pressure), y.size)
+    limit, most = _limits(given, state)
+    least, status, done = np.inf, DONE, 0
+    while True:
+        step = _iterate(given, y, pressure, push, local, metric, near, answers)
+        moved = step.moved
+        done += 1
+        push[:] = step.push
+        if moved > GROWTH * least or moved > LONGEST * model.size:
+            memory.steps[0] = 0
+        least = moved if moved > GROWTH * least else min(least, moved)
+        _shorten(y, pressure, step, LONGEST * model.size)
+        if not sound or not step.room or not np.isfinite(moved):
+            status = DIVERGED if step.room else NO_ROOM
+        if status != DONE or moved < limit or done == most:
+            break
+        _accelerate(y, pressure, step, memory)
+        joined = local_step(model, y, given.activation, pull, local)[0]
+        if joined > 0:
+            metric, sound = _new_metric(given, local, joined)
+            memory.steps[0] = 0
+            answers = no_answers(near, metric)
+        if np.abs(y - near.y).max() > STALE * NEAR * model.size:
+            _note_forces(near, forces)
+            near = _choose_near(given, forces, y)
+            answers = no_answers(near, metric)
+            push[:] = 0.0
+    _note_forces(near, forces)
+    caps = int(not moved < limit) + int(step.capped)
+    shown, left = _lifted(given, step.nodes, metric, near, answers)
+    settled = _settled(state, model, local, step, shown, forces)
+    error = _volume_error(model, shown)
+    report = Report(status, done, step.residual / model.size, error, caps + left)
+    return settled, report
+
+
+@compiled(error_model="numpy")
+def _limits(given, state):
+    """Motion of a node [scene unit] below which a solve ends, and the greatest number of
+    iterations.
+    """
+    size, farthest = given.model.size, 0.0
+    for i in range(len(state.step)):
+        for a in range(3):
+            farthest = max(farthest, abs(state.step[i, a]))
+    if farthest <= SETTLED_STILL * size:
+        return SETTLED_STILL * size, ROUNDS_STILL * given.model.iterations
+    beside = len(given.obstacles.planes.softness) > 0
+    return (SETTLED_BESIDE if beside else SETTLED) * size, given.model.iterations
+
+
+@compiled(error_model="numpy")
+def _new_metric(given, local, joined):
+    """The metric of corrections, with the stiffness of squeezed points; whether there is one."""
+    model, inverse = given.model, given.stiffness.inverse
+    if joined > 0:
+        inverse = _inverse_with(given.stiffness.matrix, model.cells, local.stiffened)
+    return find_metric(model.cells, local.gradient, inverse)
+
+
+@compiled(error_model="numpy")
+def _inverse_with(matrix, cells, stiffened):
+    """Inverse of the matrix with `STIFFNESS` w |F|² of the squeezed points."""
+    total = matrix.copy()
+    for q in np.flatnonzero(stiffened):
+        columns, slopes, weight = cells.columns[q], cells.slopes[q], STIFFNESS * cells.weights[q]
+        for k in range(len(columns)):
+            for m in range(len(columns)):
+                total[columns[k], columns[m]] += weight * (
+                    slopes[k, 0] * slopes[m, 0]
+                    + slopes[k, 1] * slopes[m, 1]
+                    + slopes[k, 2] * slopes[m, 2]
+                )
+    inverse = np.linalg.inv(total)
+    return 0.5 * (inverse + inverse.T)
+
+
+@compiled(error_model="numpy")
+def _choose_near(given, forces, y):
+    """The contact points near an obstacle, with the forces on them until now."""
+    model, obstacles = given.model, given.obstacles
+    found = find_near(carry(model.embedding, y), obstacles, NEAR * model.size)
+    return take_near(found, model, given.stiffness, obstacles, forces, y)
+
+
+@compiled(error_model="numpy")
+def _start_forces(forces, obstacles):
+    """Contact forces (n, obstacles) that a solve starts from: none where the obstacles are
+    others.
+    """
+    sources = len(obstacles.poses) + len(obstacles.planes.softness)
+    return forces.copy() if forces.shape[1] == sources else np.zeros((len(forces), sources))
+
+
+@compiled(error_model="numpy")
+def _note_forces(near, forces):
+    """Fill the forces (n, obstacles) on all contact points."""
+    forces[:] = 0.0
+    for k in range(len(near.which)):
+        forces[near.which[k]] = near.forces[k]
+
+
+@compiled(error_model="numpy")
+def _iterate(given, y, pressure, push, local, metric, near, answers):
+    """One global step with volumes and contacts; ``push`` is that of the step before."""
+    model, size, part = given.model, given.model.size, calm_share(pressure)
+    force = local.right + given.springs
+    new, change = global_step(model.cells, y, pressure, force, local, metric, part)
+    # Contacts that push now push in the next iteration too: where the points will then go decides
+    # what they meet.
+    here, motion, reach = _ways(near, y, new, push, MARGIN * size)
+    touch, room = find_touch(near, here, reach, given.obstacles, given.rounded)
+    law = _law(given, touch, near, YIELDING / part, part)
+    found = contact_push(touch, motion, near, metric, answers, law, near.forces, TOLERANCE * size)
+    pressures = corrected_pressures(pressure, change, found.taken, metric.factor, part)
+    largest = 0.0
+    for n in range(len(y)):
+        square = 0.0
+        for a in range(3):
+            new[n, a] += found.nodes[n, a]
+            square += (new[n, a] - y[n, a]) ** 2
+        # Written so that NaN is not lost.
+        if not square <= largest:
+            largest = square
+    moved = np.sqrt(largest)
+    return Step(new, pressures, found.nodes, moved, moved / part, found.capped, room)
+
+
+@compiled(error_model="numpy")
+def _ways(near, y, new, push, margin):
+    """Where near points are (m, 3), their motion in a step of the nodes, and how far to look for
+    obstacles: half as far again as they go in the step with the last push on top, and a margin.
+    """
+    nodes, count = len(y), len(near.which)
+    ways = np.empty((nodes, 9))
+    for n in range(nodes):
+        for a in range(3):
+            ways[n, a] = y[n, a]
+            ways[n, 3 + a] = new[n, a] - y[n, a]
+            ways[n, 6 + a] = push[n, a]
+    here, motion, reach = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    total = np.empty(9)
+    for s in range(count):
+        total[:] = 0.0
+        for k in range(near.columns.shape[1]):
+            way, share = ways[near.columns[s, k]], near.shares[s, k]
+            for a in range(9):
+                total[a] += share * way[a]
+        square = 0.0
+        for a in range(3):
+            here[s, a] = total[a]
+            motion[s, a] = total[3 + a]
+            square += (total[3 + a] + total[6 + a]) ** 2
+        reach[s] = 1.5 * np.sqrt(square) + margin
+    return here, motion, reach
+
+
+@compiled(error_model="numpy")
+def _law(given, touch, near, yielding, part):
+    """How contacts yield: by ``yielding`` of the muscle's size under a pressure of 2 μ, soft planes
+    more, up to a ``part`` of their greatest forces.
+    """
+    bones, softness = len(given.obstacles.poses), given.obstacles.planes.softness
+    give = yielding * given.model.size / given.model.area
+    law = Law(np.empty(len(touch.point)), np.empty(len(touch.point)))
+    for c in range(len(touch.point)):
+        kind = touch.source[c] - bones
+        law.yielding[c] = give * (softness[kind] if kind >= 0 else 1.0)
+        law.most[c] = near.most[touch.point[c]] * part
+    return law
+
+
+@compiled(error_model="numpy")
+def _shorten(y, pressure, step, longest):
+    """Shorten a step, in place, where a node goes farther than ``longest``."""
+    if step.moved > longest:
+        share = longest / step.moved
+        step.nodes[:] = y + share * (step.nodes - y)
+        step.pressures[:] = pressure + share * (step.pressures - pressure)
+
+
+@compiled(error_model="numpy")
+def _accelerate(y, pressure, step, memory):
+    """Turn nodes and pressures, in place, into those that the next iteration starts from."""
+    count = y.size
+    here, there = np.empty(count + len(pressure)), np.empty(count + len(pressure))
+    here[:count] = y.ravel()
+    here[count:] = pressure
+    there[:count] = step.nodes.ravel()
+    there[count:] = step.pressures
+    mixed = mix(memory, here, there)
+    y[:] = mixed[:count].reshape(y.shape)
+    pressure[:] = mixed[count:]
+
+
+@compiled(error_model="numpy")
+def _carry_near(near, y):
+    """Where near points are, (m, 3)."""
+    out = np.zeros((len(near.which), 3))
+    for s in range(len(out)):
+        for k in range(near.columns.shape[1]):
+            for a in range(3):
+                out[s, a] += near.shares[s, k] * y[near.columns[s, k], a]
+    return out
+
+
+@compiled(error_model="numpy")
+def _push_out(given, touch, near, metric, answers, yielding):
+    """Motion (N, 3) of nodes that stand still, out of obstacles."""
+    still, none = np.zeros((len(near.which), 3)), np.zeros_like(near.forces)
+    law, tolerance = _law(given, touch, near, yielding, 1.0), TOLERANCE * given.model.size
+    return contact_push(touch, still, near, metric, answers, law, none, tolerance).nodes
+
+
+@compiled(error_model="numpy")
+def _lifted(given, y, metric, near, answers):
+    """Nodes (N, 3), moved so far that no contact point is left in an obstacle that does not yield;
+    1 where some are left all the same, else 0.
+    """
+    size = given.model.size
+    for turn in range(LIFTS + 1):
+        here = _carry_near(near, y)
+        touch = find_exact_touch(near, here, MARGIN * size, given.obstacles, 1.0)
+        if len(touch.gap) == 0 or touch.gap.min() > -TOLERANCE * size:
+            return y, 0
+        if turn < LIFTS:
+            y = y + _push_out(given, touch, near, metric, answers, 0.0)
+    return y, 1
+
+
+@compiled(error_model="numpy")
+def _settled(state, model, local, step, shown, forces):
+    """The state after a solve; what the solve added to the prediction becomes the trend."""
+    y, pressure = step.nodes, step.pressures
+    correction, pressed, last = state.correction, state.correction_pressures, state.last_step
+    if np.abs(state.step).max() > SETTLED * model.size:
+        correction, pressed = y - state.start, pressure - state.start_pressures
+        last = state.step
+    return SolidState(
+        nodes=y,
+        shown=shown,
+        points=place_points(model, shown, state.points),
+        rotations=local.rotations,
+        stretches=local.stretches,
+        pressures=pressure,
+        forces=forces,
+        anchors=state.anchors,
+        step=state.step,
+        start=state.start,
+        start_pressures=state.start_pressures,
+        last_step=last,
+        correction=correction,
+        correction_pressures=pressed,
+        activation=state.activation,
+    )
+
+
+@compiled(error_model="numpy")
+def _volume_error(model, y):
+    """Greatest relative error of a region's volume for nodes y (N, 3)."""
+    cells = model.cells
+    volumes = np.zeros(len(cells.volumes))
+    for i in range(len(cells.weights)):
+        r0, r1, r2 = gradient_rows(y, cells.columns[i], cells.slopes[i])
+        volumes[cells.region[i]] += cells.weights[i] * (
+            r0[0] * (r1[1] * r2[2] - r1[2] * r2[1])
+            - r0[1] * (r1[0] * r2[2] - r1[2] * r2[0])
+            + r0[2] * (r1[0] * r2[1] - r1[1] * r2[0])
+        )
+    return np.abs(volumes / cells.volumes - 1.0).max()
+
+
+@compiled(error_model="numpy")
+def make_room(model, stiffness, state, obstacles, rounded):
+    """The state whose shown nodes are the settled ones, moved by the planes of neighbours and then
+    out of bones.
+    """
+    pull = tension(model, state.anchors)
+    springs = np.zeros_like(state.nodes)
+    given = Problem(model, stiffness, obstacles, rounded, springs, state.activation[0], pull)
+    local, y = start_local(model, state), state.nodes
+    joined = local_step(model, y, given.activation, pull, local)[0]
+    metric, _ = _new_metric(given, local, joined)
+    near = _choose_near(given, _start_forces(state.forces, obstacles), y)
+    answers, size = no_answers(near, metric), model.size
+    touch = find_exact_touch(near, _carry_near(near, y), MARGIN * size, obstacles, np.inf)
+    y = y + _push_out(given, touch, near, metric, answers, SHOWN_YIELDING * YIELDING)
+    shown, _ = _lifted(given, y, metric, near, answers)
+    return SolidState(
+        nodes=state.nodes,
+        shown=shown,
+        points=place_points(model, shown, state.points),
+        rotations=state.rotations,
+        stretches=state.stretches,
+        pressures=state.pressures,
+        forces=state.forces,
+        anchors=state.anchors,
+        step=state.step,
+        start=state.start,
+        start_pressures=state.start_pressures,
+        last_step=state.last_step,
+        correction=state.correction,
+        correction_pressures=state.correction_pressures,
+        activation=state.activation,
+    )
