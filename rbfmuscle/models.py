@@ -22,7 +22,8 @@ class ModelKind(NamedTuple):
 
     ``build`` makes the model of a muscle of a scene from the checked table of its settings,
     ``options`` is that table's class, ``points`` says in words what the model solves for, building
-    nothing. ``title`` is its name in tables and pictures, with ``{}`` for its number of sweeps, ``sweeps``.
+    nothing. ``title`` is its name in tables and pictures, with ``{}`` for its number of sweeps,
+    ``sweeps``.
     """
 
     # Both take the options' own class, which a type of a function cannot say.
