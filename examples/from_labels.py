@@ -3,7 +3,6 @@
 Three commands lead from a volume of labels, as segmentation programs write it, to a report of
 moment arms:
 
-    pip install -e '.[labels]'
     rbfmuscle new hip.nii.gz --labels names.json
     rbfmuscle check hip_scene/scene.toml --picture
     rbfmuscle run hip_scene/scene.toml -o out

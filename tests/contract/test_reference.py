@@ -19,8 +19,6 @@ ERRORS = "Errors and warnings"
 NAMES = [name for topic, names in TOPICS.items() if topic != ERRORS for name in names] + [
     "RBFMuscleError"
 ]
-# Packages without which an example cannot run.
-NEEDED = {"show": "viser"}
 # Modules of which every example is run, not the public names' alone.
 MODULES = (
     "rbfmuscle.geometry.surfaces",
@@ -38,8 +36,6 @@ def run_examples(tests):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_example_of_a_public_name_runs(name):
-    if name in NEEDED:
-        pytest.importorskip(NEEDED[name])
     value = getattr(rbfmuscle, name)
     module = importlib.import_module(value.__module__)
     tests = doctest.DocTestFinder(recurse=False).find(value, name, module=module)

@@ -40,6 +40,29 @@ def test_typed_marker_templates_and_scripts_travel_with_the_packages():
         assert packed == {path for path in files if path.suffix not in (".py", ".pyc")}
 
 
+def test_ci_runs_what_a_user_runs():
+    """System packages, then the two commands of the README and of CONTRIBUTING."""
+    lines = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
+    made = [line for line in lines if not line.startswith("#")]
+    assert not any(re.search(r"\bpip\b|\.venv", line) for line in made)
+    assert re.findall(r"\bmake (?!\|)([\w-]+)", "\n".join(made)) == ["test", "check"]
+
+
+def test_what_tests_import_is_installed_for_them():
+    """No extra besides ``dev`` is needed for ``make test``; ``view`` and ``new`` need none."""
+    project = PROJECT["project"]
+    found = {
+        name: {re.split(r"[^\w-]", text)[0] for text in rows}
+        for name, rows in project["optional-dependencies"].items()
+    }
+    ordinary = {re.split(r"[^\w-]", text)[0] for text in project["dependencies"]}
+    assert {"viser", "nibabel", "pynrrd"} <= ordinary
+    assert found["usd"] | found["cluster"] | {"scikit-fem"} <= found["dev"]
+    for path in (ROOT / "tests").rglob("*.py"):
+        skipped = re.findall(r'importorskip\("(\w+)', path.read_text(encoding="utf-8"))
+        assert set(skipped) <= {"opensim"}, path
+
+
 def run(*command, **options):
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(

@@ -190,7 +190,6 @@ def test_a_process_that_dies_takes_only_its_own_point(tmp_path):
 @pytest.fixture
 def cluster(tmp_path):
     """Address of a Dask scheduler on loopback, and its two workers, which nobody replaces."""
-    pytest.importorskip("distributed")
     file = tmp_path / "scheduler.json"
     home = ["--scheduler-file", str(file), "--no-dashboard"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}

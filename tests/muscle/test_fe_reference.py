@@ -18,7 +18,6 @@ HALF = np.array([5.0, 5.0, 20.0])
 
 
 def block(cells=(3, 3, 4)):
-    pytest.importorskip("skfem")
     from peers.finite_element import HexSolid, brick_grid
 
     cube, bricks = brick_grid(cells)
@@ -26,7 +25,7 @@ def block(cells=(3, 3, 4)):
 
 
 def prism(cells=(2, 2, 5)):
-    skfem = pytest.importorskip("skfem")
+    import skfem
     from peers.finite_element import TetSolid
 
     mesh = skfem.MeshTet.init_tensor(*(np.linspace(-h, h, n + 1) for h, n in zip(HALF, cells)))

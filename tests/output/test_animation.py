@@ -5,7 +5,6 @@ import shutil
 import struct
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +49,6 @@ def changing(folder, tmp_path):
     return copy, np.array(ball.vertices), np.array(ball.faces)
 
 
-@pytest.mark.skipif(find_spec("pxr") is None, reason="usd-core is not installed")
 class TestUsd:
     def read(self, path):
         from pxr import Usd
@@ -199,7 +197,6 @@ def test_files_with_y_up_or_z_up_stand_upright_whatever_the_data(folder, truth, 
     np.testing.assert_allclose(
         morphed(tree, numbers, "biceps", 1)[0], upright, rtol=0, atol=TOLERANCE
     )
-    pytest.importorskip("pxr.UsdGeom")
     (path,) = export_run(copy, "usd", output=tmp_path)
     stage, meshes = TestUsd().read(path)
     found = TestUsd().world(stage, meshes["biceps"], 1)
@@ -221,7 +218,6 @@ def test_times_of_a_motion_are_those_of_the_files(folder, tmp_path):
 
 
 def test_names_that_usd_does_not_know_stay_apart():
-    pytest.importorskip("pxr.UsdGeom")
     from rbfmuscle.output.animation.usd import identifier
 
     used = set()

@@ -57,16 +57,7 @@ def test_wrong_use_is_one_line(run_folder, capsys, arguments, says):
     assert code == 2 and says in err.splitlines()[-1]
 
 
-def test_missing_viser_is_one_line(run_folder, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    code, _, err = call(capsys, "view", run_folder, "--no-browser")
-    assert code == 7
-    lines = [line for line in err.splitlines() if line.startswith("rbfmuscle:")]
-    assert len(lines) == 1 and 'run: python -m pip install "viser>=1.1,<2"' in lines[0]
-
-
 def test_address_is_printed_and_answers_until_interrupted(run_folder):
-    pytest.importorskip("viser")
     with subprocess.Popen(
         [sys.executable, "-m", "rbfmuscle", "view", run_folder, "--no-browser"],
         stdout=subprocess.PIPE,

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.validation import MeshError, MissingPartError, UsageError
+from rbfmuscle.validation import MeshError, UsageError
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
 # Stated limits: bytes of one volume once unpacked, labels, and the edge of a voxel [mm].
@@ -61,8 +61,7 @@ def read_labels(path: Path, *, names: Path | None = None) -> LabelVolume:
     """Read a volume of labels, or a folder with one mask a file, named after what it masks.
 
     ``names`` is a table of names, as `read_names` takes it. MeshError if the volume cannot be read,
-    has not three axes, no label, too many, or no usable voxel size; MissingPartError if the package
-    that reads the format is not there.
+    has not three axes, no label, too many, or no usable voxel size.
     """
     volume = _read_folder(path) if path.is_dir() else _read_file(path)
     if names is not None:
@@ -112,11 +111,6 @@ def _read_file(path):
     )
     try:
         data, affine, unit, names = read(path)
-    except ImportError as error:
-        needed = f"reading {kind} needs {error.name}"
-        raise MissingPartError(
-            f"{needed}: pip install -e '.[labels]' in rbfmuscle's folder"
-        ) from None
     except MeshError:
         raise
     except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
