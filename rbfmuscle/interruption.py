@@ -8,6 +8,7 @@ import atexit
 import contextlib
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -38,9 +39,9 @@ def install(*, as_json: bool = False, watch: bool = False) -> None:
     _State.as_json = as_json
     _answer_by(_handle)
     if watch:
-        reader, writer = os.pipe()
-        os.set_blocking(writer, False)
-        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        reader, writer = socket.socketpair()  # a pipe cannot be made non-blocking on Windows
+        writer.setblocking(False)
+        signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
         threading.Thread(target=_listen, args=(reader,), daemon=True).start()
         # The first of all that is registered is the last that is called: signals are ignored while
         # Python exits.
@@ -91,7 +92,7 @@ def _handle(number, frame):
 
 def _listen(reader):
     while True:
-        number = os.read(reader, 1)
+        number = reader.recv(1)
         if not number:
             return
         # An interrupt that the handler has taken is not this thread's, however late it wakes.
@@ -102,7 +103,7 @@ def _listen(reader):
 def _end():
     """Exit without unwinding."""
     if not _ENDING.acquire(blocking=False):  # the other of the handler and the listener is at it
-        signal.pause()
+        threading.Event().wait()
     with contextlib.suppress(OSError):
         if sys.stderr is not None and os.isatty(2):
             os.write(2, _SHOW_CURSOR)

@@ -5,6 +5,8 @@ are not.
 import os
 import re
 import signal
+import subprocess
+import sys
 import zlib
 
 import numpy as np
@@ -102,6 +104,39 @@ class TestReader:
         os.kill(polydata._child(os.getpid()).pid, number)
         assert_refused(path, capfd)
         monkeypatch.undo()
+        assert_is_ball(path)
+
+    @pytest.mark.parametrize("form", ["pickle", "array of objects", "size", "shape", "nothing"])
+    def test_answer_of_a_process_that_was_taken_over_is_never_run(
+        self, tmp_path, monkeypatch, capfd, form
+    ):
+        """The file that it would make is not there, and the next file is read."""
+        victim = tmp_path / "victim"
+        code = f"""
+import io, numpy as np, os, pickle, sys
+class Evil:
+    def __reduce__(self):
+        return os.mkdir, ({str(victim)!r},)
+plain, objects, shape = io.BytesIO(), io.BytesIO(), io.BytesIO()
+np.save(objects, np.array([Evil()], dtype=object), allow_pickle=True)
+np.save(shape, np.zeros((3, 2)))
+whole = lambda data: len(data).to_bytes(8, "little") + data
+sys.stdout.buffer.write({{
+    "pickle": pickle.dumps(Evil()), "array of objects": whole(objects.getvalue()),
+    "size": (1 << 62).to_bytes(8, "little"), "shape": whole(2 * shape.getvalue()), "nothing": b"",
+}}[{form!r}])
+"""
+        path = write_mesh(tmp_path / "a.vtp", BALL, "vtp-Appended-ZLib")
+        polydata._child.cache_clear()
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                polydata,
+                "start_child",
+                lambda *_: subprocess.Popen([sys.executable, "-c", code], **pipes),
+            )
+            assert_refused(path, capfd)
+        assert not victim.exists()
         assert_is_ball(path)
 
     def test_file_that_unpacks_without_end_is_refused(self, tmp_path, capfd):

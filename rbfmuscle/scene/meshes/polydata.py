@@ -1,18 +1,19 @@
 """VTK and VTP files, read by pyvista in one process beside this one: some broken files end it."""
 
 import atexit
+import contextlib
+import io
 import os
-import pickle
-import select
 import subprocess
 import threading
 from functools import cache
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
 from rbfmuscle.child import Outbox, end_child, listen, send, start_child
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Array, Floats, Integers
 from rbfmuscle.validation import MeshError
 
 PATIENCE = 120.0  # Time after which a file that is not read is refused [s].
@@ -20,6 +21,7 @@ MEMORY = (
     2 << 30
 )  # Address space of the process that reads [bytes]: a small file may unpack to anything.
 _LOCK = threading.Lock()
+_SIZE = 8  # bytes of the size that stands before an answer
 
 
 def read_polydata(path: str | Path) -> tuple[Floats, Integers]:
@@ -29,20 +31,69 @@ def read_polydata(path: str | Path) -> tuple[Floats, Integers]:
     with _LOCK:
         child = _child(os.getpid())
         assert child.stdout is not None  # start_child asks for a pipe
+        late = threading.Timer(PATIENCE, child.kill)
+        late.daemon = True
+        late.start()
         try:
             send(child.stdin, str(Path(path).absolute()))
-            if not select.select([child.stdout], [], [], PATIENCE)[0]:
-                raise EOFError
-            found: tuple[Floats, Integers] | str = pickle.load(child.stdout)
-        except (OSError, EOFError, pickle.UnpicklingError):
-            end_child(child)
-            _child.cache_clear()
+            found = _receive(child.stdout)
+        except (OSError, EOFError, ValueError, MemoryError):
+            _end(child)
             found = "VTK ends, or does not end, at it"
+        except BaseException:  # its answer would be taken for that of the next file
+            _end(child)
+            raise
+        finally:
+            late.cancel()
     if isinstance(found, str):
         raise MeshError(
             f"{path}: not a readable file of VTK PolyData ({found}); export the mesh again"
         )
     return found
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    end_child(child)
+    _child.cache_clear()
+
+
+def _receive(pipe: IO[bytes]) -> tuple[Floats, Integers] | str:
+    """An answer, points and triangles or why there are none; EOFError or ValueError if it is none.
+
+    Arrays alone, as a process that has read a hostile file may send anything.
+    """
+    size = int.from_bytes(_read_whole(pipe, _SIZE), "little")
+    if size > MEMORY:
+        raise ValueError("the answer is larger than the process that gives it")
+    content = io.BytesIO(_read_whole(pipe, size))
+    first = np.load(content, allow_pickle=False)
+    if first.dtype.kind == "U":
+        return str(first)
+    corners = np.load(content, allow_pickle=False)
+    for array, kind in ((first, "f8"), (corners, "i8")):
+        if array.dtype != kind or array.ndim != 2 or array.shape[1] != 3:
+            raise ValueError("the answer is no mesh")
+    return first, corners
+
+
+def _read_whole(pipe: IO[bytes], size: int) -> bytes:
+    content = pipe.read(size)
+    if len(content) < size:
+        raise EOFError
+    return content
+
+
+def _reply(pipe: IO[bytes], *arrays: Array) -> None:
+    """Send arrays, which `_receive` takes; end the process where nobody reads."""
+    content = io.BytesIO()
+    for array in arrays:
+        np.save(content, array, allow_pickle=False)
+    try:
+        pipe.write(content.tell().to_bytes(_SIZE, "little"))
+        pipe.write(content.getvalue())
+        pipe.flush()
+    except BrokenPipeError:
+        os._exit(0)
 
 
 @cache
@@ -55,17 +106,20 @@ def _child(process: int) -> subprocess.Popen[bytes]:
 
 def _answer() -> None:
     """Take paths, and give what the files hold or why they cannot be read."""
-    import resource
-
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # VTK prints pages
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    with contextlib.suppress(ImportError):  # Windows has no such limit
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     outbox, asked = Outbox(), listen()
     while True:
         path = asked.get()
         try:
-            outbox.put(_read(path))
+            arrays: tuple[Array, ...] = _read(path)
         except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
-            outbox.put(" ".join(str(error).split())[:200] or type(error).__name__)
+            text = " ".join(str(error).split())[:200] or type(error).__name__
+            arrays = (np.array(text),)
+        _reply(outbox.file, *arrays)
 
 
 def _read(path: str) -> tuple[Floats, Integers]:
