@@ -142,11 +142,6 @@ def motion_direction(poses: Sequence[Mapping[str, Floats]], body: Floats) -> Flo
     return axis if axis @ usual > 0 or (axis @ usual == 0 and axis[1] < 0) else -axis
 
 
-def tendon_name(muscle: str) -> str:
-    """Name of the mesh of a muscle's tendons in files and viewers."""
-    return f"{muscle}_tendon"
-
-
 def tendon_mesh(
     muscle: Muscle, tendons: Mapping[str, TendonLine]
 ) -> tuple[Floats, Integers] | None:

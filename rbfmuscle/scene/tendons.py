@@ -41,6 +41,11 @@ DIRECTIONS = 64  # directions in which a convex hull is begun
 BonePoint: TypeAlias = tuple[str, Floats]
 
 
+def tendon_name(muscle: str) -> str:
+    """Name of the mesh of a muscle's tendons in files and viewers."""
+    return f"{muscle}_tendon"
+
+
 class TendonLine(NamedTuple):
     """A tendon as it is drawn: points (n, 3) from the belly's end to the insertion, and its radii
     at both.

@@ -27,6 +27,7 @@ COSTLY = 0.1
 READ = (
     1.0  # Time in which a browser has read a coloured mesh [s]; the one before it is removed then.
 )
+LONGEST = 300  # characters of a message
 PACE = 0.04  # Least time of a picture while a motion is played [s].
 FIELD_OF_VIEW = 0.5
 FIRST = (-1.4, 1.6, 0.5)  # Where the camera stands at first, along the body's axes.
@@ -158,8 +159,10 @@ class Page:
             except SolveError as error:
                 more = self._rest(f"Back to rest: {error}")
             except RBFMuscleError as error:
-                more, self._message = False, str(error)
-                self._write()
+                more = self._show_message(str(error))
+            except Exception as error:  # noqa: BLE001 - whatever it is, the page goes on
+                text = f"A bug: {type(error).__name__}: {error}; press Rest, and report it"
+                more = self._show_message(text)
             self.server.flush()
             if more:
                 time.sleep(
@@ -222,6 +225,13 @@ class Page:
                 side.draw(look, self._probes, None if other is None else other.picture)
             self._write()
             self.panel.plot_on(sides)
+
+    def _show_message(self, text: str) -> bool:
+        """Show a text as one line; returns that no picture has to follow by itself."""
+        self._message = " ".join(text.split())[:LONGEST]
+        self.panel.play.value = False
+        self._write()
+        return False
 
     def _write(self) -> None:
         sides = [side for side in self.sides if side.figure is not None]

@@ -2,6 +2,7 @@
 needed.
 """
 
+import html
 import math
 from collections.abc import Callable
 from typing import Any
@@ -104,24 +105,28 @@ class Panel:
 
     def write(self, sides: list[Side], texts: list[str]) -> None:
         """Write the scale of the colours, the numbers of all muscles and texts."""
-        colouring, units = COLOURINGS[self.colour.value], self.source.units
+        colouring, units = COLOURINGS[self.colour.value], html.escape(self.source.units)
         bar = "" if colouring is None else legend(colouring, units, self.source.millimetre)
-        head = (" / ".join(side.choice for side in sides), "volume [%]", f"in bones [{units}]")
+        head = (
+            html.escape(" / ".join(side.choice for side in sides)),
+            "volume [%]",
+            f"in bones [{units}]",
+        )
         rows = [f"<tr><th style='text-align:left'>{'</th><th>'.join(head)}</th></tr>"]
         for name, colour in self.source.colours.items() if sides else ():
-            cells = [f"<span style='color:{colour}'>■</span> {name.replace('_', ' ')}"]
+            cells = [f"<span style='color:{colour}'>■</span> {html.escape(name.replace('_', ' '))}"]
             for key, digits in (("volume", 3), ("depth", 2)):
                 # 0.0 is added so that no -0 is shown.
-                numbers = (
-                    f"{round(side.numbers[name][key], digits) + 0.0:.{digits}f}" for side in sides
-                )
+                known = (side.numbers.get(name, {}).get(key, math.nan) for side in sides)
+                numbers = (f"{round(number, digits) + 0.0:.{digits}f}" for number in known)
                 cells.append(" / ".join(numbers).replace("nan", "–"))
             rows.append(f"<tr><td style='text-align:left'>{'</td><td>'.join(cells)}</td></tr>")
         self._numbers.content = (
             f"<div style='padding:4px 12px;font-size:12px'>{bar}<div "
             "style='max-height:170px;overflow:auto'>"
             "<table style='width:100%;text-align:right;line-height:1.25'>"
-            f"{''.join(rows)}</table></div>{'<br>'.join(text for text in texts if text)}</div>"
+            f"{''.join(rows)}</table></div>"
+            f"{'<br>'.join(html.escape(text) for text in texts if text)}</div>"
         )
 
     def plot_on(self, sides: list[Side]) -> None:

@@ -6,7 +6,8 @@ import contextlib
 import http
 import io
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from types import FunctionType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.validation import MissingPartError, UsageError
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 LOOPBACK = "127.0.0.1"
-INSTALL = 'python -m pip install "viser>=1.1,<2"'  # as the extra `web` in pyproject.toml has it
 
 
 class Gate:
@@ -49,47 +49,61 @@ class Gate:
         return self.inner(connection, request)
 
 
-@contextlib.contextmanager
-def _every_request_through(gate: Gate) -> Iterator[None]:
-    """Put the gate before any websocket server that starts meanwhile; viser has no setting
-    for it.
-    """
-    from websockets.asyncio import server as module
+def _with_globals(function: Callable[..., Any], **names: Any) -> Callable[..., Any]:
+    """A copy of a function that sees other values of some global names of its module."""
+    seen = {**function.__globals__, **names}
+    copy = FunctionType(
+        function.__code__, seen, function.__name__, function.__defaults__, function.__closure__
+    )
+    copy.__kwdefaults__ = function.__kwdefaults__
+    return copy
 
-    plain = module.serve
+
+def _gated_server(gate: Gate) -> "type[ViserServer]":
+    """A class of viser's server whose requests go through a gate.
+
+    Viser has no setting for it. Copies of the two functions that start its websocket server see
+    another ``serve``; no module is changed, and no other server of the process is concerned.
+    """
+    import viser
+    import websockets.asyncio.server
+    from viser import infra
 
     def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         gate.inner = process_request
-        return plain(*arguments, process_request=gate, **options)
+        return websockets.asyncio.server.serve(*arguments, process_request=gate, **options)
 
-    module.serve = serve
-    try:
-        yield
-    finally:
-        module.serve = plain
+    server = SimpleNamespace(**{**vars(websockets.asyncio.server), "serve": serve})
+    seen = SimpleNamespace(**{**vars(websockets), "asyncio": SimpleNamespace(server=server)})
+
+    class GatedWebsockServer(infra.WebsockServer):
+        _background_worker = _with_globals(infra.WebsockServer._background_worker, websockets=seen)
+
+    inside = SimpleNamespace(**{**vars(infra), "WebsockServer": GatedWebsockServer})
+
+    class GatedServer(viser.ViserServer):
+        __init__ = _with_globals(viser.ViserServer.__init__, infra=inside)
+
+    return GatedServer
 
 
 def open_server(port: int = 0) -> "tuple[ViserServer, str]":
     """Start a server on the loopback address, at any free port for 0; return it and its address
     with the token.
 
-    MissingPartError if viser is not installed, or does not let its requests be checked.
+    MissingPartError if viser does not let its requests be checked.
     """
-    try:
-        import viser
-    except ImportError:
-        raise MissingPartError(
-            f"the viewer needs viser, which is not installed; run: {INSTALL}"
-        ) from None
+    import viser
+
     if not 0 <= port <= 65535:
         raise UsageError(f"--port {port}: ports go from 0 to 65535")
     gate = Gate(secrets.token_urlsafe(16))
-    with _every_request_through(gate), contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=LOOPBACK, port=port, label="rbfmuscle", verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = _gated_server(gate)(host=LOOPBACK, port=port, label="rbfmuscle", verbose=False)
     if gate.inner is None:
         server.stop()
         raise MissingPartError(
-            f"requests to viser {viser.__version__} cannot be checked; run: {INSTALL}"
+            f"requests to viser {viser.__version__} cannot be checked; install another version"
         )
     # Software drawing takes long for shadows, and longer for light from an image.
     server.scene.configure_default_lights(cast_shadow=False)

@@ -11,7 +11,8 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, surface_depth
-from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, linear_rgb, tendon_name
+from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, linear_rgb
+from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
 
 BONE_TRIANGLES = 6000  # Software drawing pays for each of them in every picture.

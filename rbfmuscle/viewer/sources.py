@@ -12,12 +12,13 @@ from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.models import build_models, configure_scene, model_names
-from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh, tendon_name
+from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.live import LiveSession, live_fields
 from rbfmuscle.validation import UsageError
 

@@ -11,15 +11,13 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-
-import rbfmuscle as rm
-
-pytest.importorskip("viser")
 from browser import Browser, wait_for
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+import rbfmuscle as rm
 from rbfmuscle.viewer.page import Page
+from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.sources import LiveSource
 
 FRAME, FLEXION = 0, 1  # sliders in their order
@@ -160,6 +158,20 @@ def test_solve_error_sets_controls_to_rest_and_says_so(page, tab):
     wait_for(lambda: "planted" in tab.text(), SLOW)
 
 
+def test_unexpected_error_is_one_line_and_the_page_goes_on(page):
+    wait_for(lambda: arrived(page), SLOW)
+    with pytest.MonkeyPatch.context() as patch:
+        planted = ZeroDivisionError("planted <b>\nbug")
+        patch.setattr(page.sides[0].figure, "advance", Mock(side_effect=planted))
+        page.panel.controls["hip.flexion"].value = 4.0
+        said = "A bug: ZeroDivisionError: planted &lt;b&gt; bug; press Rest"
+        wait_for(lambda: said in page.panel._numbers.content, SLOW)
+    page.panel.controls["hip.flexion"].value = 6.0
+    wait_for(lambda: abs(degrees(page) - 6.0) < 1e-6, SLOW)
+    page._touch(rest=True)
+    wait_for(lambda: page.panel.controls["hip.flexion"].value == 0 and arrived(page), SLOW)
+
+
 def status(page, path, host=None):
     place = urlsplit(page.address).netloc
     client = http.client.HTTPConnection(place, timeout=20)
@@ -201,6 +213,24 @@ def test_websocket_opens_for_the_own_page_alone(page, origin, path, opens):
     refused = nullcontext() if opens else pytest.raises(InvalidStatus, match="403")
     with refused, connect(target, **asked) as socket:
         assert socket.recv(timeout=20)
+
+
+def test_other_websocket_servers_of_the_process_are_not_gated(page):
+    """While ours starts, too: the function that starts them is never another."""
+    import websockets.asyncio.server as module
+    from viser import infra
+
+    seen, plain, start = [], module.serve, infra.WebsockServer.start
+
+    def watched(self):
+        start(self)
+        seen.append(module.serve)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(infra.WebsockServer, "start", watched)
+        server, _ = open_server()
+        server.stop()
+    assert seen == [plain] and module.serve is plain
 
 
 @pytest.mark.skipif(

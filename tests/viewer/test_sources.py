@@ -1,5 +1,7 @@
 """What a viewer shows of scenes and saved runs, without a browser."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import toy_scene
@@ -9,6 +11,7 @@ import rbfmuscle as rm
 from rbfmuscle.metrics.mesh_distance import BoneProbe
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession
+from rbfmuscle.viewer.panel import Panel
 from rbfmuscle.viewer.side import vertex_values
 from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture
 
@@ -88,6 +91,20 @@ def test_controls_of_the_phantom_have_joint_unit_and_limits():
     assert source.controls["hip.flexion"] == ("hip", "flexion [°]", -30.0, 60.0, 0.0)
     assert source.choices[0] == "pbd" and len(set(source.choices)) == len(source.choices)
     assert source.motion[-1]["hip.flexion"] == pytest.approx(60.0)
+
+
+def test_no_text_of_a_run_is_read_as_html():
+    """Names, units and messages are a stranger's: they are shown as they are."""
+    hostile = "<img src=x onerror=alert(1)>"
+    colours = {hostile: "#000000"}
+    panel = SimpleNamespace(
+        colour=SimpleNamespace(value="group"),
+        source=SimpleNamespace(units=hostile, millimetre=1.0, colours=colours),
+        _numbers=SimpleNamespace(content=""),
+    )
+    Panel.write(panel, [SimpleNamespace(choice=hostile, numbers={})], [hostile])
+    shown = panel._numbers.content
+    assert "<img" not in shown and shown.count("&lt;img src=x onerror=alert(1)&gt;") == 4
 
 
 def test_activation_of_a_muscle_is_set_and_coloured():
