@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.experiments.comparison import add_distances, measure_run, write_tables
+from rbfmuscle.folders import OutputFolder
 from rbfmuscle.models import COMPARED, build_models, configure_scene, model_kind, model_title
 from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.output.writer import check_writable
+from rbfmuscle.output.writer import run_folder
 from rbfmuscle.progress import stage
 from rbfmuscle.run import stream_run
 from rbfmuscle.scene.objects import Motion
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
 
+FILES = ("comparison.json", "comparison.csv", "report.html")
 COARSER = 5  # the motion is repeated with steps this many times as long
 
 
@@ -62,7 +64,7 @@ def compare_models(
     Raises
     ------
     UsageError
-        On an unknown model or setting.
+        On an unknown model or setting, or a folder that holds something else.
     SolveError
         If no model could be solved.
 
@@ -77,7 +79,11 @@ def compare_models(
     """
     variants = _variants(open_scene(scene), list(models), settings or {}, frames)
     folder = Path(directory)
-    check_writable(folder)
+    output = OutputFolder(folder, "compare", FILES)
+    for name in variants:
+        run_folder(folder / name)
+    output.clear()
+    output.add(*FILES)
     first = next(iter(variants.values()))
     last = len(first.motion) - 1
     poses = sorted({0, last // 2, last})

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
@@ -219,6 +220,11 @@ def _range(scene, name, given):
     raise UsageError(f"coordinate {name!r} has no range; give --range {name}=LOW:HIGH")
 
 
+def paths_folder(directory: Path) -> OutputFolder:
+    """The folder of fitted paths; UsageError if something in it is in the way."""
+    return OutputFolder(directory, "paths", ("paths.xml", "errors.csv"))
+
+
 def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[str]:
     """Fit every muscle, write the files, and return lines that say how well the fits hold where
     they were not made.
@@ -239,12 +245,12 @@ def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[s
             + (f"; {row['failed']} poses could not be solved" if row["failed"] else "")
         )
     turning = {name: f.motion != "translation" for name, f in all_coordinates(scene.joints).items()}
-    directory.mkdir(parents=True, exist_ok=True)
-    write_paths(directory / "paths.xml", fitted, scene.length(1000.0), turning)
-    with (directory / "errors.csv").open("w", encoding="utf-8", newline="") as out:
-        writer = csv.DictWriter(out, fieldnames=list(errors[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(errors)
+    with paths_folder(directory).staged() as stage:
+        write_paths(stage / "paths.xml", fitted, scene.length(1000.0), turning)
+        with (stage / "errors.csv").open("w", encoding="utf-8", newline="") as out:
+            writer = csv.DictWriter(out, fieldnames=list(errors[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(errors)
     file = directory / "paths.xml"
     return [
         *lines,

@@ -116,7 +116,7 @@ class Recording:
         self, sink: RunWriter | MemorySink, *, progress: Callable[[int, int], None] | None = None
     ) -> None:
         """Run the whole motion into a sink, which is closed whatever ends it."""
-        self.status, self.message = "interrupted", "interrupted"
+        self.status, self.message = "failed", "a bug"
         try:
             sink.write_info(self.info("running"))
             for frame, measured in self.share.frames():
@@ -128,8 +128,14 @@ class Recording:
                 if progress is not None:
                     progress(len(self.written), len(self.scene.motion))
             self.status, self.message = "complete", ""
-        except RBFMuscleError as error:
-            self.status, self.message = "failed", str(error)
+        except KeyboardInterrupt:
+            self.status, self.message = "interrupted", "interrupted"
+            raise
+        except (RBFMuscleError, MemoryError, OSError) as error:
+            self.message = str(error) or type(error).__name__
+            raise
+        except BaseException as error:
+            self.message = f"a bug: {type(error).__name__}: {error}"
             raise
         finally:
             self.close()

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rbfmuscle.folders import LIST, read_list
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.metrics.summary import parse_limits
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun, saved_frames
-from rbfmuscle.output.writer import RunWriter, check_writable
+from rbfmuscle.output.writer import RunWriter, run_folder
 from rbfmuscle.progress import Progress
 from rbfmuscle.recording import MemorySink, Recording
 from rbfmuscle.scene.phantom import open_scene
@@ -121,14 +122,15 @@ def stream_run(
     Raises
     ------
     UsageError
-        If a setting is unknown or impossible, or the folder cannot be written to.
+        If a setting is unknown or impossible, or the folder cannot be written to, or holds
+        anything but an earlier run.
     SolveError
         If a frame cannot be solved or written; frames so far are kept.
     LimitExceededError
         If a limit of ``fail_on`` is exceeded; everything is written.
     """
     limits = parse_limits(fail_on, scene)
-    check_writable(directory)
+    run_folder(directory)
     recording = Recording(scene, model=model, settings=settings, frames=frames)
     with closing(recording):
         writer = RunWriter(directory, recording.scene)
@@ -272,13 +274,14 @@ class Run:
         """Write what `stream_run` would have written; a run that was loaded is copied.
 
         ``pictures`` are those of the report and the preview. UsageError if the folder cannot be
-        written to.
+        written to, or holds anything but an earlier run.
         """
-        check_writable(directory)
+        folder = run_folder(directory)
         if self._recording is not None:
             self._recording.finish(self._write(directory), {}, pictures=pictures)
         elif Path(directory).resolve() != self.saved.directory.resolve():
-            shutil.copytree(self.saved.directory, directory, dirs_exist_ok=True)
+            with folder.staged() as stage:
+                _copy_run(self.saved.directory, stage)
 
     def export(
         self, directory: str | Path, formats: str | Sequence[str], *, units: str | None = None
@@ -320,6 +323,17 @@ class Run:
         return figure_html(
             lambda file: render_run(self.saved.directory, file), f"{self!r} {self.verdict}"
         )
+
+
+def _copy_run(source: Path, target: Path) -> None:
+    """Copy the files of a run, and nothing else that lies in its folder."""
+    names = read_list(source, "run")
+    if names is None:
+        raise UsageError(f"{source} has no {LIST}, which names the files of a run; run it again")
+    for name in names:
+        if (source / name).is_file():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(source / name, target / name)
 
 
 class MuscleRun:

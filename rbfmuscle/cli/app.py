@@ -105,8 +105,9 @@ def _fail(message, code, as_json=False, *, hint=""):
 
 
 def one_line(error: object) -> str:
-    """Return a message as one line, shortened if it is very long."""
+    """Return a message as one line without control characters, shortened if it is very long."""
     text = " ".join(str(error).split())
+    text = "".join(char if char.isprintable() else "?" for char in text)
     return text if len(text) <= LONGEST_LINE else f"{text[: LONGEST_LINE - 60]} ... {text[-50:]}"
 
 

@@ -25,6 +25,10 @@ def check(
         Measure the bones' distance fields against exact distances.
     """
     with Progress(f"check {scene.name}"):
+        if picture:
+            from rbfmuscle.report.render import check_picture, draw_scene
+
+            check_picture(scene.with_suffix(".png"))
         loaded, findings = _findings(scene)
         errors = {}
         if fields:
@@ -38,8 +42,6 @@ def check(
                 }
         drawn = {}
         if picture:
-            from rbfmuscle.report.render import draw_scene
-
             drawn = {"picture": str(scene.with_suffix(".png"))}
             with stage("drawing the picture"):
                 draw_scene(loaded, scene.with_suffix(".png"))

@@ -115,10 +115,10 @@ def _draw(opened, model, stops, path):
     """Draw a run's frame, or a scene's pose after a run to it, in the way `rbfmuscle render`
     does.
     """
-    from rbfmuscle.report.render import render_run
+    from rbfmuscle.report.render import check_picture, render_run
     from rbfmuscle.run import simulate
 
-    path.parent.mkdir(parents=True, exist_ok=True)
+    check_picture(path)
     if isinstance(opened, dict):
         _check_stops(stops, ["frame"])
         saved = next(iter(opened.values()))

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from rbfmuscle.cli.options import Force, Output
+from rbfmuscle.folders import OutputFolder
 from rbfmuscle.validation import MeshError, UsageError
 
 
@@ -38,8 +39,9 @@ def new(
         Scene file (.toml) to write, or a folder for scene.toml; the folder of the meshes by
         default.
     """
-    from rbfmuscle.importers.guess.guess import guess_scene, write_scene
+    from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
     from rbfmuscle.importers.guess.orientation import HEADER
+    from rbfmuscle.importers.labels.read import read_labels
 
     volume = _is_segmentation(source)
     if volume and units not in (None, "mm"):
@@ -50,15 +52,16 @@ def new(
         raise UsageError(
             f"--labels names the labels of a segmentation, {source} is a folder of meshes"
         )
-    folder = _beside(source, output) if volume else source
-    output = _scene_file(output, folder)
-    _check_target(output, force)
-    if volume:
-        folder = _write_surfaces(source, labels, folder, force)
-    guess = guess_scene(
-        folder, "mm" if volume else units, output.parent, header=HEADER if volume else None
-    )
-    scene = write_scene(guess, output)
+    output = _scene_file(output, _beside(source, output) if volume else source)
+    out = _new_folder(output, force)
+    base = output.parent
+    read = read_labels(source, names=labels) if volume else guess_scene(source, units, base)
+    with out.staged(replaces=()) as stage:
+        if isinstance(read, SceneGuess):
+            guess = read
+        else:
+            guess = guess_scene(_write_surfaces(read, stage), "mm", base, header=HEADER)
+        scene = write_scene(guess, output, stage)
     print(f"{output} written; check the lines marked GUESS")
     for note in guess.parts.notes:
         print(f"note: {note}")
@@ -88,14 +91,14 @@ def import_(
     muscles
         Make a tube of each muscle of the model, along its path.
     """
-    from rbfmuscle.importers.opensim.scene import import_osim, write_scene
+    from rbfmuscle.importers.opensim.scene import import_osim, scene_folder, write_scene
 
-    _check_target(output / "scene.toml", force)
+    scene_folder(output, force=force)
     for folder in geometry or []:
         if not folder.is_dir():
             raise UsageError(f"--geometry {folder}: no such folder")
     found = import_osim(model, geometry=geometry, muscles=muscles)
-    written = write_scene(found, output)
+    written = write_scene(found, output, force=force)
     for note in found.notes:
         print(f"note: {note}")
     scene = found.scene
@@ -115,9 +118,13 @@ def _scene_file(output, folder):
     return output if output.suffix.lower() == ".toml" else output / "scene.toml"
 
 
-def _check_target(file, force):
+def _new_folder(file, force):
+    """The folder of a new scene file, in which the user's meshes may be; with ``force`` the file
+    and what an earlier ``new`` wrote may be replaced.
+    """
     if file.exists() and not force:
         raise UsageError(f"{file} exists; give another --output, or --force to replace it")
+    return OutputFolder(file.parent, "new", beside=True, replace=force, forced=[file.name])
 
 
 def _is_segmentation(source):
@@ -139,23 +146,14 @@ def _beside(source, output):
     return source / "scene" if source.is_dir() else source.parent / f"{name}_scene"
 
 
-def _write_surfaces(source, labels, folder, force):
-    """Surfaces of all labels as PLY beside the scene, with ``force`` in place of those there; their
-    folder.
-    """
+def _write_surfaces(volume, stage):
+    """Surfaces of all labels as PLY in ``meshes`` of a folder; that folder."""
     from rbfmuscle.importers.guess.names import name_facts
-    from rbfmuscle.importers.labels.read import read_labels
     from rbfmuscle.importers.labels.surfaces import label_surface
     from rbfmuscle.progress import Progress
 
-    meshes = folder / "meshes"
-    before = [*meshes.glob("*.ply")]
-    if before and not force:
-        raise UsageError(f"{meshes} holds meshes; give another folder, or --force to replace them")
-    volume = read_labels(source, names=labels)
-    meshes.mkdir(parents=True, exist_ok=True)
-    for path in before:
-        path.unlink()
+    meshes = stage / "meshes"
+    meshes.mkdir()
     values, files = volume.values(), set()
     with Progress("surfaces", "label") as progress:
         for done, label in enumerate(values, start=1):
@@ -169,7 +167,7 @@ def _write_surfaces(source, labels, folder, force):
                 print(f"{error}; left out")
                 continue
             file = re.sub(r"[^A-Za-z0-9_-]+", "_", surface.name)
-            if file.lower() in files:  # two labels of one name are two parts
+            while file.lower() in files:  # two labels of one name are two parts
                 file = f"{file}_{int(label)}"
             files.add(file.lower())
             surface.mesh.export(meshes / f"{file}.ply")

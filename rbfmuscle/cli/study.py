@@ -119,13 +119,13 @@ def kernels(
         Find the fewest centres, and the kernel, that reach this RMS distance (in the mesh's unit),
         in place of a table.
     """
-    from rbfmuscle.output.writer import check_writable
+    from rbfmuscle.report.kernel_page import kernels_folder
 
     counts = _split(centres) or ["150", "300"]
     if not all(count.isdecimal() and int(count) >= 8 for count in counts):
         raise UsageError(f"--centres must be whole numbers of 8 and more, got {' '.join(counts)!r}")
     meshes, units = _meshes(source, muscle, units)
-    check_writable(output)
+    kernels_folder(output)
     options: dict[str, Any] = {"kernels": _split(names), "placement": placement}
     if error is None:
         options |= {"centres": [int(c) for c in counts], "units": units, "resolution": resolution}
@@ -174,6 +174,7 @@ def _find_wanted(meshes, output, error, options, units):
     from rbfmuscle.experiments.kernel_study import row_toml
     from rbfmuscle.experiments.wanted_error import reach_error
     from rbfmuscle.output.writer import json_text
+    from rbfmuscle.report.kernel_page import kernels_folder
 
     facts = {}
     for name, mesh in meshes.items():
@@ -189,8 +190,8 @@ def _find_wanted(meshes, output, error, options, units):
             "tried": found.tried,
             "said": found.describe(name, units),
         }
-    output.mkdir(parents=True, exist_ok=True)
-    (output / "error.json").write_text(json_text(facts), encoding="utf-8")
+    with kernels_folder(output).staged() as stage:
+        (stage / "error.json").write_text(json_text(facts), encoding="utf-8")
     print("\n".join(found["said"] for found in facts.values()))
     print(f"all that was tried in {output / 'error.json'}")
     for name, found in facts.items():
@@ -323,8 +324,7 @@ def paths(
         motion covers.
     """
     from rbfmuscle.models import configure_scene
-    from rbfmuscle.output.writer import check_writable
-    from rbfmuscle.paths import parse_ranges, report_fits, sample_muscles
+    from rbfmuscle.paths import parse_ranges, paths_folder, report_fits, sample_muscles
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
 
@@ -336,7 +336,7 @@ def paths(
             chosen_muscle(loaded, name.strip()) for name in dict.fromkeys(muscles.split(","))
         ]
     given = parse_ranges(loaded, ranges or [])
-    check_writable(output)
+    paths_folder(output)
     with Progress(loaded.name, "pose") as progress:
         sampled = sample_muscles(loaded, given, samples=samples, progress=progress)
     print("\n".join(report_fits(loaded, sampled, output)))

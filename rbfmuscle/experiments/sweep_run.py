@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.experiments.sweep import SweepPoint
+from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import shown_number
-from rbfmuscle.output.writer import check_writable, write_csv, write_json
+from rbfmuscle.output.writer import write_csv, write_json
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MissingPartError, RBFMuscleError, SolveError, UsageError
 
@@ -48,6 +49,7 @@ WORST = (
     "edge_strain_rms",
     "components",
 )
+TABLES = ("sweep.csv", "sweep.json", "sweep.html")
 TIMES = ("time_frame", "time_frame_p95", "time_extract")
 VALUES = ("error_rms", "error_max", *WORST, *TIMES)
 # The default may be this much worse than the front, in error and in time at once.
@@ -64,9 +66,8 @@ class SweepFolder:
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(os.path.abspath(directory))
         self.points, self.references = self.directory / "points", self.directory / "references"
-        check_writable(directory)
-        for folder in (self.points, self.references):
-            folder.mkdir(parents=True, exist_ok=True)
+        self.output = OutputFolder(self.directory, "sweep", ("points", "references", *TABLES))
+        self.output.add(*TABLES)
 
     def read(self, key: str) -> dict[str, Any]:
         """A point's result, empty where there is none."""
@@ -117,6 +118,8 @@ def run_sweep(
 
     folder = SweepFolder(directory)
     left = [point for point in points if not folder.is_done(point)]
+    folder.output.add(*(f"points/{point.key}.json" for point in left))
+    folder.output.add(*(f"references/{p.key}.npz" for p in left if p.role == "reference"))
     for point in left:
         (folder.points / f"{point.key}.json").unlink(missing_ok=True)
     jobs = jobs or cpu_count()

@@ -45,3 +45,11 @@ def table_text(
 
 def _commented(line, text):
     return f"{line}   # {text}" if text else line
+
+
+def attachment_file(muscle: str, bone: str) -> str:
+    """File of the vertices of a muscle that a bone holds, relative to the scene's.
+
+    No name holds a full stop, so that no two pairs share a file.
+    """
+    return f"attachments/{muscle}.{bone}.txt"

@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.animation.gltf import animated_glb
 from rbfmuscle.output.animation.usd import check_usd, write_usd
@@ -35,7 +36,8 @@ def export_run(
         Of `FORMATS`. ``pvd`` is ``vtp`` and a collection over the frames; ``glb`` gives one file a
         frame, ``usd`` and ``animated-glb`` one of all frames.
     output : path, optional
-        ``DIR/export`` where not given; each format has its own folder there.
+        ``DIR/export`` where not given; each format has its own folder there, in which an earlier
+        export is replaced. ``files.txt`` lists what was written.
     units : {"m", "cm", "mm"}, optional
         The scene's unit where not given; metres for ``glb`` and ``animated-glb``, which know no
         other.
@@ -46,7 +48,7 @@ def export_run(
     ------
     UsageError
         If the folder holds no run, or a format or unit is unknown, or a surface does not keep its
-        vertices.
+        vertices, or the folder of a format holds anything but an earlier export.
     SolveError, MissingPartError
         If a file cannot be written; if a format needs a package that is absent.
     """
@@ -57,18 +59,19 @@ def export_run(
     if not chosen or not saved.has_surfaces():
         raise UsageError(f"{directory} has no surfaces to export")
     base = Path(output) if output is not None else saved.directory / "export"
-    written = []
+    folder = OutputFolder(base, "export", formats, beside=True)
+    written: list[Path] = []
     try:
-        for name in formats:
-            folder = base / name
-            folder.mkdir(parents=True, exist_ok=True)
-            unit = units or ("m" if "glb" in name else saved.units)
-            for frames_of_file in [[frame] for frame in chosen] if name == "glb" else [chosen]:
-                run = read_moving(saved, frames_of_file, unit=unit)
-                written += _export(run, folder, name, frames_of_file)
+        with folder.staged(replaces=formats) as stage:
+            for name in dict.fromkeys(formats):
+                unit = units or ("m" if "glb" in name else saved.units)
+                (stage / name).mkdir()
+                for part in [[frame] for frame in chosen] if name == "glb" else [chosen]:
+                    run = read_moving(saved, part, unit=unit)
+                    written += _export(run, stage / name, name, part)
     except OSError as error:
         raise SolveError(f"cannot write to {base}: {error.strerror}") from None
-    return written
+    return [base / path.relative_to(stage) for path in written]
 
 
 def _check_words(formats: Sequence[str], units: str | None) -> None:
@@ -105,10 +108,14 @@ def _file_name(name: str) -> str:
 
 def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -> list[Path]:
     written, suffix = [], "vtp" if name == "pvd" else name
+    taken = {part.name.lower() for part in run.muscles}
     for group, parts in (("surfaces", run.muscles), ("bones", run.bones)):
+        # No name of a part holds a full stop.
+        same = {p.name for p in parts if group == "bones" and p.name.lower() in taken}
+        stems = {p.name: f"{p.name}.bone" if p.name in same else p.name for p in parts}
         collection = Collection(folder / f"{group}.pvd") if name == "pvd" else None
         for k, frame in enumerate(frames):
-            files = {part.name: f"{part.name}_{frame:04d}.{suffix}" for part in parts}
+            files = {p.name: f"{stems[p.name]}_{frame:04d}.{suffix}" for p in parts}
             for part in parts:
                 write_mesh(folder / files[part.name], *part.mesh(k))
             written += [folder / file for file in files.values()]

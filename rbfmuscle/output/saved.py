@@ -19,7 +19,9 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output import appearance as look
 from rbfmuscle.output.vtp import read_vtp
+from rbfmuscle.scene.build import check_name
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
+from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
 from rbfmuscle.validation import UsageError
 
@@ -46,6 +48,7 @@ class SavedRun:
         path = self.directory / "run.json"
         try:
             self.info = json.loads(path.read_text(encoding="utf-8"))
+            _check_info(self.info)
             self.units = self.info["scene"]["units"]
             self.body = body_axes(
                 *(self.info["scene"].get(word) for word in ("superior", "anterior"))
@@ -59,7 +62,7 @@ class SavedRun:
             held = [
                 m["name"] for m in muscles if any("tendon" in end for end in m.get("attach", ()))
             ]
-            self.tendons = [look.tendon_name(name) for name in held if output.get("tendons")]
+            self.tendons = [tendon_name(name) for name in held if output.get("tendons")]
             self.frames = [frame["frame"] for frame in self.info["frames"]]
         except OSError:
             message = f"{self.directory} holds no run (no run.json); give the folder of 'run -o'"
@@ -182,6 +185,21 @@ class SavedRun:
         text = path.read_text(encoding="utf-8")
         whole = text[: text.rfind("\n") + 1]  # the last line of a run that was killed may be cut
         return list(csv.reader(io.StringIO(whole, newline="")))[1:]
+
+
+def _check_info(info: Any) -> None:
+    """Raise ValueError where names in ``run.json``, which become those of files, can be none of a
+    run's.
+    """
+    scene = info["scene"]
+    for what in ("muscle", "bone"):
+        for item in scene[f"{what}s"]:
+            check_name(item["name"], what)
+    if scene["units"] not in MM_PER_UNIT:
+        raise ValueError(f"units {scene['units']!r}")
+    for frame in info["frames"]:
+        if type(frame["frame"]) is not int or frame["frame"] < 0:
+            raise ValueError(f"frame {frame['frame']!r}")
 
 
 class _SavedSurfaces(Mapping[str, ModelSurface]):

@@ -2,7 +2,6 @@
 loading VTK.
 """
 
-import os
 import re
 import zlib
 from functools import lru_cache
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbfmuscle.folders import write_whole
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.validation import MeshError
 
@@ -117,15 +117,3 @@ class Collection:
             self._lines += f'<DataSet timestep="{time}" group="" {place}/>\n'
         head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
         write_whole(self._path, f"{head}{self._lines}</Collection>\n</VTKFile>\n")
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a text in one move, so that whoever reads it finds the old file or the new, never half
-    of it.
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        part.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)

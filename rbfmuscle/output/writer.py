@@ -7,7 +7,6 @@ import hashlib
 import importlib.metadata
 import os
 import platform
-import tempfile
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -17,14 +16,16 @@ from typing import Any
 import numpy as np
 
 import rbfmuscle
+from rbfmuscle.folders import OutputFolder, write_whole
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.quantities import ALL, Row
-from rbfmuscle.output.appearance import tendon_mesh, tendon_name
-from rbfmuscle.output.vtp import Collection, write_vtp, write_whole
+from rbfmuscle.output.appearance import tendon_mesh
+from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import Frame
 from rbfmuscle.validation import SolveError, UsageError
 
@@ -35,48 +36,44 @@ TABLES = {
 }
 
 LIGHT = 1600  # triangles of a bone that moves
-# Of an earlier run in the same folder.
-_OLD_FILES = ("run.json", "surfaces.pvd", "bones.pvd", "metrics.csv", "report.html", "preview.webp")
+PAGES = ("report.html", "preview.webp")
+MESHES = ("surfaces", "bones")
+# Every file of a run, and every folder of its files.
+_PLACES = ("run.json", *TABLES, *PAGES, *MESHES, *(f"{name}.pvd" for name in MESHES))
 FORMAT = 2
 _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
 
 
-def check_writable(directory: str | Path) -> None:
-    """Write to a folder, or where it would be made, before what takes time is begun; UsageError
-    where that fails.
+def run_folder(directory: str | Path) -> OutputFolder:
+    """The folder of a run; UsageError if something in it is in the way, or it cannot be written
+    to.
     """
-    path = Path(directory).absolute()
-    there = next(place for place in (path, *path.parents) if place.exists())
-    try:
-        with tempfile.TemporaryFile(dir=there):
-            pass
-    except OSError as error:
-        raise UsageError(
-            f"cannot write to {directory}: {error.strerror}; choose another folder"
-        ) from None
+    return OutputFolder(directory, "run", _PLACES)
 
 
 class RunWriter:
     """Streams frames to a folder and keeps none of them; the scene's ``output`` table says which
     parts are written.
 
-    The folder is made where it is missing, UsageError where that fails; a run that lies there
-    already is replaced.
+    The folder is that of `run_folder`; a run that lies there already is replaced.
     """
 
     def __init__(self, directory: str | Path, scene: Scene) -> None:
         self.directory = Path(directory)
+        self.folder = run_folder(directory)
         self.scene = scene
         self.meshes = bool(scene.output.surfaces)
         self.count, self._failed = 0, False
         # Pose and file that show a bone now, and its mesh for a series.
         self._bones: dict[str, tuple[Floats, str]] = {}
         self._light: dict[str, tuple[Floats, Integers]] = {}
+        names = MESHES if self.meshes else ()
+        pages = PAGES if scene.output.report else ()
         try:
-            self._clear()
+            self.folder.clear()
+            self.folder.add("run.json", *TABLES, *pages, *(f"{name}.pvd" for name in names))
             for name, head in TABLES.items():
                 write_csv(self.directory / name, [head])
-            names = ("surfaces", "bones") if self.meshes else ()
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
         except OSError as error:
             message = f"cannot write to {self.directory}: {error.strerror}; choose another folder"
@@ -90,7 +87,7 @@ class RunWriter:
             self._write(frame, rows)
         except OSError as error:
             self._failed = True
-            self._remove(frame.index - 1)
+            self._remove_meshes(frame.index)
             kept = f"{self.count} frames are kept in {self.directory}"
             raise SolveError(
                 f"cannot write frame {frame.index}: {error.strerror}; {kept}"
@@ -147,7 +144,8 @@ class RunWriter:
             meshes |= {
                 tendon_name(name): mesh for name, mesh in tendons.items() if mesh is not None
             }
-        entries = [(name, f"surfaces/{name}_{frame.index:04d}.vtp") for name in meshes]
+        entries = [(name, f"surfaces/{name}{_frame_end(frame.index)}.vtp") for name in meshes]
+        self.folder.add(*(file for _, file in entries))
         each(lambda entry: write_vtp(self.directory / entry[1], *meshes[entry[0]]), entries)
         return entries
 
@@ -160,35 +158,32 @@ class RunWriter:
             mesh = bone.mesh
             pose = frame.poses[bone.name]
             if name not in self._bones:
-                self._bones[name] = np.eye(4), f"bones/{name}.vtp"
-                write_vtp(self.directory / self._bones[name][1], mesh.vertices, mesh.faces)
+                self._write_bone(name, np.eye(4), "", mesh.vertices, mesh.faces)
             if not np.array_equal(self._bones[name][0], pose):
                 if name not in self._light:
                     self._light[name] = simplified(mesh.vertices, mesh.faces, LIGHT)
                 vertices, faces = self._light[name]
                 moved = vertices @ pose[:3, :3].T + pose[:3, 3]
-                self._bones[name] = pose.copy(), f"bones/{name}_{frame.index:04d}.vtp"
-                write_vtp(self.directory / self._bones[name][1], moved.astype(np.float32), faces)
+                end = _frame_end(frame.index)
+                self._write_bone(name, pose.copy(), end, moved.astype(np.float32), faces)
         return [(bone.name, self._bones[bone.name][1]) for bone in self.scene.bones]
 
-    def _remove(self, last):
-        """Take the meshes of all frames after ``last`` away."""
-        for folder in ("surfaces", "bones"):
-            for file in (self.directory / folder).glob("*_[0-9][0-9][0-9][0-9]*.*"):
-                number = file.stem.rpartition("_")[2]
-                if number.isdigit() and int(number) > last:
-                    file.unlink(missing_ok=True)
+    def _write_bone(self, name, pose, end, vertices, faces):
+        file = f"bones/{name}{end}.vtp"
+        self._bones[name] = pose, file
+        self.folder.add(file)
+        write_vtp(self.directory / file, vertices, faces)
 
-    def _clear(self):
-        """Make the folders, without the files of a run that was here before."""
-        self.directory.mkdir(parents=True, exist_ok=True)
-        for old in _OLD_FILES:
-            (self.directory / old).unlink(missing_ok=True)
-        self._remove(-1)
-        for old in (self.directory / "bones").glob("*.vtp"):
-            old.unlink()
-        for folder in ("surfaces", "bones") if self.meshes else ():
-            (self.directory / folder).mkdir(exist_ok=True)
+    def _remove_meshes(self, frame):
+        """Take away the meshes of a frame that could not be written."""
+        for name in self.folder.listed:
+            if name.endswith(f"{_frame_end(frame)}.vtp"):
+                (self.directory / name).unlink(missing_ok=True)
+
+
+def _frame_end(frame: int) -> str:
+    """What the names of a frame's files end with."""
+    return f"_{frame:04d}"
 
 
 def write_csv(path: Path, rows: Iterable[Sequence[Any]], *, mode: str = "w") -> None:

@@ -13,6 +13,7 @@ from rbfmuscle.experiments.kernel_study import (
     row_name,
     row_toml,
 )
+from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.writer import json_text
 from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, number_cell
@@ -31,6 +32,7 @@ COLUMNS = {
     "fit_time": ("fit [ms]", 1e3),
     "evaluation_time": ("20,000 values [ms]", 1e3),
 }
+FILES = ("kernels.csv", "kernels.json", "kernels.html")
 _MOST_LIGHTS = 5
 _READING = """A kernel's shape parameter is chosen by the error at other points of the mesh.
 Distances are measured both ways between mesh and extracted surface, root mean square and
@@ -41,22 +43,25 @@ front. A kernel that is not C2 cannot be fitted to normals: it is fitted to valu
 surface."""
 
 
+def kernels_folder(directory: str | Path) -> OutputFolder:
+    """The folder of a kernel study; UsageError if something in it is in the way."""
+    return OutputFolder(directory, "kernels", (*FILES, "error.json"))
+
+
 def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> None:
     """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html`` of studies by the names of their
     surfaces.
     """
-    directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
     rows = [{"surface": name, **row} for name, study in studies.items() for row in study.rows]
-    with (directory / "kernels.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
     units = next(iter(studies.values())).units
-    (directory / "kernels.json").write_text(
-        json_text({"units": units, "rows": rows}), encoding="utf-8"
-    )
-    _page(studies).write(directory / "kernels.html")
+    with kernels_folder(directory).staged() as stage:
+        with (stage / "kernels.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+        text = json_text({"units": units, "rows": rows})
+        (stage / "kernels.json").write_text(text, encoding="utf-8")
+        _page(studies).write(stage / "kernels.html")
 
 
 def answer(studies: Mapping[str, KernelStudy]) -> str:

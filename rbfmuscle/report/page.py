@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from rbfmuscle.folders import write_whole
 from rbfmuscle.metrics.summary import COUNTS, shown_number, within
 from rbfmuscle.validation import SolveError
 
@@ -91,7 +92,7 @@ class Page:
         pages = Environment(loader=PackageLoader("rbfmuscle.report"), autoescape=True)
         text = pages.get_template("page.html").render(page=self, scene_file=scene_file)
         try:
-            path.write_text(text, encoding="utf-8")
+            write_whole(path, text)
         except OSError as error:
             raise SolveError(f"cannot write {path}: {error.strerror}") from None
 

@@ -4,6 +4,7 @@ display is needed.
 
 import base64
 import html
+import io
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
+from rbfmuscle.folders import write_whole
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.threads import each
@@ -40,6 +42,8 @@ _AXIS = "#0057d9"
 # Each pixel is the mean of so many by so many.
 _FINER = 2
 _MARGIN = 0.05
+# Tag of EXIF for the program that made a picture, and what pictures of ours have there.
+_SOFTWARE_TAG, _SOFTWARE = 305, "rbfmuscle"
 # Height of a row of labels, and width of a colour before one [pixel].
 _LINE, _CHIP = 22, 17
 
@@ -193,11 +197,13 @@ def render_run(
     ``frame`` is that of a picture, by default the last. ``views``, side by side, are of `VIEWS`, or
     "motion" for the plane of the motion; `USUAL_VIEWS` where not given. A view has ``area`` pixels.
     An animation of so many ``seconds`` has at ``most`` so many frames, chosen evenly. UsageError if
-    the folder holds nothing to draw, or the suffix, frame or view is unknown.
+    the folder holds nothing to draw, the suffix, frame or view is unknown, or another file is in
+    the way.
     """
     saved, output = SavedRun(directory), Path(output)
     if output.suffix not in (".png", ".gif", ".webp"):
         raise UsageError(f"{output}: the suffix must be .png, .gif or .webp")
+    check_picture(output)
     if not saved.has_surfaces():
         raise UsageError(f"{directory} has no surfaces to draw")
     if not 0.0 < seconds <= 3600.0:
@@ -268,9 +274,38 @@ def save_images(images: Sequence[Image.Image], path: Path, seconds: float) -> No
     if len(sheets) > 1:
         pauses = [max(20, int(1000 * seconds / len(sheets)))] * (len(sheets) - 1) + [900]
         kind |= {"save_all": True, "append_images": sheets[1:], "duration": pauses, "loop": 0}
+    _save_picture(sheets[0], path, **kind)
+
+
+def check_picture(path: Path) -> None:
+    """Raise UsageError if a file is there that is no picture of ours."""
+    if not path.exists():
+        return
+    try:
+        with Image.open(path) as image:
+            ours = _SOFTWARE in (image.getexif().get(_SOFTWARE_TAG), _comment(image))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        ours = False
+    if not ours:
+        raise UsageError(f"{path} is in the way, and no picture of rbfmuscle; give another file")
+
+
+def _comment(image: Image.Image) -> str:
+    comment = image.info.get("comment", b"")
+    return comment.decode("utf-8", "replace") if isinstance(comment, bytes) else ""
+
+
+def _save_picture(image: Image.Image, path: Path, **options: Any) -> None:
+    """Write a picture, marked as ours, in one move; raises SolveError if it fails."""
+    check_picture(path)
+    content, kind = io.BytesIO(), path.suffix[1:]
+    exif = Image.Exif()
+    exif[_SOFTWARE_TAG] = _SOFTWARE
+    mark: dict[str, Any] = {"comment": _SOFTWARE} if kind == "gif" else {"exif": exif}
+    image.save(content, format=kind, **mark, **options)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        sheets[0].save(path, **kind)
+        write_whole(path, content.getvalue())
     except OSError as error:
         raise SolveError(f"cannot write {path}: {error.strerror}") from None
 
@@ -290,7 +325,7 @@ def draw_scene(scene: Scene, path: str | Path) -> None:
         images.append(np.asarray(image))
     text = f"{scene.name}: held patches in the colour of their bone"
     chips = {**colours, "joint centres and axes": _AXIS}
-    labelled(np.concatenate(images, axis=1), text, _SCENE_SIDES, chips).save(path)
+    _save_picture(labelled(np.concatenate(images, axis=1), text, _SCENE_SIDES, chips), Path(path))
 
 
 def figure_html(draw: Callable[[Path], None], caption: str) -> str:

@@ -20,6 +20,7 @@ from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.motion import make_motion
 from rbfmuscle.scene.objects import Attachment, Muscle, SceneData, find_named
 from rbfmuscle.scene.options import MotionOptions
+from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.validation import SceneError, did_you_mean, shown
 
 S = TypeVar("S", bound=SceneData)
@@ -190,6 +191,7 @@ def validate(scene: S) -> S:
     for what in ("bones", "muscles"):
         if not getattr(scene, what):
             raise SceneError(f"scene {scene.name!r} has no {what}, add a [[{what[:-1]}]]")
+    _check_file_names(scene)
     known = all_coordinates(scene.joints)
     for name in (name for frame in scene.motion.frames for name in frame):
         if name not in known:
@@ -207,6 +209,24 @@ def validate(scene: S) -> S:
     return scene
 
 
+def _check_file_names(scene: SceneData) -> None:
+    """Raise SceneError if two meshes of a run would have one file."""
+    muscles = {muscle.name.lower(): muscle.name for muscle in scene.muscles}
+    for muscle in scene.muscles:
+        other = muscles.get(tendon_name(muscle.name).lower())
+        if muscle.tendons and other is not None:
+            raise SceneError(
+                f"muscle {other!r} has the name of the tendons of {muscle.name!r}; choose another"
+            )
+    bones = {bone.name.lower() for bone in scene.bones}
+    for bone in scene.bones:
+        stem, _, number = bone.name.lower().rpartition("_")
+        if stem in bones and len(number) >= 4 and number.isdecimal():
+            raise SceneError(
+                f"bone {bone.name!r} has the name of a frame of bone {stem!r}; choose another"
+            )
+
+
 def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[str, dict[str, Any]]:
     """Return (name, options) of a model given as a name or as a table with ``name``."""
     if isinstance(model, str):
@@ -219,12 +239,25 @@ def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[str, dict[s
     raise SceneError(f"{place}: model must be a name or a table with a name, got {shown(model)}")
 
 
-def check_new_name(items: Sequence[Bone | Joint | Muscle], name: str, what: str) -> None:
-    """Raise SceneError if a name is no name for a file, or taken."""
+def check_name(name: object, what: str) -> None:
+    """Raise SceneError if a name is no name for a file."""
     if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
         allowed = "letters, digits, '_' and '-' only (it becomes a file name)"
         raise SceneError(f"{what} name {shown(repr(name))} may hold {allowed}")
+
+
+def check_new_name(items: Sequence[Bone | Joint | Muscle], name: str, what: str) -> None:
+    """Raise SceneError if a name is no name for a file, or taken, in letters of another case
+    too.
+    """
+    check_name(name, what)
     if name == "all":
         raise SceneError(f"{what} name 'all' stands for the whole scene in tables, choose another")
-    if any(item.name == name for item in items):
+    same = [item.name for item in items if item.name.lower() == name.lower()]
+    if name in same:
         raise SceneError(f"{what} {name!r} is given twice")
+    if same and what != "joint":
+        raise SceneError(
+            f"{what} {name!r} differs from {same[0]!r} in case alone, and their files would be one "
+            "on some systems; choose another name"
+        )

@@ -8,7 +8,7 @@ from graphlib import CycleError, TopologicalSorter
 import pytest
 from conftest import ROOT
 
-NAMES = ("cache", "child", "geometry", "interruption", "jit", "progress", "validation")
+NAMES = ("cache", "child", "folders", "geometry", "interruption", "jit", "progress", "validation")
 LEAVES = tuple(f"rbfmuscle.{name}" for name in NAMES)
 CORE = (*LEAVES, "rbfmuscle.bones", "rbfmuscle.scene", "rbfmuscle.simulation")
 MEASURED = (
@@ -26,6 +26,7 @@ ALLOWED = {
     "rbfmuscle.progress": (),
     "rbfmuscle.cache": ("rbfmuscle.geometry",),
     "rbfmuscle.child": ("rbfmuscle.child", "rbfmuscle.validation"),
+    "rbfmuscle.folders": ("rbfmuscle.validation",),
     "rbfmuscle.geometry": ("rbfmuscle.geometry", "rbfmuscle.jit"),
     "rbfmuscle.implicit": (*LEAVES, "rbfmuscle.implicit"),
     "rbfmuscle.bones": (*LEAVES, "rbfmuscle.bones"),

@@ -13,6 +13,7 @@ import trimesh
 from command_line import call
 from scipy.spatial.transform import Rotation
 
+from rbfmuscle.folders import OutputFolder
 from rbfmuscle.importers.guess.attachments import Ends
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
@@ -96,6 +97,13 @@ def _phantom_meshes(folder, *, scale=1.0, mirror=False, plain_names=False):
         mesh.export(folder / f"{f'Segment_{number}' if plain_names else item.name}.ply")
 
 
+def _write(guess, file):
+    """The scene of a guess, written as ``rbfmuscle new`` writes it."""
+    folder = OutputFolder(file.parent, "new", beside=True)
+    with folder.staged(replaces=()) as stage:
+        return write_scene(guess, file, stage)
+
+
 @pytest.mark.parametrize(
     ("units", "options"),
     [("mm", {}), ("m", {"scale": 1e-3}), ("mm", {"mirror": True}), ("mm", {"plain_names": True})],
@@ -103,7 +111,7 @@ def _phantom_meshes(folder, *, scale=1.0, mirror=False, plain_names=False):
 def test_what_is_written_loads_and_has_the_phantoms_joint(tmp_path, units, options):
     _phantom_meshes(tmp_path, **options)
     guess = guess_scene(tmp_path, units, tmp_path)
-    scene = write_scene(guess, tmp_path / "scene.toml")
+    scene = _write(guess, tmp_path / "scene.toml")
     assert all(finding.level != "error" for finding in scene.check())
     true = phantom_scene().joints[0].centre * options.get("scale", 1.0)
     if options.get("mirror"):
@@ -134,7 +142,7 @@ def test_muscles_without_the_bones_of_their_names_still_make_a_scene(tmp_path):
     ):
         item.mesh.export(tmp_path / f"{name}.ply")
     guess = guess_scene(tmp_path, "mm", tmp_path)
-    assert len(write_scene(guess, tmp_path / "scene.toml").muscles) == 4
+    assert len(_write(guess, tmp_path / "scene.toml").muscles) == 4
     assert all(
         muscle.confidence <= 0.2 and "are not here" in muscle.reasons[0] for muscle in guess.muscles
     )
@@ -257,7 +265,7 @@ def test_bones_and_muscles_of_the_leg_hang_on_the_right_bones_at_the_right_place
         away += [np.linalg.norm(mine[bone] - true[bone]) for bone in true if bone in mine]
     assert right == 38
     assert np.median(away) < 12.0  # wanted [mm]
-    scene = write_scene(guess, folder / "scene.toml")
+    scene = _write(guess, folder / "scene.toml")
     assert len(scene.muscles) == 38 and scene.superior is not None
     last, first = scene.motion.frames[-1], scene.motion.frames[0]
     assert {name for name in last if last[name] != first[name]} == {
@@ -307,7 +315,7 @@ def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_
     guess = guess_scene(tmp_path, None, tmp_path)
     assert {"gracilis.ply", "sacrum.stl"} == {Path(file).name for file in guess.parts.unusable}
     assert any("femoral_cartilage.ply" in note for note in guess.parts.notes)
-    scene = write_scene(guess, tmp_path / "scene.toml")
+    scene = _write(guess, tmp_path / "scene.toml")
     text = (tmp_path / "scene.toml").read_text(encoding="utf-8")
     assert "# NOT USED: gracilis.ply: " in text and len(scene.muscles) == 4
     # A mesh without a name that cannot be a muscle.
@@ -323,7 +331,7 @@ def test_nothing_is_left_behind_that_does_not_load(tmp_path):
     assert guess.parts.left_out == ["sacrum"] and "sacrum.ply" in guess.parts.unusable
     guess.muscles[0].holds[0].vertices = guess.muscles[0].holds[1].vertices
     name = guess.muscles[0].muscle.name
-    scene = write_scene(guess, tmp_path / "scene.toml")
+    scene = _write(guess, tmp_path / "scene.toml")
     assert not {name, "gracilis"} & {muscle.name for muscle in scene.muscles}
     assert "# NOT RUN: " in (tmp_path / "scene.toml").read_text(encoding="utf-8")
     assert any(name in doubt for doubt in guess.doubts())
@@ -332,7 +340,7 @@ def test_nothing_is_left_behind_that_does_not_load(tmp_path):
             path.unlink()
     file = tmp_path / "second.toml"
     with pytest.raises(UsageError, match="no muscle can be held"):
-        write_scene(guess_scene(tmp_path, "mm", tmp_path), file)
+        _write(guess_scene(tmp_path, "mm", tmp_path), file)
     assert not file.exists()
 
 

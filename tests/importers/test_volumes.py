@@ -5,6 +5,8 @@ that are broken.
 import gzip
 import json
 
+import nibabel
+import nrrd
 import numpy as np
 import pytest
 from command_line import call
@@ -16,10 +18,7 @@ from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.importers.labels import surfaces
 from rbfmuscle.importers.labels.read import LabelVolume, read_labels, read_names
 from rbfmuscle.importers.labels.surfaces import label_surface
-from rbfmuscle.validation import MeshError, UsageError
-
-nibabel = pytest.importorskip("nibabel")
-nrrd = pytest.importorskip("nrrd")
+from rbfmuscle.validation import MeshError
 
 RADIUS = 20.0
 
@@ -228,14 +227,12 @@ def test_scene_of_a_segmentation_lies_beside_it_and_is_in_its_unit(tmp_path, cap
         assert code == 2 and said in err
 
 
-def test_two_labels_of_one_name_are_two_meshes(tmp_path):
+def test_labels_of_one_name_are_each_a_mesh(tmp_path):
     labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
-    source = write_nifti(tmp_path / "a.nii", labels, np.eye(4))
-    (tmp_path / "names.csv").write_text("1,Soleus\n2,soleus\n")
-    given = source, tmp_path / "names.csv", tmp_path / "new" / "out"
-    for force in (False, True):  # into a folder that is not there, and over what is
-        folder = _write_surfaces(*given, force)
-        assert sorted(path.name for path in folder.iterdir()) == ["Soleus.ply", "soleus_2.ply"]
-        (folder / "earlier.ply").touch()
-    with pytest.raises(UsageError, match="--force"):
-        _write_surfaces(*given, False)
+    labels[np.diff(labels, axis=1, prepend=0) > 0] = 0
+    labels[:, :13][labels[:, :13] == 2] = 3
+    # The name that the third label would get is that of the first.
+    names = {1: "soleus_3", 2: "soleus", 3: "Soleus"}
+    _write_surfaces(LabelVolume(labels, np.eye(4), names, "a.nii"), tmp_path)
+    found = sorted(path.name for path in (tmp_path / "meshes").iterdir())
+    assert found == ["Soleus_3_3.ply", "soleus.ply", "soleus_3.ply"]

@@ -1,23 +1,26 @@
 """Files against readers that are not ours: pyvista and trimesh."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
+import pyvista
 import trimesh
+from blend_model import arm_files
 
+from rbfmuscle.cli.app import one_line
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.output.export import _file_name, export_run
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.vtp import read_vtp, write_vtp
 from rbfmuscle.output.writer import write_json
+from rbfmuscle.run import Run, simulate
 from rbfmuscle.validation import MeshError, UsageError
 
 # Positions are written to 36 binary digits.
 ROUNDING = 2.0**-36
-
-pyvista = pytest.importorskip("pyvista")
 
 
 @pytest.fixture
@@ -84,7 +87,52 @@ class TestSaved:
             SavedRun(tmp_path)
 
 
+class TestHostileRuns:
+    @pytest.mark.parametrize(
+        ("change", "word"),
+        [
+            (lambda info: info["scene"]["muscles"][0].update(name="../../victim"), "victim"),
+            (lambda info: info["scene"]["bones"][0].update(name="a/b"), "a/b"),
+            (lambda info: info["scene"]["bones"][0].update(name=["a"]), "bone name"),
+            (lambda info: info["scene"]["muscles"][0].update(name="<img src=x>"), "<img"),
+            (lambda info: info["scene"].update(units="<b>"), "units"),
+            (lambda info: info["frames"][0].update(frame="/../x"), "frame"),
+            (lambda info: info["frames"][0].update(frame=-1), "frame"),
+            (lambda info: info["frames"][0].update(frame=True), "frame"),
+        ],
+    )
+    def test_names_that_no_run_has_are_refused(self, arm_run, tmp_path, change, word):
+        folder = shutil.copytree(arm_run[1], tmp_path / "run")
+        info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        change(info)
+        (folder / "run.json").write_text(json.dumps(info))
+        with pytest.raises(UsageError, match=r"not the run\.json") as caught:
+            SavedRun(folder)
+        assert word in str(caught.value)
+
+    def test_messages_reach_the_terminal_without_control_characters(self):
+        assert one_line("a\x1b[2J\nb\x00\u202ec") == "a?[2J b??c"
+
+    def test_a_copy_holds_the_files_of_the_run_alone(self, arm_run, tmp_path):
+        folder = shutil.copytree(arm_run[1], tmp_path / "run")
+        (folder / "surfaces" / "mine.vtp").write_text("mine")
+        Run.load(folder).save(tmp_path / "copy")
+        assert not (tmp_path / "copy" / "surfaces" / "mine.vtp").exists()
+        assert len(Run.load(tmp_path / "copy")) == 7
+        (folder / "files.txt").unlink()
+        with pytest.raises(UsageError, match=r"no files\.txt"):
+            Run.load(folder).save(tmp_path / "other")
+        assert not (tmp_path / "other").exists()
+
+
 class TestExport:
+    def test_a_bone_and_a_muscle_of_one_name_are_two_files(self, tmp_path):
+        file = arm_files(tmp_path, end=0)
+        file.write_text(file.read_text(encoding="utf-8").replace('"fore"', '"Biceps"'))
+        simulate(file, model="pbd").save(tmp_path / "run", pictures=False)
+        names = {path.name for path in export_run(tmp_path / "run", "stl")}
+        assert names == {"biceps_0000.stl", "Biceps.bone_0000.stl", "upper_0000.stl"}
+
     @pytest.mark.parametrize("name", ["pvd", "vtp", "ply", "obj"])
     def test_vertices_and_faces_come_back_in_their_order(self, arm_run, tmp_path, name):
         made, folder = arm_run

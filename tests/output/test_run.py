@@ -76,6 +76,21 @@ class TestStream:
             simulate(arm_scene())
         assert 0 < len(caught.value.run.frames) == len(saved.frames) < 3
 
+    def test_a_bug_is_never_recorded_as_an_interrupt(self, tmp_path):
+        for error, status, said in (
+            (ZeroDivisionError("planted"), "failed", "a bug: ZeroDivisionError: planted"),
+            (MemoryError("planted"), "failed", "planted"),
+            (KeyboardInterrupt(), "interrupted", "interrupted"),
+        ):
+
+            def fail(done, total, error=error):
+                raise error
+
+            with pytest.raises(type(error)):
+                stream_run(arm_scene(), tmp_path, progress=fail)
+            info = SavedRun(tmp_path).info
+            assert (info["status"], info["message"]) == (status, said)
+
     def test_limit_exceeded_after_everything_is_written(self, tmp_path):
         with pytest.raises(LimitExceededError, match="biceps: length"):
             stream_run(arm_scene(), tmp_path, fail_on="length=3")
@@ -84,9 +99,9 @@ class TestStream:
 
     def test_second_run_leaves_nothing_of_the_first(self, tmp_path):
         stream_run(arm_scene(), tmp_path)
-        (tmp_path / "bones" / "femur_2023_l.vtp").touch()  # no number of a frame at its end
         info = stream_run(arm_scene(), tmp_path, frames=":1", settings={"output.surfaces": False})
-        assert files_in(tmp_path) == ["events.csv", "metrics.csv", "poses.csv", "run.json"]
+        names = ["events.csv", "files.txt", "metrics.csv", "poses.csv", "run.json"]
+        assert files_in(tmp_path) == names
         assert info["muscles"]["biceps"]["volume_error"]["worst"] < 1e-9
 
     def test_disk_that_fills_up_keeps_the_frames(self, tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from conftest import ROOT
 
+from rbfmuscle.importers.toml_text import attachment_file
 from rbfmuscle.scene.check import bone_collisions, check_initial
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_settings, parse_slice
@@ -138,6 +139,46 @@ class TestMistakes:
         ):
             with pytest.raises(SceneError, match=words):
                 act()
+
+
+class TestFileNames:
+    """Meshes of a run are files named after muscles and bones, also where case does not count."""
+
+    @pytest.mark.parametrize(
+        ("bones", "muscles", "said"),
+        [
+            (["Femur", "femur"], [], "differs from 'Femur' in case alone"),
+            (["rib", "rib_0001"], ["a"], "bone 'rib_0001' has the name of a frame of bone 'rib'"),
+            (["b", "c"], ["a", "A"], "differs from 'a' in case alone"),
+            (["b", "c"], ["a", "A_tendon"], "'A_tendon' has the name of the tendons of 'a'"),
+            (["b", "c"], ["a_tendon", "a"], "'a_tendon' has the name of the tendons of 'a'"),
+        ],
+    )
+    def test_names_whose_files_would_be_one_are_refused(self, bones, muscles, said):
+        scene = Scene(units="mm")
+        with pytest.raises(SceneError, match=said):
+            for k, name in enumerate(bones):
+                box = trimesh.creation.box((5.0, 5.0, 5.0)).apply_translation([40.0 * k, 0, 0])
+                scene.add_bone(name, box)
+            for name in muscles:
+                ball = trimesh.creation.icosphere(radius=8.0).apply_translation([14.0, 0, 0])
+                x = ball.vertices[:, 0]
+                held = [
+                    {"bone": bones[0], "vertices": np.flatnonzero(x < 9.0).tolist()},
+                    {
+                        "bone": bones[1],
+                        "vertices": np.flatnonzero(x > 19.0).tolist(),
+                        "tendon": {"to": [36.0, 0.0, 0.0]},
+                    },
+                ]
+                scene.add_muscle(name, ball, attach=held)
+            scene.validate()
+
+    def test_names_that_stay_apart_are_taken(self):
+        scene = Scene(units="mm").add_bone("rib").add_bone("rib_1").add_bone("rib_x001")
+        assert scene.links == ["rib", "rib_1", "rib_x001"]
+        # Of muscle and bone: a_b and c, a and b_c.
+        assert attachment_file("a_b", "c") != attachment_file("a", "b_c")
 
 
 class TestOptions:

@@ -4,7 +4,7 @@ its reason.
 
 import re
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from rbfmuscle.importers.guess.attachments import MuscleGuess, Skeleton, guess_a
 from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
 from rbfmuscle.importers.guess.parts import Part, Parts, read_parts
-from rbfmuscle.importers.toml_text import table_text
+from rbfmuscle.importers.toml_text import attachment_file, table_text
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
@@ -89,38 +89,56 @@ def guess_scene(
     return guess
 
 
-def write_scene(guess: SceneGuess, path: Path) -> Scene:
-    """Write the scene file and, beside it, ``attachments/``, and return the scene as loaded from
-    there.
+def write_scene(guess: SceneGuess, path: Path, stage: Path) -> Scene:
+    """Write the scene of a file ``path``, and ``attachments/``, into a folder ``stage`` beside it,
+    from which they are moved to their places; return the scene as loaded.
 
     What cannot be loaded is commented out, with the reason. UsageError if no muscle can be held.
     """
     _check_runs(guess, path)
-    _write_coarse(guess, path.parent)
+    _write_coarse(guess, stage)
     for muscle in guess.muscles:
         for hold in muscle.holds:
-            file = path.parent / _hold_file(muscle, hold)
+            file = stage / _hold_file(muscle, hold)
             file.parent.mkdir(parents=True, exist_ok=True)
             in_file = np.isin(muscle.muscle.read.vertex_map, hold.vertices)
             np.savetxt(file, np.flatnonzero(in_file), fmt="%d")
+    # Paths in a scene file are relative to its folder, so a trial stands beside the final one.
+    trial = path.with_name(f"{stage.name}.toml")
+
+    def final(text):
+        return text.replace(trial.name, path.name).replace(f"{stage.name}/", "")
+
+    try:
+        scene = _load_trial(guess, trial, final)
+    finally:
+        trial.unlink(missing_ok=True)
+    (stage / path.name).write_text(final(_scene_text(guess)), encoding="utf-8")
+    scene.path = path
+    return scene
+
+
+def _load_trial(guess, trial, final):
+    """The scene of a trial file, which names staged files, without what cannot be loaded."""
     while True:
-        path.write_text(_scene_text(guess), encoding="utf-8")
+        trial.write_text(_scene_text(guess, trial.stem), encoding="utf-8")
         try:
-            return Scene.load(path)
+            return Scene.load(trial)
         except (SceneError, MeshError) as error:
-            path.unlink()
-            _leave_out(guess, error)
-            _check_runs(guess, path)
+            _leave_out(guess, error, final)
+            _check_runs(guess, final(str(trial)))
 
 
-def _write_coarse(guess, folder):
-    """Meshes that were made coarser, beside the scene."""
-    for part in (*guess.parts.bones, *guess.parts.muscles):
-        if part.coarse:
-            (folder / "coarse").mkdir(parents=True, exist_ok=True)
-            part.file = f"coarse/{part.name}.ply"
-            part.mesh.export(folder / part.file)
-            part.read.vertex_map = np.arange(len(part.points))
+def _write_coarse(guess, stage):
+    """Meshes that were made coarser, staged beside the scene."""
+    for folder, parts in (("bones", guess.parts.bones), ("muscles", guess.parts.muscles)):
+        for part in parts:
+            if part.coarse:
+                file = stage / "coarse" / folder / f"{part.name}.ply"
+                file.parent.mkdir(parents=True, exist_ok=True)
+                part.file = file.relative_to(stage.parent).as_posix()
+                part.mesh.export(file)
+                part.read.vertex_map = np.arange(len(part.points))
 
 
 def _check_runs(guess, path):
@@ -128,9 +146,9 @@ def _check_runs(guess, path):
         raise UsageError(f"{path}: no muscle can be held by two bones ({guess.muscles[0].wrong})")
 
 
-def _leave_out(guess, error):
+def _leave_out(guess, error, final):
     """Mark the muscle that an error names, or whose file it names, as wrong; an error that names
-    none is raised.
+    none is raised. ``final`` gives the final names of staged files in a text.
     """
     text, usable = str(error), [muscle for muscle in guess.muscles if not muscle.wrong]
     found = [muscle for muscle in usable if repr(muscle.muscle.name) in text]
@@ -138,16 +156,19 @@ def _leave_out(guess, error):
     found += sorted((m for m in usable if m.muscle.file in text), key=lambda m: -len(m.muscle.file))
     if not found:
         raise error
-    found[0].wrong, found[0].confidence = text, 0.0
+    found[0].wrong, found[0].confidence = final(text), 0.0
 
 
-def _scene_text(guess: SceneGuess) -> str:
-    """The scene file of a guess: what is not sure marked GUESS, what cannot run commented out."""
+def _scene_text(guess: SceneGuess, stage: str = "") -> str:
+    """The scene file of a guess: what is not sure marked GUESS, what cannot run commented out.
+
+    ``stage`` is the folder of the attachments' folder, relative to the file.
+    """
     rows = [({"name": bone.name, "mesh": bone.file}, _doubt(bone)) for bone in guess.parts.bones]
     bones = [table_text("[[bone]]", row, doubt) for row, doubt in rows]
     movable = [joint for joint in guess.joints if joint.axes and not joint.follows]
     motion = [_motion(movable[0])] if movable else []
-    muscles = map(_muscle, guess.muscles)
+    muscles = [_muscle(muscle, stage) for muscle in guess.muscles]
     return "\n".join([_head(guess), *bones, *map(_joint, guess.joints), *motion, *muscles, _TAIL])
 
 
@@ -202,7 +223,7 @@ def _motion(joint):
 
 def _hold_file(muscle, hold):
     """File of a hold's vertices, relative to the scene's folder."""
-    return f"attachments/{muscle.muscle.name}_{hold.bone.name}.txt"
+    return attachment_file(muscle.muscle.name, hold.bone.name)
 
 
 def _attachment(hold, file):
@@ -215,9 +236,10 @@ def _attachment(hold, file):
     return {"bone": hold.tendon.bone.name, "vertices": file, "tendon": line}
 
 
-def _muscle(guess: MuscleGuess) -> str:
+def _muscle(guess: MuscleGuess, stage: str) -> str:
     part, sure = guess.muscle, f"GUESS {guess.confidence:.1f}"
-    attach = [_attachment(hold, _hold_file(guess, hold)) for hold in guess.holds]
+    places = [PurePosixPath(stage, _hold_file(guess, hold)).as_posix() for hold in guess.holds]
+    attach = [_attachment(*pair) for pair in zip(guess.holds, places)]
     said = [f"{sure}: {len(hold.vertices)} vertices, {hold.reason}" for hold in guess.holds]
     row = {"name": part.name, "mesh": part.file, "attach": attach}
     head = "\n".join(["[[muscle]]", *(f"# {reason}" for reason in guess.reasons)])

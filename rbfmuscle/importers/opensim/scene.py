@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.importers.opensim.model import ModelMesh, OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.tubes import make_tube
-from rbfmuscle.importers.toml_text import table_text
+from rbfmuscle.importers.toml_text import attachment_file, table_text
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_arrays
 from rbfmuscle.scene.meshes.repair import ReadMesh
@@ -21,6 +22,7 @@ from rbfmuscle.validation import MeshError, SceneError, check_mesh
 
 WIDEST = 3.0  # a mesh wider than this [m] is a floor or a wall, not a bone
 NARROWEST = 0.002
+SCENE = "scene.toml"
 
 
 @dataclass
@@ -158,27 +160,40 @@ def _placed(
     return file, vertices, faces[:, ::-1] if np.prod(mesh.scale) < 0 else faces
 
 
-def write_scene(found: Imported, directory: Path) -> Path:
-    """Write ``scene.toml``, meshes and attachments to a folder, and return the scene file."""
+def scene_folder(directory: Path, *, force: bool = False) -> OutputFolder:
+    """The folder of an imported scene; UsageError if something is in the way, as an earlier scene
+    is unless ``force`` replaces it.
+    """
+    return OutputFolder(
+        directory, "import", (SCENE, "bones", "muscles", "attachments"), replace=force
+    )
+
+
+def write_scene(found: Imported, directory: Path, *, force: bool = False) -> Path:
+    """Write ``scene.toml``, meshes and attachments to a folder, and return the scene file.
+
+    The folder is that of `scene_folder`; files take their places when all are written.
+    """
     directory, scene = Path(directory), found.scene
-    target = directory / "scene.toml"
     facts = {"format": 1, "name": scene.name, "units": scene.units}
-    directory.mkdir(parents=True, exist_ok=True)
     facts |= {"left_out": scene.left_out} if scene.left_out else {}
     facts |= {"superior": scene.superior, "anterior": scene.anterior}
-    bones = [
-        {"name": bone.name, "mesh": _write_mesh(directory, "bones", bone)} for bone in scene.bones
-    ]
-    parts = [_head(found), table_text("[scene]", facts)]
-    parts += [table_text("[[bone]]", row) for row in bones]
-    parts += [
-        table_text("[[bone]]   # no mesh: joints only", {"name": name}) for name in scene.links
-    ]
-    parts += [table_text("[[joint]]", joint_row(joint)) for joint in scene.joints]
-    parts += [table_text("[[coupling]]", coupling_row(c, scene.joints)) for c in scene.couplings]
-    parts += [_muscle_text(directory, muscle) for muscle in scene.muscles]
-    target.write_text("\n".join(parts), encoding="utf-8")
-    return target
+    with scene_folder(directory, force=force).staged(replaces=()) as stage:
+        bones = [
+            {"name": bone.name, "mesh": _write_mesh(stage, "bones", bone)} for bone in scene.bones
+        ]
+        parts = [_head(found), table_text("[scene]", facts)]
+        parts += [table_text("[[bone]]", row) for row in bones]
+        parts += [
+            table_text("[[bone]]   # no mesh: joints only", {"name": name}) for name in scene.links
+        ]
+        parts += [table_text("[[joint]]", joint_row(joint)) for joint in scene.joints]
+        parts += [
+            table_text("[[coupling]]", coupling_row(c, scene.joints)) for c in scene.couplings
+        ]
+        parts += [_muscle_text(stage, muscle) for muscle in scene.muscles]
+        (stage / SCENE).write_text("\n".join(parts), encoding="utf-8")
+    return directory / SCENE
 
 
 def _head(found):
@@ -199,7 +214,7 @@ def _muscle_text(directory, muscle):
     row = {"name": muscle.name, "mesh": _write_mesh(directory, "muscles", muscle), "attach": []}
     (directory / "attachments").mkdir(exist_ok=True)
     for held in muscle.attachments:
-        file = f"attachments/{muscle.name}_{held.bone}.txt"
+        file = attachment_file(muscle.name, held.bone)
         np.savetxt(directory / file, held.vertices, fmt="%d")
         row["attach"].append({"bone": held.bone, "vertices": file})
     head = (
