@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rbfmuscle.viewer.page import Page as Page
     from rbfmuscle.viewer.page import show as show
 
-__version__ = "1.0.0"
+__version__ = "1.1.0"
 
 _ERRORS = (
     "LimitExceededError",
