@@ -1,6 +1,4 @@
-"""Directions of the fibres, softness of edges along them, and thickness of the muscle."""
-
-from collections.abc import Sequence
+"""Softness of edges along the fibres, and thickness of the muscle."""
 
 import numpy as np
 import scipy.sparse as sparse
@@ -14,31 +12,6 @@ from rbfmuscle.geometry.surfaces import vertex_areas
 # Distance over which the thickness is smoothed, and falls to 0 at held vertices, as a share of the
 # diagonal.
 SMOOTHING = 0.04
-# Nearest pieces of the polylines whose directions are averaged.
-NEAREST = 6
-
-
-def fibre_directions(
-    points: np.ndarray, along: np.ndarray, fibres: Sequence[np.ndarray] | None
-) -> np.ndarray:
-    """Unit direction (n, 3) of the fibres at each point, zero where there is none.
-
-    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the
-    last bone's weight.
-    """
-    if not fibres:
-        return _normalised(along)
-    middles = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in fibres])
-    tangents = _normalised(np.concatenate([np.diff(line, axis=0) for line in fibres]))
-    count = min(NEAREST, len(middles))
-    distance, index = cKDTree(middles).query(points, k=count)
-    distance, index = distance.reshape(-1, count), index.reshape(-1, count)
-    nearest = tangents[index[:, :1]]
-    signs = np.sign(
-        np.einsum("nkd,nkd->nk", tangents[index], np.broadcast_to(nearest, (*index.shape, 3)))
-    )
-    share = signs / np.maximum(distance, 1e-9 * np.ptp(points, axis=0).max()) ** 2
-    return _normalised(np.einsum("nk,nkd->nd", share, tangents[index]))
 
 
 def edge_stiffness(

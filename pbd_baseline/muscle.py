@@ -18,7 +18,7 @@ from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame import Mesh, ModelSurface
+from rbfmuscle.simulation.frame import Mesh, ModelSurface, SolveLog
 
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
@@ -67,7 +67,9 @@ class PBDMuscle:
         if method.tolerance > 0.0:
             self.sweeps = method.sweeps
             self.most_sweeps = self.options.iterations or MOST_SWEEPS
-        self.still = method.tolerance * diameter(self.rest.vertices)
+        self.size = diameter(self.rest.vertices)
+        self.still = method.tolerance * self.size
+        self.log = SolveLog(solver_residual=0.0)
         self.detail = 0.0
         self.contact_bone = _bone_numbers(self.rest, scene.holders(muscle))
         self.contact = ContactConstraint(reach=scene.length(REACH))
@@ -107,8 +109,11 @@ class PBDMuscle:
             if self.fibres is not None and (fresh or not self.fibres.passive):
                 self.shape.contract(self.fibres, self.points)
             self.swept = k + 1
-            if self._sweep() < self.still:
+            moved = self._sweep(last=self.swept == self.most_sweeps)
+            if moved < self.still:
                 break
+        capped = self.still > 0.0 and not moved < self.still
+        self.log.add(caps=int(capped), solver_residual=moved / self.size)
         self._finish(contacts)
 
     def activate(self, activation: float) -> None:
@@ -151,25 +156,25 @@ class PBDMuscle:
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The mesh as it is now."""
-        return ModelSurface(
-            *self.material_mesh(),
-            {"solver_penetration_max": self.penetration, "sweeps": float(self.swept)},
-        )
+        quantities, notes = self.log.take()
+        quantities |= {"solver_penetration_max": self.penetration, "sweeps": float(self.swept)}
+        return ModelSurface(*self.material_mesh(), quantities, notes)
 
     def volume(self) -> float:
         """Enclosed volume now [unit^3]."""
         return self.rest.volume.volume(self.points)
 
-    def _sweep(self):
-        """One iteration; how far it moved a vertex, asked for where a tolerance ends the sweeps."""
-        before = self.points.copy() if self.still > 0.0 else self.points
+    def _sweep(self, *, last=False):
+        """One iteration; how far it moved a vertex, asked for where a tolerance ends the sweeps and
+        of the ``last``.
+        """
+        asked = last or self.still > 0.0
+        before = self.points.copy() if asked else self.points
         self.shape.sweep(self.points, self.time / self.sweeps)
         self.contact.project(self.points)
         if self.shape.volume_in_sweeps or self.still > 0.0:
             self.shape.restore_volume(self.points, self.contact)
-        return (
-            np.sqrt(((self.points - before) ** 2).sum(axis=1).max()) if self.still > 0.0 else np.inf
-        )
+        return float(np.sqrt(((self.points - before) ** 2).sum(axis=1).max())) if asked else np.inf
 
     def _finish(self, contacts):
         """Contact and volume in turn, half-spaces found again, until both hold where the bones are

@@ -7,14 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from pbd_baseline.constraints import VolumeConstraint
-from pbd_baseline.fibres import fibre_directions, swelling_room
+from pbd_baseline.fibres import swelling_room
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.topology import Topology, cache_order
 from pbd_baseline.weights import even_weights
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.harmonic import surface_gradient
+from rbfmuscle.geometry.fibres import fibre_directions
+from rbfmuscle.geometry.harmonic import harmonic_weights, surface_gradient
 from rbfmuscle.geometry.surfaces import edge_lengths, vertex_normals
+from rbfmuscle.scene.ends import attachment_ends, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, NotFiniteError, check_finite
@@ -45,6 +47,7 @@ class RestState:
 
         Raises MeshError if its mesh is not closed, or no smooth weights can be found on it.
         """
+        muscle, place = ordered_muscle(muscle)
         order, vertices, faces, bones, attached_bone = _renumbered(muscle)
         topology = Topology.from_mesh(vertices, faces)
         volume = VolumeConstraint(vertices, faces)
@@ -58,10 +61,14 @@ class RestState:
                 f"cannot be spread over its mesh ({error}); remesh it, and attach each part of it "
                 "to a bone"
             ) from error
-        along = surface_gradient(vertices, faces, weights[:, -1])
+        along = surface_gradient(
+            vertices,
+            faces,
+            _to_insertion(muscle, scene, np.argsort(order), (faces, bones, weights)),
+        )
         fibres = fibre_directions(vertices, along, muscle.fibres)
         return cls(
-            order,
+            place[order],
             vertices,
             topology,
             bones,
@@ -80,6 +87,22 @@ class RestState:
     def relative_lengths(self) -> Floats:
         """Length of each edge in units of the median one."""
         return np.maximum(edge_lengths(self.vertices, self.topology.edges) / self.edge(), 1e-3)
+
+
+def _to_insertion(muscle, scene, place, mesh):
+    """Function (n,) that is 0 at one end of a muscle and 1 at the other; constant where it has one
+    end.
+    """
+    ends = attachment_ends(muscle, scene.joints)
+    faces, bones, weights = mesh
+    if ends is None:
+        return np.ones(len(weights))
+    first, last = ({a.holder for a in end} for end in ends)
+    if not first & last:
+        return weights[:, [bone in last for bone in bones]].sum(axis=1)
+    patches = [np.unique(place[np.concatenate([a.vertices for a in end])]) for end in ends]
+    vertices = np.asarray(muscle.mesh.vertices, dtype=float)[np.argsort(place)]
+    return harmonic_weights(vertices, faces, [np.setdiff1d(*patches), patches[1]])[:, 1]
 
 
 def _renumbered(muscle):

@@ -2,7 +2,8 @@
 fields, samples.
 
 An entry is a NumPy archive (`numpy.load` reads it). It is written to a temporary file and moved to
-its place, so that several processes may build the same field and none reads half of it.
+its place, so that several processes may build the same field and none reads half of it. The entries
+take `MOST_BYTES` at most.
 """
 
 import contextlib
@@ -10,6 +11,7 @@ import hashlib
 import logging
 import os
 import tempfile
+import time
 import zipfile
 from pathlib import Path
 from threading import Lock
@@ -21,8 +23,12 @@ from rbfmuscle.geometry.arrays import Array, Floats, Integers
 
 log = logging.getLogger(__name__)
 
-VERSION = 12  # part of every name: raise it when the arrays or the way they are built change
+VERSION = 13  # part of every name: raise it when the arrays or the way they are built change
 SUFFIX = ".sdf.npz"
+PART = SUFFIX + ".part"  # of an entry that is being written
+# Bytes that the cache may take; what was not used for longest is removed first. A file that a
+# process leaves half written is removed from this age on [s].
+MOST_BYTES, ABANDONED = 2 * 2**30, 3600.0
 _READING = Lock()
 # What reading a damaged, foreign or half-removed archive may raise.
 _DAMAGE = (
@@ -69,6 +75,8 @@ def load_arrays(key: str) -> dict[str, Array] | None:
             if archive.zip.testzip() is not None:
                 raise ValueError("a checksum is wrong")
             arrays = {name: archive[name] for name in archive.files}
+        with contextlib.suppress(OSError):  # a cache that others own can be read all the same
+            os.utime(path)
         if str(arrays.pop("key")) != key:
             raise ValueError("the entry belongs to another mesh")
     except _DAMAGE as error:
@@ -90,7 +98,7 @@ def store_arrays(key: str, arrays: dict[str, Any]) -> None:
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=key, suffix=SUFFIX + ".part", dir=folder)
+        handle, name = tempfile.mkstemp(prefix=key, suffix=PART, dir=folder)
         try:
             with os.fdopen(handle, "wb") as file:
                 np.savez(file, **entry)
@@ -100,3 +108,25 @@ def store_arrays(key: str, arrays: dict[str, Any]) -> None:
             raise
     except OSError as error:
         log.warning("cache: %s cannot be written (%s); nothing is kept", folder, error)
+        return
+    _bound(folder, folder / (key + SUFFIX))
+
+
+def _bound(folder: Path, fresh: Path) -> None:
+    """Remove what was not used for longest until the cache keeps to `MOST_BYTES`; never the
+    ``fresh`` entry.
+    """
+    found = []
+    for path in folder.glob(f"*{SUFFIX}*"):
+        with contextlib.suppress(OSError):  # another process has removed it
+            facts = path.stat()
+            found.append((facts.st_mtime, facts.st_size, path))
+    total = sum(size for _, size, _ in found)
+    for used, size, path in sorted(found):
+        writing = path.name.endswith(PART)
+        if writing and time.time() - used < ABANDONED:
+            continue
+        if path != fresh and (writing or total > MOST_BYTES):
+            with contextlib.suppress(OSError):
+                path.unlink()
+                total -= size

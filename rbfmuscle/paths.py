@@ -31,6 +31,8 @@ STEP = 1.0  # of the central differences, to either side [degree, or mm of a shi
 # A muscle has settled where no contact point moves by more than this share of its size in a solve.
 MOST_SOLVES, SETTLED = 60, 3e-7
 ARM_WEIGHT = 1.0 / 3.0  # one mm of a length weighs as much as this many mm/rad of a moment arm
+# A shift [mm] that counts as much as a rotation by one radian: one mm as one degree, as in `STEP`.
+SHIFT = math.degrees(1.0)
 MOST_COORDINATES = 6  # OpenSim's function takes up to six coordinates
 FOLDS = 5  # parts of the poses that are left out in turn to choose the order
 
@@ -46,6 +48,7 @@ class Samples:
     values: np.ndarray  # (n, d) [radian or scene unit]
     lengths: np.ndarray  # (n,) [scene unit]
     arms: np.ndarray  # (n, d) [scene unit]
+    unsettled: int = 0  # poses at which it had not settled after `MOST_SOLVES`
 
 
 def parse_ranges(scene: Scene, texts: list[str]) -> Ranges:
@@ -100,13 +103,14 @@ def sample_muscles(
             if progress is not None:
                 progress(done, samples * len(groups))
         for muscle, table in zip(muscles, np.array(rows).transpose(1, 0, 2)):
-            found.append(Samples(muscle.name, names, values, table[:, 0], table[:, 1:]))
+            capped = int(table[:, -1].sum())
+            found.append(Samples(muscle.name, names, values, table[:, 0], table[:, 1:-1], capped))
     return found
 
 
 def _measured(scene, poses):
-    """For each pose a row for each muscle: its length, then its moment arm about each coordinate of
-    the poses.
+    """For each pose a row for each muscle: its length, its moment arm about each coordinate of the
+    poses, and whether it did not settle.
     """
     scene.motion = Motion(poses[:40])  # what bones a muscle may meet is sought along it
     models = build_models(scene)
@@ -123,11 +127,13 @@ def _measured(scene, poses):
             loop.activations.target = loop.activations.at(0)  # the same in all solves
             yield _row(loop, lines, pose)
         except SolveError:
-            yield np.full((len(models), 1 + len(pose)), np.nan)
+            yield np.hstack(
+                [np.full((len(models), 1 + len(pose)), np.nan), np.zeros((len(models), 1))]
+            )
 
 
 def _row(loop, lines, pose):
-    """Length and moment arms (n, 1 + d) of the muscles at a pose."""
+    """Length and arms of the muscles at a pose, and whether they did not settle, (n, 2 + d)."""
     here, arms = _settled(loop, lines, pose), []
     facts = all_coordinates(loop.scene.joints)
     for name, value in pose.items():
@@ -136,13 +142,12 @@ def _row(loop, lines, pose):
         ends = [facts[name].honoured(value + side * step) for side in (-1.0, 1.0)]
         below, above = (_settled(loop, lines, {**pose, name: end}) for end in ends)
         arms.append(-(above - below) / (ends[1] - ends[0]))
-    return np.stack([here, *arms], axis=1)
+    capped = [any(key[2] == "iteration_cap" for key in s.events) for s in loop.steppers]
+    return np.stack([here, *arms, capped], axis=1)
 
 
 def _settled(loop, lines, pose):
-    """Lengths (n,) of the muscles when they have come to rest at a pose, or have had
-    `MOST_SOLVES`.
-    """
+    """Lengths (n,) of the muscles that rest at a pose, or have had `MOST_SOLVES`: an event."""
     loop.skip(pose)
     with loop.working():
         each(lambda stepper: _settle(stepper, loop.here), loop.steppers)
@@ -162,6 +167,7 @@ def _settle(stepper, here):
         before, points = points, stepper.model.contact_points().copy()
         if np.abs(points - before).max() <= small:
             return
+    stepper.report("", MOST_SOLVES, "iteration_cap")
 
 
 def _poses(ranges, samples):
@@ -233,8 +239,10 @@ def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[s
     lines = []
     errors = []
     unit = scene.units
+    turning = {name: f.motion != "translation" for name, f in all_coordinates(scene.joints).items()}
     for found in sampled:
-        path, row = _fit(found)
+        radian = [1.0 if turning[name] else scene.length(SHIFT) for name in found.coordinates]
+        path, row = _fit(found, np.array(radian))
         fitted.append(path)
         errors.append(row)
         lines.append(
@@ -243,8 +251,8 @@ def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[s
             f"length {row['length_rms']:.3g} {unit} RMS, {row['length_max']:.3g} at most; "
             f"arms {row['arm_rms']:.3g} {unit} RMS, {row['arm_max']:.3g} at most"
             + (f"; {row['failed']} poses could not be solved" if row["failed"] else "")
+            + (f"; at {found.unsettled} poses it did not settle" if found.unsettled else "")
         )
-    turning = {name: f.motion != "translation" for name, f in all_coordinates(scene.joints).items()}
     with paths_folder(directory).staged() as stage:
         write_paths(stage / "paths.xml", fitted, scene.length(1000.0), turning)
         with (stage / "errors.csv").open("w", encoding="utf-8", newline="") as out:
@@ -258,8 +266,10 @@ def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[s
     ]
 
 
-def _fit(found):
-    """The path of a muscle, and its errors at poses that the fit has not seen."""
+def _fit(found, radian):
+    """The path of a muscle, and its errors at poses that the fit has not seen; of shifts those of
+    the moment arm for what counts as a ``radian`` (d,).
+    """
     solved = np.isfinite(found.lengths) & np.isfinite(found.arms).all(axis=1)
     held = np.arange(len(solved)) % HELD_OUT == HELD_OUT - 1
     use = solved & ~held
@@ -269,11 +279,11 @@ def _fit(found):
         why = f"{failed} of {len(solved)} poses failed, too few are left to fit"
         raise SolveError(f"muscle {found.muscle!r}: {why}")
     parts = (found.values[use], found.lengths[use], found.arms[use])
-    path = fit_path(found.muscle, found.coordinates, *parts, most=HIGHEST_ORDER)
+    path = fit_path(found.muscle, found.coordinates, *parts, radian=radian, most=HIGHEST_ORDER)
     row = {"muscle": path.muscle, "order": path.order, "fitted": int(use.sum()), "failed": failed}
     row["held_out"] = int(out.sum())
     length = path.length(found.values[out]) - found.lengths[out]
-    arm = path.arms(found.values[out]) - found.arms[out]
+    arm = radian * (path.arms(found.values[out]) - found.arms[out])
     for name, error in {"length": length, "arm": arm}.items():
         row |= {
             f"{name}_rms": float(np.sqrt(np.mean(error**2))),
@@ -332,16 +342,18 @@ def fit_path(
     lengths: np.ndarray,
     arms: np.ndarray,
     *,
+    radian: np.ndarray | None = None,
     most: int = 7,
 ) -> FittedPath:
     """Fit a polynomial to lengths (n,) and, by its derivatives, to moment arms (n, d).
 
-    ``values`` (n, d) are the coordinates [radian or scene unit]. The order, at most ``most``, is
-    the one whose fit without a fifth of the poses, each in turn, errs least there; there are always
-    more equations than terms.
+    ``values`` (n, d) are the coordinates [radian or scene unit], of which ``radian`` (d,), 1 by
+    default, weighs as much as one radian, whatever the scene's unit. The order, at most ``most``,
+    is the one whose fit without a fifth of the poses, each in turn, errs least there; there are
+    always more equations than terms.
     """
     count, dimension = values.shape
-    weights = np.r_[1.0, np.full(dimension, ARM_WEIGHT)][:, None]
+    weights = np.r_[1.0, ARM_WEIGHT * (np.ones(dimension) if radian is None else radian)][:, None]
     wanted = weights * np.vstack([lengths, arms.T])
     group, best = np.arange(count) % FOLDS, (np.inf, 1, np.empty(0))
     for order in range(1, most + 1):

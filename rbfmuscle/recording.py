@@ -18,11 +18,13 @@ from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import frame_rows, joint_gaps, moment_arm_rows
 from rbfmuscle.metrics.summary import (
     LIMITS,
+    Limits,
     Summary,
-    default_limit,
     describe_verdict,
     exceeded,
+    parse_limits,
     require_limits,
+    unmeasured,
 )
 from rbfmuscle.models import configure_scene, kernel_names
 from rbfmuscle.output.writer import Neighbours, RunWriter, build_info, frame_facts
@@ -33,7 +35,13 @@ from rbfmuscle.sharing.crew import WorkerPool, helpers_for
 from rbfmuscle.sharing.share import MuscleGroup, timed
 from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.simulation.substeps import check_substeps
-from rbfmuscle.validation import RBFMuscleError, SceneWarning, SolveError, UsageError
+from rbfmuscle.validation import (
+    LimitExceededError,
+    RBFMuscleError,
+    SceneWarning,
+    SolveError,
+    UsageError,
+)
 
 
 class MemorySink:
@@ -60,7 +68,8 @@ class Recording:
     """One run of a scene: its models through the frame loop, measured and clocked, into a sink.
 
     ``model``, ``settings`` and ``frames`` are those of `configure_scene`; ``fields`` of the bones,
-    by name, stand in place of `BoneSDF`, and all muscles are then in this process.
+    by name, stand in place of `BoneSDF`, and all muscles are then in this process; ``fail_on`` are
+    the limits of `parse_limits`.
     """
 
     def __init__(
@@ -71,12 +80,14 @@ class Recording:
         settings: Mapping[str, Any] | None = None,
         frames: slice | str | None = None,
         fields: Mapping[str, BoneField] | None = None,
+        fail_on: str | Sequence[str] | None = None,
     ) -> None:
         self.started = datetime.now(UTC)
         self._start = time.perf_counter()
         self._end = 0.0
         scene = configure_scene(scene, settings, model=model, frames=frames)
         self.scene = orient_scene(scene.validate())
+        self.limits: Limits = parse_limits(fail_on, self.scene)
         if fields is not None and set(fields) != {bone.name for bone in scene.bones}:
             bones = ", ".join(bone.name for bone in scene.bones)
             raise UsageError(
@@ -147,11 +158,9 @@ class Recording:
                 self._end = time.perf_counter()
                 sink.write_info(self.info())
 
-    def finish(
-        self, writer: RunWriter, limits: Mapping[str, float], *, pictures: bool = True
-    ) -> dict[str, Any]:
-        """Write report and pictures of a run that is in a folder, then hold it to limits; what
-        ``run.json`` holds.
+    def finish(self, writer: RunWriter, *, pictures: bool = True) -> dict[str, Any]:
+        """Write report and pictures of a run that is in a folder, then hold it to the limits that
+        it may fail on; what ``run.json`` holds.
         """
         start = time.perf_counter()
         with timed(self.times, "report"), stage("drawing pictures"):
@@ -162,7 +171,11 @@ class Recording:
         self._end += time.perf_counter() - start
         info = self.info()
         writer.write_info(info)
-        require_limits(self.summary.table(), limits)
+        try:
+            require_limits(self.summary.table(), self.limits)
+        except LimitExceededError as error:
+            error.info = info
+            raise
         return info
 
     def close(self) -> None:
@@ -186,7 +199,7 @@ class Recording:
         self.times["wall"] = (self._end or time.perf_counter()) - self._start
         here, shared = self.times, self.share.times
         table = self.summary.table()
-        limits = {name: default_limit(name, self.scene) for name in LIMITS}
+        limits = self.limits
         return build_info(
             self.scene,
             self.started,
@@ -199,9 +212,11 @@ class Recording:
             times={
                 part: here.get(part, 0.0) + shared.get(part, 0.0) for part in {**here, **shared}
             },
-            limits=limits,
+            limits=limits.values,
+            fail_on=limits.fail_on,
             verdict=describe_verdict(table, limits, self.scene.left_out),
             beyond=exceeded(table, limits),
+            not_measured=unmeasured(table, limits),
             frames=self.written,
         )
 
@@ -218,15 +233,16 @@ def _check_skeleton(scene: Scene) -> dict[int, Found]:
         warnings.warn(f"{finding.place}: {finding.message}", SceneWarning, stacklevel=5)
     for note in scene.motion.notes:
         warnings.warn(f"motion: {note}", SceneWarning, stacklevel=5)
-    found: dict[int, Found] = {}
+    found: dict[int, Found] = {
+        frame: ([], {"bone_overlap": 0.0, "joint_gap": 0.0}) for frame in sampled_frames(scene)
+    }
     for frame, first, second, depth in collisions:
         events, values = found.setdefault(frame, ([], {}))
         events.append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))
         values["bone_overlap"] = max(values.get("bone_overlap", 0.0), depth)
-    if scene.left_out:
-        events, values = found.setdefault(0, ([], {}))
-        events.extend(Event(0, "", name, 1, "bone_left_out") for name in scene.left_out)
-        values["bones_left_out"] = float(len(scene.left_out))
+    events, values = found.setdefault(0, ([], {}))
+    events.extend(Event(0, "", name, 1, "bone_left_out") for name in scene.left_out)
+    values["bones_left_out"] = float(len(scene.left_out))
     opened = scene.length(LIMITS["joint_gap"].value)
     for frame, parent, child, opening in joint_gaps(scene, sampled_frames(scene)):
         events, values = found.setdefault(frame, ([], {}))

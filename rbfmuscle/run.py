@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from rbfmuscle.folders import LIST, read_list
 from rbfmuscle.geometry.fields import BoneField
-from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.metrics.summary import parse_limits
+from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun, saved_frames
 from rbfmuscle.output.writer import RunWriter, run_folder
@@ -127,15 +126,15 @@ def stream_run(
     SolveError
         If a frame cannot be solved or written; frames so far are kept.
     LimitExceededError
-        If a limit of ``fail_on`` is exceeded; everything is written.
+        If a limit of ``fail_on`` is exceeded, or was not measured; everything is written, and its
+        ``info`` is what ``run.json`` holds.
     """
-    limits = parse_limits(fail_on, scene)
     run_folder(directory)
-    recording = Recording(scene, model=model, settings=settings, frames=frames)
+    recording = Recording(scene, model=model, settings=settings, frames=frames, fail_on=fail_on)
     with closing(recording):
         writer = RunWriter(directory, recording.scene)
         recording.feed(writer, progress=progress)
-    return recording.finish(writer, limits, pictures=pictures)
+    return recording.finish(writer, pictures=pictures)
 
 
 class Run:
@@ -237,11 +236,32 @@ class Run:
         """All muscles."""
         return (MuscleRun(self, muscle) for muscle in self.muscles)
 
-    def values(self, muscle: str, quantity: str) -> NDArray[np.float64]:
-        """Values of a quantity over the frames, (n,) ndarray."""
-        return np.array(
-            [r.value for r in self.metrics if r.muscle == muscle and r.quantity == quantity]
-        )
+    def values(
+        self, muscle: str, quantity: str, *, coordinate: str | None = None
+    ) -> NDArray[np.float64]:
+        """Values of a quantity over the frames, (n,) ndarray; of moment arms those about a
+        ``coordinate``, which must be named where the muscle has several.
+
+        UsageError if the run has no such muscle, quantity or coordinate.
+        """
+        found: dict[str, list[Row]] = {}
+        for row in self.metrics:
+            if row.muscle == muscle:
+                found.setdefault(row.quantity, []).append(row)
+        if not found:
+            raise UsageError(
+                f"unknown muscle {muscle!r}, {did_you_mean(muscle, [*self.muscles, ALL])}"
+            )
+        if quantity not in found:
+            raise UsageError(
+                f"{quantity!r} was not measured of {muscle!r}, {did_you_mean(quantity, found)}"
+            )
+        rows = found[quantity]
+        if quantity == "moment_arm":
+            rows = _about(rows, coordinate)
+        elif coordinate is not None:
+            raise UsageError(f"{quantity!r} has no coordinate; only 'moment_arm' has")
+        return np.array([row.value for row in rows])
 
     def table(self) -> pandas.DataFrame:
         """Return the metrics as a pandas DataFrame, or raise MissingPartError if pandas is not
@@ -278,7 +298,7 @@ class Run:
         """
         folder = run_folder(directory)
         if self._recording is not None:
-            self._recording.finish(self._write(directory), {}, pictures=pictures)
+            self._recording.finish(self._write(directory), pictures=pictures)
         elif Path(directory).resolve() != self.saved.directory.resolve():
             with folder.staged() as stage:
                 _copy_run(self.saved.directory, stage)
@@ -355,6 +375,24 @@ class MuscleRun:
         surface = self.run.frames[frame].surfaces[self.name]
         return trimesh.Trimesh(surface.vertices, surface.faces, process=False)
 
-    def values(self, quantity: str) -> NDArray[np.float64]:
-        """Values of a quantity over the frames, (n,) ndarray."""
-        return self.run.values(self.name, quantity)
+    def values(self, quantity: str, *, coordinate: str | None = None) -> NDArray[np.float64]:
+        """Values of a quantity over the frames, (n,) ndarray; see `Run.values`."""
+        return self.run.values(self.name, quantity, coordinate=coordinate)
+
+
+def _about(rows: list[Row], coordinate: str | None) -> list[Row]:
+    """The rows of moment arms about one coordinate."""
+    names = list(dict.fromkeys(row.coordinate for row in rows))
+    if coordinate is None:
+        if len(names) > 1:
+            raise UsageError(
+                f"{rows[0].muscle!r} has moment arms about {', '.join(names)}; name one with "
+                "coordinate="
+            )
+        return rows
+    if coordinate not in names:
+        raise UsageError(
+            f"{rows[0].muscle!r} has no moment arm about {coordinate!r}, "
+            f"{did_you_mean(coordinate, names)}"
+        )
+    return [row for row in rows if row.coordinate == coordinate]

@@ -48,9 +48,14 @@ class SolveError(RBFMuscleError, RuntimeError):
 
 
 class LimitExceededError(RBFMuscleError, RuntimeError):
-    """A limit given with ``--fail-on`` was exceeded (exit code 6)."""
+    """A limit given with ``--fail-on`` was exceeded, or not measured (exit code 6); everything is
+    written.
+
+    ``info`` is what ``run.json`` holds.
+    """
 
     exit_code = 6
+    info: Any = None
 
 
 class MissingPartError(RBFMuscleError, ImportError):

@@ -35,7 +35,11 @@ class BlendMuscle(ToyMuscle):
             raise SolveError(f"muscle {self.name!r}: planted failure")
 
     def surface(self, contacts):
-        quantities = {"solver_penetration_max": 0.0, "time_extract": 0.001}
+        quantities = {
+            "solver_penetration_max": 0.0,
+            "solver_residual": 0.0,
+            "time_extract": 0.001,
+        }
         return ModelSurface(self.x.copy(), self.faces, quantities)
 
 

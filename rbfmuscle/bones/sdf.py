@@ -21,7 +21,7 @@ from rbfmuscle.bones.query import FieldData, query_loop
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, MeshLike
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.rest_frame import BoneFrame, on_one_line
+from rbfmuscle.geometry.rest_frame import BoneFrame, numbered_by_place, on_one_line
 from rbfmuscle.geometry.surfaces import face_normals
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.winding import inside_test
@@ -39,6 +39,9 @@ BAND = 1.2
 TOLERANCE_SHARE = 0.004
 # Points at which a field measures itself, and how often it may be refined.
 PROBES, ATTEMPTS = 4000, 5
+# Regions grow to the next of so many parts of a bone's longest side, so that motions that are alike
+# share a field; beyond the bone's box by one of these they mean nothing more.
+REGION_PARTS = 32
 # Bytes that a field may take unless told otherwise.
 MEMORY_LIMIT = 2**28
 
@@ -49,7 +52,7 @@ class BoneSDF:
     Attributes
     ----------
     vertices, faces : (n, 3) and (m, 3) ndarray
-        The mesh as used: degenerate and duplicate faces left out.
+        The mesh as used: numbered by place, degenerate and duplicate faces left out.
     bounds : (2, 3) ndarray
         Box of the mesh, bone coordinates.
     spacing : float
@@ -131,8 +134,8 @@ class BoneSDF:
             RMS error near the surface [unit of the mesh]. By default 0.4 % of the mean edge, or
             what the memory allows.
         region : (2, 3) array_like, optional
-            Box, bone coordinates, that points come from. Outside of it the field is coarse, but
-            still right.
+            Box, bone coordinates, that points come from, which is grown to the next of
+            `REGION_PARTS` parts of the bone. Outside of it the field is coarse, but still right.
         cache : bool
             Look the field up on disk, and keep it there.
         memory_limit : int
@@ -151,15 +154,18 @@ class BoneSDF:
         region = None if region is None else check_points(region, name="region")
         if region is not None and (region.shape != (2, 3) or np.any(region[0] > region[1])):
             raise ValueError(f"region must be (2, 3), least corner first, got {region.tolist()}")
-        box = None if region is None else region.tolist()
-        key = content_key(vertices, faces, (tolerance, box, memory_limit)) if cache else None
+        steps = None if region is None else _region_steps(region, vertices)
+        key = content_key(vertices, faces, (tolerance, steps, memory_limit)) if cache else None
         arrays = None if key is None else load_arrays(key)
         parts = None if arrays is None else _from_arrays(arrays)
         vertices, faces = check_mesh(vertices, faces, name=name)
         if parts is None and on_one_line(vertices):
             raise MeshError(f"{name} has no face with an area")
+        order, faces = numbered_by_place(vertices, faces)
+        vertices = vertices[order]
         frame = BoneFrame(vertices)
         if parts is None:
+            region = None if steps is None else _stepped_region(steps, vertices)
             parts = _build(
                 prepare_bone(frame.local, faces, name=name),
                 frame,
@@ -221,6 +227,23 @@ class BoneSDF:
 
         in_chunks(len(points), work, least=4096)
         return distance, slope
+
+
+def _region_steps(region, vertices):
+    """A box (2, 3) in whole steps from the least corner of the mesh's box, grown outwards; a list,
+    for a key.
+    """
+    low, extent = vertices.min(axis=0), np.ptp(vertices, axis=0)
+    steps = (region - low) * REGION_PARTS / max(float(extent.max()), 1e-300)
+    most = np.ceil(extent * REGION_PARTS / max(float(extent.max()), 1e-300)) + 1.0
+    steps = np.clip([np.floor(steps[0]), np.ceil(steps[1])], -1.0, most)
+    return steps.astype(int).tolist()
+
+
+def _stepped_region(steps, vertices):
+    """The box (2, 3) of `_region_steps`."""
+    extent = float(np.ptp(vertices, axis=0).max())
+    return vertices.min(axis=0) + np.array(steps) * extent / REGION_PARTS
 
 
 def _check_pose(pose):

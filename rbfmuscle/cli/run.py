@@ -1,12 +1,13 @@
 """``rbfmuscle run`` and ``rbfmuscle demo``: a scene through its motion, into a folder."""
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from rbfmuscle.cli.options import Frames, Json, Model, Output, SceneName, Settings, chosen_muscle
 from rbfmuscle.progress import Progress
-from rbfmuscle.validation import SolveError
+from rbfmuscle.validation import LimitExceededError, SolveError
 
 
 def demo(
@@ -15,9 +16,9 @@ def demo(
     model: Model = None,
     frames: Frames = None,
     as_json: Json = False,
-) -> None:
+) -> int:
     """Run the embedded hip: no data, no network."""
-    run(Path("phantom"), output=output, model=model, frames=frames, as_json=as_json)
+    return run(Path("phantom"), output=output, model=model, frames=frames, as_json=as_json)
 
 
 def run(
@@ -30,7 +31,7 @@ def run(
     frames: Frames = None,
     fail_on: str | None = None,
     as_json: Json = False,
-) -> None:
+) -> int:
     """Run a scene through its motion and write surfaces, metrics and a report.
 
     Parameters
@@ -38,8 +39,8 @@ def run(
     muscle
         Name of one muscle to simulate, without the others and without [sliding]; all by default.
     fail_on
-        Limits, by commas: a value beyond one of them makes the exit code 6. For instance
-        volume_error=0.001,penetration_max, or all.
+        Limits, by commas: a value beyond one of them, or none at all, makes the exit code 6. For
+        instance volume_error=0.001,penetration_max, or all.
     """
     from rbfmuscle import interruption
 
@@ -63,16 +64,26 @@ def run(
         if muscle is not None:
             loaded.muscles, loaded.sliding = [chosen_muscle(loaded, muscle)], None
         options: dict[str, Any] = {"model": model, "frames": frames, "fail_on": fail_on}
+        failed: dict[str, Any] = {}
         try:
             info = stream_run(loaded, output, settings=changes, progress=advance, **options)
         except SolveError as error:
             raise SolveError("; ".join(filter(None, [str(error), kept()]))) from None
+        except LimitExceededError as error:
+            info, failed = error.info, {"error": str(error), "exit_code": error.exit_code}
     if as_json:
         from rbfmuscle.output.writer import json_text
 
-        print(json_text({"directory": str(output), **info}))
-        return
+        print(json_text({"directory": str(output), **info, **failed}))
+    else:
+        _print_result(info, output, time.perf_counter() - start)
+    if failed:
+        print(f"rbfmuscle: {failed['error']}", file=sys.stderr)
+    return failed.get("exit_code", 0)
+
+
+def _print_result(info: dict[str, Any], output: Path, seconds: float) -> None:
     print(f"verdict: {info['verdict']}")
     report = output / "report.html"
     there = f"in {output}, open {report}" if report.exists() else f"in {output}"
-    print(f"{len(info['frames'])} frames in {time.perf_counter() - start:.1f} s, {there}")
+    print(f"{len(info['frames'])} frames in {seconds:.1f} s, {there}")

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rbfmuscle.output.writer import versions
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_value
 from rbfmuscle.validation import UsageError
@@ -27,10 +28,10 @@ FINER_DOWN = ("contact.substep_angle", "motion.step")
 class SweepPoint:
     """One combination of settings of one scene.
 
-    ``key`` is a hash of the scene's content and the settings; ``scene`` a name; ``settings`` are
-    dotted keys with their values, the model first; ``role`` is "reference", "default" (the scene's
-    own settings) or ""; ``reference`` is the key of the point that the error is measured against,
-    "" without a grid.
+    ``key`` is a hash of the library's version, the scene's content and the settings; ``scene`` a
+    name; ``settings`` are dotted keys with their values, the model first; ``role`` is "reference",
+    "default" (the scene's own settings) or ""; ``reference`` is the key of the point that the error
+    is measured against, "" without a grid.
     """
 
     key: str
@@ -116,12 +117,13 @@ def _model_first(settings):
 
 
 def scene_content(scene: Scene, frames: str | None = None) -> str:
-    """Hash of what a scene would simulate, wherever its files lie."""
+    """Hash of what a scene would simulate, wherever its files lie, and of the library's version."""
     facts = scene.resolved()
     for part in ("file", "output"):
         facts.pop(part)
     for item in [*facts["bones"], *facts["muscles"]]:
         item.pop("mesh")
+    facts["motion"].pop("file", None)
     ends = [muscle.attachments for muscle in scene.muscles]
     held = [
         [(a.bone, a.vertices.tolist(), a.tendon and a.tendon.model_dump()) for a in end]
@@ -129,7 +131,8 @@ def scene_content(scene: Scene, frames: str | None = None) -> str:
     ]
     fibres = [[line.tolist() for line in muscle.fibres or []] for muscle in scene.muscles]
     track = [sorted(frame.items()) for frame in scene.motion.frames]
-    return _hash([facts, held, fibres, track, str(frames or "")])
+    version = versions()["rbfmuscle"]
+    return _hash([facts, held, fibres, track, str(frames or ""), version])
 
 
 def point_key(content: str, settings: Mapping[str, Any]) -> str:

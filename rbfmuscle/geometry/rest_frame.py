@@ -34,8 +34,9 @@ class RestFrame:
 
     Sampling and binding choose between points; two that are equally good must not be told apart by
     rounding, or a moved scene would get other centres. Here they see the same numbers, ``local``
-    (n, 3), wherever the scene lies: vertices in a frame spanned by the first of them, in units of
-    the mesh's size, rounded to 1e-8.
+    (n, 3), wherever the scene lies: vertices in a frame spanned by those farthest from their mean
+    and from the line to it, in units of the mesh's size, rounded to 1e-8. The frame is that of any
+    numbering of the vertices, but for meshes so symmetric that several lie equally far.
     """
 
     def __init__(self, vertices: Floats) -> None:
@@ -43,11 +44,11 @@ class RestFrame:
         offset = vertices - self.origin
         distance = np.linalg.norm(offset, axis=1)
         self.size = float(distance.max())
-        first = offset[np.argmax(distance > 0.3 * self.size)]
+        first = offset[_farthest(distance)]
         first = first / np.linalg.norm(first)
         across = offset - (offset @ first)[:, None] * first
         span = np.linalg.norm(across, axis=1)
-        second = across[np.argmax(span > 0.3 * span.max())]
+        second = across[_farthest(span)]
         second = second / np.linalg.norm(second)
         self.axes = np.array([first, second, np.cross(first, second)])
         self.local = np.round(offset @ self.axes.T / self.size, 8) + 0.0  # no zero has a sign
@@ -64,6 +65,24 @@ class RestFrame:
     def directions(self, local: Floats) -> Floats:
         """World directions of local ones."""
         return local @ self.axes
+
+
+def _farthest(distance: Floats) -> int:
+    """The greatest of some distances; of those that are equal but for rounding the first."""
+    return int(np.argmax(distance >= (1.0 - 1e-9) * distance.max()))
+
+
+def numbered_by_place(vertices: Floats, faces: Integers) -> tuple[Integers, Integers]:
+    """Order (n,) of a mesh's vertices that follows from where they lie, and its faces (m, 3) in it.
+
+    It is the same wherever the scene lies and however the mesh was numbered, but for symmetric
+    meshes (see `RestFrame`) and vertices at one place.
+    """
+    order = np.lexsort(RestFrame(vertices).local.T)
+    renumbered = np.argsort(order)[faces]
+    first = renumbered.argmin(axis=1)[:, None]
+    renumbered = np.take_along_axis(renumbered, (first + np.arange(3)) % 3, axis=1)
+    return order, renumbered[np.lexsort(renumbered.T[::-1])]
 
 
 def on_one_line(vertices: Floats) -> bool:
@@ -100,6 +119,13 @@ class BoneFrame:
         self.size = frame.size
         self.axes = turn @ frame.axes
         self.local = np.round(frame.local @ turn.T, 8) + 0.0
+        self._placed = lru_cache(maxsize=16)(self._place)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in vars(self).items() if name != "_placed"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        vars(self).update(state)
         self._placed = lru_cache(maxsize=16)(self._place)
 
     def box(self, bounds: ArrayLike) -> Floats:

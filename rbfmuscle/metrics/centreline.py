@@ -20,7 +20,7 @@ from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.jit import compiled
 from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bones_about
-from rbfmuscle.scene.joints.joint import Joint, all_coordinates
+from rbfmuscle.scene.joints.joint import Joint, all_coordinates, rigid_body
 from rbfmuscle.scene.objects import Attachment, Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import TendonLine
@@ -152,14 +152,7 @@ def split_ends(
     insertion. Bones whose joint does not move are one body with its parent. Where all are on one
     body, the first attachment is the origin.
     """
-    joint_of = {joint.child: joint for joint in joints}
-
-    def body(bone):
-        while moving is not None and bone in joint_of and joint_of[bone].name not in moving:
-            bone = joint_of[bone].parent
-        return bone if bone in joint_of else None
-
-    bodies = [body(a.bone) for a in muscle.attachments]
+    bodies = [rigid_body(a.bone, joints, moving) for a in muscle.attachments]
     origin = [a for a, owner in zip(muscle.attachments, bodies) if owner == bodies[0]]
     insertion = [a for a, owner in zip(muscle.attachments, bodies) if owner != bodies[0]]
     if insertion:

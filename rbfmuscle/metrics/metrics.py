@@ -1,6 +1,7 @@
 """What is measured of every muscle in a written frame."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ Values = dict[str, float]
 _FROM_MODEL = (
     "solver_penetration_max",
     "sweeps",
+    "solver_residual",
+    "solid_volume_error",
     "unfitted_fraction",
     "condition",
     "time_fit",
@@ -29,9 +32,6 @@ _FROM_MODEL = (
 
 # Events whose points stayed beyond a bone; those turned back or halved away are in events.csv only.
 _THROUGH = ("reported", "unresolved")
-
-# Of these the greatest at rest is the overlap that is left there.
-_OVERLAPS = ("penetration_max", "bone_penetration_max", "solver_penetration_max")
 
 
 class MuscleMeasures:
@@ -46,11 +46,19 @@ class MuscleMeasures:
             muscle.name: _Tracker(muscle, scene, *carried[muscle.name]) for muscle in mine
         }
 
+    def measure_rest(self, surfaces: Mapping[str, ModelSurface], poses: dict[str, Floats]) -> None:
+        """Measure the surfaces at rest, before the first frame, by muscle; ``poses`` (4, 4) are
+        those of rest.
+
+        The values are among those of the first frame that is measured.
+        """
+        trackers = list(self.trackers.values())
+        each(lambda t: t.measure_rest(surfaces[t.name], self.probes, poses), trackers)
+
     def measure(self, frame: Frame) -> dict[str, Values]:
         """Measure a frame: for each muscle its values by quantity, in the order of `QUANTITIES`."""
-        at_rest = all(np.abs(pose - np.eye(4)).max() < 1e-9 for pose in frame.poses.values())
         trackers = list(self.trackers.values())
-        found = each(lambda tracker: tracker.measure(frame, self.probes, at_rest), trackers)
+        found = each(lambda tracker: tracker.measure(frame, self.probes), trackers)
         return dict(zip(self.trackers, found))
 
 
@@ -69,23 +77,20 @@ class _Tracker:
         if len(muscle.attachments) > 1:
             self.line = Centreline(muscle, scene.joints, vertices, faces, moving=moving)
         self.form = SurfaceForm()
-        self.rest_measured = False
+        self.carried = vertices
+        self.at_rest: Values = {}  # what was measured there, until the first frame takes it
         # Of the last surface.
         self.distance: MeshDistance | None = None
         self.offset: Floats | None = None
         self.near: Integers | None = None
 
-    def measure(self, frame: Frame, probes: list[BoneProbe], at_rest: bool) -> dict[str, float]:
+    def measure(self, frame: Frame, probes: list[BoneProbe]) -> dict[str, float]:
         """What there is to measure of this muscle in a frame."""
-        found: dict[str, float] = {}
+        found, self.at_rest = self.at_rest, {}
         carried, surface = frame.carried[self.name][0], frame.surfaces.get(self.name)
         if surface is not None:
             found.update(self._of_surface(surface, carried, probes, frame.poses))
             found.update({q: surface.quantities[q] for q in _FROM_MODEL if q in surface.quantities})
-            if at_rest and not self.rest_measured:
-                found.update(self._at_rest(surface, probes, frame.poses))
-                found["initial_overlap"] = max(found.get(name, 0.0) for name in _OVERLAPS)
-                self.rest_measured = True
         mine = [event for event in frame.events if event.muscle == self.name]
         found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
         edges = self.edges @ carried
@@ -133,17 +138,26 @@ class _Tracker:
         before, self.offset = self.offset, self.distance.signed(carried, near=self.near)
         return {"flicker": np.abs(self.offset - before).max() if before is not None else 0.0}
 
-    def _at_rest(self, surface, probes, poses):
-        """What is measured once, in the first frame in which all bones are at rest."""
+    def measure_rest(
+        self, surface: ModelSurface, probes: list[BoneProbe], poses: dict[str, Floats]
+    ) -> None:
+        """What is measured once, before the first frame, with all bones at rest."""
         mesh = self.mesh.vertices, self.mesh.faces
         rms, worst = surface_distance(surface.vertices, surface.faces, *mesh)
         bones = {probe.name: probe for probe in probes}
         held = [a for a in self.attachments if a.tendon is None]
         gaps = [bones[a.bone].unsigned(mesh[0][a.vertices]).min() for a in held]
         found = {"rest_error_rms": rms, "rest_error_max": worst, "end_gap": max(gaps, default=0.0)}
+        shown = MeshDistance(surface.vertices, np.asarray(surface.faces))
+        found["initial_overlap"] = max(
+            float(surface_depth(surface.vertices, probes, poses).max()),
+            bone_depth(shown, probes, poses),
+            surface.quantities.get("solver_penetration_max", 0.0),
+        )
         if self.line is not None:
             found["thickness"] = self.line.section(*mesh, poses)["belly_thickness"]
-        return found
+            found["bowing_at_rest"] = self.line.measure(self.carried, poses, probes)[1]
+        self.at_rest = found
 
 
 def _edge_operator(vertices: Floats, faces: Integers) -> sparse.csr_matrix:

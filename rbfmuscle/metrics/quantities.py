@@ -20,6 +20,15 @@ QUANTITIES = {
         "deepest of the model's points inside a bone, before the cut along bones",
     ),
     "sweeps": ("1", "sweeps of the last solve of a mesh model"),
+    "solver_residual": (
+        "1",
+        "how far the last iteration of the last solve would have moved a point, of the muscle's "
+        "size; without the shortening of steps",
+    ),
+    "solid_volume_error": (
+        "1",
+        "greatest relative error of the volume of a region of the elastic solid",
+    ),
     "components": ("1", "closed pieces of the surface"),
     "euler": ("1", "Euler characteristic of the surface: 2 for a sphere, two less for each handle"),
     "self_crossings": ("1", "triangles of the surface that cross others of it"),
@@ -52,6 +61,7 @@ QUANTITIES = {
         "length of the centreline without tendons / that of the shortest path between its ends "
         "that keeps off the bones by the muscle's half thickness at rest",
     ),
+    "bowing_at_rest": ("1", "the same at rest, before the first frame"),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
     "activation": ("1", "activation, 0 to 1; this and the next three for muscles that contract"),
     "belly_thickness": ("length", "least width of the greatest section across the line of action"),

@@ -18,6 +18,25 @@ from rbfmuscle.validation import LimitExceededError, UsageError, did_you_mean
 Table = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 
+class Limits(NamedTuple):
+    """What a run is held to: the limit of each quantity in the scene's unit.
+
+    ``fail_on`` are those that make the exit code 6, with the value that the caller gave; None where
+    it is the default. A value that was given holds for every muscle as it is (`muscle_limit`).
+    """
+
+    values: Mapping[str, float]
+    fail_on: Mapping[str, float | None] = {}
+
+    def is_given(self, quantity: str) -> bool:
+        """Whether the caller gave the value of this limit."""
+        return self.fail_on.get(quantity) is not None
+
+    def failing(self) -> "Limits":
+        """Those of ``fail_on`` alone."""
+        return Limits({name: self.values[name] for name in self.fail_on}, self.fail_on)
+
+
 class Limit(NamedTuple):
     """Greatest allowed magnitude of a quantity (of those in `LEAST` the least), lengths in
     millimetres.
@@ -28,6 +47,7 @@ class Limit(NamedTuple):
     remedy: str
 
 
+_SETTLE = "raise model.iterations (of a mesh model take one that converges, as pbd-converged)"
 _SMALLER_STEPS = "lower contact.substep_angle"
 _MORE_CENTRES = "raise model.centres"
 _LOOK = "look at that frame: rbfmuscle render RUN --frame FRAME -o frame.png"
@@ -48,6 +68,10 @@ LIMITS = {
     "self_crossings": Limit(
         0.0, "self-crossing triangles", "raise model.iterations, or use model pbd-converged"
     ),
+    "solver_residual": Limit(1e-4, "last motion of the solver", _SETTLE),
+    "solid_volume_error": Limit(
+        0.02, "volume error of the solid", f"{_SETTLE}, or {_SMALLER_STEPS}"
+    ),
     "unfitted_fraction": Limit(
         0.999, "surface shown without a fit", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"
     ),
@@ -62,6 +86,16 @@ LIMITS = {
 }
 # Quantities of which too little is wrong: their limit is the least allowed value.
 LEAST = {"euler"}
+# Limits of the whole scene, measured under the muscle `ALL`; all others are of each muscle.
+OF_SCENE = ("bone_overlap", "joint_gap", "bones_left_out")
+# Limits that not every muscle has, and the quantity without which it has none: mesh models have no
+# level set, muscles with one attachment no centreline.
+NEEDS = {
+    "flicker": "unfitted_fraction",
+    "unfitted_fraction": "unfitted_fraction",
+    "solid_volume_error": "unfitted_fraction",
+    "bowing": "length",
+}
 COUNTS = ("components", "euler", "self_crossings", "tunnelled")
 # A muscle thinner than this [mm] may have this rest error [mm].
 THIN, THIN_REST_ERROR = 10.0, 1.0
@@ -133,8 +167,8 @@ class Summary:
         return facts
 
 
-def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> dict[str, float]:
-    """Limits as a dict of quantity to greatest allowed magnitude.
+def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> Limits:
+    """The limits of a run: those of `LIMITS`, and in their place or beside them those asked for.
 
     ``limits`` are like ``"penetration_max=0.5,volume_error"``, or a list of such: a quantity with a
     value in the unit of ``metrics.csv``, or alone with the limit of `LIMITS`; ``"all"`` for every
@@ -144,10 +178,10 @@ def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> dict[str, 
     if isinstance(limits, Mapping):
         raise UsageError("limits are text, for instance 'penetration_max=0.5,volume_error'")
     listed = [limits] if isinstance(limits, str) else limits or []
-    found = {}
+    found: dict[str, float | None] = {}
     for part in (part.strip() for text in listed for part in text.split(",") if part.strip()):
         if part == "all":
-            found |= {name: default_limit(name, scene) for name in LIMITS}
+            found = dict.fromkeys(LIMITS) | found
             continue
         name, given, value = part.replace("<=", "=").partition("=")
         name = name.strip()
@@ -155,13 +189,13 @@ def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> dict[str, 
             raise UsageError(
                 f"--fail-on: unknown quantity {name!r}, {did_you_mean(name, QUANTITIES)}"
             )
-        if given:
-            found[name] = _number(value, part)
-        elif name in LIMITS:
-            found[name] = default_limit(name, scene)
-        else:
+        if not given and name not in LIMITS:
             raise UsageError(f"--fail-on {name}: give a value, for instance {name}=1")
-    return found
+        found[name] = _number(value, part) if given else found.get(name)
+    values = {name: default_limit(name, scene) for name in LIMITS}
+    return Limits(
+        values | {name: value for name, value in found.items() if value is not None}, found
+    )
 
 
 def _number(text, part):
@@ -183,18 +217,19 @@ def _in_unit(value, quantity, unit):
     return value / MM_PER_UNIT[unit] if QUANTITIES[quantity][0] == "length" else value
 
 
-def muscle_limit(quantity: str, limit: float, found: Mapping[str, Mapping[str, Any]]) -> float:
-    """Limit of one muscle: thin ones and those that bow at rest have their own, by its facts, in
-    place of the default.
-    """
-    unit = found[quantity]["unit"]
-    if quantity not in LIMITS or limit != _in_unit(LIMITS[quantity].value, quantity, unit):
+def muscle_limit(quantity: str, limits: Limits, found: Mapping[str, Mapping[str, Any]]) -> float:
+    """Limit of one muscle: of defaults, thin ones and those bowed at rest have wider ones."""
+    limit = limits.values[quantity]
+    if limits.is_given(quantity):
         return limit
     if quantity == "rest_error_rms" and "thickness" in found:
+        unit = found["thickness"]["unit"]
         thin = found["thickness"]["first"] < _in_unit(THIN, "thickness", unit)
         return _in_unit(THIN_REST_ERROR, quantity, unit) if thin else limit
-    first = found[quantity]["first"]
-    return max(limit, first + MORE_BOWING) if quantity == "bowing" and first is not None else limit
+    at_rest = found.get("bowing_at_rest", {}).get("first")
+    return (
+        max(limit, at_rest + MORE_BOWING) if quantity == "bowing" and at_rest is not None else limit
+    )
 
 
 def within(quantity: str, worst: float, limit: float) -> bool:
@@ -204,24 +239,45 @@ def within(quantity: str, worst: float, limit: float) -> bool:
     return worst >= limit if quantity in LEAST else abs(worst) <= limit
 
 
-def exceeded(
-    table: Table, limits: Mapping[str, float]
-) -> list[tuple[str, str, float, float, int | None]]:
+def exceeded(table: Table, limits: Limits) -> list[tuple[str, str, float, float, int | None]]:
     """List of (muscle, quantity, worst value, limit, frame) beyond the limits; NaN counts as
     beyond.
     """
     found = []
     for muscle, quantities in table.items():
         for name, facts in quantities.items():
-            limit = limits.get(name.partition(":")[0])
-            if limit is None:
+            quantity = name.partition(":")[0]
+            if quantity not in limits.values:
                 continue
-            limit = muscle_limit(name, limit, quantities)
+            limit = muscle_limit(quantity, limits, quantities)
             worst = facts.get("worst")
             worst = math.nan if worst is None else worst  # as a file has it
-            if not within(name, worst, limit):
+            if not within(quantity, worst, limit):
                 found.append((muscle, name, worst, limit, facts.get("worst_frame")))
     return sorted(found, key=lambda row: excess(*row[1:4]), reverse=True)
+
+
+def unmeasured(table: Table, limits: Limits) -> list[tuple[str, str]]:
+    """List of (muscle, quantity) for limits without a value; `ALL` where no muscle has one."""
+    muscles = [name for name in table if name != ALL]
+    found = []
+    for quantity in limits.values:
+        having = {
+            muscle
+            for muscle, quantities in table.items()
+            if any(name.partition(":")[0] == quantity for name in quantities)
+        }
+        if quantity in OF_SCENE or not muscles:
+            wanted = [ALL]
+        elif quantity in LIMITS:
+            need = NEEDS.get(quantity)
+            wanted = [name for name in muscles if need is None or need in table[name]]
+        else:
+            wanted = [] if having else [ALL]
+        if limits.is_given(quantity) and not having:
+            wanted = wanted or [ALL]
+        found += [(muscle, quantity) for muscle in wanted if muscle not in having]
+    return found
 
 
 def excess(quantity: str, worst: float, limit: float) -> float:
@@ -233,29 +289,44 @@ def excess(quantity: str, worst: float, limit: float) -> float:
     return abs(worst) / limit
 
 
-def describe_verdict(
-    table: Table, limits: Mapping[str, float], left_out: Sequence[str] = ()
-) -> str:
-    """Which muscles are within all limits, the worst value of the others, and what to do; bones
-    ``left_out``.
+def describe_verdict(table: Table, limits: Limits, left_out: Sequence[str] = ()) -> str:
+    """Which muscles are within all limits, the worst of the others, what to do, and what was not
+    measured; bones ``left_out``.
     """
     muscles, found = [name for name in table if name != ALL], exceeded(table, limits)
+    missing = unmeasured(table, limits)
     wrong = [name for name in dict.fromkeys(row[0] for row in found) if name != ALL]
+    unknown = [name for name in dict.fromkeys(row[0] for row in missing) if name != ALL]
     if not muscles:
         text = "nothing was measured"
     elif not wrong:
-        text = "every muscle is within all limits in every frame"
+        held = "all limits that were measured" if missing else "all limits"
+        text = f"every muscle is within {held} in every frame"
     elif len(muscles) == 1:
         text = f"{muscles[0]} is not within all limits"
     else:
-        right = len(muscles) - len(wrong)
+        right = len(set(muscles).difference(wrong, unknown))
         count = (
             f"{right} of {len(muscles)} muscles {'is' if right == 1 else 'are'} within all limits"
         )
         text = f"{count}; {_listed(wrong)} {'is' if len(wrong) == 1 else 'are'} not"
-    if not found:
-        return text
     text += "; the bones are not" if any(row[0] == ALL for row in found) and not wrong else ""
+    if found:
+        text += _worst_and_remedies(found, table, left_out)
+    return f"{text}. Not measured: {describe_unmeasured(missing)}" if missing and muscles else text
+
+
+def describe_unmeasured(missing: Sequence[tuple[str, str]]) -> str:
+    """Each limit that was not measured, with the muscles of which it was not."""
+    by_quantity: dict[str, list[str]] = {}
+    for muscle, quantity in missing:
+        by_quantity.setdefault(quantity, []).extend([] if muscle == ALL else [muscle])
+    texts = [f"{q}{f' of {_listed(n)}' if n else ''}" for q, n in by_quantity.items()]
+    more = f" and {len(texts) - MOST_NAMED} more" if len(texts) > MOST_NAMED else ""
+    return "; ".join(texts[:MOST_NAMED]) + more
+
+
+def _worst_and_remedies(found, table, left_out):
     # The worst of each muscle first, then whatever else is beyond a limit.
     first = {row[0]: row for row in reversed(found)}.values()
     named = sorted(found, key=lambda row: row not in first)[:MOST_NAMED]
@@ -267,17 +338,17 @@ def describe_verdict(
     values = "; ".join(_describe_excess(row, table, left_out) for row in named)
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
     to_do = f". What to do: {'; '.join(remedies.values())}" if remedies else ""
-    return f"{text}. Worst: {values}{more}{to_do}"
+    return f". Worst: {values}{more}{to_do}"
 
 
 def _remedy(row, table):
     """What to do about one excess; smaller steps do not mend an overlap of the meshes at rest."""
     muscle, quantity, _, limit, _ = row
-    first = table[muscle][quantity]["first"]
+    overlap = table[muscle].get("initial_overlap", {}).get("worst")
     at_rest = (
         quantity in ("penetration_max", "bone_penetration_max")
-        and first is not None
-        and first > limit
+        and overlap is not None
+        and overlap > limit
     )
     return LIMITS["initial_overlap" if at_rest else quantity].remedy
 
@@ -313,11 +384,16 @@ def shown_number(value: float | None, unit: str = "") -> str:
     return text if unit in ("", "1") else f"{text} {unit}"
 
 
-def require_limits(table: Table, limits: Mapping[str, float]) -> None:
-    """Raise LimitExceededError naming everything beyond the limits."""
+def require_limits(table: Table, limits: Limits) -> None:
+    """Raise LimitExceededError naming everything beyond the limits of ``fail_on``, and those of
+    them that were not measured.
+    """
+    failing = limits.failing()
     texts = [
         f"{m}: {q} = {v:.4g} {'<' if q in LEAST else '>'} {limit:g} at frame {f}"
-        for m, q, v, limit, f in exceeded(table, limits)
+        for m, q, v, limit, f in exceeded(table, failing)
     ]
+    missing = unmeasured(table, failing)
+    texts += [f"not measured: {describe_unmeasured(missing)}"] if missing else []
     if texts:
         raise LimitExceededError("; ".join(texts))

@@ -29,11 +29,14 @@ DENSEST = 10.0
 LEAST_STRAIN = 1e-3
 
 
-def contracting_fibres(model: SolidModel, muscle: Muscle) -> Fibres:
-    """The fibres of a muscle that contracts; the springs of active ones at full activation."""
+def contracting_fibres(model: SolidModel, muscle: Muscle, insertion: Booleans) -> Fibres:
+    """The fibres of a muscle that contracts; the springs of active ones at full activation.
+
+    ``insertion`` (h,) are the points held at the muscle's second end.
+    """
     given, passive = resolve_contraction(muscle), model.fibres
     tendon = given.tendon[cKDTree(np.asarray(muscle.mesh.vertices)).query(model.cells.points)[1]]
-    density = fibre_density(model, ~tendon)
+    density = fibre_density(model, ~tendon, insertion)
     slack = 1.0 / given.stretch_at_rest
     lower, upper = passive.lower.copy(), np.full(len(tendon), max(1.0, slack))
     if given.slack:
@@ -48,12 +51,13 @@ def contracting_fibres(model: SolidModel, muscle: Muscle) -> Fibres:
     return Fibres(passive.direction, stiff, active, lower, upper, content)
 
 
-def fibre_density(model: SolidModel, belly: Booleans) -> Floats:
+def fibre_density(model: SolidModel, belly: Booleans, insertion: Booleans) -> Floats:
     """Fibres through a unit area at the quadrature points (Q,), 1 where the belly is widest.
 
-    They run as a flux without sources from one end to the other, spread evenly over both.
+    They run as a flux without sources from one end to the other, spread evenly over both;
+    ``insertion`` (h,) are the points held at the second.
     """
-    size = np.linalg.norm(flux(model), axis=1)
+    size = np.linalg.norm(flux(model, insertion), axis=1)
     order = np.argsort(size[belly], kind="stable")
     weight = np.cumsum(model.cells.weights[belly][order])
     widest = size[belly][order][np.searchsorted(weight, 0.5 * WIDEST * weight[-1])]

@@ -1,59 +1,46 @@
-"""Directions of the fibres in an RBF muscle, and the flux that they are."""
+"""Gradients along the fibres of an RBF muscle, from origin to insertion."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.muscle.model import SolidModel
+from rbfmuscle.scene.ends import attachment_ends
+from rbfmuscle.scene.joints.joint import Joint
+from rbfmuscle.scene.objects import Muscle
 
-# Pieces of polyline that speak for one place.
-NEAREST = 3
 
-
-def fibre_directions(
-    points: np.ndarray,
-    along: np.ndarray,
-    fibres: Sequence[np.ndarray] | None,
-    *,
-    fallback: np.ndarray,
-) -> np.ndarray:
-    """Unit direction of the fibres at each point (n, 3).
-
-    They follow the polylines (k, 3), or where there are none ``along`` (n, 3), the gradient of the
-    harmonic field from the first attachment to the last; where neither has a direction the
-    ``fallback`` (3,).
+def held_at_insertion(model: SolidModel, muscle: Muscle, joints: Sequence[Joint]) -> Booleans:
+    """Which of the solid's held points (h,) lie nearer to the second end of the muscle than to the
+    first; none where it has one end.
     """
-    if fibres:
-        middles = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in fibres])
-        pieces = np.concatenate([np.diff(line, axis=0) for line in fibres])
-        near = min(NEAREST, len(middles))
-        distance, index = cKDTree(middles).query(points, k=np.arange(1, near + 1))
-        unit = pieces / np.linalg.norm(pieces, axis=1, keepdims=True)
-        floor = 1e-9 * np.ptp(points, axis=0).max()
-        unit = unit[index]
-        against = np.einsum("nkd,nd->nk", unit, unit[:, 0]) < 0.0  # a fibre has no sense
-        unit = np.where(against[:, :, None], -unit, unit)
-        along = (unit / np.maximum(distance, floor)[:, :, None]).sum(axis=1)
-    length = np.linalg.norm(along, axis=1)
-    weak = length < 1e-9 * max(length.max(), 1e-300)
-    along = np.where(weak[:, None], fallback, along)
-    return along / np.linalg.norm(along, axis=1, keepdims=True)
+    held = model.points[model.held]
+    ends = attachment_ends(muscle, joints)
+    if ends is None:
+        return np.zeros(len(held), dtype=bool)
+    vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+    first, last = (
+        cKDTree(vertices[np.concatenate([a.vertices for a in end])]).query(held)[0] for end in ends
+    )
+    return np.asarray(last < first)
 
 
-def rise(model: SolidModel) -> Floats:
-    """Unit directions at the quadrature points from the muscle's first bone to its last, (Q, 3)."""
-    slope = _gradient(model, model.motion_weights @ np.arange(model.motion_weights.shape[1]))
-    return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
-
-
-def flux(model: SolidModel) -> Floats:
-    """Gradient (Q, 3) of a potential whose flux from the first bone's held points to the others' is
-    one.
+def along_fibres(model: SolidModel, insertion: Booleans) -> Floats:
+    """Gradient (Q, 3) at the quadrature points of the share that the points held at the
+    ``insertion`` (h,) have in what moves a node.
     """
-    first = model.held_bone == model.held_bone.min()
-    source = np.where(first, -1.0 / max(first.sum(), 1), 1.0 / max((~first).sum(), 1))
+    matrix = model.matrix + model.springs @ model.springs.T / model.spring
+    share = np.linalg.solve(matrix, model.springs @ np.stack([insertion, ~insertion], axis=1))
+    return _gradient(model, share[:, 0] / share.sum(axis=1))
+
+
+def flux(model: SolidModel, insertion: Booleans) -> Floats:
+    """Gradient (Q, 3) of a potential whose flux from the points held at the origin to those at the
+    ``insertion`` (h,) is one.
+    """
+    source = np.where(insertion, 1.0 / max(insertion.sum(), 1), -1.0 / max((~insertion).sum(), 1))
     right = model.springs @ source / model.spring
     return _gradient(model, np.linalg.lstsq(model.matrix, right, rcond=None)[0])
 

@@ -1,15 +1,16 @@
 """RBFMuscle: an implicit RBF surface whose centres move with an elastic solid."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rbfmuscle.geometry.fibres import fibre_directions
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.muscle.activation import contracting_fibres
 from rbfmuscle.muscle.drawing import Placement, SurfaceBuilder
-from rbfmuscle.muscle.fibres import fibre_directions, rise
+from rbfmuscle.muscle.fibres import along_fibres, held_at_insertion
 from rbfmuscle.muscle.model import (
     SolidModel,
     attached_owner,
@@ -25,10 +26,12 @@ from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
 from rbfmuscle.muscle.rounded_bones import RoundedBones, grown, round_bones
 from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, make_room, settle
 from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform, turn
+from rbfmuscle.scene.ends import ordered_muscle
+from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame import Mesh, ModelSurface
+from rbfmuscle.simulation.frame import Mesh, ModelSurface, SolveLog
 
 # Neighbours meet a muscle at contact points so far apart, of the side of a lattice cell, which has
 # three nodes on it.
@@ -69,13 +72,16 @@ class RBFMuscle:
     """
 
     def __init__(self, muscle: Muscle, scene: Scene, options: RBFOptions | None = None) -> None:
+        muscle, _ = ordered_muscle(muscle)
         self.name = muscle.name
         self.options = options or RBFOptions()
         self.rest = RestState.from_muscle(muscle, scene, self.options)
         self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options)
         self.frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         lattice = Lattice(self.frame.local, np.asarray(muscle.mesh.faces), self.options.nodes)
-        self.model = _build_solid(muscle, lattice, self.frame, self.rest, self.options)
+        self.model = _build_solid(
+            muscle, scene.joints, lattice, self.frame, self.rest, self.options
+        )
         self.state = rest_state(self.model)
         self._stiffness = stiffness(self.model, 0.0)
         shown = self.drawer.shown
@@ -91,9 +97,7 @@ class RBFMuscle:
             for bone in scene.bones
         }
         self._rounded: tuple[BoneContacts, RoundedBones] | None = None
-        #: Of the solves since the surface was drawn last: greatest residual, greatest error of a
-        #: volume, caps that were hit.
-        self.worst = (0.0, 0.0, 0)
+        self.log = SolveLog(solver_residual=0.0, solid_volume_error=0.0)
 
     @property
     def points(self) -> np.ndarray:
@@ -129,11 +133,10 @@ class RBFMuscle:
         if report.status == DIVERGED:
             raise FloatingPointError("the solid does not settle")
         self.state = state
-        residual, volume, caps = self.worst
-        self.worst = (
-            max(residual, report.residual),
-            max(volume, report.volume_error),
-            caps + report.caps,
+        self.log.add(
+            caps=report.caps,
+            solver_residual=report.residual,
+            solid_volume_error=report.volume_error,
         )
 
     def _round(self, contacts: BoneContacts) -> RoundedBones:
@@ -199,16 +202,19 @@ class RBFMuscle:
         carried, _ = self.carried_mesh()
         now = Placement(self.points, self.normals(), self.contact_points(), carried)
         drawn = self.drawer.draw(now, contacts)
-        residual, volume, caps = self.worst
-        drawn.quantities.update(solver_residual=residual, solid_volume_error=volume)
-        if caps:
-            drawn.notes.append(("", caps, "iteration_cap"))
-        self.worst = (0.0, 0.0, 0)
+        quantities, notes = self.log.take()
+        drawn.quantities.update(quantities)
+        drawn.notes.extend(notes)
         return drawn
 
 
 def _build_solid(
-    muscle: Muscle, lattice: Lattice, frame: RestFrame, rest: RestState, options: RBFOptions
+    muscle: Muscle,
+    joints: Sequence[Joint],
+    lattice: Lattice,
+    frame: RestFrame,
+    rest: RestState,
+    options: RBFOptions,
 ) -> SolidModel:
     """The solid that carries the centres, with its fibres."""
     points = rest.contact_points()
@@ -229,7 +235,10 @@ def _build_solid(
         iterations=options.iterations,
     )
     axis = points[held].mean(axis=0) - points.mean(axis=0)
-    along = fibre_directions(model.cells.points, rise(model), muscle.fibres, fallback=axis)
+    insertion = held_at_insertion(model, muscle, joints)
+    along = fibre_directions(
+        model.cells.points, along_fibres(model, insertion), muscle.fibres, fallback=axis
+    )
     count = len(along)
     fibres = model.fibres._replace(
         direction=np.ascontiguousarray(along),
@@ -239,4 +248,4 @@ def _build_solid(
     model = model._replace(fibres=fibres)
     if muscle.contraction is None:
         return model
-    return model._replace(fibres=contracting_fibres(model, muscle))
+    return model._replace(fibres=contracting_fibres(model, muscle, insertion))

@@ -90,6 +90,7 @@ def choose_centres(
         round(options.epsilon * frame.size, 9),
         options.condition,
         options.placement,
+        options.samples,
         SEED,
     )
     key = content_key(

@@ -12,6 +12,7 @@ from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import choose_centres, place_points
+from rbfmuscle.scene.ends import ordered_muscle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
@@ -32,7 +33,7 @@ class RestState:
     sample_faces: np.ndarray  # (m, 3) closed outward triangulation of the samples
     fit: FieldFit  # how the field through the centres is fitted
     parts: np.ndarray  # (P, n) centres of its local fits
-    bones: list[str]  # bones, and ends of tendons, that hold the muscle, in the order of the scene
+    bones: list[str]  # bones, and ends of tendons, that hold the muscle, by their names
     attached_bone: (
         np.ndarray
     )  # (K + S,) position in ``bones`` of what holds a contact point, -1 where free
@@ -99,7 +100,7 @@ class _Attachment:
         centres: np.ndarray,
         samples: np.ndarray,
     ) -> None:
-        names = scene.holders(muscle)
+        names = sorted(scene.holders(muscle))
         patches = [np.asarray(attachment.vertices) for attachment in muscle.attachments]
         numbers = np.array([names.index(attachment.holder) for attachment in muscle.attachments])
         owner = np.full(len(frame.local), -1)
@@ -115,8 +116,22 @@ class _Attachment:
         self.centres, self.samples = owner[nearest], owner[tree.query(samples)[1]]
         for number, patch in zip(numbers, patches):
             if number >= 0 and np.isin(nearest, patch).sum() < LEAST_ATTACHED:
-                distance = cKDTree(frame.local[patch]).query(centres)[0]
-                self.centres[np.argsort(distance, kind="stable")[:LEAST_ATTACHED]] = number
+                self._claim(number, cKDTree(frame.local[patch]).query(centres)[0])
+
+    def _claim(self, number: int, distance: Floats) -> None:
+        """Give a bone the centres nearest to its patch, but none that a bone next to it needs."""
+        held = np.bincount(self.centres[self.centres >= 0], minlength=len(self.bones))
+        left = LEAST_ATTACHED
+        for centre in np.argsort(distance, kind="stable"):
+            own = self.centres[centre]
+            if own >= 0 and own != number:
+                if held[own] <= LEAST_ATTACHED:
+                    continue
+                held[own] -= 1
+            self.centres[centre] = number
+            left -= 1
+            if left == 0:
+                return
 
 
 def _principal_axes(points: Floats) -> Floats:
@@ -128,5 +143,5 @@ def _principal_axes(points: Floats) -> Floats:
 
 def solved_points(muscle: Muscle, scene: Scene, options: RBFOptions) -> str:
     """How many centres a muscle will have, and why."""
-    chosen = choose_centres(muscle, scene, options, known_only=True)
+    chosen = choose_centres(ordered_muscle(muscle)[0], scene, options, known_only=True)
     return f"{chosen.centres} centres ({chosen.reason})"

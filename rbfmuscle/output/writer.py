@@ -221,8 +221,9 @@ def build_info(
 
     Other facts are kept as they are: ``status`` ("running", "complete", "interrupted" or "failed"),
     ``message`` (why it did not complete), ``options`` of the caller, ``kernels`` by muscle,
-    ``times`` of the parts of the run [s], ``limits``, ``verdict``, ``beyond`` (muscle, quantity,
-    worst value, limit, frame), ``frames`` (`frame_facts`).
+    ``times`` of the parts of the run [s], ``limits``, ``fail_on`` (those that it may fail on, None
+    for the default), ``verdict``, ``beyond`` (muscle, quantity, worst value, limit, frame),
+    ``not_measured`` (muscle, quantity), ``frames`` (`frame_facts`).
     """
     return {
         "format": FORMAT,

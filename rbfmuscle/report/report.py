@@ -15,6 +15,8 @@ from rbfmuscle.metrics.summary import (
     COUNTS,
     LEAST,
     LIMITS,
+    Limits,
+    describe_unmeasured,
     exceeded,
     excess,
     muscle_limit,
@@ -112,7 +114,7 @@ def _page(saved: SavedRun) -> Page:
         info["scene"]["name"],
         _facts(saved),
         f"{answer[:1].upper()}{answer[1:].rstrip('.')}.",
-        BAD if info["beyond"] or not complete else GOOD,
+        GOOD if complete and not (info["beyond"] or info.get("not_measured")) else BAD,
         detail=detail and f"{detail.rstrip('.')}.",
         lights=_lights(saved),
         sections=[
@@ -142,21 +144,31 @@ def _facts(saved: SavedRun) -> list[str]:
 def _lights(saved: SavedRun) -> list[Light]:
     """A row for each of `LIGHTS`, then one for whatever else is beyond a limit."""
     known = {quantity for quantities in LIGHTS.values() for quantity in quantities}
-    beyond = exceeded(saved.info["muscles"], saved.info["limits"])
-    other = sorted({name.partition(":")[0] for _, name, *_ in beyond} - known)
+    limits, missing = _limits(saved), saved.info.get("not_measured", [])
+    beyond = {name.partition(":")[0] for _, name, *_ in exceeded(saved.info["muscles"], limits)}
+    other = sorted((beyond | set(limits.fail_on)) - known)
     rows = [_light(saved, *row) for row in (*LIGHTS.items(), *((name, (name,)) for name in other))]
-    return [row for row in rows if row]
+    found = [row for row in rows if row]
+    if missing:
+        found.append(
+            Light("Not measured", [Cell(str(len(missing)), BAD)], "", describe_unmeasured(missing))
+        )
+    return found
+
+
+def _limits(saved: SavedRun) -> Limits:
+    return Limits(saved.info["limits"], saved.info.get("fail_on", {}))
 
 
 def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | None:
     """The worst of some quantities against their limits, over muscles and frames."""
-    limits, found = saved.info["limits"], []
+    limits, found = _limits(saved), []
     for muscle, table in saved.info["muscles"].items():
         for name in quantities:
             facts = table.get(name)
-            if facts and limits.get(name) is not None and muscle != ALL:
+            if facts and name in limits.values and muscle != ALL:
                 worst = math.nan if facts.get("worst") is None else facts["worst"]
-                limit = muscle_limit(name, limits[name], table)
+                limit = muscle_limit(name, limits, table)
                 near = (
                     0.0
                     if name in COUNTS and within(name, worst, limit)
@@ -227,7 +239,8 @@ def _tracks(
 
 def _summary(saved: SavedRun) -> Table:
     """A row for each muscle, those beyond most limits first."""
-    muscles, limits = saved.info["muscles"], saved.info["limits"]
+    muscles, limits = saved.info["muscles"], _limits(saved)
+    values = limits.values
     used = [
         q
         for q in QUANTITIES
@@ -236,7 +249,7 @@ def _summary(saved: SavedRun) -> Table:
     head = ["muscle"]
     for name in used:
         unit = next(found[name]["unit"] for found in muscles.values() if name in found)
-        limit = "" if name not in limits else f" ({'≥' if name in LEAST else '≤'} {limits[name]:g})"
+        limit = "" if name not in values else f" ({'≥' if name in LEAST else '≤'} {values[name]:g})"
         head.append(f"{name.replace('_', ' ')}{'' if unit == '1' else f' [{unit}]'}{limit}")
     rows = [
         [Cell(name), *(_cell(q, found, limits) for q in used)] for name, found in muscles.items()
@@ -244,7 +257,7 @@ def _summary(saved: SavedRun) -> Table:
     return Table(head, sorted(rows, key=lambda row: -sum(cell.state == BAD for cell in row)))
 
 
-def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Mapping[str, float]) -> Cell:
+def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Limits) -> Cell:
     facts = found.get(name)
     if not facts or facts.get("worst") is None:
         return Cell("–")
@@ -252,7 +265,7 @@ def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Mapping[str
         return Cell(f"{facts['min']:.4g} … {facts['max']:.4g}")
     if name == "time_frame":
         return number_cell(facts["median"], "s")
-    limit = muscle_limit(name, limits[name], found) if name in limits else None
+    limit = muscle_limit(name, limits, found) if name in limits.values else None
     state = limit_state(name, facts["worst"], limit)
     return number_cell(facts["worst"], state=state) if state == BAD else number_cell(facts["worst"])
 

@@ -11,7 +11,7 @@ from rbfmuscle.models import build_models
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame
-from rbfmuscle.simulation.frame_loop import simulate_frames
+from rbfmuscle.simulation.frame_loop import FrameLoop
 
 
 class Solved(NamedTuple):
@@ -49,15 +49,18 @@ class MuscleGroup:
         """The frames as they are solved and measured; SolveError names muscle, frame and
         coordinates.
         """
-        frames = simulate_frames(self.scene, self.models, fields=self._fields)
-        with stage("solving the first frame"), timed(self.times, "simulate"):
-            frame = next(frames, None)
-        while frame is not None:
+        with stage("solving the first frame"):
+            with timed(self.times, "simulate"):
+                loop = FrameLoop(self.scene, self.models, fields=self._fields)
+                surfaces, poses = loop.at_rest()
+            with timed(self.times, "metrics"):
+                self._measures.measure_rest(surfaces, poses)
+        for coordinates in self.scene.motion.frames:
+            with timed(self.times, "simulate"):
+                frame = loop.advance(coordinates)
             with timed(self.times, "metrics"):
                 measured = self._measures.measure(frame)
             yield Solved(frame, measured)
-            with timed(self.times, "simulate"):
-                frame = next(frames, None)
 
     def close(self) -> None:
         """Nothing is held."""

@@ -55,7 +55,9 @@ class ModelSurface:
             name: 0.0 if name.startswith("time_") else value
             for name, value in self.quantities.items()
         }
-        return ModelSurface(vertices, self.faces, quantities, list(self.notes), (self, motion))
+        # What is said of the solves was said with this surface.
+        notes = [note for note in self.notes if note[2] != "iteration_cap"]
+        return ModelSurface(vertices, self.faces, quantities, notes, (self, motion))
 
 
 @dataclass
@@ -82,6 +84,32 @@ class Frame:
     neighbours: dict = field(default_factory=dict)
     # TendonLine by the end that each holds; the poses have these too
     tendons: dict = field(default_factory=dict)
+
+
+class SolveLog:
+    """How the solves of a model ended since its last drawing, for the quantities and notes of its
+    surface; ``at_rest`` are the quantities before any solve.
+    """
+
+    def __init__(self, **at_rest: float) -> None:
+        self._worst = dict(at_rest)
+        self._capped, self._taken = 0, False
+
+    def add(self, *, caps: int, **quantities: float) -> None:
+        """Count a solve: how often it ended at a cap, and its ``solver_residual`` and others, of
+        which the greatest are kept.
+        """
+        if self._taken:
+            self._worst, self._taken = {}, False
+        self._capped += caps
+        for name, value in quantities.items():
+            self._worst[name] = float(np.fmax(value, self._worst.get(name, 0.0)))
+
+    def take(self) -> tuple[dict[str, float], list[tuple[str, int, str]]]:
+        """Quantities and notes for a `ModelSurface`."""
+        notes = [("", self._capped, "iteration_cap")] if self._capped else []
+        self._capped, self._taken = 0, True
+        return dict(self._worst), notes
 
 
 class MuscleModel(Protocol):

@@ -13,6 +13,7 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.activation.contraction import Activations
 from rbfmuscle.scene.motion import completed, rest_coordinates
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
@@ -82,6 +83,19 @@ class FrameLoop:
         with self.working():
             each(resolve_initial_overlap, self.steppers)
             self._sliding = None if scene.sliding is None else Sliding(scene, self.steppers)
+
+    def at_rest(self) -> tuple[dict[str, ModelSurface], Poses]:
+        """Surfaces of the muscles before the first frame, by muscle, and the poses of the bones
+        there.
+        """
+        with self.working():
+            shown = each(MuscleStepper.surface, self.steppers)
+        for stepper, surface in zip(self.steppers, shown):
+            for note in surface.notes:
+                if note[2] == "iteration_cap":
+                    stepper.report(*note)
+        names = [stepper.name for stepper in self.steppers]
+        return dict(zip(names, shown)), self._poses(rest_coordinates(self.scene))
 
     def advance(self, coordinates: Mapping[str, float]) -> Frame:
         """Advance to the given coordinates and return the frame.

@@ -47,7 +47,7 @@ def resolve_initial_overlap(stepper: MuscleStepper) -> None:
 
 def _resolve(stepper: MuscleStepper, overlap: dict[int, Floats]) -> None:
     """Solve while the depth (n,) that is allowed in each bone shrinks to zero, until no contact
-    point moves.
+    point moves; an event where that does not happen.
     """
     contacts, model = stepper.contacts, stepper.model
     model.predict(contacts.poses, contacts.poses)
@@ -62,3 +62,4 @@ def _resolve(stepper: MuscleStepper, overlap: dict[int, Floats]) -> None:
         moved = np.linalg.norm(model.contact_points() - before, axis=1).max()
         if k + 1 >= growths and moved < settled:
             return
+    stepper.report("", MOST_SOLVES + growths, "iteration_cap")

@@ -49,10 +49,26 @@ class TestRun:
         trimesh.Trimesh(vertices, mesh.faces, process=False).export(folder / "spike.ply")
         scene = (folder / "arm.toml").read_text(encoding="utf-8")
         (folder / "spike.toml").write_text(scene.replace("biceps.ply", "spike.ply"))
-        code, out, _ = call(capsys, "run", folder / "spike.toml", *command[2:])
+        code, out, _ = call(capsys, "run", folder / "spike.toml", *command[2:-1], "0:3")
         assert code == 0 and re.search(
             r"verdict: biceps is not within all limits. Worst: biceps, ", out
         )
+
+    def test_limit_that_fails_ends_with_verdict_folder_and_the_whole_json(
+        self, folder, tmp_path, capsys
+    ):
+        out, limits = tmp_path / "out", ("--fail-on", "length=3")
+        words = ("run", folder / "arm.toml", "-o", out, "--frames", "0:1", "--model", "pbd")
+        code, said, err = call(capsys, *words, *limits)
+        written = json.loads((out / "run.json").read_text(encoding="utf-8"))
+        assert code == 6 and said.startswith(f"verdict: {written['verdict']}\n")
+        assert "1 frames in" in said and f"in {out}" in said and "biceps: length = " in err
+        assert written["fail_on"] == {"length": 3.0} and written["limits"]["length"] == 3.0
+        assert "length" in written["verdict"]
+        code, said, _ = call(capsys, *words, *limits, "--json")
+        found = json.loads(said)
+        assert code == 6 == found["exit_code"] and "biceps: length = " in found["error"]
+        assert set(written) - set(found) == set() and found["directory"] == str(out)
 
     def test_json_is_all_there_is_on_stdout(self, folder, tmp_path, capsys):
         code, out, _ = call(

@@ -7,6 +7,8 @@ from peers import paper_models
 from toy_scene import held
 
 import rbfmuscle as rm
+from pbd_baseline.shapes import METHODS
+from rbfmuscle.metrics.summary import LIMITS
 from rbfmuscle.models import build_model, model_names
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.motion import bone_poses
@@ -154,3 +156,30 @@ def test_one_big_step_and_overlap_at_rest_leave_no_point_in_a_bone(name, angles,
     assert _volume(frames[0].surfaces["strap0"]) == pytest.approx(
         scene.muscles[0].mesh.volume, rel=1e-3
     )
+
+
+@pytest.mark.parametrize("name", ["rbf", *METHODS])
+def test_every_solve_reports_how_it_ended(name):
+    frames, _ = _run(name, _scene([0, 20]))
+    assert frames[0].surfaces["strap0"].quantities["solver_residual"] == 0.0  # nothing was solved
+    assert 0.0 < frames[1].surfaces["strap0"].quantities["solver_residual"] < 0.1
+
+
+def test_a_solve_at_its_cap_is_an_event_and_beyond_its_limit():
+    scene = _scene([0, 20])
+    settled, capped = (
+        rm.simulate(scene, "rbf", settings={"model.iterations": count}) for count in (60, 1)
+    )
+    actions = [[event.action for event in run.events] for run in (settled, capped)]
+    assert "iteration_cap" not in actions[0] and "iteration_cap" in actions[1]
+    residuals = [run.values("strap0", "solver_residual").max() for run in (settled, capped)]
+    assert residuals[0] < LIMITS["solver_residual"].value < residuals[1]
+    assert "last motion of the solver" in capped.verdict
+    assert settled.values("strap0", "solid_volume_error").max() < LIMITS["solid_volume_error"].value
+
+
+def test_an_overlap_that_does_not_settle_is_an_event(monkeypatch):
+    monkeypatch.setattr("rbfmuscle.simulation.overlap.SETTLED", 0.0)
+    monkeypatch.setattr("rbfmuscle.simulation.overlap.MOST_SOLVES", 2)
+    frames, _ = _run("pbd", _scene([0], overlap=2.0))
+    assert "iteration_cap" in {event.action for event in frames[0].events}

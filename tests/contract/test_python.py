@@ -11,6 +11,7 @@ import pytest
 from conftest import ROOT
 
 import rbfmuscle as rm
+from rbfmuscle.metrics.quantities import Row
 
 SCRIPT = ROOT / "tests" / "data" / "user_script.py"
 
@@ -96,6 +97,31 @@ def test_metrics_as_a_table_where_pandas_is_there(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", fake)
     lengths = [row["value"] for row in run.table() if row["quantity"] == "length"]
     assert lengths == list(run.values("abductor", "length"))
+
+
+def test_values_are_of_known_names_and_moment_arms_of_one_coordinate(run, loaded):
+    for one in (run, loaded):
+        with pytest.raises(rm.UsageError, match="unknown muscle 'abducter', did you mean"):
+            one.values("abducter", "length")
+        with pytest.raises(rm.UsageError, match="'lenght' was not measured of 'abductor', did you"):
+            one["abductor"].values("lenght")
+        with pytest.raises(rm.UsageError, match="'length' has no coordinate"):
+            one.values("abductor", "length", coordinate="hip.flexion")
+    assert len(run.values("all", "time_frame")) == 3
+    rows = [
+        Row(k, f"hip.{name}", 0.0, "abductor", "moment_arm", 1.0 * k + (name == "b"), "mm")
+        for name in "ab"
+        for k in range(2)
+    ]
+    two = rm.Run([], rows)
+    two.info = {"scene": {"muscles": [{"name": "abductor"}]}}
+    with pytest.raises(rm.UsageError, match=r"about hip\.a, hip\.b; name one with coordinate="):
+        two.values("abductor", "moment_arm")
+    assert two["abductor"].values("moment_arm", coordinate="hip.b").tolist() == [1.0, 2.0]
+    with pytest.raises(rm.UsageError, match=r"no moment arm about 'hip\.c', did you mean"):
+        two.values("abductor", "moment_arm", coordinate="hip.c")
+    about_one = rm.Run([], rows[:2])
+    assert about_one.values("abductor", "moment_arm").tolist() == [0.0, 1.0]
 
 
 def test_plot_shows_every_value(run):

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from blend_model import arm_files, arm_scene, use_blend_model
 
+import rbfmuscle as rm
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.study import _names, run_point
-from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep
+from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep, scene_content
 from rbfmuscle.experiments.sweep_run import (
     SweepFolder,
     mark_front,
@@ -94,6 +95,18 @@ class TestGrid:
         one, other = plan_sweep({"a": arm_scene(end=10), "b": arm_scene(end=20)}, {})
         assert (one.scene, one.role, one.reference) == ("a", "default", "") and other.scene == "b"
         assert one.key != other.key
+
+    def test_keys_hold_the_version_and_no_paths(self, tmp_path, monkeypatch):
+        scene = rm.Scene.load(arm_files(tmp_path, end=10))
+        (tmp_path / "other").mkdir()
+        moved = rm.Scene.load(arm_files(tmp_path / "other", end=10))
+        for number, folder in enumerate((scene, moved)):
+            motion, file = folder.motion, tmp_path / str(number) / "gait.mot"
+            motion.options = motion.options.model_copy(update={"file": file})
+        assert scene_content(scene) == scene_content(moved)
+        before = scene_content(scene)
+        monkeypatch.setattr(rm, "__version__", "0.0.0")
+        assert scene_content(scene) != before
 
 
 def row(error, time, role=""):

@@ -11,11 +11,14 @@ from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
 from rbfmuscle.metrics.rows import joint_gaps
 from rbfmuscle.metrics.summary import (
     LIMITS,
+    NEEDS,
+    OF_SCENE,
+    Limits,
     Summary,
-    default_limit,
     describe_verdict,
     exceeded,
     parse_limits,
+    unmeasured,
 )
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.run import simulate, stream_run
@@ -35,6 +38,8 @@ TABLE = {
     "bowing": (1.03, 1.04),
     "end_gap": (25.0, 25.1),
     "unfitted_fraction": (0.9, 1.0),
+    "solver_residual": (1e-4, 1.1e-4),
+    "solid_volume_error": (0.02, 0.021),
     "tunnelled": (0, 1),
     "bone_overlap": (0.0, 0.06),
     "joint_gap": (5.0, 5.1),
@@ -59,17 +64,15 @@ def facts(values, *, units="mm", muscle="psoas", **others):
 @pytest.mark.parametrize("quantity", TABLE)
 def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantity, units):
     scale = 0.001 if units == "m" and QUANTITIES[quantity][0] == "length" else 1.0
-    limits = {name: default_limit(name, arm_scene(units=units)) for name in LIMITS}
-    # A muscle that is straight and in no bone at rest; other quantities are the same in both
-    # frames.
-    rest = {"bowing": 1.0, "penetration_max": 0.0, "bone_penetration_max": 0.0}
+    limits = parse_limits(None, arm_scene(units=units))
+    # A muscle that is straight and in no bone at rest.
     allowed, beyond = (
-        {quantity: [rest.get(quantity, scale * v), scale * v]} for v in TABLE[quantity]
+        {"bowing_at_rest": [1.0], "initial_overlap": [0.0], quantity: [scale * v]}
+        for v in TABLE[quantity]
     )
     assert set(TABLE) == set(LIMITS) and exceeded(facts(allowed, units=units), limits) == []
-    assert "every muscle is within all limits" in describe_verdict(
-        facts(allowed, units=units), limits
-    )
+    said = describe_verdict(facts(allowed, units=units), limits)
+    assert said.startswith("every muscle is within all limits that were measured")
     ((muscle, name, worst, limit, _),) = exceeded(facts(beyond, units=units), limits)
     assert (muscle, name, limit) == (
         "psoas",
@@ -85,30 +88,67 @@ def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantit
 @pytest.mark.parametrize(
     ("values", "kept"),
     [
-        # A thin muscle may have a larger rest error, unless a limit is asked for.
+        # A thin muscle may have a larger rest error.
         ({"rest_error_rms": [0.95], "thickness": [9.9]}, True),
         ({"rest_error_rms": [0.95], "thickness": [10.1]}, False),
         ({"rest_error_rms": [1.05], "thickness": [9.9]}, False),
-        # One that bows at rest may do so a little more.
-        ({"bowing": [1.05, 1.07]}, True),
-        ({"bowing": [1.05, 1.09]}, False),
-        ({"bowing": [1.0, 1.031]}, False),
+        # One that is bowed at rest may be a little more so, whatever it is in the first frame.
+        ({"bowing_at_rest": [1.05], "bowing": [1.07]}, True),
+        ({"bowing_at_rest": [1.05], "bowing": [1.07, 1.09]}, False),
+        ({"bowing_at_rest": [1.0], "bowing": [1.031]}, False),
+        ({"bowing_at_rest": [1.0], "bowing": [1.05, 1.06]}, False),
         ({"volume_error": [np.nan]}, False),
     ],
 )
 def test_exceptions_from_limits(values, kept):
-    limits = {"rest_error_rms": 0.6, "bowing": 1.03, "volume_error": 1.0}
-    assert (exceeded(facts(values), limits) == []) == kept
-    assert "thickness" not in values or exceeded(facts(values), {"rest_error_rms": 0.9})
+    assert (exceeded(facts(values), parse_limits("all", arm_scene())) == []) == kept
+    # Of a limit that is asked for there are none, were it the default itself.
+    for quantity, default in (("rest_error_rms", 0.6), ("bowing", 1.03)):
+        asked = parse_limits(f"{quantity}={default}", arm_scene())
+        assert quantity not in values or exceeded(facts(values), asked)
+
+
+def test_what_was_not_measured_is_within_no_limit():
+    scene = arm_scene()
+    values = {name: [LIMITS[name].value] for name in LIMITS if name not in OF_SCENE}
+    values |= {"length": [30.0]}
+    whole = {ALL: {name: [0.0] for name in OF_SCENE}}
+    implicit = [name for name, need in NEEDS.items() if need == "unfitted_fraction"]
+    mesh = {name: series for name, series in values.items() if name not in implicit}
+
+    def table(muscle=values, other=values, scene_values=whole):
+        summary = Summary()
+        for name, quantities in {"psoas": muscle, "teres": other, **scene_values}.items():
+            for quantity, (value,) in quantities.items():
+                summary.add([Row(0, "", 0.0, name, quantity, value, "1")])
+        return summary.table()
+
+    def found(fail_on, *muscles, **parts):
+        return unmeasured(table(*muscles, **parts), parse_limits(fail_on, scene))
+
+    assert found(None) == found("all") == found(None, other=mesh) == []
+    lacking = {name: series for name, series in values.items() if name != "rest_error_rms"}
+    assert found(None, lacking) == [("psoas", "rest_error_rms")]
+    assert found("rest_error_rms=9", lacking, lacking)[0] == ("psoas", "rest_error_rms")
+    assert found(None, scene_values={}) == [(ALL, name) for name in OF_SCENE]
+    # What is asked for by value has to be measured of some muscle.
+    assert found("flicker=1", mesh) == [] and found("flicker=1", mesh, mesh) == [(ALL, "flicker")]
+    assert found("moment_arm=50") == [(ALL, "moment_arm")]
+    said = describe_verdict(table(lacking), parse_limits(None, scene))
+    assert said == (
+        "every muscle is within all limits that were measured in every frame. Not measured: "
+        "rest_error_rms of psoas"
+    )
 
 
 def test_the_worst_by_its_limit_is_named_first_and_bones_are_named_too():
     values = {"penetration_max": [0.2], "volume_error": [1e-6]}
     table = facts(values, teres={"flicker": [0.0, 3.0]}, **{ALL: {"joint_gap": [0.0, 8.0]}})
-    said = describe_verdict(table, {name: limit.value for name, limit in LIMITS.items()})
+    said = describe_verdict(table, parse_limits(None, arm_scene()))
     assert said.startswith(
-        "1 of 3 muscles is within all limits; psoas, teres are not. Worst: psoas, volume"
+        "0 of 3 muscles are within all limits; psoas, teres are not. Worst: psoas, volume"
     )
+    assert "; penetration_max of other, teres; " in said
     assert (
         "; teres, flicker 3 mm at frame 1 (limit 0.5); the bones, joint that opens 8 mm at frame 1"
         in said
@@ -117,9 +157,13 @@ def test_the_worst_by_its_limit_is_named_first_and_bones_are_named_too():
 
 
 def test_limits_of_the_command_line_follow_the_unit():
-    limits = parse_limits("all", arm_scene(units="m"))
-    assert limits["penetration_max"] == pytest.approx(0.0001) and limits["volume_error"] == 1e-9
-    assert parse_limits("flicker=2,euler", arm_scene()) == {"flicker": 2.0, "euler": 2.0}
+    limits = parse_limits("all,flicker=2", arm_scene(units="m"))
+    assert limits.values["penetration_max"] == pytest.approx(0.0001)
+    assert limits.values["volume_error"] == 1e-9 and limits.values["flicker"] == 2.0
+    assert limits.fail_on == {name: 2.0 if name == "flicker" else None for name in LIMITS}
+    asked = parse_limits("flicker=2,euler,length=9", arm_scene())
+    assert asked.fail_on == {"flicker": 2.0, "euler": None, "length": 9.0}
+    assert asked.failing() == Limits({"flicker": 2.0, "euler": 2.0, "length": 9.0}, asked.fail_on)
     for text in ("penetration", "length", "volume_error=abc", "volume_error=-1"):
         with pytest.raises(UsageError):
             parse_limits(text, arm_scene())
@@ -143,6 +187,29 @@ def test_overlap_and_ends_away_from_bones_are_seen_in_a_run(
     with pytest.raises(LimitExceededError, match=name) as caught:
         stream_run(scene, tmp_path, fail_on="all", pictures=False)
     assert caught.value.exit_code == 6
+
+
+def test_rest_is_measured_whatever_frames_are_asked_for(monkeypatch, tmp_path):
+    use_blend_model(monkeypatch)
+    rest = ("rest_error_rms", "rest_error_max", "initial_overlap", "end_gap", "bowing_at_rest")
+    whole, part = (simulate(arm_scene(), frames=frames) for frames in (None, "1:2"))
+    for name in (*rest, "thickness"):
+        assert len(part.values("biceps", name)) == 1
+        assert part.values("biceps", name) == whole.values("biceps", name)
+    assert part.info["not_measured"] == [] and "Not measured" not in part.verdict
+    for name in rest[:3]:  # the model shows the input mesh
+        stream_run(arm_scene(), tmp_path, frames="1:2", fail_on=f"{name}=0.5", pictures=False)
+
+
+def test_a_limit_that_cannot_be_measured_fails(monkeypatch, tmp_path):
+    use_blend_model(monkeypatch)
+    with pytest.raises(LimitExceededError, match="not measured: moment_arm") as caught:
+        stream_run(arm_scene(end=0), tmp_path, fail_on="moment_arm=50", pictures=False)
+    info = SavedRun(tmp_path).info
+    assert info["fail_on"] == {"moment_arm": 50.0} and info["limits"]["moment_arm"] == 50.0
+    assert info["not_measured"] == [[ALL, "moment_arm"]]
+    assert info["verdict"] == caught.value.info["verdict"]
+    assert info["verdict"].endswith("Not measured: moment_arm")
 
 
 def test_a_joint_that_opens_is_measured_and_one_that_is_apart_at_rest_is_not():

@@ -152,6 +152,21 @@ def elastic(model, y):
     return out
 
 
+def test_cells_that_large_triangles_cross_with_their_inside_alone_hold_material():
+    corners = np.array([[0.0, 0, 0], [100, 0, 0], [10, 45, 0], [20, 10, 30]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    shares = np.random.default_rng(4).dirichlet(np.ones(3), (4, 3000))
+    surface = np.einsum("fnk,fkc->fnc", shares, corners[faces]).reshape(-1, 3)
+    lattice = Lattice(corners, faces, 300)
+    at = (surface @ lattice.axes.T - lattice.low) / lattice.spacing
+    crossed = np.unique(np.clip(at.astype(int), 0, lattice.count - 1), axis=0)
+    used = {tuple(cell) for cell in lattice.cells}
+    # Those cut by less than the points on the triangles lie apart may be missing.
+    assert np.mean([tuple(cell) in used for cell in crossed]) > 0.97
+    # Whole cells that only touch the surface weigh a thousandth each.
+    assert lattice.weights.sum() == pytest.approx(100 * 45 * 30 / 6, rel=0.01)
+
+
 @pytest.mark.parametrize("slack", [1.0, 1.6])
 def test_right_side_is_the_derivative_of_the_energy(slack):
     solid = Bar().with_fibres([0.8, 0.6, 0.0], ratio=4.0, slack=slack)

@@ -115,3 +115,31 @@ def test_hip_flexes_within_the_promised_figures(hip_scene):
             # Slack fibres shorten to 1 / 1.6 of their length, and edges to 0.6 of that before they
             # are hard.
             assert low >= 0.375 and high <= 2.5, (model.name, low, high)
+
+
+def test_sweeps_that_end_at_their_cap_say_so_with_their_last_motion():
+    """A muscle that settles reports less than its tolerance, one that is stopped more, once."""
+
+    def ended(**options):
+        rig = Rig("pbd", **options)
+        rig.go(20.0)
+        surface = rig.model.surface(rig.contacts)
+        again = rig.model.surface(rig.contacts)
+        assert again.quantities == surface.quantities and again.notes == []
+        return surface.quantities["solver_residual"], surface.notes
+
+    residual, notes = ended(tolerance=1e-4)
+    assert residual < 1e-4 and notes == []
+    residual, notes = ended(tolerance=1e-4, iterations=4)
+    assert residual > 1e-4 and notes == [("", 1, "iteration_cap")]
+    few, notes = ended(iterations=4)  # a number of sweeps that was asked for is no cap
+    assert few > 1e-4 and notes == []
+    assert ended(iterations=40)[0] < few
+
+
+def test_last_motion_is_that_of_the_worst_solve_since_the_last_drawing():
+    rig = Rig("pbd")
+    rig.go(60.0, 60.0, 60.0)
+    worst = rig.model.surface(rig.contacts).quantities["solver_residual"]
+    rig.go(60.0)
+    assert 0.0 < rig.model.surface(rig.contacts).quantities["solver_residual"] < worst

@@ -19,6 +19,8 @@ GROUPS = 8  # quadrature points in a cell
 LEAST_FILLED = 1e-3  # of a cell: the weight of one that only touches the surface
 # Quadrature points move apart at most by this factor to give the material's second moments.
 MOST_WIDENED = 1.3
+# Points that find the cells which the surface crosses: so far apart, of a cell's least side.
+DENSITY = 0.25
 LEAST_REGION = 0.3  # of the mean volume of the regions
 
 
@@ -48,22 +50,21 @@ class Lattice:
         box = vertices @ self.axes.T
         self.low, self.extent = box.min(axis=0), np.ptp(box, axis=0)
         self.distance = ExactDistance(vertices, faces).signed_distance
-        surface = box[np.asarray(faces)].mean(axis=1)
-        self._choose_spacing(np.concatenate([box, surface]), nodes)
+        self._choose_spacing(box[np.asarray(faces)], nodes)
         self._number_nodes()
         self._integrate()
 
-    def _choose_spacing(self, surface: Floats, wanted: float) -> None:
-        """The coarsest cells that give the wanted nodes, by bisection."""
+    def _choose_spacing(self, triangles: Floats, wanted: float) -> None:
+        """The coarsest cells that give the wanted nodes, by bisection; ``triangles`` (m, 3, 3)."""
         small, large = 0.01 * self.extent.max(), self.extent.max()
         for _ in range(25):
             side = np.sqrt(small * large)
-            self._lay_cells(surface, side)
+            self._lay_cells(triangles, side)
             self._number_nodes()
             small, large = (small, side) if len(self.rest) < wanted else (side, large)
-        self._lay_cells(surface, large)
+        self._lay_cells(triangles, large)
 
-    def _lay_cells(self, surface: Floats, side: float) -> None:
+    def _lay_cells(self, triangles: Floats, side: float) -> None:
         self.count = np.maximum(1, np.ceil(self.extent / side - 1e-9).astype(int))
         self.spacing = self.extent / self.count
         every = np.indices(self.count).reshape(3, -1).T
@@ -71,6 +72,7 @@ class Lattice:
         depth = self.distance(middle @ self.axes)
         half = 0.5 * float(np.linalg.norm(self.spacing))
         used = depth < 0.0
+        surface = _points_on(triangles, DENSITY * float(self.spacing.min()))
         touched = self._key(
             np.clip(((surface - self.low) / self.spacing).astype(int), 0, self.count - 1)
         )
@@ -194,6 +196,21 @@ class Lattice:
                     row = [before, k, after]
                     out[np.ix_(row, row)] += stencil
         return out
+
+
+def _points_on(triangles: Floats, apart: float) -> Floats:
+    """Corners and middles of triangles (m, 3, 3), and points on the large ones, ``apart`` at
+    most.
+    """
+    sides = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    parts = np.ceil(sides / apart).astype(int)
+    found = [triangles.reshape(-1, 3), triangles.mean(axis=1)]
+    # Of smaller ones corners and middles are near enough to each other.
+    for count in np.unique(parts[parts > 2]):
+        a, b = np.indices((count + 1, count + 1)).reshape(2, -1) / count
+        shares = np.stack([a, b, 1.0 - a - b], axis=1)[a + b <= 1.0 + 1e-12]
+        found.append((shares @ triangles[parts == count]).reshape(-1, 3))
+    return np.concatenate(found)
 
 
 def _axes(points: Floats) -> Floats:

@@ -8,7 +8,7 @@ then joint after joint from the root.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from typing import Literal, NamedTuple, Self, TypeAlias
@@ -271,3 +271,18 @@ def joint_values(
         joint.name: {name: values[f"{joint.name}.{name}"] for name in joint.coordinates}
         for joint in joints
     }
+
+
+def rigid_body(
+    bone: str, joints: Sequence[Joint], moving: Collection[str] | None = None
+) -> str | None:
+    """The bone that stands for the rigid body of a bone: the child of its joint, None for the body
+    that no joint moves.
+
+    With ``moving`` names of joints, bones whose joint is none of these are one body with its
+    parent.
+    """
+    joint_of = {joint.child: joint for joint in joints}
+    while moving is not None and bone in joint_of and joint_of[bone].name not in moving:
+        bone = joint_of[bone].parent
+    return bone if bone in joint_of else None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rbfmuscle.paths import (
+    SHIFT,
     FittedPath,
     Samples,
     exponents,
@@ -37,6 +38,25 @@ def test_fit_holds_at_poses_that_it_has_not_seen():
     length, arms = smooth(held)
     assert np.sqrt(np.mean((path.length(held) - length) ** 2)) < 1e-3
     assert np.sqrt(np.mean((path.arms(held) - arms) ** 2)) < 1e-2
+
+
+@pytest.mark.parametrize("unit", [1e-3, 0.1])
+def test_fit_over_a_shift_does_not_depend_on_the_unit(unit):
+    """A rotation and a shift [mm], with noise that no polynomial fits, in another unit."""
+    rng = np.random.default_rng(6)
+    turn, shift = rng.uniform([-0.5, -30.0], [1.2, 30.0], (80, 2)).T
+    lengths = 300.0 + 20.0 * np.sin(turn) + 0.3 * shift + rng.normal(scale=2.0, size=80)
+    arms = np.stack([-20.0 * np.cos(turn), np.full(80, -0.3)], axis=1)
+    arms = arms + rng.normal(scale=[2.0, 0.05], size=arms.shape)
+
+    def length(unit):
+        values = np.stack([turn, unit * shift], axis=1)
+        radian = np.array([1.0, unit * SHIFT])
+        given = values, unit * lengths, arms * [unit, 1.0]
+        path = fit_path("m", ("a.turn", "a.shift"), *given, radian=radian)
+        return path.length(values) / unit
+
+    np.testing.assert_allclose(length(unit), length(1.0), rtol=1e-9)
 
 
 def test_file_is_in_metres_with_terms_in_the_order_of_opensim(tmp_path):
