@@ -31,8 +31,7 @@ STEP = 1.0  # of the central differences, to either side [degree, or mm of a shi
 # A muscle has settled where no contact point moves by more than this share of its size in a solve.
 MOST_SOLVES, SETTLED = 60, 3e-7
 ARM_WEIGHT = 1.0 / 3.0  # one mm of a length weighs as much as this many mm/rad of a moment arm
-# A shift [mm] that counts as much as a rotation by one radian: one mm as one degree, as in `STEP`.
-SHIFT = math.degrees(1.0)
+SHIFT = math.degrees(1.0)  # mm of a shift that count as a radian: one mm as one degree
 MOST_COORDINATES = 6  # OpenSim's function takes up to six coordinates
 FOLDS = 5  # parts of the poses that are left out in turn to choose the order
 
@@ -109,9 +108,7 @@ def sample_muscles(
 
 
 def _measured(scene, poses):
-    """For each pose a row for each muscle: its length, its moment arm about each coordinate of the
-    poses, and whether it did not settle.
-    """
+    """For each pose and muscle: length, arm about each coordinate, whether it did not settle."""
     scene.motion = Motion(poses[:40])  # what bones a muscle may meet is sought along it
     models = build_models(scene)
     rest = [model.snapshot() for model in models]
@@ -127,9 +124,7 @@ def _measured(scene, poses):
             loop.activations.target = loop.activations.at(0)  # the same in all solves
             yield _row(loop, lines, pose)
         except SolveError:
-            yield np.hstack(
-                [np.full((len(models), 1 + len(pose)), np.nan), np.zeros((len(models), 1))]
-            )
+            yield np.array([[np.nan] * (1 + len(pose)) + [0.0]] * len(models))
 
 
 def _row(loop, lines, pose):
@@ -267,9 +262,7 @@ def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[s
 
 
 def _fit(found, radian):
-    """The path of a muscle, and its errors at poses that the fit has not seen; of shifts those of
-    the moment arm for what counts as a ``radian`` (d,).
-    """
+    """The path of a muscle, and its errors at poses not fitted, arms over a ``radian`` (d,)."""
     solved = np.isfinite(found.lengths) & np.isfinite(found.arms).all(axis=1)
     held = np.arange(len(solved)) % HELD_OUT == HELD_OUT - 1
     use = solved & ~held
