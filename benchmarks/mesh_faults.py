@@ -114,7 +114,7 @@ def main():
         start = time.process_time()
     report(faults, spent)
     for key, count in events.items():
-        if key[2] not in ("rotated", "halved", "held_back"):
+        if key[2] not in ("halved", "held_back"):
             print("event", *key, count)
 
 

@@ -124,11 +124,6 @@ class PBDMuscle:
     def make_room(self, contacts: BoneContacts) -> None:
         """Nothing: `solve` moves vertices out of neighbours all the way."""
 
-    def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
-        """Move the vertices marked in a bool mask (n,) by a (4, 4) transform; held ones stay."""
-        which = which & (self.rest.attached_bone < 0)
-        self.points[which] = self.points[which] @ transform[:3, :3].T + transform[:3, 3]
-
     def transform(self, motion: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4), as the muscle is."""
         self.points[:] = self.points @ motion[:3, :3].T + motion[:3, 3]

@@ -47,6 +47,13 @@ def compiled(function: Callable | None = None, **options: object) -> Callable:
     return loop
 
 
+def inner(**options: object) -> Callable:
+    """Declare a loop that only other loops call: what Python would call it by is not compiled,
+    which takes longer than many a loop where arguments hold dozens of arrays.
+    """
+    return compiled(None, no_cpython_wrapper=True, **options)
+
+
 def loops_path() -> Path:
     """Folder of compiled loops: ``RBFMUSCLE_LOOPS``, or in the user's cache folder of the
     platform.

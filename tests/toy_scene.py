@@ -171,9 +171,6 @@ class ToyMuscle(MuscleModel):
             near = contacts.half_spaces(self.x, self.reach)
             self.x = press(self.target, self.x, self.inverse, near.index, near.gap, near.normal)
 
-    def turn(self, which, transform):
-        self.x[which] = self.x[which] @ transform[:3, :3].T + transform[:3, 3]
-
     def transform(self, motion):
         self.x, self.target = (
             points @ motion[:3, :3].T + motion[:3, 3] for points in (self.x, self.target)

@@ -41,6 +41,37 @@ class Bones(NamedTuple):
     across: np.ndarray
 
 
+class PlaneStack(NamedTuple):
+    """Planes of several kinds, one below the other."""
+
+    point: np.ndarray  # (p,) contact point
+    gap: np.ndarray  # (p,) distance of the anchor [scene unit]
+    normal: np.ndarray  # (p, 3)
+    anchor: np.ndarray  # (p, 3)
+    kind: np.ndarray  # (p,)
+    softness: np.ndarray  # (kinds,)
+
+
+class Known(NamedTuple):
+    """Where points were when they were last asked about bones, and what bounds the distances
+    there.
+    """
+
+    anchor: np.ndarray  # (b, n, 3) in bone coordinates
+    bound: np.ndarray  # (b, n), -infinity where nothing is known
+
+
+class Obstacles(NamedTuple):
+    """What a muscle's contact points meet, for compiled loops."""
+
+    bones: Bones  # the b bones in reach
+    poses: np.ndarray  # (b, 4, 4)
+    free: np.ndarray  # (n,) whether no bone holds a contact point
+    allowed: np.ndarray  # (b, n) how deep a contact point may be in a bone [scene unit]
+    known: Known  # changed in place
+    planes: PlaneStack
+
+
 # The arrays of no bone.
 NOTHING = [
     np.zeros(0, np.int32),

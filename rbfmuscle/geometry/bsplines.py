@@ -2,6 +2,8 @@
 their sum.
 """
 
+import numpy as np
+
 from rbfmuscle.jit import compiled
 
 
@@ -19,24 +21,27 @@ def bspline_weights(t, weight, slope):
     slope[2] = 2.0 * s - 1.5 * s * s
 
 
-@compiled(error_model="numpy")
-def bspline_sum(nodes, first, weight, slope):
-    """Value and gradient, in units of a cell, from the 4 x 4 x 4 nodes from ``first`` on and
-    weights (3, 4).
+@compiled(error_model="numpy", fastmath={"contract"})
+def bspline_sum(nodes, start, width, weight, slope):
+    """Value and gradient, in units of a cell, of the 4 x 4 x 4 nodes from ``start`` on of a block
+    of ``width`` nodes along each axis, flattened; weights and slopes are (3, 4).
     """
-    value = 0.0
-    gx = 0.0
-    gy = 0.0
-    gz = 0.0
+    value, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
+    w0, w1, w2, w3 = weight[2, 0], weight[2, 1], weight[2, 2], weight[2, 3]
+    s0, s1, s2, s3 = slope[2, 0], slope[2, 1], slope[2, 2], slope[2, 3]
     for a in range(4):
+        line, lean, side = 0.0, 0.0, 0.0
         for b in range(4):
-            line, lean = 0.0, 0.0
-            for c in range(4):
-                node = nodes[first[0] + a, first[1] + b, first[2] + c]
-                line += weight[2, c] * node
-                lean += slope[2, c] * node
-            value += weight[0, a] * weight[1, b] * line
-            gx += slope[0, a] * weight[1, b] * line
-            gy += weight[0, a] * slope[1, b] * line
-            gz += weight[0, a] * weight[1, b] * lean
+            # Unsigned, as compiled code looks for negative ones otherwise.
+            k = np.uint64(start + (a * width + b) * width)
+            n0, n1 = nodes[k], nodes[k + np.uint64(1)]
+            n2, n3 = nodes[k + np.uint64(2)], nodes[k + np.uint64(3)]
+            here = w0 * n0 + w1 * n1 + w2 * n2 + w3 * n3
+            line += weight[1, b] * here
+            side += slope[1, b] * here
+            lean += weight[1, b] * (s0 * n0 + s1 * n1 + s2 * n2 + s3 * n3)
+        value += weight[0, a] * line
+        gx += slope[0, a] * line
+        gy += weight[0, a] * side
+        gz += weight[0, a] * lean
     return value, gx, gy, gz

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.jit import compiled
+from rbfmuscle.jit import compiled, inner
 
 
 class Memory(NamedTuple):
@@ -67,7 +67,7 @@ def mix(memory, state, image):
     return out
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _solve_definite(matrix, right):
     """Solve a small system with a positive definite matrix by elimination, both in place.
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.jit import compiled
+from rbfmuscle.jit import compiled, inner
 
 # Contacts that join the working set in one round, rounds, sweeps in each.
 BATCH = 24
@@ -62,7 +62,7 @@ def no_answers(near, metric):
     )
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _answer(i, near, metric, answers):
     """Number of near point i; its answers are found when it is first asked for."""
     if answers.number[i] >= 0:
@@ -93,7 +93,7 @@ def _answer(i, near, metric, answers):
     return number
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _schur(start, numbers, normal, answers, rows, gram, own):
     """Rows ρ and entries of G of the contacts from ``start`` on; ``own`` is its diagonal."""
     for c in range(start, len(numbers)):
@@ -157,7 +157,7 @@ def deepest(lacking, is_chosen, tolerance, most):
     return found[:count]
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
     """Motion of the nodes by contact forces, and what these take from the whitened pressures."""
     push[:] = 0.0
@@ -177,7 +177,7 @@ def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
                 push[j, a] -= taken[r] * metric.response[r, a, j]
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _find_lacking(touch, need, near, push, lacking):
     """Motion that each contact still needs after a push of the nodes."""
     for c in range(len(need)):

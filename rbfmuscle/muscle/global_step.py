@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.jit import compiled
+from rbfmuscle.jit import compiled, inner
 
 # Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in
 # volume. The surface is drawn at the volume at rest in any case.
@@ -62,7 +62,7 @@ def find_metric(cells, gradient, inverse):
     return Metric(inverse, response, factor), sound
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _factor_small(matrix):
     """Turn the lower triangle of a small matrix into its Cholesky factor; returns whether it is
     positive definite.
@@ -99,7 +99,7 @@ def swell(motion, cells, gradient):
     return out
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def calm_share(pressure):
     """Share of a full step that is taken under these pressures."""
     highest = 0.0
@@ -108,7 +108,7 @@ def calm_share(pressure):
     return 1.0 / max(1.0, highest / CALM_PRESSURE)
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def global_step(cells, y, pressure, force, local, metric, part):
     """Nodes (N, 3) after ``part`` of a step from ``y`` under the ``force`` of targets and springs
     and the pressures, with the volumes corrected, and the whitened correction (M,) of the
@@ -135,7 +135,7 @@ def global_step(cells, y, pressure, force, local, metric, part):
     return step, change
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def corrected_pressures(pressure, change, taken, factor, part):
     """Pressures (M,) after a whitened change, of which contacts ``taken`` some: q = L⁻ᵀ (change -
     taken), in units of a full step.

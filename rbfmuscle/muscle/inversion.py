@@ -8,7 +8,7 @@ only the points that need it.
 
 import numpy as np
 
-from rbfmuscle.jit import compiled
+from rbfmuscle.jit import compiled, inner
 
 LEAST = 0.5  # det F that a point keeps
 STIFFNESS = 100.0  # over 2 μ
@@ -16,7 +16,7 @@ SMALLEST = 0.1  # stretch that the search for the nearest deformation starts wit
 ROUNDS = 10  # of that search
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _determinant(m):
     return (
         m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])

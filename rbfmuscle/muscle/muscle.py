@@ -24,8 +24,8 @@ from rbfmuscle.muscle.model import (
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
 from rbfmuscle.muscle.rounded_bones import RoundedBones, grown, round_bones
-from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, make_room, settle
-from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform, turn
+from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, Report, settle
+from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform
 from rbfmuscle.scene.ends import ordered_muscle
 from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.objects import Muscle
@@ -122,14 +122,7 @@ class RBFMuscle:
         """Solve for the equilibrium under elasticity, volume and contact at the bones' present
         poses.
         """
-        obstacles = contacts.obstacles(len(self.state.points))
-        rounded = self._round(contacts)
-        while True:
-            state, report = settle(self.model, self._stiffness, self.state, obstacles, rounded)
-            if report.status != NO_ROOM:
-                break
-            rounded = grown(rounded)
-            self._rounded = contacts, rounded
+        state, report = self._settled(contacts)
         if report.status == DIVERGED:
             raise FloatingPointError("the solid does not settle")
         self.state = state
@@ -139,29 +132,28 @@ class RBFMuscle:
             solid_volume_error=report.volume_error,
         )
 
-    def _round(self, contacts: BoneContacts) -> RoundedBones:
-        """The bones in reach, rounded."""
-        if self._rounded is None or self._rounded[0] is not contacts:
-            spacing = float(np.sqrt(self.model.area))
-            self._rounded = contacts, round_bones(contacts, self.frame, spacing, self._meshes)
-        return self._rounded[1]
-
     def make_room(self, contacts: BoneContacts) -> None:
         """Move what is shown out of the planes of neighbours."""
+        self.state, _ = self._settled(contacts, room=True)
+
+    def _settled(self, contacts: BoneContacts, *, room: bool = False) -> tuple[SolidState, Report]:
+        """What `settle` gives, with the bones in reach rounded and room for their blocks."""
+        if self._rounded is None or self._rounded[0] is not contacts:
+            fields = {contacts.names[b]: contacts.fields[b] for b in contacts.reached}
+            spacing = float(np.sqrt(self.model.area))
+            self._rounded = contacts, round_bones(fields, self.frame, spacing, self._meshes)
+        given = self.model, self._stiffness, self.state
         obstacles = contacts.obstacles(len(self.state.points))
-        rounded = self._round(contacts)
-        self.state = make_room(self.model, self._stiffness, self.state, obstacles, rounded)
+        while True:
+            state, report = settle(*given, obstacles, self._rounded[1], room=room)
+            if report.status != NO_ROOM:
+                return state, report
+            self._rounded = contacts, grown(self._rounded[1])
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         if activation != self.state.activation[0]:
             self.restore(self.state._replace(activation=np.array([activation])))
-
-    def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
-        """Move the nodes that carry contact points marked in a bool mask by a (4, 4) transform;
-        held ones stay.
-        """
-        self.state = turn(self.model, self.state, which, transform)
 
     def transform(self, motion: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4), as the muscle is."""

@@ -5,10 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, lower_bound, note_query
-from rbfmuscle.bones.obstacles import query_bone
-from rbfmuscle.jit import compiled
-from rbfmuscle.muscle.rounded_bones import rounded_distance
-from rbfmuscle.simulation.contact import Known
+from rbfmuscle.bones.obstacles import Known, query_bone
+from rbfmuscle.jit import inner
+from rbfmuscle.muscle.rounded_bones import SPREAD, no_scratch, rounded_distance
 
 
 class Near(NamedTuple):
@@ -35,7 +34,7 @@ class Touch(NamedTuple):
     source: np.ndarray  # (c,) obstacle: the bones in reach, then kinds of planes
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def find_near(points, obstacles, reach):
     """Mask (n,) of the contact points nearer than ``reach`` to an obstacle."""
     bones, free, known = obstacles.bones, obstacles.free, obstacles.known
@@ -69,7 +68,7 @@ def find_near(points, obstacles, reach):
     return found
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def plane_gap(planes, p, point):
     """Signed distance of a point from plane p."""
     value = planes.gap[p]
@@ -78,39 +77,46 @@ def plane_gap(planes, p, point):
     return value
 
 
-@compiled(error_model="numpy")
-def take_near(found, model, stiffness, obstacles, forces, y):
-    """The contact points of a mask (n,), with the ``forces`` (n, obstacles) on them."""
-    which = np.flatnonzero(found)
-    count, bones = len(which), len(obstacles.poses)
-    embedding = model.embedding
+@inner(error_model="numpy")
+def take_near(found, model, most, obstacles, edges, forces, y):
+    """The contact points of a mask (n,), with the greatest and the present forces of all on them.
+
+    ``edges`` (b,) are those of the cells that bones are rounded over.
+    """
+    which, columns, shares = np.flatnonzero(found), model.embedding.columns, model.embedding.shares
+    count, bones, width = len(which), len(edges), columns.shape[1]
     near = Near(
         which,
-        np.empty((count, embedding.columns.shape[1]), np.int64),
-        np.empty((count, embedding.columns.shape[1])),
+        np.empty((count, width), np.int64),
+        np.empty((count, width)),
         np.empty(count, np.bool_),
         np.empty(count),
         np.empty((count, forces.shape[1])),
         np.empty((bones, count)),
         Known(np.empty((bones, count, 3)), np.empty((bones, count))),
-        Known(np.zeros((bones, count, 3)), np.full((bones, count), -np.inf)),
+        Known(np.empty((bones, count, 3)), np.empty((bones, count))),
         y.copy(),
     )
     for k in range(count):
         i = which[k]
-        near.columns[k] = embedding.columns[i]
-        near.shares[k] = embedding.shares[i]
         near.free[k] = obstacles.free[i]
-        near.most[k] = stiffness.most[i]
-        near.forces[k] = forces[i]
+        near.most[k] = most[i]
+        for m in range(width):
+            near.columns[k, m] = columns[i, m]
+            near.shares[k, m] = shares[i, m]
+        for m in range(forces.shape[1]):
+            near.forces[k, m] = forces[i, m]
         for b in range(bones):
             near.allowed[b, k] = obstacles.allowed[b, i]
             near.exact.bound[b, k] = obstacles.known.bound[b, i]
-            near.exact.anchor[b, k] = obstacles.known.anchor[b, i]
+            near.rounded.bound[b, k] = obstacles.known.bound[b, i] - SPREAD * edges[b]
+            for a in range(3):
+                near.exact.anchor[b, k, a] = obstacles.known.anchor[b, i, a]
+                near.rounded.anchor[b, k, a] = obstacles.known.anchor[b, i, a]
     return near
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def find_touch(near, here, reach, obstacles, rounded):
     """Half-spaces that near points ``here`` (m, 3) meet within ``reach`` (m,), bones rounded.
 
@@ -118,7 +124,7 @@ def find_touch(near, here, reach, obstacles, rounded):
     """
     bones, planes = obstacles.bones, obstacles.planes
     touch = _no_touch(len(obstacles.poses) * len(here) + len(planes.point))
-    normal, box = np.empty(3), np.empty((2, 3))
+    normal, box, scratch = np.empty(3), np.empty((2, 3)), no_scratch()
     farthest = _farthest(here, near.free, reach, box)
     count, room = 0, True
     for b in range(len(obstacles.poses)):
@@ -129,7 +135,7 @@ def find_touch(near, here, reach, obstacles, rounded):
         for i in range(len(here)):
             if not near.free[i] or lower_bound(here, i, pose, bounds, anchor, bound) > reach[i]:
                 continue
-            distance = rounded_distance(rounded, bones, b, pose, here[i], normal)
+            distance = rounded_distance(rounded, bones, b, pose, here[i], normal, scratch)
             if np.isnan(distance):
                 distance = _exact_distance(bones, b, pose, here[i], normal)
             elif distance == np.inf:
@@ -143,7 +149,7 @@ def find_touch(near, here, reach, obstacles, rounded):
     return _first(touch, count), room
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def find_exact_touch(near, here, reach, obstacles, softest):
     """The same with bones as they are, and without planes softer than ``softest``; ``reach`` is a
     number.
@@ -176,7 +182,7 @@ def find_exact_touch(near, here, reach, obstacles, softest):
     return _first(touch, _add_planes(touch, count, near, here, reach, obstacles, softest))
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _farthest(here, free, reach, box):
     """Greatest reach of the free points, and the box about these."""
     box_loop(here, free, box)
@@ -187,7 +193,7 @@ def _farthest(here, free, reach, box):
     return farthest
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _greatest(reach):
     greatest = 0.0
     for i in range(len(reach)):
@@ -195,7 +201,7 @@ def _greatest(reach):
     return greatest
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _exact_distance(bones, b, pose, point, normal):
     """Distance of one point to a bone as it is, and its gradient."""
     at, distance, gradient = point.reshape((1, 3)), np.empty(1), np.empty((1, 3))
@@ -204,19 +210,19 @@ def _exact_distance(bones, b, pose, point, normal):
     return distance[0]
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _no_touch(room):
     return Touch(
         np.empty(room, np.int64), np.empty(room), np.empty((room, 3)), np.empty(room, np.int64)
     )
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _first(touch, count):
     return Touch(touch.point[:count], touch.gap[:count], touch.normal[:count], touch.source[:count])
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _add_touch(touch, count, i, gap, normal, source):
     touch.point[count] = i
     touch.gap[count] = gap
@@ -225,7 +231,7 @@ def _add_touch(touch, count, i, gap, normal, source):
         touch.normal[count, a] = normal[a]
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _add_planes(touch, count, near, here, reach, obstacles, softest):
     """Add the planes nearer than ``reach`` to near points; returns how many half-spaces there
     are.

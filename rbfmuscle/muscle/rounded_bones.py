@@ -17,22 +17,25 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.jit import compiled
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.jit import compiled, inner
 
-SIDE = 4  # cells along a block
+SHIFT = 2
+SIDE = 1 << SHIFT  # cells along a block
 WIDE = SIDE + 3  # nodes along it, those of the splines that reach into it too
 MOST = 1 << 20  # blocks along an axis in either direction: beyond any bone
 BITS = 21  # of each of a block's three numbers in its key
 PROBES, STEPS_IN = 300, 12  # paths into a bone that tell how thick it is, and places along each
 LEAST_SLOPE = 0.3  # where the distance's slope is less, inside a thin bone, the exact one answers
-FIRST_ROOM = 256  # blocks that there is room for at first
+FIRST_ROOM = 256  # blocks that there is room for at first, a power of two
 FULLEST = 0.6  # share of the room that may be filled
 # Edge of the cells that a bone is rounded over, relative to the spacing of the samples. With 0.7 to
 # 1.0 one pose of the phantom's extensor has shapes 0.6 to 1.6 mm RMS apart, from 1.5 to 2 at most
 # 0.06.
 ROUNDING = 1.7
 LEAST_ROUNDING = 0.1  # of that
+# A spline is a mean of the distances at nodes so many cells away (a root mean square of 0.58 along
+# each axis), so where it is positive it errs by less.
+SPREAD = 1.1
 
 
 class RoundedBones(NamedTuple):
@@ -46,12 +49,12 @@ class RoundedBones(NamedTuple):
     origin: np.ndarray  # (3,)
     axes: np.ndarray  # (3, 3) rows
     keys: np.ndarray  # (room, 2) bone and place of each block, -1 where there is none
-    nodes: np.ndarray  # (room, WIDE, WIDE, WIDE) distances, in cells
+    nodes: np.ndarray  # (room, WIDE³) distances, in cells
     filled: np.ndarray  # (1,) blocks that are filled
 
 
 def round_bones(
-    contacts: BoneContacts,
+    fields: Mapping[str, BoneField],
     frame: RestFrame,
     spacing: float,
     meshes: Mapping[str, tuple[Floats, Integers]],
@@ -63,10 +66,8 @@ def round_bones(
     """
     edge = ROUNDING * spacing
     edges = []
-    for b in contacts.reached:
-        name, thickness = contacts.names[b], edge
-        if name in meshes:
-            thickness = bone_thickness(contacts.fields[b], *meshes[name], edge)
+    for name, field in fields.items():
+        thickness = bone_thickness(field, *meshes[name], edge) if name in meshes else edge
         edges.append(max(thickness, LEAST_ROUNDING * edge))
     return _with_room(np.array(edges, dtype=np.float64), frame.origin, frame.axes, FIRST_ROOM)
 
@@ -74,7 +75,7 @@ def round_bones(
 def _with_room(edges: Floats, origin: Floats, axes: Floats, room: int) -> RoundedBones:
     keys = np.full((room, 2), -1, dtype=np.int64)
     return RoundedBones(
-        edges, origin, axes, keys, np.empty((room, WIDE, WIDE, WIDE)), np.zeros(1, dtype=np.int64)
+        edges, origin, axes, keys, np.empty((room, WIDE**3)), np.zeros(1, dtype=np.int64)
     )
 
 
@@ -111,16 +112,16 @@ def bone_thickness(field: BoneField, vertices: Floats, faces: Integers, most: fl
 
 @compiled(error_model="numpy")
 def find_slot(keys, b, key):
-    """Where a block of bone b stands in the table, or would stand."""
-    room = len(keys)
+    """Where a block of bone b stands in the table, or would stand; its room is a power of two."""
+    last = len(keys) - 1
     # Neighbouring blocks should lie apart: multiply by an odd number and take high bits (Knuth).
-    slot = ((key * np.int64(0x9E3779B97F4A7C1) >> 20) + b) % room
+    slot = ((key * np.int64(0x9E3779B97F4A7C1) >> 20) + b) & last
     while keys[slot, 0] >= 0 and (keys[slot, 0] != b or keys[slot, 1] != key):
-        slot = (slot + 1) % room
+        slot = (slot + 1) & last
     return slot
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _fill_block(rounded, bones, b, key, slot):
     """Find the distances at the nodes of a block of bone b."""
     edge, place, first = rounded.edges[b], np.empty(3), np.empty(3)
@@ -141,55 +142,71 @@ def _fill_block(rounded, bones, b, key, slot):
                 n += 1
     distance = np.empty(n)
     query_bone(bones, b, np.eye(4), points, np.full(n, np.inf), distance, np.empty((0, 3)))
-    n = 0
-    for i in range(WIDE):
-        for j in range(WIDE):
-            for k in range(WIDE):
-                rounded.nodes[slot, i, j, k] = distance[n] / edge
-                n += 1
+    for n in range(len(distance)):
+        rounded.nodes[slot, n] = distance[n] / edge
     rounded.keys[slot, 0] = b
     rounded.keys[slot, 1] = key
     rounded.filled[0] += 1
 
 
+class Scratch(NamedTuple):
+    """Room for one question."""
+
+    local: np.ndarray  # (3,) the point in bone coordinates
+    place: np.ndarray  # (3,) in cells of the lattice
+    weight: np.ndarray  # (3, 4)
+    lean: np.ndarray  # (3, 4)
+
+
 @compiled(error_model="numpy")
-def rounded_distance(rounded, bones, b, pose, point, normal):
+def no_scratch():
+    """Room for questions."""
+    return Scratch(
+        np.empty(3),
+        np.empty(3),
+        np.empty((3, 4)),
+        np.empty((3, 4)),
+    )
+
+
+@compiled(error_model="numpy")
+def rounded_distance(rounded, bones, b, pose, point, normal, scratch):
     """Distance of a point to bone b, rounded, and its unit gradient ``normal`` (3,) in the world.
 
     Infinite where there is no room for the block; NaN where the spline is flat.
     """
-    edge, local, place = rounded.edges[b], np.empty(3), np.empty(3)
-    cell, first = np.empty(3, np.int64), np.empty(3, np.int64)
+    local, place, weight, lean = scratch
+    edge = rounded.edges[b]
     for a in range(3):
         local[a] = -rounded.origin[a]
         for k in range(3):
             local[a] += pose[k, a] * (point[k] - pose[k, 3])
-    key = np.int64(0)
+    key, start = np.int64(0), np.int64(0)
     for a in range(3):
         place[a] = 0.0
         for k in range(3):
             place[a] += local[k] * rounded.axes[a, k]
         place[a] /= edge
-        cell[a] = np.int64(np.floor(place[a]))
-        block = np.int64(np.floor(place[a] / SIDE))
-        first[a] = cell[a] - SIDE * block
+        cell = np.int64(np.floor(place[a]))
+        place[a] -= cell
+        block = cell >> SHIFT
+        start = start * WIDE + cell - SIDE * block
         key += (block + MOST) << (BITS * (2 - a))
     slot = find_slot(rounded.keys, b, key)
     if rounded.keys[slot, 0] < 0:
         if rounded.filled[0] >= FULLEST * len(rounded.keys):
             return np.inf
         _fill_block(rounded, bones, b, key, slot)
-    weight, lean, slope = np.empty((3, 4)), np.empty((3, 4)), np.empty(3)
     for a in range(3):
-        bspline_weights(place[a] - cell[a], weight[a], lean[a])
-    value, x, y, z = bspline_sum(rounded.nodes[slot], first, weight, lean)
+        bspline_weights(place[a], weight[a], lean[a])
+    value, x, y, z = bspline_sum(rounded.nodes[slot], start, WIDE, weight, lean)
     steep = np.sqrt(x * x + y * y + z * z)
     if not steep > LEAST_SLOPE:
         return np.nan
     for a in range(3):
-        slope[a] = (
+        local[a] = (
             x * rounded.axes[0, a] + y * rounded.axes[1, a] + z * rounded.axes[2, a]
         ) / steep
     for a in range(3):
-        normal[a] = pose[a, 0] * slope[0] + pose[a, 1] * slope[1] + pose[a, 2] * slope[2]
+        normal[a] = pose[a, 0] * local[0] + pose[a, 1] * local[1] + pose[a, 2] * local[2]
     return value / steep * edge

@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.jit import compiled
+from rbfmuscle.bones.obstacles import Obstacles
+from rbfmuscle.jit import compiled, inner
 from rbfmuscle.muscle.anderson import mix, no_memory
 from rbfmuscle.muscle.contact_forces import Law, contact_push, no_answers
 from rbfmuscle.muscle.global_step import (
@@ -31,7 +32,6 @@ from rbfmuscle.muscle.model import SolidModel, Stiffness, carry
 from rbfmuscle.muscle.near_points import find_exact_touch, find_near, find_touch, take_near
 from rbfmuscle.muscle.rounded_bones import RoundedBones
 from rbfmuscle.muscle.state import SolidState, place_points, tension
-from rbfmuscle.simulation.contact import Obstacles
 
 # All lengths are relative to the muscle's size.
 SETTLED = 2e-5  # an iteration that moves no node farther was the last one
@@ -71,6 +71,18 @@ class Report(NamedTuple):
     caps: int
 
 
+class Settled(NamedTuple):
+    """What a solve changes of a `SolidState`, fields as there."""
+
+    nodes: np.ndarray
+    shown: np.ndarray
+    points: np.ndarray
+    rotations: np.ndarray
+    stretches: np.ndarray
+    pressures: np.ndarray
+    forces: np.ndarray
+
+
 class Problem(NamedTuple):
     """What is given through a solve."""
 
@@ -95,11 +107,29 @@ class Step(NamedTuple):
     room: bool  # whether the table of rounded bones had room
 
 
+def settle(
+    model: SolidModel,
+    stiffness: Stiffness,
+    state: SolidState,
+    obstacles: Obstacles,
+    rounded: RoundedBones,
+    *,
+    room: bool = False,
+) -> tuple[SolidState, Report]:
+    """The state in equilibrium under elasticity, pressures and contacts, and a `Report`.
+
+    With ``room`` nodes stay as they are, and only those shown move, by the planes of neighbours and
+    then out of bones.
+    """
+    found, report = _settle(model, stiffness, state, obstacles, rounded, room)
+    return state._replace(**found._asdict()), report
+
+
 @compiled(error_model="numpy")
-def settle(model, stiffness, state, obstacles, rounded):
-    """The state in equilibrium under elasticity, pressures and contacts, and a `Report`."""
+def _settle(model, stiffness, state, obstacles, rounded, room):
+    """What changes of a state, and a `Report`; see `settle`."""
     springs = np.dot(model.springs, state.anchors)
-    pull = tension(model, state.anchors)
+    pull = tension(model.end, model.end_distance, state.anchors)
     given = Problem(model, stiffness, obstacles, rounded, springs, state.activation[0], pull)
     y, pressure, local = state.nodes.copy(), state.pressures.copy(), start_local(model, state)
     joined = local_step(model, y, given.activation, pull, local)[0]
@@ -109,8 +139,11 @@ def settle(model, stiffness, state, obstacles, rounded):
     answers, push = no_answers(near, metric), np.zeros_like(y)
     memory = no_memory(MEMORY, y.size + len(pressure), y.size)
     limit, most = _limits(given, state)
-    least, status, done = np.inf, DONE, 0
-    while True:
+    least, status, done, caps, residual = np.inf, DONE, 0, 0, 0.0
+    shown = y
+    if room:
+        shown = y + _push_out(given, near, metric, answers, y, np.inf)
+    while not room:
         step = _iterate(given, y, pressure, push, local, metric, near, answers)
         moved = step.moved
         done += 1
@@ -122,6 +155,10 @@ def settle(model, stiffness, state, obstacles, rounded):
         if not sound or not step.room or not np.isfinite(moved):
             status = DIVERGED if step.room else NO_ROOM
         if status != DONE or moved < limit or done == most:
+            y[:] = step.nodes
+            pressure[:] = step.pressures
+            caps = int(not moved < limit) + int(step.capped)
+            residual = step.residual / model.size
             break
         _accelerate(y, pressure, step, memory)
         joined = local_step(model, y, given.activation, pull, local)[0]
@@ -135,15 +172,17 @@ def settle(model, stiffness, state, obstacles, rounded):
             answers = no_answers(near, metric)
             push[:] = 0.0
     _note_forces(near, forces)
-    caps = int(not moved < limit) + int(step.capped)
-    shown, left = _lifted(given, step.nodes, metric, near, answers)
-    settled = _settled(state, model, local, step, shown, forces)
-    error = _volume_error(model, shown)
-    report = Report(status, done, step.residual / model.size, error, caps + left)
-    return settled, report
+    shown, left = _lifted(given, shown, metric, near, answers)
+    points = place_points(model, shown, state.points)
+    rotations, stretches = local.rotations, local.stretches
+    if room:
+        rotations, stretches = state.rotations, state.stretches
+    found = Settled(y, shown, points, rotations, stretches, pressure, forces)
+    report = Report(status, done, residual, _volume_error(model.cells, shown), caps + left)
+    return found, report
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy", inline="always")
 def _limits(given, state):
     """Motion of a node [scene unit] below which a solve ends, and the greatest number of
     iterations.
@@ -158,7 +197,7 @@ def _limits(given, state):
     return (SETTLED_BESIDE if beside else SETTLED) * size, given.model.iterations
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _new_metric(given, local, joined):
     """The metric of corrections, with the stiffness of squeezed points; whether there is one."""
     model, inverse = given.model, given.stiffness.inverse
@@ -167,7 +206,7 @@ def _new_metric(given, local, joined):
     return find_metric(model.cells, local.gradient, inverse)
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _inverse_with(matrix, cells, stiffened):
     """Inverse of the matrix with `STIFFNESS` w |F|² of the squeezed points."""
     total = matrix.copy()
@@ -184,15 +223,16 @@ def _inverse_with(matrix, cells, stiffened):
     return 0.5 * (inverse + inverse.T)
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _choose_near(given, forces, y):
     """The contact points near an obstacle, with the forces on them until now."""
     model, obstacles = given.model, given.obstacles
     found = find_near(carry(model.embedding, y), obstacles, NEAR * model.size)
-    return take_near(found, model, given.stiffness, obstacles, forces, y)
+    most, edges = given.stiffness.most, given.rounded.edges
+    return take_near(found, model, most, obstacles, edges, forces, y)
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy", inline="always")
 def _start_forces(forces, obstacles):
     """Contact forces (n, obstacles) that a solve starts from: none where the obstacles are
     others.
@@ -201,7 +241,7 @@ def _start_forces(forces, obstacles):
     return forces.copy() if forces.shape[1] == sources else np.zeros((len(forces), sources))
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _note_forces(near, forces):
     """Fill the forces (n, obstacles) on all contact points."""
     forces[:] = 0.0
@@ -209,7 +249,7 @@ def _note_forces(near, forces):
         forces[near.which[k]] = near.forces[k]
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy", inline="always")
 def _iterate(given, y, pressure, push, local, metric, near, answers):
     """One global step with volumes and contacts; ``push`` is that of the step before."""
     model, size, part = given.model, given.model.size, calm_share(pressure)
@@ -235,7 +275,7 @@ def _iterate(given, y, pressure, push, local, metric, near, answers):
     return Step(new, pressures, found.nodes, moved, moved / part, found.capped, room)
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy", inline="always")
 def _ways(near, y, new, push, margin):
     """Where near points are (m, 3), their motion in a step of the nodes, and how far to look for
     obstacles: half as far again as they go in the step with the last push on top, and a margin.
@@ -264,7 +304,7 @@ def _ways(near, y, new, push, margin):
     return here, motion, reach
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _law(given, touch, near, yielding, part):
     """How contacts yield: by ``yielding`` of the muscle's size under a pressure of 2 μ, soft planes
     more, up to a ``part`` of their greatest forces.
@@ -279,7 +319,7 @@ def _law(given, touch, near, yielding, part):
     return law
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy", inline="always")
 def _shorten(y, pressure, step, longest):
     """Shorten a step, in place, where a node goes farther than ``longest``."""
     if step.moved > longest:
@@ -288,7 +328,7 @@ def _shorten(y, pressure, step, longest):
         step.pressures[:] = pressure + share * (step.pressures - pressure)
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy", inline="always")
 def _accelerate(y, pressure, step, memory):
     """Turn nodes and pressures, in place, into those that the next iteration starts from."""
     count = y.size
@@ -302,7 +342,7 @@ def _accelerate(y, pressure, step, memory):
     pressure[:] = mixed[count:]
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _carry_near(near, y):
     """Where near points are, (m, 3)."""
     out = np.zeros((len(near.which), 3))
@@ -313,61 +353,40 @@ def _carry_near(near, y):
     return out
 
 
-@compiled(error_model="numpy")
-def _push_out(given, touch, near, metric, answers, yielding):
-    """Motion (N, 3) of nodes that stand still, out of obstacles."""
+@inner(error_model="numpy")
+def _push_out(given, near, metric, answers, y, softest):
+    """Motion (N, 3) of nodes y that stand still, out of obstacles that are at most so soft.
+
+    Bones and planes as hard do not yield; where softer planes are asked for too, all yield a
+    little. Zero where nothing is left in one of them.
+    """
+    size, push = given.model.size, np.zeros_like(y)
+    touch = find_exact_touch(near, _carry_near(near, y), MARGIN * size, given.obstacles, softest)
+    hard = softest <= 1.0
+    if hard and (len(touch.gap) == 0 or touch.gap.min() > -TOLERANCE * size):
+        return push
     still, none = np.zeros((len(near.which), 3)), np.zeros_like(near.forces)
-    law, tolerance = _law(given, touch, near, yielding, 1.0), TOLERANCE * given.model.size
-    return contact_push(touch, still, near, metric, answers, law, none, tolerance).nodes
+    law = _law(given, touch, near, 0.0 if hard else SHOWN_YIELDING * YIELDING, 1.0)
+    found = contact_push(touch, still, near, metric, answers, law, none, TOLERANCE * size)
+    return found.nodes
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy", inline="always")
 def _lifted(given, y, metric, near, answers):
     """Nodes (N, 3), moved so far that no contact point is left in an obstacle that does not yield;
-    1 where some are left all the same, else 0.
+    1 where some may be left all the same, else 0.
     """
-    size = given.model.size
-    for turn in range(LIFTS + 1):
-        here = _carry_near(near, y)
-        touch = find_exact_touch(near, here, MARGIN * size, given.obstacles, 1.0)
-        if len(touch.gap) == 0 or touch.gap.min() > -TOLERANCE * size:
+    for _ in range(LIFTS):
+        push = _push_out(given, near, metric, answers, y, 1.0)
+        if not push.any():
             return y, 0
-        if turn < LIFTS:
-            y = y + _push_out(given, touch, near, metric, answers, 0.0)
+        y = y + push
     return y, 1
 
 
-@compiled(error_model="numpy")
-def _settled(state, model, local, step, shown, forces):
-    """The state after a solve; what the solve added to the prediction becomes the trend."""
-    y, pressure = step.nodes, step.pressures
-    correction, pressed, last = state.correction, state.correction_pressures, state.last_step
-    if np.abs(state.step).max() > SETTLED * model.size:
-        correction, pressed = y - state.start, pressure - state.start_pressures
-        last = state.step
-    return SolidState(
-        nodes=y,
-        shown=shown,
-        points=place_points(model, shown, state.points),
-        rotations=local.rotations,
-        stretches=local.stretches,
-        pressures=pressure,
-        forces=forces,
-        anchors=state.anchors,
-        step=state.step,
-        start=state.start,
-        start_pressures=state.start_pressures,
-        last_step=last,
-        correction=correction,
-        correction_pressures=pressed,
-        activation=state.activation,
-    )
-
-
-@compiled(error_model="numpy")
-def _volume_error(model, y):
+@inner(error_model="numpy")
+def _volume_error(cells, y):
     """Greatest relative error of a region's volume for nodes y (N, 3)."""
-    cells = model.cells
     volumes = np.zeros(len(cells.volumes))
     for i in range(len(cells.weights)):
         r0, r1, r2 = gradient_rows(y, cells.columns[i], cells.slopes[i])
@@ -377,38 +396,3 @@ def _volume_error(model, y):
             + r0[2] * (r1[0] * r2[1] - r1[1] * r2[0])
         )
     return np.abs(volumes / cells.volumes - 1.0).max()
-
-
-@compiled(error_model="numpy")
-def make_room(model, stiffness, state, obstacles, rounded):
-    """The state whose shown nodes are the settled ones, moved by the planes of neighbours and then
-    out of bones.
-    """
-    pull = tension(model, state.anchors)
-    springs = np.zeros_like(state.nodes)
-    given = Problem(model, stiffness, obstacles, rounded, springs, state.activation[0], pull)
-    local, y = start_local(model, state), state.nodes
-    joined = local_step(model, y, given.activation, pull, local)[0]
-    metric, _ = _new_metric(given, local, joined)
-    near = _choose_near(given, _start_forces(state.forces, obstacles), y)
-    answers, size = no_answers(near, metric), model.size
-    touch = find_exact_touch(near, _carry_near(near, y), MARGIN * size, obstacles, np.inf)
-    y = y + _push_out(given, touch, near, metric, answers, SHOWN_YIELDING * YIELDING)
-    shown, _ = _lifted(given, y, metric, near, answers)
-    return SolidState(
-        nodes=state.nodes,
-        shown=shown,
-        points=place_points(model, shown, state.points),
-        rotations=state.rotations,
-        stretches=state.stretches,
-        pressures=state.pressures,
-        forces=state.forces,
-        anchors=state.anchors,
-        step=state.step,
-        start=state.start,
-        start_pressures=state.start_pressures,
-        last_step=state.last_step,
-        correction=state.correction,
-        correction_pressures=state.correction_pressures,
-        activation=state.activation,
-    )

@@ -7,14 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import exponential_loop, logarithm_loop
 from rbfmuscle.geometry.rotations import turned_quaternions
-from rbfmuscle.jit import compiled
+from rbfmuscle.jit import compiled, inner
 from rbfmuscle.muscle.model import MOST_TONE, TONE, SolidModel, carry
 
-# Greatest multiple of the last sub-step's correction that the next one starts with.
-MOST_TREND = 1.5
+# Greatest multiple of the last sub-step's correction that the next one starts with, and the least
+# motion of an attachment, of the muscle's size, in a step whose correction counts.
+MOST_TREND, LEAST_STEP = 1.5, 2e-5
 
 
 class SolidState(NamedTuple):
@@ -32,14 +33,11 @@ class SolidState(NamedTuple):
     pressures: np.ndarray  # (M,) over 2 μ
     forces: np.ndarray  # (n, obstacles) of contacts, over 2 μ
     anchors: np.ndarray  # (h, 3) where the bones hold the held points
-    # The last step of the anchors (h, 3), and nodes (N, 3) and pressures (M,) as first predicted.
+    # The last step of the anchors (h, 3), and nodes (N, 3) and pressures (M,) as first predicted;
+    # what a solve added to these is the correction that the next step starts with.
     step: np.ndarray
     start: np.ndarray
     start_pressures: np.ndarray
-    # Step of the anchors before, and what the solve then added to nodes and pressures.
-    last_step: np.ndarray
-    correction: np.ndarray
-    correction_pressures: np.ndarray
     activation: np.ndarray  # (1,)
 
 
@@ -59,32 +57,30 @@ def rest_state(model: SolidModel) -> SolidState:
         np.zeros_like(held),
         nodes,
         np.zeros(regions),
-        np.zeros_like(held),
-        np.zeros_like(nodes),
-        np.zeros(regions),
         np.zeros(1),
     )
 
 
 @compiled(error_model="numpy")
-def tension(model, anchors):
-    """Tension τ of slack fibres, which goes with the distance between the muscle's ends."""
+def tension(end, distance, anchors):
+    """Tension τ of slack fibres: it grows as the muscle's ends, those of the anchors (h, 3) whose
+    ``end`` is 0 or 1, approach from their ``distance`` at rest.
+    """
     middle, count = np.zeros((2, 3)), np.zeros(2)
     for i in range(len(anchors)):
-        end = model.end[i]
-        if end >= 0:
-            count[end] += 1.0
-            middle[end] += anchors[i]
+        if end[i] >= 0:
+            count[end[i]] += 1.0
+            for a in range(3):
+                middle[end[i], a] += anchors[i, a]
     if count[0] == 0.0:
         return 0.0
     square = 0.0
     for a in range(3):
         square += (middle[0, a] / count[0] - middle[1, a] / count[1]) ** 2
-    approach = 1.0 - np.sqrt(square) / model.end_distance
-    return min(max(0.0, TONE * approach), MOST_TONE)
+    return min(max(0.0, TONE * (1.0 - np.sqrt(square) / distance)), MOST_TONE)
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _along(rest, pose, out):
     """A point at rest where a pose of its bone takes it."""
     for a in range(3):
@@ -93,7 +89,7 @@ def _along(rest, pose, out):
             out[a] += pose[a, k] * rest[k]
 
 
-@compiled(error_model="numpy")
+@inner(error_model="numpy")
 def _relative(before, after):
     """Rigid motion (4, 4) from one pose to another: after · before⁻¹."""
     out = np.eye(4)
@@ -108,13 +104,30 @@ def _relative(before, after):
     return out
 
 
-@compiled(error_model="numpy")
-def predict(model, state, before, after):
+def predict(model: SolidModel, state: SolidState, before: Floats, after: Floats) -> SolidState:
     """The state after the bones moved between two sets of poses (b, 4, 4).
 
     Nodes take a mean of the bones' motions: the twists are averaged with the nodes' weights.
     Where the motion goes on as before, so does the last correction; what is shown has no part in
     that: neighbours add a mean of several corrections (`NeighbourSurface`).
+    """
+    nodes, start, points, pressures, anchors, step = _predicted(model, state, before, after)
+    return state._replace(
+        nodes=nodes,
+        shown=start,
+        points=points,
+        pressures=pressures,
+        anchors=anchors,
+        step=step,
+        start=start,
+        start_pressures=state.pressures,
+    )
+
+
+@compiled(error_model="numpy")
+def _predicted(model, state, before, after):
+    """Nodes, these without the last correction, contact points, pressures, anchors, and the
+    anchors' step.
     """
     twists, one = np.empty((len(before), 6)), np.empty((1, 6))
     for b in range(len(before)):
@@ -130,30 +143,19 @@ def predict(model, state, before, after):
         at = model.fixed[i]
         _along(model.points[at], after[model.fixed_bone[i]], points[at])
     step = anchors - state.anchors
-    along = 0.0
-    square = 0.0
+    along, square, farthest = 0.0, 0.0, 0.0
     for i in range(len(step)):
         for a in range(3):
-            along += step[i, a] * state.last_step[i, a]
-            square += state.last_step[i, a] ** 2
-    share = min(max(along / max(square, 1e-30), -MOST_TREND), MOST_TREND)
-    return SolidState(
-        nodes=start + share * state.correction,
-        shown=start,
-        points=points,
-        rotations=state.rotations,
-        stretches=state.stretches,
-        pressures=state.pressures + share * state.correction_pressures,
-        forces=state.forces,
-        anchors=anchors,
-        step=step,
-        start=start,
-        start_pressures=state.pressures,
-        last_step=state.last_step,
-        correction=state.correction,
-        correction_pressures=state.correction_pressures,
-        activation=state.activation,
-    )
+            last = state.step[i, a]
+            along += step[i, a] * last
+            square += last * last
+            farthest = max(farthest, abs(last))
+    share = 0.0
+    if farthest > LEAST_STEP * model.size:
+        share = min(max(along / square, -MOST_TREND), MOST_TREND)
+    nodes = start + share * (state.nodes - state.start)
+    pressures = state.pressures + share * (state.pressures - state.start_pressures)
+    return nodes, start, points, pressures, anchors, step
 
 
 @compiled(error_model="numpy")
@@ -167,22 +169,6 @@ def place_points(model, nodes, before):
     return points
 
 
-def turn(model: SolidModel, state: SolidState, which: Booleans, transform: Floats) -> SolidState:
-    """The state after a rigid transform (4, 4) of the nodes, as far as they carry free contact
-    points of the mask ``which`` (n,).
-    """
-    hit, every = np.zeros((2, len(state.nodes)))
-    columns, shares = model.embedding.columns, model.embedding.shares
-    marked = which & (model.owner < 0)
-    np.add.at(hit, columns[marked], shares[marked])
-    np.add.at(every, columns, shares)
-    share = (hit / np.maximum(every, 1e-12))[:, None]
-    moved = state.nodes @ transform[:3, :3].T + transform[:3, 3]
-    nodes = state.nodes + share * (moved - state.nodes)
-    points = place_points(model, nodes, state.points)
-    return state._replace(nodes=nodes, shown=nodes, points=points)
-
-
 def transform(state: SolidState, motion: Floats) -> SolidState:
     """The state after a rigid motion (4, 4) of the whole muscle."""
     turned, shift = np.ascontiguousarray(motion[:3, :3].T), motion[:3, 3]
@@ -192,6 +178,6 @@ def transform(state: SolidState, motion: Floats) -> SolidState:
         points=state.points @ turned + shift,
         rotations=turned_quaternions(state.rotations, motion[:3, :3]),
         anchors=state.anchors @ turned + shift,
-        last_step=state.last_step @ turned,
-        correction=state.correction @ turned,
+        step=state.step @ turned,
+        start=state.start @ turned + shift,
     )

@@ -173,7 +173,7 @@ class TunnellingOptions(Table):
     """``detect.tunnelling``: points that pass through a bone in one step."""
 
     angle: Annotated[float, Field(gt=0, lt=180)] = 135.0
-    action: Literal["report", "rotate", "substep"] = "substep"
+    action: Literal["report", "substep"] = "substep"
     swept: bool = True
 
 

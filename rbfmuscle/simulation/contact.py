@@ -8,10 +8,10 @@ represented.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,8 @@ from rbfmuscle.bones.broad_phase import (
     path_loop,
     take_contacts_loop,
 )
-from rbfmuscle.bones.obstacles import Bones, stack_bones
+from rbfmuscle.bones.obstacles import Bones, Known, Obstacles, PlaneStack, stack_bones
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.scene.tendons import AtRest
 from rbfmuscle.validation import check_points
@@ -69,51 +70,6 @@ class Planes:
         self.anchor = anchor
 
 
-class PlaneStack(NamedTuple):
-    """Planes of several kinds, one below the other."""
-
-    point: np.ndarray  # (p,) contact point
-    gap: np.ndarray  # (p,) distance of the anchor [scene unit]
-    normal: np.ndarray  # (p, 3)
-    anchor: np.ndarray  # (p, 3)
-    kind: np.ndarray  # (p,)
-    softness: np.ndarray  # (kinds,)
-
-    @classmethod
-    def of(cls, kinds: Sequence[Planes]) -> PlaneStack:
-        """The planes of some kinds, which may be none."""
-        none = Planes()
-        some = [none, *kinds]
-        return cls(
-            np.concatenate([planes.index for planes in some]),
-            np.concatenate([planes.gap for planes in some]),
-            np.concatenate([planes.normal for planes in some]),
-            np.concatenate([planes.anchor for planes in some]),
-            np.repeat(np.arange(len(kinds)), [len(planes.index) for planes in kinds]),
-            np.array([planes.softness for planes in kinds], dtype=np.float64),
-        )
-
-
-class Known(NamedTuple):
-    """Where points were when they were last asked about bones, and what bounds the distances
-    there.
-    """
-
-    anchor: np.ndarray  # (b, n, 3) in bone coordinates
-    bound: np.ndarray  # (b, n), -infinity where nothing is known
-
-
-class Obstacles(NamedTuple):
-    """What a muscle's contact points meet, for compiled loops."""
-
-    bones: Bones  # the b bones in reach
-    poses: np.ndarray  # (b, 4, 4)
-    free: np.ndarray  # (n,) whether no bone holds a contact point
-    allowed: np.ndarray  # (b, n) how deep a contact point may be in a bone [scene unit]
-    known: Known  # changed in place
-    planes: PlaneStack
-
-
 class BoneContacts:
     """The obstacles of one muscle, in one pose.
 
@@ -152,7 +108,7 @@ class BoneContacts:
         missing = [self.names[b] for b in self.reached if self.names[b] not in poses]
         if missing:
             raise ValueError(f"poses lack the bone {missing[0]!r}")
-        self.poses, self.placed = poses, self._stacked(poses)
+        self.poses, self.placed = poses, self.stacked(poses)
 
     def frozen(self) -> BoneContacts:
         """A copy in the present poses, for queries from another thread while the bones move."""
@@ -161,9 +117,10 @@ class BoneContacts:
         return other
 
     @cached_property
-    def bones(self) -> Bones:
-        """The fields of the bones in reach, for compiled loops."""
-        return stack_bones([self.fields[b] for b in self.reached])
+    def bones(self) -> Bones | None:
+        """The fields of the bones in reach, for compiled loops; None where one is no `BoneSDF`."""
+        fields = [self.fields[b] for b in self.reached]
+        return stack_bones(fields) if all(isinstance(f, BoneSDF) for f in fields) else None
 
     def obstacles(self, count: int) -> Obstacles:
         """What ``count`` contact points meet in the present poses."""
@@ -171,10 +128,11 @@ class BoneContacts:
             self._allowed = np.zeros((len(self.reached), count))
             for row, b in enumerate(self.reached):
                 self._allowed[row] = self.allowed.get(b, 0.0)
-        planes = PlaneStack.of(self.neighbours)
-        return Obstacles(
-            self.bones, self.placed, self.free(count), self._allowed, self._bounds(count), planes
-        )
+        if self.bones is None:
+            raise TypeError("a model that asks bones from compiled loops needs BoneSDF fields")
+        planes = _stacked_planes(self.neighbours) if self.neighbours else NO_PLANES
+        free, known = self.free(count), self._bounds(count)
+        return Obstacles(self.bones, self.placed, free, self._allowed, known, planes)
 
     def allow(self, bone_index: int, depth: Floats) -> None:
         """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it
@@ -275,7 +233,7 @@ class BoneContacts:
         """
         if not self.neighbours:
             return spaces
-        planes = PlaneStack.of(self.neighbours)
+        planes = _stacked_planes(self.neighbours)
         gap = planes.gap + np.einsum(
             "ij,ij->i", planes.normal, points[planes.point] - planes.anchor
         )
@@ -309,7 +267,7 @@ class BoneContacts:
         pose to pose.
         """
         length = np.empty((len(self.reached), len(start)))
-        path_loop(start, end, self._stacked(before), self._stacked(after), length)
+        path_loop(start, end, self.stacked(before), self.stacked(after), length)
         return length
 
     def free(self, count: int) -> Booleans:
@@ -322,7 +280,7 @@ class BoneContacts:
             )
         return self.contact_bone < 0
 
-    def _stacked(self, poses):
+    def stacked(self, poses: Mapping[str, Floats]) -> Floats:
         """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""
         return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)
 
@@ -348,3 +306,19 @@ class BoneContacts:
             points, pose, self.boxes[row], near, distance, gradient, anchor[row], bound[row]
         )
         return distance, gradient
+
+
+def _stacked_planes(kinds: Sequence[Planes]) -> PlaneStack:
+    """The planes of some kinds, which may be none."""
+    some = [Planes(), *kinds]
+    return PlaneStack(
+        np.concatenate([planes.index for planes in some]),
+        np.concatenate([planes.gap for planes in some]),
+        np.concatenate([planes.normal for planes in some]),
+        np.concatenate([planes.anchor for planes in some]),
+        np.repeat(np.arange(len(kinds)), [len(planes.index) for planes in kinds]),
+        np.array([planes.softness for planes in kinds], dtype=np.float64),
+    )
+
+
+NO_PLANES = _stacked_planes([])

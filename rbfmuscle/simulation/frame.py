@@ -16,7 +16,7 @@ class Event:
     """Something a user should know: ``count`` points of a muscle at a bone, and what was done.
 
     ``action`` is ``"angle_flag"`` (the angle test found a crossing), ``"reported"`` (crossed, not
-    corrected), ``"rotated"``, ``"halved"`` (the step), ``"held_back"`` (kept on its side of a
+    corrected), ``"halved"`` (the step), ``"held_back"`` (kept on its side of a
     plane), ``"grazed"`` (crossed by the bone's field, by its triangles less than 0.1 mm deep),
     ``"unresolved"`` (crossed all the same), ``"carried_stretched"``, ``"carried_held_end"`` or
     ``"carried_sheets"`` (no level set could be shown, so the surface is where the material is: it
@@ -134,9 +134,6 @@ class MuscleModel(Protocol):
         """Move what is shown out of neighbours, by planes at where these are now; nothing where
         `solve` does that.
         """
-
-    def turn(self, which: np.ndarray, transform: np.ndarray) -> None:
-        """Move the contact points marked in a bool mask (n,) by a (4, 4) transform."""
 
     def transform(self, motion: np.ndarray) -> None:
         """Move the whole muscle rigidly by (4, 4)."""

@@ -79,7 +79,7 @@ class FrameLoop:
                 stepper.carrier = RigidTransport(scene.muscle(stepper.name), scene)
         self._next_index = 0
         self._wall = 0.0
-        self._blas = ThreadpoolController()
+        self._blas = ThreadpoolController().select(user_api="blas").lib_controllers
         with self.working():
             each(resolve_initial_overlap, self.steppers)
             self._sliding = None if scene.sliding is None else Sliding(scene, self.steppers)
@@ -145,10 +145,14 @@ class FrameLoop:
         More would spin and take the cores from the loops, and results would depend on their number.
         """
         start = time.perf_counter()
+        before = [library.num_threads for library in self._blas]
         try:
-            with self._blas.limit(limits=1, user_api="blas"):
-                yield
+            for library in self._blas:
+                library.set_num_threads(1)
+            yield
         finally:
+            for library, threads in zip(self._blas, before):
+                library.set_num_threads(threads)
             self._wall += time.perf_counter() - start
 
     def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, Path]:

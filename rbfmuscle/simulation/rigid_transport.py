@@ -11,11 +11,11 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
-from rbfmuscle.scene.motion import turned_angle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import MuscleModel
+from rbfmuscle.simulation.substeps import step_excess
 
 # Bones farther than this [mm] from a muscle do not act on it.
 CLEAR = 2.0
@@ -24,6 +24,8 @@ CLEAR = 2.0
 STILL = 1e-9
 # Displacement of an attachment, in sizes of its muscle, that counts as a rotation by one radian.
 ARC = 0.5
+# Of a root and a bone the second has the attachment.
+ATTACHED = np.array([1])
 
 
 class MuscleStatus(NamedTuple):
@@ -110,9 +112,6 @@ class RigidTransport:
         """Whether a bone that holds the muscle rotates, or its attachment moves, as seen from
         another bone.
         """
-        old, new = (np.linalg.inv(poses[root]) @ poses[name] for poses in (before, after))
-        if np.array_equal(old, new):
-            return False
-        way = self._corners[name] @ (new - old)[:3, :3].T + (new - old)[:3, 3]
-        moved = float(np.sqrt((way**2).sum(axis=1)).max()) / (ARC * self.size)
-        return max(float(turned_angle(new[:3, :3] @ old[:3, :3].T)), moved) > STILL
+        old, new = np.array([before[root], before[name]]), np.array([after[root], after[name]])
+        corners, lever = self._corners[name][None], np.array([ARC * self.size])
+        return bool(step_excess(old, new, 0, ATTACHED, corners, lever, 1.0) > STILL)

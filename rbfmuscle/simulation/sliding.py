@@ -21,7 +21,7 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
 from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
 from rbfmuscle.simulation.sliding_pair import BoneLink, SlidingLimits, SlidingPair
-from rbfmuscle.simulation.stepper import MuscleStepper
+from rbfmuscle.simulation.stepper import MuscleStepper, Path
 from rbfmuscle.validation import SceneError
 
 Coordinates = dict[str, float]
@@ -95,24 +95,23 @@ class Sliding:
             for stepper in due if len(activations) else ():
                 stepper.set_activation(activations[stop - 1])
             if due:
-                self._step(due, {name: (stops[k], stops[stop]) for name, k in here.items()})
+                ends = stops[stop]
+                self._step(due, {s.name: s.path(stops[here[s.name]], ends) for s in self.steppers})
             here.update((stepper.name, stop) for stepper in due)
         self._link_near()
 
-    def _step(
-        self, due: list[MuscleStepper], paths: Mapping[str, tuple[Coordinates, Coordinates]]
-    ) -> None:
+    def _step(self, due: list[MuscleStepper], paths: Mapping[str, Path]) -> None:
         """One sub-step of some muscles, each from its own last coordinates."""
 
         def predict(stepper: MuscleStepper) -> None:
-            stepper.predict(*paths[stepper.name])
-            self.refresh(stepper, *paths[stepper.name])
+            stepper.predict(paths[stepper.name])
+            self.refresh(stepper, paths[stepper.name])
 
         def wait(stepper: MuscleStepper) -> None:
-            state, (before, after) = stepper.model.snapshot(), paths[stepper.name]
+            state, path = stepper.model.snapshot(), paths[stepper.name]
             with stepper.timed("predict"):
-                stepper.model.predict(stepper.poses(before), stepper.poses(after))
-            self.refresh(stepper, before, after)
+                stepper.model.predict(path.old, path.new)
+            self.refresh(stepper, path)
             stepper.model.restore(state)
 
         def find_planes(stepper: MuscleStepper) -> None:
@@ -125,7 +124,7 @@ class Sliding:
         def learn(stepper: MuscleStepper) -> None:
             if stepper.name in self.surfaces:
                 with stepper.timed("sliding"):
-                    self.surfaces[stepper.name].learn(*paths[stepper.name])
+                    self.surfaces[stepper.name].learn(*paths[stepper.name][:2])
 
         each(predict, due)
         seen = {link.other.model.name for stepper in due for link in self.links[stepper.name]}
@@ -136,13 +135,11 @@ class Sliding:
         for act in (find_planes, MuscleStepper.correct, learn):
             each(act, due)
 
-    def refresh(self, stepper: MuscleStepper, *path: Coordinates) -> None:
-        """Update a muscle's surface from its present state, extrapolated for a path from
-        coordinates to others.
-        """
+    def refresh(self, stepper: MuscleStepper, path: Path | None = None) -> None:
+        """Update a muscle's surface from its present state, extrapolated for a path."""
         if stepper.name in self.surfaces:
             with stepper.timed("sliding"):
-                self.surfaces[stepper.name].refresh(*path)
+                self.surfaces[stepper.name].refresh(*(() if path is None else path[:2]))
 
     def finish_frame(self) -> None:
         """Make room where the solved muscles overlap, so that surfaces can be drawn; updates

@@ -5,9 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from rbfmuscle.simulation.tunnelling import (
     find_crossings,
     one_sided_planes,
     only_grazed,
-    rotate_with_bone,
 )
 from rbfmuscle.validation import NotFiniteError, SolveError
 
@@ -33,6 +31,29 @@ TOUCH = 0.1
 FENCES = 4
 # Sub-steps are not halved below this angle [radian].
 SMALLEST_STEP = math.radians(0.1)
+
+
+class Path(NamedTuple):
+    """A way between two sets of coordinates, and the bones' poses at its ends."""
+
+    before: dict[str, float]
+    after: dict[str, float]
+    old: Poses
+    new: Poses
+
+
+class _Stage:
+    """Adds the time spent inside to an entry of ``times`` [s]."""
+
+    def __init__(self, times: dict[str, float], key: str) -> None:
+        self.times, self.key = times, key
+
+    def __enter__(self) -> None:
+        self.start = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        spent = time.perf_counter() - self.start
+        self.times[self.key] = self.times.get(self.key, 0.0) + spent
 
 
 class MuscleStepper:
@@ -64,7 +85,7 @@ class MuscleStepper:
         met = [contacts.names[b] for b in contacts.reached]
         self.cut = SubSteps(scene, scene.muscle(self.name), bones=met, poses=self.poses)
         self.carrier: RigidTransport | None = None
-        self._path: Any = None
+        self._path: Path
         self._saved: Any = None
         # The surface since the last solve, where later ones are that one moved rigidly.
         self._shown: ModelSurface | None = None
@@ -72,15 +93,9 @@ class MuscleStepper:
         # not tried again.
         self._unresolved = False
 
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[Any]:
+    def timed(self, stage: str) -> _Stage:
         """Add the time spent inside to ``time_<stage>``."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            key = f"time_{stage}"
-            self.times[key] = self.times.get(key, 0.0) + time.perf_counter() - start
+        return _Stage(self.times, f"time_{stage}")
 
     def go(
         self, stops: list[dict[str, float]], activations: Sequence[Mapping[str, float]] = ()
@@ -90,43 +105,46 @@ class MuscleStepper:
         """
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
             self.set_activation(activation or {})
-            poses = self.poses(before), self.poses(after)
+            path = self.path(before, after)
             if self.carrier is None or not self.carrier.try_carry(
-                self.model, self.contacts, *poses
+                self.model, self.contacts, path.old, path.new
             ):
-                self.step(before, after)
+                self.step(path)
         return self
+
+    def path(self, before: dict[str, float], after: dict[str, float]) -> Path:
+        """A way from coordinates to others."""
+        return Path(before, after, self.poses(before), self.poses(after))
 
     def set_activation(self, activation: Mapping[str, float]) -> None:
         """Set the model's activation from a dict by muscle, where it is in there."""
         if self.name in activation:
             self.model.activate(activation[self.name])
 
-    def step(self, before: dict[str, float], after: dict[str, float]) -> None:
+    def step(self, path: Path) -> None:
         """One sub-step, with the tunnelling test where the scene has one."""
-        self.predict(before, after)
+        self.predict(path)
         self.correct()
 
-    def predict(self, before: dict[str, float], after: dict[str, float]) -> None:
+    def predict(self, path: Path) -> None:
         """First half of a sub-step: the bones move and the model predicts."""
-        self._path, poses = (before, after), (self.poses(before), self.poses(after))
-        self._saved = self._shown = None
+        self._path = path
+        self._shown = None
         if self.detect is not None:
-            self._saved = self.model.snapshot(), self.model.contact_points().copy(), poses
-        self._predict(poses)
+            self._saved = self.model.snapshot(), self.model.contact_points().copy()
+        self._predict()
 
     def correct(self) -> None:
         """Second half: the model solves, and points that passed through a bone are corrected."""
-        before, after = self._path
-        self.solve(after)
+        path = self._path
+        self.solve(path.after)
         self.solves += 1
-        if self._saved is not None:
-            state, start, poses = self._saved
-            crossings = self._crossings(start, poses)
+        if self.detect is not None:
+            crossings = self._crossings(path, self._saved[1])
             if crossings:
-                self._correct(state, start, poses, before, after, crossings)
+                self._correct(path, crossings)
         if self.carrier is not None:
-            self.carrier.solved = self.poses(after)
+            self.carrier.solved = path.new
 
     def solve(self, coordinates: Mapping[str, float]) -> None:
         """Solve; raise SolveError with muscle, mesh, frame and coordinates where that fails or is
@@ -136,7 +154,7 @@ class MuscleStepper:
             with self.timed("solve"):
                 self.model.solve(self.contacts)
             points = self.model.contact_points()
-            if not np.isfinite(points).all():
+            if not math.isfinite(points.sum()):
                 bad = ~np.isfinite(points).all(axis=1)
                 raise NotFiniteError(f"{int(bad.sum())} of {len(bad)} positions are not finite")
         except (np.linalg.LinAlgError, FloatingPointError, NotFiniteError) as error:
@@ -186,71 +204,65 @@ class MuscleStepper:
             MuscleStatus("solved" if solves else "carried" if moved else "skipped", solves),
         )
 
-    def _predict(self, poses):
-        self.contacts.move(poses[1])
+    def _predict(self):
+        path = self._path
         with self.timed("predict"):
-            self.model.predict(*poses)
+            self.contacts.move(path.new)
+            self.model.predict(path.old, path.new)
 
-    def _crossings(self, start, poses, *, flag=True):
+    def _crossings(self, path, start, *, flag=True):
+        """What crossed a bone on the way from contact points (n, 3) to the present ones."""
         with self.timed("tunnelling"):
             end = self.model.contact_points()
             found = find_crossings(
-                self.contacts, start, end, *poses, self.detect, tolerance=self.tolerance
+                self.contacts, start, end, *path[2:], self.detect, tolerance=self.tolerance
             )
         for crossing in found:
             if flag and crossing.flagged:
                 self.report(self.contacts.names[crossing.bone], crossing.flagged, "angle_flag")
         return [crossing for crossing in found if len(crossing.index)]
 
-    def _correct(self, state, start, poses, before, after, crossings):
-        """Rotate points that crossed with the bone and solve again; then halve the step, down to
-        the smallest.
-        """
+    def _correct(self, path, crossings):
+        """Halve the step, down to the smallest, and then hold points on their side by planes."""
         if self.detect.action == "report":
             self._report_all(crossings, "reported")
             return
-        self.model.restore(state)
-        self._predict(poses)
-        rotate_with_bone(self.model, crossings, start, *poses, self.contacts.names)
-        self.solve(after)
-        remaining = self._crossings(start, poses, flag=False)
-        if not remaining:
-            self._report_all(crossings, "rotated")
+        state, start = self._saved
+        if step_angle(self.scene, path.before, path.after) > 2.0 * SMALLEST_STEP and (
+            not self._unresolved
+        ):
+            self._report_all(crossings, "halved")
+            self.model.restore(state)
+            middle = interpolate(path.before, path.after, 0.5)
+            self.step(self.path(path.before, middle))
+            self.step(self.path(middle, path.after))
             return
-        smallest = step_angle(self.scene, before, after) <= 2.0 * SMALLEST_STEP
-        if self.detect.action == "rotate" or smallest or self._unresolved:
-            for crossing in self._held_back(state, start, poses, after, remaining):
-                name = self.contacts.names[crossing.bone]
-                paths, ends = (start, self.model.contact_points()), (poses[0][name], poses[1][name])
-                touched = only_grazed(
-                    crossing, self.scene.bone(name).mesh, paths, *ends, self.tolerance
-                )
-                self.report(name, len(crossing.index), "grazed" if touched else "unresolved")
-                self._unresolved |= not touched
-            return
-        self._report_all(remaining, "halved")
-        self.model.restore(state)
-        middle = interpolate(before, after, 0.5)
-        self.step(before, middle)
-        self.step(middle, after)
+        for crossing in self._held_back(path, state, start, crossings):
+            name = self.contacts.names[crossing.bone]
+            paths, ends = (start, self.model.contact_points()), (path.old[name], path.new[name])
+            mesh = self.scene.bone(name).mesh
+            touched = only_grazed(crossing, mesh, paths, *ends, self.tolerance)
+            self.report(name, len(crossing.index), "grazed" if touched else "unresolved")
+            self._unresolved |= not touched
 
-    def _held_back(self, state, start, poses, after, crossings):
+    def _held_back(self, path, state, start, crossings):
         """Solve with crossing points held on their side by planes; return what crosses all the
         same.
         """
         neighbours = self.contacts.neighbours
         fenced = [*neighbours]
+        self._path = path
         try:
             for _ in range(FENCES):
                 fenced += [
-                    one_sided_planes(self.contacts, crossing, start, *poses)
+                    one_sided_planes(self.contacts, crossing, start, path.old, path.new)
                     for crossing in crossings
                 ]
                 self.contacts.neighbours = fenced
                 self.model.restore(state)
-                self._predict(poses)
-                self.solve(after)
-                held, crossings = crossings, self._crossings(start, poses, flag=False)
+                self._predict()
+                self.solve(path.after)
+                held, crossings = crossings, self._crossings(path, start, flag=False)
                 self._report_all(held, "held_back")
                 if not crossings:
                     break

@@ -9,14 +9,13 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
-from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.jit import compiled, inner
+from rbfmuscle.scene.joints.joint import Coordinate, all_coordinates
 from rbfmuscle.scene.motion import (
     bone_poses,
-    completed,
     interpolate,
     rest_coordinates,
     step_angle,
-    turned_angle,
 )
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
@@ -52,6 +51,7 @@ class SubSteps:
         poses: Callable[[Coordinates], Poses] | None = None,
     ) -> None:
         self.scene, self._poses = scene, poses or PoseCache(scene)
+        self._rest = rest_coordinates(scene)
         muscles = scene.muscles if muscle is None else [muscle]
         attachments = [(part, attachment) for part in muscles for attachment in part.attachments]
         own = [attachment.holder for _, attachment in attachments]
@@ -60,13 +60,11 @@ class SubSteps:
         #: are seen from the
         #: first that holds it, a whole scene's from the world.
         if muscle is None:
-            self._root, self.bones = (
-                None,
-                [*dict.fromkeys([*own, *(bone.name for bone in scene.bones)])],
-            )
+            self._root = -1
+            self.bones = [*dict.fromkeys([*own, *(bone.name for bone in scene.bones)])]
             self.relevant = set(self._facts)
         else:
-            self._root, self.bones = own[0], [*dict.fromkeys([*own, *bones])]
+            self._root, self.bones = 0, [*dict.fromkeys([*own, *bones])]
             guides = [name for _, attachment in attachments for name in attachment.bones]
             self.relevant = _moving_apart(scene, [*guides, *bones])
         self.limit = math.radians(scene.contact.substep_angle)
@@ -83,7 +81,7 @@ class SubSteps:
         """Coordinates of the sub-steps to the next frame, ``before`` left out; empty where nothing
         moves.
         """
-        before, after = completed(self.scene, before), completed(self.scene, after)
+        before, after = {**self._rest, **before}, {**self._rest, **after}
         moving = [k for k in {*before, *after} if before.get(k, 0.0) != after.get(k, 0.0)]
         if not moving:
             return []
@@ -98,7 +96,9 @@ class SubSteps:
         """The fewest equal sub-steps that are short enough."""
         # What does not move these bones against each other does not count.
         start = {**before, **{k: value for k, value in after.items() if k not in self.relevant}}
-        count = max(1, math.ceil(path_angle(self.scene, start, after) / self.limit - 1e-9))
+        count = max(
+            1, math.ceil(path_angle(self.scene, start, after, self._facts) / self.limit - 1e-9)
+        )
         while True:
             if count > MOST_SUBSTEPS:
                 raise SceneError(
@@ -108,7 +108,7 @@ class SubSteps:
                 )
             stops = [interpolate(before, after, k / count) for k in range(count + 1)]
             poses = [self._matrices(stop) for stop in stops]
-            excess = max(self._excess(a, b) for a, b in itertools.pairwise(poses))
+            excess = max(map(self._excess, poses[:-1], poses[1:]))
             if excess <= 1.0 + 1e-9:
                 return stops[1:]
             count = max(count + 1, math.ceil(count * min(excess, 4.0)))
@@ -152,26 +152,58 @@ class SubSteps:
 
     def _matrices(self, coordinates):
         poses = self._poses(coordinates)
-        found = np.array([poses[name] for name in self.bones])
-        return found if self._root is None else np.linalg.inv(poses[self._root]) @ found
+        return np.array([poses[name] for name in self.bones])
 
     def _excess(self, old, new):
         """How far a step between poses (b, 4, 4) goes beyond what one sub-step may do: 1 is just
         allowed.
         """
-        turns = new[:, :3, :3] @ old[:, :3, :3].transpose(0, 2, 1)
-        excess = float(turned_angle(turns).max()) / self.limit
-        # How the bones that carry the corners move, seen from every bone.
-        change = (
-            np.linalg.inv(new)[:, None] @ new[self._owner]
-            - np.linalg.inv(old)[:, None] @ old[self._owner]
-        )
-        moved = (
-            np.einsum("bkij,kcj->bkci", change[..., :3, :3], self._corners)
-            + change[..., None, :3, 3]
-        )
-        length = np.sqrt((moved**2).sum(axis=-1)).max(axis=(0, 2))
-        return max(excess, float((length / self._travel).max(initial=0.0)))
+        attached = self._owner, self._corners, self._travel
+        return step_excess(old, new, self._root, *attached, self.limit)
+
+
+@compiled(error_model="numpy")
+def step_excess(old, new, root, owner, corners, travel, limit):
+    """How far a step between poses (b, 4, 4) goes, relative to what is allowed.
+
+    Bones turn by ``limit`` [radian] as seen from the bone ``root``, from the world for -1; corners
+    (a, 8, 3) on the bones ``owner`` (a,) move by ``travel`` (a,) as seen from any bone.
+    """
+    most, first, second = 0.0, np.empty((3, 4)), np.empty((3, 4))
+    for b in range(len(old)):
+        if root < 0:
+            first[:], second[:] = old[b, :3], new[b, :3]
+        else:
+            _seen_from(old[root], old[b], first)
+            _seen_from(new[root], new[b], second)
+        square = 0.0
+        for a in range(3):
+            for k in range(3):
+                square += (second[a, k] - first[a, k]) ** 2
+        # |A - B|² of two rotations by θ apart is 8 sin²(θ / 2).
+        most = max(most, 2.0 * np.arcsin(min(np.sqrt(square / 8.0), 1.0)) / limit)
+        for n in range(len(owner)):
+            _seen_from(old[b], old[owner[n]], first)
+            _seen_from(new[b], new[owner[n]], second)
+            for c in range(corners.shape[1]):
+                away = 0.0
+                for a in range(3):
+                    way = second[a, 3] - first[a, 3]
+                    for k in range(3):
+                        way += (second[a, k] - first[a, k]) * corners[n, c, k]
+                    away += way * way
+                most = max(most, np.sqrt(away) / travel[n])
+    return most
+
+
+@inner(error_model="numpy")
+def _seen_from(root, pose, out):
+    """A pose as seen from another: root⁻¹ · pose, (3, 4)."""
+    for a in range(3):
+        for k in range(4):
+            out[a, k] = 0.0
+            for m in range(3):
+                out[a, k] += root[m, a] * (pose[m, k] - (root[m, 3] if k == 3 else 0.0))
 
 
 class PoseCache:
@@ -240,13 +272,18 @@ def check_substeps(scene: Scene) -> None:
             )
 
 
-def path_angle(scene: Scene, before: Coordinates, after: Coordinates) -> float:
+def path_angle(
+    scene: Scene,
+    before: Coordinates,
+    after: Coordinates,
+    facts: Mapping[str, Coordinate] | None = None,
+) -> float:
     """How far the bones turn from one set of coordinates to another [radian].
 
     Angles count as they are given; where other coordinates move too, the path is followed in a few
     pieces.
     """
-    facts = all_coordinates(scene.joints)
+    facts = all_coordinates(scene.joints) if facts is None else facts
     changes = {k: abs(after.get(k, 0.0) - before.get(k, 0.0)) for k in {*before, *after}}
     angle = max(
         (change for k, change in changes.items() if facts[k].motion == "rotation"), default=0.0

@@ -9,18 +9,20 @@ cannot miss what is thicker than its tolerance.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, lower_bound, path_loop
+from rbfmuscle.bones.obstacles import query_bone
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.rotations import rigid_fit
+from rbfmuscle.jit import compiled, inner
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, Planes
-from rbfmuscle.simulation.frame import MuscleModel
 
 # 135 degrees, the bound of the angle test.
 RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
@@ -29,7 +31,7 @@ STEP_SHARE = 0.9
 # A path that leaves a bone facing within 90 degrees of where it went in has slid along, not passed
 # through.
 SLIDING_COSINE = 0.0
-# Halvings of a path to show that it stays outside, before it is traced.
+# Halvings of a path to show that it stays outside; it is traced where they do not.
 HALVINGS = 5
 # Greatest number of steps in tracing a path.
 MAX_ROUNDS = 10_000
@@ -79,22 +81,19 @@ def sweep_paths(
     index = np.flatnonzero(distance < length)
     last = field.distance(end[index])
     near = distance[index] + last <= length[index] + tolerance
-    index, last = index[near], last[near]
+    index = index[near]
     if len(index) == 0:
         nothing = np.zeros(0, dtype=bool)
         return Sweep(index, np.zeros(0), nothing, nothing)
     start, end = start[index], end[index]
-    lowest = _halve(field, start, end, distance[index], last, tolerance)
+    lowest, first, last = _trace(field, start, end, tolerance)
     through = np.zeros(len(index), dtype=bool)
-    # Undecided by halving.
     deep = np.flatnonzero(lowest < -tolerance)
     if len(deep):
-        lowest[deep], first, last = _trace(field, start[deep], end[deep], tolerance)
         way = end[deep] - start[deep]
-        entry = _directions(field, start[deep] + first[:, None] * way)
-        leave = _directions(field, start[deep] + last[:, None] * way)
-        turned = np.einsum("ij,ij->i", entry, leave) < SLIDING_COSINE
-        through[deep] = turned & (lowest[deep] < -tolerance)
+        entry = _directions(field, start[deep] + first[deep, None] * way)
+        leave = _directions(field, start[deep] + last[deep, None] * way)
+        through[deep] = np.einsum("ij,ij->i", entry, leave) < SLIDING_COSINE
     cosine = np.einsum("ij,ij->i", _directions(field, start), _directions(field, end))
     return Sweep(index, lowest, through, cosine < math.cos(angle))
 
@@ -116,44 +115,35 @@ def find_crossings(
     scene's unit.
     """
     crossings = []
-    # A path that is shorter than the distance of its end touches nothing.
-    lengths = contacts.path_lengths(start, end, before, after)
-    for b, index in contacts.near(end, lengths):
+    angle = math.radians(options.angle)
+    for b, index in _suspects(contacts, start, end, before, math.cos(angle), tolerance):
         name = contacts.names[b]
         first, second = _local(start[index], before[name]), _local(end[index], after[name])
-        sweep = sweep_paths(
-            contacts.fields[b],
-            first,
-            second,
-            tolerance=tolerance,
-            angle=math.radians(options.angle),
-        )
+        sweep = sweep_paths(contacts.fields[b], first, second, tolerance=tolerance, angle=angle)
         crossed = sweep.through if options.swept else sweep.flagged
         if crossed.any() or sweep.flagged.any():
             crossings.append(Crossing(b, index[sweep.index[crossed]], int(sweep.flagged.sum())))
     return crossings
 
 
-def rotate_with_bone(
-    model: MuscleModel,
-    crossings: list[Crossing],
+def _suspects(
+    contacts: BoneContacts,
     start: Floats,
+    end: Floats,
     before: dict[str, Floats],
-    after: dict[str, Floats],
-    names: list[str],
-) -> None:
-    """Move points that crossed back to where they were relative to the bone: rotated with it about
-    its joint.
-
-    The model has predicted already; it gets the rigid transform from the predicted to the corrected
-    positions.
-    """
-    for crossing in crossings:
-        motion = after[names[crossing.bone]] @ np.linalg.inv(before[names[crossing.bone]])
-        wanted = start[crossing.index] @ motion[:3, :3].T + motion[:3, 3]
-        which = np.zeros(len(start), dtype=bool)
-        which[crossing.index] = True
-        model.turn(which, rigid_fit(model.contact_points()[crossing.index], wanted))
+    cosine: float,
+    tolerance: float,
+) -> Iterable[tuple[int, Integers]]:
+    """Bones, each with the points whose paths are not shown to be clear of it."""
+    if contacts.bones is None:
+        # A path that is shorter than the distance of its end touches nothing.
+        return contacts.near(end, contacts.path_lengths(start, end, before, contacts.poses))
+    obstacles, old = contacts.obstacles(len(end)), contacts.stacked(before)
+    found, count = suspect_paths(obstacles, start, end, old, cosine, tolerance)
+    if count == 0:
+        return []
+    rows = np.flatnonzero(found.any(axis=1))
+    return [(contacts.reached[row], np.flatnonzero(found[row])) for row in rows]
 
 
 def one_sided_planes(
@@ -210,45 +200,6 @@ def only_grazed(
     return True
 
 
-def _halve(field, start, end, distance, last, tolerance):
-    """Smallest distance found along each path by halving it; -infinity where that does not show it
-    clear.
-
-    Between two places s apart, at distances d and d' from the bone, nothing is deeper than (s - d -
-    d') / 2.
-    """
-    length = np.linalg.norm(end - start, axis=1) / STEP_SHARE
-    lowest = np.minimum(distance, last)
-    # Pieces: which path, where they begin (fraction), the distances at their ends.
-    path = np.arange(len(start))
-    at = np.zeros(len(start))
-    near = distance
-    far = last
-    size = 1.0
-    for halvings in range(HALVINGS + 1):
-        left = near + far - size * length[path] < -2.0 * tolerance
-        path = path[left]
-        at = at[left]
-        near = near[left]
-        far = far[left]
-        if len(path) == 0 or halvings == HALVINGS:
-            break
-        size *= 0.5
-        middle = at + size
-        between = field.distance(start[path] + middle[:, None] * (end[path] - start[path]))
-        np.minimum.at(lowest, path, between)
-        path, at = np.concatenate([path, path]), np.concatenate([at, middle])
-        near, far = np.concatenate([near, between]), np.concatenate([between, far])
-        clear = lowest[path] >= -tolerance
-        path = path[clear]
-        at = at[clear]
-        near = near[clear]
-        far = far[clear]
-    lowest[path] = -np.inf
-    lowest[lowest < -tolerance] = -np.inf
-    return lowest
-
-
 def _trace(field, start, end, tolerance):
     """Smallest distance along each path, and the places (fraction) right before it first went in
     and after it came out.
@@ -294,3 +245,98 @@ def _directions(field, points):
 def _local(points, pose):
     """Points in the coordinates of a bone in a rigid pose."""
     return (points - pose[:3, 3]) @ pose[:3, :3]
+
+
+@compiled(error_model="numpy")
+def suspect_paths(obstacles, start, end, before, cosine, tolerance):
+    """Mask (b, n) of paths of points that may touch a bone by more than the tolerance, or that the
+    angle test flags: whose directions at the bone differ by less than the ``cosine``.
+
+    Bones go from the poses ``before`` (b, 4, 4) to those of the obstacles. Also how many they are.
+    """
+    total = 0
+    found = np.zeros((len(before), len(end)), np.bool_)
+    box, known = np.empty((2, 3)), obstacles.known
+    box_loop(end, obstacles.free, box)
+    some, length = np.empty(len(end), np.int64), np.empty((1, len(end)))
+    for b in range(len(before)):
+        pose, bounds = obstacles.poses[b], obstacles.bones.boxes[b]
+        path_loop(start, end, before[b : b + 1], obstacles.poses[b : b + 1], length)
+        if boxes_apart(box, pose, bounds) > length.max():
+            continue
+        count = 0
+        for i in range(len(end)):
+            # A path that is shorter than the distance of its end touches nothing.
+            if (
+                obstacles.free[i]
+                and lower_bound(end, i, pose, bounds, known.anchor[b], known.bound[b])
+                <= length[0, i]
+            ):
+                some[count] = i
+                count += 1
+        first, last = np.empty((count, 3)), np.empty((count, 3))
+        for k in range(count):
+            _to_bone(start[some[k]], before[b], first[k])
+            _to_bone(end[some[k]], pose, last[k])
+        unclear = unclear_paths(obstacles.bones, b, first, last, cosine, tolerance)
+        for k in range(count):
+            found[b, some[k]] = unclear[k]
+            total += unclear[k]
+    return found, total
+
+
+@inner(error_model="numpy")
+def _to_bone(point, pose, out):
+    """A point in the coordinates of a bone in a rigid pose."""
+    for a in range(3):
+        out[a] = 0.0
+        for k in range(3):
+            out[a] += pose[k, a] * (point[k] - pose[k, 3])
+
+
+@compiled(error_model="numpy")
+def unclear_paths(bones, b, start, end, cosine, tolerance):
+    """Mask (n,) of straight paths (n, 3), in the coordinates of bone b, that may come deeper into
+    it than the tolerance, or whose directions at the ends differ by less than the ``cosine``.
+
+    Paths are halved: between two places s apart, at distances d and d' from the bone, nothing is
+    deeper than (s - d - d') / 2.
+    """
+    count, pose = len(start), np.eye(4)
+    length, found = np.empty(count), np.zeros(count, np.bool_)
+    for k in range(count):
+        length[k] = np.sqrt(((end[k] - start[k]) ** 2).sum())
+    first, last = np.empty(count), np.empty(count)
+    way, out = np.empty((count, 3)), np.empty((count, 3))
+    query_bone(bones, b, pose, start, length, first, way)
+    query_bone(bones, b, pose, end, length + tolerance, last, out)
+    # Pieces of the paths: which path, where they begin (fraction), the distances at their ends.
+    path, at, near, far = np.arange(count), np.zeros(count), first, last
+    size, left = 1.0, np.zeros(count, np.bool_)
+    for k in range(count):
+        left[k] = first[k] < length[k] and first[k] + last[k] <= length[k] + tolerance
+        if left[k]:
+            found[k] = min(first[k], last[k]) < -tolerance or (way[k] * out[k]).sum() < cosine
+    for halvings in range(HALVINGS + 1):
+        for k in range(len(path)):
+            deepest = near[k] + far[k] - size * length[path[k]] / STEP_SHARE
+            left[k] &= deepest < -2.0 * tolerance and not found[path[k]]
+        path, at, near, far = path[left], at[left], near[left], far[left]
+        if len(path) == 0:
+            break
+        if halvings == HALVINGS:
+            for k in path:
+                found[k] = True
+            break
+        size *= 0.5
+        middle, between = np.empty((len(path), 3)), np.empty(len(path))
+        for k in range(len(path)):
+            share = at[k] + size
+            middle[k] = start[path[k]] + share * (end[path[k]] - start[path[k]])
+        query_bone(bones, b, pose, middle, np.full(len(path), np.inf), between, way[:0])
+        for k in range(len(path)):
+            found[path[k]] |= between[k] < -tolerance
+        path, at = np.concatenate((path, path)), np.concatenate((at, at + size))
+        near, far = np.concatenate((near, between)), np.concatenate((between, far))
+        left = np.ones(len(path), np.bool_)
+    return found

@@ -103,27 +103,6 @@ def test_rest_is_a_rest_and_restore_brings_a_snapshot_back(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_turn_moves_free_points_and_leaves_held_ones(name):
-    scene = _scene([0])
-    part = build_model(scene.muscles[0], scene, name)
-    before = part.contact_points().copy()
-    which = before[:, 2] > 0
-    shift = np.eye(4)
-    shift[:3, 3] = [0, 1.0, 0]
-    part.turn(which, shift)
-    moved = part.contact_points() - before
-    held = part.contact_bone >= 0
-    free = which & ~held
-    assert moved[free, 1].mean() > 0.5
-    # A model's own points come first; those that a bone holds stay, whoever asks.
-    own = slice(len(part.points))
-    attached = which[own] & (part.rest.attached_bone[own] >= 0)
-    assert attached.any() and np.abs(moved[own][attached]).max() == 0.0
-    # Samples between held and free centres of an RBF muscle go a part of the way.
-    assert np.abs(moved[held]).mean() < 0.1
-
-
-@pytest.mark.parametrize("name", MODELS)
 def test_moving_the_whole_scene_moves_the_result_and_units_do_not_matter(name):
     plain, _ = _run(name, _scene([0, 20]), surfaces=False)
     scene = _scene([0, 20])

@@ -13,6 +13,7 @@ from rbfmuscle.muscle.rounded_bones import (
     FULLEST,
     ROUNDING,
     grown,
+    no_scratch,
     round_bones,
     rounded_distance,
 )
@@ -34,10 +35,12 @@ def ball():
     frame = RestFrame(np.asarray(mesh.vertices))
 
     def rounded(points):
-        bones = grown(grown(round_bones(contacts, frame, EDGE / ROUNDING, {})))
+        bones = grown(grown(round_bones({"ball": field}, frame, EDGE / ROUNDING, {})))
         normal, gap = np.empty_like(points), np.empty(len(points))
         for i, point in enumerate(points):
-            gap[i] = rounded_distance(bones, contacts.bones, 0, pose, point, normal[i])
+            gap[i] = rounded_distance(
+                bones, contacts.bones, 0, pose, point, normal[i], no_scratch()
+            )
         return gap, normal
 
     return field, rounded, pose
@@ -73,11 +76,14 @@ def test_blocks_are_filled_once_kept_when_the_table_grows_and_refused_when_it_is
     field, _, pose = ball
     contacts = BoneContacts(["ball"], [field])
     frame = RestFrame(np.asarray(trimesh.creation.icosphere(2, RADIUS).vertices))
-    bones, normal = round_bones(contacts, frame, 0.2 / ROUNDING, {}), np.empty(3)
+    bones, normal = round_bones({"ball": field}, frame, 0.2 / ROUNDING, {}), np.empty(3)
     points, _ = around(pose)
 
     def ask(table):
-        return [rounded_distance(table, contacts.bones, 0, pose, p, normal) for p in points]
+        return [
+            rounded_distance(table, contacts.bones, 0, pose, p, normal, no_scratch())
+            for p in points
+        ]
 
     few = np.array(ask(bones))
     full = int(np.ceil(FULLEST * len(bones.keys)))

@@ -4,6 +4,7 @@ acceleration."""
 import numpy as np
 import pytest
 
+from rbfmuscle.bones.obstacles import Known
 from rbfmuscle.muscle.anderson import mix, no_memory
 from rbfmuscle.muscle.contact_forces import (
     Law,
@@ -16,7 +17,6 @@ from rbfmuscle.muscle.global_step import BULK, Metric, find_metric, press, swell
 from rbfmuscle.muscle.local_step import Local, stress_loop, target_loop
 from rbfmuscle.muscle.model import Cells, Embedding, Fibres, carry, mobility
 from rbfmuscle.muscle.near_points import Near, Touch
-from rbfmuscle.simulation.contact import Known
 
 CENTRES, POINTS = 7, 9
 
