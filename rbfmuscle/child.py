@@ -15,8 +15,6 @@ import traceback
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rbfmuscle.validation import SolveError
-
 
 def start_child(module: str, threads: int) -> subprocess.Popen[bytes]:
     """Start a process that runs a module of ours, with pipes, and with ``threads`` threads for
@@ -47,17 +45,6 @@ def end_child(process: subprocess.Popen[bytes]) -> None:
         with contextlib.suppress(OSError):  # what it did not read is lost
             if pipe is not None:
                 pipe.close()
-
-
-def unexpected_end(process: subprocess.Popen[bytes]) -> SolveError:
-    """Return the error for a process that ended unexpectedly, or ends now."""
-    code = process.wait()
-    how = f" by signal {-code}" if code < 0 else f" (exit code {code})"
-    return SolveError(
-        f"a helper process was ended{how}; memory may have run out: with NUMBA_NUM_THREADS=1 set, "
-        "one process does "
-        "it all"
-    )
 
 
 class Outbox:

@@ -4,16 +4,14 @@ frames for a sink.
 
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from typing import Any
 
-import numba
-
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
-from rbfmuscle.metrics.metrics import Values
+from rbfmuscle.metrics.metrics import MuscleMeasures, Values
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import frame_rows, joint_gaps, moment_arm_rows
 from rbfmuscle.metrics.summary import (
@@ -26,14 +24,13 @@ from rbfmuscle.metrics.summary import (
     require_limits,
     unmeasured,
 )
-from rbfmuscle.models import configure_scene, kernel_names
+from rbfmuscle.models import build_models, configure_scene, kernel_names
 from rbfmuscle.output.writer import Neighbours, RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.sharing.crew import WorkerPool, helpers_for
-from rbfmuscle.sharing.share import MuscleGroup, timed
 from rbfmuscle.simulation.frame import Event, Frame
+from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.simulation.substeps import check_substeps
 from rbfmuscle.validation import (
     LimitExceededError,
@@ -68,8 +65,7 @@ class Recording:
     """One run of a scene: its models through the frame loop, measured and clocked, into a sink.
 
     ``model``, ``settings`` and ``frames`` are those of `configure_scene`; ``fields`` of the bones,
-    by name, stand in place of `BoneSDF`, and all muscles are then in this process; ``fail_on`` are
-    the limits of `parse_limits`.
+    by name, stand in place of `BoneSDF`; ``fail_on`` are the limits of `parse_limits`.
     """
 
     def __init__(
@@ -105,23 +101,13 @@ class Recording:
         self._path: dict[int, dict[str, float]] = {}
         self._place = {muscle.name: k for k, muscle in enumerate(scene.muscles)}
         with timed(self.times, "build"), stage("building"):
-            helpers = 0 if fields is not None else helpers_for(scene, numba.get_num_threads())
-            self.share, self._skeleton = self._build(helpers, fields)
-
-    def _build(self, helpers, fields):
-        """All muscles, in this process or in several, and what is found of the bones."""
-        with ExitStack() as undo:
-            pool = WorkerPool(self.scene, helpers) if helpers > 1 else None
-            if pool is not None:
-                undo.callback(pool.close)
             check_substeps(self.scene)
             check_initial(self.scene)
-            skeleton = _check_skeleton(self.scene)
-            if pool is None:
-                return MuscleGroup(self.scene, fields=fields), skeleton
-            pool.wait_until_built()
-            undo.pop_all()
-            return pool, skeleton
+            self._skeleton = _check_skeleton(self.scene)
+            self._models = build_models(self.scene)
+            carried = {model.name: model.material_mesh() for model in self._models}
+            self._measures = MuscleMeasures(self.scene, carried)
+        self._fields = fields
 
     def feed(
         self, sink: RunWriter | MemorySink, *, progress: Callable[[int, int], None] | None = None
@@ -130,7 +116,7 @@ class Recording:
         self.status, self.message = "failed", "a bug"
         try:
             sink.write_info(self.info("running"))
-            for frame, measured in self.share.frames():
+            for frame, measured in self._frames():
                 rows = self._take(frame, measured)
                 with timed(self.times, "write"):
                     sink.write(frame, rows)
@@ -149,7 +135,6 @@ class Recording:
             self.message = f"a bug: {type(error).__name__}: {error}"
             raise
         finally:
-            self.close()
             rows = moment_arm_rows(self.scene, self._path, self.summary.series("length"))
             self.summary.add(rows)
             # What ended the run says more than a disk that then refuses the rest.
@@ -178,13 +163,26 @@ class Recording:
             raise
         return info
 
-    def close(self) -> None:
-        """End what helps; nothing more can be solved."""
-        self.share.close()
+    def _frames(self) -> Iterator[tuple[Frame, dict[str, Values]]]:
+        """The frames as they are solved, with their values by muscle and quantity; SolveError names
+        muscle, frame and coordinates.
+        """
+        with stage("solving the first frame"):
+            with timed(self.times, "simulate"):
+                loop = FrameLoop(self.scene, self._models, fields=self._fields)
+                surfaces, poses = loop.at_rest()
+            with timed(self.times, "metrics"):
+                self._measures.measure_rest(surfaces, poses)
+        for coordinates in self.scene.motion.frames:
+            with timed(self.times, "simulate"):
+                frame = loop.advance(coordinates)
+            with timed(self.times, "metrics"):
+                measured = self._measures.measure(frame)
+            yield frame, measured
 
     def _take(self, frame: Frame, measured: Mapping[str, Values]) -> list[Row]:
         """Complete the events of a frame; the rows of metrics that became complete with it."""
-        # By muscle, whoever solved it.
+        # By muscle, whichever thread was first.
         frame.events.sort(key=lambda event: self._place[event.muscle])
         events, together = self._skeleton.get(frame.index, ([], {}))
         frame.events.extend(events)
@@ -197,7 +195,6 @@ class Recording:
     def info(self, status: str | None = None) -> dict:
         """What ``run.json`` holds by now."""
         self.times["wall"] = (self._end or time.perf_counter()) - self._start
-        here, shared = self.times, self.share.times
         table = self.summary.table()
         limits = self.limits
         return build_info(
@@ -209,9 +206,7 @@ class Recording:
             message=self.message,
             options=self.options,
             kernels=kernel_names(self.scene),
-            times={
-                part: here.get(part, 0.0) + shared.get(part, 0.0) for part in {**here, **shared}
-            },
+            times=self.times,
             limits=limits.values,
             fail_on=limits.fail_on,
             verdict=describe_verdict(table, limits, self.scene.left_out),
@@ -219,6 +214,16 @@ class Recording:
             not_measured=unmeasured(table, limits),
             frames=self.written,
         )
+
+
+@contextmanager
+def timed(times: dict[str, float], part: str) -> Iterator[None]:
+    """Add the time spent inside to one entry of ``times`` [s]."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        times[part] = times.get(part, 0.0) + time.perf_counter() - start
 
 
 Found = tuple[list[Event], dict[str, float]]

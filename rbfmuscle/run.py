@@ -7,7 +7,6 @@ import html
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -131,9 +130,8 @@ def stream_run(
     """
     run_folder(directory)
     recording = Recording(scene, model=model, settings=settings, frames=frames, fail_on=fail_on)
-    with closing(recording):
-        writer = RunWriter(directory, recording.scene)
-        recording.feed(writer, progress=progress)
+    writer = RunWriter(directory, recording.scene)
+    recording.feed(writer, progress=progress)
     return recording.finish(writer, pictures=pictures)
 
 

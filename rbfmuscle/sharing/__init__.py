@@ -1,1 +1,0 @@
-"""The muscles of a run, distributed to processes where there are many."""
