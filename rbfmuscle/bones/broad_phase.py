@@ -92,9 +92,9 @@ def take_contacts_loop(near, distance, direction, limits, found):
 
 
 @compiled(error_model="numpy")
-def lower_bound(points, i, pose, bounds, anchor, bound):
-    """Lower bound of the distance of point i: from the bone's box, or an earlier bound less the
-    motion since.
+def may_reach(points, i, pose, bounds, anchor, bound, reach):
+    """Whether point i may be as near to a bone as ``reach``, by the bone's box and by what an
+    earlier bound less the motion since says.
     """
     moved, outside = 0.0, 0.0
     for k in range(3):
@@ -104,8 +104,10 @@ def lower_bound(points, i, pose, bounds, anchor, bound):
         moved += (local - anchor[i, k]) ** 2
         beyond = max(bounds[0, k] - local, local - bounds[1, k], 0.0)
         outside += beyond * beyond
-    known = bound[i] - np.sqrt(moved)
-    return max(np.sqrt(outside), known) if outside > 0.0 else known
+    if outside > 0.0 and (reach < 0.0 or outside > reach * reach):
+        return False
+    spare = bound[i] - reach
+    return spare <= 0.0 or moved >= spare * spare
 
 
 @compiled(error_model="numpy")
@@ -165,10 +167,7 @@ def near_loop(points, free, reach, bones, known, found, counts):
         if boxes_apart(box, poses[b], boxes[b]) > farthest:
             continue
         for i in range(len(points)):
-            if (
-                free[i]
-                and lower_bound(points, i, poses[b], boxes[b], anchor[b], bound[b]) <= limit[i]
-            ):
+            if free[i] and may_reach(points, i, poses[b], boxes[b], anchor[b], bound[b], limit[i]):
                 found[b, count] = i
                 count += 1
         counts[b] = count

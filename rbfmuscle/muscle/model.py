@@ -30,7 +30,9 @@ from rbfmuscle.implicit.placement.lattice import Embedding as LatticePoints
 from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.jit import compiled
 
-HOLD = 25.0  # stiffness of the spring at a held point, relative to that of a cell
+# Stiffness of the spring at a held point that stands for a 4000th of the surface, relative to that
+# of a cell: springs are spread evenly over an attachment, however many points it has.
+HOLD, HELD_OF = 25.0, 4000
 # Stiffness of second differences, relative to a cell: for nodes that hold hardly any material.
 GHOST = 1e-3
 NODES_PER_REGION = 8
@@ -127,12 +129,14 @@ def build_solid(
     held: Integers,
     *,
     fixed: Integers,
+    surface: float,
     area: float,
     iterations: int,
 ) -> SolidModel:
     """The solid on a lattice through a muscle, its fibres slack along no direction.
 
-    ``points`` (n, 3) at rest are its contact points, each of which stands for an ``area``;
+    ``points`` (n, 3) at rest are its contact points, each of which stands for an ``area`` of the
+    ``surface`` [scene unit squared];
     ``owner`` (n,) is the row of the bone that holds each, -1 where it is free. The bones hold it by
     the points ``held``; those ``fixed`` go exactly with their bone.
     """
@@ -140,6 +144,7 @@ def build_solid(
     rest = frame.points(lattice.rest)
     cells = _number_regions(lattice, frame)
     embedding = embed(lattice, frame, points)
+    spring = HOLD * side * HELD_OF * area / surface
     hangs = np.zeros((len(rest), len(held)))
     spots = embedding.columns[held].T, np.arange(len(held))
     np.add.at(hangs, spots, embedding.shares[held].T)
@@ -159,8 +164,8 @@ def build_solid(
         held_bone=owner[held].astype(np.int64),
         end=end,
         end_distance=distance,
-        springs=HOLD * side * hangs,
-        spring=HOLD * side,
+        springs=spring * hangs,
+        spring=spring,
         matrix=GHOST * side * lattice.second_differences() + _gram(cells, len(rest)),
         motion_weights=np.empty((0, 0)),
         size=diameter(points),

@@ -223,6 +223,7 @@ def _build_solid(
         owner,
         held,
         fixed=rest.held,
+        surface=float(muscle.mesh.area),
         area=float(muscle.mesh.area) / len(rest.samples),
         iterations=options.iterations,
     )

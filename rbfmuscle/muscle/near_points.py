@@ -4,7 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, lower_bound, note_query
+from rbfmuscle.bones.broad_phase import (
+    TRUSTED_SHARE,
+    box_loop,
+    boxes_apart,
+    may_reach,
+    note_query,
+)
 from rbfmuscle.bones.obstacles import Known, query_bone
 from rbfmuscle.jit import inner
 from rbfmuscle.muscle.rounded_bones import SPREAD, no_scratch, rounded_distance
@@ -46,11 +52,9 @@ def find_near(points, obstacles, reach):
         if boxes_apart(box, pose, bounds) > reach:
             continue
         count = 0
+        anchor, bound = known.anchor[b], known.bound[b]
         for i in range(len(points)):
-            if (
-                free[i]
-                and lower_bound(points, i, pose, bounds, known.anchor[b], known.bound[b]) <= reach
-            ):
+            if free[i] and may_reach(points, i, pose, bounds, anchor, bound, reach):
                 some[count] = i
                 count += 1
         at, distance = np.empty((count, 3)), np.empty(count)
@@ -60,7 +64,7 @@ def find_near(points, obstacles, reach):
         query_bone(bones, b, pose, at, np.full(count, reach), distance, np.empty((0, 3)))
         for k in range(count):
             i = some[k]
-            note_query(points, i, pose, distance[k], known.anchor[b], known.bound[b])
+            note_query(points, i, pose, distance[k], anchor, bound)
             found[i] |= distance[k] + obstacles.allowed[b, i] < reach
     planes = obstacles.planes
     for p in range(len(planes.point)):
@@ -125,6 +129,7 @@ def find_touch(near, here, reach, obstacles, rounded):
     bones, planes = obstacles.bones, obstacles.planes
     touch = _no_touch(len(obstacles.poses) * len(here) + len(planes.point))
     normal, box, scratch = np.empty(3), np.empty((2, 3)), no_scratch()
+    local = scratch.local
     farthest = _farthest(here, near.free, reach, box)
     count, room = 0, True
     for b in range(len(obstacles.poses)):
@@ -133,15 +138,24 @@ def find_touch(near, here, reach, obstacles, rounded):
         if boxes_apart(box, pose, bounds) > farthest:
             continue
         for i in range(len(here)):
-            if not near.free[i] or lower_bound(here, i, pose, bounds, anchor, bound) > reach[i]:
+            if not near.free[i] or not may_reach(here, i, pose, bounds, anchor, bound, reach[i]):
                 continue
-            distance = rounded_distance(rounded, bones, b, pose, here[i], normal, scratch)
+            for k in range(3):
+                local[k] = 0.0
+                for a in range(3):
+                    local[k] += pose[a, k] * (here[i, a] - pose[a, 3])
+            distance = rounded_distance(rounded, bones, b, scratch)
             if np.isnan(distance):
                 distance = _exact_distance(bones, b, pose, here[i], normal)
             elif distance == np.inf:
                 room = False
             else:
-                note_query(here, i, pose, distance, anchor, bound)
+                bound[i] = TRUSTED_SHARE * distance
+                for k in range(3):
+                    anchor[i, k] = local[k]
+                    normal[k] = 0.0
+                    for a in range(3):
+                        normal[k] += pose[k, a] * scratch.gradient[a]
             if distance + near.allowed[b, i] < reach[i]:
                 _add_touch(touch, count, i, distance + near.allowed[b, i], normal, b)
                 count += 1
@@ -166,7 +180,7 @@ def find_exact_touch(near, here, reach, obstacles, softest):
             continue
         asked = 0
         for i in range(len(here)):
-            if near.free[i] and lower_bound(here, i, pose, bounds, anchor, bound) <= reach:
+            if near.free[i] and may_reach(here, i, pose, bounds, anchor, bound, reach):
                 some[asked] = i
                 asked += 1
         at, distance, normal = np.empty((asked, 3)), np.empty(asked), np.empty((asked, 3))

@@ -153,6 +153,7 @@ class Scratch(NamedTuple):
     """Room for one question."""
 
     local: np.ndarray  # (3,) the point in bone coordinates
+    gradient: np.ndarray  # (3,) of the distance there
     place: np.ndarray  # (3,) in cells of the lattice
     weight: np.ndarray  # (3, 4)
     lean: np.ndarray  # (3, 4)
@@ -161,34 +162,25 @@ class Scratch(NamedTuple):
 @compiled(error_model="numpy")
 def no_scratch():
     """Room for questions."""
-    return Scratch(
-        np.empty(3),
-        np.empty(3),
-        np.empty((3, 4)),
-        np.empty((3, 4)),
-    )
+    return Scratch(np.empty(3), np.empty(3), np.empty(3), np.empty((3, 4)), np.empty((3, 4)))
 
 
 @compiled(error_model="numpy")
-def rounded_distance(rounded, bones, b, pose, point, normal, scratch):
-    """Distance of a point to bone b, rounded, and its unit gradient ``normal`` (3,) in the world.
+def rounded_distance(rounded, bones, b, scratch):
+    """Distance of the point ``scratch.local`` to bone b, rounded; fills its unit gradient.
 
     Infinite where there is no room for the block; NaN where the spline is flat.
     """
-    local, place, weight, lean = scratch
-    edge = rounded.edges[b]
-    for a in range(3):
-        local[a] = -rounded.origin[a]
-        for k in range(3):
-            local[a] += pose[k, a] * (point[k] - pose[k, 3])
+    local, gradient, place, weight, lean = scratch
+    edge, axes = rounded.edges[b], rounded.axes
     key, start = np.int64(0), np.int64(0)
     for a in range(3):
-        place[a] = 0.0
+        at = 0.0
         for k in range(3):
-            place[a] += local[k] * rounded.axes[a, k]
-        place[a] /= edge
-        cell = np.int64(np.floor(place[a]))
-        place[a] -= cell
+            at += (local[k] - rounded.origin[k]) * axes[a, k]
+        at /= edge
+        cell = np.int64(np.floor(at))
+        place[a] = at - cell
         block = cell >> SHIFT
         start = start * WIDE + cell - SIDE * block
         key += (block + MOST) << (BITS * (2 - a))
@@ -204,9 +196,5 @@ def rounded_distance(rounded, bones, b, pose, point, normal, scratch):
     if not steep > LEAST_SLOPE:
         return np.nan
     for a in range(3):
-        local[a] = (
-            x * rounded.axes[0, a] + y * rounded.axes[1, a] + z * rounded.axes[2, a]
-        ) / steep
-    for a in range(3):
-        normal[a] = pose[a, 0] * local[0] + pose[a, 1] * local[1] + pose[a, 2] * local[2]
+        gradient[a] = (x * axes[0, a] + y * axes[1, a] + z * axes[2, a]) / steep
     return value / steep * edge

@@ -222,7 +222,7 @@ class PoseCache:
 
     def __call__(self, coordinates: Mapping[str, float]) -> Poses:
         """Poses (4, 4) by bone, as `bone_poses` gives them; shared, so not to be changed."""
-        key = tuple(sorted(coordinates.items()))
+        key = tuple(coordinates.items())
         found = self._known.get(key)
         if found is None:
             if len(self._known) >= self.MOST:

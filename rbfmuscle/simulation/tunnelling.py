@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, lower_bound, path_loop
+from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, may_reach, path_loop
 from rbfmuscle.bones.obstacles import query_bone
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats, Integers
@@ -265,13 +265,10 @@ def suspect_paths(obstacles, start, end, before, cosine, tolerance):
         if boxes_apart(box, pose, bounds) > length.max():
             continue
         count = 0
+        anchor, bound = known.anchor[b], known.bound[b]
         for i in range(len(end)):
             # A path that is shorter than the distance of its end touches nothing.
-            if (
-                obstacles.free[i]
-                and lower_bound(end, i, pose, bounds, known.anchor[b], known.bound[b])
-                <= length[0, i]
-            ):
+            if obstacles.free[i] and may_reach(end, i, pose, bounds, anchor, bound, length[0, i]):
                 some[count] = i
                 count += 1
         first, last = np.empty((count, 3)), np.empty((count, 3))

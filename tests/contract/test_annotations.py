@@ -8,7 +8,7 @@ from conftest import ROOT
 
 MODULES = sorted([*(ROOT / "rbfmuscle").rglob("*.py"), *(ROOT / "pbd_baseline").rglob("*.py")])
 # Loops that are compiled take plain arrays; their public half is annotated.
-COMPILED = ("compiled", "njit", "vectorize")
+COMPILED = ("compiled", "inner", "njit", "vectorize")
 CORE = ("implicit", "geometry", "muscle")
 
 

@@ -31,9 +31,9 @@ DATA = ROOT / "tests" / "data"
 class Bar:
     """A block whose ends two bones hold, with its surface's vertices as contact points."""
 
-    def __init__(self, iterations=100, tension=True):
+    def __init__(self, iterations=100, tension=True, subdivisions=4):
         block = trimesh.creation.box(extents=(40.0, 10.0, 8.0))
-        for _ in range(4):
+        for _ in range(subdivisions):
             block = block.subdivide()
         frame = RestFrame(block.vertices)
         points = np.asarray(block.vertices)
@@ -45,6 +45,7 @@ class Bar:
             owner,
             np.flatnonzero(owner >= 0),
             fixed=np.zeros(0, dtype=int),
+            surface=float(block.area),
             area=float(block.area) / len(points),
             iterations=iterations,
         )
@@ -218,6 +219,14 @@ def test_iteration_ends_where_forces_balance():
     held = springs @ (anchors - solid.state.points[solid.model.held])
     # Forces that the stop at 2e-5 of the size leaves, against those that hold the ends.
     assert np.abs(residual).max() < 0.02 * np.abs(held).max()
+
+
+def test_springs_of_an_attachment_do_not_depend_on_the_number_of_its_points():
+    coarse, fine = (Bar(subdivisions=count).model for count in (3, 5))
+    assert len(fine.held) > 10 * len(coarse.held)
+    pulls = [model.springs.sum() for model in (coarse, fine)]
+    # Points on the rim of an end stand for less than others, the more so the coarser they are.
+    assert pulls[0] == pytest.approx(pulls[1], rel=0.25)
 
 
 def test_solve_that_is_cut_short_says_so_and_its_residual_shrinks_with_iterations():

@@ -76,14 +76,15 @@ def test_blocks_are_filled_once_kept_when_the_table_grows_and_refused_when_it_is
     field, _, pose = ball
     contacts = BoneContacts(["ball"], [field])
     frame = RestFrame(np.asarray(trimesh.creation.icosphere(2, RADIUS).vertices))
-    bones, normal = round_bones({"ball": field}, frame, 0.2 / ROUNDING, {}), np.empty(3)
+    bones = round_bones({"ball": field}, frame, 0.2 / ROUNDING, {})
     points, _ = around(pose)
 
     def ask(table):
-        return [
-            rounded_distance(table, contacts.bones, 0, pose, p, normal, no_scratch())
-            for p in points
-        ]
+        found, scratch = [], no_scratch()
+        for point in (points - pose[:3, 3]) @ pose[:3, :3]:
+            scratch.local[:] = point
+            found.append(rounded_distance(table, contacts.bones, 0, scratch))
+        return found
 
     few = np.array(ask(bones))
     full = int(np.ceil(FULLEST * len(bones.keys)))
