@@ -19,7 +19,9 @@ from contraction_scenes import (
 from peers.known_scenes import Bar
 
 import rbfmuscle as rm
+from rbfmuscle.models import build_model
 from rbfmuscle.scene.activation.keys import ContractionTable
+from rbfmuscle.simulation.contact import BoneContacts
 
 MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume")
 SETTLED = ("rbf", "arap-volume")
@@ -60,6 +62,27 @@ def test_shapes_do_not_depend_on_how_activation_gets_there(model):
         back = np.linalg.norm(carried(run, -1) - carried(run, 0), axis=1).max()
         assert back < 0.05  # mm, as the issue asks
     assert np.linalg.norm(reached[0] - reached[1], axis=1).max() < 0.1  # mm, likewise
+
+
+def test_snapshot_holds_the_activation():
+    scene = spindle_scene(model="rbf", frames=2, spacing=6.0)
+    model = build_model(scene.muscles[0], scene, "rbf")
+    names = [bone.name for bone in scene.bones]
+    contacts = BoneContacts(names, [None] * len(names), contact_bone=model.contact_bone)
+
+    def solved():
+        model.predict(contacts.poses, contacts.poses)
+        model.solve(contacts)
+        return model.contact_points()
+
+    model.activate(0.5)
+    solved()
+    state = model.snapshot()
+    wanted = solved()
+    model.activate(1.0)
+    assert np.abs(solved() - wanted).max() > 0.1  # mm
+    model.restore(state)
+    np.testing.assert_array_equal(solved(), wanted)
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import igl
+import numba
 import numpy as np
 import pytest
 import trimesh
@@ -18,7 +19,7 @@ from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.material import project_to_level_set
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
-from rbfmuscle.models import build_model
+from rbfmuscle.models import build_model, build_models
 from rbfmuscle.muscle import placement
 from rbfmuscle.muscle.display_mesh import display_vertices
 from rbfmuscle.muscle.muscle import RBFMuscle
@@ -300,3 +301,33 @@ def test_key_of_the_number_of_centres_holds_all_that_it_depends_on(monkeypatch):
         options = RBFOptions(**change)
         placement.choose_centres(scene.muscles[0], scene, options, known_only=True)
     assert len(set(keys)) == len(changes)
+
+
+def test_muscles_on_two_threads_are_those_of_one_and_report_their_convergence():
+    scene = phantom_scene()
+    scene.set_motion(ramp=ramp(12, 0, 0, step=6))
+    scene.muscles = scene.muscles[:2]
+    before, found = numba.get_num_threads(), []
+    try:
+        for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
+            numba.set_num_threads(threads)
+            found.append(list(simulate_frames(scene, build_models(scene))))
+    finally:
+        numba.set_num_threads(before)
+    for one, two in zip(*(frames[1:] for frames in found)):  # nothing is solved at rest
+        for muscle in scene.muscles:
+            surface, other = one.surfaces[muscle.name], two.surfaces[muscle.name]
+            np.testing.assert_array_equal(surface.vertices, other.vertices)
+            # An iteration that moves no node by more than 2e-5 was the last one.
+            assert 0.0 < surface.quantities["solver_residual"] < 1e-4
+            assert surface.quantities["solid_volume_error"] < 0.05
+        assert not [event for event in one.events if event.action == "iteration_cap"]
+
+
+def test_one_iteration_is_no_clean_run():
+    scene = phantom_scene().with_options({"model.iterations": 1})
+    scene.set_motion(ramp=ramp(12, 0, 0, step=6))
+    scene.muscles = [scene.muscle("extensor")]
+    frames = list(simulate_frames(scene, build_models(scene)))
+    assert frames[-1].surfaces["extensor"].quantities["solver_residual"] > 5e-4
+    assert ("extensor", "iteration_cap") in {(e.muscle, e.action) for e in frames[-1].events}

@@ -38,9 +38,10 @@ def ball():
         bones = grown(grown(round_bones({"ball": field}, frame, EDGE / ROUNDING, {})))
         normal, gap = np.empty_like(points), np.empty(len(points))
         for i, point in enumerate(points):
-            gap[i] = rounded_distance(
-                bones, contacts.bones, 0, pose, point, normal[i], no_scratch()
-            )
+            scratch = no_scratch()
+            scratch.local[:] = (point - pose[:3, 3]) @ pose[:3, :3]
+            gap[i] = rounded_distance(bones, contacts.bones, 0, scratch)
+            normal[i] = pose[:3, :3] @ scratch.gradient
         return gap, normal
 
     return field, rounded, pose

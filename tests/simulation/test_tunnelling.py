@@ -5,12 +5,21 @@ import pytest
 import trimesh
 from toy_scene import ToyMuscle, attach, box, cylinder, ellipsoid, joint, muscle, scene, sphere
 
+from rbfmuscle.bones.obstacles import stack_bones
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.stepper import MuscleStepper
-from rbfmuscle.simulation.tunnelling import Crossing, find_crossings, only_grazed, sweep_paths
+from rbfmuscle.simulation.tunnelling import (
+    RIGHT_ANGLE_AND_HALF,
+    Crossing,
+    find_crossings,
+    only_grazed,
+    sweep_paths,
+    unclear_paths,
+)
 
 TOLERANCE = 0.01
 
@@ -81,6 +90,19 @@ def test_angle_test_has_the_known_recall(shape, step, recall):
     # The published figures have two digits and an unnamed sampling; the count here gives 1 % at
     # worst.
     assert sweep.flagged.sum() / crossing.sum() == pytest.approx(recall, abs=0.03)
+
+
+@pytest.mark.parametrize("step", [1.0, 5.0])
+def test_paths_that_are_called_clear_neither_touch_nor_turn(step):
+    field = BoneSDF.from_mesh(trimesh.creation.box((3.0, 2.0, 0.5)), cache=False)
+    start, end = random_segments(step, count=20_000)
+    sweep = sweep_paths(field, start, end, tolerance=TOLERANCE)
+    cosine = np.cos(RIGHT_ANGLE_AND_HALF)
+    found = unclear_paths(stack_bones([field]), 0, start, end, cosine, TOLERANCE)
+    wanted = sweep.index[sweep.flagged | (sweep.lowest < -TOLERANCE)]
+    assert found[wanted].all() and len(wanted) > 100
+    # Few others are left to be traced.
+    assert found.sum() < 1.3 * len(wanted)
 
 
 def test_angle_test_alone_decides_where_it_is_asked_for():
