@@ -3,7 +3,6 @@ well they hold.
 """
 
 import csv
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
+from rbfmuscle.scene.joints.functions import exponents
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.joints.tables import full_name
 from rbfmuscle.scene.motion import bone_poses, inner_value
@@ -306,14 +306,6 @@ class FittedPath:
     def arms(self, values: np.ndarray) -> np.ndarray:
         """Moment arms (n, d) at coordinates (n, d)."""
         return (_rows(values, self.order)[1:] @ self.coefficients).T
-
-
-def exponents(dimension: int, order: int) -> np.ndarray:
-    """Return the exponents (m, d) of every term up to an order, the last coordinate's going
-    fastest, as OpenSim's.
-    """
-    powers = itertools.product(range(order + 1), repeat=dimension)
-    return np.array([power for power in powers if sum(power) <= order])
 
 
 def _rows(values, order):

@@ -209,7 +209,7 @@ class Recording:
             times=self.times,
             limits=limits.values,
             fail_on=limits.fail_on,
-            verdict=describe_verdict(table, limits, self.scene.left_out),
+            verdict=_with_doubts(describe_verdict(table, limits, self.scene.left_out), self.scene),
             beyond=exceeded(table, limits),
             not_measured=unmeasured(table, limits),
             frames=self.written,
@@ -224,6 +224,14 @@ def timed(times: dict[str, float], part: str) -> Iterator[None]:
         yield
     finally:
         times[part] = times.get(part, 0.0) + time.perf_counter() - start
+
+
+def _with_doubts(verdict: str, scene: Scene) -> str:
+    """A verdict, and what makes the scene another one than its source."""
+    if not scene.doubts:
+        return verdict
+    more = f"; and {len(scene.doubts) - 1} more" if len(scene.doubts) > 1 else ""
+    return f"{verdict}. Doubtful: {scene.doubts[0]}{more} (rbfmuscle check lists all)"
 
 
 Found = tuple[list[Event], dict[str, float]]

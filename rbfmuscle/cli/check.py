@@ -45,7 +45,7 @@ def check(
             drawn = {"picture": str(scene.with_suffix(".png"))}
             with stage("drawing the picture"):
                 draw_scene(loaded, scene.with_suffix(".png"))
-    usable = not any(finding.level == "error" for finding in findings)
+    usable = bool(loaded.bones) and not any(finding.level == "error" for finding in findings)
     if as_json:
         facts = {"scene": loaded.resolved(), "findings": [vars(finding) for finding in findings]}
         print(json.dumps(facts | drawn | ({"fields": errors} if errors else {}), indent=1))
@@ -74,7 +74,7 @@ def _findings(path):
         check_substeps(loaded)
     except SceneError as error:
         findings.append(Finding("error", loaded.name, str(error)))
-    if not any(finding.level == "error" for finding in findings):
+    if loaded.bones and not any(finding.level == "error" for finding in findings):
         with stage("checking the motion"):
             findings += motion_findings(loaded)
     return loaded, sort_findings(findings)

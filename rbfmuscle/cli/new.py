@@ -102,6 +102,8 @@ def import_(
     for note in found.notes:
         print(f"note: {note}")
     scene = found.scene
+    for doubt in scene.doubts:
+        print(f"doubtful: {doubt}")
     counts = (
         f"{len(scene.bones)} bones, {len(scene.links)} without a mesh, {len(scene.joints)} joints"
     )

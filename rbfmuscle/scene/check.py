@@ -55,8 +55,12 @@ def check_scene(scene: SceneData) -> list[Finding]:
     unusable = "no mesh of this bone could be used: muscles pass through it"
     findings += [Finding("warning", bone.name, opened) for bone in scene.bones if not bone.closed]
     findings += [Finding("warning", name, unusable) for name in scene.left_out]
+    findings += [Finding("warning", scene.name, doubt) for doubt in scene.doubts]
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
     findings += _rest_overlaps(scene)
+    if scene.links and not scene.bones:
+        words = "no bone has a mesh, so nothing can be run; give the bones meshes"
+        return sort_findings([*findings, Finding("note", scene.name, words)])
     try:
         findings += bone_findings(bone_collisions(scene), scene.units)
         check_extents(scene)

@@ -51,6 +51,7 @@ class SceneTable(Table):
     name: str | None = None
     units: Literal["m", "cm", "mm"]
     left_out: list[str] = Field(default=[])
+    doubts: list[str] = Field(default=[])
     superior: Axis | None = None
     anterior: Axis | None = None
 
@@ -166,6 +167,7 @@ def _fill(scene: SceneData, tables: SceneFile) -> None:
     ):
         raise SceneError("[scene]: give superior and anterior, of different directions, or neither")
     scene.left_out = about.left_out
+    scene.doubts = about.doubts
     scene.superior = about.superior
     scene.anterior = about.anterior
     for bone in tables.bone:
@@ -242,6 +244,7 @@ def describe_scene(scene: SceneData) -> dict[str, Any]:
         "bones": [{"name": bone.name, **_describe_mesh(bone)} for bone in scene.bones],
         "links": list(scene.links),
         "left_out": list(scene.left_out),
+        "doubts": list(scene.doubts),
         "joints": [joint_row(joint) for joint in scene.joints],
         "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
         "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},

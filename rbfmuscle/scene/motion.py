@@ -16,15 +16,18 @@ from rbfmuscle.scene.joints.joint import (
     resolve,
 )
 from rbfmuscle.scene.joints.tables import FACTORS, full_name
+from rbfmuscle.scene.names import plain_name
 from rbfmuscle.scene.objects import Motion, SceneData
 from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions
 from rbfmuscle.scene.tendons import Poses
-from rbfmuscle.validation import SceneError, did_you_mean, read_text
+from rbfmuscle.validation import SceneError, did_you_mean, read_text, shown
 
 SHIFT_LEVER = 50.0  # lever [mm] at which a shift of a joint is counted as a turn
 NOT_MOVED = 1e-9  # A locked coordinate may be given, at its rest value.
 # Share of a turn [radian] or of a length that rounding may take a coordinate beyond its range.
 RANGE_TOLERANCE = 1e-6
+TURN = 2.0 * math.pi
+MOST_LISTED = 8  # columns that a note lists
 IN_DEGREES = dict.fromkeys(("yes", "true", "1"), math.pi / 180) | dict.fromkeys(
     ("no", "false", "0"), 1.0
 )
@@ -272,8 +275,11 @@ def read_motion_file(
     if len(values) > MAX_FRAMES:
         raise SceneError(f"[motion]: {path} has {len(values)} rows, more than {MAX_FRAMES}")
     columns: dict[str, int] = {}
+    unknown = []
     for column, label in enumerate(labels):
         name = match_label(label, list(facts))
+        if name is None and label.lower() != "time":
+            unknown.append(label)
         if name in columns:
             raise SceneError(
                 f"[motion]: {path} has two columns of coordinate {name!r}, leave one out"
@@ -291,6 +297,11 @@ def read_motion_file(
             f"[motion]: {path} row {row + 1}: {labels[used[column]]} is not a finite number"
         )
     factor, notes = _angle_factor(path, header)
+    notes += _storage_notes(path, header, unknown, len(values))
+    if "time" in labels:
+        notes += _time_notes(path, values[:, labels.index("time")])
+    turns = [(n, values[:, c]) for n, c in columns.items() if facts[n].motion == "rotation"]
+    notes += _degree_notes(path, factor, [(name, facts[name], track) for name, track in turns])
     units = {"rotation": factor, "translation": metre, "coupled": 1.0}
     tracks = {}
     for name, column in columns.items():
@@ -301,6 +312,41 @@ def read_motion_file(
             tracks[name] = (values[:, column] * units[facts[name].motion]).tolist()
     frames = [{name: track[row] for name, track in tracks.items()} for row in range(len(values))]
     return frames, values[:, labels.index("time")].tolist() if "time" in labels else None, notes
+
+
+def _storage_notes(path, header, unknown, rows):
+    """Columns of a motion file that are of no coordinate, and rows counted wrongly."""
+    notes = []
+    if unknown:
+        more = f" and {len(unknown) - MOST_LISTED} more" if len(unknown) > MOST_LISTED else ""
+        listed = ", ".join(map(shown, unknown[:MOST_LISTED]))
+        notes.append(f"{path}: columns of no coordinate of the scene are not used: {listed}{more}")
+    said = header.get("nrows", header.get("datarows"))
+    if said is not None and said != str(rows):
+        notes.append(f"{path}: nRows says {shown(said)}, {rows} rows are there: is it whole?")
+    return notes
+
+
+def _time_notes(path, times):
+    """Times that do not increase."""
+    back = np.flatnonzero(np.diff(times) <= 0.0)
+    if not len(back):
+        return []
+    row = int(back[0])
+    words = f"the first after row {row + 1}, {times[row]:g} and {times[row + 1]:g} s"
+    return [f"{path}: {len(back)} times do not increase, {words}; each row is a frame all the same"]
+
+
+def _degree_notes(path, factor, turns):
+    """A question where angles that are said to be radians can only be degrees."""
+    for name, coordinate, track in turns:
+        most = float(np.abs(track).max())
+        ends = (-TURN, TURN) if coordinate.range is None else coordinate.range
+        widest = min(TURN, max(math.pi, 1.5 * max(map(abs, ends))))
+        if factor == 1.0 and most > widest:
+            what = f"{name} reaches {most:.4g} radians, {most / TURN:.3g} turns"
+            return [f"{path}: {what}: does the file mean degrees (inDegrees=yes)?"]
+    return []
 
 
 def _read_storage(path: Path) -> tuple[dict[str, str], list[str], Floats]:
@@ -337,7 +383,8 @@ def match_label(label: str, known: list[str]) -> str | None:
     ``.../joint/name/value``.
     """
     parts = label.removesuffix("/value").split("/")
-    for name in (label, ".".join(parts[-2:]), parts[-1]):
+    plain = [plain_name(part) for part in parts]
+    for name in (label, ".".join(parts[-2:]), parts[-1], ".".join(plain[-2:]), plain[-1]):
         owners = [full for full in known if name in (full, full.split(".", 1)[1])]
         if name in owners or len(owners) == 1:
             return name if name in owners else owners[0]

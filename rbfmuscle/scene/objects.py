@@ -139,6 +139,9 @@ class SceneData:
         The file it was loaded from.
     left_out : list of str
         Bones of which no mesh could be used; they count in the verdict of a run.
+    doubts : list of str
+        What makes the scene another one than its source, in sentences; warnings of a check, and in
+        the verdict of a run.
     superior, anterior : list of float or None
         Anatomical directions (3,) at rest: those of the file, or found from the bones before a run
         or a picture.
@@ -159,6 +162,7 @@ class SceneData:
     output: OutputOptions = field(default_factory=OutputOptions)
     path: Path | None = None
     left_out: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
     superior: list[float] | None = None
     anterior: list[float] | None = None
 
@@ -190,7 +194,7 @@ class SceneData:
     def copy(self) -> Self:
         """Return a copy whose lists and tables are its own; meshes are shared."""
         other = copy.copy(self)
-        for name in ("bones", "joints", "couplings", "links", "left_out"):
+        for name in ("bones", "joints", "couplings", "links", "left_out", "doubts"):
             setattr(other, name, list(getattr(self, name)))
         other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
         return other

@@ -256,6 +256,8 @@ def check_substeps(scene: Scene) -> None:
     """Raise SceneError for a motion of more than `MOST_SUBSTEPS`, before anything grows with their
     number.
     """
+    if not scene.bones:
+        return
     cut = SubSteps(scene)
     frames = scene.motion.frames
     rest = rest_coordinates(scene)

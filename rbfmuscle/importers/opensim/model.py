@@ -2,15 +2,15 @@
 radians.
 """
 
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint, ordered, resolve
-from rbfmuscle.validation import SceneError
+from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint, all_coordinates, resolve
+from rbfmuscle.scene.joints.tables import full_name
 
 GROUND = "ground"
 
@@ -25,6 +25,11 @@ class ModelJoint(Joint):
 
     parent_frame: np.ndarray = field(default_factory=lambda: np.eye(4))
     child_frame: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+    def across(self, values: Mapping[str, float]) -> np.ndarray:
+        """The child's frame (4, 4) in the parent's, at values of coordinates by full names."""
+        own = {name: values[f"{self.name}.{name}"] for name in self.coordinates}
+        return self.parent_frame @ self.displacement(own) @ np.linalg.inv(self.child_frame)
 
 
 @dataclass
@@ -56,19 +61,45 @@ class WrapShape:
 class ModelMuscle:
     """A muscle of the model: points by body in their frames [metre], shapes it wraps around, volume
     [m3].
+
+    ``title`` is its type and its name in the file.
     """
 
     name: str
     points: list[tuple[str, np.ndarray]]
     wraps: list[WrapShape] = field(default_factory=list)
     volume: float = 0.0
+    title: str = ""
+
+
+@dataclass
+class ModelConstraint:
+    """A constraint between two bodies that is not taken, and its type and name in the file."""
+
+    title: str
+    bodies: tuple[str, str]
+
+
+class Walk(NamedTuple):
+    """How the bodies hang together.
+
+    ``steps`` are joints from the roots outwards, with whether each is walked from its child to its
+    parent; ``roots`` the bodies that no joint joins to those before them; ``left`` the joints
+    between two bodies that are joined already: each closes a loop.
+    """
+
+    steps: list[tuple[ModelJoint, bool]]
+    roots: list[str]
+    left: list[ModelJoint]
 
 
 @dataclass
 class OsimModel:
     """All that is taken from an ``.osim`` file; ``bodies`` begin with ``"ground"``.
 
-    ``notes`` say what is in the file and is not taken, or taken otherwise than a user may expect.
+    ``welds`` are its weld constraints, as joints. ``notes`` say what is in the file and is not
+    taken, or taken otherwise than a user may expect; ``doubts`` what makes the scene another one
+    than the model.
     """
 
     name: str
@@ -76,40 +107,57 @@ class OsimModel:
     path: Path
     bodies: list[str] = field(default_factory=list)
     joints: list[ModelJoint] = field(default_factory=list)
+    welds: list[ModelJoint] = field(default_factory=list)
     couplings: list[Coupling] = field(default_factory=list)
+    constraints: list[ModelConstraint] = field(default_factory=list)
     meshes: list[ModelMesh] = field(default_factory=list)
     muscles: list[ModelMuscle] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
     def coordinates(self) -> dict[str, Coordinate]:
-        """Every coordinate by its bare name, which is unique in a model."""
-        return {name: facts for joint in self.joints for name, facts in joint.coordinates.items()}
+        """Every coordinate by its full name, joint.coordinate."""
+        return all_coordinates(list(self.joints))
 
-    def tree(self) -> Iterator[tuple[ModelJoint, bool]]:
-        """Joints from the ground outwards; the flag says that the joint is walked from its child to
-        its parent.
+    def walk(self, *, welds: bool = True) -> Walk:
+        """How the bodies hang together, by joints and, unless told otherwise, by weld constraints.
 
-        A joint between two bodies that are both reached already closes a loop and is left out.
+        A weld constraint comes after the joints, a joint that leaves its body free after both.
         """
-        reached, waiting = {GROUND}, list(self.joints)
-        while ready := next(
-            (j for j in waiting if (j.parent in reached) != (j.child in reached)), None
-        ):
-            waiting.remove(ready)
-            backward = ready.child in reached
-            reached |= {ready.parent, ready.child}
-            yield ready, backward
+        joints = [*self.joints, *(self.welds if welds else [])]
+        waiting = sorted(joints, key=lambda joint: joint.kind == "free")
+        steps: list[tuple[ModelJoint, bool]] = []
+        roots: list[str] = []
+        reached: set[str] = set()
+        for body in [GROUND, *_by_depth(self.bodies, joints)]:
+            if body in reached:
+                continue
+            reached.add(body)
+            roots.append(body)
+            while ready := next(
+                (j for j in waiting if (j.parent in reached) != (j.child in reached)), None
+            ):
+                waiting.remove(ready)
+                steps.append((ready, ready.child in reached))
+                reached |= {ready.parent, ready.child}
+        return Walk(steps, roots, waiting)
 
-    def transforms(self, values: dict[str, float] | None = None) -> dict[str, np.ndarray]:
-        """The (4, 4) transform from every body to the ground [metre], at values of coordinates by
-        bare names.
+    def resolved(self, values: Mapping[str, float] | None = None) -> dict[str, float]:
+        """Every coordinate's value by its full name; bare names may be given where one joint has
+        them.
         """
-        resolved = resolve(values or {}, self.coordinates(), self.couplings)
+        facts = self.coordinates()
+        asked = {full_name(n, list(facts), place="pose"): v for n, v in (values or {}).items()}
+        return resolve(asked, facts, self.couplings)
+
+    def transforms(
+        self, values: Mapping[str, float] | None = None, *, welds: bool = True
+    ) -> dict[str, np.ndarray]:
+        """The (4, 4) transform from every body to the ground [metre], at values of coordinates."""
+        resolved = self.resolved(values)
         found = {body: np.eye(4) for body in self.bodies}
-        for joint, backward in self.tree():
-            moved = joint.displacement(resolved)
-            across = joint.parent_frame if moved is None else joint.parent_frame @ moved
-            across = across @ np.linalg.inv(joint.child_frame)
+        for joint, backward in self.walk(welds=welds).steps:
+            across = joint.across(resolved)
             if backward:
                 found[joint.parent] = found[joint.child] @ np.linalg.inv(across)
             else:
@@ -117,40 +165,29 @@ class OsimModel:
         return found
 
 
-def finish(model: OsimModel) -> OsimModel:
-    """The model, what is not connected noted; SceneError if names are shared, or if one names what
-    is not there.
-    """
-    coordinates = [name for joint in model.joints for name in joint.coordinates]
-    joints = [joint.name for joint in model.joints]
-    for what, names in (("bodies", model.bodies), ("joints", joints), ("coordinates", coordinates)):
-        for name, count in Counter(names).items():
-            if count > 1:
-                raise SceneError(f"two {what} are named {name!r}; rename one")
-    for joint in model.joints:
-        for body in (joint.parent, joint.child):
-            if body not in model.bodies:
-                raise SceneError(
-                    f"joint {joint.name!r}: there is no body {body!r}; correct its frames"
-                )
-    for coupling in model.couplings:
-        for name in (coupling.coordinate, *coupling.of):
-            if name not in coordinates:
-                raise SceneError(
-                    f"a coupling names coordinate {name!r}, which no joint has; correct it"
-                )
-    model.couplings = ordered(model.couplings)
-    used = [joint.name for joint, _ in model.tree()]
-    for joint in model.joints:
-        if joint.name not in used:
-            ends = f"({joint.parent} to {joint.child})"
-            model.notes.append(
-                f"joint {joint.name!r} {ends} closes a loop or is not connected: not taken"
-            )
-    held = {GROUND} | {b for j in model.joints if j.name in used for b in (j.parent, j.child)}
-    for body in model.bodies:
-        if body not in held:
-            model.notes.append(
-                f"body {body!r} has no joint to the ground: it stays where its file puts it"
-            )
-    return model
+def _by_depth(bodies: list[str], joints: list[ModelJoint]) -> list[str]:
+    """Bodies that are no joint's child, then the others: the order in which roots are chosen."""
+    children = {joint.child for joint in joints}
+    return sorted(bodies, key=lambda body: body in children)
+
+
+def joints_between(walk: Walk, first: str, second: str) -> list[ModelJoint]:
+    """The joints on the way from a body to another; none where they have different roots."""
+    above = {
+        (joint.parent if backward else joint.child): (
+            joint,
+            joint.child if backward else joint.parent,
+        )
+        for joint, backward in walk.steps
+    }
+    chains = []
+    for name in (first, second):
+        chain = []
+        while name in above:
+            joint, name = above[name]
+            chain.append(joint)
+        chains.append((chain, name))
+    (one, root), (two, other) = chains
+    if root != other:
+        return []
+    return [j for j in one if j not in two] + [j for j in reversed(two) if j not in one]

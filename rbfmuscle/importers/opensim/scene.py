@@ -12,8 +12,9 @@ from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.importers.opensim.model import ModelMesh, OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
-from rbfmuscle.importers.opensim.tubes import make_tube
+from rbfmuscle.importers.opensim.tubes import TUBE_MODEL, make_tube
 from rbfmuscle.importers.toml_text import attachment_file, table_text
+from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_arrays
 from rbfmuscle.scene.meshes.repair import ReadMesh
@@ -30,7 +31,8 @@ class Imported:
     """A scene made from a model.
 
     ``places`` are (4, 4) from every body of the model to the scene, rest pose [metre]; ``notes``
-    say what was not taken, or taken otherwise than one may expect.
+    say what was not taken, or taken otherwise than one may expect; what makes it another model than
+    the file's is in the scene's ``doubts``.
     """
 
     scene: Scene
@@ -61,36 +63,55 @@ def import_osim(
         else:
             scene.add_bone(body)
             scene.left_out += [body] if any(mesh.body == body for mesh in model.meshes) else []
-    full = {}
-    for joint, backward in model.tree():
-        full |= {name: f"{joint.name}.{name}" for name in joint.coordinates}
+    walk = model.walk()
+    for joint, backward in walk.steps:
         parent, child = (joint.child, joint.parent) if backward else (joint.parent, joint.child)
         placed = joint.moved(places[joint.parent] @ joint.parent_frame)
         scene.place_joint(replace(placed, parent=parent, child=child, backward=backward))
+    known = all_coordinates(scene.joints)
     for coupling in model.couplings:
-        if all(name in full for name in (coupling.coordinate, *coupling.of)):
-            of = tuple(full[name] for name in coupling.of)
-            scene.place_coupling(replace(coupling, coordinate=full[coupling.coordinate], of=of))
+        missing = [n for n in (coupling.coordinate, *coupling.of) if n not in known]
+        if not missing:
+            scene.place_coupling(coupling)
+        elif coupling.coordinate in known:
+            scene.doubts.append(f"{coupling.coordinate} does not follow {missing[0]}, not taken")
+    scene.doubts += model.doubts
     scene.superior, scene.anterior = [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]
     found = Imported(scene, model, places, notes)
     if muscles:
-        _add_muscles(found)
+        _add_muscles(found, walk)
     return found
 
 
-def _add_muscles(found):
+def _add_muscles(found, walk):
     """A tube for each muscle of the model."""
     scene = found.scene
     bones = {bone.name: ExactDistance(bone.mesh.vertices, bone.mesh.faces) for bone in scene.bones}
+    holders = _holders(walk, found.model.bodies, bones)
     for muscle in found.model.muscles:
         try:
-            tube = make_tube(muscle, found.places, bones)
+            tube = make_tube(muscle, found.places, bones, holders)
             attach: Any = [
                 {"bone": body, "vertices": held.tolist()} for body, held in tube.held.items()
             ]
-            scene.add_muscle(muscle.name, (tube.vertices, tube.faces), attach=attach)
+            mesh = tube.vertices, tube.faces
+            scene.add_muscle(muscle.name, mesh, attach=attach, model=dict(TUBE_MODEL))
         except (SceneError, MeshError) as error:
-            found.notes.append(f"muscle {muscle.name!r} is not taken: {error}")
+            scene.doubts.append(f"{muscle.title} is not taken: {error}")
+
+
+def _holders(walk, bodies, bones):
+    """For each body the one that holds its muscles: itself where it has a mesh, else one with a
+    mesh that no coordinate moves against it; without one, itself.
+    """
+    groups = {body: body for body in bodies}
+    for joint, _ in walk.steps:
+        if not joint.coordinates:
+            first, second = groups[joint.parent], groups[joint.child]
+            groups = {body: first if one == second else one for body, one in groups.items()}
+    # Of several the last that is reached on the way out, which is nearest to what it carries.
+    seen = {groups[body]: body for body in bodies if body in bones}
+    return {body: body if body in bones else seen.get(groups[body], body) for body in bodies}
 
 
 def _find_mesh(name: str, folders: list[Path]) -> Path | None:
@@ -177,6 +198,7 @@ def write_scene(found: Imported, directory: Path, *, force: bool = False) -> Pat
     directory, scene = Path(directory), found.scene
     facts = {"format": 1, "name": scene.name, "units": scene.units}
     facts |= {"left_out": scene.left_out} if scene.left_out else {}
+    facts |= {"doubts": scene.doubts} if scene.doubts else {}
     facts |= {"superior": scene.superior, "anterior": scene.anterior}
     with scene_folder(directory, force=force).staged(replaces=()) as stage:
         bones = [
@@ -211,7 +233,8 @@ def _head(found):
 
 def _muscle_text(directory, muscle):
     """The table of a muscle, its mesh and attachments written."""
-    row = {"name": muscle.name, "mesh": _write_mesh(directory, "muscles", muscle), "attach": []}
+    row = {"name": muscle.name, "mesh": _write_mesh(directory, "muscles", muscle)}
+    row |= {"model": {"name": muscle.model, **muscle.options}, "attach": []}
     (directory / "attachments").mkdir(exist_ok=True)
     for held in muscle.attachments:
         file = attachment_file(muscle.name, held.bone)
@@ -221,7 +244,7 @@ def _muscle_text(directory, muscle):
         "[[muscle]]   # a tube along the model's path, of its fibres' volume; put a mesh of "
         "your own here"
     )
-    return table_text(head, row)
+    return table_text(head, row, {"model": "enough for a tube; leave it out for your own mesh"})
 
 
 def _write_mesh(directory, folder, item):

@@ -11,15 +11,22 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.geometry.surfaces import mesh_volume, unique_edges
 from rbfmuscle.geometry.tubes import SIDES, distance_along, line_length, points_along, tube_mesh
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.validation import SceneError
 
 # Sections along a tube; radius at the ends against the middle; share of the length held at an end.
-SECTIONS = 28
+SECTIONS = 48
 END_RADIUS = 0.3
 HELD = 0.06
+ENDS = 5  # sections at either end that may lie in bones
+# Of bones that a tube lies on: the gap left [m], the depth to which its vertices are brought out
+# [m], and how often, as what leaves one bone may enter another.
+MARGIN, FLATTENED, FLATTENINGS = 5e-4, 0.03, 8
+FITTINGS = 6  # rounds in which the radius is fitted to the volume
+# A tube is smooth: fewer points of its surface and a coarser mesh show and bound it as well.
+TUBE_MODEL = {"name": "rbf", "samples": 1200, "resolution": 60}
 ROUNDS = 60  # rounds in which the middle line is drawn straight and put out of what is in its way
 
 
@@ -33,18 +40,24 @@ class Tube:
 
 
 def make_tube(
-    muscle: ModelMuscle, places: dict[str, np.ndarray], bones: dict[str, ExactDistance]
+    muscle: ModelMuscle,
+    places: dict[str, np.ndarray],
+    bones: dict[str, ExactDistance],
+    holders: dict[str, str],
 ) -> Tube:
     """The tube of a muscle in the scene, or SceneError where no two bodies with a mesh hold it.
 
-    ``places`` are (4, 4) from every body of the model to the scene [metre], ``bones`` their meshes.
+    ``places`` are (4, 4) from every body of the model to the scene [metre], ``bones`` their meshes,
+    ``holders`` the body that holds what is fixed to each.
     """
-    bodies = [body for body, _ in muscle.points]
-    if len(set(bodies[:1] + bodies[-1:])) < 2 or muscle.volume <= 0.0:
-        raise SceneError(f"muscle {muscle.name!r}: it has no two bodies, or no volume")
+    bodies = [holders[body] for body, _ in muscle.points]
+    if muscle.volume <= 0.0:
+        raise SceneError("it has no volume; give it a force and a fibre length above zero")
+    if len(set(bodies[:1] + bodies[-1:])) < 2:
+        raise SceneError("its path does not go from one moving body to another")
     for body in (bodies[0], bodies[-1]):
         if body not in bones:
-            raise SceneError(f"muscle {muscle.name!r}: body {body!r} has no mesh to hold it")
+            raise SceneError(f"body {body!r} has no mesh to hold it; give it one")
     points = np.array(
         [places[body][:3, :3] @ at + places[body][:3, 3] for body, at in muscle.points]
     )
@@ -57,11 +70,14 @@ def make_tube(
     radius = share * np.sqrt(muscle.volume / (np.pi * length * np.mean(share**2)))
     wraps = [(wrap, places[wrap.body] @ wrap.frame) for wrap in muscle.wraps]
     line = _clear_line(line, fixed, radius, wraps, list(bones.values()))
-    found = mesh_volume(
-        *tube_mesh(line, radius)
-    )  # as its square, but for where sections run into each other
-    vertices, faces = tube_mesh(line, radius * np.sqrt(muscle.volume / found))
-    return Tube(vertices, faces, _held(bodies, fixed, bones))
+    held = _held(bodies, fixed, bones)
+    free = np.setdiff1d(np.arange(SECTIONS * SIDES + 2), np.concatenate(list(held.values())))
+    for _ in range(FITTINGS):
+        vertices, faces = tube_mesh(line, radius)
+        vertices = _beside_bones(vertices, faces, free, list(bones.values()))
+        # As its square, but for where sections run into each other or lie flat on a bone.
+        radius = radius * np.sqrt(muscle.volume / mesh_volume(vertices, faces))
+    return Tube(vertices, faces, held)
 
 
 def _clear_line(line, fixed, radius, wraps, bones):
@@ -69,7 +85,7 @@ def _clear_line(line, fixed, radius, wraps, bones):
     bones.
     """
     line, start = line.copy(), line.copy()
-    middle = np.arange(3, len(line) - 3)
+    middle = np.arange(ENDS, len(line) - ENDS)
     for number in range(ROUNDS):
         line[1:-1] = 0.25 * (line[:-2] + 2.0 * line[1:-1] + line[2:])
         line[fixed] = 0.5 * (line[fixed] + start[fixed])
@@ -111,6 +127,36 @@ def _out_of_bone(bone, points, reach):
     distance, closest, *_ = bone.nearest(points, reach=float(reach.max()))
     away = (points - closest) / np.where(distance == 0.0, 1.0, distance)[:, None]
     return np.where((distance < reach)[:, None], closest + away * reach[:, None], points)
+
+
+def _beside_bones(vertices, faces, free, bones):
+    """A tube's vertices (n, 3), those ``free`` of them out of all bones by `MARGIN`, where they are
+    no deeper than `FLATTENED`: there the tube lies flat on them, and is smooth beside.
+    """
+    edges = unique_edges(faces)
+    count = np.bincount(edges.ravel(), minlength=len(vertices))
+    still = np.setdiff1d(np.arange(len(vertices)), free)
+    shift = np.zeros_like(vertices)
+    for number in range(FLATTENINGS):
+        beside = np.zeros_like(shift)
+        np.add.at(beside, edges[:, 0], shift[edges[:, 1]])
+        np.add.at(beside, edges[:, 1], shift[edges[:, 0]])
+        if number < FLATTENINGS - 1:  # in the last round what is out stays out
+            shift = 0.5 * (shift + beside / count[:, None])
+            shift[still] = 0.0
+        points = vertices + shift
+        for bone in bones:
+            points[free] = _pushed(bone, points[free])
+        shift = points - vertices
+    return vertices + shift
+
+
+def _pushed(bone, points):
+    """Points (n, 3), those in a bone, but not deep in it, moved to `MARGIN` before it."""
+    distance, closest, *_ = bone.nearest(points, reach=FLATTENED)
+    inside = (distance < MARGIN) & (distance > -FLATTENED)
+    away = (points - closest) / np.where(distance == 0.0, 1.0, distance)[:, None]
+    return np.where(inside[:, None], closest + MARGIN * away, points)
 
 
 def _held(bodies, fixed, bones):

@@ -7,9 +7,10 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import cast
 from xml.etree import ElementTree
 
+import defusedxml.ElementTree
 import numpy as np
 
 from rbfmuscle.validation import SceneError
@@ -21,22 +22,20 @@ MOST_DEPTH = 100
 _LEVELS = ("OpenSimDocument", "Model", "objects", "components", "frames")
 
 
-def plain_name(name: str) -> str:
-    """A name as a scene may have it, of letters, digits, ``_`` and ``-``; of a path every name."""
-    return "/".join(
-        word if word == ".." else re.sub(r"[^A-Za-z0-9_-]+", "_", word) for word in name.split("/")
-    )
-
-
 class Node(ElementTree.Element):
-    """One element; ``owner`` is the element that it stands in."""
+    """One element.
+
+    ``owner`` is the element that it stands in, ``prototype`` that of the file's defaults for its
+    tag, which has what it does not say itself.
+    """
 
     owner: Node | None = None
+    prototype: Node | None = None
 
     @property
     def name(self) -> str:
-        """The attribute ``name``, plain."""
-        return plain_name(self.get("name", ""))
+        """The attribute ``name``, as it is written."""
+        return self.get("name", "").strip()
 
     @property
     def path(self) -> str:
@@ -64,8 +63,11 @@ class Node(ElementTree.Element):
         return [node for node in self if isinstance(node, Node)]
 
     def child(self, tag: str) -> Node | None:
-        """The first child of that tag."""
-        return next((node for node in self.nodes() if node.tag == tag), None)
+        """The first child of that tag, the prototype's where there is none."""
+        found = cast("Node | None", self.find(tag))
+        if found is None and self.prototype is not None:
+            return cast("Node | None", self.prototype.find(tag))
+        return found
 
     def objects(self, tag: str) -> list[Node]:
         """What a set holds: children of ``<tag><objects>``, or of ``<tag>`` itself where there is
@@ -79,11 +81,12 @@ class Node(ElementTree.Element):
         """Text of the child of that tag, without white space around it; the default where it is
         missing or empty.
         """
-        return (self.findtext(tag) or "").strip() or default
+        node = self.child(tag)
+        return ("" if node is None else node.text or "").strip() or default
 
     def names(self, tag: str) -> tuple[str, ...]:
-        """The names in the child of that tag, plain."""
-        return tuple(map(plain_name, self.word(tag).split()))
+        """The names in the child of that tag."""
+        return tuple(self.word(tag).split())
 
     def truth(self, tag: str, default: bool = False) -> bool:
         """Whether the child of that tag says true."""
@@ -111,29 +114,17 @@ class Node(ElementTree.Element):
         return np.array(self.numbers(tag, default, count=3))
 
 
-class _Builder(ElementTree.TreeBuilder):
-    """Stops at a document type, before any entity is read, and at elements that are nested too
-    deep.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(element_factory=Node)
-        self.open: list[Any] = []
-
-    def doctype(self, *_: str | None) -> NoReturn:
-        raise SceneError("has a DOCTYPE or entities, which no model needs; delete the declaration")
-
-    def start(self, tag: str, attributes: dict[str, str], /) -> ElementTree.Element:
-        if len(self.open) == MOST_DEPTH:
-            raise SceneError(f"elements nested deeper than {MOST_DEPTH}, this is no OpenSim model")
-        node: Any = super().start(tag, attributes)
-        node.owner = self.open[-1] if self.open else None
-        self.open.append(node)
-        return node
-
-    def end(self, tag: str, /) -> ElementTree.Element:
-        self.open.pop()
-        return super().end(tag)
+def _link(root: Node) -> Node:
+    """The root, every element with its owner; SceneError where they are nested too deep."""
+    level = [root]
+    for _ in range(MOST_DEPTH):
+        for owner in level:
+            for node in owner.nodes():
+                node.owner = owner
+        level = [node for owner in level for node in owner.nodes()]
+    if level:
+        raise SceneError(f"elements nested deeper than {MOST_DEPTH}, this is no OpenSim model")
+    return root
 
 
 def _as_utf8(data):
@@ -159,17 +150,16 @@ def read_xml(path: Path) -> Node:
             data = file.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
             raise SceneError(f"more than {MOST_BYTES / 1e6:.0f} MB, this is no OpenSim model")
-        parser = ElementTree.XMLParser(target=_Builder())
+        builder = ElementTree.TreeBuilder(element_factory=Node)
+        parser = defusedxml.ElementTree.DefusedXMLParser(target=builder, forbid_dtd=True)
         parser.feed(_as_utf8(data).replace(b"::", b"__"))  # nine published models have such names
-        return cast("Node", parser.close())
+        return _link(cast("Node", parser.close()))
     except OSError as error:
         reason = f"cannot read the model: {error.strerror}"
     except SceneError as error:
         reason = str(error)
-    except (
-        ElementTree.ParseError,
-        ValueError,
-        LookupError,
-    ) as error:  # the latter of an unknown encoding
+    except defusedxml.DefusedXmlException:
+        reason = "has a DOCTYPE or entities, which no model needs; delete the declaration"
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # of an unknown encoding
         reason = f"not well-formed XML: {' '.join(str(error).split())[:100]}"
     raise SceneError(f"{path}: {reason}") from None

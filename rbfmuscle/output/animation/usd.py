@@ -29,7 +29,8 @@ def write_usd(path: Path, run: MovingRun) -> None:
 
     Time codes count 24 a second. A surface that keeps its vertices has its topology once and its
     points at every time; another one has both at every time. Lengths stay in the run's unit, named
-    by ``metersPerUnit``; the root brings superior to z.
+    by ``metersPerUnit``; the root brings superior to z. The default value of whatever is sampled is
+    that of the first frame.
     """
     from pxr import Gf, Usd, UsdGeom
 
@@ -65,16 +66,18 @@ def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
     from pxr import Gf, UsdGeom, Vt
 
     for k, (vertices, faces) in enumerate(zip(part.vertices, part.faces)):
-        at = (codes[k],) if part.poses is None else ()
+        at = [codes[k]] if part.poses is None else []
         if k == 0 or not part.keeps_vertices:
-            topology_at = () if part.keeps_vertices else at
+            topology_at = [] if part.keeps_vertices else at
             corners = np.ascontiguousarray(faces, dtype=np.int32).ravel()
-            mesh.CreateFaceVertexCountsAttr().Set(Vt.IntArray(len(faces), 3), *topology_at)
-            mesh.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(corners), *topology_at)
+            counts = Vt.IntArray(len(faces), 3)
+            _set(mesh.CreateFaceVertexCountsAttr(), counts, topology_at, first=k == 0)
+            corners = Vt.IntArray.FromNumpy(corners)
+            _set(mesh.CreateFaceVertexIndicesAttr(), corners, topology_at, first=k == 0)
         points = np.ascontiguousarray(vertices, dtype=np.float32)
         extent = np.stack([points.min(axis=0), points.max(axis=0)])
-        mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(points), *at)
-        mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), *at)
+        _set(mesh.CreatePointsAttr(), Vt.Vec3fArray.FromNumpy(points), at, first=k == 0)
+        _set(mesh.CreateExtentAttr(), Vt.Vec3fArray.FromNumpy(extent), at, first=k == 0)
     if part.poses is not None:
         # Without normals a surface that is no subdivision surface is drawn facet by facet.
         normals = np.ascontiguousarray(
@@ -83,8 +86,18 @@ def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
         mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         place = mesh.AddTransformOp()
-        for code, pose in zip(codes, part.poses):
-            place.Set(Gf.Matrix4d(pose.T), *((code,) if part.moves else ()))
+        for k, (code, pose) in enumerate(zip(codes, part.poses)):
+            _set(place, Gf.Matrix4d(pose.T), [code] if part.moves else [], first=k == 0)
+
+
+def _set(attribute: Any, value: Any, at: list[float], *, first: bool) -> None:
+    """Give an attribute a value at time codes; without any, or of the first frame, as its default
+    too.
+    """
+    if first or not at:
+        attribute.Set(value)
+    for code in at:
+        attribute.Set(value, code)
 
 
 def identifier(name: str, used: set[str]) -> str:

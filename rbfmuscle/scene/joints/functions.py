@@ -1,4 +1,4 @@
-"""Functions of joint coordinates: linear, polynomial, piecewise linear, splines.
+"""Functions of joint coordinates: linear, polynomials, piecewise linear, splines.
 
 Each takes the values of its coordinates in order and returns one number; those of one variable take
 the first. ``rescaled`` gives the function in other units, ``g(f_k q_k) = output * self(q)``, f the
@@ -6,6 +6,7 @@ the first. ``rescaled`` gives the function in other units, ``g(f_k q_k) = output
 """
 
 import bisect
+import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -105,12 +106,40 @@ class Spline(PiecewiseLinear):
     degree = 3
 
 
-Function = Linear | Polynomial | PiecewiseLinear
+@dataclass(frozen=True)
+class Multivariate:
+    """A polynomial of several coordinates: of each term the coefficient, then the power of each."""
+
+    terms: tuple[tuple[float, ...], ...]
+
+    def __call__(self, *values: float) -> float:
+        """Value at these coordinates."""
+        return sum(c * math.prod(map(pow, values, powers)) for c, *powers in self.terms)
+
+    def rescaled(self, inputs: list[float], output: float) -> "Multivariate":
+        """Return the function in other units."""
+        factors = [output / math.prod(map(pow, inputs, powers)) for _, *powers in self.terms]
+        return Multivariate(
+            tuple((c * factor, *powers) for factor, (c, *powers) in zip(factors, self.terms))
+        )
+
+
+Function = Linear | Polynomial | PiecewiseLinear | Multivariate
+
+
+def exponents(dimension: int, order: int) -> np.ndarray:
+    """Return the exponents (m, d) of every term up to an order, the last coordinate's going
+    fastest, as OpenSim's.
+    """
+    powers = itertools.product(range(order + 1), repeat=dimension)
+    return np.array([power for power in powers if sum(power) <= order])
 
 
 def scaled(function: Function, factor: float) -> Function:
     """Return ``factor`` times a function."""
     count = len(function.slopes) if isinstance(function, Linear) else 1
+    if isinstance(function, Multivariate):
+        count = max((len(term) - 1 for term in function.terms), default=1)
     return function.rescaled([1.0] * count, factor)
 
 

@@ -104,6 +104,10 @@ class Joint:
     translations: tuple[TransformAxis, ...] = ()
     kind: str = "ball"  # a key of KINDS
     backward: bool = False  # written from child to parent: its motion is inverted
+    # What the third axis carries as the joint turns: a point of an ellipsoid with these radii along
+    # the three axes, where its normal is that axis; or the end of an arc of this length.
+    radii: tuple[float, float, float] | None = None
+    arc: float = 0.0
 
     def motion(self, values: dict[str, float], rest: dict[str, float]) -> np.ndarray:
         """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity
@@ -137,7 +141,23 @@ class Joint:
         for axis in self.rotations:
             if angle := axis.amount(values):
                 transform = transform @ rotation_about(axis.direction, angle, self.centre)
+        if self.radii is not None or self.arc:
+            transform[:3, 3] += self._carried(transform[:3, :3])
         return transform
+
+    def _carried(self, turn):
+        """Shift (3,) of what the third axis carries, the joint turned by ``turn`` (3, 3)."""
+        axes = np.array([axis.direction for axis in self.rotations])
+        ahead = turn @ axes[2]
+        if self.radii is not None:
+            return (self.radii * (axes @ ahead)) @ axes
+        across = ahead - (ahead @ axes[2]) * axes[2]
+        sine = float(np.linalg.norm(across))
+        angle = math.atan2(sine, float(ahead @ axes[2]))
+        if angle < 1e-8:
+            return self.arc * axes[2]
+        beside = (1.0 - math.cos(angle)) / sine * across
+        return self.arc / angle * (math.sin(angle) * axes[2] + beside)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,14 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from rbfmuscle.scene.joints.functions import Function, Linear, PiecewiseLinear, Polynomial, Spline
+from rbfmuscle.scene.joints.functions import (
+    Function,
+    Linear,
+    Multivariate,
+    PiecewiseLinear,
+    Polynomial,
+    Spline,
+)
 from rbfmuscle.scene.joints.joint import (
     IDENTITY,
     KINDS,
@@ -26,7 +33,7 @@ from rbfmuscle.validation import SceneError, did_you_mean
 
 # What a number in a file is multiplied by.
 FACTORS = {"rotation": math.pi / 180.0, "translation": 1.0, "coupled": 1.0}
-FUNCTIONS = ("constant", "linear", "polynomial", "piecewise", "spline")
+FUNCTIONS = ("constant", "linear", "polynomial", "terms", "piecewise", "spline")
 
 
 class PointsTable(Table):
@@ -50,6 +57,7 @@ class FunctionTable(Table):
     constant: Finite | None = None
     linear: list[Finite] | None = Field(default=None, min_length=1)
     polynomial: list[Finite] | None = Field(default=None, min_length=1)
+    terms: list[list[Finite]] | None = Field(default=None, min_length=1)
     piecewise: PointsTable | None = None
     spline: PointsTable | None = None
 
@@ -68,6 +76,8 @@ class FunctionTable(Table):
             raise SceneError(f"{place}: {given[0]} is of 1 coordinate, {count} are given")
         elif self.polynomial is not None:
             found = Polynomial(tuple(self.polynomial))
+        elif self.terms is not None:
+            found = _multivariate(self.terms, count, place)
         elif points is not None:
             found = (Spline if self.spline else PiecewiseLinear)(tuple(points.x), tuple(points.y))
         else:
@@ -82,6 +92,14 @@ class FunctionTable(Table):
         """The first slope of a linear function, 0 of any other."""
         plain = all(getattr(self, name) is None for name in FUNCTIONS)
         return 1.0 if plain else (self.linear or [0.0])[0]
+
+
+def _multivariate(terms, count, place):
+    for term in terms:
+        if len(term) != count + 1 or any(power < 0 or power % 1 for power in term[1:]):
+            needed = f"a coefficient and the whole powers of {count} coordinates"
+            raise SceneError(f"{place}: each of terms is {needed}, got {term}")
+    return Multivariate(tuple((c, *map(int, powers)) for c, *powers in terms))
 
 
 class AxisTable(FunctionTable):
@@ -131,12 +149,16 @@ class JointTable(Table):
     rotations: list[AxisTable] = Field(default_factory=list, max_length=3)
     translations: list[AxisTable] = Field(default_factory=list, max_length=3)
     backward: bool = False
+    radii: Vector | None = None
+    arc: Finite = 0.0
 
     def joint(self) -> Joint:
         """Return the joint that the table describes, or raise SceneError naming it."""
         place = f"joint {self.name!r}"
         if self.centre is None and self.type != "fixed":
             raise SceneError(f"{place}: centre is missing, give the joint's place at rest")
+        if (self.radii or self.arc) and (self.type != "custom" or len(self.rotations) != 3):
+            raise SceneError(f"{place}: radii and arc need type 'custom' with three rotations")
         groups: dict[Any, list[AxisTable]] = {
             "rotation": self.rotations,
             "translation": self.translations,
@@ -172,9 +194,14 @@ class JointTable(Table):
         )
         centre = np.array(self.centre or (0.0, 0.0, 0.0))
         bones = self.parent, self.child
-        return Joint(
+        joint = Joint(
             self.name, *bones, centre, coordinates, turns, shifts, self.type, self.backward
         )
+        joint.arc = self.arc
+        if self.radii is not None:
+            x, y, z = self.radii
+            joint.radii = (x, y, z)
+        return joint
 
     def _axes_of_kind(self, place):
         """Tables of the rotations and of the translations that the kind has, each of one
@@ -249,6 +276,10 @@ def joint_row(joint: Joint) -> dict:
         row["coordinates"] = tables
     if joint.backward:
         row["backward"] = True
+    if joint.radii is not None:
+        row["radii"] = list(joint.radii)
+    if joint.arc:
+        row["arc"] = joint.arc
     return row
 
 
@@ -291,5 +322,7 @@ def _function_row(function: Function, inputs: Sequence[str], output: str) -> dic
         return {"linear": [*function.slopes, function.constant]}
     if isinstance(function, Polynomial):
         return {"polynomial": list(function.coefficients)}
+    if isinstance(function, Multivariate):
+        return {"terms": [list(term) for term in function.terms]}
     points = {"x": list(function.x), "y": list(function.y)}
     return {"spline" if isinstance(function, Spline) else "piecewise": points}

@@ -11,7 +11,7 @@ import rbfmuscle as rm
 from rbfmuscle.importers.opensim.elements import frame_at
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import import_osim, write_scene
-from rbfmuscle.scene.joints.joint import all_coordinates, resolve, rotation_about
+from rbfmuscle.scene.joints.joint import all_coordinates, rotation_about
 from rbfmuscle.scene.motion import bone_poses
 
 MODELS = (
@@ -48,7 +48,7 @@ def poses_of(found):
 def test_body_transforms_are_opensims(osim_data, name):
     path, found = reference(osim_data, name)
     model = read_osim(path)
-    kinds = {coordinate: facts.motion for coordinate, facts in model.coordinates().items()}
+    kinds = {name.split(".")[1]: facts.motion for name, facts in model.coordinates().items()}
     assert kinds == {row["name"]: KINDS[row["motion"]] for row in found["coordinates"]}
     for values, bodies in poses_of(found):
         got = model.transforms(values)
@@ -56,8 +56,8 @@ def test_body_transforms_are_opensims(osim_data, name):
             assert np.abs(got[body][:3, 3] - wanted[:, 3]).max() <= 1e-8
             assert np.abs(got[body][:3, :3] - wanted[:, :3]).max() <= 1e-7
         # Assembly meets couplers to 1e-10.
-        resolved = resolve(values, model.coordinates(), model.couplings)
-        assert all(abs(value - values[n]) < 2e-10 for n, value in resolved.items())
+        resolved = model.resolved(values)
+        assert all(abs(v - values[name.split(".")[1]]) < 2e-10 for name, v in resolved.items())
 
 
 @pytest.mark.parametrize("name", ["leg6dof9musc", "synthetic", "gait10dof18musc"])
@@ -105,12 +105,12 @@ class TestSmall:
             <Coordinate name="strut_angle"><range>-1 1</range></Coordinate>
             </coordinates>
             </PinJoint>"""
-        assert not any("closes a loop" in note for note in read_osim(small).notes)
+        assert not any("closes a loop" in doubt for doubt in read_osim(small).doubts)
         small.write_text(
             small.read_text(encoding="utf-8").replace("<SliderJoint", joint + "<SliderJoint")
         )
-        (note,) = [note for note in read_osim(small).notes if "closes a loop" in note]
-        assert "joint 'strut' (ground to shank)" in note
+        (doubt,) = [doubt for doubt in read_osim(small).doubts if "closes a loop" in doubt]
+        assert "strut (ground to shank) closes a loop with hip, knee" in doubt
 
 
 def test_ground_may_be_the_child(small):

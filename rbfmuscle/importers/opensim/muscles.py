@@ -1,0 +1,188 @@
+"""Muscles of a model and what their paths go around, as ``.osim`` files write them."""
+
+from collections import defaultdict
+
+import numpy as np
+
+from rbfmuscle.importers.opensim.elements import frame_at, read_function, socket
+from rbfmuscle.importers.opensim.joints import Reading
+from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
+from rbfmuscle.importers.opensim.xml import Node
+from rbfmuscle.scene.names import new_name
+from rbfmuscle.validation import SceneError
+
+# Force per area of muscle [N/m2] (Arnold et al. 2010, Ann Biomed Eng 38: 269; Rajagopal et al. 2016
+# have 60 N/cm2).
+SPECIFIC_TENSION = 61e4
+# What OpenSim takes where a muscle, and the defaults of its file, say nothing [N], [m].
+FORCE, FIBRE = 1000.0, 0.1
+ENDLESS = 1.0  # half the length [m] of a cylinder of contact geometry, which has no ends
+GEOMETRY = "GeometryPath"
+# Paths of other kinds, and sets of points beside a path, as old versions write them.
+PATHS = (GEOMETRY, "Scholz2015GeometryPath", "FunctionBasedPath")
+POINTS = ("PathPointSet", "MusclePointSet")
+WRAPS = ("PathWrapSet", "MuscleWrapSet")
+
+
+def read_muscles(reading: Reading, model: Node, forces: list[Node]) -> None:
+    """Add the muscles among the forces of a model; those that cannot be taken, and what else has a
+    path, are named.
+    """
+    shapes = _Shapes(reading, model)
+    others = defaultdict(list)
+    for force in forces:
+        path = next((force.child(tag) for tag in PATHS if force.child(tag) is not None), None)
+        if path is None and any(force.child(tag) is not None for tag in POINTS):
+            path = force
+        muscle = "Muscle" in force.tag or force.child("optimal_fiber_length") is not None
+        if not muscle:
+            others[force.tag] += [force.name or force.tag] if path is not None else []
+            continue
+        title = f"{force.tag} {force.name!r}"
+        try:
+            if path is None:
+                raise SceneError("it has no path; give it one")
+            if path.tag == "FunctionBasedPath":
+                why = "gives its length and no points; give it a mesh, or the model before"
+                raise SceneError(f"its FunctionBasedPath {why}")
+            reading.model.muscles.append(_read_muscle(reading, force, path, title, shapes))
+        except SceneError as error:
+            reading.model.doubts.append(f"{title} is not taken: {error}")
+    for tag, names in others.items():
+        if names:
+            reading.model.notes.append(f"{tag} is no muscle: {', '.join(names)} not taken")
+
+
+def _read_muscle(reading, force, path, title, shapes):
+    resting = reading.model.resolved()
+    points, wraps = [], []
+    if path.tag == "Scholz2015GeometryPath":
+        for element in path.objects("path_elements"):
+            inner = next((node for node in element.nodes() if node.tag.endswith("Point")), None)
+            if inner is not None:
+                points.append(_path_point(inner, reading, resting))
+            else:
+                shape = shapes.obstacle(element, title)
+                wraps += [] if shape is None else [shape]
+    else:
+        for tag in POINTS:
+            points += [_path_point(point, reading, resting) for point in path.objects(tag)]
+        for tag in WRAPS:
+            found = [shapes.wrap(wrap.word("wrap_object"), title) for wrap in path.objects(tag)]
+            wraps += [shape for shape in found if shape is not None]
+    force_most = force.number("max_isometric_force", FORCE)
+    volume = force_most * force.number("optimal_fiber_length", FIBRE) / SPECIFIC_TENSION
+    name = new_name(force.name or force.tag, [one.name for one in reading.model.muscles])
+    kept = [point for point in points if point is not None]
+    return ModelMuscle(name, kept, wraps, volume, title)
+
+
+class _Shapes:
+    """What paths go around: wrapping objects by owner, and contact geometry by its path."""
+
+    def __init__(self, reading: Reading, model: Node) -> None:
+        self._notes = reading.model.notes
+        self._frames = reading.frames
+        self._wraps: dict[str, list[Node]] = defaultdict(list)
+        for node in model.iter("WrapObjectSet"):
+            for shape in node.owner.objects("WrapObjectSet"):
+                self._wraps[shape.name].append(shape)
+        self._geometry = {
+            node.path: node for node in model.iter() if node.tag.startswith("Contact")
+        }
+
+    def wrap(self, name: str, title: str) -> WrapShape | None:
+        """A wrapping object by its name, or by owner and name; None where it is not taken.
+
+        Of several of one name it is the first, as OpenSim takes it.
+        """
+        words = [word for word in name.strip().split("/") if word != "wrapobjectset"]
+        found = self._wraps.get(words[-1], [])
+        found = [s for s in found if len(words) > 1 and _owner(s).name == words[-2]] or found
+        if not found:
+            self._note(f"{title}: there is no wrapping object {name!r}; correct its path")
+            return None
+        shape = found[0]
+        body, frame = self._place(shape)
+        if len(found) > 1:
+            where = f"the first, on {body}, is taken, as OpenSim does"
+            self._note(f"{len(found)} wrapping objects are named {name!r}: {where}")
+        radii = _radii(shape)
+        if radii is None:
+            self._note(f"{title}: its wrapping object {name!r} ({shape.tag}) is not taken")
+            return None
+        if not shape.truth("active", True) or min(radii) <= 0.0:
+            return None
+        own = frame_at(shape.vector("translation"), shape.vector("xyz_body_rotation").tolist())
+        quadrant = shape.word("quadrant", "all").lower().removeprefix("+").replace("all", "")
+        return WrapShape(body, frame @ own, np.array(radii), shape.tag, quadrant)
+
+    def obstacle(self, element: Node, title: str) -> WrapShape | None:
+        """The contact geometry that a path goes around, on the side of its hint."""
+        name = socket(element, "contact_geometry")
+        shape = self._geometry.get(name)
+        radii = None if shape is None else _radii(shape)
+        if shape is None or radii is None:
+            what = f"obstacle {name!r} ({'not there' if shape is None else shape.tag})"
+            self._note(f"{title}: its {what} is not taken")
+            return None
+        body, frame = self._frames.place(socket(shape, "frame"), inside=shape.path)
+        own = frame_at(shape.vector("location"), shape.vector("orientation").tolist())
+        hint = element.vector("contact_hint")[: 2 if shape.tag == "ContactCylinder" else 3]
+        k = int(np.argmax(np.abs(hint)))
+        quadrant = "" if hint[k] == 0.0 else f"{'-' if hint[k] < 0.0 else ''}{'xyz'[k]}"
+        kind = shape.tag.replace("Contact", "Wrap")
+        return WrapShape(body, frame @ own, np.array(radii), kind, quadrant)
+
+    def _place(self, shape):
+        owner = _owner(shape)
+        return self._frames.place(owner.name if owner.tag == "Body" else owner.path)
+
+    def _note(self, text):
+        if text not in self._notes:
+            self._notes.append(text)
+
+
+def _owner(shape):
+    """The body or frame that a wrapping object stands in."""
+    owner = shape.owner
+    while owner.tag in ("objects", "WrapObjectSet"):
+        owner = owner.owner
+    return owner
+
+
+def _radii(shape):
+    """Radii along x, y and z [m], of a cylinder with half its length; None of other shapes."""
+    kind = shape.tag.replace("Wrap", "Contact")
+    if kind == "ContactCylinder":
+        half = 0.5 * shape.number("length", 2.0 * ENDLESS if shape.tag == kind else 0.0)
+        return [shape.number("radius")] * 2 + [half]
+    if kind == "ContactSphere":
+        return [shape.number("radius")] * 3
+    if kind == "ContactEllipsoid":
+        return shape.numbers("radii" if shape.tag == kind else "dimensions", "0 0 0", count=3)
+    return None
+
+
+def _path_point(point, reading, resting):
+    """Body and place in it of a path point where coordinates are at their defaults; None where it
+    is not active.
+    """
+    where = socket(point, "parent_frame") or point.word("body")
+    body, frame = reading.frames.place(where, inside=point.path)
+
+    def value_of(tag):
+        named = point.word(f"socket_{tag}") or point.word(tag) or point.word(f"{tag}_name")
+        return resting.get(reading.coordinate(named), 0.0)
+
+    if point.tag in ("ConditionalPathPoint", "MuscleViaPoint"):
+        low, high = point.numbers("range", "-1e9 1e9", count=2)
+        if not low <= value_of("coordinate") <= high:
+            return None
+    at = point.vector("location")
+    if point.tag in ("MovingPathPoint", "MovingMusclePoint"):
+        for k, axis in enumerate("xyz"):
+            function = read_function(point.child(f"{axis}_location"))
+            if function is not None:
+                at[k] = function(value_of(f"{axis}_coordinate"))
+    return body, frame[:3, :3] @ at + frame[:3, 3]

@@ -1,0 +1,29 @@
+"""Names that a scene may have, from names of any kind."""
+
+import re
+import unicodedata
+from collections.abc import Iterable
+
+
+def plain_name(name: str) -> str:
+    """A name as a scene may have it, of letters, digits, ``_`` and ``-``.
+
+    Accents are dropped; letters of other scripts become ``u`` and their number, so that different
+    names stay different.
+    """
+    words = []
+    for letter in name.strip():
+        plain = unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode()
+        other = letter.isalnum() and not plain
+        words.append(f"u{ord(letter):04x}" if other else plain or " ")
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", "".join(words)) or "_"
+
+
+def new_name(name: str, taken: Iterable[str]) -> str:
+    """The plain name, numbered where it is taken."""
+    plain, number = plain_name(name), 2
+    found = plain
+    while found in taken:
+        found = f"{plain}_{number}"
+        number += 1
+    return found
