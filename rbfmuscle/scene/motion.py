@@ -279,7 +279,8 @@ def read_motion_file(
     for column, label in enumerate(labels):
         name = match_label(label, list(facts))
         if name is None and label.lower() != "time":
-            unknown.append(label)
+            several = [full for full in facts if full.split(".", 1)[1] == label.split("/")[-1]]
+            unknown.append(f"{label} (of {' or '.join(several)})" if several else label)
         if name in columns:
             raise SceneError(
                 f"[motion]: {path} has two columns of coordinate {name!r}, leave one out"

@@ -84,6 +84,19 @@ class TestUsd:
         # Topology once, bones rigid.
         assert [samples.GetNumTimeSamples() for samples in numbers] == [0, 7, 0, 7, 0]
 
+    def test_default_values_are_those_of_the_first_frame(self, folder, truth, tmp_path):
+        from pxr import Usd, UsdGeom
+
+        (path,) = export_run(folder, "usd", output=tmp_path)
+        stage, meshes = self.read(path)
+        for name, prim in meshes.items():
+            found = self.world(stage, prim, Usd.TimeCode.Default())
+            np.testing.assert_allclose(found, truth[name, 0], rtol=0, atol=TOLERANCE)
+            points = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get())
+            extent = np.array(UsdGeom.Mesh(prim).GetExtentAttr().Get())
+            np.testing.assert_array_equal(extent, [points.min(axis=0), points.max(axis=0)])
+            assert len(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get())
+
     def test_changing_surface_has_its_topology_at_every_time(self, changing, tmp_path):
         from pxr import UsdGeom
 

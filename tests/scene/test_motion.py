@@ -74,6 +74,38 @@ class TestOpenSimFile:
         frames = chain().set_motion(file="walk.mot", folder=tmp_path).motion.frames
         assert frames == [{"two.bend": 0.5, "one.turn": 1.0}]
 
+    def notes(self, tmp_path, rows, flag="yes", **changed):
+        path = self.write(tmp_path, rows, flag)
+        for before, after in changed.items():
+            path.write_text(path.read_text(encoding="utf-8").replace(before, after, 1))
+        return chain().set_motion(file="walk.mot", folder=tmp_path).motion.notes
+
+    def test_a_whole_file_has_no_notes(self, tmp_path):
+        assert not self.notes(tmp_path, "0 10 20\n0.1 11 21\n")
+
+    def test_columns_of_no_coordinate_are_named_in_one_line(self, tmp_path):
+        (note,) = self.notes(tmp_path, "0 10 20\n0.1 11 21\n", bend="knee.activation")
+        assert note.endswith("columns of no coordinate of the scene are not used: knee.activation")
+
+    def test_a_column_that_several_joints_have_names_them(self, tmp_path):
+        self.write(tmp_path, "0 10 20\n0.1 11 21\n")
+        scene = chain().add_joint("three", "c", "d", (30, 0, 0), {"bend": (0, 1, 0)})
+        (note,) = scene.set_motion(file="walk.mot", folder=tmp_path).motion.notes
+        assert note.endswith("are not used: bend (of two.bend or three.bend)")
+
+    def test_rows_that_are_missing_are_counted(self, tmp_path):
+        (note,) = self.notes(tmp_path, "0 10 20\n")
+        assert "nRows says 2, 1 rows are there" in note
+
+    def test_times_that_do_not_increase_are_named(self, tmp_path):
+        (note,) = self.notes(tmp_path, "0 1 2\n0.1 1 2\n0.1 2 3\n0.05 2 3\n", nRows="row_s")
+        assert "2 times do not increase, the first after row 2, 0.1 and 0.1 s" in note
+
+    def test_radians_that_can_only_be_degrees_are_questioned(self, tmp_path):
+        (note,) = self.notes(tmp_path, "0 0 20\n0.1 1 60\n", flag="no")
+        assert "one.turn reaches 60 radians, 9.55 turns: does the file mean degrees" in note
+        assert not self.notes(tmp_path, "0 0 2\n0.1 1 6\n", flag="no")
+
     @pytest.mark.parametrize("rows", ["0 1\n", "0 x 1\n", "0 nan 1\n", "", "\n"])
     def test_bad_rows(self, tmp_path, rows):
         self.write(tmp_path, rows)

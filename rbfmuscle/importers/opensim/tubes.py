@@ -17,16 +17,16 @@ from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.validation import SceneError
 
 # Sections along a tube; radius at the ends against the middle; share of the length held at an end.
-SECTIONS = 48
+SECTIONS = 28
 END_RADIUS = 0.3
 HELD = 0.06
-ENDS = 5  # sections at either end that may lie in bones
+ENDS = 3  # sections at either end that may lie in bones
 # Of bones that a tube lies on: the gap left [m], the depth to which its vertices are brought out
 # [m], and how often, as what leaves one bone may enter another.
 MARGIN, FLATTENED, FLATTENINGS = 5e-4, 0.03, 8
-FITTINGS = 6  # rounds in which the radius is fitted to the volume
+FITTINGS = 4  # rounds in which the radius is fitted to the volume
 # A tube is smooth: fewer points of its surface and a coarser mesh show and bound it as well.
-TUBE_MODEL = {"name": "rbf", "samples": 1200, "resolution": 60}
+TUBE_MODEL = {"name": "rbf", "samples": 800, "resolution": 40}
 ROUNDS = 60  # rounds in which the middle line is drawn straight and put out of what is in its way
 
 
@@ -72,9 +72,16 @@ def make_tube(
     line = _clear_line(line, fixed, radius, wraps, list(bones.values()))
     held = _held(bodies, fixed, bones)
     free = np.setdiff1d(np.arange(SECTIONS * SIDES + 2), np.concatenate(list(held.values())))
+    reach = FLATTENED + 2.0 * float(radius.max())
+    low, high = line.min(axis=0) - reach, line.max(axis=0) + reach
+    near = [
+        bone
+        for bone in bones.values()
+        if (bone.vertices.min(axis=0) < high).all() and (bone.vertices.max(axis=0) > low).all()
+    ]
     for _ in range(FITTINGS):
         vertices, faces = tube_mesh(line, radius)
-        vertices = _beside_bones(vertices, faces, free, list(bones.values()))
+        vertices = _beside_bones(vertices, faces, free, near)
         # As its square, but for where sections run into each other or lie flat on a bone.
         radius = radius * np.sqrt(muscle.volume / mesh_volume(vertices, faces))
     return Tube(vertices, faces, held)
