@@ -84,12 +84,11 @@ class _Shapes:
         self._notes = reading.model.notes
         self._frames = reading.frames
         self._wraps: dict[str, list[Node]] = defaultdict(list)
-        for node in model.iter("WrapObjectSet"):
-            for shape in node.owner.objects("WrapObjectSet"):
+        nodes = [node for node in model.iter() if isinstance(node, Node)]
+        for owner in nodes:
+            for shape in owner.objects("WrapObjectSet"):
                 self._wraps[shape.name].append(shape)
-        self._geometry = {
-            node.path: node for node in model.iter() if node.tag.startswith("Contact")
-        }
+        self._geometry = {node.path: node for node in nodes if node.tag.startswith("Contact")}
 
     def wrap(self, name: str, title: str) -> WrapShape | None:
         """A wrapping object by its name, or by owner and name; None where it is not taken.

@@ -26,7 +26,7 @@ ENDS = 3  # sections at either end that may lie in bones
 MARGIN, FLATTENED, FLATTENINGS = 5e-4, 0.03, 8
 FITTINGS = 4  # rounds in which the radius is fitted to the volume
 # A tube is smooth: fewer points of its surface and a coarser mesh show and bound it as well.
-TUBE_MODEL = {"name": "rbf", "samples": 800, "resolution": 40}
+TUBE_MODEL = {"name": "rbf", "samples": 1200, "resolution": 60}
 ROUNDS = 60  # rounds in which the middle line is drawn straight and put out of what is in its way
 
 

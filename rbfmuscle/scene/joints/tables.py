@@ -192,16 +192,18 @@ class JointTable(Table):
             tuple(axis(motion, number, table) for number, table in enumerate(group, 1))
             for motion, group in groups.items()
         )
+        return self._made(coordinates, turns, shifts)
+
+    def _made(self, coordinates, turns, shifts):
+        """The joint of these coordinates, rotations and translations."""
         centre = np.array(self.centre or (0.0, 0.0, 0.0))
-        bones = self.parent, self.child
-        joint = Joint(
-            self.name, *bones, centre, coordinates, turns, shifts, self.type, self.backward
-        )
-        joint.arc = self.arc
+        radii = None
         if self.radii is not None:
             x, y, z = self.radii
-            joint.radii = (x, y, z)
-        return joint
+            radii = x, y, z
+        bones = self.parent, self.child
+        motions = coordinates, turns, shifts, self.type, self.backward
+        return Joint(self.name, *bones, centre, *motions, radii, self.arc)
 
     def _axes_of_kind(self, place):
         """Tables of the rotations and of the translations that the kind has, each of one
