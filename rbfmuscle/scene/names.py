@@ -19,11 +19,12 @@ def plain_name(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "_", "".join(words)) or "_"
 
 
-def new_name(name: str, taken: Iterable[str]) -> str:
-    """The plain name, numbered where it is taken."""
+def new_name(name: str, taken: Iterable[str], *, file: bool = True) -> str:
+    """The plain name, numbered where it is taken; of a ``file`` in letters of another case too."""
     plain, number = plain_name(name), 2
+    known = {one.lower() if file else one for one in taken} | {"all"}  # that is the whole scene
     found = plain
-    while found in taken:
+    while (found.lower() if file else found) in known:
         found = f"{plain}_{number}"
         number += 1
     return found

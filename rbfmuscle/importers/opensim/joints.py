@@ -64,12 +64,12 @@ def read_joint(reading: Reading, node: Node, ends: list[End], holder: str) -> No
             f"{parent} to {child}: its kind {why}; replace it by a CustomJoint in OpenSim"
         )
     taken = [joint.name for joint in model.joints]
-    name = new_name(node.name, taken)
+    name = new_name(node.name, taken, file=False)
     found, names = _coordinates(node, holder, kind)
     # Scene names of the coordinates, by the file's.
     plain: dict[str, str] = {}
     for one in names:
-        plain[one] = new_name(one, plain.values())
+        plain[one] = new_name(one, plain.values(), file=False)
     axes = _axes(node, kind, names)
     joints = [ModelJoint(name, parent, child, np.zeros(3), {}, kind=kind)]
     joints[0].parent_frame, joints[0].child_frame = first, second

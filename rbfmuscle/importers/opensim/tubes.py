@@ -24,7 +24,8 @@ ENDS = 3  # sections at either end that may lie in bones
 # Of bones that a tube lies on: the gap left [m], the depth to which its vertices are brought out
 # [m], and how often, as what leaves one bone may enter another.
 MARGIN, FLATTENED, FLATTENINGS = 5e-4, 0.03, 8
-FITTINGS = 4  # rounds in which the radius is fitted to the volume
+# Rounds in which the radius is fitted to the volume, at most, and the share of it that is left.
+FITTINGS, FITTED = 12, 1e-8
 # A tube is smooth: fewer points of its surface and a coarser mesh show and bound it as well.
 TUBE_MODEL = {"name": "rbf", "samples": 1200, "resolution": 60}
 ROUNDS = 60  # rounds in which the middle line is drawn straight and put out of what is in its way
@@ -83,7 +84,10 @@ def make_tube(
         vertices, faces = tube_mesh(line, radius)
         vertices = _beside_bones(vertices, faces, free, near)
         # As its square, but for where sections run into each other or lie flat on a bone.
-        radius = radius * np.sqrt(muscle.volume / mesh_volume(vertices, faces))
+        ratio = float(np.sqrt(muscle.volume / mesh_volume(vertices, faces)))
+        if abs(ratio - 1.0) < FITTED:
+            break
+        radius = radius * ratio
     return Tube(vertices, faces, held)
 
 

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from command_line import call
 from conftest import ROOT
 from osim_text import (
     axis_joint,
@@ -83,6 +84,14 @@ class TestRoots:
         warned = [f.message for f in scene.check() if f.level == "warning"]
         assert [message.split("'")[1] for message in warned] == ["upper", "alone"]
         check_written(tmp_path, {"knee.knee_q": 0.9, "root.root_q": -0.3})
+
+
+def test_a_scene_in_which_no_bone_has_a_mesh_is_a_note_and_not_usable(read, tmp_path, capsys):
+    read(model("a", [pin("p", "ground", "a")]))
+    path = write_scene(import_osim(tmp_path / "m.osim"), tmp_path / "s")
+    code, out, err = call(capsys, "check", path)
+    assert code == 3 and out.count("note: m: no bone has a mesh") == 1
+    assert "not usable" in err and "bug" not in err
 
 
 class TestLoops:

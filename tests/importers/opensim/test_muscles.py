@@ -52,6 +52,18 @@ def test_path_goes_around_a_cylinder_on_the_side_that_it_says(quadrant, side):
     assert away.min() > 0.0298 and side * middles[len(middles) // 2, 0] > 0.02
 
 
+def test_tube_lies_flat_on_a_bone_in_its_way_and_keeps_its_volume():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.02)
+    ball.apply_translation([0.025, 0.0, 0.15])
+    bones = _bones("a", "b", "c") | {"ball": ExactDistance(ball.vertices, ball.faces)}
+    points = [("a", np.zeros(3)), ("b", np.array([0.0, 0.0, 0.3]))]
+    tube = make_tube(ModelMuscle("m", points, volume=1e-4), PLACES, bones, HELD_BY)
+    away = np.linalg.norm(tube.vertices - [0.025, 0.0, 0.15], axis=1) - 0.02
+    assert 0.0 < away.min() < 0.001
+    mesh = trimesh.Trimesh(tube.vertices, tube.faces, process=False)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(1e-4, rel=1e-7)
+
+
 def test_muscle_without_a_bone_to_hold_it_is_named():
     muscle = ModelMuscle("m", [("a", np.zeros(3)), ("b", np.ones(3))], volume=1e-4)
     with pytest.raises(SceneError, match="body 'b' has no mesh"):
