@@ -3,7 +3,7 @@ muscle.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import RestState
 from pbd_baseline.shapes import METHODS, Method
 from rbfmuscle.geometry.harmonic import blended_motion
+from rbfmuscle.geometry.interpolation import SurfaceInterpolation
 from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
@@ -144,6 +145,13 @@ class PBDMuscle:
         vertices = np.empty_like(self.points)
         vertices[self.rest.order] = self.points
         return vertices, self.rest.order[self.rest.topology.faces]
+
+    def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
+        """What gives the present places (n, 3) of points (n, 3) of the muscle at rest, by
+        interpolation of the displacement of the surface.
+        """
+        inside = SurfaceInterpolation(self.rest.vertices, points)
+        return lambda: inside(self.points)
 
     def carried_mesh(self) -> Mesh:
         """That of the material."""

@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from typing import Any
 
+from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
@@ -107,6 +108,7 @@ class Recording:
             self._models = build_models(self.scene)
             carried = {model.name: model.material_mesh() for model in self._models}
             self._measures = MuscleMeasures(self.scene, carried)
+            self._bundles = build_bundles(self.scene, self._models)
         self._fields = fields
 
     def feed(
@@ -176,6 +178,7 @@ class Recording:
         for coordinates in self.scene.motion.frames:
             with timed(self.times, "simulate"):
                 frame = loop.advance(coordinates)
+                frame.fibres = {name: bundle.at(frame) for name, bundle in self._bundles.items()}
             with timed(self.times, "metrics"):
                 measured = self._measures.measure(frame)
             yield frame, measured

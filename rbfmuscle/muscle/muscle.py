@@ -1,6 +1,6 @@
 """RBFMuscle: an implicit RBF surface whose centres move with an elastic solid."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -78,15 +78,15 @@ class RBFMuscle:
         self.rest = RestState.from_muscle(muscle, scene, self.options)
         self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options)
         self.frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
-        lattice = Lattice(self.frame.local, np.asarray(muscle.mesh.faces), self.options.nodes)
+        self._lattice = Lattice(self.frame.local, np.asarray(muscle.mesh.faces), self.options.nodes)
         self.model = _build_solid(
-            muscle, scene.joints, lattice, self.frame, self.rest, self.options
+            muscle, scene.joints, self._lattice, self.frame, self.rest, self.options
         )
         self.state = rest_state(self.model)
         self._stiffness = stiffness(self.model, 0.0)
         shown = self.drawer.shown
-        self._shown = None if shown is None else embed(lattice, self.frame, shown.rest)
-        self._normals_at = lattice_slopes(lattice, self.frame, self.rest.centres)
+        self._shown = None if shown is None else embed(self._lattice, self.frame, shown.rest)
+        self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
         names = scene.holders(muscle)
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
         owner = attached_owner(self.model)
@@ -179,6 +179,11 @@ class RBFMuscle:
     def field(self) -> RBFField:
         """The RBF field through the present centres."""
         return self.rest.field(self.points, self.normals())
+
+    def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
+        """What gives the present places (n, 3) of points (n, 3) of the muscle at rest."""
+        embedding = embed(self._lattice, self.frame, points)
+        return lambda: carry(embedding, self.state.shown)
 
     def carried_mesh(self) -> Mesh:
         """The shown mesh where the solid carries it; the samples where marching cubes show the

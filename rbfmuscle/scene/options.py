@@ -194,11 +194,20 @@ def _accept_format(value: object) -> object:
     return value
 
 
+DEFAULT_FIBRES, MOST_FIBRES = 32, 1000
+
+
+def _accept_true(value: object) -> object:
+    """True stands for the usual number of fibres, false for none."""
+    return DEFAULT_FIBRES * value if isinstance(value, bool) else value
+
+
 class OutputOptions(Table):
-    """``[output]``: which files a run writes."""
+    """``[output]``: which files a run writes, and how many fibres of each muscle it follows."""
 
     surfaces: Annotated[bool, BeforeValidator(_accept_format)] = True
     tendons: bool = True
+    fibres: Annotated[int, Field(ge=0, le=MOST_FIBRES), BeforeValidator(_accept_true)] = 0
     report: bool = True
 
 

@@ -1,8 +1,8 @@
 """The data of a frame, and the interface that a muscle model implements."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -60,6 +60,23 @@ class ModelSurface:
         return ModelSurface(vertices, self.faces, quantities, notes, (self, motion))
 
 
+class FibreLines(NamedTuple):
+    """Fibres of a muscle, from origin to insertion, with the tendons at their ends.
+
+    Points (N, k, 3) of the lines [scene unit], the stretch (N,) of each fibre, its length without
+    tendons over that at rest, and at its points (N, k), 1 in tendons.
+    """
+
+    points: np.ndarray
+    stretch: np.ndarray
+    local_stretch: np.ndarray
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Of each fibre with its tendons (N,) [scene unit]."""
+        return np.linalg.norm(np.diff(self.points, axis=1), axis=2).sum(axis=1)
+
+
 @dataclass
 class Frame:
     """One written frame."""
@@ -84,6 +101,8 @@ class Frame:
     neighbours: dict = field(default_factory=dict)
     # TendonLine by the end that each holds; the poses have these too
     tendons: dict = field(default_factory=dict)
+    # FibreLines by muscle, where the scene asks for them
+    fibres: Mapping[str, FibreLines] = field(default_factory=dict, repr=False)
 
 
 class SolveLog:
@@ -149,6 +168,9 @@ class MuscleModel(Protocol):
 
     def material_mesh(self) -> Mesh:
         """Vertices and faces of a surface of constant topology that moves with the material."""
+
+    def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
+        """What gives the present places (n, 3) of points (n, 3) of the muscle at rest."""
 
     def carried_mesh(self) -> Mesh:
         """Vertices and faces of the mesh that is shown, where the material takes it."""

@@ -1,0 +1,1 @@
+"""Muscle fibres as lines: traced at rest, carried by the material, measured."""

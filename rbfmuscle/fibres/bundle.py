@@ -1,0 +1,141 @@
+"""The fibres of one muscle over a motion: traced at rest, carried by the material and the bones."""
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from rbfmuscle.fibres.trace import POINTS, trace_fibres
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.threads import each
+from rbfmuscle.metrics.centreline import moving_joints, split_ends
+from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bones_about
+from rbfmuscle.scene.objects import Attachment, Muscle
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.tendons import NODES, TendonLine
+from rbfmuscle.simulation.frame import FibreLines, Frame, MuscleModel
+from rbfmuscle.validation import SceneWarning
+
+PATCH_POINTS = 3000  # of an end
+
+
+class FibreBundle:
+    """Fibres of a muscle at rest, and what carries them.
+
+    Inner points go with the material, as the ``model`` says; the ends go with the bones, or with
+    the ends of tendons, that hold the patches they lie on.
+    """
+
+    def __init__(self, muscle: Muscle, scene: Scene, model: MuscleModel, count: int) -> None:
+        mesh = MeshDistance(muscle.mesh.vertices, muscle.mesh.faces)
+        groups = split_ends(muscle, scene.joints, moving_joints(scene))
+        patches = [_end_points(mesh, group) for group in groups]
+        probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
+        near = bones_about(mesh.vertices, probes, {probe.name: np.eye(4) for probe in probes})
+        ends = (patches[0][0], patches[1][0])
+        traced = trace_fibres(mesh, ends, count, polylines=muscle.fibres, bones=near)
+        self.rest = traced.lines
+        self.holders = [a.holder for group in groups for a in group]
+        first = patches[0][1][traced.ends[:, 0]]
+        last = len(groups[0]) + patches[1][1][traced.ends[:, 1]]
+        self._held = np.stack([first, last], axis=1)  # place in holders of each end
+        self._segments = _segments(self.rest)
+        self._follow = model.follower(np.ascontiguousarray(self.rest.reshape(-1, 3)))
+        self._tendon = [[a.tendon is not None for a in group] for group in groups]
+
+    def at(self, frame: Frame) -> FibreLines:
+        """The fibres in a frame to which the model has just come."""
+        belly = self._follow().reshape(self.rest.shape)
+        for end, place in ((0, 0), (1, POINTS - 1)):
+            belly[:, place] = self._carried(end, place, frame)
+        now = _segments(belly)
+        ratio = now / self._segments
+        local = np.empty((len(belly), POINTS))
+        local[:, 1:-1] = 0.5 * (ratio[:, 1:] + ratio[:, :-1])
+        local[:, [0, -1]] = ratio[:, [0, -1]]
+        before, after = (self._tendons(end, belly, frame) for end in (0, 1))
+        points = np.concatenate([before[:, ::-1], belly, after], axis=1)
+        still = [np.ones(part.shape[:2]) for part in (before, after)]
+        stretch = now.sum(axis=1) / self._segments.sum(axis=1)
+        return FibreLines(points, stretch, np.concatenate([still[0], local, still[1]], axis=1))
+
+    def _carried(self, end: int, place: int, frame: Frame) -> Floats:
+        """Ends (N, 3) of the fibres where their bones, or ends of tendons, carry them."""
+        poses = np.array([frame.poses[name] for name in self.holders])[self._held[:, end]]
+        return np.asarray(
+            np.einsum("nij,nj->ni", poses[:, :3, :3], self.rest[:, place]) + poses[:, :3, 3]
+        )
+
+    def _tendons(self, end: int, belly: Floats, frame: Frame) -> Floats:
+        """Points (N, k, 3) of the tendon of each fibre beyond an end, away from the belly: none
+        where no fibre has one there, the end itself for fibres that have none.
+        """
+        if not any(self._tendon[end]):
+            return np.empty((len(belly), 0, 3))
+        out = np.repeat(belly[:, [0 if end == 0 else -1]], NODES - 1, axis=1)
+        for place, name in enumerate(self.holders):
+            tendon: TendonLine | None = frame.tendons.get(name)
+            if tendon is not None:
+                out[self._held[:, end] == place] = tendon.points[1:]
+        return out
+
+
+def build_bundles(scene: Scene, models: Sequence[MuscleModel]) -> dict[str, FibreBundle]:
+    """Fibres of each model's muscle, as many as the scene asks for; a muscle in which none can be
+    traced is left out with a warning.
+    """
+    count = scene.output.fibres
+    if count == 0:
+        return {}
+
+    def build(model: MuscleModel) -> FibreBundle | None:
+        muscle = scene.muscle(model.name)
+        if len(muscle.attachments) < 2:
+            return None
+        try:
+            return FibreBundle(muscle, scene, model, count)
+        except np.linalg.LinAlgError as error:
+            message = f"muscle {muscle.name!r} has no fibres: {error}"
+            warnings.warn(message, SceneWarning, stacklevel=2)
+            return None
+
+    found = zip(models, each(build, models))
+    return {model.name: bundle for model, bundle in found if bundle is not None}
+
+
+def _segments(lines: Floats) -> Floats:
+    """Length (N, k - 1) of each segment of lines (N, k, 3)."""
+    return np.asarray(np.linalg.norm(np.diff(lines, axis=1), axis=2))
+
+
+def _end_points(mesh: MeshDistance, group: Sequence[Attachment]) -> tuple[Floats, Integers]:
+    """Points (n, 3) evenly over the area of some attachments, and the number (n,) of each one's."""
+    owner = np.full(len(mesh.vertices), -1)
+    for number, attachment in enumerate(group):
+        owner[attachment.vertices] = number
+    corners = owner[mesh.faces]
+    whole = (corners[:, 0] >= 0) & (corners == corners[:, :1]).all(axis=1)
+    points, face = _on_faces(mesh.vertices, mesh.faces[whole], PATCH_POINTS)
+    number = corners[whole][face, 0]
+    # Attachments without a whole triangle count by their vertices.
+    for k, attachment in enumerate(group):
+        if not (number == k).any():
+            points = np.concatenate([points, mesh.vertices[attachment.vertices]])
+            number = np.concatenate([number, np.full(len(attachment.vertices), k)])
+    return points, number
+
+
+def _on_faces(vertices: Floats, faces: Integers, count: int) -> tuple[Floats, Integers]:
+    """So many points (n, 3) evenly over the area of triangles, and the triangle (n,) of each."""
+    if not len(faces):
+        return np.empty((0, 3)), np.empty(0, dtype=np.int64)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    number = np.arange(count) + 0.5
+    face = np.searchsorted(area, number / count * area[-1])
+    # The additive recurrence of the plastic number spreads points evenly (Roberts 2018).
+    share = (number[:, None] * [0.7548776662466927, 0.5698402909980532]) % 1.0
+    over = share.sum(axis=1) > 1.0
+    share[over] = 1.0 - share[over]
+    s, t = share.T[:, :, None]
+    return a[face] + s * (b - a)[face] + t * (c - a)[face], face
