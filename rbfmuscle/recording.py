@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from rbfmuscle.fibres.bundle import build_bundles
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
@@ -100,6 +101,7 @@ class Recording:
         self.summary, self.neighbours = Summary(), Neighbours()
         self.written: list[dict] = []
         self._path: dict[int, dict[str, float]] = {}
+        self._fibres: dict[str, dict[int, Floats]] = {}  # lengths (N,) by muscle and frame
         self._place = {muscle.name: k for k, muscle in enumerate(scene.muscles)}
         with timed(self.times, "build"), stage("building"):
             check_substeps(self.scene)
@@ -123,6 +125,8 @@ class Recording:
                 with timed(self.times, "write"):
                     sink.write(frame, rows)
                 self._path[frame.index] = dict(frame.coordinates)
+                for name, fibres in frame.fibres.items():
+                    self._fibres.setdefault(name, {})[frame.index] = fibres.lengths
                 self.written.append(frame_facts(self.scene, frame))
                 if progress is not None:
                     progress(len(self.written), len(self.scene.motion))
@@ -137,7 +141,8 @@ class Recording:
             self.message = f"a bug: {type(error).__name__}: {error}"
             raise
         finally:
-            rows = moment_arm_rows(self.scene, self._path, self.summary.series("length"))
+            lengths = self.summary.series("length")
+            rows = moment_arm_rows(self.scene, self._path, lengths, self._fibres)
             self.summary.add(rows)
             # What ended the run says more than a disk that then refuses the rest.
             with suppress(*((SolveError,) if self.status == "failed" else ())):

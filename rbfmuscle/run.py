@@ -17,14 +17,16 @@ from numpy.typing import NDArray
 from rbfmuscle.folders import LIST, read_list
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.metrics.quantities import ALL, Row
+from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.saved import SavedRun, saved_frames
 from rbfmuscle.output.writer import RunWriter, run_folder
 from rbfmuscle.progress import Progress
 from rbfmuscle.recording import MemorySink, Recording
+from rbfmuscle.scene.joints.tables import full_name
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.frame import Event, Frame
+from rbfmuscle.simulation.frame import Event, FibreLines, Frame
 from rbfmuscle.validation import MissingPartError, SolveError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
@@ -255,10 +257,10 @@ class Run:
                 f"{quantity!r} was not measured of {muscle!r}, {did_you_mean(quantity, found)}"
             )
         rows = found[quantity]
-        if quantity == "moment_arm":
+        if "moment_arm" in quantity:
             rows = _about(rows, coordinate)
         elif coordinate is not None:
-            raise UsageError(f"{quantity!r} has no coordinate; only 'moment_arm' has")
+            raise UsageError(f"{quantity!r} has no coordinate; only moment arms have")
         return np.array([row.value for row in rows])
 
     def table(self) -> pandas.DataFrame:
@@ -376,6 +378,42 @@ class MuscleRun:
     def values(self, quantity: str, *, coordinate: str | None = None) -> NDArray[np.float64]:
         """Values of a quantity over the frames, (n,) ndarray; see `Run.values`."""
         return self.run.values(self.name, quantity, coordinate=coordinate)
+
+    def fibres(self, frame: int = -1) -> NDArray[np.float64]:
+        """Points (N, k, 3) of the fibres in a frame of the run, each from origin to insertion with
+        its tendons [scene unit]; of a run whose scene had ``output.fibres``.
+        """
+        return self._fibres(self.run.frames[frame]).points
+
+    @property
+    def fibre_lengths(self) -> NDArray[np.float64]:
+        """Length (frames, N) of each fibre with its tendons [scene unit]."""
+        return np.array([self._fibres(frame).lengths for frame in self.run.frames])
+
+    def moment_arms(self, coordinate: str) -> NDArray[np.float64]:
+        """Moment arm (frames, N) of each fibre about a coordinate, of its full or its short name.
+
+        Minus the slope of the fibre's length [scene unit per radian, or 1 of a translation], see
+        `rbfmuscle.metrics.rows.moment_arms`; NaN where the coordinate does not move alone.
+        """
+        path = [frame.coordinates for frame in self.run.frames]
+        known = sorted({name for coordinates in path for name in coordinates})
+        name = full_name(coordinate, known, place="moment_arms")
+        scene = self.run.info["scene"]
+        reach = reaches(known, scene.get("coordinate_units", {}), scene["units"])
+        lengths = self.fibre_lengths
+        out = np.full(lengths.shape, np.nan)
+        for row, found in zip(out, moment_arms(path, lengths, reach)):
+            row[:] = found.get(name, np.nan)
+        return out
+
+    def _fibres(self, frame: Frame) -> FibreLines:
+        if self.name not in frame.fibres:
+            raise UsageError(
+                f"the run has no fibres of {self.name!r}; run it with output.fibres=32"
+            )
+        return frame.fibres[self.name]
+
 
 
 def _about(rows: list[Row], coordinate: str | None) -> list[Row]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rbfmuscle.fibres.trace import POINTS, trace_fibres
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import moving_joints, split_ends
 from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bones_about

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.fibres.flux import FluxField
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.tubes import distance_along, points_along
 from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance
 
@@ -92,9 +92,7 @@ def even_seeds(points: Floats, count: int) -> Floats:
 class _Tracer:
     """Follows a flux from seeds to the patches at its ends."""
 
-    def __init__(
-        self, mesh: MeshDistance, flux: FluxField, ends: tuple[Floats, Floats]
-    ) -> None:
+    def __init__(self, mesh: MeshDistance, flux: FluxField, ends: tuple[Floats, Floats]) -> None:
         from scipy.spatial import cKDTree
 
         self.mesh = mesh
@@ -132,7 +130,7 @@ class _Tracer:
         half = here + 0.5 * sense * self.step * _unit(self.flux(here))
         return here + sense * self.step * _unit(self.flux(half))
 
-    def _inside(self, points: Floats) -> tuple[Floats, Integers]:
+    def _inside(self, points: Floats) -> tuple[Floats, Booleans]:
         """Points (n, 3), those outside moved to the surface, and which (n,) these are."""
         outside = ~self.mesh.inside(points)
         if outside.any():

@@ -36,8 +36,8 @@ class SurfaceInterpolation:
 
 
 def spread_points(points: Floats, count: int) -> Integers:
-    """Which of some points (n, 3) are ``count`` that lie far from each other, each the farthest from
-    those before; all where there are not more.
+    """Numbers (count,) of points (n, 3) that lie far from each other, each the farthest from those
+    before; of all points where there are not more.
     """
     if len(points) <= count:
         return np.arange(len(points))

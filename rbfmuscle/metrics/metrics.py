@@ -13,7 +13,7 @@ from rbfmuscle.geometry.surfaces import edge_lengths, label_sheets, mesh_volume,
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
 from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bone_depth, surface_depth
-from rbfmuscle.metrics.quantities import QUANTITIES
+from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame, ModelSurface
 
@@ -99,6 +99,8 @@ class _Tracker:
         if self.line is not None:
             belly, found["bowing"] = self.line.measure(carried, frame.poses, probes)
             found["length"] = belly + self.line.tendon_length(frame.tendons)
+        if self.name in frame.fibres:
+            found.update(percentiles("fibre_stretch", frame.fibres[self.name].stretch))
         if self.contracts:
             found["activation"] = frame.activations[self.name]
             if surface is not None and self.line is not None:

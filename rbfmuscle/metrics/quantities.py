@@ -2,7 +2,20 @@
 measured.
 """
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+
+# Of what is measured of every fibre of a muscle.
+PERCENTILES: Mapping[str, int] = MappingProxyType({"p05": 5, "p50": 50, "p95": 95})
+_FIBRES = {
+    "fibre_stretch": ("1", "length of a fibre without tendons over that at rest"),
+    "fibre_moment_arm": ("length", "moment arm of a fibre with its tendons"),
+}
 
 # Quantity: kind of unit (volume and length follow the scene's unit), meaning; in the order of the
 # tables.
@@ -63,6 +76,11 @@ QUANTITIES = {
     ),
     "bowing_at_rest": ("1", "the same at rest, before the first frame"),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
+    **{
+        f"{quantity}_{name}": (kind, f"{meaning}: {number}th percentile of the fibres")
+        for quantity, (kind, meaning) in _FIBRES.items()
+        for name, number in PERCENTILES.items()
+    },
     "activation": ("1", "activation, 0 to 1; this and the next three for muscles that contract"),
     "belly_thickness": ("length", "least width of the greatest section across the line of action"),
     "csa_max": ("area", "area of the greatest section across the line of action"),
@@ -97,6 +115,12 @@ class Row(NamedTuple):
     quantity: str
     value: float
     unit: str
+
+
+def percentiles(quantity: str, values: Floats) -> dict[str, float]:
+    """`PERCENTILES` of a quantity's values (n,), by the names of `QUANTITIES`."""
+    found = np.percentile(values, list(PERCENTILES.values())).tolist()
+    return {f"{quantity}_{name}": value for name, value in zip(PERCENTILES, found)}
 
 
 def unit_text(kind: str, units: str) -> str:

@@ -4,13 +4,14 @@ along the motion.
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, percentiles, unit_text
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, shown_value
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -54,24 +55,48 @@ def frame_rows(
 
 
 def moment_arm_rows(
-    scene: Scene, path: Mapping[int, Coordinates], lengths: Mapping[str, Mapping[int, float]]
+    scene: Scene,
+    path: Mapping[int, Coordinates],
+    lengths: Mapping[str, Mapping[int, float]],
+    fibres: Mapping[str, Mapping[int, Floats]],
 ) -> list[Row]:
-    """Rows of the moment arms, from each frame's coordinates [radian or scene unit] and muscles'
-    lengths by frame.
+    """Rows of the moment arms, from each frame's coordinates [radian or scene unit] and the lengths
+    of muscles, and of their fibres (N,), by frame.
     """
-    facts, rows = all_coordinates(scene.joints), []
-    shifts = {name for name, fact in facts.items() if fact.motion == "translation"}
-    names, near = {name for row in path.values() for name in row}, REACH / MM_PER_UNIT[scene.units]
-    reach = {name: near if name in shifts else math.radians(REACH) for name in names}
+    rows = []
     for muscle, found in lengths.items():
-        along: Sequence[float] = [found.get(index, math.nan) for index in path]
-        moments_along = moment_arms(list(path.values()), along, reach)
-        for (index, coordinates), moments in zip(path.items(), moments_along):
-            for name, moment_arm in moments.items():
-                angle = shown_value(scene, name, coordinates.get(name, 0.0))
-                unit = "1" if name in shifts else scene.units
-                rows.append(Row(index, name, angle, muscle, "moment_arm", moment_arm, unit))
+        along = np.array([found.get(index, math.nan) for index in path])
+        for moments, row in _moments(scene, path, along):
+            rows.append(row._replace(muscle=muscle, value=float(moments)))
+    for muscle, of_fibres in fibres.items():
+        none = np.full(len(next(iter(of_fibres.values()))), math.nan)
+        along = np.array([of_fibres.get(index, none) for index in path])
+        for moments, row in _moments(scene, path, along):
+            for quantity, value in percentiles("fibre_moment_arm", moments).items():
+                rows.append(row._replace(muscle=muscle, quantity=quantity, value=value))
     return rows
+
+
+def _moments(scene, path, lengths):
+    """Moment arms along a path, each with a row that says where, as `moment_arms` finds them."""
+    facts = all_coordinates(scene.joints)
+    shifts = {name for name, fact in facts.items() if fact.motion == "translation"}
+    names = {name for coordinates in path.values() for name in coordinates}
+    reach = reaches(names, shifts, scene.units)
+    found = moment_arms(list(path.values()), lengths, reach)
+    for (index, coordinates), moments in zip(path.items(), found):
+        for name, moment_arm in moments.items():
+            angle = shown_value(scene, name, coordinates.get(name, 0.0))
+            unit = "1" if name in shifts else scene.units
+            yield moment_arm, Row(index, name, angle, "", "moment_arm", 0.0, unit)
+
+
+def reaches(names: Iterable[str], shifts: Collection[str], units: str) -> dict[str, float]:
+    """Over how much of each of some coordinates moment arms are fitted [radian, or of ``shifts``
+    scene unit].
+    """
+    near = REACH / MM_PER_UNIT[units]
+    return {name: near if name in shifts else math.radians(REACH) for name in names}
 
 
 def _leading_coordinate(scene, frame, before):
@@ -90,19 +115,20 @@ def _leading_coordinate(scene, frame, before):
 
 def moment_arms(
     path: Sequence[Mapping[str, float]],
-    lengths: Sequence[float],
+    lengths: ArrayLike,
     reach: Mapping[str, float] | None = None,
-) -> list[dict[str, float]]:
+) -> list[dict[str, Floats]]:
     """Moment arms -dl/dq along a motion, for each frame by coordinate that moves alone before or
     after it.
 
     A parabola is fitted to the ``lengths`` [scene unit] of the frames within ``reach`` [radian or
     scene unit, `REACH` degrees by default], and always of both neighbours, as far as the coordinate
     goes on alone and in one direction: with two neighbours it is the central difference, at an end
-    the difference to the one. ``path`` holds the coordinates of each frame; lengths are NaN where
-    not known. Moment arms are in scene units per radian, or 1.
+    the difference to the one. ``path`` holds the coordinates of each frame; lengths (n,), or of
+    several lines (n, m), are NaN where not known. Moment arms (), or (m,), are in scene units per
+    radian, or 1.
     """
-    values, found = np.asarray(lengths, dtype=float), [dict[str, float]() for _ in path]
+    values, found = np.asarray(lengths, dtype=float), [dict[str, Floats]() for _ in path]
     for name, first, last in _single_motions(path, values):
         at = np.array([path[k].get(name, 0.0) for k in range(first, last + 1)])
         wide = math.radians(REACH) if reach is None else reach[name]
@@ -111,7 +137,7 @@ def moment_arms(
             near[max(0, k - first - 1) : k - first + 2] = True
             away, long = at[near] - at[k - first], values[first : last + 1][near]
             slope = np.polyfit(away, long, min(2, len(away) - 1))[-2]
-            found[k].setdefault(name, -float(slope))
+            found[k].setdefault(name, -slope)
     return found
 
 

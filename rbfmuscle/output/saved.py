@@ -18,6 +18,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output import appearance as look
+from rbfmuscle.output.fibre_files import SavedFibres
 from rbfmuscle.output.vtp import read_vtp
 from rbfmuscle.scene.build import check_name
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
@@ -230,9 +231,10 @@ def saved_frames(saved: SavedRun) -> list[Frame]:
         angles = {n: v if n in units else math.radians(v) for n, v in entry["coordinates"].items()}
         events = [Event(*row) for row in saved.events if row[0] == index]
         surfaces = _SavedSurfaces(saved, index)
-        found.append(
-            Frame(index, angles, saved.poses[index], surfaces, {}, events, {}, entry["wall"])
-        )
+        fibres = SavedFibres(saved.directory, saved.muscles, index)
+        poses = saved.poses[index]
+        wall = entry["wall"]
+        found.append(Frame(index, angles, poses, surfaces, {}, events, {}, wall, fibres=fibres))
     return found
 
 

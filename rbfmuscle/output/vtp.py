@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.folders import write_whole
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Array, Floats, Integers
 from rbfmuscle.validation import MeshError
 
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32"}
@@ -32,7 +32,7 @@ _HEAD = """<?xml version="1.0"?>
 </Piece>
 </PolyData>
 """
-_BEFORE_DATA, _AFTER_DATA = b'<AppendedData encoding="raw">\n_', b"\n</AppendedData>\n</VTKFile>\n"
+BEFORE_DATA, AFTER_DATA = b'<AppendedData encoding="raw">\n_', b"\n</AppendedData>\n</VTKFile>\n"
 
 
 def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
@@ -42,7 +42,7 @@ def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
     points = np.ascontiguousarray(vertices)
     points = _rounded(points) if points.dtype != np.float32 else points
     corners = np.ascontiguousarray(faces, dtype="<i4")
-    blocks = _packed(points.tobytes()), *_packed_faces(corners.tobytes())
+    blocks = packed(points.tobytes()), *_packed_faces(corners.tobytes())
     elements, offset = [], 0
     for name, kind, components, block in zip(
         ("Points", "connectivity", "offsets"), (points.dtype.str[1:], "i4", "i4"), (3, 1, 1), blocks
@@ -53,7 +53,7 @@ def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
         )
         offset += len(block)
     head = _HEAD.format(len(points), len(corners), *elements).encode("ascii")
-    Path(path).write_bytes(b"".join([head, _BEFORE_DATA, *blocks, _AFTER_DATA]))
+    Path(path).write_bytes(b"".join([head, BEFORE_DATA, *blocks, AFTER_DATA]))
 
 
 @lru_cache(maxsize=128)
@@ -62,13 +62,13 @@ def _packed_faces(corners: bytes) -> tuple[bytes, bytes]:
     frame.
     """
     ends = np.arange(3, len(corners) // 4 + 1, 3, dtype="<i4")
-    return _packed(corners), _packed(ends.tobytes())
+    return packed(corners), packed(ends.tobytes())
 
 
-def _packed(raw: bytes) -> bytes:
+def packed(raw: bytes) -> bytes:
     """VTK's header with the sizes of one zlib block, then the block."""
-    packed = zlib.compress(raw, 1)
-    return np.array([1, len(raw), 0, len(packed)], dtype="<u4").tobytes() + packed
+    block = zlib.compress(raw, 1)
+    return np.array([1, len(raw), 0, len(block)], dtype="<u4").tobytes() + block
 
 
 def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
@@ -76,9 +76,9 @@ def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
     another or damaged.
     """
     try:
-        text, _, data = Path(path).read_bytes().partition(_BEFORE_DATA)
+        text, _, data = Path(path).read_bytes().partition(BEFORE_DATA)
         starts = re.findall(rb'type="(\w+)" Name="(Points|connectivity)"[^>]*offset="(\d+)"', text)
-        found = {name: _unpacked(data, kind.decode(), int(start)) for kind, name, start in starts}
+        found = {name: unpacked(data, kind.decode(), int(start)) for kind, name, start in starts}
         points, corners = (found[name].reshape(-1, 3) for name in (b"Points", b"connectivity"))
         return points.astype(float), corners.astype(int)
     except FileNotFoundError:
@@ -89,7 +89,8 @@ def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
         ) from None
 
 
-def _unpacked(data, kind, start):
+def unpacked(data: bytes, kind: str, start: int) -> Array:
+    """Numbers of a block of VTK's type ``kind`` that begins at a byte of the appended data."""
     size = int(np.frombuffer(data, "<u4", 4, start)[3])
     block = zlib.decompress(data[start + 16 : start + 16 + size])
     return np.frombuffer(block, next(f"<{code}" for code, name in _TYPES.items() if name == kind))

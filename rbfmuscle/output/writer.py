@@ -22,6 +22,7 @@ from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.output.appearance import tendon_mesh
+from rbfmuscle.output.fibre_files import FOLDER, TABLE, begin_table, fibre_file, write_frame
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.scene import Scene
@@ -39,7 +40,8 @@ LIGHT = 1600  # triangles of a bone that moves
 PAGES = ("report.html", "preview.webp")
 MESHES = ("surfaces", "bones")
 # Every file of a run, and every folder of its files.
-_PLACES = ("run.json", *TABLES, *PAGES, *MESHES, *(f"{name}.pvd" for name in MESHES))
+_COLLECTIONS = tuple(f"{name}.pvd" for name in MESHES)
+_PLACES = ("run.json", *TABLES, *PAGES, *MESHES, *_COLLECTIONS, FOLDER, TABLE)
 FORMAT = 2
 _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
 
@@ -74,6 +76,9 @@ class RunWriter:
             self.folder.add("run.json", *TABLES, *pages, *(f"{name}.pvd" for name in names))
             for name, head in TABLES.items():
                 write_csv(self.directory / name, [head])
+            if scene.output.fibres:
+                self.folder.add(TABLE)
+                begin_table(self.directory)
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
         except OSError as error:
             message = f"cannot write to {self.directory}: {error.strerror}; choose another folder"
@@ -122,6 +127,9 @@ class RunWriter:
             surfaces = self._write_surfaces(frame)
             self._collections["bones"].add(step, self._write_bones(frame))
             self._collections["surfaces"].add(step, surfaces)
+        if frame.fibres:
+            self.folder.add(*(fibre_file(name, frame.index) for name in frame.fibres))
+            write_frame(self.directory, frame.index, frame.fibres)
         # A frame's surfaces are on the disk before its poses: readers of a run that was killed rely
         # on it.
         poses = [
