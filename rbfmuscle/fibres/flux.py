@@ -1,10 +1,11 @@
 """A flux through a muscle's volume from its origin to its insertion, along which fibres run.
 
 It is D ∇u for a potential u in cubic cells with div(D ∇u) = 0. It enters through the patches of the
-origin and leaves through those of the insertion, evenly over their areas, and none passes through
-the rest of the surface, so that its lines run from patch to patch inside the muscle. Where the
-scene gives no polylines D is the identity and u is harmonic. Along polylines of direction a it is
-D = a aᵀ + ACROSS (I - a aᵀ): the flux follows them, and closes where they leave gaps.
+origin and leaves through those of the insertion, and none passes through the rest of the surface,
+so that its lines run from patch to patch inside the muscle. Where the scene gives no polylines D is
+the identity, u is harmonic, and the flux is even over the area of each end. Along polylines of
+direction a it is D = a aᵀ + ACROSS (I - a aᵀ), and u is the same all over an end: the flux follows
+the polylines, and enters and leaves where these do.
 """
 
 from collections.abc import Sequence
@@ -20,6 +21,7 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.metrics.mesh_distance import MeshDistance
 
 CELLS = 30_000  # of a muscle, about
+GRIP = 30.0  # conductance of an end where u is given, over that of a cube of the muscle's volume
 ACROSS = 0.02  # conductivity across polylines, over that along them
 NEAREST = 4  # pieces of polylines that speak for one place
 TOLERANCE = 1e-8  # relative residual of the potential
@@ -69,6 +71,10 @@ class FluxField:
         conductivity = _conductivity(self.middles, polylines)
         matrix = self._assemble(conductivity)
         source = self._source(ends)
+        if polylines:
+            grip = GRIP * self.side * len(self.cells) ** (1 / 3)
+            matrix += sparse.diags(grip * np.abs(source))
+            source = grip * source
         potential = _solve(matrix, source)
         self._spread(conductivity, potential)
 
@@ -121,7 +127,7 @@ class FluxField:
 
     def _assemble(self, conductivity: Floats) -> sparse.csr_matrix:
         """Matrix of the potential's energy, trilinear in each cell."""
-        element = np.einsum("cij,ijkl->ckl", conductivity, _element_matrices())
+        element = self.side * np.einsum("cij,ijkl->ckl", conductivity, _element_matrices())
         rows = np.repeat(self.nodes, 8, axis=1).ravel()
         columns = np.tile(self.nodes, (1, 8)).ravel()
         size = len(self._known)
@@ -207,14 +213,13 @@ def _element_matrices() -> Floats:
 
 
 def _solve(matrix: sparse.csr_matrix, source: Floats) -> Floats:
-    """Potential (n,) of mean zero by conjugate gradients; the matrix leaves a constant open."""
+    """Potential (n,) by conjugate gradients; where fluxes are given up to a constant."""
     if connected_components(matrix, directed=False)[0] > 1:
         raise np.linalg.LinAlgError("the muscle's cells lie in separate pieces")
-    source = source - source.mean()
     scale = 1.0 / matrix.diagonal()
     found, status = cg(
         matrix, source, rtol=TOLERANCE, maxiter=MOST_ITERATIONS, M=sparse.diags(scale)
     )
     if status != 0:
         raise np.linalg.LinAlgError("the potential of the fibres does not converge")
-    return np.asarray(found - found.mean())
+    return np.asarray(found)

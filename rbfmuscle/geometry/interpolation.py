@@ -11,7 +11,7 @@ class SurfaceInterpolation:
     """Places of points in a surface that is deformed: a polyharmonic spline of its displacement.
 
     Of the vertices (n, 3) at rest some `CENTRES`, evenly over the surface, are the centres of a
-    spline of kernel r with a linear polynomial: the biharmonic one in space, of which each affine
+    spline of kernel r³ with a linear polynomial: the triharmonic one in space. Each affine
     displacement, hence each rigid motion, comes out exactly. ``points`` (m, 3) are at rest.
     """
 
@@ -54,4 +54,4 @@ def _row(points: Floats, centres: Floats) -> Floats:
     """Kernels about the centres (m, 3), then 1, x, y and z, at points (n, 3)."""
     from scipy.spatial.distance import cdist
 
-    return np.hstack([cdist(points, centres), np.ones((len(points), 1)), points])
+    return np.hstack([cdist(points, centres) ** 3, np.ones((len(points), 1)), points])

@@ -1,0 +1,132 @@
+"""Moment arms of fibres at the hip beside published ones: a finite-element model that was compared
+with MRI (Blemker and Delp 2005).
+
+    python benchmarks/hip_moment_arms.py [--data hip,leg] [--model rbf] [--set KEY=VALUE ...]
+
+One coordinate moves at a time, the muscles in the scenes of the data folder. The published band
+reaches, at each angle, from the least to the greatest moment arm over a muscle's fibres; ours is
+the same of `FIBRES` fibres. Printed for each muscle and motion, over the angles that both have:
+
+overlap   share of the published band's area that ours covers (a wide fan covers all)
+inside    share of fibres x poses within the published band
+union     area that both cover over the area that either covers
+stretch   of fibres, 5th and 95th percentile over all poses; beside it that of the straight lines
+          between their ends
+"""
+
+import argparse
+import json
+
+import numpy as np
+from evidence import data_folder
+
+from rbfmuscle.fibres.published import published_band
+from rbfmuscle.run import simulate
+from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.settings import parse_settings
+
+FIBRES = 100
+STEP = 5.0  # degrees
+RANGES = {"flexion": (-10.0, 60.0), "adduction": (-40.0, 40.0), "rotation": (-30.0, 30.0)}
+DATA = {
+    "hip": (
+        "flexion.toml",
+        {"flexion": "flexion", "adduction": "adduction", "rotation": "internal_rotation"},
+    ),
+    "leg": (
+        "tendons/leg.toml",
+        {name: f"hip_{name}" for name in RANGES},
+    ),
+}
+MUSCLES = ("psoas_major", "iliacus", "gluteus_maximus", "gluteus_medius")
+
+
+def moving(file, coordinate, ends):
+    """A scene in which one coordinate moves, with the muscles of the table."""
+    scene = Scene.load(file)
+    angles = np.radians(np.arange(ends[0], ends[1] + 0.5 * STEP, STEP))
+    scene.motion = Motion([{coordinate: float(angle)} for angle in angles])
+    scene.muscles = [muscle for muscle in scene.muscles if muscle.name in MUSCLES]
+    return scene
+
+
+def compared(run, muscle, coordinate):
+    """Measures of one muscle's fibres about one coordinate."""
+    band = published_band(muscle, coordinate)
+    angles = np.degrees([frame.coordinates[coordinate] for frame in run.frames])
+    arms = run[muscle].moment_arms(coordinate)
+    shared = (angles >= band.angle[0] - 1e-6) & (angles <= band.angle[-1] + 1e-6)
+    arms = arms[shared]
+    least = np.interp(angles[shared], band.angle, band.least)
+    greatest = np.interp(angles[shared], band.angle, band.greatest)
+    ours = arms.min(axis=1), arms.max(axis=1)
+    both = np.maximum(np.minimum(greatest, ours[1]) - np.maximum(least, ours[0]), 0.0).sum()
+    areas = (greatest - least).sum(), (ours[1] - ours[0]).sum()
+    middle = np.median(arms, axis=1)
+    fibres = [frame.fibres[muscle] for frame in run.frames]
+    straight = np.array([np.linalg.norm(f.points[:, 0] - f.points[:, -1], axis=1) for f in fibres])
+    at_rest = np.argmin(np.abs(angles))
+    stretch = np.array([f.stretch for f in fibres])
+    apart = stretch - straight / straight[at_rest]
+    return {
+        "overlap": both / areas[0],
+        "inside": ((arms >= least[:, None]) & (arms <= greatest[:, None])).mean(),
+        "union": both / (areas[0] + areas[1] - both),
+        "median inside": ((middle >= least) & (middle <= greatest)).mean(),
+        "arms": [float(arms.min()), float(arms.max())],
+        "stretch": np.percentile(stretch, [5, 95]).tolist(),
+        "straight": np.percentile(straight / straight[at_rest], [5, 95]).tolist(),
+        "near straight": (np.abs(apart) <= 0.1).mean(),
+    }
+
+
+def table(data, model, settings):
+    """Measures by muscle and motion."""
+    file, names = DATA[data]
+    found = {}
+    for motion, name in names.items():
+        coordinate = f"hip.{name}"
+        scene = moving(data_folder(data) / file, coordinate, RANGES[motion])
+        asked = {"output.fibres": FIBRES, **settings}
+        run = simulate(scene, model=model, settings=asked)
+        for muscle in run.muscles:
+            found[muscle, motion] = compared(run, muscle, coordinate)
+    return found
+
+
+def show(title, found):
+    """Print a table, and its means."""
+    print(f"\n{title}\n")
+    print("| muscle | motion | overlap | inside | union | median inside | arms [mm] | stretch |")
+    print("|---|---|---|---|---|---|---|---|")
+    shares = ("overlap", "inside", "union", "median inside")
+    for (muscle, motion), row in found.items():
+        numbers = " | ".join(f"{row[name]:.2f}" for name in shares)
+        arms = " to ".join(f"{x:.0f}" for x in row["arms"])
+        stretch = " to ".join(f"{x:.2f}" for x in row["stretch"])
+        straight = " to ".join(f"{x:.2f}" for x in row["straight"])
+        print(f"| {muscle} | {motion} | {numbers} | {arms} | {stretch} ({straight}) |")
+    means = {name: np.mean([row[name] for row in found.values()]) for name in shares}
+    print(f"| mean | | {' | '.join(f'{x:.2f}' for x in means.values())} | | |")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", default="hip,leg")
+    parser.add_argument("--model", default="rbf")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--json", help="file for the figures")
+    given = parser.parse_args()
+    kept = {}
+    for data in given.data.split(","):
+        found = table(data, given.model, parse_settings(given.set))
+        show(f"data/{data}, {given.model} {' '.join(given.set)}", found)
+        kept[data] = {f"{muscle} {motion}": row for (muscle, motion), row in found.items()}
+    if given.json:
+        with open(given.json, "w", encoding="utf-8") as file:
+            json.dump(kept, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()

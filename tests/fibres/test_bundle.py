@@ -1,0 +1,132 @@
+"""Fibres over a motion: what both kinds of model and a saved run give."""
+
+import csv
+
+import numpy as np
+import pytest
+import pyvista
+import trimesh
+from toy_scene import held
+
+import rbfmuscle as rm
+from rbfmuscle.fibres.published import published_band
+from rbfmuscle.geometry.tubes import line_length
+from rbfmuscle.validation import UsageError
+
+FIBRES = 12
+
+
+def hinge(model="rbf"):
+    """A strap along two bones that a hinge joins 30 mm behind it, held by the lower one by a
+    tendon.
+    """
+    scene = rm.Scene("hinge", units="mm")
+    for name, middle in (("trunk", 60.0), ("limb", -65.0)):
+        mesh = trimesh.creation.cylinder(8.0, 120.0, sections=24)
+        scene.add_bone(name, mesh.apply_translation([0.0, 30.0, middle]))
+    scene.add_joint("elbow", "trunk", "limb", [0.0, 30.0, 0.0], {"bend": [-1, 0, 0]})
+    belly = trimesh.creation.capsule(70.0, 9.0, count=[12, 12]).subdivide()
+    belly.apply_translation([0.0, 0.0, 15.0])
+    z = belly.vertices[:, 2]
+    attach = held(trunk=z > z.max() - 6.0, limb=z < z.min() + 6.0)
+    attach[1]["tendon"] = {"to": [0.0, 0.0, -70.0]}
+    scene.add_muscle("strap", belly, attach=attach, model=model)
+    return scene.set_motion(ramp={"elbow.bend": {"from": -10.0, "to": 10.0, "step": 5.0}})
+
+
+@pytest.fixture(scope="module", params=["rbf", "pbd"])
+def run(request):
+    return rm.simulate(hinge(request.param), settings={"output.fibres": FIBRES})
+
+
+def test_fibres_go_from_bone_to_bone_with_their_tendon(run):
+    strap = run["strap"]
+    for k, frame in enumerate(run.frames):
+        points = strap.fibres(k)
+        assert points.shape[0] == FIBRES
+        insertion = frame.poses["limb"] @ [0.0, 0.0, -70.0, 1.0]
+        np.testing.assert_allclose(points[:, -1], np.tile(insertion[:3], (FIBRES, 1)), atol=1e-9)
+        origins = points[:, 0] - frame.poses["trunk"][:3, 3]
+        np.testing.assert_allclose(origins, strap.fibres(0)[:, 0], atol=1e-9)
+        lengths = [line_length(line) for line in points]
+        np.testing.assert_allclose(strap.fibre_lengths[k], lengths, rtol=1e-12)
+
+
+def test_moment_arms_of_fibres_are_their_distances_from_the_axis(run):
+    arms = run["strap"].moment_arms("bend")
+    assert arms.shape == (len(run), FIBRES)
+    # Fibres lie within 9 mm of the strap's middle, the axis 30 mm behind that; their tendon is one.
+    assert np.abs(arms).min() > 20.0
+    assert np.abs(arms).max() < 40.0
+    assert np.median(arms, axis=1) == pytest.approx(run.values("strap", "moment_arm"), abs=3.0)
+    found = np.percentile(arms, [5, 50, 95], axis=1)
+    for name, values in zip(("p05", "p50", "p95"), found):
+        np.testing.assert_allclose(run.values("strap", f"fibre_moment_arm_{name}"), values)
+
+
+def test_stretch_is_one_at_rest_and_that_of_the_belly(run):
+    middle = run.frames[2].fibres["strap"]
+    assert middle.stretch == pytest.approx(1.0, abs=2e-3)  # of the solver
+    for frame in run.frames:
+        fibres = frame.fibres["strap"]
+        tendon = line_length(frame.tendons["strap tendon 2 to limb"].points)
+        belly = fibres.lengths - tendon
+        at_rest = middle.lengths - line_length(
+            run.frames[2].tendons["strap tendon 2 to limb"].points
+        )
+        # Each fibre's tendon begins at its own end, within 6 mm of the tendon's line.
+        assert fibres.stretch == pytest.approx(belly / at_rest, abs=0.02)
+    assert run.values("strap", "fibre_stretch_p50")[0] == pytest.approx(
+        np.median(run.frames[0].fibres["strap"].stretch)
+    )
+
+
+def test_a_saved_run_has_the_fibres(run, tmp_path):
+    run.save(tmp_path, pictures=False)
+    loaded = rm.Run.load(tmp_path)
+    np.testing.assert_array_equal(loaded["strap"].fibres(1), run["strap"].fibres(1))
+    np.testing.assert_array_equal(
+        loaded["strap"].moment_arms("elbow.bend"), run["strap"].moment_arms("bend")
+    )
+    drawn = pyvista.read(tmp_path / "fibres" / "strap_0003.vtp")
+    fibres = run.frames[3].fibres["strap"]
+    assert drawn.n_lines == drawn.n_cells == FIBRES
+    np.testing.assert_allclose(drawn.points, fibres.points.reshape(-1, 3), rtol=1e-12)
+    np.testing.assert_allclose(drawn.cell_data["length"], fibres.lengths)
+    np.testing.assert_allclose(drawn.cell_data["stretch"], fibres.stretch)
+    np.testing.assert_allclose(drawn.point_data["local_stretch"], fibres.local_stretch.ravel())
+    with (tmp_path / "fibres.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == FIBRES * len(run)
+    row = rows[FIBRES * 3 + 5]
+    assert (row["frame"], row["muscle"], row["fibre"]) == ("3", "strap", "5")
+    assert float(row["length"]) == pytest.approx(fibres.lengths[5])
+
+
+def test_a_run_without_fibres_says_how_to_have_them():
+    run = rm.simulate(rm.phantom_scene(end=0.0, model="pbd"))
+    with pytest.raises(UsageError, match=r"output\.fibres=32"):
+        run["extensor"].fibres(0)
+
+
+def test_the_number_of_fibres_is_checked_and_true_is_the_usual_one():
+    scene = rm.phantom_scene(end=0.0)
+    assert scene.with_options({"output.fibres": True}).output.fibres == 32
+    assert scene.output.fibres == scene.with_options({"output.fibres": False}).output.fibres == 0
+    for wrong in (1001, -1, "many"):
+        with pytest.raises(UsageError, match=r"output\.fibres"):
+            scene.with_options({"output.fibres": wrong})
+
+
+def test_published_bands_are_found_by_name():
+    band = published_band("psoas_major", "hip.hip_flexion")
+    assert band.angle[0] == -5.0 and (band.least < band.greatest).all()
+    assert published_band("Iliacus_r", "hip_r.internal_rotation") is not None
+    # Extensors have negative moment arms about flexion.
+    assert published_band("gluteus_maximus", "hip.flexion").greatest.max() < 0.0
+    for muscle, coordinate in (
+        ("psoas", "knee.flexion"),
+        ("psoas", "hip.shift"),
+        ("sartorius", "hip.flexion"),
+    ):
+        assert published_band(muscle, coordinate) is None
