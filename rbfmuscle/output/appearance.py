@@ -25,6 +25,9 @@ MUSCLE_COLOURS = (
     "#aa4499",
     "#999933",
 )
+# Stretch of fibres that has the last colour of the scale, and the colours at its ends and middle.
+SHORT, LONG = 0.6, 1.4
+STRETCH_COLOURS = ("#2166ac", "#f7f7f7", "#b2182b")
 # How much nearer to white or black the muscles of one group are, one after the other.
 _SHADES = (0.0, 0.3, -0.25)
 # From the subject to the camera, along the body's axes: left, posterior, superior.
@@ -109,6 +112,17 @@ def linear_rgb(colour: Floats) -> Floats:
     return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
 
 
+def stretch_colours(stretch: Floats) -> Floats:
+    """Colours (..., 3) of a fibre's stretch (...), 0 to 1: blue from `SHORT` down, white at 1, red
+    from `LONG` up.
+    """
+    ends = [rgb(colour) for colour in STRETCH_COLOURS]
+    places = (SHORT, 1.0, LONG)
+    return np.stack(
+        [np.interp(stretch, places, [end[axis] for end in ends]) for axis in range(3)], axis=-1
+    )
+
+
 def view_axes(direction: Sequence[float] | Floats, body: Floats) -> Floats:
     """Right, up (superior, else anterior) and towards the camera (3, 3), from a direction along the
     body's axes.
@@ -140,6 +154,11 @@ def motion_direction(poses: Sequence[Mapping[str, Floats]], body: Floats) -> Flo
         return usual
     axis = widest / angle
     return axis if axis @ usual > 0 or (axis @ usual == 0 and axis[1] < 0) else -axis
+
+
+def fibres_name(muscle: str) -> str:
+    """Name of the lines of a muscle's fibres in files."""
+    return f"{muscle}_fibres"
 
 
 def tendon_mesh(

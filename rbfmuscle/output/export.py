@@ -8,6 +8,7 @@ from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.animation.gltf import animated_glb
 from rbfmuscle.output.animation.usd import check_usd, write_usd
+from rbfmuscle.output.fibre_files import write_fibres
 from rbfmuscle.output.saved import MovingRun, SavedRun, read_moving
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -123,6 +124,16 @@ def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -
                 collection.add(run.times[k] if run.timed else frame, list(files.items()))
         if collection is not None:
             written.append(folder / f"{group}.pvd")
+    return written + (_export_fibres(run, folder, frames) if suffix == "vtp" else [])
+
+
+def _export_fibres(run: MovingRun, folder: Path, frames: list[int]) -> list[Path]:
+    """Write the fibres of a run as polylines, and return the files."""
+    written = []
+    for part in run.fibres:
+        for frame, lines in zip(frames, part.lines):
+            written.append(folder / f"{part.name}_{frame:04d}.vtp")
+            write_fibres(written[-1], lines)
     return written
 
 

@@ -8,7 +8,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from rbfmuscle.output.vtp import read_vtp
 from rbfmuscle.scene.build import check_name
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
 from rbfmuscle.scene.tendons import tendon_name
-from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
+from rbfmuscle.simulation.frame import Event, FibreLines, Frame, ModelSurface
 from rbfmuscle.validation import UsageError
 
 # Coordinates that a caption names at most.
@@ -98,6 +98,10 @@ class SavedRun:
         """Vertices and faces of a muscle in a frame."""
         self._check_surfaces()
         return read_vtp(self._surface_file(muscle, frame))
+
+    def fibres(self, frame: int) -> SavedFibres:
+        """Fibres of the muscles that have them, in a frame."""
+        return SavedFibres(self.directory, self.muscles, frame)
 
     def bone(self, name: str) -> tuple[Floats, Integers]:
         """Vertices and faces of a bone at rest."""
@@ -231,7 +235,7 @@ def saved_frames(saved: SavedRun) -> list[Frame]:
         angles = {n: v if n in units else math.radians(v) for n, v in entry["coordinates"].items()}
         events = [Event(*row) for row in saved.events if row[0] == index]
         surfaces = _SavedSurfaces(saved, index)
-        fibres = SavedFibres(saved.directory, saved.muscles, index)
+        fibres = saved.fibres(index)
         poses = saved.poses[index]
         wall = entry["wall"]
         found.append(Frame(index, angles, poses, surfaces, {}, events, {}, wall, fibres=fibres))
@@ -272,9 +276,24 @@ class MovingPart:
 
 
 @dataclass(frozen=True)
+class MovingFibres:
+    """The fibres of a muscle in each frame, always as many lines of as many points."""
+
+    name: str
+    lines: list[FibreLines]
+
+    @property
+    def segments(self) -> Integers:
+        """Numbers (s, 2) of the points that each piece of the lines joins, line by line."""
+        count, points = self.lines[0].points.shape[:2]
+        first = np.arange(count * points).reshape(count, points)
+        return np.stack([first[:, :-1].ravel(), first[:, 1:].ravel()], axis=1)
+
+
+@dataclass(frozen=True)
 class MovingRun:
     """All muscles and bones of a run over time; ``name`` is the scene's, all lengths are in
-    ``unit``: m, cm or mm.
+    ``unit``: m, cm or mm. Fibres are those of the muscles that have them.
 
     ``times`` (T,) of the frames [s] are the motion's own where ``timed``, ``captions`` those of the
     frames. ``body`` (3, 3) is left, posterior and superior; the motion is seen in its plane from
@@ -290,6 +309,7 @@ class MovingRun:
     bones: list[MovingPart]
     body: Floats
     direction: Floats
+    fibres: list[MovingFibres] = field(default_factory=list)
 
 
 def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
@@ -320,5 +340,25 @@ def read_moving(saved: SavedRun, frames: list[int], *, unit: str) -> MovingRun:
     captions = [saved.caption(frame) for frame in frames]
     direction = look.motion_direction([saved.poses[frame] for frame in frames], saved.body)
     return MovingRun(
-        name, unit, at, times is not None, captions, muscles, bones, saved.body, direction
+        name,
+        unit,
+        at,
+        times is not None,
+        captions,
+        muscles,
+        bones,
+        saved.body,
+        direction,
+        _moving_fibres(saved, frames, factor),
     )
+
+
+def _moving_fibres(saved: SavedRun, frames: list[int], factor: float) -> list[MovingFibres]:
+    """Fibres of the muscles that have them in all of some frames, lengths scaled."""
+    found = []
+    for name in saved.muscles:
+        lines = [saved.fibres(frame).get(name) for frame in frames]
+        known = [x._replace(points=factor * x.points) for x in lines if x is not None]
+        if len(known) == len(frames):
+            found.append(MovingFibres(look.fibres_name(name), known))
+    return found

@@ -13,6 +13,7 @@ from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.saved import SavedRun
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -49,6 +50,17 @@ class Track(NamedTuple):
     y: Floats
 
 
+class Band(NamedTuple):
+    """An area of a plot between y ``low`` and ``high`` at places x: shaded, or its edges dashed."""
+
+    name: str
+    colour: str
+    x: Floats
+    low: Floats
+    high: Floats
+    dashed: bool = False
+
+
 class Point(NamedTuple):
     """A point of error against time: a star where it is the default; its label is drawn there and
     on the front.
@@ -67,11 +79,13 @@ def line_plot(
     tracks: Sequence[Track],
     labels: tuple[str, str],
     *,
+    bands: Sequence[Band] = (),
     limits: Sequence[float] = (),
     zero: bool = False,
     legend: bool = False,
 ) -> str:
-    """Markup of a plot of lines; one that bears a muscle's name is switched on and off with it.
+    """Markup of a plot of lines; one that bears a muscle's name is switched on and off with it, as
+    are ``bands``.
 
     ``labels`` are those of the axes, ``limits`` dashed lines; the axis begins at ``zero``; a
     ``legend`` stands below.
@@ -91,11 +105,23 @@ def line_plot(
             axes.plot(
                 track.x, track.y, color=track.colour, label=track.name, gid=f"muscle:{track.name}"
             )
+        for band in bands:
+            _draw_band(axes, band)
         axes.margins(x=0.0)
         axes.set_ylim(bottom=0.0 if zero else None)
         if legend:
             figure.legend(loc="lower left", handlelength=1.0, labelspacing=0.2)
         return _svg(figure, title)
+
+
+def _draw_band(axes: "Axes", band: Band) -> None:
+    name = f"muscle:{band.name}"
+    if not band.dashed:
+        area = axes.fill_between(band.x, band.low, band.high, alpha=0.2, linewidth=0.0, gid=name)
+        area.set_color(band.colour)
+        return
+    for edge in (band.low, band.high):
+        axes.plot(band.x, edge, color=band.colour, linestyle="--", linewidth=0.8, gid=name)
 
 
 def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:

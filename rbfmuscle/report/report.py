@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rbfmuscle.fibres.published import published_band
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import (
     COUNTS,
@@ -36,8 +37,9 @@ from rbfmuscle.report.page import (
     limit_state,
     number_cell,
 )
-from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
+from rbfmuscle.report.plots import Band, Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, render_run
+from rbfmuscle.scene.objects import MM_PER_UNIT
 
 # What the rows beside the picture say, and the quantities that each holds to a limit.
 LIGHTS = {
@@ -213,7 +215,36 @@ def _plots(saved: SavedRun) -> list[Section]:
             zero = quantity != "length" and not signed
             group = mechanics if quantity in ("length", "activation", "moment_arm") else errors
             plots[group].append(line_plot(title, tracks, (label, unit), limits=limits, zero=zero))
+    plots[mechanics] += [_fibre_plot(saved, name, axis, label) for name in _fibre_arms(saved)]
     return [Section(title, plots=found) for title, found in plots.items()]
+
+
+def _fibre_arms(saved: SavedRun) -> list[str]:
+    """The coordinates about which fibres have moment arms."""
+    names = saved.moment_arm_coordinates()
+    quantity = "fibre_moment_arm_p50"
+    return [c for c in names if any(len(saved.series(m, quantity, c)[0]) for m in saved.muscles)]
+
+
+def _fibre_plot(saved: SavedRun, coordinate: str, axis: Mapping[int, float], label: str) -> str:
+    """Moment arms of the fibres about a coordinate: each muscle's median and the band from the 5th
+    to the 95th percentile, and dashed the published band of a muscle that has one.
+    """
+    name = "fibre_moment_arm"
+    tracks = _tracks(saved, f"{name}_p50", 1.0, axis, coordinate)
+    bands = []
+    for track in tracks:
+        low, high = (
+            saved.series(track.name, f"{name}_{end}", coordinate)[1] for end in ("p05", "p95")
+        )
+        bands.append(Band(track.name, track.colour, track.x, low, high))
+        known = published_band(track.name, coordinate)
+        if known is not None and label.startswith(coordinate):
+            scale = 1.0 / MM_PER_UNIT[saved.units]
+            ends = scale * known.least, scale * known.greatest
+            bands.append(Band(track.name, track.colour, known.angle, *ends, dashed=True))
+    labels = (label, arm_unit(saved, coordinate))
+    return line_plot(f"Moment arms of fibres: {coordinate}", tracks, labels, bands=bands)
 
 
 def _tracks(

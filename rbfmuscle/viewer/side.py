@@ -11,10 +11,19 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
 from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, surface_depth
-from rbfmuscle.output.appearance import BONE_COLOUR, TENDON_COLOUR, linear_rgb
+from rbfmuscle.output.appearance import (
+    BONE_COLOUR,
+    LONG,
+    SHORT,
+    TENDON_COLOUR,
+    fibres_name,
+    linear_rgb,
+    stretch_colours,
+)
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
 
+LINE = 2.0  # thickness of a fibre [pixel]
 BONE_TRIANGLES = 6000  # Software drawing pays for each of them in every picture.
 
 
@@ -30,6 +39,7 @@ class Colouring(NamedTuple):
 
 COLOURINGS = {
     "group": None,
+    "fibres": Colouring("Stretch of the fibres", SHORT, LONG, "RdBu_r"),
     "activation": Colouring("Activation", 0.0, 1.0, "viridis"),
     "stretch": Colouring("Stretch of the edges", -0.5, 0.5, "coolwarm"),
     "penetration": Colouring("Depth in a bone", 0.0, 2.0, "inferno", length=True),
@@ -139,6 +149,7 @@ class Side:
         self._volumes: dict[str, float] = {}
         self._nodes: dict[str, Any] = {}
         self._painted: list[Any] = []
+        self._lines: dict[str, Any] = {}
 
     def choose(self, choice: str) -> bool:
         """Show another model or run, or none; returns whether it is another."""
@@ -175,6 +186,8 @@ class Side:
                 depth = self.picture.depth.get(name, math.nan)
                 self.numbers[name] = {"volume": error, "depth": depth, "mean": float(values.mean())}
             part, shown = self._part(mesh, look.cut), name not in look.hidden
+            if look.colour == "fibres" and name in self.picture.fibres:
+                shown = False  # the surface would hide them
             self._show(name, part, self.source.colours[name], visible=shown and colouring is None)
             if shown and colouring is not None:
                 painted.append(
@@ -184,9 +197,29 @@ class Side:
             part = self._part(mesh, look.cut)
             self._show(tendon_name(name), part, TENDON_COLOUR, visible=name not in look.hidden)
         self._paint(painted)
+        self._draw_fibres(look)
         for node in self._nodes.values():
             # The inside is seen in a cut alone, and software drawing pays for it.
             node.side = "front" if look.cut is None else "double"
+
+    def _draw_fibres(self, look: Look) -> None:
+        """Show fibres as lines where they are asked for, coloured by their stretch."""
+        for name, fibres in self.picture.fibres.items():
+            shown = look.colour == "fibres" and name not in look.hidden
+            known = self._lines.get(name)
+            if shown:
+                points = fibres.points * (0.001 / self.source.millimetre)
+                colours = np.rint(255.0 * stretch_colours(fibres.local_stretch)).astype(np.uint8)
+                ends = [
+                    np.stack([x[:, :-1], x[:, 1:]], axis=2).reshape(-1, 2, 3)
+                    for x in (points, colours)
+                ]
+                place = f"{self.root}/{fibres_name(name)}"
+                self._lines[name] = self.server.scene.add_line_segments(
+                    place, *ends, thickness=LINE, thickness_units="screen"
+                )
+            elif known is not None:
+                known.visible = False
 
     def _part(self, mesh: Mesh, cut: tuple[int, float] | None) -> Mesh:
         """The part of a mesh that is shown, in metres."""

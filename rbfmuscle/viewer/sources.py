@@ -3,10 +3,12 @@
 import math
 from collections.abc import Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.fields import BoneField
@@ -19,6 +21,7 @@ from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_si
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
+from rbfmuscle.simulation.frame import FibreLines
 from rbfmuscle.simulation.live import LiveSession, live_fields
 from rbfmuscle.validation import UsageError
 
@@ -40,8 +43,8 @@ class Control(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One picture's content by bone or muscle; tendons, activation and depth [scene unit] of those
-    that have them.
+    """One picture's content by bone or muscle; tendons, activation, depth [scene unit] and fibres
+    of those that have them.
     """
 
     poses: dict[str, Floats]
@@ -50,6 +53,7 @@ class Picture(NamedTuple):
     activation: dict[str, float]
     depth: dict[str, float]
     text: str
+    fibres: Mapping[str, FibreLines] = MappingProxyType({})
 
 
 class LiveSource:
@@ -121,6 +125,7 @@ class LiveFigure:
 
     def __init__(self, session: LiveSession, models: list[Any]) -> None:
         self.session, self._unfinished = session, True
+        self._bundles = build_bundles(session.scene, models)
         self.stride = math.radians(session.scene.contact.substep_angle)
         session.use(models)
 
@@ -157,7 +162,8 @@ class LiveFigure:
         meshes = {m.name: tendon_mesh(m, frame.tendons) for m in self.session.scene.muscles}
         tendons = {name: mesh for name, mesh in meshes.items() if mesh is not None}
         known = {name: depth for name, depth in depths.items() if depth is not None}
-        return Picture(frame.poses, surfaces, tendons, frame.activations, known, "")
+        fibres = {name: bundle.at(frame) for name, bundle in self._bundles.items()}
+        return Picture(frame.poses, surfaces, tendons, frame.activations, known, "", fibres)
 
 
 class SavedSource:
@@ -222,9 +228,8 @@ class SavedFigure:
         activation, depth = (
             self._known(quantity) for quantity in ("activation", "penetration_max")
         )
-        return Picture(
-            saved.poses[frame], surfaces, tendons, activation, depth, saved.caption(frame)
-        )
+        text, fibres = saved.caption(frame), dict(saved.fibres(frame))
+        return Picture(saved.poses[frame], surfaces, tendons, activation, depth, text, fibres)
 
     def _known(self, quantity: str) -> dict[str, float]:
         series = {name: self.saved.series(name, quantity) for name in self.saved.muscles}

@@ -18,7 +18,7 @@ MEASURED = (
     "rbfmuscle.output",
     "rbfmuscle.experiments",
 )
-ABOVE = (*MEASURED, "rbfmuscle.report", "rbfmuscle.__version__")
+ABOVE = (*MEASURED, "rbfmuscle.fibres", "rbfmuscle.report", "rbfmuscle.__version__")
 # Which of our own modules (by prefix) a package may import; the first matching package counts.
 ALLOWED = {
     "rbfmuscle.validation": (),

@@ -14,12 +14,13 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.output.appearance import linear_rgb, rgb
-from rbfmuscle.output.saved import MovingPart, MovingRun
+from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
+from rbfmuscle.output.saved import MovingFibres, MovingPart, MovingRun
 from rbfmuscle.validation import UsageError
 
 _FLOAT, _INT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963  # what a view is bound as
+_LINES = 1  # mode of a primitive
 
 
 def animated_glb(run: MovingRun) -> bytes:
@@ -37,6 +38,7 @@ def animated_glb(run: MovingRun) -> bytes:
     if len(run.times) > 1:
         file.times = file.add(run.times[:, None] - run.times[0], "SCALAR", bounds=True)
     children = [_add_part(file, part) for part in (*run.bones, *run.muscles)]
+    children += [_add_fibres(file, fibres) for fibres in run.fibres]
     root: dict[str, Any] = {"name": run.name, "children": children}
     left, posterior, superior = run.body  # glTF looks at what faces +z, with y up
     root["rotation"] = _quaternions(np.stack([left, superior, -posterior])[None])[0].tolist()
@@ -64,6 +66,39 @@ def _add_part(file: "_File", part: MovingPart) -> int:
         if part.moves:
             file.animate(node, "rotation", file.add(turns, "VEC4"))
             file.animate(node, "translation", file.add(shifts, "VEC3"))
+    return node
+
+
+def _add_fibres(file: "_File", fibres: MovingFibres) -> int:
+    """Number of a new node of lines, coloured by the stretch of the first frame."""
+    first = fibres.lines[0]
+    base = first.points.reshape(-1, 3)
+    colours = linear_rgb(stretch_colours(first.local_stretch)).reshape(-1, 3)
+    primitive: dict[str, Any] = {
+        "mode": _LINES,
+        "attributes": {
+            "POSITION": file.add(base, "VEC3", target=_VERTICES, bounds=True),
+            "COLOR_0": file.add(colours, "VEC3", target=_VERTICES),
+        },
+        "indices": file.add(fibres.segments.reshape(-1, 1), "SCALAR", target=_INDICES),
+    }
+    targets = [
+        {
+            "POSITION": file.add(
+                lines.points.reshape(-1, 3) - base, "VEC3", target=_VERTICES, bounds=True
+            )
+        }
+        for lines in fibres.lines[1:]
+    ]
+    entry: dict[str, Any] = {"name": fibres.name, "primitives": [primitive]}
+    if targets:
+        primitive["targets"] = targets
+        entry["weights"] = [0.0] * len(targets)
+    mesh = file.append("meshes", entry)
+    node = file.append("nodes", {"name": fibres.name, "mesh": mesh})
+    if targets:
+        weights = np.eye(len(fibres.lines))[:, 1:]
+        file.animate(node, "weights", file.add(weights.reshape(-1, 1), "SCALAR"))
     return node
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.output.appearance import linear_rgb, rgb
-from rbfmuscle.output.saved import FRAMES_A_SECOND, MovingPart, MovingRun
+from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
+from rbfmuscle.output.saved import FRAMES_A_SECOND, MovingFibres, MovingPart, MovingRun
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingPartError
 
@@ -56,7 +56,28 @@ def write_usd(path: Path, run: MovingRun) -> None:
         _fill(mesh, part, codes)
         mesh.CreateDisplayColorAttr([Gf.Vec3f(*linear_rgb(rgb(part.colour)).tolist())])
         mesh.GetPrim().SetDisplayName(part.name)
+    for fibres in run.fibres:
+        curves = UsdGeom.BasisCurves.Define(stage, f"{place}/{identifier(fibres.name, used)}")
+        _fill_curves(curves, fibres, codes)
+        curves.GetPrim().SetDisplayName(fibres.name)
     stage.GetRootLayer().Export(str(path))
+
+
+def _fill_curves(curves: Any, fibres: MovingFibres, codes: list[float]) -> None:
+    """Fibres get their points and their colours, by their stretch, at each time."""
+    from pxr import UsdGeom, Vt
+
+    count, points = fibres.lines[0].points.shape[:2]
+    curves.CreateTypeAttr(UsdGeom.Tokens.linear)
+    curves.CreateCurveVertexCountsAttr(Vt.IntArray(count, points))
+    colours = curves.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+    for code, lines in zip(codes, fibres.lines):
+        places = np.ascontiguousarray(lines.points.reshape(-1, 3), dtype=np.float32)
+        extent = np.stack([places.min(axis=0), places.max(axis=0)])
+        shades = linear_rgb(stretch_colours(lines.local_stretch)).reshape(-1, 3)
+        curves.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(places), code)
+        curves.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), code)
+        colours.Set(Vt.Vec3fArray.FromNumpy(shades.astype(np.float32)), code)
 
 
 def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
