@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline
@@ -40,7 +41,9 @@ Ranges = dict[str, tuple[float, float]]
 
 @dataclass
 class Samples:
-    """A muscle's lengths and moment arms at some poses; a pose that could not be solved has NaN."""
+    """Lengths and moment arms of a muscle, or of one of its fibres, at some poses; NaN at a pose
+    that could not be solved.
+    """
 
     muscle: str
     coordinates: tuple[str, ...]  # that the muscle depends on, full names
@@ -71,17 +74,23 @@ def parse_ranges(scene: Scene, texts: list[str]) -> Ranges:
 
 
 def sample_muscles(
-    scene: Scene, given: Ranges, *, samples: int, progress: Callable[[int, int], None] | None = None
+    scene: Scene,
+    given: Ranges,
+    *,
+    samples: int,
+    fibres: int = 0,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Samples]:
     """Return lengths and moment arms of every muscle at quasi-random poses of the coordinates that
     it depends on.
 
     Each of the ``samples`` poses is reached from rest in a straight line and the muscle settles
-    there. A moment arm is minus the central difference of the length over `STEP` to both sides, the
-    muscle settling there too. Ranges that are ``given`` stand for the coordinates' own;
-    ``progress`` is called with the poses that are done, and of how many.
+    there. Where so many ``fibres`` are asked for, each of them is sampled in place of the muscle,
+    by its name and the fibre's number. A moment arm is minus the central difference of the length
+    over `STEP` to both sides, the muscle settling there too. Ranges that are ``given`` stand for
+    the coordinates' own; ``progress`` is called with the poses that are done, and of how many.
     """
-    scene = scene.validate().copy()
+    scene = scene.validate().with_options({"output.fibres": fibres})
     scene.sliding = None
     groups = _groups(scene)
     found = []
@@ -96,25 +105,68 @@ def sample_muscles(
         part.muscles = muscles
         values = _poses([ranges[name] for name in names], samples)
         rows = []
-        for row in _measured(part, [dict(zip(names, pose)) for pose in values.tolist()]):
+        poses = [dict(zip(names, pose)) for pose in values.tolist()]
+        models = build_models(_along(part, poses))
+        gauges = _Gauges(part, models)
+        for row in _measured(part, models, gauges, poses):
             rows.append(row)
             done += 1
             if progress is not None:
                 progress(done, samples * len(groups))
-        for muscle, table in zip(muscles, np.array(rows).transpose(1, 0, 2)):
+        for name, table in zip(gauges.names, np.array(rows).transpose(1, 0, 2)):
             capped = int(table[:, -1].sum())
-            found.append(Samples(muscle.name, names, values, table[:, 0], table[:, 1:-1], capped))
+            found.append(Samples(name, names, values, table[:, 0], table[:, 1:-1], capped))
     return found
 
 
-def _measured(scene, poses):
-    """For each pose and muscle: length, arm about each coordinate, whether it did not settle."""
-    scene.motion = Motion(poses[:40])  # what bones a muscle may meet is sought along it
-    models = build_models(scene)
+class _Gauges:
+    """What is measured at a pose: the centrelines of muscles, or of all the fibres that were asked
+    for.
+    """
+
+    def __init__(self, scene, models):
+        self.scene = scene
+        self.bundles = build_bundles(scene, models)
+        self.lines = {
+            model.name: Centreline(scene.muscle(model.name), scene.joints, *model.material_mesh())
+            for model in models
+        }
+        self.names = []
+        self.counts = []  # gauges of each model
+        for model in models:
+            fibres = self.bundles.get(model.name)
+            count = 0 if fibres is None else len(fibres.rest)
+            names = [f"{model.name}_{k + 1}" for k in range(count)] or [model.name]
+            self.names += names
+            self.counts.append(len(names))
+
+    def lengths(self, models, here):
+        """Lengths (n,) where the models are now, at coordinates."""
+        poses = bone_poses(self.scene, here)
+        found = []
+        for model in models:
+            if model.name in self.bundles:
+                for end in self.scene.muscle(model.name).tendons:
+                    poses[end.name]  # its tendon is found when it is first asked for
+                found += self.bundles[model.name].at(poses, poses.tendons).lengths.tolist()
+            else:
+                line = self.lines[model.name]
+                belly = line.length(model.material_mesh()[0], poses)
+                found.append(belly + line.tendon_length(poses.tendons))
+        return np.array(found)
+
+
+def _along(scene, poses):
+    """A scene whose motion passes through poses: what bones a muscle may meet is sought along
+    it.
+    """
+    scene.motion = Motion(poses[:40])
+    return scene
+
+
+def _measured(scene, models, gauges, poses):
+    """For each pose and gauge: length, arm about each coordinate, whether it did not settle."""
     rest = [model.snapshot() for model in models]
-    lines = {
-        m.name: Centreline(scene.muscle(m.name), scene.joints, *m.material_mesh()) for m in models
-    }
     fields = build_fields(scene, find_contact_pairs(scene))
     for pose in poses:
         for model, state in zip(models, rest):
@@ -122,36 +174,31 @@ def _measured(scene, poses):
         try:
             loop = FrameLoop(scene, models, fields=fields, surfaces=False)
             loop.activations.target = loop.activations.at(0)  # the same in all solves
-            yield _row(loop, lines, pose)
+            yield _row(loop, gauges, pose)
         except SolveError:
-            yield np.array([[np.nan] * (1 + len(pose)) + [0.0]] * len(models))
+            yield np.array([[np.nan] * (1 + len(pose)) + [0.0]] * len(gauges.names))
 
 
-def _row(loop, lines, pose):
-    """Length and arms of the muscles at a pose, and whether they did not settle, (n, 2 + d)."""
-    here, arms = _settled(loop, lines, pose), []
+def _row(loop, gauges, pose):
+    """Length and arms of the gauges at a pose, and whether they did not settle, (n, 2 + d)."""
+    here, arms = _settled(loop, gauges, pose), []
     facts = all_coordinates(loop.scene.joints)
     for name, value in pose.items():
         turns = facts[name].motion != "translation"
         step = math.radians(STEP) if turns else loop.scene.length(STEP)
         ends = [facts[name].honoured(value + side * step) for side in (-1.0, 1.0)]
-        below, above = (_settled(loop, lines, {**pose, name: end}) for end in ends)
+        below, above = (_settled(loop, gauges, {**pose, name: end}) for end in ends)
         arms.append(-(above - below) / (ends[1] - ends[0]))
     capped = [any(key[2] == "iteration_cap" for key in s.events) for s in loop.steppers]
-    return np.stack([here, *arms, capped], axis=1)
+    return np.stack([here, *arms, np.repeat(capped, gauges.counts)], axis=1)
 
 
-def _settled(loop, lines, pose):
-    """Lengths (n,) of the muscles that rest at a pose, or have had `MOST_SOLVES`: an event."""
+def _settled(loop, gauges, pose):
+    """Lengths (n,) when the muscles rest at a pose, or have had `MOST_SOLVES`: an event."""
     loop.skip(pose)
     with loop.working():
         each(lambda stepper: _settle(stepper, loop.here), loop.steppers)
-    poses, found = bone_poses(loop.scene, loop.here), []
-    for stepper in loop.steppers:
-        line = lines[stepper.name]
-        belly = line.length(stepper.model.material_mesh()[0], poses)
-        found.append(belly + line.tendon_length(poses.tendons))
-    return np.array(found)
+    return gauges.lengths([stepper.model for stepper in loop.steppers], loop.here)
 
 
 def _settle(stepper, here):

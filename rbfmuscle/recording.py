@@ -183,7 +183,8 @@ class Recording:
         for coordinates in self.scene.motion.frames:
             with timed(self.times, "simulate"):
                 frame = loop.advance(coordinates)
-                frame.fibres = {name: bundle.at(frame) for name, bundle in self._bundles.items()}
+                poses, tendons = frame.poses, frame.tendons
+                frame.fibres = {n: lines.at(poses, tendons) for n, lines in self._bundles.items()}
             with timed(self.times, "metrics"):
                 measured = self._measures.measure(frame)
             yield frame, measured

@@ -306,6 +306,7 @@ def paths(
     output: Output,
     samples: int = 120,
     muscles: str | None = None,
+    fibres: int = 0,
     ranges: Annotated[list[str] | None, Parameter(name="--range", negative="")] = None,
     model: Model = None,
     settings: Settings = None,
@@ -319,6 +320,8 @@ def paths(
         Poses for each muscle, of which every fifth is held out of the fit.
     muscles
         Names, separated by commas; all by default.
+    fibres
+        Of each muscle, for each of which a path is fitted, in place of one for the muscle.
     ranges
         COORDINATE=LOW:HIGH in degrees or scene units; else the coordinate's range, or what the
         motion covers.
@@ -338,5 +341,5 @@ def paths(
     given = parse_ranges(loaded, ranges or [])
     paths_folder(output)
     with Progress(loaded.name, "pose") as progress:
-        sampled = sample_muscles(loaded, given, samples=samples, progress=progress)
+        sampled = sample_muscles(loaded, given, samples=samples, fibres=fibres, progress=progress)
     print("\n".join(report_fits(loaded, sampled, output)))

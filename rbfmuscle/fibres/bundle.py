@@ -1,7 +1,7 @@
 """The fibres of one muscle over a motion: traced at rest, carried by the material and the bones."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bones_about
 from rbfmuscle.scene.objects import Attachment, Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import NODES, TendonLine
-from rbfmuscle.simulation.frame import FibreLines, Frame, MuscleModel
+from rbfmuscle.simulation.frame import FibreLines, MuscleModel
 from rbfmuscle.validation import SceneWarning
 
 PATCH_POINTS = 3000  # of an end
@@ -43,30 +43,31 @@ class FibreBundle:
         self._follow = model.follower(np.ascontiguousarray(self.rest.reshape(-1, 3)))
         self._tendon = [[a.tendon is not None for a in group] for group in groups]
 
-    def at(self, frame: Frame) -> FibreLines:
-        """The fibres in a frame to which the model has just come."""
+    def at(self, poses: Mapping[str, Floats], tendons: Mapping[str, TendonLine]) -> FibreLines:
+        """The fibres where the model is now, at poses (4, 4) of bones and ends of tendons, and the
+        tendons by the end that each holds.
+        """
         belly = self._follow().reshape(self.rest.shape)
         for end, place in ((0, 0), (1, POINTS - 1)):
-            belly[:, place] = self._carried(end, place, frame)
+            belly[:, place] = self._carried(end, place, poses)
         now = _segments(belly)
         ratio = now / self._segments
         local = np.empty((len(belly), POINTS))
         local[:, 1:-1] = 0.5 * (ratio[:, 1:] + ratio[:, :-1])
         local[:, [0, -1]] = ratio[:, [0, -1]]
-        before, after = (self._tendons(end, belly, frame) for end in (0, 1))
+        before, after = (self._tendons(end, belly, tendons) for end in (0, 1))
         points = np.concatenate([before[:, ::-1], belly, after], axis=1)
         still = [np.ones(part.shape[:2]) for part in (before, after)]
         stretch = now.sum(axis=1) / self._segments.sum(axis=1)
         return FibreLines(points, stretch, np.concatenate([still[0], local, still[1]], axis=1))
 
-    def _carried(self, end: int, place: int, frame: Frame) -> Floats:
+    def _carried(self, end: int, place: int, poses: Mapping[str, Floats]) -> Floats:
         """Ends (N, 3) of the fibres where their bones, or ends of tendons, carry them."""
-        poses = np.array([frame.poses[name] for name in self.holders])[self._held[:, end]]
-        return np.asarray(
-            np.einsum("nij,nj->ni", poses[:, :3, :3], self.rest[:, place]) + poses[:, :3, 3]
-        )
+        pose = np.array([poses[name] for name in self.holders])[self._held[:, end]]
+        turned = np.einsum("nij,nj->ni", pose[:, :3, :3], self.rest[:, place])
+        return np.asarray(turned + pose[:, :3, 3])
 
-    def _tendons(self, end: int, belly: Floats, frame: Frame) -> Floats:
+    def _tendons(self, end: int, belly: Floats, tendons: Mapping[str, TendonLine]) -> Floats:
         """Points (N, k, 3) of the tendon of each fibre beyond an end, away from the belly: none
         where no fibre has one there, the end itself for fibres that have none.
         """
@@ -74,9 +75,8 @@ class FibreBundle:
             return np.empty((len(belly), 0, 3))
         out = np.repeat(belly[:, [0 if end == 0 else -1]], NODES - 1, axis=1)
         for place, name in enumerate(self.holders):
-            tendon: TendonLine | None = frame.tendons.get(name)
-            if tendon is not None:
-                out[self._held[:, end] == place] = tendon.points[1:]
+            if name in tendons:
+                out[self._held[:, end] == place] = tendons[name].points[1:]
         return out
 
 

@@ -162,7 +162,8 @@ class LiveFigure:
         meshes = {m.name: tendon_mesh(m, frame.tendons) for m in self.session.scene.muscles}
         tendons = {name: mesh for name, mesh in meshes.items() if mesh is not None}
         known = {name: depth for name, depth in depths.items() if depth is not None}
-        fibres = {name: bundle.at(frame) for name, bundle in self._bundles.items()}
+        places = frame.poses, frame.tendons
+        fibres = {name: bundle.at(*places) for name, bundle in self._bundles.items()}
         return Picture(frame.poses, surfaces, tendons, frame.activations, known, "", fibres)
 
 

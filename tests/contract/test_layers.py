@@ -41,12 +41,7 @@ ALLOWED = {
     "rbfmuscle.experiments": MEASURED,
     "rbfmuscle.report": ABOVE,
     "rbfmuscle.viewer": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models", "rbfmuscle.viewer"),
-    "rbfmuscle.recording": (
-        *ABOVE,
-        "rbfmuscle.fibres",
-        "rbfmuscle.importers",
-        "rbfmuscle.models",
-    ),
+    "rbfmuscle.recording": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models"),
     "rbfmuscle.run": (*ABOVE, "rbfmuscle.recording"),
     "rbfmuscle.compare": (*ABOVE, "rbfmuscle.models", "rbfmuscle.run"),
     "rbfmuscle.paths": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models"),

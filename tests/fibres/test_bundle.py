@@ -1,6 +1,7 @@
 """Fibres over a motion: what both kinds of model and a saved run give."""
 
 import csv
+import json
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from toy_scene import held
 import rbfmuscle as rm
 from rbfmuscle.fibres.published import published_band
 from rbfmuscle.geometry.tubes import line_length
+from rbfmuscle.output.appearance import stretch_colours
 from rbfmuscle.validation import UsageError
+from rbfmuscle.viewer.sources import SavedSource
 
 FIBRES = 12
 
@@ -101,6 +104,49 @@ def test_a_saved_run_has_the_fibres(run, tmp_path):
     row = rows[FIBRES * 3 + 5]
     assert (row["frame"], row["muscle"], row["fibre"]) == ("3", "strap", "5")
     assert float(row["length"]) == pytest.approx(fibres.lengths[5])
+
+
+def test_fibres_are_exported_and_drawn(run, tmp_path):
+    run.save(tmp_path / "run", pictures=False)
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert page.count("Moment arms of fibres: elbow.bend") >= 1
+    run.export(tmp_path / "out", ["vtp", "animated-glb"], units=None)
+    moved = pyvista.read(tmp_path / "out" / "vtp" / "strap_fibres_0004.vtp")
+    np.testing.assert_allclose(moved.points, run["strap"].fibres(4).reshape(-1, 3), rtol=1e-12)
+    data = (tmp_path / "out" / "animated-glb" / "hinge.glb").read_bytes()
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    (lines,) = (mesh for mesh in tree["meshes"] if mesh["name"] == "strap_fibres")
+    (primitive,) = lines["primitives"]
+    ends = tree["accessors"][primitive["indices"]]
+    assert (primitive["mode"], len(primitive["targets"])) == (1, len(run) - 1)
+    assert ends["count"] == 2 * FIBRES * (run["strap"].fibres(0).shape[1] - 1)
+    place = tree["accessors"][primitive["attributes"]["POSITION"]]
+    metres = 0.001 * run["strap"].fibres(0).reshape(-1, 3)
+    np.testing.assert_allclose(place["max"], metres.max(axis=0), rtol=1e-6)
+    source = SavedSource({"run": rm.Run.load(tmp_path / "run").saved})
+    picture = source.figure("run").advance()
+    assert picture.fibres["strap"].points.shape == run["strap"].fibres(0).shape
+
+
+def test_curves_of_usd_follow_the_fibres(run, tmp_path):
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom
+
+    run.save(tmp_path / "run", pictures=False)
+    (file,) = run.export(tmp_path / "out", "usd")
+    stage = usd.Stage.Open(str(file))
+    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath("/hinge/strap_fibres"))
+    for frame in (0, 3):
+        np.testing.assert_allclose(
+            curves.GetPointsAttr().Get(frame), run["strap"].fibres(frame).reshape(-1, 3), rtol=1e-5
+        )
+    assert len(curves.GetCurveVertexCountsAttr().Get()) == FIBRES
+
+
+def test_colours_of_stretch_are_white_at_one():
+    blue, white, red = stretch_colours(np.array([0.3, 1.0, 1.6]))
+    assert white.min() > 0.95
+    assert blue[2] > blue[0] and red[0] > red[2]
 
 
 def test_a_run_without_fibres_says_how_to_have_them():

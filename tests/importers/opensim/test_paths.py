@@ -135,6 +135,16 @@ def test_a_pose_is_sampled_from_rest_whatever_was_sampled_before(scene):
     np.testing.assert_allclose(two.arms, four.arms[:2], rtol=1e-9)
 
 
+def test_each_fibre_is_sampled_as_a_path_of_its_own(scene):
+    fibres = sample_muscles(scene, RANGES, samples=1, fibres=6)
+    (muscle,) = sample_muscles(scene, RANGES, samples=1)
+    assert [found.muscle for found in fibres] == [f"abductor_{k}" for k in range(1, 7)]
+    arms = np.array([found.arms[0] for found in fibres])
+    # The muscle is 25 mm thick, and its centreline among its fibres.
+    assert (np.abs(arms - muscle.arms[0]) < 25.0).all()
+    assert np.abs(arms.mean(axis=0) - muscle.arms[0]).max() < 5.0
+
+
 def test_poses_that_fail_are_left_out_and_too_many_are_refused(tmp_path, scene):
     values, lengths, arms = made(20)
     lengths[3] = arms[4] = np.nan
