@@ -19,7 +19,10 @@ TABLES = {
         options.TunnellingOptions,
         {"angle": 120.0, "action": "report", "swept": False},
     ),
-    "output": (options.OutputOptions, {"surfaces": False, "tendons": False, "report": False}),
+    "output": (
+        options.OutputOptions,
+        {"surfaces": False, "tendons": False, "fibres": 5, "report": False},
+    ),
 }
 MODELS = {
     "rbf": (

@@ -129,12 +129,11 @@ def test_fibres_are_exported_and_drawn(run, tmp_path):
 
 
 def test_curves_of_usd_follow_the_fibres(run, tmp_path):
-    usd = pytest.importorskip("pxr.Usd")
-    from pxr import UsdGeom
+    from pxr import Usd, UsdGeom
 
     run.save(tmp_path / "run", pictures=False)
     (file,) = run.export(tmp_path / "out", "usd")
-    stage = usd.Stage.Open(str(file))
+    stage = Usd.Stage.Open(str(file))
     curves = UsdGeom.BasisCurves(stage.GetPrimAtPath("/hinge/strap_fibres"))
     for frame in (0, 3):
         np.testing.assert_allclose(
