@@ -415,7 +415,6 @@ class MuscleRun:
         return frame.fibres[self.name]
 
 
-
 def _about(rows: list[Row], coordinate: str | None) -> list[Row]:
     """The rows of moment arms about one coordinate."""
     names = list(dict.fromkeys(row.coordinate for row in rows))
