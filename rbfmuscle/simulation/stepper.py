@@ -167,17 +167,17 @@ class MuscleStepper:
             ) from error
 
     def surface(self) -> ModelSurface:
-        """The surface of the present state; the earlier one, moved, where the muscle moved rigidly
-        since.
+        """The surface of the present state: the earlier one, moved, where the muscle was not solved
+        since and has no neighbours that slide.
         """
         carrier = self.carrier
         with self.timed("surface"):
-            if self._shown is not None and carrier is not None:
-                return self._shown.moved(carrier.since)
-            shown = self.model.surface(self.contacts)
+            if self._shown is not None and not self.contacts.beside:
+                return self._shown.moved(np.eye(4) if carrier is None else carrier.since)
+            self._shown = self.model.surface(self.contacts)
         if carrier is not None:
-            self._shown, carrier.since = shown, np.eye(4)
-        return shown
+            carrier.since = np.eye(4)
+        return self._shown
 
     def report(self, bone: str, count: int, action: str) -> None:
         """Record an event of the present frame; of one kind the greatest number of points is
