@@ -1,31 +1,30 @@
-"""Where a muscle holds: at its ends, and where it lies on a bone that anatomy names.
+"""Where a muscle holds: at the sites that anatomy names, else where its ends lie on bones.
 
-A muscle's length is measured along its surface. Where an end lies on a bone, the patch is what
-touches it; where the belly stops short of its bone, the patch is the cap of the end that points
-there, and a tendon goes straight to the nearest place of the bone. At a patella that follows its
-knee, the tendon goes on along the patellar ligament to the tibia.
+A muscle's length is measured along its surface. Where an end lies on its site, the patch is what
+touches it; where the belly stops short of it, the patch is what lies nearest, or the cap of the
+end, and a tendon goes to the site.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from rbfmuscle.importers.guess.anatomy import JointGuess
+from rbfmuscle.importers.guess.ends import Ends
+from rbfmuscle.importers.guess.frames import PELVIS, BoneFrame
 from rbfmuscle.importers.guess.landmarks import unit
 from rbfmuscle.importers.guess.parts import Part
+from rbfmuscle.importers.guess.sites import Site, anatomy_of, find_site, sites_on, whole_bone
 from rbfmuscle.scene.bone import Bone
 
-if TYPE_CHECKING:
-    import trimesh
-
-# A bone nearer than this [mm] is touched; the patch is what lies within TOUCH of the nearest.
+# A site nearer than this [mm] is touched; the patch is what lies within TOUCH of the nearest.
 NEAR, TOUCH = 6.0, 3.0
+AROUND = 6.0  # of an end beside its site, what lies so much farther than the nearest [mm] is held
 MAYBE = 4.0  # a bone that only may hold a muscle does so where it is nearer than this [mm]
 # Length [mm] of the cap that is held where an end stops short of its bone, and as a share of the
 # muscle.
@@ -36,7 +35,21 @@ REACH = (
     0.75  # how far along the muscle a patch at one end may reach (0 at that end, 1 at the other)
 )
 ASIDE = 60.0  # how much farther a bone counts that an end does not point to
-FAR = 25.0  # an end farther than this [mm] from its bone gets a tendon
+# An end farther than this from its site gets a tendon: [mm], and as a share of the muscle.
+FAR, FAR_SHARE = 25.0, 0.1
+FAR_FROM_PATELLA = 5.0  # the same at the patella, where the tendon takes the muscle round the knee
+LONG = 100.0  # a tendon longer than this [mm] is less sure
+# How much of a muscle is held where bones that are not here would hold it along its length.
+UPPER = 0.25
+# The muscle whose tendon is drawn on, in front of the patella and along its ligament; the patella's
+# poles and front.
+ALONG_LIGAMENT = "rectus femoris"
+POLES = "patella_base", "patella_front", "patella_apex"
+CLEAR = 1.5  # via points lie so far out of bones [mm]
+# Confidence where a muscle touches its site, lies beside it, has a tendon, a long one; where its site
+# is not known; where a bone stands for one that is not here; where not even its bones are known.
+TOUCHES, BESIDE, TENDON, LONG_TENDON = 1.0, 0.9, 0.8, 0.7
+NO_SITE, STAND_IN, NO_BONE, NO_NAME = 0.5, 0.4, 0.2, 0.4
 
 
 class TendonGuess(NamedTuple):
@@ -51,14 +64,15 @@ class TendonGuess(NamedTuple):
 
 @dataclass
 class AttachmentGuess:
-    """Vertices of a muscle's mended mesh that a bone holds, their least distance to it [mm], and
-    why.
+    """Vertices of a muscle's mended mesh that a bone holds, their least distance to it [mm], why,
+    and how sure that is.
     """
 
     bone: Part
     vertices: np.ndarray
     gap: float
     reason: str
+    confidence: float = 1.0
     tendon: TendonGuess | None = None
 
 
@@ -74,45 +88,49 @@ class MuscleGuess:
     confidence: float
     reasons: list[str] = field(default_factory=list)
     wrong: str = ""
+    doubted: bool = False  # whether more than one attachment is in doubt
 
     def doubt(self, confidence: float, reason: str) -> None:
         """Add a reason why the confidence is at most so much."""
         self.confidence = min(self.confidence, confidence)
         self.reasons.append(reason)
+        self.doubted = True
 
 
 class Skeleton(NamedTuple):
     """What muscles are held by; ``bodies`` gives of bones that move as one the one that stands for
-    all.
+    all, ``frames`` and ``articular`` their axes and the points (n, 3) of their joints' surfaces.
     """
 
     bones: dict[Part, Bone]
     bodies: dict[Part, Part]
     joints: list[JointGuess]
     millimetre: float
+    frames: dict[Part, list[BoneFrame]]
+    articular: dict[Part, np.ndarray]
+
+    def frame(self, bone: Part, points: np.ndarray) -> BoneFrame | None:
+        """The frame of a bone that is nearest to some points (n, 3), of several."""
+        here = points.mean(axis=0)
+        frames = self.frames.get(bone, [])
+        return min(frames, key=lambda f: np.linalg.norm(f.origin - here), default=None)
+
+    def site(self, name: str, bone: Part, points: np.ndarray) -> Site | None:
+        """A site on a bone, for a muscle of these points (n, 3); None without landmarks."""
+        frame = self.frame(bone, points)
+        return frame and find_site(name, bone, frame, self.articular[bone])
 
 
-class Ends:
-    """The two ends of a closed surface: the points farthest apart along it."""
+class Place(NamedTuple):
+    """A bone, the end of the muscle that it holds, the sites there, none where they are not known,
+    the first place that the tendon passes, and whether the bone stands for one that is not here.
+    """
 
-    def __init__(self, mesh: trimesh.Trimesh) -> None:
-        count = len(mesh.vertices)
-        graph = coo_matrix(
-            (mesh.edges_unique_length, mesh.edges_unique.T), shape=(count, count)
-        ).tocsr()
-
-        def away_from(vertex):
-            distance = dijkstra(graph, directed=False, indices=vertex)
-            return distance, int(np.argmax(np.where(np.isfinite(distance), distance, -1.0)))
-
-        first = away_from(0)[1]
-        away, second = away_from(first)
-        self.tips, self.away = (first, second), (away, away_from(second)[0])
-        self.length = float(away[second])
-
-    def along(self, end: int) -> np.ndarray:
-        """Place of each vertex between an end (0) and the other one (1)."""
-        return self.away[end] / np.maximum(self.away[0] + self.away[1], 1e-300)
+    bone: Part
+    end: int
+    sites: tuple[Site, ...] = ()
+    via: tuple[tuple[Part, np.ndarray], ...] = ()
+    stands_in: bool = False
 
 
 def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -> MuscleGuess:
@@ -124,31 +142,29 @@ def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -
         b: bone.distances(muscle.points) / millimetre for b, bone in skeleton.bones.items()
     }
     guess = MuscleGuess(muscle, [], 1.0)
-    places = _named_places(guess, distances, ends) if named and muscle.facts is not None else []
+    places: list[Place] = []
+    if named and muscle.facts is not None:
+        places = _named_places(guess, distances, ends, skeleton)
     by_name = bool(places)
     if not by_name:
         places = _nearest_places(muscle, skeleton.bodies, distances, ends)
         known = muscle.facts is not None
         why = "the bones of its name are not here" if known else "its name is not known"
         guess.reasons = []
-        guess.doubt(0.2 if known else 0.4, f"{why}; the bones are the nearest to its two ends")
-    holds = [_hold(bone, distances[bone], ends, end, millimetre) for bone, end in places]
+        guess.doubt(
+            NO_BONE if known else NO_NAME, f"{why}; the bones are the nearest to its two ends"
+        )
+    holds = [_hold(place, distances[place.bone], ends, muscle, skeleton) for place in places]
     guess.holds = _disjoint(holds, distances)
-    if by_name:  # the nearer its ends are to the bones, the surer
-        worst = max((hold.gap for hold in guess.holds), default=FAR)
-        guess.confidence = 1.0 - 0.4 * min(worst / FAR, 1.0)
-        _compare(guess, skeleton.bodies, distances)
-        guess.confidence = 0.5 if guess.reasons else guess.confidence
+    if by_name:
+        _say_touched(guess, distances, skeleton.bodies)
     _doubt(guess, skeleton.bodies)
-    for hold in guess.holds:
-        if hold.gap > FAR and not guess.wrong:
-            hold.tendon = _tendon(hold, muscle, skeleton.joints)
     return guess
 
 
-def _compare(guess, bodies, distances):
-    """Name what names and distances say differently: a patch that touches another bone than that of
-    its name.
+def _say_touched(guess, distances, bodies):
+    """Say where an end that is farther than `NEAR` from its bone touches another, as it may where
+    its name is wrong.
     """
     named = {bodies[hold.bone] for hold in guess.holds}
     for hold in guess.holds:
@@ -159,28 +175,45 @@ def _compare(guess, bodies, distances):
             guess.reasons.append(f"{away}, but it touches {nearest.name}")
 
 
-def _named_places(guess, distances, ends):
-    """(bone, end) for the bones that anatomy names: origins at one end, insertions at the other."""
-    groups, facts = [], guess.muscle.facts
-    for listed in (facts.origin, facts.insertion):
-        chosen = []
-        for kinds, must in listed:
-            bone = _best_of(kinds, guess.muscle, distances)
+def _named_places(guess, distances, ends, skeleton):
+    """Places on the bones that anatomy names: origins at one end, insertions at the other."""
+    muscle, groups = guess.muscle, []
+    known = anatomy_of(muscle.facts.name)
+    for side in ("origin", "insertion"):
+        chosen: dict[Part, Place] = {}
+        for kinds, must in getattr(muscle.facts, side):
+            bone = _best_of(kinds, muscle, distances)
             if bone is None and must:
                 guess.reasons.append(f"no bone here is its {' or '.join(kinds)}")
             if bone is not None and (must or distances[bone].min() < MAYBE):
-                chosen.append(bone)
+                stands_in = bone.kind != kinds[0] and not {bone.kind, kinds[0]} <= {*PELVIS}
+                if stands_in:
+                    guess.doubt(STAND_IN, f"no {kinds[0]} is here, the {bone.name} stands for it")
+                names = sites_on(getattr(known, side), bone) if known else ()
+                sites = (skeleton.site(name, bone, muscle.points) for name in names)
+                via = _via(known, muscle, skeleton) if names and side == "insertion" else ()
+                chosen[bone] = Place(bone, 0, tuple(filter(None, sites)), via, stands_in)
         groups.append(chosen)
 
     def cost(first):
-        tips = ends.tips[first], ends.tips[1 - first]
-        return sum(
-            max(distances[bone][tip], 0.0) for group, tip in zip(groups, tips) for bone in group
-        )
+        tips = (muscle.points[ends.tips[k]] for k in (first, 1 - first))
+        return sum(_away(place, tip) for g, tip in zip(groups, tips) for place in g.values())
 
     first = min((0, 1), key=cost)
-    insertions = [(bone, 1 - first) for bone in groups[1] if bone not in groups[0]]
-    return [(bone, first) for bone in groups[0]] + insertions
+    return [
+        place._replace(end=end)
+        for group, end in zip(groups, (first, 1 - first))
+        for bone, place in group.items()
+        if group is groups[0] or bone not in groups[0]
+    ]
+
+
+def _away(place, tip):
+    """Distance of a tip (3,) from the landmarks of sites, or from a bone where there are none."""
+    points = place.bone.points
+    if place.sites:
+        points = np.concatenate([site.core for site in place.sites])
+    return float(np.sqrt(((points - tip) ** 2).sum(axis=1).min()))
 
 
 def _best_of(kinds, muscle, distances):
@@ -196,7 +229,7 @@ def _best_of(kinds, muscle, distances):
 
 
 def _nearest_places(muscle, bodies, distances, ends):
-    """(bone, end) without names: what an end touches, else what it points to; not twice the same
+    """Places without names: what an end touches, else what it points to; not twice the same
     body.
     """
     places, wishes = [], []
@@ -211,8 +244,9 @@ def _nearest_places(muscle, bodies, distances, ends):
         order = sorted(score, key=score.__getitem__)
         wishes.append((score[order[0]], end, order))
     for _, end, order in sorted(wishes, key=lambda wish: wish[0]):
-        taken = {bodies[bone] for bone, _ in places}
-        places.append((next((bone for bone in order if bodies[bone] not in taken), order[0]), end))
+        taken = {bodies[place.bone] for place in places}
+        free = (bone for bone in order if bodies[bone] not in taken)
+        places.append(Place(next(free, order[0]), end))
     return places
 
 
@@ -227,33 +261,112 @@ def _aim(points, along, bone):
     return float((distance * (1.0 + ASIDE * (1.0 - away @ direction / distance))).min())
 
 
-def _hold(bone, distance, ends, end, millimetre):
+def _hold(place, distance, ends, muscle, skeleton):
     """What a bone holds of an end."""
-    at_end = ends.along(end) <= REACH
-    least = float(distance[at_end].min())
-    if least <= NEAR:
-        limit = max(least, 0.0) + TOUCH
-        chosen = np.flatnonzero(at_end & (distance <= limit))
-        if len(chosen) >= FEWEST:
-            return AttachmentGuess(bone, chosen, least, f"within {limit:.3g} mm of the bone")
-    chosen = np.flatnonzero(ends.away[end] <= min(CAP * millimetre, CAP_SHARE * ends.length))
+    bone, millimetre = place.bone, skeleton.millimetre
+    points = muscle.points
+    sites = place.sites or (whole_bone(bone, skeleton.articular[bone]),)
+    near = cKDTree(np.concatenate([site.points for site in sites])).query(points)[0] / millimetre
+    # The nearest place of the bone belongs to a site where the site's points are no farther.
+    coarse = np.sqrt(bone.mesh.area / len(bone.faces[0])) / millimetre
+    on_site = near <= np.maximum(distance, 0.0) + TOUCH + coarse
+    chosen, gap = _touching(np.where(on_site, distance, np.inf), ends.along(place.end))
+    where = " and ".join(site.name.replace("_", " ") for site in sites)
+    confidence = TOUCHES
+    far = min(FAR, FAR_SHARE * ends.length / millimetre)
+    if bone.kind == "patella":
+        far = FAR_FROM_PATELLA
+    reason = f"within {gap + TOUCH:.3g} mm of the {where}"
     if len(chosen) < FEWEST:
-        chosen = np.sort(np.argsort(ends.away[end], kind="stable")[:FEWEST])
-    gap = float(distance[chosen].min())
-    return AttachmentGuess(
-        bone, chosen, gap, f"at the end that points to the bone, {gap:.3g} mm from it"
-    )
+        chosen = _end(near, ends, place, muscle, millimetre)
+        gap, confidence = float(near[chosen].min()), BESIDE
+        reason = f"at the end that points to the {where}, {gap:.3g} mm from it"
+    hold = AttachmentGuess(bone, chosen, gap, reason, confidence)
+    if confidence == BESIDE:
+        if place.stands_in:
+            hold.vertices = np.flatnonzero(ends.along(place.end) <= UPPER)
+        elif gap > far:
+            _add_tendon(hold, place, muscle, skeleton)
+    if not place.sites:
+        hold.confidence = min(hold.confidence, NO_SITE)
+    return hold
 
 
-def _tendon(hold, muscle, joints):
+def _touching(distance, along):
+    """Vertices that touch their site, given distances [mm] of those that lie at it, and the least
+    of these.
+    """
+    distance = np.where(along <= REACH, distance, np.inf)
+    least = max(float(distance.min()), 0.0)
+    if least > NEAR:
+        return np.empty(0, dtype=int), least
+    return np.flatnonzero(distance <= least + TOUCH), least
+
+
+def _end(near, ends, place, muscle, millimetre):
+    """Vertices of an end that does not touch its site: what is nearest to it, or to the first place
+    that its tendon passes, or the cap where that is far.
+    """
+    if place.via:
+        near = np.linalg.norm(muscle.points - place.via[0][1], axis=1) / millimetre
+    near = np.where(ends.along(place.end) <= REACH, near, np.inf)
+    if place.sites and near.min() < FAR:
+        chosen = np.flatnonzero(near <= near.min() + AROUND)
+    else:
+        share = min(CAP * millimetre, CAP_SHARE * ends.length)
+        chosen = np.flatnonzero(ends.away[place.end] <= share)
+        near = ends.away[place.end]
+    return chosen if len(chosen) >= FEWEST else np.sort(np.argsort(near, kind="stable")[:FEWEST])
+
+
+def _add_tendon(hold, place, muscle, skeleton):
+    """A tendon to the nearest landmark of the site, or to the nearest place of the bone, past the
+    places that anatomy names.
+    """
     end = muscle.points[hold.vertices].mean(axis=0)
-    place = hold.bone.points[np.argmin(((hold.bone.points - end) ** 2).sum(axis=1))]
-    patella = next((j for j in joints if j.child is hold.bone and j.ligament is not None), None)
-    if patella is None:
-        return TendonGuess(hold.bone, place)
-    tibia = next(j.child for j in joints if j.child.kind == "tibia" and j.parent is patella.parent)
-    apex, tuberosity = patella.ligament
-    return TendonGuess(tibia, tuberosity, ((hold.bone, place), (hold.bone, apex)))
+    last = place.via[-1][1] if place.via else end
+    ends = [site.nearest(last) for site in place.sites] or [place.bone.points]
+    points = np.vstack(ends)
+    to = points[np.argmin(((points - last) ** 2).sum(axis=1))]
+    to = _out_of_bones(to, hold.bone, skeleton)
+    hold.tendon = TendonGuess(hold.bone, to, place.via)
+    if hold.bone.kind == "patella" and muscle.facts.name == ALONG_LIGAMENT:
+        hold.tendon = _past_patella(hold.bone, muscle, skeleton) or hold.tendon
+    hold.confidence = TENDON if hold.gap < LONG else LONG_TENDON
+
+
+def _past_patella(patella, muscle, skeleton):
+    """A tendon in front of a patella that follows its knee, on along its ligament to the tibia;
+    else None.
+    """
+    follows = {j.child: j.parent for j in skeleton.joints if j.ligament is not None}
+    shins = {j.parent: j.child for j in skeleton.joints if j.child.kind == "tibia"}
+    tibia = shins.get(follows.get(patella))
+    tuberosity = tibia and skeleton.site("tibial_tuberosity", tibia, muscle.points)
+    if tuberosity is None:
+        return None
+    poles = [skeleton.site(name, patella, muscle.points).core[0] for name in POLES]
+    via = tuple((patella, _out_of_bones(pole, patella, skeleton)) for pole in poles)
+    return TendonGuess(tibia, _out_of_bones(tuberosity.core[0], tibia, skeleton), via)
+
+
+def _via(known, muscle, skeleton):
+    """(bone, place) that the tendon of an insertion passes, out of the bones."""
+    found = []
+    for name in known.via:
+        bones = [b for b in skeleton.bones if sites_on((name,), b)]
+        bones = [b for b in bones if not b.side or not muscle.side or b.side == muscle.side]
+        sites = ((b, skeleton.site(name, b, muscle.points)) for b in bones)
+        bone, site = next(((b, s) for b, s in sites if s is not None), (None, None))
+        if site is not None:
+            found.append((bone, _out_of_bones(site.core[0], bone, skeleton)))
+    return tuple(found)
+
+
+def _out_of_bones(point, bone, skeleton):
+    """A place (3,) of a bone's surface, moved out of it by `CLEAR`."""
+    nearest = np.argmin(((bone.faces[0] - point) ** 2).sum(axis=1))
+    return point + CLEAR * skeleton.millimetre * bone.faces[1][nearest]
 
 
 def _disjoint(holds, distances):
@@ -269,9 +382,12 @@ def _disjoint(holds, distances):
 def _doubt(guess, bodies):
     """Lower the confidence, or say that the muscle cannot be run."""
     for hold in guess.holds:
-        if hold.gap > FAR:
+        guess.confidence = min(guess.confidence, hold.confidence)
+        if hold.confidence == NO_SITE:
+            guess.reasons.append(f"its site on the {hold.bone.name} is not known: the nearest place")
+        if hold.tendon is not None and not hold.confidence > NO_SITE:
             away = f"{hold.gap:.0f} mm from the {hold.bone.name}"
-            guess.doubt(0.5, f"the mesh ends {away}: a straight tendon was added, check its path")
+            guess.reasons.append(f"the mesh ends {away}: a straight tendon was added")
     if guess.muscle.doubt:
         guess.confidence = min(guess.confidence, 0.3)
     share = sum(len(hold.vertices) for hold in guess.holds) / len(guess.muscle.points)

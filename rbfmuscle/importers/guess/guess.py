@@ -10,10 +10,12 @@ import numpy as np
 
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
 from rbfmuscle.importers.guess.attachments import MuscleGuess, Skeleton, guess_attachments
+from rbfmuscle.importers.guess.frames import bone_frames
 from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
 from rbfmuscle.importers.guess.parts import Part, Parts, read_parts
 from rbfmuscle.importers.toml_text import attachment_file, table_text
+from rbfmuscle.scene.articular import articular_points
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
@@ -74,9 +76,7 @@ def guess_scene(
     for joint in joints:  # parents come before their children
         if joint.kind == "fixed":
             bodies[joint.child] = bodies[joint.parent]
-    skeleton = Skeleton(
-        {bone: Bone(bone.name, bone.mesh) for bone in bones}, bodies, joints, millimetre
-    )
+    skeleton = _skeleton(guess, bodies, millimetre)
     guess.muscles = [guess_attachments(muscle, skeleton) for muscle in parts.muscles]
     # Where the bones that names ask for are not here, what is there is taken.
     if all(muscle.wrong for muscle in guess.muscles):
@@ -87,6 +87,23 @@ def guess_scene(
     for muscle in guess.muscles:  # from the bone that stands still outwards
         muscle.holds.sort(key=lambda hold: order.index(hold.bone) if hold.bone in order else 0)
     return guess
+
+
+def _skeleton(guess, bodies, millimetre):
+    bones, joints = guess.parts.bones, guess.joints
+    moving = [j for j in joints if j.kind != "fixed"]
+    meetings = [
+        (j.parent.name, j.child.name, j.centre if j.kind == "ball" else None) for j in moving
+    ]
+    surfaces = articular_points(meetings, {bone.name: bone.mesh for bone in bones}, millimetre)
+    return Skeleton(
+        {bone: Bone(bone.name, bone.mesh) for bone in bones},
+        bodies,
+        joints,
+        millimetre,
+        bone_frames(bones, joints, guess.orientation, millimetre),
+        {bone: surfaces[bone.name] for bone in bones},
+    )
 
 
 def write_scene(guess: SceneGuess, path: Path, stage: Path) -> Scene:
@@ -237,10 +254,15 @@ def _attachment(hold, file):
 
 
 def _muscle(guess: MuscleGuess, stage: str) -> str:
-    part, sure = guess.muscle, f"GUESS {guess.confidence:.1f}"
+    part = guess.muscle
+    # What makes the muscle doubtful, not one attachment, makes all of them so.
+    cap = guess.confidence if guess.doubted else 1.0
     places = [PurePosixPath(stage, _hold_file(guess, hold)).as_posix() for hold in guess.holds]
     attach = [_attachment(*pair) for pair in zip(guess.holds, places)]
-    said = [f"{sure}: {len(hold.vertices)} vertices, {hold.reason}" for hold in guess.holds]
+    said = [
+        f"GUESS {min(hold.confidence, cap):.1f}: {len(hold.vertices)} vertices, {hold.reason}"
+        for hold in guess.holds
+    ]
     row = {"name": part.name, "mesh": part.file, "attach": attach}
     head = "\n".join(["[[muscle]]", *(f"# {reason}" for reason in guess.reasons)])
     text = table_text(head, row, {"attach": said, **_doubt(part)})
