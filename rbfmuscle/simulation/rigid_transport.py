@@ -26,6 +26,7 @@ STILL = 1e-9
 ARC = 0.5
 # Of a root and a bone the second has the attachment.
 ATTACHED = np.array([1])
+BONES = np.zeros(2, dtype=np.bool_)  # both count as bones, also the ends that tendons hold
 
 
 class MuscleStatus(NamedTuple):
@@ -114,4 +115,5 @@ class RigidTransport:
         """
         old, new = np.array([before[root], before[name]]), np.array([after[root], after[name]])
         corners, lever = self._corners[name][None], np.array([ARC * self.size])
-        return bool(step_excess(old, new, 0, ATTACHED, corners, lever, 1.0) > STILL)
+        moved = step_excess(old, new, 0, ATTACHED, corners, lever, 1.0, BONES, len(BONES))
+        return bool(moved.max() > STILL)

@@ -26,6 +26,9 @@ Coordinates: TypeAlias = dict[str, float]
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's
 # diameter.
 TRAVEL = 1.0 / 27.0
+# A tendon's end asks for at most so many times the sub-steps that the bones themselves need: where it
+# jumps, no number of them would do.
+FINER = 8.0
 # Sub-steps that one coordinate may take in a motion.
 MOST_SUBSTEPS = 100_000
 # Pieces in which a path is followed to see how far it turns the bones.
@@ -59,14 +62,15 @@ class SubSteps:
         #: The bones that count, and the coordinates that move them against each other. A muscle's
         #: are seen from the
         #: first that holds it, a whole scene's from the world.
+        guides = [name for _, attachment in attachments for name in attachment.bones]
         if muscle is None:
             self._root = -1
             self.bones = [*dict.fromkeys([*own, *(bone.name for bone in scene.bones)])]
             self.relevant = set(self._facts)
         else:
-            self._root, self.bones = 0, [*dict.fromkeys([*own, *bones])]
-            guides = [name for _, attachment in attachments for name in attachment.bones]
+            self.bones = [*dict.fromkeys([*own, *bones])]
             self.relevant = _moving_apart(scene, [*guides, *bones])
+        self._muscle = muscle
         self.limit = math.radians(scene.contact.substep_angle)
         # Of each attachment: its bone, a box about it, and how far that may move in one sub-step.
         frames = {part.name: RestFrame(np.asarray(part.mesh.vertices)) for part in muscles}
@@ -74,6 +78,14 @@ class SubSteps:
             frames[part.name].corners(attachment.vertices) for part, attachment in attachments
         ]
         sizes = [diameter(np.asarray(part.mesh.vertices)) for part, _ in attachments]
+        ends = {attachment.holder for _, attachment in attachments if attachment.tendon is not None}
+        # Those from which attached points are seen; behind them come the bones that guide tendons.
+        self._seen = len(self.bones)
+        self.bones = [*dict.fromkeys([*self.bones, *guides])]
+        if muscle is not None:
+            # Seen from a bone, not from an end that may jump.
+            self._root = self.bones.index(guides[0]) if guides else 0
+        self._is_end = np.array([name in ends for name in self.bones], dtype=bool)
         self._owner = np.array([self.bones.index(name) for name in own], dtype=int)
         self._travel, self._corners = TRAVEL * np.array(sizes), np.array(corners).reshape(-1, 8, 3)
 
@@ -101,10 +113,11 @@ class SubSteps:
         )
         while True:
             if count > MOST_SUBSTEPS:
+                whose = "" if self._muscle is None else f" for muscle {self._muscle.name!r}"
+                ways = ", ".join(f"{k} {before.get(k, 0.0):.4g} to {after[k]:.4g}" for k in after)
                 raise SceneError(
-                    f"[motion]: one frame takes more than {MOST_SUBSTEPS} sub-steps; make its "
-                    "step or "
-                    "the angles smaller"
+                    f"[motion]: the way {ways} (radian or scene unit) takes more than "
+                    f"{MOST_SUBSTEPS} sub-steps{whose}; make its step or the angles smaller"
                 )
             stops = [interpolate(before, after, k / count) for k in range(count + 1)]
             poses = [self._matrices(stop) for stop in stops]
@@ -159,17 +172,21 @@ class SubSteps:
         allowed.
         """
         attached = self._owner, self._corners, self._travel
-        return step_excess(old, new, self._root, *attached, self.limit)
+        ends = self._is_end, self._seen
+        moved = step_excess(old, new, self._root, *attached, self.limit, *ends)
+        return max(moved[0], min(moved[1], FINER * moved[0]))
 
 
 @compiled(error_model="numpy")
-def step_excess(old, new, root, owner, corners, travel, limit):
-    """How far a step between poses (b, 4, 4) goes, relative to what is allowed.
+def step_excess(old, new, root, owner, corners, travel, limit, is_end, seen):
+    """How far a step between poses (b, 4, 4) takes bones, and ends that tendons hold, relative to
+    what is allowed.
 
     Bones turn by ``limit`` [radian] as seen from the bone ``root``, from the world for -1; corners
-    (a, 8, 3) on the bones ``owner`` (a,) move by ``travel`` (a,) as seen from any bone.
+    (a, 8, 3) on the bones ``owner`` (a,) move by ``travel`` (a,) as seen from any of the
+    first ``seen`` bones. ``is_end`` (b,) are ends among the bones.
     """
-    most, first, second = 0.0, np.empty((3, 4)), np.empty((3, 4))
+    most, first, second = np.zeros(2), np.empty((3, 4)), np.empty((3, 4))
     for b in range(len(old)):
         if root < 0:
             first[:], second[:] = old[b, :3], new[b, :3]
@@ -181,8 +198,11 @@ def step_excess(old, new, root, owner, corners, travel, limit):
             for k in range(3):
                 square += (second[a, k] - first[a, k]) ** 2
         # |A - B|² of two rotations by θ apart is 8 sin²(θ / 2).
-        most = max(most, 2.0 * np.arcsin(min(np.sqrt(square / 8.0), 1.0)) / limit)
-        for n in range(len(owner)):
+        turned = 2.0 * np.arcsin(min(np.sqrt(square / 8.0), 1.0)) / limit
+        kind = 1 if is_end[b] else 0
+        most[kind] = max(most[kind], turned)
+        for n in range(len(owner) if b < seen else 0):
+            kind = 1 if is_end[owner[n]] else 0
             _seen_from(old[b], old[owner[n]], first)
             _seen_from(new[b], new[owner[n]], second)
             for c in range(corners.shape[1]):
@@ -192,7 +212,7 @@ def step_excess(old, new, root, owner, corners, travel, limit):
                     for k in range(3):
                         way += (second[a, k] - first[a, k]) * corners[n, c, k]
                     away += way * way
-                most = max(most, np.sqrt(away) / travel[n])
+                most[kind] = max(most[kind], np.sqrt(away) / travel[n])
     return most
 
 

@@ -384,7 +384,9 @@ def _doubt(guess, bodies):
     for hold in guess.holds:
         guess.confidence = min(guess.confidence, hold.confidence)
         if hold.confidence == NO_SITE:
-            guess.reasons.append(f"its site on the {hold.bone.name} is not known: the nearest place")
+            guess.reasons.append(
+                f"its site on the {hold.bone.name} is not known: the nearest place"
+            )
         if hold.tendon is not None and not hold.confidence > NO_SITE:
             away = f"{hold.gap:.0f} mm from the {hold.bone.name}"
             guess.reasons.append(f"the mesh ends {away}: a straight tendon was added")
