@@ -30,6 +30,7 @@ from rbfmuscle.models import build_models, configure_scene, kernel_names
 from rbfmuscle.output.writer import Neighbours, RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
+from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.simulation.frame_loop import FrameLoop
@@ -265,6 +266,8 @@ def _check_skeleton(scene: Scene) -> dict[int, Found]:
     events, values = found.setdefault(0, ([], {}))
     events.extend(Event(0, "", name, 1, "bone_left_out") for name in scene.left_out)
     values["bones_left_out"] = float(len(scene.left_out))
+    if doubts := doubtful(scene.guesses, "joint"):
+        values["doubtful_guesses"] = float(len(doubts))
     opened = scene.length(LIMITS["joint_gap"].value)
     for frame, parent, child, opening in joint_gaps(scene, sampled_frames(scene)):
         events, values = found.setdefault(frame, ([], {}))

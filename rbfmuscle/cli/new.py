@@ -69,6 +69,10 @@ def new(
         print(f"doubtful: {doubt}")
     for finding in scene.check():
         print(finding)
+    if scene.guesses:
+        print(
+            "how to correct guesses: docs/new.md; removing the word GUESS from a line confirms it"
+        )
     print(f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out")
 
 

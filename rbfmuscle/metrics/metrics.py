@@ -14,6 +14,8 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
 from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
+from rbfmuscle.scene.articular import articular_share, scene_surfaces
+from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame, ModelSurface
 
@@ -41,10 +43,16 @@ class MuscleMeasures:
 
     def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
         self.probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
+        surfaces = scene_surfaces(scene)
         mine = [muscle for muscle in scene.muscles if muscle.name in carried]
         self.trackers = {
             muscle.name: _Tracker(muscle, scene, *carried[muscle.name]) for muscle in mine
         }
+        for muscle in mine:
+            self.trackers[muscle.name].first = {
+                "articular_share": articular_share(muscle, scene, surfaces)[0],
+                "doubtful_guesses": len(doubtful(scene.guesses, "muscle", muscle.name)),
+            }
 
     def measure_rest(self, surfaces: Mapping[str, ModelSurface], poses: dict[str, Floats]) -> None:
         """Measure the surfaces at rest, before the first frame, by muscle; ``poses`` (4, 4) are
@@ -71,6 +79,9 @@ class _Tracker:
         self.attachments = muscle.attachments
         self.rest_volume = float(muscle.mesh.volume)
         self.edges = _edge_operator(vertices, faces)
+        #: What is measured once, with the first frame.
+        self.first: dict[str, float] = {}
+        self.ends = [attachment.holder for attachment in muscle.attachments if attachment.tendon]
         self.contracts = muscle.contraction is not None
         moving = moving_joints(scene)
         self.line = None
@@ -86,7 +97,12 @@ class _Tracker:
 
     def measure(self, frame: Frame, probes: list[BoneProbe]) -> dict[str, float]:
         """What there is to measure of this muscle in a frame."""
-        found, self.at_rest = self.at_rest, {}
+        found = {**self.first, **self.at_rest}
+        self.first, self.at_rest = {}, {}
+        lines = [frame.tendons[end].points[1:-1] for end in self.ends if end in frame.tendons]
+        points = np.concatenate([np.empty((0, 3)), *lines])
+        depth = surface_depth(points, probes, frame.poses)
+        found["tendon_depth"] = float(depth.max(initial=0.0))
         carried, surface = frame.carried[self.name][0], frame.surfaces.get(self.name)
         if surface is not None:
             found.update(self._of_surface(surface, carried, probes, frame.poses))

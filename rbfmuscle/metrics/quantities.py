@@ -64,6 +64,11 @@ QUANTITIES = {
         "length",
         "least width of the input mesh's greatest section across its line of action",
     ),
+    "articular_share": (
+        "1",
+        "share of an attachment that lies on an articular surface at rest, the greatest",
+    ),
+    "tendon_depth": ("length", "deepest point of a tendon inside a bone"),
     "initial_overlap": ("length", "deepest overlap of muscle and bones that is left at rest"),
     "end_gap": ("length", "distance of the end that lies furthest from its bone at rest"),
     "edge_strain_rms": ("1", "relative change of edge lengths of the material mesh"),
@@ -76,6 +81,8 @@ QUANTITIES = {
     ),
     "bowing_at_rest": ("1", "the same at rest, before the first frame"),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
+    "moment_arm_jump": ("length", "greatest change of the moment arm within 5 degrees before"),
+    "moment_arm_reversal": ("length", "how far the moment arm goes to either side of zero"),
     **{
         f"{quantity}_{name}": (kind, f"{meaning}: {number}th percentile of the fibres")
         for quantity, (kind, meaning) in _FIBRES.items()
@@ -92,6 +99,10 @@ QUANTITIES = {
     "joint_gap": (
         "length",
         "a joint's bones farther apart than at rest; muscle 'all', some frames",
+    ),
+    "doubtful_guesses": (
+        "1",
+        "doubtful guesses of the file about the muscle, under 'all' about joints; first frame",
     ),
     "bones_left_out": ("1", "bones of which no mesh could be used; muscle 'all', first frame"),
     "time": ("s", "time of the frame in the motion file; muscle 'all'"),

@@ -23,6 +23,7 @@ Coordinates = Mapping[str, float]
 # frames next to it. In motions by one degree moment arms then ripple about smooth curves by at most
 # 0.3 mm RMS (docs/validation.md).
 REACH = 8.0
+JUMP = 5.0  # the change of a moment arm is taken within so many degrees
 # Coordinates that change by less [radian or scene unit] rest.
 _STILL = 1e-9
 # Bones of a joint that are nearer than this at rest [mm] meet there; others, as a tendon's end, are
@@ -68,6 +69,9 @@ def moment_arm_rows(
         along = np.array([found.get(index, math.nan) for index in path])
         for moments, row in _moments(scene, path, along):
             rows.append(row._replace(muscle=muscle, value=float(moments)))
+    facts = all_coordinates(scene.joints)
+    turning = [row for row in rows if facts[row.coordinate].motion == "rotation"]
+    rows += [new for each in _by_muscle(turning) for new in _smoothness(each)]
     for muscle, of_fibres in fibres.items():
         none = np.full(len(next(iter(of_fibres.values()))), math.nan)
         along = np.array([of_fibres.get(index, none) for index in path])
@@ -75,6 +79,33 @@ def moment_arm_rows(
             for quantity, value in percentiles("fibre_moment_arm", moments).items():
                 rows.append(row._replace(muscle=muscle, quantity=quantity, value=value))
     return rows
+
+
+def _by_muscle(rows: Sequence[Row]) -> list[list[Row]]:
+    """Rows of each muscle and coordinate, in the order of the frames."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        found.setdefault((row.muscle, row.coordinate), []).append(row)
+    return list(found.values())
+
+
+def _smoothness(arms: Sequence[Row]) -> list[Row]:
+    """For each moment arm but the first: its change against those within `JUMP` degrees before, or
+    so much of the last step's as falls on them, and how far the moment arms went to both sides of
+    zero.
+    """
+    angles, values = (np.array([getattr(arm, key) for arm in arms]) for key in ("angle", "value"))
+    found = []
+    for k in range(1, len(arms)):
+        away = np.abs(angles[:k] - angles[k])
+        share = np.where(np.arange(k) == k - 1, JUMP / np.maximum(away, JUMP), away <= JUMP)
+        jump = float((np.abs(values[:k] - values[k]) * share).max())
+        sides = max(values[: k + 1].max(), 0.0), max(-values[: k + 1].min(), 0.0)
+        found += [
+            arms[k]._replace(quantity="moment_arm_jump", value=jump),
+            arms[k]._replace(quantity="moment_arm_reversal", value=float(min(sides))),
+        ]
+    return found
 
 
 def _moments(scene, path, lengths):

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row
+from rbfmuscle.scene.check import MOST_ARTICULAR
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import LimitExceededError, UsageError, did_you_mean
@@ -52,6 +53,8 @@ _SMALLER_STEPS = "lower contact.substep_angle"
 _MORE_CENTRES = "raise model.centres"
 _LOOK = "look at that frame: rbfmuscle render RUN --frame FRAME -o frame.png"
 _JOINT = "correct the joint's centre, axes or range"
+_ATTACH = "correct the attachment: docs/new.md"
+_LINE = "give the tendon via points, or correct the attachments: docs/new.md"
 LIMITS = {
     "volume_error": Limit(
         1e-9, "volume error", "let the model settle: raise its iterations or sweeps"
@@ -80,6 +83,18 @@ LIMITS = {
     "tunnelled": Limit(0.0, "points beyond a bone", _SMALLER_STEPS),
     "rest_error_rms": Limit(0.6, "rest error", _MORE_CENTRES),
     "end_gap": Limit(25.0, "end away from its bone", "correct the attachment, or give it a tendon"),
+    "tendon_depth": Limit(
+        0.3, "tendon in a bone", "give the tendon via points, or move them out of the bones"
+    ),
+    "articular_share": Limit(MOST_ARTICULAR, "attachment on an articular surface", _ATTACH),
+    "moment_arm_jump": Limit(10.0, "moment arm that jumps within 5 degrees", _LINE),
+    "moment_arm_reversal": Limit(5.0, "moment arm that changes its sign", _LINE),
+    "doubtful_guesses": Limit(
+        0.0,
+        "doubtful guesses",
+        "look at them (rbfmuscle check SCENE --picture), correct them, and remove the word GUESS "
+        "from their lines",
+    ),
     "bone_overlap": Limit(0.0, "bones in each other", _JOINT),
     "joint_gap": Limit(5.0, "joint that opens", _JOINT),
     "bones_left_out": Limit(0.0, "bones left out", "repair their meshes and add them to the scene"),
@@ -95,8 +110,13 @@ NEEDS = {
     "unfitted_fraction": "unfitted_fraction",
     "solid_volume_error": "unfitted_fraction",
     "bowing": "length",
+    # Known by coordinate alone, and only where one moves by itself.
+    "moment_arm_jump": "moment_arm_jump",
+    "moment_arm_reversal": "moment_arm_reversal",
 }
-COUNTS = ("components", "euler", "self_crossings", "tunnelled")
+COUNTS = ("components", "euler", "self_crossings", "tunnelled", "doubtful_guesses")
+# An end without a tendon lies no farther from its bone than this share of the muscle's length.
+END_SHARE = 0.1
 # A muscle thinner than this [mm] may have this rest error [mm].
 THIN, THIN_REST_ERROR = 10.0, 1.0
 # A muscle that bows at rest may do so by this much more.
@@ -222,6 +242,8 @@ def muscle_limit(quantity: str, limits: Limits, found: Mapping[str, Mapping[str,
     limit = limits.values[quantity]
     if limits.is_given(quantity):
         return limit
+    if quantity == "end_gap" and "length" in found:
+        return min(limit, END_SHARE * found["length"]["first"])
     if quantity == "rest_error_rms" and "thickness" in found:
         unit = found["thickness"]["unit"]
         thin = found["thickness"]["first"] < _in_unit(THIN, "thickness", unit)
@@ -332,7 +354,7 @@ def _worst_and_remedies(found, table, left_out):
     named = sorted(found, key=lambda row: row not in first)[:MOST_NAMED]
     remedies: dict[str, str] = {}
     for row in named:
-        if row[1] in LIMITS:
+        if row[1].partition(":")[0] in LIMITS:
             remedy = _remedy(row, table)
             remedies.setdefault(remedy, remedy.replace("FRAME", str(row[4])))
     values = "; ".join(_describe_excess(row, table, left_out) for row in named)
@@ -350,7 +372,7 @@ def _remedy(row, table):
         and overlap is not None
         and overlap > limit
     )
-    return LIMITS["initial_overlap" if at_rest else quantity].remedy
+    return LIMITS["initial_overlap" if at_rest else quantity.partition(":")[0]].remedy
 
 
 def _listed(names):
@@ -363,7 +385,9 @@ def _describe_excess(row, table, left_out):
     unit = table[muscle][quantity]["unit"]
     value = shown_number(worst, unit)
     place = "the bones" if muscle == ALL else muscle
+    quantity, _, coordinate = quantity.partition(":")
     title = LIMITS[quantity].title if quantity in LIMITS else quantity
+    title += f" ({coordinate})" if coordinate else ""
     title += f" ({_listed(left_out)})" if quantity == "bones_left_out" else ""
     return f"{place}, {title} {value} at frame {frame} (limit {limit:.3g})"
 

@@ -48,8 +48,8 @@ class Light(NamedTuple):
 
 
 class Section(NamedTuple):
-    """What is folded: plots (SVG), a table, a text, terms with their meaning, text to copy; left
-    out where empty.
+    """What is folded unless ``opened``: plots (SVG), a table, a text, terms with meanings, text
+    to copy; left out where empty.
     """
 
     title: str
@@ -59,6 +59,7 @@ class Section(NamedTuple):
     text: str = ""
     terms: Sequence[tuple[str, str]] = ()
     code: str = ""
+    opened: bool = False
 
 
 @dataclass

@@ -21,6 +21,7 @@ from rbfmuscle.jit import compiled
 from rbfmuscle.output import appearance as look
 from rbfmuscle.output.appearance import rgb, tendon_mesh
 from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import AT_REST
@@ -32,9 +33,12 @@ USUAL_VIEWS = ("front", "right", "back")
 _MOST_CHIPS = 8
 _AREA = 220_000
 # Of pictures of scenes: pixels of a view, the views, how pale bones are.
-_SCENE_SIZE = (480, 860)
+_SCENE_SIZE = (640, 1000)
 _SCENE_SIDES = ("front", "right", "back", "left")
 _PALE = 0.72
+# Width that is kept free at both sides of a view for names, their heights [pixel], their colours.
+_NAMES, _STEP = 130, 14
+_MUSCLE_NAME, _BONE_NAME, _DOUBTED = "#26282b", "#7a756c", "#a3281f"
 _SMALL = 900, 600  # pixels of a picture in a notebook, at most
 _MUSCLE = "#9a8f8f"
 _OPACITY = 0.12
@@ -318,13 +322,17 @@ def draw_scene(scene: Scene, path: str | Path) -> None:
     solids = [Solid(np.asarray(b.mesh.vertices), b.mesh.faces, pale[b.name]) for b in scene.bones]
     solids += [solid for muscle in scene.muscles for solid in _muscle_solids(muscle, colours)]
     points, images = np.concatenate([solid.vertices for solid in solids]), []
+    inner = _SCENE_SIZE[0] - 2 * _NAMES, _SCENE_SIZE[1]
     for side in _SCENE_SIDES:
-        camera = aim(look.view_axes(look.VIEWS[side], scene.body), points, _SCENE_SIZE)
+        camera = aim(look.view_axes(look.VIEWS[side], scene.body), points, inner)
+        camera = camera._replace(size=_SCENE_SIZE)
         image = Image.fromarray(draw_solids(solids, camera))
-        _draw_joints(ImageDraw.Draw(image), camera, scene)
+        pen = ImageDraw.Draw(image)
+        _draw_joints(pen, camera, scene)
+        _draw_names(pen, camera, scene)
         images.append(np.asarray(image))
     text = f"{scene.name}: held patches in the colour of their bone"
-    chips = {**colours, "joint centres and axes": _AXIS}
+    chips = {**colours, "joint centres and axes": _AXIS, "muscles with doubtful guesses": _DOUBTED}
     _save_picture(labelled(np.concatenate(images, axis=1), text, _SCENE_SIDES, chips), Path(path))
 
 
@@ -356,6 +364,30 @@ def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:
     if tendons is not None:
         solids.append(Solid(*tendons, look.TENDON_COLOUR))
     return [Solid(vertices, faces[free], _MUSCLE, _OPACITY), *solids]
+
+
+def _draw_names(pen: ImageDraw.ImageDraw, camera: Camera, scene: Scene) -> None:
+    """Names of the muscles at the left, of the bones at the right, each with a line to its
+    middle.
+    """
+    font = ImageFont.load_default(12)
+    for items, left in ((scene.muscles, True), (scene.bones, False)):
+        middles = [np.asarray(item.mesh.vertices).mean(axis=0) for item in items]
+        places = camera.project(np.reshape(middles, (-1, 3)))
+        row = 2.0
+        for k in np.argsort(places[:, 1], kind="stable"):
+            x, y, _ = places[k]
+            rest = int((places[:, 1] > y).sum()) * _STEP
+            row = max(row, min(y - 0.5 * _STEP, camera.size[1] - rest - _STEP - 2.0))
+            name, wide = items[k].name, pen.textlength(items[k].name, font=font)
+            colour = _MUSCLE_NAME if left else _BONE_NAME
+            if left and doubtful(scene.guesses, "muscle", name):
+                colour = _DOUBTED
+            start = 4.0 if left else camera.size[0] - wide - 4.0
+            end = start + wide + 2.0 if left else start - 2.0
+            pen.line([(end, row + 0.5 * _STEP), (x, y)], fill=colour, width=1)
+            pen.text((start, row), name, fill=colour, font=font)
+            row += _STEP
 
 
 def _draw_joints(pen: ImageDraw.ImageDraw, camera: Camera, scene: Scene) -> None:

@@ -214,9 +214,27 @@ def _plots(saved: SavedRun) -> list[Section]:
             limits = [factor * limit, -factor * limit][: 1 + signed] if limit else []
             zero = quantity != "length" and not signed
             group = mechanics if quantity in ("length", "activation", "moment_arm") else errors
-            plots[group].append(line_plot(title, tracks, (label, unit), limits=limits, zero=zero))
+            bands = _bands(tracks, coordinate, label, saved) if coordinate else ()
+            text = line_plot(title, tracks, (label, unit), limits=limits, zero=zero, bands=bands)
+            plots[group].append(text)
     plots[mechanics] += [_fibre_plot(saved, name, axis, label) for name in _fibre_arms(saved)]
-    return [Section(title, plots=found) for title, found in plots.items()]
+    hints = {mechanics: "dashed: published moment arms, where names match"}
+    return [
+        Section(title, hints.get(title, ""), plots=found, opened=title == mechanics)
+        for title, found in plots.items()
+    ]
+
+
+def _bands(tracks: Sequence[Track], coordinate: str, label: str, saved: SavedRun) -> list[Band]:
+    """Published moment arms about a coordinate that alone moves, of the muscles of the tracks."""
+    bands = []
+    for track in tracks:
+        known = published_band(track.name, coordinate)
+        if known is not None and label.startswith(coordinate):
+            scale = 1.0 / MM_PER_UNIT[saved.units]
+            ends = scale * known.least, scale * known.greatest
+            bands.append(Band(track.name, track.colour, known.angle, *ends, dashed=True))
+    return bands
 
 
 def _fibre_arms(saved: SavedRun) -> list[str]:
@@ -238,11 +256,7 @@ def _fibre_plot(saved: SavedRun, coordinate: str, axis: Mapping[int, float], lab
             saved.series(track.name, f"{name}_{end}", coordinate)[1] for end in ("p05", "p95")
         )
         bands.append(Band(track.name, track.colour, track.x, low, high))
-        known = published_band(track.name, coordinate)
-        if known is not None and label.startswith(coordinate):
-            scale = 1.0 / MM_PER_UNIT[saved.units]
-            ends = scale * known.least, scale * known.greatest
-            bands.append(Band(track.name, track.colour, known.angle, *ends, dashed=True))
+    bands += _bands(tracks, coordinate, label, saved)
     labels = (label, arm_unit(saved, coordinate))
     return line_plot(f"Moment arms of fibres: {coordinate}", tracks, labels, bands=bands)
 

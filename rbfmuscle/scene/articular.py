@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.scene.objects import Muscle, SceneData
 
 if TYPE_CHECKING:
     import trimesh
@@ -16,9 +17,13 @@ BAND, FARTHEST = 6.0, 15.0
 # Least cosine between a face's normal and the direction to the other bone.
 LOOK = 0.5
 # Radii of a head [mm]; what belongs to it and to its socket, in radii from the centre.
-HEAD, SHELL, SOCKET = (12.0, 35.0), 1.15, 1.4
+HEAD, SHELL, SOCKET = (12.0, 35.0), 1.08, 1.4
 # The nearest points of a bone to the centre, of which the radius is the median.
 NEAREST = 50
+# What is attached lies on an articular surface where that is farther by no more than this than the
+# bone itself [mm].
+BESIDE = 1.5
+TOUCHED = 8.0  # what is farther from the bone than this [mm] lies on none of its surfaces
 
 
 def articular_points(
@@ -28,8 +33,8 @@ def articular_points(
 ) -> dict[str, Floats]:
     """Points (n, 3) of the articular surfaces by bone.
 
-    ``joints`` are (parent, child, centre of a ball or None) of the joints that move; bones without a
-    mesh are left out.
+    ``joints`` are (parent, child, centre of a ball or None) of the joints that move; bones without
+    a mesh are left out.
     """
     found: dict[str, list[Floats]] = {name: [] for name in meshes}
     for parent, child, centre in joints:
@@ -44,6 +49,37 @@ def articular_points(
             found[parent].append(_facing(pair[0], pair[1], millimetre))
             found[child].append(_facing(pair[1], pair[0], millimetre))
     return {name: np.concatenate([np.empty((0, 3)), *parts]) for name, parts in found.items()}
+
+
+def scene_surfaces(scene: SceneData) -> dict[str, Floats]:
+    """The same of a scene, by its joints that move."""
+    meshes = {bone.name: bone.mesh for bone in scene.bones}
+    joints = [
+        (joint.parent, joint.child, joint.centre if len(joint.coordinates) > 1 else None)
+        for joint in scene.joints
+        if joint.coordinates
+    ]
+    return articular_points(joints, meshes, scene.length(1.0))
+
+
+def articular_share(
+    muscle: Muscle, scene: SceneData, surfaces: Mapping[str, Floats]
+) -> tuple[float, str]:
+    """Greatest share of an attachment that lies on an articular surface, and its bone.
+
+    ``surfaces`` are as of `scene_surfaces`.
+    """
+    worst = (0.0, "")
+    for held in muscle.attachments:
+        surface = surfaces.get(held.bone, np.empty((0, 3)))
+        if held.tendon is None and len(surface):
+            points = np.asarray(muscle.mesh.vertices)[held.vertices]
+            near, _ = cKDTree(surface).query(points)
+            away = np.abs(scene.bone(held.bone).distances(points))
+            lies = (near <= away + scene.length(BESIDE)) & (away < scene.length(TOUCHED))
+            share = float(np.mean(lies))
+            worst = max(worst, (share, held.bone))
+    return worst
 
 
 def _head_radius(mesh, centre):
@@ -64,11 +100,22 @@ def _about(mesh, centre, reach, sign):
 
 def _facing(mesh, other, millimetre):
     """Middles of the triangles that look at another bone within `BAND` of the least gap."""
-    points = np.asarray(mesh.triangles_center)
-    theirs = np.asarray(other.triangles_center)
+    reach = (FARTHEST + BAND) * millimetre
+    near = _within(mesh, other.bounds, reach)
+    points = np.asarray(mesh.triangles_center)[near]
+    theirs = np.asarray(other.triangles_center)[_within(other, mesh.bounds, reach)]
+    if len(points) == 0 or len(theirs) == 0:
+        return points[:0]
     distance, nearest = cKDTree(theirs).query(points)
     if distance.min() > FARTHEST * millimetre:
         return points[:0]
     away = (theirs[nearest] - points) / np.maximum(distance, 1e-12)[:, None]
-    look = np.einsum("ij,ij->i", np.asarray(mesh.face_normals), away)
+    look = np.einsum("ij,ij->i", np.asarray(mesh.face_normals)[near], away)
     return points[(distance < distance.min() + BAND * millimetre) & (look > LOOK)]
+
+
+def _within(mesh, bounds, reach):
+    """Which triangles have their middles in a box (2, 3) or so near to it."""
+    low, high = bounds
+    points = np.asarray(mesh.triangles_center)
+    return ((points > low - reach) & (points < high + reach)).all(axis=1)

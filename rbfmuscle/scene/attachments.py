@@ -16,11 +16,13 @@ from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import bones_between
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.objects import Attachment, LineTable, Muscle, SceneData, ViaTable, find_named
-from rbfmuscle.scene.options import NotNegative, Positive, Table, Vector, in_folder
+from rbfmuscle.scene.options import FileName, NotNegative, Positive, Table, Vector, in_folder
+from rbfmuscle.scene.picked import painted_vertices, picked_vertices, read_points
 from rbfmuscle.scene.tendons import BonePoint, TendonEnd
 from rbfmuscle.validation import SceneError, read_text, shown, shown_path
 
 THIN = 0.05  # section of a tendon as it is drawn, over the mean section of its muscle
+_WAYS = ("vertices", "near", "sphere", "points", "colour")  # to say what a bone holds
 PATCH = 16  # points of a belly's end that are kept out of bones, at most
 
 
@@ -41,14 +43,16 @@ def _check_vertices(value: object, info: ValidationInfo) -> object:
 
 
 class AttachTable(Table):
-    """A bone, and one of: a file or list of vertex numbers, a distance to the bone, a ball; maybe a
-    tendon.
+    """A bone, and one of: a file or list of vertex numbers, a distance to the bone, a ball, a file
+    of picked points, a painted colour; maybe a tendon.
     """
 
     bone: str
     vertices: Annotated[Path | list[int] | None, BeforeValidator(_check_vertices)] = None
     near: NotNegative | None = None
     sphere: SphereTable | None = None
+    points: FileName | None = None
+    colour: str | None = None
     tendon: LineTable | None = None
 
 
@@ -144,10 +148,11 @@ def _patch(points: Floats, areas: Floats, towards: Floats) -> tuple[Floats, floa
 
 
 def _select(table, read, bone, place):
-    given = [key for key in ("vertices", "near", "sphere") if getattr(table, key) is not None]
+    given = [key for key in _WAYS if getattr(table, key) is not None]
     if len(given) != 1:
         raise SceneError(
-            f"{place}give one of vertices, near and sphere, got {' and '.join(given) or 'none'}"
+            f"{place}give one of {', '.join(_WAYS[:-1])} and {_WAYS[-1]}, got "
+            f"{' and '.join(given) or 'none'}"
         )
     if table.vertices is not None:
         kept = read.vertex_map[_listed(table.vertices, len(read.vertex_map), place)]
@@ -155,6 +160,10 @@ def _select(table, read, bone, place):
             raise SceneError(f"{place}none of its vertices is part of the mended surface")
         return kept[kept >= 0]
     points = np.asarray(read.mesh.vertices)
+    if table.points is not None:
+        return picked_vertices(read_points(table.points, place=place), points, place=place)
+    if table.colour is not None:
+        return painted_vertices(table.colour, read, place=place)
     if table.sphere is not None:
         distance = np.linalg.norm(points - table.sphere.centre, axis=1)
         limit, what = table.sphere.radius, "sphere.radius"

@@ -12,8 +12,10 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.build import validate
+from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Muscle, SceneData
@@ -29,6 +31,7 @@ FAR_AWAY = (
 FARTHEST_CENTRE = (
     1000.0  # the same for the centre of a joint: a nearly straight path has one far away
 )
+MOST_ARTICULAR = 0.5  # share of an attachment that may lie on an articular surface
 MOTION_SAMPLES = 10
 COUNTED_DEPTH_MM = 0.05  # bones that touch by less are not reported
 
@@ -58,9 +61,11 @@ def check_scene(scene: SceneData) -> list[Finding]:
     findings += [Finding("warning", scene.name, doubt) for doubt in scene.doubts]
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
     findings += _rest_overlaps(scene)
+    findings += _guess_findings(scene)
     if scene.links and not scene.bones:
         words = "no bone has a mesh, so nothing can be run; give the bones meshes"
         return sort_findings([*findings, Finding("note", scene.name, words)])
+    findings += _attachment_findings(scene)
     try:
         findings += bone_findings(bone_collisions(scene), scene.units)
         check_extents(scene)
@@ -68,6 +73,36 @@ def check_scene(scene: SceneData) -> list[Finding]:
     except RBFMuscleError as error:
         findings.append(Finding("error", scene.name, str(error)))
     return sort_findings(findings)
+
+
+def _guess_findings(scene):
+    """A warning for each doubtful guess of the file."""
+    said = "look at it (--picture), correct it or remove the word GUESS from its line"
+    return [
+        Finding(
+            "warning",
+            f"{table} {guess.name}",
+            f"a doubtful guess ({guess.confidence:.1f}): {guess.text}; {said}",
+        )
+        for table in ("joint", "muscle")
+        for guess in doubtful(scene.guesses, table)
+    ]
+
+
+def _attachment_findings(scene):
+    """A warning for each attachment on an articular surface."""
+    surfaces = scene_surfaces(scene)
+    shares = ((muscle.name, *articular_share(muscle, scene, surfaces)) for muscle in scene.muscles)
+    return [
+        Finding(
+            "warning",
+            name,
+            f"{100 * share:.0f} % of an attachment lies on an articular surface of {bone!r}; "
+            "correct the attachment",
+        )
+        for name, share, bone in shares
+        if share > MOST_ARTICULAR
+    ]
 
 
 def sort_findings(findings: Iterable[Finding]) -> list[Finding]:

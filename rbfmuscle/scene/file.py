@@ -14,6 +14,7 @@ from rbfmuscle.scene.attachments import AttachTable
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.build import add_bone, add_muscle, place_coupling, place_joint, validate
 from rbfmuscle.scene.check import check_centre, check_place, check_size
+from rbfmuscle.scene.guesses import find_guesses
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.joints.tables import (
     CouplingTable,
@@ -152,6 +153,7 @@ def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
     path = Path(path)
     tables = read_scene_file(path)
     scene = cls(tables.scene.name or path.stem, units=tables.scene.units, path=path)
+    scene.guesses = find_guesses(path.read_text(encoding="utf-8"))
     try:
         _fill(scene, tables)
         return scene if skeleton and not scene.muscles else validate(scene)
@@ -245,6 +247,7 @@ def describe_scene(scene: SceneData) -> dict[str, Any]:
         "links": list(scene.links),
         "left_out": list(scene.left_out),
         "doubts": list(scene.doubts),
+        "guesses": [guess._asdict() for guess in scene.guesses],
         "joints": [joint_row(joint) for joint in scene.joints],
         "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
         "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},

@@ -14,6 +14,7 @@ from pydantic import Field
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.scene.joints.joint import Coupling, Joint
 from rbfmuscle.scene.options import (
     ContactOptions,
@@ -142,6 +143,8 @@ class SceneData:
     doubts : list of str
         What makes the scene another one than its source, in sentences; warnings of a check, and in
         the verdict of a run.
+    guesses : list of Guess
+        Lines of the file that are marked GUESS; the doubtful ones count in the verdict of a run.
     superior, anterior : list of float or None
         Anatomical directions (3,) at rest: those of the file, or found from the bones before a run
         or a picture.
@@ -163,6 +166,7 @@ class SceneData:
     path: Path | None = None
     left_out: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
+    guesses: list[Guess] = field(default_factory=list)
     superior: list[float] | None = None
     anterior: list[float] | None = None
 
@@ -194,7 +198,7 @@ class SceneData:
     def copy(self) -> Self:
         """Return a copy whose lists and tables are its own; meshes are shared."""
         other = copy.copy(self)
-        for name in ("bones", "joints", "couplings", "links", "left_out", "doubts"):
+        for name in ("bones", "joints", "couplings", "links", "left_out", "doubts", "guesses"):
             setattr(other, name, list(getattr(self, name)))
         other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
         return other

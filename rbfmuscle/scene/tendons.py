@@ -171,7 +171,23 @@ class TendonEnd:
             middle = middle + excess / max(float(np.linalg.norm(ahead)), 1e-300) * ahead
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turn, middle - turn @ self.middle
-        return TendonLine(_with_nodes(tendon), self.radii), pose
+        return TendonLine(self._lifted(_with_nodes(tendon), poses), self.radii), pose
+
+    def _lifted(self, line: Floats, poses: Mapping[str, Floats]) -> Floats:
+        """A line (n, 3) whose inner points that graze a bone, no deeper than the tendon's radius,
+        are moved to its surface.
+        """
+        line = line.copy()
+        for bone in self.obstacles:
+            pose = poses[bone.name]
+            local = (line[1:-1] - pose[:3, 3]) @ pose[:3, :3]
+            low, high = bone.bounds
+            near = np.flatnonzero(((local > low) & (local < high)).all(axis=1))
+            if len(near):
+                distance, places = bone.nearest(local[near])
+                graze = (distance < 0.0) & (distance > -self.radii[1])
+                line[1 + near[graze]] = places[graze] @ pose[:3, :3].T + pose[:3, 3]
+        return line
 
     def _lift(
         self, turn: Floats, middle: Floats, direction: Floats, poses: Mapping[str, Floats]

@@ -26,8 +26,8 @@ Coordinates: TypeAlias = dict[str, float]
 # No attached point moves farther against a bone in one sub-step than this share of its muscle's
 # diameter.
 TRAVEL = 1.0 / 27.0
-# A tendon's end asks for at most so many times the sub-steps that the bones themselves need: where it
-# jumps, no number of them would do.
+# A tendon's end asks for at most so many times the sub-steps that the bones themselves need: where
+# it jumps, no number of them would do.
 FINER = 8.0
 # Sub-steps that one coordinate may take in a motion.
 MOST_SUBSTEPS = 100_000

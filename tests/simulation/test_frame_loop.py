@@ -4,13 +4,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from tendon_scene import END, arm
 from toy_scene import ToyMuscle, bone, box, hinged_scene
 
 from rbfmuscle.scene.motion import bone_poses, turned_angle
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact_pairs import find_contact_pairs, sampled_poses
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
-from rbfmuscle.simulation.substeps import SubSteps
+from rbfmuscle.simulation.substeps import FINER, SubSteps
 from rbfmuscle.validation import SceneError, SolveError
 
 
@@ -44,6 +45,23 @@ def test_sub_steps_end_at_the_same_angles_however_frames_are_spaced():
     np.testing.assert_allclose(others, whole.round(9), rtol=0)
     back = np.array([s["hinge.bend"] for s in SubSteps(made).split(end, start)])
     np.testing.assert_allclose(back[-2::-1], whole[:-1], rtol=0, atol=1e-12)
+
+
+def test_a_tendons_end_that_jumps_takes_no_more_sub_steps_than_the_bones_allow():
+    made = arm()
+    before, after = ({"elbow.bend": np.radians(angle), "elbow.turn": 0.0} for angle in (0, 2))
+
+    def jumping(coordinates):
+        poses = bone_poses(made, dict(coordinates))
+        end = np.array(poses[END])
+        end[0, 3] += 500.0 * (coordinates["elbow.bend"] > np.radians(1.0))
+        poses[END] = end
+        return poses
+
+    count = len(
+        SubSteps(made, made.muscles[0], bones=["trunk"], poses=jumping).split(before, after)
+    )
+    assert 1 < count <= 2 * FINER
 
 
 def test_bones_out_of_reach_of_the_motion_are_left_out():

@@ -46,8 +46,8 @@ UPPER = 0.25
 ALONG_LIGAMENT = "rectus femoris"
 POLES = "patella_base", "patella_front", "patella_apex"
 CLEAR = 1.5  # via points lie so far out of bones [mm]
-# Confidence where a muscle touches its site, lies beside it, has a tendon, a long one; where its site
-# is not known; where a bone stands for one that is not here; where not even its bones are known.
+# Confidence where a muscle touches its site, lies beside it, has a tendon, a long one; where its
+# site is not known; where a bone stands for one that is not here; where not even its bones are.
 TOUCHES, BESIDE, TENDON, LONG_TENDON = 1.0, 0.9, 0.8, 0.7
 NO_SITE, STAND_IN, NO_BONE, NO_NAME = 0.5, 0.4, 0.2, 0.4
 

@@ -17,10 +17,10 @@ from rbfmuscle.importers.guess.parts import Part, Parts, read_parts
 from rbfmuscle.importers.toml_text import attachment_file, table_text
 from rbfmuscle.scene.articular import articular_points
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.guesses import DOUBTFUL
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
-DOUBTFUL = 0.6  # below this confidence a guess is listed on the terminal
 _TAIL = """[contact]
 initial = "resolve"   # muscles that start inside a bone are pushed out; or "keep", "error"
 

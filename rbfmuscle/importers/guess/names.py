@@ -15,6 +15,7 @@ from typing import NamedTuple
 # Fewest letters of a word that may be misspelt, and how much of it must agree with a known one
 # (`difflib`'s ratio).
 FEWEST, LIKE = 5, 0.8
+PARTS = ("origin", "insertion", "attachment", "enthesis")  # of a muscle
 MIDLINE = ("sacrum", "vertebra", "sternum", "skull", "mandible")
 _SIGNS = str.maketrans(
     {"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "é": "e", "è": "e", "ô": "o", "â": "a"}
@@ -47,6 +48,7 @@ class NameFacts:
     muscle: MuscleFacts | None = None
     side: str = ""
     spelling: str = ""
+    part: str = ""  # the word that makes a muscle's name that of a part of one
 
 
 class _Table(NamedTuple):
@@ -107,7 +109,8 @@ def name_facts(name: str) -> NameFacts:
         f"{wrong!r} read as {right!r}" for wrong, right in spelling.items() if right in used
     )
     side = "" if kind in MIDLINE else side
-    return NameFacts(tissue, kind, table.muscles[muscle] if muscle else None, side, shown)
+    part = next((word for word in words if word in PARTS), "") if muscle else ""
+    return NameFacts(tissue, kind, table.muscles[muscle] if muscle else None, side, shown, part)
 
 
 def _longest(words, table):

@@ -118,6 +118,10 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
             found.unusable[path.name] = str(error).removeprefix(f"{path}: ")
             found.left_out += [path.stem] if tissue != "muscle" else []
             continue
+        if facts.part:
+            part.doubt = (
+                f"a muscle by its name, of which {facts.part!r} says that it is a part of one"
+            )
         if facts.spelling:
             found.notes.append(f"{path.name}: {facts.spelling}")
         {"bone": found.bones, "muscle": found.muscles, "": unknown}[tissue].append(part)

@@ -1,9 +1,10 @@
 """Sites of attachment on bones, found by landmarks of the bone itself.
 
-A site lies about the places that ``sites.toml`` gives in the bone's frame, moved to the landmark that
-stands out there. Articular surfaces belong to no site.
+A site lies about the places that ``sites.toml`` gives in the bone's frame, moved to the landmark
+that stands out there. Articular surfaces belong to no site.
 """
 
+import itertools
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -97,7 +98,7 @@ def find_site(name: str, bone: Part, frame: BoneFrame, articular: np.ndarray) ->
                 place = near[np.argmax(near @ (facts.out @ frame.axes))]
         stops.append(place)
     line = np.concatenate(
-        [np.linspace(a, b, STEPS) for a, b in zip(stops, stops[1:])] or [np.array(stops)]
+        [np.linspace(a, b, STEPS) for a, b in itertools.pairwise(stops)] or [np.array(stops)]
     )
     core = points[np.unique(tree.query(line)[1])]
     near = cKDTree(line).query(points)[0] < facts.radius * frame.size
