@@ -25,8 +25,8 @@ from leg_tendons import convert
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.models import build_models
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs

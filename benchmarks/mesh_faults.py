@@ -16,8 +16,9 @@ import time
 
 import numpy as np
 
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bone_depth, surface_depth
+from rbfmuscle.metrics.depths import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.metrics.metrics import SurfaceForm
 from rbfmuscle.models import build_model, configure_scene
 from rbfmuscle.scene.scene import Scene

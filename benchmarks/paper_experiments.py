@@ -24,7 +24,8 @@ from pathlib import Path
 import numpy as np
 from peers import paper_models
 
-from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bone_depth, surface_depth
+from rbfmuscle.geometry.mesh_distance import MeshDistance
+from rbfmuscle.metrics.depths import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions

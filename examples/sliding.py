@@ -8,7 +8,7 @@ import numpy as np
 from pictures import draw, folder, plot
 
 import rbfmuscle as rm
-from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.scene.options import SlidingOptions
 
 out = folder("sliding")

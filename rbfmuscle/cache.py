@@ -23,7 +23,7 @@ from rbfmuscle.geometry.arrays import Array, Floats, Integers
 
 log = logging.getLogger(__name__)
 
-VERSION = 13  # part of every name: raise it when the arrays or the way they are built change
+VERSION = 14  # part of every name: raise it when the arrays or the way they are built change
 SUFFIX = ".sdf.npz"
 PART = SUFFIX + ".part"  # of an entry that is being written
 # Bytes that the cache may take; what was not used for longest is removed first. A file that a

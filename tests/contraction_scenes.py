@@ -11,8 +11,8 @@ import trimesh
 from peers.known_scenes import FAR, Bar, _block
 from toy_scene import held
 
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.metrics.centreline import belly_measures
-from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom_shapes import stitch
 from rbfmuscle.scene.scene import Scene

@@ -21,10 +21,11 @@ from rbfmuscle.bones.query import FieldData, query_loop
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, MeshLike
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.rest_frame import BoneFrame, numbered_by_place, on_one_line
+from rbfmuscle.geometry.solids import outer_surface
 from rbfmuscle.geometry.surfaces import face_normals
 from rbfmuscle.geometry.threads import in_chunks
-from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.validation import MeshError, check_mesh, check_points, check_positive
 
 log = logging.getLogger(__name__)
@@ -52,7 +53,8 @@ class BoneSDF:
     Attributes
     ----------
     vertices, faces : (n, 3) and (m, 3) ndarray
-        The mesh as used: numbered by place, degenerate and duplicate faces left out.
+        The mesh as used: numbered by place; degenerate and duplicate faces and inner shells left
+        out.
     bounds : (2, 3) ndarray
         Box of the mesh, bone coordinates.
     spacing : float
@@ -158,7 +160,7 @@ class BoneSDF:
         key = content_key(vertices, faces, (tolerance, steps, memory_limit)) if cache else None
         arrays = None if key is None else load_arrays(key)
         parts = None if arrays is None else _from_arrays(arrays)
-        vertices, faces = check_mesh(vertices, faces, name=name)
+        vertices, faces, solid = outer_surface(*check_mesh(vertices, faces, name=name))
         if parts is None and on_one_line(vertices):
             raise MeshError(f"{name} has no face with an area")
         order, faces = numbered_by_place(vertices, faces)
@@ -176,6 +178,7 @@ class BoneSDF:
             )
             if key is not None:
                 store_arrays(key, _to_arrays(parts))
+        parts = parts._replace(notes=[*solid, *parts.notes])
         for note in parts.notes:
             log.warning("%s: %s", name, note)
         return cls(vertices, frame, parts)
@@ -275,7 +278,8 @@ def _build(mesh, frame, tolerance, region, memory_limit, name):
     spacing = min(CELL_SHARE * edge, extent / LEAST_CELLS)
     box = None if region is None else frame.box(region)
     wanted = TOLERANCE_SHARE * edge if tolerance is None else tolerance / frame.size
-    inside = None if mesh.closed else inside_test(mesh.vertices, mesh.faces)
+    wound = MeshDistance(mesh.vertices, mesh.faces, closed=mesh.closed).inside
+    inside = None if mesh.closed else wound
     error = np.inf
     for _ in range(ATTEMPTS):
         spacing = _check_memory(mesh, exact, spacing, tolerance, memory_limit, name)
@@ -284,7 +288,7 @@ def _build(mesh, frame, tolerance, region, memory_limit, name):
         )
         if inside is None and not sound:
             mesh.notes.append("intersects itself: the sign comes from winding numbers")
-            inside = inside_test(mesh.vertices, mesh.faces)
+            inside = wound
             continue
         error = _measure(mesh, data, exact, BAND * spacing, box)
         reached = _Parts(mesh.faces, mesh.notes, data, spacing, error, inside is None)

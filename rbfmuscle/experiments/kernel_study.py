@@ -15,6 +15,7 @@ import numpy as np
 
 from rbfmuscle.experiments.sweep_run import OnProgress, pareto_front, threads_limited
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import face_normals, mesh_volume, vertex_areas
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
@@ -23,7 +24,6 @@ from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
 from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface, spread_points
 from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing
-from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
 
 # Errors this much apart are alike: points of another seed move them as far.

@@ -8,9 +8,11 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.jit import compiled
 
 
-def inside_test(vertices: Floats, faces: Integers) -> Callable[[Floats], Booleans]:
-    """``inside(points) -> (n,) bool`` by fast generalised winding numbers (Barill 2018), for meshes
-    with holes too.
+def inside_test(
+    vertices: Floats, faces: Integers, *, least: float = 0.5
+) -> Callable[[Floats], Booleans]:
+    """``inside(points) -> (n,) bool`` by fast generalised winding numbers above ``least`` (Barill
+    2018), for meshes with holes too.
     """
     import igl
 
@@ -18,7 +20,7 @@ def inside_test(vertices: Floats, faces: Integers) -> Callable[[Floats], Boolean
     tree.init(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64), 2)
 
     def inside(points: Floats) -> Booleans:
-        return tree.winding_number(np.ascontiguousarray(points)) > 0.5
+        return tree.winding_number(np.ascontiguousarray(points)) > least
 
     return inside
 

@@ -16,10 +16,11 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.jit import compiled
-from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bones_about
+from rbfmuscle.metrics.depths import BoneProbe, bones_about
 from rbfmuscle.scene.joints.joint import Joint, all_coordinates, rigid_body
 from rbfmuscle.scene.objects import Attachment, Muscle
 from rbfmuscle.scene.scene import Scene

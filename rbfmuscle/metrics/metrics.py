@@ -9,10 +9,11 @@ import scipy.sparse as sparse
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import edge_lengths, label_sheets, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
-from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bone_depth, surface_depth
+from rbfmuscle.metrics.depths import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
 from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.guesses import doubtful

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Booleans, Floats
-from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.winding import inside_test
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.solids import SolidDistance
 
 if TYPE_CHECKING:
     import trimesh
@@ -39,29 +37,19 @@ class Bone:
         return np.array(self.mesh.bounds)
 
     @cached_property
-    def _distance(self) -> ExactDistance:
-        return ExactDistance(self.mesh.vertices, self.mesh.faces)
-
-    @cached_property
-    def _inside(self) -> Callable[[Floats], Booleans] | None:
-        """Of an open mesh, by winding numbers."""
-        return None if self.mesh.is_watertight else inside_test(self.mesh.vertices, self.mesh.faces)
+    def _distance(self) -> SolidDistance:
+        return SolidDistance(self.mesh.vertices, self.mesh.faces)
 
     def distances(self, points: Floats) -> Floats:
-        """Distances (n,) of points (n, 3) to the mesh, negative inside, of an open mesh by winding
-        numbers.
-        """
-        distance = self._distance.signed_distance(points)
-        if self._inside is None:
-            return distance
-        return np.where(self._inside(points), -1.0, 1.0) * np.abs(distance)
+        """Distances (n,) of points (n, 3) to the outer surface, negative inside."""
+        return self._distance.signed(points)
 
     def nearest(self, points: Floats) -> tuple[Floats, Floats]:
-        """Distances (n,) to the mesh, negative inside, and the nearest places (n, 3) on it, of
-        points (n, 3).
+        """Distances (n,) to the outer surface, negative inside, and the nearest places (n, 3) on
+        it, of points (n, 3).
         """
-        distances, places, *_ = self._distance.nearest(points)
-        return distances, places
+        distances, places, _ = self._distance.nearest(points)
+        return np.where(self._distance.inside(points), -1.0, 1.0) * np.abs(distances), places
 
     @cached_property
     def surface_points(self) -> Floats:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.metrics.mesh_distance import BoneProbe
+from rbfmuscle.metrics.depths import BoneProbe
 from rbfmuscle.output.appearance import VIEWS, view_axes
 from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.scene.scene import Scene

@@ -9,8 +9,9 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
-from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, surface_depth
+from rbfmuscle.metrics.depths import BoneProbe, surface_depth
 from rbfmuscle.output.appearance import (
     BONE_COLOUR,
     LONG,

@@ -50,9 +50,31 @@ def test_soup_and_faces_of_mixed_orientation_are_mended(ball):
         assert field.closed and _sides_right(field, _random()) == 1.0
 
 
+def _crossed(ball, away):
+    """Two balls that overlap, made one shell by a tube between their facing sides."""
+    other = ball.copy().apply_translation([away, 0.0, 0.0])
+    one = int(np.argmax(ball.triangles_center[:, 0]))
+    corners = ball.faces[one]
+    mirrored = ball.vertices[corners] * [-1, 1, 1]
+    across = [int(np.linalg.norm(ball.vertices - at, axis=1).argmin()) for at in mirrored]
+    two = int(np.flatnonzero(np.isin(ball.faces, across).all(axis=1))[0])
+    far = np.array(across) + len(ball.vertices)
+    tube = [
+        side
+        for k in range(3)
+        for side in (
+            (corners[k], corners[k - 2], far[k - 2]),
+            (corners[k], far[k - 2], far[k]),
+        )
+    ]
+    faces = [np.delete(ball.faces, one, axis=0), np.delete(other.faces, two, axis=0)]
+    faces = np.vstack([faces[0], faces[1] + len(ball.vertices), tube])
+    return np.vstack([ball.vertices, other.vertices]), faces
+
+
 def test_bone_that_intersects_itself_is_signed_by_winding_numbers(ball):
-    other = ball.copy().apply_translation([15.0, 0.0, 0.0])
-    field = BoneSDF.from_mesh(trimesh.util.concatenate([ball, other]), cache=False)
+    vertices, faces = _crossed(ball, 15.0)
+    field = BoneSDF.from_mesh((vertices, faces), cache=False)
     assert not field.closed
     points = _random() + [7.5, 0.0, 0.0]
     depth = (

@@ -14,9 +14,9 @@ import rbfmuscle as rm
 from rbfmuscle.experiments import kernel_study, wanted_error
 from rbfmuscle.experiments.kernel_study import ReferenceSurface, recommend, row_toml
 from rbfmuscle.experiments.wanted_error import STEP, reach_error
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
-from rbfmuscle.metrics.mesh_distance import MeshDistance
 from rbfmuscle.validation import MeshError, UsageError
 
 

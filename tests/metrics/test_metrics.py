@@ -8,14 +8,9 @@ import pytest
 import trimesh
 
 from rbfmuscle.geometry.crossing import crossing_faces
+from rbfmuscle.geometry.mesh_distance import Columns, MeshDistance
 from rbfmuscle.metrics.centreline import Centreline, split_ends
-from rbfmuscle.metrics.mesh_distance import (
-    BoneProbe,
-    Columns,
-    MeshDistance,
-    bone_depth,
-    surface_depth,
-)
+from rbfmuscle.metrics.depths import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
 from rbfmuscle.metrics.rows import moment_arms
 from rbfmuscle.run import simulate

@@ -122,13 +122,6 @@ class TestMending:
         assert read.vertex_map[5] == -1 and read.vertex_map[6] == 5
         assert any("2 degenerate or repeated" in note for note in read.notes)
 
-    def test_cavity_of_a_bone_stays_a_cavity(self, tmp_path):
-        inner = ball(8.0)
-        inner.invert()
-        both = trimesh.util.concatenate([ball(), inner])
-        read = read_mesh(write(tmp_path / "a.ply", both.vertices, both.faces), may_be_open=True)
-        assert read.mesh.volume == pytest.approx(ball().volume + inner.volume, rel=1e-6)
-
     def test_few_triangles_at_edges_of_more_than_two_are_dropped_from_a_bone(self, tmp_path):
         mesh = ball()
         edges = mesh.edges_unique[[10, 300]]

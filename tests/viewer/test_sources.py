@@ -8,7 +8,7 @@ import toy_scene
 import trimesh
 
 import rbfmuscle as rm
-from rbfmuscle.metrics.mesh_distance import BoneProbe
+from rbfmuscle.metrics.depths import BoneProbe
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession
 from rbfmuscle.viewer.panel import Panel

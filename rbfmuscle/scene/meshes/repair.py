@@ -10,6 +10,8 @@ import igl
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.solids import outer_surface
+from rbfmuscle.geometry.surfaces import repeated_faces
 from rbfmuscle.validation import MeshError
 
 if TYPE_CHECKING:
@@ -54,7 +56,7 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
     Holes and several parts are kept where it ``may_be_open`` (bones), and refused by a MeshError
     elsewhere.
     """
-    bad = _repeated(faces)
+    bad = repeated_faces(faces)
     state = ReadMesh(vertices, faces[~bad], np.arange(len(vertices)))
     if bad.any():
         state.notes.append(f"{int(bad.sum())} degenerate or repeated triangles dropped")
@@ -63,8 +65,12 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
         _drop_fins(state)
     if len(state.faces) == 0:
         raise MeshError(f"{place}: nothing is left of the mesh without degenerate triangles")
-    _drop_crumbs(state, keep_parts=may_be_open)
-    state.vertices, state.faces, new, _ = igl.remove_unreferenced(vertices, state.faces)
+    _drop_crumbs(state)
+    if may_be_open:
+        state.vertices, state.faces, notes = outer_surface(vertices, state.faces)
+        parts = int(_parts(state.faces).max()) + 1
+        state.notes += notes + ([f"the surface has {parts} parts"] if parts > 1 else [])
+    state.vertices, state.faces, new, _ = igl.remove_unreferenced(state.vertices, state.faces)
     state.vertex_map = new[state.vertex_map]
     if not _is_closed(state.faces):
         if may_be_open:
@@ -158,16 +164,6 @@ def _parts(faces: Integers) -> Integers:
     )[1]
 
 
-def _repeated(faces):
-    """Which faces name a vertex twice, or the vertices of a face before them."""
-    degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    rows = np.sort(faces, axis=1).astype(np.int64).view("V24")  # bytes sort faster than rows
-    _, first = np.unique(rows, return_index=True)
-    again = np.ones(len(faces), dtype=bool)
-    again[first] = False
-    return degenerate | again
-
-
 def _merge_equal(state):
     """Merge vertices that are one point; a closed surface only by contracting edges, so that it
     stays closed.
@@ -181,7 +177,7 @@ def _merge_equal(state):
     if not count:
         return
     new = merged[faces]
-    new = new[~_repeated(new)]
+    new = new[~repeated_faces(new)]
     if _is_closed(faces) and not (_is_closed(new) and _euler(new) == _euler(faces)):
         return
     lost = (
@@ -211,7 +207,7 @@ def _drop_fins(state):
         state.notes.append(f"{before - len(state.faces)} dangling triangles dropped")
 
 
-def _drop_crumbs(state, *, keep_parts):
+def _drop_crumbs(state):
     part = _parts(state.faces)
     area = np.bincount(part, weights=igl.doublearea(state.vertices, state.faces))
     large = area >= CRUMB_LIMIT * area.max()
@@ -220,8 +216,6 @@ def _drop_crumbs(state, *, keep_parts):
         state.notes.append(
             f"{int((~large).sum())} loose parts of less than 1 % of the surface dropped"
         )
-    if keep_parts and large.sum() > 1:
-        state.notes.append(f"the surface has {int(large.sum())} parts")
 
 
 def _fill_holes(state, place):

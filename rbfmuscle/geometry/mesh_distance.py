@@ -1,10 +1,8 @@
-"""Distances that are measured: exact, sure of their side where a mesh is folded or open; depths in
-each other.
-"""
+"""Distances that are measured: exact, sure of their side where a mesh is folded or open."""
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,10 +18,6 @@ from rbfmuscle.geometry.exact_distance import (
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.jit import compiled
-from rbfmuscle.validation import check_mesh, check_points
-
-if TYPE_CHECKING:
-    import trimesh
 
 # Cells along the longer side, at most; below that the square root of the number of triangles.
 _MOST_CELLS = 512
@@ -207,6 +201,10 @@ def _above(at, vertices, faces, f, axes):
     return 1 if west_falls else -1
 
 
+def _as_points(points: ArrayLike) -> Floats:
+    return np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+
+
 class MeshDistance:
     """Exact distance of points to an outward mesh (vertices (n, 3) [scene unit], faces (m, 3));
     negative inside.
@@ -227,7 +225,8 @@ class MeshDistance:
         layout: Layout | None = None,
     ) -> None:
         self.closed = closed
-        self.vertices, self.faces = check_mesh(vertices, faces)
+        self.vertices = _as_points(vertices)
+        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
         self._known_layout = layout
 
     @cached_property
@@ -250,7 +249,7 @@ class MeshDistance:
         """Which points (n, 3) lie inside, (n,), once a pose (4, 4) has carried them into the mesh's
         coordinates.
         """
-        return self._inside(check_points(points), pose)
+        return self._inside(_as_points(points), pose)
 
     def unsigned(self, points: ArrayLike, *, near: Integers | None = None) -> Floats:
         """Distance (n,) of points (n, 3) to the surface [scene unit].
@@ -258,7 +257,7 @@ class MeshDistance:
         ``near`` (n,) holds the place in the tree of a triangle near each point, -1 where none is
         known; afterwards that of the nearest one, for the next call with a mesh of the same layout.
         """
-        points = check_points(points)
+        points = _as_points(points)
         out, near = np.empty(len(points)), np.full(len(points), -1) if near is None else near
 
         def work(first: int, last: int) -> None:
@@ -282,7 +281,7 @@ class MeshDistance:
         """How deep points (n, 3) lie inside, (n,) [scene unit], 0 where outside; the pose is as for
         `inside`.
         """
-        points = check_points(points)
+        points = _as_points(points)
         out, inside = np.zeros(len(points)), self.inside(points, pose=pose)
         if inside.any():
             out[inside] = self.unsigned(points[inside] @ pose[:3, :3].T + pose[:3, 3])
@@ -302,57 +301,3 @@ def _distance_loop(points, tree, near, out):
         square = np.inf if best < 0 else record_square(tree.records, best, x, y, z)
         best, square = nearest_triangle(tree, (x, y, z), best, square, 0.0, stack)
         near[i], out[i] = best, np.sqrt(square)
-
-
-class BoneProbe(MeshDistance):
-    """One bone, prepared once in its own coordinates, faces outward; it may have holes."""
-
-    def __init__(self, name: str, mesh: "trimesh.Trimesh") -> None:
-        super().__init__(mesh.vertices, mesh.faces, closed=bool(mesh.is_watertight))
-        self.name = name
-        self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-
-
-def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> Floats:
-    """Greatest depth (n,) of vertices (n, 3) in the bones, of poses (4, 4) by name; 0 where in none
-    [scene unit].
-    """
-    out = np.zeros(len(vertices))
-    for probe in bones_about(vertices, probes, poses):
-        np.maximum(out, probe.depth(vertices, pose=inverse_pose(poses[probe.name])), out=out)
-    return out
-
-
-def inverse_pose(pose: Floats) -> Floats:
-    """The pose (4, 4) that takes a rigid one back."""
-    back = np.eye(4)
-    back[:3, :3] = pose[:3, :3].T
-    back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return back
-
-
-def bones_about(
-    vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]
-) -> list[BoneProbe]:
-    """The bones whose boxes, where they are now, meet the box of the points (n, 3)."""
-    if not probes or len(vertices) == 0:
-        return []
-    # Column by column, which takes a tenth of the time of both at once.
-    low, high = (np.array([end(column) for column in vertices.T]) for end in (np.min, np.max))
-    placed = np.array([poses[probe.name] for probe in probes])
-    ends = np.array([probe.bounds for probe in probes])
-    middle = np.einsum("bij,bj->bi", placed[:, :3, :3], ends.mean(axis=1)) + placed[:, :3, 3]
-    half = np.einsum("bij,bj->bi", np.abs(placed[:, :3, :3]), 0.5 * (ends[:, 1] - ends[:, 0]))
-    met = np.all((middle - half < high) & (middle + half > low), axis=1)
-    return [probe for probe, near in zip(probes, met) if near]
-
-
-def bone_depth(surface: MeshDistance, probes: list[BoneProbe], poses: dict[str, Floats]) -> float:
-    """Greatest depth of any bone vertex in a closed, outward surface in the world, 0 where none is
-    [scene unit].
-    """
-    near = bones_about(surface.vertices, probes, poses)
-    depths = [
-        surface.depth(probe.vertices, pose=poses[probe.name]).max(initial=0.0) for probe in near
-    ]
-    return float(max(depths, default=0.0))
