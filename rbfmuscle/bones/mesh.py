@@ -79,8 +79,10 @@ def _mend(mesh):
 
     _, first, inverse = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
     if len(first) < len(mesh.vertices):
+        used = len(np.unique(mesh.faces))
         mesh.faces = np.ascontiguousarray(first[inverse.reshape(-1)][mesh.faces])
-        mesh.notes.append(f"{len(mesh.vertices) - len(first)} repeated vertices merged")
+        repeated = used - len(np.unique(mesh.faces))
+        mesh.notes += [f"{repeated} repeated vertices merged"] if repeated else []
         flat = _flat(mesh.vertices, mesh.faces)
         if flat.any():
             _keep(mesh, ~flat, f"{int(flat.sum())} faces without area left out")

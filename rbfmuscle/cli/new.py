@@ -135,7 +135,7 @@ def _new_folder(file, force):
 
 def _is_segmentation(source):
     from rbfmuscle.importers.labels.read import is_volume
-    from rbfmuscle.scene.meshes.read import MESH_SUFFIXES
+    from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES
 
     if not source.is_dir():
         return is_volume(source)

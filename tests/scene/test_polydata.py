@@ -15,7 +15,7 @@ import trimesh
 from fuzz.meshes import FORMS, suffix_of, write_mesh
 
 from rbfmuscle.scene.meshes import polydata
-from rbfmuscle.scene.meshes.polydata import read_polydata
+from rbfmuscle.scene.meshes.formats import read_part
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.validation import MeshError
 
@@ -24,7 +24,7 @@ ASCII, ENCODED = "vtp-Ascii-None", "vtp-Appended-LZMA-UInt32-encoded"
 
 
 def assert_is_ball(path):
-    points, triangles = read_polydata(path)
+    _, points, triangles, _ = read_part(path)
     np.testing.assert_array_equal(triangles, BALL.faces)
     np.testing.assert_allclose(points, BALL.vertices, atol=2e-6)  # float32
 
@@ -51,7 +51,7 @@ class TestWholeFiles:
             f"# vtk DataFile Version 3.0\ncube\nASCII\nDATASET POLYDATA\nPOINTS 8 float\n{points}\n"
             "POLYGONS 2 10\n4 0 3 2 1\n4 4 5 6 7\nTRIANGLE_STRIPS 1 11\n10 4 0 5 1 6 2 7 3 4 0\n"
         )
-        cube = trimesh.Trimesh(*read_polydata(path), process=False)
+        cube = trimesh.Trimesh(*read_part(path)[1:3], process=False)
         assert abs(cube.volume) == pytest.approx(1.0) and len(cube.faces) == 12
 
 

@@ -181,12 +181,19 @@ def _scene_text(guess: SceneGuess, stage: str = "") -> str:
 
     ``stage`` is the folder of the attachments' folder, relative to the file.
     """
-    rows = [({"name": bone.name, "mesh": bone.file}, _doubt(bone)) for bone in guess.parts.bones]
-    bones = [table_text("[[bone]]", row, doubt) for row, doubt in rows]
+    bones = [
+        table_text(_headed("[[bone]]", bone), {"name": bone.name, "mesh": bone.file}, _doubt(bone))
+        for bone in guess.parts.bones
+    ]
     movable = [joint for joint in guess.joints if joint.axes and not joint.follows]
     motion = [_motion(movable[0])] if movable else []
     muscles = [_muscle(muscle, stage) for muscle in guess.muscles]
     return "\n".join([_head(guess), *bones, *map(_joint, guess.joints), *motion, *muscles, _TAIL])
+
+
+def _headed(head, part, reasons=()):
+    """The line that begins a table, and comments: what was mended of the mesh, and reasons."""
+    return "\n".join([head, *(f"# {line}" for line in (*part.read.notes, *reasons))])
 
 
 def _doubt(part):
@@ -200,6 +207,7 @@ def _head(guess):
         "Check every line marked GUESS; the number is its confidence, 0 to 1.",
         "# All keys: docs/scene_file.md. Then: rbfmuscle check --picture, rbfmuscle run.",
         *(f"# NOT USED: {file}: {reason}" for file, reason in parts.unusable.items()),
+        *(f"# note: {note}" for note in parts.notes),
     ]
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
     row = {"format": 1, "name": name, "units": parts.units}
@@ -264,7 +272,7 @@ def _muscle(guess: MuscleGuess, stage: str) -> str:
         for hold in guess.holds
     ]
     row = {"name": part.name, "mesh": part.file, "attach": attach}
-    head = "\n".join(["[[muscle]]", *(f"# {reason}" for reason in guess.reasons)])
+    head = _headed("[[muscle]]", part, guess.reasons)
     text = table_text(head, row, {"attach": said, **_doubt(part)})
     if guess.wrong:
         text = "".join(f"# {line}\n" for line in [f"NOT RUN: {guess.wrong}", *text.splitlines()])

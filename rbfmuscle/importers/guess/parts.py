@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.importers.guess.names import MuscleFacts, name_facts
 from rbfmuscle.scene.check import LARGEST_MM, SMALLEST_MM
-from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_arrays
+from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES, read_file
+from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.validation import MeshError, UsageError
 
 # Folders below the one that is given, as people sort their meshes.
@@ -106,17 +107,19 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
     unknown = []
     names = set()
     other = []
-    for path in _find_meshes(folder):
-        facts = name_facts(path.stem)
+    for path, stem, mesh in _file_meshes(folder, found.notes):
+        facts = name_facts(stem)
         if facts.tissue == "other":
             other.append(path.name)
             continue
         tissue = facts.tissue if path.parent == folder else FOLDERS[path.parent.name.lower()]
         try:
-            part = _read_part(path, base, names, facts, found.notes, closed=tissue == "muscle")
+            part = _read_part(
+                path, stem, mesh, base, names, facts, found, closed=tissue == "muscle"
+            )
         except MeshError as error:
             found.unusable[path.name] = str(error).removeprefix(f"{path}: ")
-            found.left_out += [path.stem] if tissue != "muscle" else []
+            found.left_out += [stem] if tissue != "muscle" else []
             continue
         if facts.part:
             part.doubt = (
@@ -174,17 +177,40 @@ def _find_meshes(folder):
     return [path for path in files if path.suffix.lower() in MESH_SUFFIXES]
 
 
-def _read_part(path, base, names, facts, notes, *, closed):
-    name = re.sub(r"[^a-z0-9_-]+", "_", path.stem.lower()).strip("_") or "part"
+def _file_meshes(folder, notes):
+    """Path, name and FilePart of each mesh in the files of a folder, several of a file as
+    ``FILE#NAME``; of a file that cannot be read its MeshError.
+    """
+    for path in _find_meshes(folder):
+        try:
+            meshes = read_file(path)
+        except MeshError as error:
+            yield path, path.stem, error
+            continue
+        if len(meshes) == 1:
+            yield path, path.stem, meshes[0]
+            continue
+        names = [mesh.name for mesh in meshes]
+        notes.append(f"{path.name}: {len(names)} meshes in one file ({', '.join(names)})")
+        for mesh in meshes:
+            yield path.with_name(f"{path.name}#{mesh.name}"), mesh.name, mesh
+
+
+def _read_part(path, stem, mesh, base, names, facts, found, *, closed):
+    if isinstance(mesh, MeshError):
+        raise mesh
+    name = re.sub(r"[^a-z0-9_-]+", "_", stem.lower()).strip("_") or "part"
     while name in names:
         name += "_2"
     names.add(name)
-    vertices, faces = read_arrays(path)
+    vertices, faces = mesh.vertices, mesh.faces
     coarse = len(faces) > MOST_TRIANGLES and not closed  # cells of thin walls may open a surface
     if coarse:
-        notes.append(f"{path.name}: {len(faces)} triangles, made coarser to about {MOST_TRIANGLES}")
+        words = f"{len(faces)} triangles, made coarser to about {MOST_TRIANGLES}"
+        found.notes.append(f"{path.name}: {words}")
         vertices, faces = clustered(vertices, faces, MOST_TRIANGLES)
-    read = prepare_mesh(vertices, faces, place=str(path), name=path.stem, may_be_open=not closed)
+    read = prepare_mesh(vertices, faces, place=str(path), name=stem, may_be_open=not closed)
+    read.notes[:0] = mesh.notes
     file = os.path.relpath(path, base).replace(os.sep, "/")
     return Part(name, file, read, facts.bone, facts.side, facts=facts.muscle, coarse=coarse)
 

@@ -16,7 +16,8 @@ from rbfmuscle.importers.opensim.tubes import TUBE_MODEL, make_tube
 from rbfmuscle.importers.toml_text import attachment_file, table_text
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
-from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_arrays
+from rbfmuscle.scene.meshes.formats import ALL, MESH_SUFFIXES, read_part
+from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, check_mesh
@@ -172,7 +173,8 @@ def _placed(
     if file is None:
         where = ", ".join(str(folder) for folder in folders)
         raise MeshError(f"it is not there (looked in {where}); give its folder with --geometry")
-    vertices, faces = check_mesh(*read_arrays(file))
+    part = read_part(file.with_name(f"{file.name}#{ALL}"))
+    vertices, faces = check_mesh(part.vertices, part.faces)
     transform = place @ mesh.transform
     vertices = (vertices * mesh.scale) @ transform[:3, :3].T + transform[:3, 3]
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))

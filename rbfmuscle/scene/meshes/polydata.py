@@ -1,4 +1,4 @@
-"""VTK and VTP files, read by pyvista in one process beside this one: some broken files end it."""
+"""Files that VTK reads, by pyvista in one process beside this one: some broken files end it."""
 
 import atexit
 import contextlib
@@ -8,7 +8,7 @@ import subprocess
 import threading
 from functools import cache
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 
@@ -24,10 +24,20 @@ _LOCK = threading.Lock()
 _SIZE = 8  # bytes of the size that stands before an answer
 
 
-def read_polydata(path: str | Path) -> tuple[Floats, Integers]:
-    """Return points (n, 3) and triangles (m, 3) of a ``.vtk`` or ``.vtp`` file; polygons and strips
-    split.
+class PolyData(NamedTuple):
+    """Points (n, 3), and polygons: of polygon k the points ``numbers[ends[k] : ends[k + 1]]``.
+
+    ``other`` is the number of lines and single points in the file.
     """
+
+    points: Floats
+    ends: Integers
+    numbers: Integers
+    other: int
+
+
+def read_polydata(path: str | Path) -> PolyData:
+    """Return what a ``.vtk``, ``.vtp`` or ``.ply`` file holds; strips are split into triangles."""
     with _LOCK:
         child = _child(os.getpid())
         assert child.stdout is not None  # start_child asks for a pipe
@@ -57,8 +67,8 @@ def _end(child: subprocess.Popen[bytes]) -> None:
     _child.cache_clear()
 
 
-def _receive(pipe: IO[bytes]) -> tuple[Floats, Integers] | str:
-    """An answer, points and triangles or why there are none; EOFError or ValueError if it is none.
+def _receive(pipe: IO[bytes]) -> PolyData | str:
+    """An answer, or why there is none; EOFError or ValueError if it is neither.
 
     Arrays alone, as a process that has read a hostile file may send anything.
     """
@@ -66,14 +76,20 @@ def _receive(pipe: IO[bytes]) -> tuple[Floats, Integers] | str:
     if size > MEMORY:
         raise ValueError("the answer is larger than the process that gives it")
     content = io.BytesIO(_read_whole(pipe, size))
-    first = np.load(content, allow_pickle=False)
-    if first.dtype.kind == "U":
-        return str(first)
-    corners = np.load(content, allow_pickle=False)
-    for array, kind in ((first, "f8"), (corners, "i8")):
-        if array.dtype != kind or array.ndim != 2 or array.shape[1] != 3:
+    points = np.load(content, allow_pickle=False)
+    if points.dtype.kind == "U":
+        return str(points)
+    ends, numbers, other = (np.load(content, allow_pickle=False) for _ in range(3))
+    for array, kind, shape in (
+        (points, "f8", (*points.shape[:1], 3)),
+        (ends, "i8", (ends.size,)),
+        (numbers, "i8", (numbers.size,)),
+        (other, "i8", (1,)),
+    ):
+        if array.dtype != kind or array.shape != shape:
             raise ValueError("the answer is no mesh")
-    return first, corners
+    _check_cells(ends, numbers, len(points))
+    return PolyData(points, ends, numbers, int(other[0]))
 
 
 def _read_whole(pipe: IO[bytes], size: int) -> bytes:
@@ -115,14 +131,14 @@ def _answer() -> None:
     while True:
         path = asked.get()
         try:
-            arrays: tuple[Array, ...] = _read(path)
+            arrays = _read(path)
         except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
             text = " ".join(str(error).split())[:200] or type(error).__name__
             arrays = (np.array(text),)
         _reply(outbox.file, *arrays)
 
 
-def _read(path: str) -> tuple[Floats, Integers]:
+def _read(path: str) -> tuple[Array, ...]:
     import pyvista
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
@@ -136,10 +152,15 @@ def _read(path: str) -> tuple[Floats, Integers]:
             raise ValueError(
                 "no points" if isinstance(data, pyvista.PolyData) else type(data).__name__
             )
-        sides, numbers = _cells(data.GetPolys(), data.n_points)
-        if data.n_strips or (np.diff(sides) != 3).any():
-            sides, numbers = _cells(data.triangulate().GetPolys(), data.n_points)
-    return np.array(data.points, dtype=np.float64), numbers.reshape(-1, 3)
+        ends, numbers = _cells(data.GetPolys(), data.n_points)
+        if data.n_strips:
+            strips = data.copy()
+            strips.GetPolys().Reset()
+            split = _cells(strips.triangulate().GetPolys(), data.n_points)
+            ends = np.concatenate([ends, split[0][1:] + len(numbers)])
+            numbers = np.concatenate([numbers, split[1]])
+        other = data.n_lines + (data.n_verts if len(numbers) else 0)
+    return np.array(data.points, dtype=np.float64), ends, numbers, np.array([other])
 
 
 def _cells(cells, points):
@@ -148,13 +169,18 @@ def _cells(cells, points):
 
     parts = cells.GetOffsetsArray(), cells.GetConnectivityArray()
     ends, numbers = (convert_array(part).astype(np.int64) for part in parts)
+    _check_cells(ends, numbers, points)
+    return ends, numbers
+
+
+def _check_cells(ends, numbers, points):
+    """ValueError where cells name points that are not there, or do not fit their numbers."""
     if len(numbers) and (numbers.min() < 0 or numbers.max() >= points):
         raise ValueError(
             f"a cell names points {numbers.min()} to {numbers.max()}, there are {points}"
         )
     if len(numbers) and (ends[0] != 0 or (np.diff(ends) < 0).any() or ends[-1] != len(numbers)):
         raise ValueError(f"the cells do not fit their {len(numbers)} point numbers")
-    return ends, numbers
 
 
 if __name__ == "__main__":

@@ -58,6 +58,9 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
     """
     bad = repeated_faces(faces)
     state = ReadMesh(vertices, faces[~bad], np.arange(len(vertices)))
+    unused = len(vertices) - len(np.unique(faces))
+    if unused:
+        state.notes.append(f"{unused} vertices of no triangle left out")
     if bad.any():
         state.notes.append(f"{int(bad.sum())} degenerate or repeated triangles dropped")
     if len(state.faces):
@@ -168,11 +171,13 @@ def _merge_equal(state):
     """Merge vertices that are one point; a closed surface only by contracting edges, so that it
     stays closed.
     """
-    vertices, faces = state.vertices, state.faces
+    faces, used = state.faces, np.unique(state.faces)
+    vertices = state.vertices[used]
     size = max(MERGE_TOLERANCE * np.linalg.norm(np.ptp(vertices, axis=0)), 1e-300)
     keys = np.round((vertices - vertices.min(axis=0)) / size).astype(np.int64)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    merged = first[inverse.ravel()]
+    merged = np.arange(len(state.vertices))
+    merged[used] = used[first[inverse.ravel()]]
     count = int((merged != np.arange(len(merged))).sum())
     if not count:
         return

@@ -1,0 +1,241 @@
+"""Mesh files as they stand: the parts of an STL, OBJ, PLY, VTK or VTP file, by their names."""
+
+import io
+import os
+import re
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.scene.meshes.obj import read_obj
+from rbfmuscle.scene.meshes.polydata import read_polydata
+from rbfmuscle.scene.meshes.polygons import cut_polygons
+from rbfmuscle.validation import MeshError, did_you_mean, shown, shown_path
+
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
+# Part of a file's path that names one of its meshes, and what names all of them.
+_PART = re.compile(r"(.+\.(?:stl|obj|ply|vtk|vtp))#(.+)", re.IGNORECASE)
+ALL = "*"
+# A binary STL file: header, number of triangles, and normal, corners and two bytes of each.
+_HEAD = 84
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+_VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+_SOLID = re.compile(rb"^[ \t]*(end)?solid\b([^\r\n]*)", re.IGNORECASE | re.MULTILINE)
+
+
+class FilePart(NamedTuple):
+    """One mesh of a file: vertices (n, 3), triangles (m, 3), and what was left out or assumed."""
+
+    name: str  # empty where the file gives none
+    vertices: Floats
+    faces: Integers
+    notes: list[str]
+
+
+def split_path(path: Path) -> tuple[Path, str]:
+    """The file and the name of one of its meshes, of ``FILE#NAME``; no name where none is given."""
+    match = _PART.fullmatch(path.name)
+    return (path.with_name(match[1]), match[2]) if match else (path, "")
+
+
+def read_part(path: Path) -> FilePart:
+    """Return the mesh of a file, or of ``FILE#NAME``, or all of ``FILE#*`` as one; or raise
+    MeshError.
+
+    A file of several meshes is refused where none is named.
+    """
+    file, name = split_path(path)
+    parts = read_file(file)
+    if name == ALL:
+        return _together(parts)
+    if not name and len(parts) == 1:
+        return parts[0]
+    names = [part.name for part in parts]
+    if name in names:
+        return parts[names.index(name)]
+    if name:
+        raise MeshError(f"{path}: no mesh of this name in the file, {did_you_mean(name, names)}")
+    example = f"{file.name}#{names[0]}"
+    raise MeshError(
+        f"{path}: {len(parts)} meshes in one file ({', '.join(names[:8])}); name one of them, as "
+        f"{example}, or take all as one rigid mesh by {file.name}#{ALL}"
+    )
+
+
+def _together(parts):
+    """All meshes of a file as one."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, starts)]
+    notes = [note for part in parts for note in part.notes]
+    if len(parts) > 1:
+        notes.append(f"{len(parts)} meshes of the file taken as one")
+    vertices = np.concatenate([part.vertices for part in parts])
+    return FilePart("", vertices, np.concatenate(faces), notes)
+
+
+def read_file(path: Path) -> list[FilePart]:
+    """Return the meshes of a file as they stand, at least one; several have names, each another."""
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        words = (
+            f"{shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
+        )
+        raise MeshError(f"{shown_path(path)}: {words}")
+    if not os.path.isfile(path):
+        raise MeshError(f"{shown_path(path)}: no such mesh file{_neighbours(path)}")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise MeshError(f"{path}: cannot read the mesh: {error.strerror}") from None
+    if not content:
+        raise MeshError(f"{path}: the file is empty")
+    try:
+        if suffix == ".stl":
+            return _named(_read_stl(content))
+        if suffix == ".obj":
+            return _named([FilePart(*part) for part in read_obj(content)])
+        return [_read_ply(path, content) if suffix == ".ply" else _read_polydata(path)]
+    except MeshError:
+        raise
+    except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
+        why = shown(" ".join(str(error).split())) or type(error).__name__
+        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} file ({why})") from None
+
+
+def _neighbours(path):
+    """Words for the nearest mesh file in the folder of a missing one."""
+    if not os.path.isdir(path.parent):
+        return f" (no folder {shown_path(path.parent)})"
+    try:
+        names = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+    except OSError:
+        return ""
+    return ", " + did_you_mean(path.name, names[:50]) if names else " (no meshes in that folder)"
+
+
+def _named(parts):
+    """The parts that have triangles, with names that differ; those without are noted."""
+    full = [part for part in parts if len(part.faces)]
+    empty = [part.name or "without a name" for part in parts if not len(part.faces)]
+    full = full or parts[:1]
+    if empty and len(parts) > len(full):
+        full[0].notes.append(f"{len(empty)} empty meshes in the file ({', '.join(empty[:8])})")
+    if len(full) == 1:
+        return full
+    names: list[str] = []
+    for number, part in enumerate(full, start=1):
+        # A name may become that of a file, and begins no folder.
+        name = stem = re.sub(r"[^\w.+-]+", "_", part.name).strip("_.") or f"part_{number}"
+        count = 1
+        while name in names:
+            count += 1
+            name = f"{stem}_{count}"
+        names.append(name)
+    return [part._replace(name=name) for part, name in zip(full, names)]
+
+
+def _read_stl(content):
+    """The solids of an STL file; triangles have their own vertices there, equal ones are merged."""
+    if not _is_binary(content):
+        return _read_stl_text(content)
+    parts, start = [], 0
+    while len(content) - start >= _HEAD:
+        count = int.from_bytes(content[start + 80 : start + _HEAD], "little")
+        whole = start + _HEAD + 50 * count
+        if whole > len(content):
+            if parts:  # not another solid, but other bytes
+                break
+            raise ValueError(
+                f"it is cut off: {len(content):,} bytes, {count:,} triangles need {whole:,}"
+            )
+        rows = np.frombuffer(content, _TRIANGLE, count, start + _HEAD)
+        parts.append(_soup("", rows["corners"].astype(np.float64)))
+        start = whole
+        if count == 0:
+            break
+    if start < len(content):
+        more = len(content) - start
+        parts[0].notes.append(f"{more} bytes behind the last triangle left out")
+    return parts
+
+
+def _is_binary(content):
+    """Whether an STL file is binary: by its length, or by bytes that no text has."""
+    count = int.from_bytes(content[80:_HEAD], "little")
+    if len(content) == _HEAD + 50 * count and count:
+        return True
+    text = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:5].lower() == b"solid"
+    return len(content) >= _HEAD and (not text or b"\0" in content)
+
+
+def _read_stl_text(content):
+    parts, name, start = [], b"", None
+    for match in [*_SOLID.finditer(content), None]:
+        if start is not None and (match is None or match[1] is None):
+            raise ValueError(f"it is cut off: solid {name.decode('utf-8', 'replace')!r} has no end")
+        if match is None:
+            break
+        if match[1] is None:
+            name, start = match[2].strip(), match.end()
+            continue
+        if start is None:
+            raise ValueError("a solid ends that has not begun")
+        inside = content[start : match.start()]
+        corners = np.array(_VERTEX.findall(inside)).astype(np.float64)
+        facets = len(re.findall(rb"\bendfacet\b", inside, re.IGNORECASE))
+        if len(corners) != 3 * facets:
+            raise ValueError(f"{len(corners)} corners of {facets} triangles")
+        parts.append(_soup(name.decode("utf-8", "replace"), corners.reshape(-1, 3, 3)))
+        start = None
+    if not parts:
+        raise ValueError("neither text from 'solid' to 'endsolid' nor binary")
+    return parts
+
+
+def _soup(name, corners):
+    """Triangles (m, 3, 3) as a mesh whose equal corners are one vertex, in order of first use."""
+    # Bytes sort faster than rows; 0.0 is -0.0.
+    rows = np.ascontiguousarray(corners.reshape(-1, 3) + 0.0)
+    _, first, inverse = np.unique(rows.view("V24").ravel(), return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    return FilePart(name, rows[first[order]], np.argsort(order)[inverse].reshape(-1, 3), [])
+
+
+def _read_ply(path, content):
+    """The mesh of a PLY file: triangles by trimesh; polygons, which it cuts into fans, by VTK."""
+    import trimesh
+
+    try:
+        with warnings.catch_warnings():
+            # Older NumPy warns of text that is no number and goes on.
+            warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
+            # Vertices are not split where textures meet.
+            mesh = trimesh.load(
+                io.BytesIO(content),
+                file_type="ply",
+                process=False,
+                force="mesh",
+                fix_texture=False,
+                skip_materials=True,
+            )
+    except Exception as error:  # noqa: BLE001 - lists of different lengths, too
+        try:
+            return _read_polydata(path)
+        except MeshError:
+            raise error from None
+    faces = np.asarray(getattr(mesh, "faces", ()), np.int64).reshape(-1, 3)
+    declared = re.search(rb"element\s+face\s+(\d+)", content[:10000])
+    if declared and int(declared[1]) != len(faces):
+        return _read_polydata(path)
+    return FilePart("", np.asarray(mesh.vertices, np.float64), faces, [])
+
+
+def _read_polydata(path):
+    found = read_polydata(path)
+    faces, notes = cut_polygons(found.points, found.ends, found.numbers)
+    if found.other:
+        notes.append(f"{found.other} lines and points left out")
+    return FilePart("", found.points, faces, notes)
