@@ -60,11 +60,12 @@ def new(
         if isinstance(read, SceneGuess):
             guess = read
         else:
-            guess = guess_scene(_write_surfaces(read, stage), "mm", base, header=HEADER)
+            folder, capped, notes = _write_surfaces(read, stage)
+            header = HEADER if read.directed else None
+            guess = guess_scene(folder, "mm", base, header=header, capped=capped)
+            guess.parts.notes[:0] = notes
         scene = write_scene(guess, output, stage)
     print(f"{output} written; check the lines marked GUESS")
-    for note in guess.parts.notes:
-        print(f"note: {note}")
     for doubt in guess.doubts():
         print(f"doubtful: {doubt}")
     for finding in scene.check():
@@ -153,31 +154,35 @@ def _beside(source, output):
 
 
 def _write_surfaces(volume, stage):
-    """Surfaces of all labels as PLY in ``meshes`` of a folder; that folder."""
+    """Surfaces of all labels as PLY in ``meshes`` of a folder; that folder, vertices on caps by
+    file, and notes.
+    """
     from rbfmuscle.importers.guess.names import name_facts
     from rbfmuscle.importers.labels.surfaces import label_surface
     from rbfmuscle.progress import Progress
 
     meshes = stage / "meshes"
     meshes.mkdir()
-    values, files = volume.values(), set()
+    values, files, capped = volume.values(), set(), {}
+    frame = "right, forward, up (RAS), mm"
+    notes = [f"surfaces of {Path(volume.source).name}, in its frame: {frame}", *volume.notes]
     with Progress("surfaces", "label") as progress:
         for done, label in enumerate(values, start=1):
             tissue = name_facts(volume.name(label)).tissue
             if tissue == "other":
-                print(f"{volume.name(label)}: neither bone nor muscle, left out")
+                notes.append(f"{volume.name(label)}: neither bone nor muscle, left out")
                 continue
             try:
                 surface = label_surface(volume, int(label), pieces=tissue == "bone")
             except MeshError as error:
-                print(f"{error}; left out")
+                notes.append(f"{error}; left out")
                 continue
             file = re.sub(r"[^A-Za-z0-9_-]+", "_", surface.name)
             while file.lower() in files:  # two labels of one name are two parts
                 file = f"{file}_{int(label)}"
             files.add(file.lower())
             surface.mesh.export(meshes / f"{file}.ply")
-            for note in surface.notes:
-                print(f"{surface.name}: {note}")
+            capped[file] = surface.capped
+            notes += [f"{surface.name}: {note}" for note in surface.notes]
             progress(done, len(values))
-    return meshes
+    return meshes, capped, notes

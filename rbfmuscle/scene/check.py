@@ -54,6 +54,7 @@ def check_scene(scene: SceneData) -> list[Finding]:
     """
     items: list[Bone | Muscle] = [*scene.bones, *scene.muscles]
     findings = [Finding("note", item.name, note) for item in items for note in item.notes]
+    findings += [Finding("note", scene.name, note) for note in scene.notes]
     opened = "the bone is open, its inside follows from winding numbers"
     unusable = "no mesh of this bone could be used: muscles pass through it"
     findings += [Finding("warning", bone.name, opened) for bone in scene.bones if not bone.closed]

@@ -53,6 +53,7 @@ class SceneTable(Table):
     units: Literal["m", "cm", "mm"]
     left_out: list[str] = Field(default=[])
     doubts: list[str] = Field(default=[])
+    notes: list[str] = Field(default=[])
     superior: Axis | None = None
     anterior: Axis | None = None
 
@@ -170,6 +171,7 @@ def _fill(scene: SceneData, tables: SceneFile) -> None:
         raise SceneError("[scene]: give superior and anterior, of different directions, or neither")
     scene.left_out = about.left_out
     scene.doubts = about.doubts
+    scene.notes = about.notes
     scene.superior = about.superior
     scene.anterior = about.anterior
     for bone in tables.bone:
@@ -248,6 +250,7 @@ def describe_scene(scene: SceneData) -> dict[str, Any]:
         "left_out": list(scene.left_out),
         "doubts": list(scene.doubts),
         "guesses": [guess._asdict() for guess in scene.guesses],
+        "notes": list(scene.notes),
         "joints": [joint_row(joint) for joint in scene.joints],
         "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
         "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},

@@ -145,6 +145,8 @@ class SceneData:
         the verdict of a run.
     guesses : list of Guess
         Lines of the file that are marked GUESS; the doubtful ones count in the verdict of a run.
+    notes : list of str
+        What was assumed about the data or left out, for `check` to repeat.
     superior, anterior : list of float or None
         Anatomical directions (3,) at rest: those of the file, or found from the bones before a run
         or a picture.
@@ -167,6 +169,7 @@ class SceneData:
     left_out: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     guesses: list[Guess] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     superior: list[float] | None = None
     anterior: list[float] | None = None
 
@@ -198,7 +201,8 @@ class SceneData:
     def copy(self) -> Self:
         """Return a copy whose lists and tables are its own; meshes are shared."""
         other = copy.copy(self)
-        for name in ("bones", "joints", "couplings", "links", "left_out", "doubts", "guesses"):
+        lists = ("bones", "joints", "couplings", "links", "left_out", "doubts", "guesses", "notes")
+        for name in lists:
             setattr(other, name, list(getattr(self, name)))
         other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
         return other

@@ -239,7 +239,7 @@ def test_new_takes_each_solid_of_a_file_and_writes_what_was_mended(tmp_path, cap
     assert call(capsys, "new", tmp_path, "--units", "mm")[0] == 0
     scene = (tmp_path / "scene.toml").read_text()
     assert 'mesh = "bones.stl#pelvis"' in scene and 'mesh = "bones.stl#femur"' in scene
-    assert "# note: bones.stl: 2 meshes in one file (pelvis, femur)" in scene
+    assert "bones.stl: 2 meshes in one file (pelvis, femur)" in scene
     assert "# 2 nested shells, the inner one is ignored" in scene
     _, out, _ = call(capsys, "check", tmp_path / "scene.toml")
     assert "tibia: 2 nested shells, the inner one is ignored" in out

@@ -3,13 +3,20 @@ its reason.
 """
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
-from rbfmuscle.importers.guess.attachments import MuscleGuess, Skeleton, guess_attachments
+from rbfmuscle.importers.guess.attachments import (
+    FEWEST,
+    MuscleGuess,
+    Skeleton,
+    guess_attachments,
+)
 from rbfmuscle.importers.guess.frames import bone_frames
 from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
@@ -59,12 +66,18 @@ class SceneGuess:
 
 
 def guess_scene(
-    folder: Path, units: str | None, base: Path, *, header: Orientation | None = None
+    folder: Path,
+    units: str | None,
+    base: Path,
+    *,
+    header: Orientation | None = None,
+    capped: Mapping[str, Booleans] | None = None,
 ) -> SceneGuess:
     """Guess a scene from the meshes of a folder, or of folders ``bones`` and ``muscles`` in it.
 
     ``units`` are ``"mm"``, ``"cm"`` or ``"m"``, by the size of the bones where None; the scene's
-    paths are relative to ``base``; a ``header`` holds anatomical directions where they are known.
+    paths are relative to ``base``; a ``header`` holds anatomical directions where they are known;
+    ``capped`` marks vertices (n,) of files, by their stems, to which nothing is attached.
     UsageError if the folder is missing, holds no bone or no muscle, or is of no known unit.
     """
     parts = read_parts(folder, units, base)
@@ -83,6 +96,8 @@ def guess_scene(
         guess.muscles = [
             guess_attachments(muscle, skeleton, named=False) for muscle in parts.muscles
         ]
+    for muscle in guess.muscles:
+        _leave_caps(muscle, (capped or {}).get(Path(muscle.muscle.file).stem))
     order = [root, *(joint.child for joint in joints)]
     for muscle in guess.muscles:  # from the bone that stands still outwards
         muscle.holds.sort(key=lambda hold: order.index(hold.bone) if hold.bone in order else 0)
@@ -104,6 +119,20 @@ def _skeleton(guess, bodies, millimetre):
         bone_frames(bones, joints, guess.orientation, millimetre),
         {bone: surfaces[bone.name] for bone in bones},
     )
+
+
+def _leave_caps(muscle, capped):
+    """Take the vertices on the cap at the scan's end from what holds a muscle."""
+    if capped is None or not capped.any():
+        return
+    on_cap = muscle.muscle.read.vertex_map[np.flatnonzero(capped)]
+    for hold in list(muscle.holds):
+        hold.vertices = np.setdiff1d(hold.vertices, on_cap)
+        if len(hold.vertices) < FEWEST:
+            muscle.holds.remove(hold)
+            muscle.reasons.append(f"not held by {hold.bone.name}: its end is where the scan ends")
+    if len(muscle.holds) < 2 and not muscle.wrong:
+        muscle.wrong, muscle.confidence = "an end of it is where the scan ends", 0.0
 
 
 def write_scene(guess: SceneGuess, path: Path, stage: Path) -> Scene:
@@ -207,7 +236,6 @@ def _head(guess):
         "Check every line marked GUESS; the number is its confidence, 0 to 1.",
         "# All keys: docs/scene_file.md. Then: rbfmuscle check --picture, rbfmuscle run.",
         *(f"# NOT USED: {file}: {reason}" for file, reason in parts.unusable.items()),
-        *(f"# note: {note}" for note in parts.notes),
     ]
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
     row = {"format": 1, "name": name, "units": parts.units}
@@ -217,6 +245,9 @@ def _head(guess):
         comments["left_out"] = (
             "bones whose meshes cannot be used; every run counts them as beyond its limits"
         )
+    if parts.notes:
+        row["notes"] = parts.notes
+        comments["notes"] = "what was assumed, left out or joined; check repeats it"
     for word in ("superior", "anterior") if guess.orientation is not None else ():
         row[word] = rounded(getattr(guess.orientation, word), 5)
         comments[word] = f"by {guess.orientation.source}"

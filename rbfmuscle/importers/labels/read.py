@@ -8,11 +8,13 @@ whatever the order and the signs of the voxels' axes; NRRD files in LPS are turn
 import json
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Array, Floats
+from rbfmuscle.importers.labels.volume import LAYER, LabelVolume
 from rbfmuscle.validation import MeshError, UsageError
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
@@ -22,34 +24,24 @@ MOST_LABELS = 512
 VOXEL_RANGE = (0.02, 20.0)
 _TO_MM = {"mm": 1.0, "millimeter": 1.0, "unknown": 1.0, "cm": 10.0, "m": 1000.0, "meter": 1000.0}
 _TO_MM |= {"um": 0.001, "micron": 0.001}
+# Labels may be stored with this much less or more than whole numbers.
+ROUNDED = 1e-3
+NO_DIRECTIONS = (
+    "the header states no directions: the voxels' axes are taken to run to the right, forward and "
+    "up (RAS), so left and right may be exchanged"
+)
+NO_UNIT = "the header states no unit of length: mm taken"
 
 
 @dataclass
-class LabelVolume:
-    """Labels (i, j, k) on a regular grid, 0 for what belongs to nothing.
+class _Header:
+    """What a file says besides its voxels."""
 
-    ``affine`` (4, 4) takes voxel indices to positions [mm, RAS]; ``names`` are those of the labels
-    that have one.
-    """
-
-    labels: np.ndarray
-    affine: np.ndarray
+    affine: Floats  # (4, 4), in its unit
+    unit: str
     names: dict[int, str]
-    source: str
-
-    @property
-    def spacing(self) -> np.ndarray:
-        """Edges of a voxel [mm], (3,)."""
-        return np.linalg.norm(self.affine[:3, :3], axis=0)
-
-    def values(self) -> np.ndarray:
-        """Labels that occur, without 0."""
-        found = np.flatnonzero(np.bincount(self.labels.ravel()))
-        return found[found > 0]
-
-    def name(self, label: int) -> str:
-        """Name of a label; its number where it has none."""
-        return self.names.get(int(label)) or f"label_{int(label)}"
+    notes: list[str] = field(default_factory=list)
+    directed: bool = True
 
 
 def is_volume(path: Path) -> bool:
@@ -67,9 +59,10 @@ def read_labels(path: Path, *, names: Path | None = None) -> LabelVolume:
     if names is not None:
         volume.names.update(read_names(names))
     values, image = volume.values(), "is it the image instead of its segmentation?"
+    volume.notes += volume.overlaps()
     if len(values) == 0:
         raise MeshError(f"{path}: no voxel has a label; {image}")
-    if not (values % 256).any():
+    if not (values % LAYER % 256).any():
         raise MeshError(
             f"{path}: all labels are multiples of 256, so its bytes are swapped; export it again"
         )
@@ -89,18 +82,39 @@ def _read_folder(path):
             f"{path}: {len(files)} masks ({' '.join(VOLUME_SUFFIXES)}), 1 to {MOST_LABELS}"
         )
     first = _read_file(files[0])
-    together = LabelVolume(np.zeros_like(first.labels), first.affine, {}, str(path))
+    layers: list[Array] = []
+    together = LabelVolume(first.labels, first.affine, {}, str(path), first.notes, first.directed)
+    empty = []
     for number, file in enumerate(files, start=1):
         mask = _read_file(file)
         if mask.labels.shape != first.labels.shape or not np.allclose(
             mask.affine, first.affine, atol=1e-3
         ):
             raise MeshError(f"{file}: its grid differs from that of {files[0].name}; resample it")
-        together.labels[mask.labels > 0] = number
-        together.names[number] = re.sub(
-            r"(\.seg)?(\.nii(\.gz)?|\.nrrd)$", "", file.name, flags=re.IGNORECASE
-        )
+        name = re.sub(r"(\.seg)?(\.nii(\.gz)?|\.nrrd)$", "", file.name, flags=re.IGNORECASE)
+        voxels = np.flatnonzero(mask.labels.max(axis=0))
+        together.notes += [note for note in mask.notes if note not in together.notes]
+        if len(voxels) == 0:
+            empty.append(name)
+            continue
+        layer = _free_layer(layers, voxels, first.labels.shape[1:], path)
+        layers[layer].ravel()[voxels] = number
+        together.names[number + layer * LAYER] = name
+    if empty:
+        together.notes.append(f"{len(empty)} of {len(files)} masks are empty: {', '.join(empty)}")
+    together.labels = np.stack(layers) if layers else np.zeros_like(first.labels)
     return together
+
+
+def _free_layer(layers, voxels, shape, path):
+    """Number of the first layer in which nothing has these voxels, a new one where all do."""
+    for number, layer in enumerate(layers):
+        if not layer.ravel()[voxels].any():
+            return number
+    layers.append(np.zeros(shape, dtype=np.uint16))
+    if len(layers) * layers[0].nbytes > MOST_BYTES:
+        raise MeshError(f"{path}: its masks overlap in {len(layers)} layers; crop or split them")
+    return len(layers) - 1
 
 
 def _read_file(path):
@@ -110,22 +124,29 @@ def _read_file(path):
         ("NRRD", _read_nrrd) if path.name.lower().endswith(".nrrd") else ("NIfTI", _read_nifti)
     )
     try:
-        data, affine, unit, names = read(path)
+        data, header = read(path)
     except MeshError:
         raise
     except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
         why = " ".join(str(error).split())[:120] or type(error).__name__
         raise MeshError(f"{path}: no readable {kind} volume ({why}); export it again") from None
-    if unit not in _TO_MM:
-        raise MeshError(f"{path}: unknown unit of length {unit!r} in its header")
-    affine[:3] *= _TO_MM[unit]
-    return LabelVolume(_check_labels(data, path), _check_affine(affine, path), names, str(path))
+    if header.unit not in _TO_MM:
+        raise MeshError(f"{path}: unknown unit of length {header.unit!r} in its header")
+    header.affine[:3] *= _TO_MM[header.unit]
+    labels = _check_labels(data, path, header.notes)
+    affine = _check_affine(header.affine, path)
+    if not header.directed:
+        header.notes.append(NO_DIRECTIONS)
+    volume = LabelVolume(labels, affine, header.names, str(path), header.notes, header.directed)
+    occur = set(volume.values().tolist())
+    empty = [name for label, name in header.names.items() if label not in occur]
+    if empty:
+        volume.notes.append(f"{len(empty)} named labels have no voxel: {', '.join(empty)}")
+    return volume
 
 
 def _read_nifti(path):
-    """Voxels, affine (4, 4), its unit, and names that segmentation programs leave in the header as
-    XML.
-    """
+    """Voxels (i, j, k) and header, with names that segmentation programs leave in it as XML."""
     import nibabel
 
     image = nibabel.load(path)
@@ -138,38 +159,74 @@ def _read_nifti(path):
             r'<Label[^>]*?Key="(\d+)"[^>]*?>(?:<!\[CDATA\[)?([^<\]]+)', text
         ):
             names[int(number)] = name.strip()
-    unit = image.header.get_xyzt_units()[0]
-    return np.asanyarray(image.dataobj), np.array(image.affine, dtype=np.float64), unit, names
+    data = np.asanyarray(image.dataobj)
+    header = _Header(
+        np.array(image.affine, dtype=np.float64), image.header.get_xyzt_units()[0], names
+    )
+    header.notes += [NO_UNIT] if header.unit == "unknown" else []
+    if not (int(image.header["qform_code"]) or int(image.header["sform_code"])):
+        header.directed = False
+        header.affine = np.diag([*map(float, image.header.get_zooms()[:3]), 1.0])
+    return data.reshape(data.shape[:3]), header
 
 
 def _read_nrrd(path):
-    """Voxels, affine (4, 4), its unit, and the names that Slicer writes for segments."""
+    """Voxels (i, j, k), or (layers, i, j, k), and header, with the names that Slicer writes for
+    segments.
+    """
     import nrrd
 
-    _check_size(tuple(int(size) for size in nrrd.read_header(str(path))["sizes"]), 8, path)
-    data, header = nrrd.read(str(path))
-    across = np.diag(np.asarray(header.get("spacings", np.ones(3)), dtype=np.float64))
-    directions = np.asarray(header.get("space directions", across), dtype=np.float64)
+    said = nrrd.read_header(str(path))
+    sizes = tuple(int(size) for size in said["sizes"])
+    layered = _layer_axis(said, len(sizes))
+    _check_size(sizes if layered is None else np.delete(sizes, layered), 8, path)
+    data, said = nrrd.read(str(path))
+    if layered is not None:
+        data = np.moveaxis(data, layered, 0)
+    across = np.diag(np.asarray(said.get("spacings", np.ones(3)), dtype=np.float64)[-3:])
+    directions = np.asarray(said.get("space directions", across), dtype=np.float64)
+    directions = directions[np.isfinite(directions).all(axis=1)]
     if directions.shape != (3, 3):
         raise MeshError(
             f"{path}: its directions are not those of three axes; export one label map in 3-D"
         )
     affine = np.eye(4)
-    affine[:3, :3], affine[:3, 3] = directions.T, header.get("space origin", np.zeros(3))
-    space = str(header.get("space", "lps")).lower()
+    affine[:3, :3], affine[:3, 3] = directions.T, said.get("space origin", np.zeros(3))
+    space = str(said.get("space", "ras")).lower()
     ends = "".join(word[:1] for word in space.split("-")) if "-" in space else space
     if len(ends) < 3 or any(end not in pair for end, pair in zip(ends, ("lr", "pa", "si"))):
         raise MeshError(f"{path}: its space is {space!r}; export it as left-posterior-superior")
     affine[:3] *= [[-1.0] if end in "lpi" else [1.0] for end in ends[:3]]
+    unit = str((said.get("space units") or [""])[0]).strip('"').lower()
+    header = _Header(affine, unit or "mm", _segment_names(said, layered is not None))
+    header.directed = "space" in said
+    # Spaces of the body are in mm by convention.
+    header.notes += [] if unit or header.directed else [NO_UNIT]
+    return data, header
+
+
+def _layer_axis(header, count):
+    """The axis of a NRRD file along which its layers lie; None where it has no layers."""
+    kinds = [str(kind) for kind in header.get("kinds", [])]
+    if count != 4 or not any(re.fullmatch(r"Segment\d+_Name", str(key)) for key in header):
+        return kinds.index("list") if count == 4 and "list" in kinds else None
+    other = [k for k, kind in enumerate(kinds) if kind not in ("domain", "space")]
+    return other[0] if other else 0
+
+
+def _segment_names(header, layered):
+    """Names of Slicer's segments by label; of one layer a segment where no layer is said."""
     names = {}
     for key, value in header.items():
         segment = re.fullmatch(r"Segment(\d+)_Name", str(key))
         if segment:
-            names[int(header.get(f"Segment{segment[1]}_LabelValue", int(segment[1]) + 1))] = str(
-                value
-            )
-    unit = str((header.get("space units") or ["mm"])[0]).strip('"').lower()
-    return data, affine, unit or "mm", names
+            number = int(segment[1])
+            said = header.get(f"Segment{number}_Layer")
+            layer = int(said if said is not None else number) if layered else 0
+            usual = 1 if layered and said is None else number + 1
+            label = int(header.get(f"Segment{number}_LabelValue", usual))
+            names[label + layer * LAYER] = str(value)
+    return names
 
 
 def _check_size(shape, itemsize, path):
@@ -185,21 +242,26 @@ def _check_size(shape, itemsize, path):
         )
 
 
-def _check_labels(data, path):
-    """Whole numbers from 0 on, (i, j, k) of int32."""
-    data = data.reshape(data.shape[:3])
+def _check_labels(data, path, notes):
+    """Whole numbers from 0 on, of uint16; rounded where they are nearly whole."""
     if not np.issubdtype(data.dtype, np.number) or np.iscomplexobj(data):
         raise MeshError(f"{path}: voxels of type {data.dtype}; labels are whole numbers")
     if not np.isfinite(data).all():
         raise MeshError(f"{path}: some voxels are not finite; labels are whole numbers")
-    if not (data == np.rint(data)).all():
+    whole = np.rint(data)
+    off = np.abs(data - whole)
+    if off.max(initial=0.0) > ROUNDED:
+        wrong = data.ravel()[off.ravel().argmax()]
         raise MeshError(
-            f"{path}: voxels between whole numbers; is it the image instead of its segmentation?"
+            f"{path}: {int((off > ROUNDED).sum())} voxels between whole numbers, as {wrong:g}; "
+            "is it the image instead of its segmentation?"
         )
-    low, high = float(data.min()), float(data.max())
-    if low < 0 or high > 65535:
-        raise MeshError(f"{path}: labels from {low:g} to {high:g}, allowed are 0 to 65535")
-    return np.ascontiguousarray(data, dtype=np.int32)
+    if off.any():
+        notes.append(f"labels that are no whole numbers rounded, by {off.max():.2g} at most")
+    low, high = float(whole.min()), float(whole.max())
+    if low < 0 or high >= LAYER:
+        raise MeshError(f"{path}: labels from {low:g} to {high:g}, allowed are 0 to {LAYER - 1}")
+    return np.ascontiguousarray(whole, dtype=np.uint16)
 
 
 def _check_affine(affine, path):

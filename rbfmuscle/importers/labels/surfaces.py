@@ -16,13 +16,15 @@ from scipy.ndimage import label as connected
 
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normals
-from rbfmuscle.importers.labels.read import LabelVolume
+from rbfmuscle.importers.labels.volume import LabelVolume
 from rbfmuscle.validation import MeshError
 
 SMOOTHING, PASSES = (
     1.3,
     4,
 )  # deviation of the Gaussian [voxels], and how often what it lost is smoothed again
+CUT_OFF = 0.4  # area in the outermost slice against the fourth: that of a ball is 0.14
+ON_CAP = 1.2  # vertices nearer than this to the scan's end are on a cap [voxels]
 MARGIN = 6  # voxels kept around a label, beyond which the filter sees nothing
 PIECE = 0.01  # share of the largest piece from which on a piece belongs to a bone of several parts
 # Edge of the surface's triangles [voxels], and rounds in which triangles that cross are drawn
@@ -33,13 +35,14 @@ EDGE, UNTANGLE = 2.2, 20
 @dataclass
 class LabelSurface:
     """A label's surface, closed and outward [mm], the volume of its voxels [mm3], and what was left
-    out or filled.
+    out, filled or cut; ``capped`` (n,) are the vertices on the cap where the scan ends.
     """
 
     name: str
     mesh: Any
     volume: float
     notes: list[str]
+    capped: np.ndarray
 
 
 def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> LabelSurface:
@@ -53,9 +56,12 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     from skimage.measure import marching_cubes
 
     name, notes = volume.name(label), []
-    box = find_objects((volume.labels == label).astype(np.int8))[0]
-    mask = np.pad(volume.labels[box] == label, MARGIN)
-    mask = _without_islands(mask, notes, PIECE if pieces else 1.0)
+    mask = volume.mask(label)
+    box = find_objects(mask.astype(np.int8))[0]
+    cuts = _cuts(mask, box, notes)
+    others = np.pad((volume.labels[(slice(None), *box)] > 0).any(axis=0) & ~mask[box], MARGIN)
+    mask = _without_islands(np.pad(mask[box], MARGIN), notes, PIECE if pieces else 1.0)
+    mask = _filled(mask, others, notes)
     count = int(mask.sum())
     if count < 27:
         raise MeshError(
@@ -74,11 +80,16 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     # other.
     vertices = _to_volume(_untangled(vertices, faces, smooth), faces, count)
     corner = np.array([part.start for part in box]) - MARGIN
-    world = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+    places = vertices + corner
+    capped = np.zeros(len(places), dtype=bool)
+    for axis, end in cuts:
+        capped |= np.abs(places[:, axis] - end) < ON_CAP
+    world = places @ volume.affine[:3, :3].T + volume.affine[:3, 3]
     mesh = trimesh.Trimesh(world, faces, process=False)
     if mesh.volume < 0:
         mesh.invert()
-    return LabelSurface(name, mesh, count * float(np.prod(volume.spacing)), notes)
+    volume_mm3 = count * float(np.prod(volume.spacing))
+    return LabelSurface(name, mesh, volume_mm3, notes, capped)
 
 
 def smooth_mask(mask: np.ndarray) -> np.ndarray:
@@ -93,9 +104,7 @@ def smooth_mask(mask: np.ndarray) -> np.ndarray:
 
 
 def _without_islands(mask, notes, least):
-    """The pieces of at least a share of the largest, their inner holes filled; what was left out
-    goes to ``notes``.
-    """
+    """The pieces of at least a share of the largest; what was left out goes to ``notes``."""
     pieces, count = connected(mask)
     if count > 1:
         sizes = np.bincount(pieces.ravel())
@@ -108,11 +117,37 @@ def _without_islands(mask, notes, least):
                 f"{int((~kept).sum()) - 1} islands of {rest} voxels left out ({share:.2g} %)"
             )
         mask = kept[pieces]
+    return mask
+
+
+def _filled(mask, others, notes):
+    """The mask with its inner holes filled, but those that hold voxels of other labels."""
     filled = binary_fill_holes(mask)
-    hollow = int((filled & ~mask).sum())
+    holes, _ = connected(filled & ~mask)
+    kept = np.isin(holes, np.unique(holes[others & (holes > 0)])) & (holes > 0)
+    hollow = int(((holes > 0) & ~kept).sum())
     if hollow:
         notes.append(f"holes of {hollow} voxels filled")
-    return filled
+    if kept.any():
+        notes.append(f"holes of {int(kept.sum())} voxels hold other labels and stay")
+    return filled & ~kept
+
+
+def _cuts(mask, box, notes):
+    """Axis and end [voxel] of each side of the volume at which a label is cut off, not rounded."""
+    found = []
+    for axis, (part, size) in enumerate(zip(box, mask.shape)):
+        for at, inner, end in ((0, 3, -0.5), (size - 1, size - 4, size - 0.5)):
+            if part.stop - part.start < 4 or not part.start <= at < part.stop:
+                continue
+            area, behind = (np.count_nonzero(mask.take(k, axis=axis)) for k in (at, inner))
+            if area > CUT_OFF * behind:
+                found.append((axis, end))
+                notes.append(
+                    f"cut off where the scan ends ({area} voxels there): closed by a flat cap, "
+                    "to which nothing is attached"
+                )
+    return found
 
 
 def _untangled(vertices, faces, smooth):
