@@ -1,0 +1,209 @@
+"""Label volumes as other programs write them: overlaps, layers, floating point, no directions."""
+
+import numpy as np
+import pytest
+from command_line import call
+
+from rbfmuscle.cli.new import _write_surfaces
+from rbfmuscle.importers.guess.guess import guess_scene
+from rbfmuscle.importers.labels.read import read_labels
+from rbfmuscle.importers.labels.surfaces import label_surface
+from rbfmuscle.importers.labels.volume import LAYER, LabelVolume
+from rbfmuscle.validation import MeshError
+
+nibabel = pytest.importorskip("nibabel")
+nrrd = pytest.importorskip("nrrd")
+
+SHAPE = (30, 26, 40)
+SPACING = 2.0
+
+
+def ball(centre, radius):
+    grid = np.stack(np.indices(SHAPE), axis=-1)
+    return np.linalg.norm(grid - np.array(centre), axis=-1) < radius
+
+
+FEMUR, PELVIS, MUSCLE = ball((14, 12, 8), 6.2), ball((14, 12, 28), 7.2), ball((14, 12, 18), 7.6)
+
+
+def write_nifti(path, data, *, codes=(0, 2), unit="mm", slope=None):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = nibabel.Nifti1Image(data, np.diag([SPACING, SPACING, SPACING, 1.0]))
+    image.set_qform(image.affine if codes[0] else None, codes[0])
+    image.set_sform(image.affine if codes[1] else None, codes[1])
+    image.header.set_xyzt_units(unit)
+    if slope:
+        image.header.set_slope_inter(slope, 0.0)
+    nibabel.save(image, path)
+    return path
+
+
+def write_masks(folder, masks):
+    for name, mask in masks.items():
+        write_nifti(folder / f"{name}.nii.gz", mask.astype(np.uint8))
+    return folder
+
+
+def by_name(volume):
+    return {volume.name(label): volume.mask(label) for label in volume.values().tolist()}
+
+
+def test_masks_that_overlap_are_kept_whole_and_their_overlap_is_said(tmp_path):
+    masks = {"femur": FEMUR, "gluteus_maximus": MUSCLE, "pelvis": PELVIS, "soleus": MUSCLE & FEMUR}
+    volume = read_labels(write_masks(tmp_path / "m", masks))
+    found = by_name(volume)
+    assert found.keys() == masks.keys()
+    for name, mask in masks.items():
+        np.testing.assert_array_equal(found[name], mask)
+    count, least = int((MUSCLE & PELVIS).sum()), int(min(MUSCLE.sum(), PELVIS.sum()))
+    share = f"{100 * count / least:.2g} %"
+    said = [note for note in volume.notes if "gluteus_maximus" in note and "pelvis" in note]
+    assert len(said) == 1 and f"in {count} voxels ({share}" in said[0] and "both kept" in said[0]
+    for label in volume.values().tolist():
+        surface = label_surface(volume, label)
+        # Voxels of a small ball are coarse: a hundredth of the volume.
+        assert surface.mesh.volume == pytest.approx(
+            masks[surface.name].sum() * SPACING**3, rel=1e-2
+        )
+
+
+@pytest.mark.parametrize("place", [0, 3])
+def test_layers_of_segments_are_read_with_names_and_empty_ones_are_named(tmp_path, place):
+    layers = np.zeros((2, *SHAPE), np.uint8)
+    layers[0][FEMUR], layers[0][PELVIS], layers[1][MUSCLE] = 1, 2, 1
+    rows = [*(SPACING * np.eye(3)).tolist()]
+    rows.insert(place, [np.nan] * 3)
+    kinds = ["domain"] * 3
+    kinds.insert(place, "list")
+    header = {
+        "space": "right-anterior-superior",
+        "space directions": np.array(rows),
+        "space origin": [5.0, 6, 7],
+        "kinds": kinds,
+    }
+    for k, (name, layer, value) in enumerate(
+        [("femur", 0, 1), ("pelvis", 0, 2), ("gluteus_maximus", 1, 1), ("sartorius", 1, 2)]
+    ):
+        header |= {f"Segment{k}_Name": name, f"Segment{k}_Layer": str(layer)}
+        header |= {f"Segment{k}_LabelValue": str(value)}
+    file = tmp_path / "s.seg.nrrd"
+    nrrd.write(str(file), np.moveaxis(layers, 0, place), header)
+    volume = read_labels(file)
+    found = by_name(volume)
+    for name, mask in {"femur": FEMUR, "pelvis": PELVIS, "gluteus_maximus": MUSCLE}.items():
+        np.testing.assert_array_equal(found[name], mask)
+    assert volume.affine[:3, 3].tolist() == [5, 6, 7]
+    assert "1 named labels have no voxel: sartorius" in volume.notes
+    assert any("gluteus_maximus" in note and "overlap" in note for note in volume.notes)
+
+
+@pytest.mark.parametrize(
+    ("values", "kind", "slope"),
+    [
+        ((3.0000458, 5.9999995, 9.00002), np.float32, None),
+        ((2.9999542, 5.9998, 9.0), np.float64, None),
+        ((30, 60, 90), np.int16, 0.1),
+    ],
+)
+def test_labels_in_floating_point_are_rounded_not_cut(tmp_path, values, kind, slope):
+    data = np.zeros(SHAPE, kind)
+    for mask, value in zip((MUSCLE, FEMUR, PELVIS), values):
+        data[mask] = value
+    volume = read_labels(write_nifti(tmp_path / "a.nii.gz", data, slope=slope))
+    assert volume.values().tolist() == [3, 6, 9]
+    np.testing.assert_array_equal(volume.mask(6), FEMUR & ~PELVIS)
+    assert any("rounded" in note for note in volume.notes)
+
+
+def test_values_between_labels_are_refused_with_one_of_them(tmp_path):
+    data = np.where(PELVIS, 9.0, 3.0 * FEMUR)
+    data[14, 12, 8] = 1.5
+    with pytest.raises(MeshError, match=r"1 voxels between whole numbers, as 1\.5;"):
+        read_labels(write_nifti(tmp_path / "a.nii", data))
+
+
+def test_no_directions_are_said_and_both_formats_are_taken_alike(tmp_path):
+    data = np.where(PELVIS, 2, FEMUR).astype(np.int16)
+    data[ball((22, 18, 28), 4)] = 3  # without a mirror plane
+    plain = write_nifti(tmp_path / "a.nii.gz", data, codes=(0, 0), unit="unknown")
+    nrrd.write(str(tmp_path / "b.nrrd"), data, {"spacings": [SPACING] * 3})
+    volumes = [read_labels(plain), read_labels(tmp_path / "b.nrrd")]
+    np.testing.assert_allclose(volumes[0].affine, volumes[1].affine)
+    np.testing.assert_allclose(volumes[0].affine, np.diag([SPACING, SPACING, SPACING, 1]))
+    for volume in volumes:
+        assert not volume.directed
+        assert any("states no directions" in note and "RAS" in note for note in volume.notes)
+        assert any("no unit of length: mm" in note for note in volume.notes)
+    stated = read_labels(write_nifti(tmp_path / "c.nii.gz", data))
+    assert stated.directed and stated.notes == []
+
+
+def test_empty_masks_are_counted_and_named_and_the_scene_and_check_repeat_it(tmp_path, capsys):
+    masks = {"femur_right": FEMUR, "hip_right": PELVIS, "gluteus_maximus_right": MUSCLE}
+    none = {f"{name}_left": np.zeros(SHAPE, bool) for name in ("femur", "hip")}
+    folder = write_masks(tmp_path / "masks", masks | none)
+    for name in masks:
+        image = nibabel.load(folder / f"{name}.nii.gz")
+        write_nifti(folder / f"{name}.nii.gz", np.asarray(image.dataobj), unit="unknown")
+    code, out, _ = call(capsys, "new", folder, "-o", tmp_path / "o" / "scene.toml")
+    words = "2 of 5 masks are empty: femur_left, hip_left"
+    assert code == 0 and out.count(words) == 1
+    scene = (tmp_path / "o" / "scene.toml").read_text()
+    assert words in scene and "surfaces of masks, in its frame: right, forward, up (RAS)" in scene
+    _, out, _ = call(capsys, "check", tmp_path / "o" / "scene.toml")
+    assert words in out and "no unit of length: mm taken" in out
+
+
+def test_holes_that_hold_other_labels_stay_and_others_are_filled():
+    labels = ball((14, 12, 20), 10).astype(np.uint16)
+    labels[ball((14, 12, 24), 3)] = 2
+    labels[13:15, 11:13, 14:16] = 0
+    inner, own = int((labels == 2).sum()), int((labels == 1).sum())
+    surface = label_surface(LabelVolume(labels, np.eye(4), {}, "x.nii"), 1, pieces=True)
+    assert "holes of 8 voxels filled" in surface.notes
+    assert f"holes of {inner} voxels hold other labels and stay" in surface.notes
+    assert surface.mesh.volume == pytest.approx(own + 8, rel=1e-2)
+
+
+def test_a_label_cut_off_by_the_scan_has_a_cap_that_is_said_and_holds_nothing(tmp_path):
+    k = np.indices(SHAPE)[2]
+    belly = (np.hypot(*(np.indices(SHAPE)[:2] - np.array([14, 12])[:, None, None, None])) < 5.2) & (
+        k < 25
+    )
+    surface = label_surface(LabelVolume(belly.astype(np.uint16), np.eye(4), {}, "x.nii"), 1)
+    assert any("cut off where the scan ends" in note for note in surface.notes)
+    assert surface.mesh.is_watertight
+    low = surface.mesh.vertices[:, 2] < 0.2
+    assert surface.capped[low].all() and not surface.capped[surface.mesh.vertices[:, 2] > 2].any()
+    whole = label_surface(LabelVolume(MUSCLE.astype(np.uint16), np.eye(4), {}, "x.nii"), 1)
+    assert not whole.capped.any() and whole.notes == []
+    # A label that only touches the end is round there.
+    touching = ball((14, 12, 7), 7.4).astype(np.uint16)
+    assert label_surface(LabelVolume(touching, np.eye(4), {}, "x.nii"), 1).notes == []
+
+
+def test_nothing_is_attached_where_the_scan_ends(tmp_path):
+    i, j, k = np.indices(SHAPE)
+    round_ = np.hypot(i - 9, j - 12)
+    labels = np.zeros(SHAPE, np.uint16)
+    labels[(round_ < 4.2) & (k < 18)] = 1
+    labels[(round_ < 5.2) & (k > 20)] = 2
+    labels[(np.hypot(i - 18, j - 12) < 4.2) & (k < 36)] = 3  # cut off beside the femur's own end
+    source = write_nifti(tmp_path / "a.nii", labels)
+    (tmp_path / "n.csv").write_text("1,femur\n2,pelvis\n3,gluteus_maximus\n")
+    folder, _, capped, notes = _write_surfaces(source, tmp_path / "n.csv", tmp_path / "o", False)
+    assert any("gluteus_maximus: cut off where the scan ends" in note for note in notes)
+    on_cap = np.flatnonzero(capped["gluteus_maximus"])
+    assert len(on_cap) > 8
+    for caps in (None, capped):
+        guess = guess_scene(folder, "mm", tmp_path, capped=caps)
+        held = [np.isin(hold.vertices, on_cap).sum() for hold in guess.muscles[0].holds]
+        assert (sum(held) > 0) == (caps is None)
+
+
+def test_a_layer_is_a_label_of_its_own():
+    layers = np.zeros((2, *SHAPE), np.uint16)
+    layers[0][FEMUR], layers[1][FEMUR] = 4, 4
+    volume = LabelVolume(layers, np.eye(4), {}, "x.nrrd")
+    assert volume.values().tolist() == [4, 4 + LAYER]
+    assert [volume.name(label) for label in volume.values()] == ["label_4", "label_4_layer_2"]
