@@ -86,7 +86,7 @@ def outer_surface(vertices: Floats, faces: Integers) -> OuterSurface:
         inner = count - len(outer)
         ignored = "the inner one is" if inner == 1 else f"the {inner} inner ones are"
         nested = "nested shells" if len(outer) == 1 else "shells"
-        notes.append(f"{count} {nested}, {ignored} ignored: for contact a bone is solid")
+        notes.append(f"{count} {nested}, {ignored} ignored: the inside counts as solid")
     bounds = []
     for group in _groups(outer):
         vertices, joined = _join(vertices, [outer[k] for k in group], notes)
@@ -175,12 +175,12 @@ def _join(vertices: Floats, shells: list[_Shell], notes: list[str]) -> tuple[Flo
         ]
         lost = sum(int((~each).sum()) for each in kept)
         if lost:
-            notes.append(f"{lost} faces inside another part left out: for contact a bone is solid")
+            notes.append(f"{lost} faces inside another part left out: the inside counts as solid")
         return vertices, np.concatenate([part[each] for part, each in zip(faces, kept)])
     points, joined = union
     if len(points) == 0:
         return vertices, np.concatenate(faces)
-    notes.append(f"{len(shells)} parts overlap, joined: for contact a bone is their union")
+    notes.append(f"{len(shells)} parts overlap, joined: their union counts")
     return np.vstack([vertices, points]), joined + len(vertices)
 
 

@@ -1,5 +1,7 @@
 """Label volumes as other programs write them: overlaps, layers, floating point, no directions."""
 
+import nibabel
+import nrrd
 import numpy as np
 import pytest
 from command_line import call
@@ -10,9 +12,6 @@ from rbfmuscle.importers.labels.read import read_labels
 from rbfmuscle.importers.labels.surfaces import label_surface
 from rbfmuscle.importers.labels.volume import LAYER, LabelVolume
 from rbfmuscle.validation import MeshError
-
-nibabel = pytest.importorskip("nibabel")
-nrrd = pytest.importorskip("nrrd")
 
 SHAPE = (30, 26, 40)
 SPACING = 2.0
@@ -191,7 +190,8 @@ def test_nothing_is_attached_where_the_scan_ends(tmp_path):
     labels[(np.hypot(i - 18, j - 12) < 4.2) & (k < 36)] = 3  # cut off beside the femur's own end
     source = write_nifti(tmp_path / "a.nii", labels)
     (tmp_path / "n.csv").write_text("1,femur\n2,pelvis\n3,gluteus_maximus\n")
-    folder, _, capped, notes = _write_surfaces(source, tmp_path / "n.csv", tmp_path / "o", False)
+    volume = read_labels(source, names=tmp_path / "n.csv")
+    folder, capped, notes = _write_surfaces(volume, tmp_path)
     assert any("gluteus_maximus: cut off where the scan ends" in note for note in notes)
     on_cap = np.flatnonzero(capped["gluteus_maximus"])
     assert len(on_cap) > 8
