@@ -7,9 +7,10 @@ import numpy as np
 
 from rbfmuscle.fibres.trace import POINTS, trace_fibres
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import moving_joints, split_ends
-from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance, bones_about
+from rbfmuscle.metrics.depths import BoneProbe, bones_about
 from rbfmuscle.scene.objects import Attachment, Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import NODES, TendonLine

@@ -18,7 +18,7 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.metrics.mesh_distance import MeshDistance
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 
 CELLS = 30_000  # of a muscle, about
 GRIP = 30.0  # conductance of an end where u is given, over that of a cube of the muscle's volume

@@ -7,8 +7,9 @@ import numpy as np
 
 from rbfmuscle.fibres.flux import FluxField
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.tubes import distance_along, points_along
-from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance
+from rbfmuscle.metrics.depths import BoneProbe
 
 POINTS = 25  # of a fibre, at even distances along it
 STEP = 0.5  # of a line that is traced, in cells

@@ -6,7 +6,8 @@ import trimesh
 
 from rbfmuscle.fibres.flux import FluxField
 from rbfmuscle.fibres.trace import trace_fibres
-from rbfmuscle.metrics.mesh_distance import BoneProbe, MeshDistance
+from rbfmuscle.geometry.mesh_distance import MeshDistance
+from rbfmuscle.metrics.depths import BoneProbe
 
 LENGTH, SIDE = 60.0, 12.0
 
