@@ -180,7 +180,8 @@ class Recording:
                 loop = FrameLoop(self.scene, self._models, fields=self._fields)
                 surfaces, poses = loop.at_rest()
             with timed(self.times, "metrics"):
-                self._measures.measure_rest(surfaces, poses)
+                carried = {m.name: m.material_mesh()[0] for m in self._models}
+                self._measures.measure_rest(surfaces, carried, poses)
         for coordinates in self.scene.motion.frames:
             with timed(self.times, "simulate"):
                 frame = loop.advance(coordinates)

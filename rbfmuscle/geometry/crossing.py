@@ -1,9 +1,11 @@
 """Triangles of a surface that go through others of the same surface."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.surfaces import opposite_half_edges, touching_faces
+from rbfmuscle.geometry.surfaces import opposite_half_edges
 from rbfmuscle.geometry.triangles import triangle_normal
 from rbfmuscle.jit import compiled
 
@@ -26,6 +28,15 @@ def morton_order(points: Floats) -> Integers:
     return np.argsort(code, kind="stable")
 
 
+class TreeArrays(NamedTuple):
+    """What a search for crossings reads of a `FaceTree`."""
+
+    order: np.ndarray  # (m,) triangles in the order of the leaves
+    corners: np.ndarray  # (m, 3) their vertices
+    leaves: int
+    closed: bool  # whether every edge has two triangles that agree on their outside
+
+
 class FaceTree:
     """Boxes around the triangles of a mesh, by nearness at one moment; good for later ones with the
     same faces.
@@ -36,12 +47,13 @@ class FaceTree:
         middle = (
             vertices[self.faces[:, 0]] + vertices[self.faces[:, 1]] + vertices[self.faces[:, 2]]
         ) / 3.0
-        self.order = morton_order(middle)
-        self._corners = self.faces[self.order]
-        self.leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
-        # Every edge has two triangles that agree on their outside.
-        self.closed = bool((opposite_half_edges(self.faces) >= 0).all())
-        self._room = 16 * self.leaves
+        order = morton_order(middle)
+        self.arrays = TreeArrays(
+            order,
+            self.faces[order],
+            1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length(),
+            bool((opposite_half_edges(self.faces) >= 0).all()),
+        )
 
     def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
         """Which triangles cross others, as `crossing_faces` says, for places of the vertices (n, 3)
@@ -51,35 +63,49 @@ class FaceTree:
         not lie side by side.
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-        faces, count = self._corners, len(self._corners)
-        plain = np.full(len(vertices), self.closed, dtype=np.bool_)
-        if self.closed:
-            _plain_loop(
-                vertices, faces, np.zeros_like(vertices), np.zeros(len(vertices), np.int64), plain
-            )
-        asked = np.ones(count, dtype=np.bool_)
-        if among is not None:
-            asked = among[self.order] | touching_faces(faces, ~plain)
-            if not asked.any():
-                return np.zeros(count, dtype=np.bool_)
-        box, node = np.empty((self.leaves, 6, LEAF)), np.empty((2 * self.leaves, 6))
-        _boxes_loop(vertices, faces, box, self.leaves, node)
-        wanted = np.zeros(2 * self.leaves, dtype=np.bool_)
-        _wanted_loop(asked, self.leaves, wanted)
-        found = np.zeros(count, dtype=np.bool_)
-        _cross_loop(vertices, faces, (self._pairs(node, wanted), box), (asked, plain), found)
-        marked = np.zeros(count, dtype=np.bool_)
-        marked[self.order] = found
-        return marked
+        asked = np.ones(len(self.faces), dtype=np.bool_) if among is None else among
+        found = np.zeros(len(self.faces), dtype=np.bool_)
+        crossing_loop(vertices, self.arrays, asked, True, found)
+        return found
 
-    def _pairs(self, node: Floats, wanted: Booleans) -> Integers:
-        """Pairs (k, 2) of leaves whose boxes touch."""
-        while True:
-            pairs = np.empty((self._room, 2), dtype=np.int64)
-            count = _pairs_loop(node, wanted, pairs)
-            if count <= len(pairs):
-                return pairs[:count]
-            self._room = max(self._room, 2 * count)
+
+@compiled
+def crossing_loop(vertices, tree, among, folds, found):
+    """Mark the triangles (m,) that cross others, among pairs as `FaceTree.crossing` says; how many.
+
+    Without ``folds`` pairs at folded corners are not sought elsewhere. Without a folded corner and
+    without triangles that are asked for no box is made.
+    """
+    faces, count = tree.corners, len(tree.corners)
+    plain = np.full(len(vertices), tree.closed and folds)
+    if tree.closed and folds:
+        normals, turns = np.zeros_like(vertices), np.zeros(len(vertices), np.int64)
+        _plain_loop(vertices, faces, normals, turns, plain)
+    asked, any_asked = np.empty(count, np.bool_), False
+    for f in range(count):
+        folded = not (plain[faces[f, 0]] and plain[faces[f, 1]] and plain[faces[f, 2]])
+        asked[f] = among[tree.order[f]] or (folds and folded)
+        any_asked |= asked[f]
+    found[:] = False
+    if not any_asked:
+        return 0
+    box, node = np.empty((tree.leaves, 6, LEAF)), np.empty((2 * tree.leaves, 6))
+    _boxes_loop(vertices, faces, box, tree.leaves, node)
+    wanted = np.zeros(2 * tree.leaves, np.bool_)
+    _wanted_loop(asked, tree.leaves, wanted)
+    room = 16 * tree.leaves
+    pairs = np.empty((room, 2), np.int64)
+    met = _pairs_loop(node, wanted, pairs)
+    if met > room:
+        pairs = np.empty((met, 2), np.int64)
+        _pairs_loop(node, wanted, pairs)
+    crossed = np.zeros(count, np.bool_)
+    _cross_loop(vertices, faces, (pairs[:met], box), (asked, plain), crossed)
+    total = 0
+    for f in range(count):
+        found[tree.order[f]] = crossed[f]
+        total += crossed[f]
+    return total
 
 
 def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:

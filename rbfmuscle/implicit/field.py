@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import trimesh
 
 # Centres of each local fit of a muscle's field, and how many of these count as covered by it.
-PART, COVERED = 24, 14
+PART, COVERED = 15, 8
 # Part of the touching ball's radius that a step off the surface may use.
 SAFETY = 0.5
 

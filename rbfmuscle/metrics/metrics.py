@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
+from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
@@ -55,14 +56,20 @@ class MuscleMeasures:
                 "doubtful_guesses": len(doubtful(scene.guesses, "muscle", muscle.name)),
             }
 
-    def measure_rest(self, surfaces: Mapping[str, ModelSurface], poses: dict[str, Floats]) -> None:
-        """Measure the surfaces at rest, before the first frame, by muscle; ``poses`` (4, 4) are
-        those of rest.
+    def measure_rest(
+        self,
+        surfaces: Mapping[str, ModelSurface],
+        carried: Mapping[str, Floats],
+        poses: dict[str, Floats],
+    ) -> None:
+        """Measure the surfaces at rest, before the first frame, by muscle; ``carried`` (n, 3) is
+        the material there, ``poses`` (4, 4) are those of rest.
 
         The values are among those of the first frame that is measured.
         """
         trackers = list(self.trackers.values())
-        each(lambda t: t.measure_rest(surfaces[t.name], self.probes, poses), trackers)
+        given = self.probes, poses
+        each(lambda t: t.measure_rest(surfaces[t.name], carried[t.name], *given), trackers)
 
     def measure(self, frame: Frame) -> dict[str, Values]:
         """Measure a frame: for each muscle its values by quantity, in the order of `QUANTITIES`."""
@@ -158,15 +165,30 @@ class _Tracker:
         return {"flicker": np.abs(self.offset - before).max() if before is not None else 0.0}
 
     def measure_rest(
-        self, surface: ModelSurface, probes: list[BoneProbe], poses: dict[str, Floats]
+        self,
+        surface: ModelSurface,
+        carried: Floats,
+        probes: list[BoneProbe],
+        poses: dict[str, Floats],
     ) -> None:
-        """What is measured once, before the first frame, with all bones at rest."""
-        mesh = self.mesh.vertices, self.mesh.faces
-        rms, worst = surface_distance(surface.vertices, surface.faces, *mesh)
+        """What is measured once, before the first frame, with all bones at rest.
+
+        Where muscle and bones overlap in the input, the surface is compared with the input mesh
+        moved as the material was, and out of the bones: that way is ``initial_shift``, not an
+        error of the shape.
+        """
+        mesh = np.asarray(self.mesh.vertices, dtype=float), np.asarray(self.mesh.faces)
+        there = mesh[0] + carried_shift(mesh[0], self.carried, carried - self.carried)
+        for probe in probes:
+            inside = probe.inside(there)
+            if inside.any():
+                there[inside] = probe.nearest(there[inside])[1]
+        rms, worst = surface_distance(surface.vertices, surface.faces, there, mesh[1])
         bones = {probe.name: probe for probe in probes}
         held = [a for a in self.attachments if a.tendon is None]
         gaps = [bones[a.bone].unsigned(mesh[0][a.vertices]).min() for a in held]
         found = {"rest_error_rms": rms, "rest_error_max": worst, "end_gap": max(gaps, default=0.0)}
+        found["initial_shift"] = float(np.linalg.norm(there - mesh[0], axis=1).max())
         shown = MeshDistance(surface.vertices, np.asarray(surface.faces))
         found["initial_overlap"] = max(
             float(surface_depth(surface.vertices, probes, poses).max()),
@@ -189,6 +211,16 @@ def _edge_operator(vertices: Floats, faces: Integers) -> sparse.csr_matrix:
     return sparse.csr_matrix(
         (np.concatenate([inverse, -inverse]), places), (len(edges), len(vertices))
     )
+
+
+def carried_shift(points: Floats, at: Floats, shift: Floats) -> Floats:
+    """Shifts (n, 3) of points (n, 3): those of the three nearest places ``at`` (k, 3), weighted by
+    1 / distance^2.
+    """
+    distance, near = cKDTree(at).query(points, k=3)
+    weights = 1.0 / np.maximum(distance, 1e-9 * np.ptp(at)) ** 2
+    weights /= weights.sum(axis=1, keepdims=True)
+    return np.einsum("nk,nkd->nd", weights, shift[near])
 
 
 def surface_distance(

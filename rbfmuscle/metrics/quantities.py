@@ -57,7 +57,8 @@ QUANTITIES = {
     "tunnelled": ("1", "points that passed through a bone and were not brought back"),
     "rest_error_rms": (
         "length",
-        "distance between surface and input mesh at rest, in both directions",
+        "distance between surface and input mesh at rest, in both directions; what overlapped "
+        "bones counts where it was moved to",
     ),
     "rest_error_max": ("length", "the same, greatest (Hausdorff)"),
     "thickness": (
@@ -70,6 +71,7 @@ QUANTITIES = {
     ),
     "tendon_depth": ("length", "deepest point of a tendon inside a bone"),
     "initial_overlap": ("length", "deepest overlap of muscle and bones that is left at rest"),
+    "initial_shift": ("length", "greatest way that the muscle was moved out of bones at rest"),
     "end_gap": ("length", "distance of the end that lies furthest from its bone at rest"),
     "edge_strain_rms": ("1", "relative change of edge lengths of the material mesh"),
     "condition": ("1", "condition estimate of the fit"),

@@ -1,23 +1,35 @@
-"""How an RBF muscle is shown: its field refitted, the bones cut away, the closed surface brought
-onto the level set.
+"""How an RBF muscle is shown: its field fitted anew, the bones cut away, the shown mesh on the
+level set.
 """
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.fields import ClipDistance
-from rbfmuscle.implicit.extraction.material import FittedMesh, project_to_level_set
-from rbfmuscle.implicit.extraction.material_mesh import MaterialMesh
-from rbfmuscle.implicit.extraction.obstacles import Obstacles, PointGrid
-from rbfmuscle.implicit.extraction.surface import ExtractedSurface, extract_surface
-from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.muscle.display_mesh import DisplayMesh
+from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.geometry.crossing import FaceTree
+from rbfmuscle.implicit.blend import Blend, material_blend, refit_loop
+from rbfmuscle.implicit.evaluation import Terms
+from rbfmuscle.implicit.extraction.obstacles import PointGrid, stack_grids
+from rbfmuscle.implicit.extraction.surface import extract_surface
+from rbfmuscle.muscle.display_mesh import display_mesh, neighbour_lists
+from rbfmuscle.muscle.model import Embedding
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import RestState
+from rbfmuscle.muscle.surface import (
+    FITTED,
+    NO_VOLUME,
+    UNSURE,
+    Obstacles,
+    SurfaceModel,
+    SurfaceState,
+    clear_rest,
+    finish_surface,
+    start_surface,
+)
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
@@ -26,17 +38,9 @@ from rbfmuscle.validation import SolveError
 
 # Cells along the longest side where marching cubes is asked for and no resolution.
 MARCHING_CELLS = 48
-# Bones are asked for exact distances within so many mean edges of the mesh.
-REACH = 3.0
 # A tenth of the edges this much longer than at rest is the cause of what cannot be fitted.
 STRETCHED = 1.6
-
-# Where the material is no sound surface, what it does beside a rigid motion is smoothed so often,
-# until it is one; how deep in a bone a vertex of a sound one may be, in mean edges, and how much
-# volume may be lacking.
-CALM = (30, 120, 500, 2000, 10_000)
-SUNKEN = 0.01
-LOST = 1e-10
+NO_EXCESS = np.zeros(0)
 
 
 class Placement(NamedTuple):
@@ -45,162 +49,210 @@ class Placement(NamedTuple):
     centres: np.ndarray  # (K, 3)
     normals: np.ndarray  # (K, 3)
     points: np.ndarray  # (K + S, 3), contact points
-    carried: np.ndarray  # (n, 3) vertices of the shown mesh where the material takes them
+    nodes: np.ndarray  # (N, 3) of the solid
 
 
-class _Surroundings(TypedDict):
-    """Bones and neighbours, as `project_to_level_set` takes them."""
+class MuscleFit:
+    """The field of a muscle, fitted anew where its centres are now.
 
-    cut: ClipDistance | None
-    obstacles: Obstacles
-    excess: Callable[[Floats], Floats] | None
-
-
-class TimedFit:
-    """Fits the field of a muscle when it is asked for, once; ``condition`` is infinite before, and
-    ``seconds`` the time spent.
+    ``terms`` and ``form`` are what compiled loops read, ``sound`` says whether there is a fit,
+    ``flat`` whether it is flat at rest, and ``condition`` is the worst of a matrix, infinite
+    without a fit. A Hermite fit without a bound of its condition is made in one compiled call.
     """
 
-    def __init__(self, rest: RestState, now: Placement) -> None:
-        self._rest, self._now = rest, now
-        self.condition, self.seconds = np.inf, 0.0
+    def __init__(self, rest: RestState) -> None:
+        self.rest, kernel = rest, rest.fit.kernel
+        self.form = None if kernel.plain_cube else kernel.form
+        self._epsilon = rest.fit.epsilon if kernel.has_epsilon else 0.0
+        self._quick = kernel.hermite and not np.isfinite(rest.fit.condition)
+        self.terms = _no_terms(len(kernel.form.table))
+        self.sound, self.flat, self.condition = False, False, np.inf
+        self.move(rest.centres, rest.normals, first=True)
 
-    def __call__(self) -> RBFField:
-        """The field."""
-        started = time.perf_counter()
+    def move(self, centres: Floats, normals: Floats, *, first: bool = False) -> None:
+        """Fit through centres (K, 3) with unit normals (K, 3)."""
+        if self._quick and not first and len(self.terms.middle):
+            self.condition = refit_loop(
+                centres, normals, self.rest.parts, self.terms, self.form, self._epsilon
+            )
+            self.sound = self.condition < np.inf
+            return
         try:
-            fitted = self._rest.field(self._now.centres, self._now.normals)
-        finally:
-            self.seconds = time.perf_counter() - started
-        self.condition = fitted.condition
-        return fitted
+            field = self.rest.field(centres, normals)
+        except (ValueError, np.linalg.LinAlgError):
+            self.sound, self.condition = False, np.inf
+            return
+        self.terms, self.sound, self.condition = field.terms, True, field.condition
+
+
+def _no_terms(count: int) -> Terms:
+    """Those of a field without a fit."""
+    none = np.zeros((0, 3))
+    return Terms(
+        none,
+        np.zeros(0),
+        np.zeros((0, 3, 0)),
+        np.zeros((0, 0)),
+        np.zeros((0, 3, 0)),
+        True,
+        np.zeros(0),
+        np.zeros((0, 0)),
+        np.zeros((0, 3), np.int64),
+        none,
+        np.zeros(0),
+    )
 
 
 class SurfaceBuilder:
     """Draws the surface of one muscle, from frame to frame.
 
-    ``level`` is that of the field that met the rest volume last, where the next search begins;
-    ``shown`` the material's mesh, None where marching cubes show the surface.
+    ``mesh`` is the shown one at rest; ``embed`` gives the places of points (n, 3) in the solid.
     """
 
-    def __init__(self, muscle: Muscle, scene: Scene, rest: RestState, options: RBFOptions) -> None:
+    def __init__(
+        self,
+        muscle: Muscle,
+        scene: Scene,
+        rest: RestState,
+        options: RBFOptions,
+        embed: Callable[[Floats], Embedding],
+    ) -> None:
         self.name = f"muscle {muscle.name!r}" + (f" ({muscle.source})" if muscle.source else "")
-        self.rest, self.options = rest, options
-        self._bones = [
-            PointGrid(np.asarray(bone.mesh.vertices, dtype=float)) for bone in scene.bones
-        ]
-        self.level = 0.0
-        self.shown = DisplayMesh(muscle, rest, options) if options.surface == "material" else None
+        self.rest, self.options, self._embed = rest, options, embed
+        self.mesh = vertices, _ = display_mesh(muscle, options.resolution)
+        self._grids = {
+            bone.name: PointGrid.of(np.asarray(bone.mesh.vertices, dtype=float))
+            for bone in scene.bones
+        }
+        self.embedded = options.surface == "embedded"
+        self.marching = options.surface == "marching"
+        self.state = SurfaceState(
+            np.zeros(1), np.zeros(len(vertices)), np.zeros((0, 0, 3)), np.zeros((0, 0))
+        )
+        self._met: tuple[list[int], Obstacles] | None = None
+        self._take(vertices)
+
+    def _take(self, vertices: Floats) -> None:
+        """Take the places of the shown vertices at rest, and find their offsets there."""
+        faces = self.mesh[1]
+        self.mesh = vertices, faces
+        self.fit = fit = None if self.embedded or self.marching else MuscleFit(self.rest)
+        offset, slope = np.zeros(len(vertices)), np.zeros(len(vertices))
+        blend = Blend(np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros(0))
+        if fit is not None and fit.sound:
+            blend = material_blend(vertices, fit.terms)
+            offset, gradient = blend.field(vertices, fit.terms, fit.form)
+            slope = np.linalg.norm(gradient, axis=1)
+            # A field that is flat between its centres is none of the surface.
+            fit.flat = bool(np.median(slope) < UNSURE)
+        self.model = SurfaceModel(
+            faces,
+            *neighbour_lists(faces, len(vertices)),
+            FaceTree(vertices, faces).arrays,
+            self._embed(vertices),
+            blend,
+            offset,
+            slope,
+            self.rest.mesh_volume,
+        )
+
+    def _clear_rest(self, obstacles: Obstacles) -> None:
+        """Bring what is held inside a bone at rest out of it, once."""
+        vertices = self.mesh[0]
+        still = np.tile(np.eye(4), (len(obstacles.poses), 1, 1))
+        nearest = cKDTree(self.rest.contact_points()).query(vertices)[1]
+        held = self.rest.attached_bone[nearest] >= 0
+        there = obstacles._replace(poses=still)
+        self._take(clear_rest(self.model, self.state, there, vertices, held))
+
+    def snapshot(self) -> SurfaceState:
+        """What the next search starts from."""
+        return self.state._replace(level=self.state.level.copy(), height=self.state.height.copy())
+
+    def restore(self, state: SurfaceState) -> None:
+        """Go back to a snapshot; what is known of the bones stays known."""
+        self.state.level[:] = state.level
+        self.state.height[:] = state.height
 
     def draw(self, now: Placement, contacts: BoneContacts) -> ModelSurface:
-        """The closed surface at the rest volume of the field through the centres, cut by the
-        contacts.
+        """The closed surface at the rest volume, cut by the contacts.
 
-        Raises SolveError if marching cubes find no closed surface.
+        Raises SolveError where there is none.
         """
         started = time.perf_counter()
-        fit = TimedFit(self.rest, now)
-        notes: list[tuple[str, int, str]] = []
-        left = 0.0
-        if self.shown is None:
-            result: ExtractedSurface = self._march(fit, now, contacts)
+        if self.marching:
+            surface = self._march(now, contacts)
         else:
-            result = self._of_material(fit, now.carried, contacts)
-            left = result.left / len(now.carried)
-            if left == 1.0:
-                bone, cause = self._cause(now, contacts)
-                notes.append((bone, len(now.carried), f"carried_{cause}"))
-        quantities = {
-            "components": result.components,
-            "level": self.level,
-            "unfitted_fraction": left,
-            "condition": fit.condition,
-            "time_fit": fit.seconds,
-            "time_extract": time.perf_counter() - started - fit.seconds,
-            "solver_penetration_max": max(
-                (float(depth.max()) for depth in contacts.depths(now.points).values()), default=0.0
-            ),
-        }
-        return ModelSurface(result.vertices, result.faces, quantities, notes)
+            surface = self._of_material(now, contacts)
+        spent = time.perf_counter() - started - surface.quantities["time_fit"]
+        surface.quantities["time_extract"] = spent
+        depths = contacts.depths(now.points).values()
+        deepest = max((float(depth.max()) for depth in depths), default=0.0)
+        surface.quantities["solver_penetration_max"] = deepest
+        return surface
 
-    def _of_material(
-        self, fit: TimedFit, carried: np.ndarray, contacts: BoneContacts
-    ) -> FittedMesh:
-        """The material's mesh on the level set, or where the material is if there is no fit."""
-        mesh, volume = self.shown.mesh, self.rest.mesh_volume
-        reach = REACH * mesh.edge(carried)
-        where: _Surroundings = {
-            "cut": _BoneCut(contacts, reach) if contacts.names else None,
-            "obstacles": self._obstacles(contacts),
-            "excess": contacts.excess if contacts.beside else None,
-        }
-        try:
-            result = project_to_level_set(
-                mesh, carried, fit(), volume=volume, level=self.level, **where
+    def _of_material(self, now: Placement, contacts: BoneContacts) -> ModelSurface:
+        """The shown mesh on the level set, or where the material is."""
+        started, fit = time.perf_counter(), self.fit
+        if fit is not None:
+            fit.move(now.centres, now.normals)
+        time_fit = time.perf_counter() - started
+        obstacles = self._obstacles(contacts)
+        fitted = fit is not None and fit.sound and not fit.flat
+        given = (fit.terms, fit.form) if fit is not None else (_no_terms(0), None)
+        work, outcome = start_surface(self.model, self.state, obstacles, now.nodes, given, fitted)
+        excess = contacts.excess(work.vertices) if contacts.beside else NO_EXCESS
+        _, outcome = finish_surface(self.model, self.state, obstacles, work, outcome, excess)
+        if outcome == NO_VOLUME or not np.isfinite(work.vertices).all():
+            raise SolveError(
+                f"{self.name}: no surface outside the bones holds its volume of "
+                f"{self.model.volume:.6g}; look for spikes in its mesh, and check where its "
+                "attachments lie and what the motion drives into it"
             )
-        except (ValueError, np.linalg.LinAlgError):
-            return self._carry(mesh, carried, volume, where)
-        self.level = result.level
-        return self._sounder(result, mesh, carried, volume, where) if result.crossing else result
+        quantities = {"time_fit": time_fit}
+        notes = []
+        if fit is not None:
+            left = 1.0 if outcome != FITTED else float(work.left.mean())
+            quantities |= {"condition": fit.condition, "unfitted_fraction": left}
+            if left == 1.0:
+                bone, cause = self._cause(now, work.carried, contacts)
+                notes.append((bone, len(work.left), f"carried_{cause}"))
+        return ModelSurface(work.vertices, self.model.faces, quantities, notes)
 
-    def _sounder(
-        self,
-        fitted: FittedMesh,
-        mesh: MaterialMesh,
-        carried: Floats,
-        volume: float,
-        where: _Surroundings,
-    ) -> FittedMesh:
-        """What was fitted and crosses itself, or the surface without a fit where that has fewer
-        faults.
-        """
-        try:
-            other = self._carry(mesh, carried, volume, where)
-        except SolveError:
-            return fitted
-        return min(fitted, other, key=lambda result: _faults(result, where["cut"], volume))
+    def _obstacles(self, contacts: BoneContacts) -> Obstacles:
+        """The bones in reach, and their poses now."""
+        if self._met is None or self._met[0] != contacts.reached:
+            grids = [self._grids[contacts.names[b]] for b in contacts.reached]
+            met = Obstacles(contacts.bones, contacts.placed, stack_grids(grids))
+            self._met = list(contacts.reached), met
+            count = len(self.mesh[0])
+            self.state = self.state._replace(
+                places=np.zeros((len(grids), count, 3)),
+                bounds=np.full((len(grids), count), -np.inf),
+            )
+            self._clear_rest(met)
+        return self._met[1]._replace(poses=contacts.placed)
 
-    def _carry(
-        self, mesh: MaterialMesh, carried: Floats, volume: float, where: _Surroundings
-    ) -> FittedMesh:
-        """The mesh where the material is; where no sound surface comes of that, where the material
-        is on the whole.
-        """
-        found: list[tuple[float, FittedMesh]] = []
-        reason: ValueError | None = None
-        for sweeps in (0, *CALM):
-            start = carried if sweeps == 0 else self.shown.smooth_displacement(carried, sweeps)
-            try:
-                result = project_to_level_set(mesh, start, None, volume=volume, **where)
-            except ValueError as error:
-                reason = error
-                continue
-            faults = _faults(result, where["cut"], volume)
-            if faults == 0.0:
-                return result
-            found.append((faults, result))
-        if found:
-            return min(found, key=lambda pair: pair[0])[1]
-        raise SolveError(
-            f"{self.name}: no surface outside the bones holds its volume of {volume:.6g} "
-            f"({reason}); look for spikes "
-            "in its mesh, and check where its attachments lie and what the motion drives into it"
-        ) from reason
-
-    def _march(self, fit: TimedFit, now: Placement, contacts: BoneContacts) -> ExtractedSurface:
+    def _march(self, now: Placement, contacts: BoneContacts) -> ModelSurface:
+        started = time.perf_counter()
         axes, resolution = self._axes(contacts), self.options.resolution or MARCHING_CELLS
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
         reach = 1.25 * float(np.ptp(now.points @ axes.T, axis=0).max()) / resolution
         try:
+            field = self.rest.field(now.centres, now.normals)
+            time_fit = time.perf_counter() - started
             result = extract_surface(
-                fit(),
+                field,
                 points=now.points,
                 resolution=resolution,
                 cut=_BoneCut(contacts, reach) if contacts.names else None,
                 volume=self.rest.mesh_volume,
-                level=self.level,
+                level=float(self.state.level[0]),
                 axes=axes,
-                obstacles=self._obstacles(contacts),
+                obstacles=[
+                    (self._grids[contacts.names[b]], contacts.poses[contacts.names[b]])
+                    for b in contacts.reached
+                ],
             )
         except (ValueError, np.linalg.LinAlgError) as error:
             raise SolveError(
@@ -208,45 +260,38 @@ class SurfaceBuilder:
                 f"{self.options.kernel!r} and {len(now.centres)} centres: {error}; surface = "
                 "'material' shows one"
             ) from error
-        self.level = result.level
-        return result
+        self.state.level[0] = result.level
+        quantities = {"time_fit": time_fit, "condition": field.condition}
+        return ModelSurface(result.vertices, result.faces, quantities, [])
 
     def _axes(self, contacts: BoneContacts) -> np.ndarray:
         """Axes that turn with the scene: what is sorted by them then falls out alike."""
         return self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
 
-    def _obstacles(self, contacts: BoneContacts) -> Obstacles:
-        """Points of bones, which faces have to leave outside."""
-        return [(self._bones[b], contacts.poses[contacts.names[b]]) for b in contacts.reached]
-
-    def _cause(self, now: Placement, contacts: BoneContacts) -> tuple[str, str]:
+    def _cause(self, now: Placement, carried: Floats, contacts: BoneContacts) -> tuple[str, str]:
         """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or
         sheets that met.
         """
-        depth, found = self.shown.mesh.edge(now.carried), ""
+        lengths, found = _lengths(carried, self.mesh[1]), ""
+        depth = float(lengths.mean())
         attached_bone = self.rest.attached_bone[: len(now.centres)]
         for b in contacts.reached:
             name = contacts.names[b]
             own = self.rest.bones.index(name) if name in self.rest.bones else -1
-            held = (attached_bone >= 0) & (attached_bone != own)
+            held: Booleans = (attached_bone >= 0) & (attached_bone != own)
             deepest = -contacts.distance_and_direction(now.centres[held], b)[0].min(initial=0.0)
             if deepest > depth:
                 depth, found = deepest, name
         if found:
             return found, "held_end"
-        return "", "stretched" if self.shown.stretch(now.carried) > STRETCHED else "sheets"
+        stretch = np.percentile(lengths / _lengths(*self.mesh), 90.0)
+        return "", "stretched" if stretch > STRETCHED else "sheets"
 
 
-def _faults(result: FittedMesh, cut: ClipDistance | None, volume: float) -> float:
-    """Triangles that cross others, mean edges of depth in a bone, thousandths of volume lost; 0
-    where it is sound.
-    """
-    deep = 0.0 if cut is None else -float(cut(result.vertices).min()) / result.spacing
-    lost = abs(result.volume / volume - 1.0)
-    # Asked the other way round: NaN is no sound surface.
-    return (
-        result.crossing + (0.0 if deep <= SUNKEN else deep) + (0.0 if lost <= LOST else 1e3 * lost)
-    )
+def _lengths(vertices: Floats, faces: np.ndarray) -> Floats:
+    """Lengths (m, 3) of the triangles' sides."""
+    sides = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+    return np.maximum(np.linalg.norm(sides, axis=2), np.finfo(float).tiny)
 
 
 class _BoneCut:

@@ -1,6 +1,7 @@
 """RBFMuscle: an implicit RBF surface whose centres move with an elastic solid."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
 from rbfmuscle.muscle.rounded_bones import RoundedBones, grown, round_bones
 from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, Report, settle
 from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform
+from rbfmuscle.muscle.surface import SurfaceState
 from rbfmuscle.scene.ends import ordered_muscle
 from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.objects import Muscle
@@ -76,7 +78,6 @@ class RBFMuscle:
         self.name = muscle.name
         self.options = options or RBFOptions()
         self.rest = RestState.from_muscle(muscle, scene, self.options)
-        self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options)
         self.frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         self._lattice = Lattice(self.frame.local, np.asarray(muscle.mesh.faces), self.options.nodes)
         self.model = _build_solid(
@@ -84,9 +85,9 @@ class RBFMuscle:
         )
         self.state = rest_state(self.model)
         self._stiffness = stiffness(self.model, 0.0)
-        shown = self.drawer.shown
-        self._shown = None if shown is None else embed(self._lattice, self.frame, shown.rest)
         self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
+        embedding = partial(embed, self._lattice, self.frame)
+        self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options, embedding)
         names = scene.holders(muscle)
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
         owner = attached_owner(self.model)
@@ -153,18 +154,23 @@ class RBFMuscle:
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         if activation != self.state.activation[0]:
-            self.restore(self.state._replace(activation=np.array([activation])))
+            self._take(self.state._replace(activation=np.array([activation])))
 
     def transform(self, motion: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4), as the muscle is."""
         self.state = transform(self.state, motion)
 
-    def snapshot(self) -> SolidState:
+    def snapshot(self) -> tuple[SolidState, SurfaceState]:
         """Everything that :meth:`restore` needs."""
-        return self.state
+        return self.state, self.drawer.snapshot()
 
-    def restore(self, state: SolidState) -> None:
+    def restore(self, state: tuple[SolidState, SurfaceState]) -> None:
         """Go back to a snapshot."""
+        self.drawer.restore(state[1])
+        self._take(state[0])
+
+    def _take(self, state: SolidState) -> None:
+        """Take a state of the solid, and the stiffness that goes with its activation."""
         if state.activation[0] != self.state.activation[0]:
             self._stiffness = stiffness(self.model, float(state.activation[0]))
         self.state = state
@@ -186,18 +192,12 @@ class RBFMuscle:
         return lambda: carry(embedding, self.state.shown)
 
     def carried_mesh(self) -> Mesh:
-        """The shown mesh where the solid carries it; the samples where marching cubes show the
-        surface.
-        """
-        shown = self.drawer.shown
-        if shown is None:
-            return self.material_mesh()
-        return carry(self._shown, self.state.shown), shown.mesh.faces
+        """The shown mesh where the solid carries it."""
+        return carry(self.drawer.model.embedding, self.state.shown), self.drawer.model.faces
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lies in the way."""
-        carried, _ = self.carried_mesh()
-        now = Placement(self.points, self.normals(), self.contact_points(), carried)
+        now = Placement(self.points, self.normals(), self.contact_points(), self.state.shown)
         drawn = self.drawer.draw(now, contacts)
         quantities, notes = self.log.take()
         drawn.quantities.update(quantities)

@@ -2,11 +2,12 @@
 inside it.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.jit import compiled
 
 # A chord is never farther from its surface than this share of a cell. As vertices move while points
@@ -15,107 +16,186 @@ from rbfmuscle.jit import compiled
 CHORD = 0.35
 MARGIN = 0.5
 BESIDE = 0.3
+# Points deeper than the tolerance by less than this share are there but for rounding.
+ASKED = 1.0 + 1e-6
 # Room for pairs of a point and a triangle near it, at first, for each triangle.
 PAIRS = 2
 # Cells of a grid for each point; passes over the points that are pushed off.
 CELLS, ROUNDS = 5, 4
 
 
-class PointGrid:
+class PointGrid(NamedTuple):
     """Points (k, 3), sorted by the cells of a grid: some times as many as points, as a surface
     leaves most empty.
 
     ``points`` are those given, cell by cell, ``start`` (c + 1,) the first of each cell; ``low``
-    (3,), ``edge`` and ``shape`` (3,) are corner, edge length and number of cells.
+    (3,), ``edge`` and ``shape`` (3,) are corner, edge length and number of cells, ``number`` (k,)
+    the place of each point among those given.
     """
 
-    def __init__(self, points: Floats) -> None:
-        self.low = points.min(axis=0) if len(points) else np.zeros(3)
-        extent = points.max(axis=0) - self.low if len(points) else np.zeros(3)
+    points: np.ndarray
+    start: np.ndarray
+    low: np.ndarray
+    edge: float
+    shape: np.ndarray
+    number: np.ndarray
+
+    @classmethod
+    def of(cls, points: Floats) -> "PointGrid":
+        """The grid of some points."""
+        low = points.min(axis=0) if len(points) else np.zeros(3)
+        extent = points.max(axis=0) - low if len(points) else np.zeros(3)
         size = float(extent.max()) or 1.0
         sides = np.maximum(extent / size, 1e-2)
-        self.edge = size * float(sides.prod() / (CELLS * max(len(points), 1))) ** (1.0 / 3.0)
-        self.shape = (extent / self.edge).astype(np.int64) + 1
-        strides = self.shape[1] * self.shape[2], self.shape[2], 1
-        cell = ((points - self.low) / self.edge).astype(np.int64) @ strides
+        edge = size * float(sides.prod() / (CELLS * max(len(points), 1))) ** (1.0 / 3.0)
+        shape = (extent / edge).astype(np.int64) + 1
+        cell = ((points - low) / edge).astype(np.int64) @ [shape[1] * shape[2], shape[2], 1]
         order = np.argsort(cell, kind="stable")
-        self.points = np.ascontiguousarray(points[order])
-        self.start = np.searchsorted(cell[order], np.arange(int(self.shape.prod()) + 1))
+        start = np.searchsorted(cell[order], np.arange(int(shape.prod()) + 1))
+        return cls(np.ascontiguousarray(points[order]), start, low, edge, shape, order)
+
+
+class PointGrids(NamedTuple):
+    """Several `PointGrid`, one behind the other; ``first`` (b + 1, 2) says where the points and the
+    starts of each begin.
+    """
+
+    points: np.ndarray
+    start: np.ndarray
+    low: np.ndarray  # (b, 3)
+    edge: np.ndarray  # (b,)
+    shape: np.ndarray  # (b, 3)
+    number: np.ndarray
+    first: np.ndarray
+
+
+def stack_grids(grids: Sequence[PointGrid]) -> PointGrids:
+    """Grids as one set of arrays."""
+    sizes = np.array([[len(grid.points), len(grid.start)] for grid in grids]).reshape(-1, 2)
+    first = np.vstack([np.zeros((1, 2), np.int64), np.cumsum(sizes, axis=0)])
+    return PointGrids(
+        np.concatenate([np.zeros((0, 3)), *(grid.points for grid in grids)]),
+        np.concatenate([np.zeros(0, np.int64), *(grid.start for grid in grids)]),
+        np.array([grid.low for grid in grids]).reshape(-1, 3),
+        np.array([grid.edge for grid in grids], dtype=np.float64),
+        np.array([grid.shape for grid in grids], dtype=np.int64).reshape(-1, 3),
+        np.concatenate([np.zeros(0, np.int64), *(grid.number for grid in grids)]),
+        first.astype(np.int64),
+    )
+
+
+@compiled(error_model="numpy")
+def grid_of(grids, b):
+    """Grid b: views into the arrays of all."""
+    low, high = grids.first[b], grids.first[b + 1]
+    return PointGrid(
+        grids.points[low[0] : high[0]],
+        grids.start[low[1] : high[1]],
+        grids.low[b],
+        grids.edge[b],
+        grids.shape[b],
+        grids.number[low[0] : high[0]],
+    )
 
 
 # Points with their pose (4, 4) to the world.
 Obstacles = list[tuple[PointGrid, Floats]]
 
 
-class NearTriangles(NamedTuple):
-    """Points (p, 3) in the world that triangles are near: those of point k are ``faces[first[k] :
-    first[k + 1]]``.
-    """
-
-    points: Floats
-    first: Integers
-    faces: Integers
-
-
-def near_triangles(
-    obstacles: Obstacles, vertices: Floats, faces: Integers, margin: float
-) -> NearTriangles:
-    """Obstacle points right above or below triangles in the world, or nearly, by at most ``margin``
-    [scene unit].
-    """
-    points = [np.zeros((0, 3))]
-    counts = [np.zeros(0, np.int64)]
-    near = [np.zeros(0, np.int64)]
-    for grid, pose in obstacles:
-        local = np.ascontiguousarray((vertices - pose[:3, 3]) @ pose[:3, :3])
-        cells, room = (grid.points, grid.start, grid.low, grid.edge, grid.shape), PAIRS * len(faces)
-        while True:
-            pairs = np.empty((2, room), dtype=np.int64)
-            met = _near_loop(local, faces, margin, cells, pairs)
-            if met <= room:
-                break
-            room = met
-        order = np.argsort(pairs[0, :met], kind="stable")
-        point = pairs[0, order]
-        begin = np.flatnonzero(np.diff(point, prepend=-1))
-        points.append(grid.points[point[begin]] @ pose[:3, :3].T + pose[:3, 3])
-        counts.append(np.diff(begin, append=met))
-        near.append(pairs[1, order])
-    first = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
-    return NearTriangles(np.concatenate(points), first, np.concatenate(near))
-
-
-def push_off_points(
-    vertices: Floats, faces: Integers, near: NearTriangles, spacing: float, tolerance: float
-) -> Booleans:
-    """Move the vertices of triangles that obstacle points have come through, into the surface: a
-    mask (n,) of these.
+@compiled(error_model="numpy")
+def push_off_loop(vertices, faces, grid, pose, tolerance, moved):
+    """Move the vertices (n, 3) of triangles (m, 3) that obstacle points have come through, into the
+    surface, and mark them.
 
     A point behind a triangle (inside the mesh) by more than ``tolerance`` [scene unit] moves its
     three corners along the normal, by barycentric weights, until it is not. Points deeper than
-    ``CHORD`` of the spacing, the length of the triangles' edges, are left alone: they are behind
-    another part of the muscle. ``vertices`` (n, 3) [scene unit] are changed in place; faces (m, 3)
-    look outward.
+    ``CHORD`` of the length of the triangle's edges are left alone: they are behind another part of
+    the muscle.
     """
-    moved = np.zeros(len(vertices), dtype=np.bool_)
+    local, known = np.empty_like(vertices), np.zeros(len(vertices), np.bool_)
+    for f in range(len(faces)):
+        for k in range(3):
+            v = faces[f, k]
+            if known[v]:
+                continue
+            known[v] = True
+            for a in range(3):
+                local[v, a] = 0.0
+                for b in range(3):
+                    local[v, a] += (vertices[v, b] - pose[b, 3]) * pose[b, a]
+    room = PAIRS * len(faces)
+    pairs = np.empty((2, room), np.int64)
+    met = _near_loop(local, faces, grid, pairs)
+    if met > room:
+        pairs = np.empty((2, met), np.int64)
+        met = _near_loop(local, faces, grid, pairs)
+    point, first, near = _sort_loop(pairs, met, len(grid.points))
+    places = np.empty((len(point), 3))
+    for p in range(len(point)):
+        for a in range(3):
+            places[p, a] = pose[a, 3]
+            for b in range(3):
+                places[p, a] += pose[a, b] * grid.points[point[p], b]
+    # In the order of the bone's vertices, so that a scene that is turned is drawn alike.
+    order = np.argsort(grid.number[point])
     for _ in range(ROUNDS):
-        if not _push_loop(vertices, faces, near, spacing, tolerance, moved):
+        if not _push_loop(vertices, faces, (places, first, near, order), tolerance, moved):
             break
-    return moved
 
 
 @compiled(error_model="numpy")
-def _near_loop(vertices, faces, margin, cells, pairs):
+def _sort_loop(pairs, met, count):
+    """Points that triangles are near, and the triangles of point k: ``near[first[k] : first[k +
+    1]]``.
+    """
+    begin = np.zeros(count + 1, np.int64)
+    for m in range(met):
+        begin[pairs[0, m] + 1] += 1
+    used = 0
+    for p in range(count):
+        used += begin[p + 1] > 0
+    point, first, near = (
+        np.empty(used, np.int64),
+        np.zeros(used + 1, np.int64),
+        np.empty(met, np.int64),
+    )
+    used = 0
+    for p in range(count):
+        if begin[p + 1] > 0:
+            point[used], first[used + 1] = p, first[used] + begin[p + 1]
+            used += 1
+        begin[p + 1] += begin[p]
+    for m in range(met):
+        near[begin[pairs[0, m]]] = pairs[1, m]
+        begin[pairs[0, m]] += 1
+    return point, first, near
+
+
+@compiled(error_model="numpy", inline="always")
+def _length(vertices, faces, f):
+    """Length of the longest edge of a triangle."""
+    square = 0.0
+    for k in range(3):
+        one, other = faces[f, k], faces[f, (k + 1) % 3]
+        side = 0.0
+        for a in range(3):
+            side += (vertices[one, a] - vertices[other, a]) ** 2
+        square = max(square, side)
+    return np.sqrt(square)
+
+
+@compiled(error_model="numpy")
+def _near_loop(vertices, faces, grid, pairs):
     """Pairs of a point and a triangle near it; how many there are, also beyond the room for
     them.
     """
-    points, start, low, edge, shape = cells
+    points, start, low, edge, shape, _ = grid
     least, most = np.empty(3), np.empty(3)
     begin = np.empty(3, np.int64)
     end = np.empty(3, np.int64)
     met = 0
     for f in range(len(faces)):
-        empty = False
+        empty, margin = False, MARGIN * _length(vertices, faces, f)
         for a in range(3):
             x = vertices[faces[f, 0], a]
             y = vertices[faces[f, 1], a]
@@ -157,28 +237,33 @@ def _near_loop(vertices, faces, margin, cells, pairs):
 
 
 @compiled(error_model="numpy")
-def _push_loop(vertices, faces, near_points, spacing, tolerance, moved):
+def _push_loop(vertices, faces, near_points, tolerance, moved):
     """One pass over the points; returns whether any had to be pushed off."""
-    points, first, near = near_points
+    points, first, near, order = near_points
     pushed = False
-    for p in range(len(points)):
+    for p in order:
         x = points[p, 0]
         y = points[p, 1]
         z = points[p, 2]
         best = -1
-        least = spacing
-        signed = -spacing
+        least = np.inf
+        signed = 0.0
         for f in near[first[p] : first[p + 1]]:
             plane = _plane(vertices, faces, f)
             square, (at_b, at_c) = _square(plane), _areas(plane, x, y, z)
             if square == 0.0 or min(at_b, at_c, square - at_b - at_c) < -1e-9 * square:
                 continue  # beside it
             depth = -_height(plane, x, y, z) / np.sqrt(square)
-            if abs(depth) < least:
+            # Of triangles that are equally near, but for rounding, the first.
+            if abs(depth) < least * (1.0 - 1e-6):
                 best = f
                 least = abs(depth)
                 signed = depth
-        if signed <= tolerance or signed > CHORD * spacing:
+        if (
+            best < 0
+            or signed <= ASKED * tolerance
+            or signed > CHORD * _length(vertices, faces, best)
+        ):
             continue
         pushed = True
         plane = _plane(vertices, faces, best)
@@ -186,8 +271,8 @@ def _push_loop(vertices, faces, near_points, spacing, tolerance, moved):
         (at_b, at_c) = _areas(plane, x, y, z)
         (nx, ny, nz) = plane[3]
         weight = 1.0 - (at_b + at_c) / square, at_b / square, at_c / square
-        # Half the tolerance is left, so that rounding does not ask for another round.
-        way = (signed - 0.5 * tolerance) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2)
+        # The tolerance is left: what is a little deeper does not leap.
+        way = (signed - tolerance) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2)
         way /= np.sqrt(square)
         for k in range(3):
             v = faces[best, k]

@@ -1,0 +1,653 @@
+"""The surface of an RBF muscle in one frame: compiled functions of constants, state and nodes.
+
+With F the field that a vertex blends (`rbfmuscle.implicit.blend`), r its level offset, d the
+distance to the bones and s the level that gives the muscle its volume at rest, each vertex is
+brought onto the zero set of
+
+    max(F(x) - r - s, -d(x)).
+
+A Newton step on the field is  x += (s + r - F) g / max(|g|, g_0)^2,  g = grad F, with g_0 a share
+of |g| at rest, so that what falls on a fold of the field does not leap; a change ds of the level
+moves the vertex by  ds g / |g|^2. On a bone it is  x -= d grad d. The volume is a cubic polynomial
+of ds, which is met by Newton steps too.
+
+The search starts from where the solid carries the vertex, moved along the normal there by the
+height above it that the vertex had in the last frame.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.bones.obstacles import Bones, query_bone
+from rbfmuscle.geometry.crossing import TreeArrays, crossing_loop
+from rbfmuscle.geometry.surfaces import _vertex_normal_loop, volume_cubic
+from rbfmuscle.implicit.blend import Blend, blend_loop
+from rbfmuscle.implicit.extraction.obstacles import PointGrids, grid_of, push_off_loop
+from rbfmuscle.jit import compiled
+from rbfmuscle.muscle.model import Embedding, carry
+
+# Lengths below are in mean edges of the mesh.
+NEAR_BONE = 1.5  # what is within this of a bone may come to lie on it
+# No point of a triangle is farther from a corner than its longest side over root 3, and a bone's
+# vertex behind it, which pushes it, no deeper than a third of that side; in longest sides.
+NEAR_FACE = 0.8
+SUNK = 1.0  # deeper in a bone the material is sunk
+OUT = 1e-5  # what is no deeper in a bone counts as out of it
+PUSHED = 0.01  # a bone's vertex may lie within the surface by so much
+LAMELLA = 0.02  # where both sides of a muscle sink into a bone, the far one stays above it by this
+# No vertex goes farther than this from where the material carries it; and where the field's slope
+# has sunk to these shares of its slope at rest, not at all, or as far as it likes within that.
+FARTHEST = 1.0
+UNSURE, SURE = 0.3, 0.7
+KEPT_HEIGHT = 0.5  # the search starts at the last height above the material, up to this
+SETTLED = 0.01  # a step of less is one whose error, of second order, does not count
+BLOWN = 1e-3  # the same of the material blown up to its volume, whose last digit follows
+NEWTON, LEVELS, LIFTS, MEET = 6, 20, 2, 4  # rounds, at most
+# What crosses is taken back towards the material by a share of the way as long as that helps, then
+# smoothed by some sweeps; rounds, at most, and in how many of them the region grows by a ring.
+BACK, TRIED, SWEEPS, ROUNDS, GROWTH = 0.2, 10, 1, 40, 6
+# All of that is done up to so many times, as the way back to the volume can make triangles cross.
+AGAIN = 4
+# Outcomes.
+FITTED, NO_FIT, NOT_FINITE, NO_LEVEL, CROSSED, NO_VOLUME = range(6)
+
+
+class SurfaceModel(NamedTuple):
+    """What never changes of a shown mesh: n vertices, m outward triangles."""
+
+    faces: np.ndarray  # (m, 3)
+    start: np.ndarray  # (n + 1,) neighbours of vertex v are other[start[v] : start[v + 1]]
+    other: np.ndarray
+    tree: TreeArrays
+    embedding: Embedding  # of the vertices in the solid
+    blend: Blend  # local fits of each vertex
+    offset: np.ndarray  # (n,) level offset, the field's value at rest
+    slope: np.ndarray  # (n,) |grad F| at rest; 0 where there is no field
+    volume: float  # at rest
+
+
+class SurfaceState(NamedTuple):
+    """What goes from frame to frame; r bones."""
+
+    level: np.ndarray  # (1,)
+    height: np.ndarray  # (n,) above the carried material, along its normal
+    places: np.ndarray  # (r, n, 3) of the last questions, in bone coordinates
+    bounds: np.ndarray  # (r, n) lower bounds of the distances there
+
+
+class Obstacles(NamedTuple):
+    """The bones in reach, their poses (r, 4, 4), and grids of their vertices."""
+
+    bones: Bones
+    poses: np.ndarray
+    grids: PointGrids
+
+
+class Work(NamedTuple):
+    """A surface on its way; all arrays by vertex."""
+
+    carried: np.ndarray
+    vertices: np.ndarray
+    direction: np.ndarray  # motion for a unit of level; 0 where held
+    near: np.ndarray  # may come to a bone
+    least: np.ndarray  # lower bound of the distance from all bones, where carried
+    clearance: np.ndarray  # above a bone
+    on_field: np.ndarray  # and not on a bone
+    odd: np.ndarray  # what may cross others without a fold at a corner
+    left: np.ndarray  # kept from a level set that is too far away
+    edge: np.ndarray  # (1,) mean length of an edge
+
+
+@compiled(error_model="numpy")
+def start_surface(model, state, obstacles, nodes, fit, fitted):
+    """The vertices on the level set at the volume, or where the material is if that cannot be;
+    and how it ended.
+
+    ``fit`` holds the `Terms` of the field and the kernel's form, and counts where ``fitted``.
+    """
+    work = _begin(model, state, obstacles, carry(model.embedding, nodes))
+    outcome = NO_FIT
+    if fitted:
+        outcome = _reach(model, state, obstacles, fit, work)
+    if outcome != FITTED and not _embed(model, state, obstacles, work):
+        outcome = NO_VOLUME
+    return work, outcome
+
+
+@compiled(error_model="numpy")
+def finish_surface(model, state, obstacles, work, outcome, excess):
+    """Room made for neighbours, bone vertices pushed off, crossings undone and the volume met.
+
+    ``excess`` (n,) says how far vertices move inwards, (0,) for none. Returns the triangles that
+    cross all the same, and the outcome: where a fitted surface crosses itself or has not the
+    volume, the surface without a field is taken if it has fewer faults.
+    """
+    crossing = -1
+    if outcome == FITTED:
+        crossing = _finish(model, state, obstacles, work, excess, False)
+        if crossing == 0:
+            return 0, outcome
+    fitted, left = work.vertices.copy(), work.left.copy()
+    if not _embed(model, state, obstacles, work):
+        other = -1
+    else:
+        other = _finish(model, state, obstacles, work, excess, True)
+    if crossing >= 0 and (other < 0 or other >= crossing):
+        work.vertices[:], work.left[:] = fitted, left
+        return crossing, outcome
+    return other, (NO_VOLUME if other < 0 else (CROSSED if outcome == FITTED else outcome))
+
+
+@compiled(error_model="numpy")
+def clear_rest(model, state, obstacles, vertices, held):
+    """Bring vertices (n, 3) at rest that a bone holds, marked by ``held`` (n,), out of the bones,
+    without crossings.
+
+    The bone takes them along, so they are out of it in all frames.
+    """
+    work = _begin(model, state, obstacles, vertices)
+    work.near[:] = work.near & held
+    if not lift(obstacles, state, work, np.flatnonzero(work.near)):
+        return vertices
+    _untangle(model, state, obstacles, work, True, np.zeros(len(vertices), np.bool_))
+    return work.vertices
+
+
+@compiled(error_model="numpy")
+def _begin(model, state, obstacles, carried):
+    """The vertices where the solid carries them, moved by the last heights, and the bones there."""
+    n = len(model.offset)
+    normals = np.zeros((n, 3))
+    _vertex_normal_loop(carried, model.faces, normals)
+    edge = _mean_edge(carried, model.faces)
+    flags = np.zeros((4, n), np.bool_)
+    work = Work(
+        carried,
+        carried.copy(),
+        np.zeros((n, 3)),
+        flags[0],
+        np.full(n, np.inf),
+        np.zeros(n),
+        np.ones(n, np.bool_),
+        flags[1],
+        flags[2],
+        np.full(1, edge),
+    )
+    rows, limit = np.arange(n), np.full(n, NEAR_BONE * edge)
+    distance, outward = np.empty(n), np.empty((n, 3))
+    ask_bones(obstacles, state, carried, rows, limit, distance, outward)
+    for v in range(n):
+        work.least[v] = distance[v]
+        along = 0.0
+        for a in range(3):
+            along += normals[v, a] * outward[v, a]
+            if abs(state.height[v]) <= KEPT_HEIGHT * edge:
+                work.vertices[v, a] += state.height[v] * normals[v, a]
+        if distance[v] < limit[v]:
+            work.near[v] = True
+            work.odd[v] = distance[v] < -SUNK * edge
+            # Of what sinks into a bone, what looks away from it keeps off the rest.
+            work.clearance[v] = LAMELLA * edge if along > 0.0 else 0.0
+    return work
+
+
+@compiled(error_model="numpy")
+def _mean_edge(vertices, faces):
+    total = 0.0
+    for f in range(len(faces)):
+        for k in range(3):
+            square = 0.0
+            for d in range(3):
+                square += (vertices[faces[f, k], d] - vertices[faces[f, (k + 1) % 3], d]) ** 2
+            total += np.sqrt(square)
+    return total / (3.0 * len(faces))
+
+
+@compiled(error_model="numpy")
+def ask_bones(obstacles, state, x, rows, limit, distance, outward):
+    """Distances (k,) of vertices x[rows] to the nearest bone and the directions (k, 3) in which
+    they grow; beyond a limit (k,) a lower bound without a direction.
+
+    A bone is asked only where what is known of it does not say that it is farther.
+    """
+    count = len(rows)
+    asked, here = np.empty(count, np.int64), np.empty((count, 3))
+    points, reach, one, way = here.copy(), np.empty(count), np.empty(count), here.copy()
+    distance[:count] = np.inf
+    outward[:count] = 0.0
+    for b in range(len(obstacles.poses)):
+        pose, places, bounds = obstacles.poses[b], state.places[b], state.bounds[b]
+        m = 0
+        for i in range(count):
+            v = rows[i]
+            dx, dy, dz = x[v, 0] - pose[0, 3], x[v, 1] - pose[1, 3], x[v, 2] - pose[2, 3]
+            px = dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]
+            py = dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]
+            pz = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
+            here[m, 0], here[m, 1], here[m, 2] = px, py, pz
+            square = (px - places[v, 0]) ** 2 + (py - places[v, 1]) ** 2 + (pz - places[v, 2]) ** 2
+            least = bounds[v] - np.sqrt(square)
+            most = min(distance[i], limit[i])
+            if least > most:
+                distance[i] = min(distance[i], least)
+                continue
+            asked[m], reach[m] = i, most
+            for a in range(3):
+                points[m, a] = x[v, a]
+            m += 1
+        if m == 0:
+            continue
+        query_bone(obstacles.bones, b, pose, points[:m], reach[:m], one[:m], way[:m])
+        for j in range(m):
+            i = asked[j]
+            v = rows[i]
+            bounds[v] = one[j]
+            for a in range(3):
+                places[v, a] = here[j, a]
+            if one[j] < distance[i]:
+                distance[i] = one[j]
+                for a in range(3):
+                    outward[i, a] = way[j, a] if one[j] <= reach[j] else 0.0
+
+
+@compiled(error_model="numpy")
+def _reach(model, state, obstacles, fit, work):
+    """Bring the vertices onto the level set that has the volume; how that ended."""
+    edge, level = work.edge[0], state.level[0]
+    allowed = np.full(len(model.offset), -1.0)
+    for _ in range(LEVELS):
+        if not _project(model, state, obstacles, fit, work, level, allowed):
+            return NOT_FINITE
+        step, largest = _level_step(model, work, 1), _fastest(work)
+        if np.isnan(step):
+            return NO_LEVEL
+        step = min(max(step, -edge / largest), edge / largest)
+        level += step
+        _shift(work, step)
+        if abs(step) * largest < SETTLED * edge:
+            state.level[0] = level
+            return FITTED
+    return NO_LEVEL
+
+
+@compiled(error_model="numpy")
+def _project(model, state, obstacles, fit, work, level, allowed):
+    """Newton steps of all vertices onto the level, no farther from the material than the field is
+    to be trusted; False where the field is not finite.
+    """
+    n, edge = len(model.offset), work.edge[0]
+    value, gradient, todo = np.empty(n), np.empty((n, 3)), np.ones(n, np.bool_)
+    rows, limit, miss = np.empty(n, np.int64), np.empty(n), np.empty(n)
+    for _ in range(NEWTON):
+        blend_loop(work.vertices, fit[0], fit[1], model.blend, todo, value, gradient)
+        count, settled = 0, True
+        for v in range(n):
+            if not todo[v]:
+                continue
+            square = gradient[v, 0] ** 2 + gradient[v, 1] ** 2 + gradient[v, 2] ** 2
+            if not (square < np.inf and abs(value[v]) < np.inf):
+                return False
+            if allowed[v] < 0.0:
+                allowed[v] = edge * _trust(np.sqrt(square), model.slope[v])
+            least = SURE * model.slope[v]
+            work.odd[v] |= square <= least * least
+            square = max(square, least * least, 2.3e-308)
+            miss[v] = level + model.offset[v] - value[v]
+            for a in range(3):
+                work.direction[v, a] = gradient[v, a] / square
+            work.on_field[v] = True
+            if work.near[v]:
+                rows[count] = v
+                limit[count] = work.clearance[v] + miss[v] / np.sqrt(square)
+                count += 1
+        _turn_to_bones(obstacles, state, work, rows[:count], limit[:count], miss)
+        for v in range(n):
+            if todo[v]:
+                todo[v] = _move(work.vertices, v, work.direction, miss[v], edge) > SETTLED * edge
+                settled &= not todo[v]
+        if settled:
+            break
+    for v in range(n):
+        if not work.on_field[v]:
+            work.direction[v] = 0.0
+    _bound(work, allowed)
+    lift(obstacles, state, work, np.flatnonzero(work.left & work.near))
+    return True
+
+
+@compiled(error_model="numpy")
+def _trust(slope, at_rest):
+    """How far, in mean edges, a vertex may go from the material for a field of this slope."""
+    if not at_rest > UNSURE:
+        return 0.0
+    return FARTHEST * min(max((slope / at_rest - UNSURE) / (SURE - UNSURE), 0.0), 1.0)
+
+
+@compiled(error_model="numpy", inline="always")
+def _move(vertices, v, direction, share, most):
+    """x += share * direction, by no more than a length; the length that it asked for."""
+    length = np.sqrt(direction[v, 0] ** 2 + direction[v, 1] ** 2 + direction[v, 2] ** 2)
+    length *= abs(share)
+    share = share * most / length if length > most else share
+    for a in range(3):
+        vertices[v, a] += share * direction[v, a]
+    return length
+
+
+@compiled(error_model="numpy")
+def _turn_to_bones(obstacles, state, work, rows, limit, miss):
+    """Where a bone is the surface, the step onto it replaces that onto the field."""
+    distance, outward = np.empty(len(rows)), np.empty((len(rows), 3))
+    ask_bones(obstacles, state, work.vertices, rows, limit, distance, outward)
+    for i in range(len(rows)):
+        v = rows[i]
+        gap = distance[i] - work.clearance[v]
+        if distance[i] < limit[i]:
+            work.on_field[v] = False
+            miss[v] = -gap
+            for a in range(3):
+                work.direction[v, a] = outward[i, a]
+
+
+@compiled(error_model="numpy")
+def _bound(work, allowed):
+    """Bring back what went beyond where the field is to be trusted, which stays, and mark it."""
+    edge = work.edge[0]
+    for v in range(len(allowed)):
+        # A way to a bone from outside it, which the field asked for, is bounded too.
+        bounded = work.on_field[v] or (work.least[v] >= 0.0 and allowed[v] < FARTHEST * edge)
+        square = 0.0
+        for a in range(3):
+            square += (work.vertices[v, a] - work.carried[v, a]) ** 2
+        work.left[v] = bounded and not (square <= allowed[v] ** 2 and allowed[v] > 0.0)
+        if work.left[v]:
+            share = allowed[v] / max(np.sqrt(square), 1e-300)
+            for a in range(3):
+                away = work.vertices[v, a] - work.carried[v, a]
+                work.vertices[v, a] = work.carried[v, a] + share * away
+                work.direction[v, a] = 0.0
+
+
+@compiled(error_model="numpy")
+def lift(obstacles, state, work, rows):
+    """Move vertices that lie in a bone onto it, where they stay; whether any did."""
+    moved = False
+    count, limit = len(rows), np.empty(len(rows))
+    distance, outward = np.empty(len(rows)), np.empty((len(rows), 3))
+    rows = rows.copy()
+    for _ in range(LIFTS):
+        for i in range(count):
+            limit[i] = work.clearance[rows[i]]
+        ask_bones(obstacles, state, work.vertices, rows[:count], limit[:count], distance, outward)
+        left = 0
+        for i in range(count):
+            v = rows[i]
+            gap = distance[i] - work.clearance[v]
+            if gap < -OUT * work.edge[0]:
+                for a in range(3):
+                    work.vertices[v, a] -= gap * outward[i, a]
+                    work.direction[v, a] = 0.0
+                rows[left] = v
+                left += 1
+        count = left
+        moved |= left > 0
+        if left == 0:
+            break
+    return moved
+
+
+@compiled(error_model="numpy")
+def _fastest(work):
+    """Greatest motion of a vertex for a unit of level."""
+    most = 2.3e-308
+    for v in range(len(work.direction)):
+        square = 0.0
+        for a in range(3):
+            square += work.direction[v, a] ** 2
+        most = max(most, square)
+    return np.sqrt(most)
+
+
+@compiled(error_model="numpy")
+def _level_step(model, work, steps):
+    """Change of the level that brings the mesh to its volume, by Newton steps; NaN where no level
+    does.
+    """
+    c0, c1, c2, c3 = volume_cubic(work.vertices, model.faces, work.direction)
+    change = 0.0
+    for _ in range(steps):
+        lack = model.volume - (c0 + change * (c1 + change * (c2 + change * c3)))
+        if lack == 0.0:
+            break
+        rate = c1 + change * (2.0 * c2 + change * 3.0 * c3)
+        if not rate > 0.0:
+            return np.nan
+        change += lack / rate
+    return change
+
+
+@compiled(error_model="numpy")
+def _shift(work, step):
+    """Move the vertices as the level set moves with its level, to first order."""
+    for v in range(len(work.vertices)):
+        for a in range(3):
+            work.vertices[v, a] += step * work.direction[v, a]
+
+
+@compiled(error_model="numpy")
+def _embed(model, state, obstacles, work):
+    """The material out of the bones, blown up along its normals to the volume: the surface without
+    a field. False where no such surface has the volume.
+    """
+    work.vertices[:] = work.carried
+    work.left[:] = True
+    near, most = np.flatnonzero(work.near), 0.5 * work.edge[0]
+    lift(obstacles, state, work, near)
+    for _ in range(LEVELS):
+        _take_normals(model, work)
+        step = _level_step(model, work, 1)
+        if np.isnan(step):
+            return False
+        step = min(max(step, -most), most)
+        _shift(work, step)
+        lift(obstacles, state, work, near)
+        if abs(step) < BLOWN * work.edge[0]:
+            break
+    return True
+
+
+@compiled(error_model="numpy")
+def _take_normals(model, work):
+    """Let vertices move along their normals when the level changes."""
+    work.direction[:] = 0.0
+    _vertex_normal_loop(work.vertices, model.faces, work.direction)
+
+
+@compiled(error_model="numpy")
+def _give_room(model, state, obstacles, work, excess):
+    """Move vertices inwards by their excess (n,) over neighbours, where they stay."""
+    normals = np.zeros_like(work.vertices)
+    _vertex_normal_loop(work.vertices, model.faces, normals)
+    for v in range(len(excess)):
+        if excess[v] > 0.0:
+            work.odd[v] = True
+            for a in range(3):
+                work.vertices[v, a] -= excess[v] * normals[v, a]
+                work.direction[v, a] = 0.0
+    lift(obstacles, state, work, np.flatnonzero((excess > 0.0) & work.near))
+
+
+@compiled(error_model="numpy")
+def _finish(model, state, obstacles, work, excess, embedded):
+    """`finish_surface` of a surface with a field or without; -1 where it has not the volume."""
+    if len(excess) > 0:
+        _give_room(model, state, obstacles, work, excess)
+    moved = np.ones(len(work.vertices), np.bool_)
+    _push_off(model, state, obstacles, work, moved)
+    for _ in range(AGAIN):
+        if not _fill(model, state, obstacles, work, embedded):
+            return -1
+        if not _untangle(model, state, obstacles, work, embedded, moved):
+            if not embedded:
+                _keep_heights(model, state, work)
+            return 0
+        # What was smoothed may lie over a bone's vertex again.
+        _push_off(model, state, obstacles, work, moved)
+    if not _fill(model, state, obstacles, work, embedded):
+        return -1
+    found = np.zeros(len(model.faces), np.bool_)
+    return crossing_loop(work.vertices, model.tree, ~found, True, found.copy())
+
+
+@compiled(error_model="numpy")
+def _push_off(model, state, obstacles, work, among):
+    """Move the corners of triangles, of those with a marked corner, that a bone's vertices came
+    through, and out of the bones again what that drove into another.
+    """
+    if len(obstacles.poses) == 0:
+        return
+    edge, m = work.edge[0], len(model.faces)
+    faces, count = np.empty_like(model.faces), 0
+    for f in range(m):
+        if not (among[model.faces[f, 0]] or among[model.faces[f, 1]] or among[model.faces[f, 2]]):
+            continue
+        least, side = np.inf, 0.0
+        for k in range(3):
+            v, w = model.faces[f, k], model.faces[f, (k + 1) % 3]
+            away, length = 0.0, 0.0
+            for a in range(3):
+                away += (work.vertices[v, a] - work.carried[v, a]) ** 2
+                length += (work.vertices[v, a] - work.vertices[w, a]) ** 2
+            least = min(least, work.least[v] - np.sqrt(away))
+            side = max(side, length)
+        if least < NEAR_FACE * np.sqrt(side):
+            faces[count] = model.faces[f]
+            count += 1
+    if count == 0:
+        return
+    moved = np.zeros(len(work.vertices), np.bool_)
+    for _ in range(2):
+        for b in range(len(obstacles.poses)):
+            push_off_loop(
+                work.vertices,
+                faces[:count],
+                grid_of(obstacles.grids, b),
+                obstacles.poses[b],
+                PUSHED * edge,
+                moved,
+            )
+        rows = np.flatnonzero(moved)
+        for v in rows:
+            work.odd[v] = True
+            work.direction[v] = 0.0
+        if len(rows) == 0 or not lift(obstacles, state, work, rows):
+            break
+
+
+@compiled(error_model="numpy")
+def _fill(model, state, obstacles, work, embedded):
+    """The volume to the last digit; what its last step drove into a bone is brought out and stays
+    there. False where no level has the volume.
+    """
+    near = np.flatnonzero(work.near)
+    if embedded:
+        # What was smoothed stays put otherwise, and that may be all of it.
+        _take_normals(model, work)
+        lift(obstacles, state, work, near)
+    for turn in range(MEET + 1):
+        step = _level_step(model, work, 4)
+        if np.isnan(step):
+            return False
+        if not embedded:
+            state.level[0] += step
+        _shift(work, step)
+        if turn == MEET or not lift(obstacles, state, work, near):
+            break
+    return True
+
+
+@compiled(error_model="numpy")
+def _untangle(model, state, obstacles, work, embedded, moved):
+    """Take what crosses itself back towards the material, then smooth it; whether anything was
+    moved for it, and marked.
+    """
+    m, n = len(model.faces), len(work.vertices)
+    found, among = np.zeros(m, np.bool_), np.ones(m, np.bool_)
+    if not embedded:
+        _touching(model.faces, work.odd | work.left, among)
+    moved[:] = False
+    last, back = m + 1, not embedded
+    for turn in range(ROUNDS):
+        # What was not moved does not begin to cross.
+        count = crossing_loop(work.vertices, model.tree, among, turn == 0, found)
+        if count == 0:
+            return turn > 0
+        # Where the material crosses itself the way back to it does not help.
+        back &= turn < TRIED or count < last
+        last = count
+        marked = np.zeros(n, np.bool_)
+        for f in range(m):
+            if found[f]:
+                for k in range(3):
+                    marked[model.faces[f, k]] = True
+        for _ in range(1 + turn // GROWTH):
+            marked = _grown(model, marked)
+        _touching(model.faces, marked, among)
+        rows = np.flatnonzero(marked)
+        for v in rows:
+            work.odd[v], moved[v] = True, True
+        if back:
+            # What the material takes into a bone cannot go back there.
+            for v in rows:
+                if work.least[v] >= 0.0:
+                    for a in range(3):
+                        away = work.vertices[v, a] - work.carried[v, a]
+                        work.vertices[v, a] -= BACK * away
+            rows = np.flatnonzero(marked & (work.least < 0.0))
+        for _ in range(SWEEPS):
+            smooth_loop(work.vertices, rows, model.start, model.other)
+        lift(obstacles, state, work, np.flatnonzero(marked & work.near))
+    return True
+
+
+@compiled(error_model="numpy")
+def _touching(faces, marked, out):
+    """Mark the triangles with a marked corner."""
+    for f in range(len(faces)):
+        out[f] = marked[faces[f, 0]] or marked[faces[f, 1]] or marked[faces[f, 2]]
+
+
+@compiled(error_model="numpy")
+def _grown(model, marked):
+    """The marked vertices and their neighbours."""
+    out = marked.copy()
+    for v in range(len(marked)):
+        if marked[v]:
+            for k in range(model.start[v], model.start[v + 1]):
+                out[model.other[k]] = True
+    return out
+
+
+@compiled(error_model="numpy")
+def smooth_loop(vertices, rows, start, other):
+    """Half the way to the mean of the neighbours, one vertex after the other."""
+    for v in rows:
+        count = start[v + 1] - start[v]
+        for a in range(3):
+            total = 0.0
+            for n in range(start[v], start[v + 1]):
+                total += vertices[other[n], a]
+            vertices[v, a] = 0.5 * (vertices[v, a] + total / count)
+
+
+@compiled(error_model="numpy")
+def _keep_heights(model, state, work):
+    """Heights of the vertices above the carried material, for the next frame."""
+    normals = np.zeros_like(work.carried)
+    _vertex_normal_loop(work.carried, model.faces, normals)
+    for v in range(len(normals)):
+        height = 0.0
+        for a in range(3):
+            height += normals[v, a] * (work.vertices[v, a] - work.carried[v, a])
+        state.height[v] = height
