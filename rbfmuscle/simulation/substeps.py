@@ -202,7 +202,7 @@ def step_excess(old, new, root, owner, corners, travel, limit, is_end, seen):
         kind = 1 if is_end[b] else 0
         most[kind] = max(most[kind], turned)
         for n in range(len(owner) if b < seen else 0):
-            kind = 1 if is_end[owner[n]] else 0
+            kind = 1 if is_end[b] or is_end[owner[n]] else 0
             _seen_from(old[b], old[owner[n]], first)
             _seen_from(new[b], new[owner[n]], second)
             for c in range(corners.shape[1]):
