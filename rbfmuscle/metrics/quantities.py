@@ -83,7 +83,10 @@ QUANTITIES = {
     ),
     "bowing_at_rest": ("1", "the same at rest, before the first frame"),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
-    "moment_arm_jump": ("length", "greatest change of the moment arm within 5 degrees before"),
+    "moment_arm_jump": (
+        "length",
+        "change of the moment arm's slope over 5 degrees, times 5 degrees",
+    ),
     "moment_arm_reversal": ("length", "how far the moment arm goes to either side of zero"),
     **{
         f"{quantity}_{name}": (kind, f"{meaning}: {number}th percentile of the fibres")

@@ -71,7 +71,9 @@ def moment_arm_rows(
             rows.append(row._replace(muscle=muscle, value=float(moments)))
     facts = all_coordinates(scene.joints)
     turning = [row for row in rows if facts[row.coordinate].motion == "rotation"]
-    rows += [new for each in _by_muscle(turning) for new in _smoothness(each)]
+    guessed = {guess.name for guess in scene.guesses if guess.table == "muscle"}
+    for arms in _by_muscle(turning):
+        rows += _smoothness(arms, guessed=arms[0].muscle in guessed)
     for muscle, of_fibres in fibres.items():
         none = np.full(len(next(iter(of_fibres.values()))), math.nan)
         along = np.array([of_fibres.get(index, none) for index in path])
@@ -89,23 +91,34 @@ def _by_muscle(rows: Sequence[Row]) -> list[list[Row]]:
     return list(found.values())
 
 
-def _smoothness(arms: Sequence[Row]) -> list[Row]:
-    """For each moment arm but the first: its change against those within `JUMP` degrees before, or
-    so much of the last step's as falls on them, and how far the moment arms went to both sides of
-    zero.
+def _smoothness(arms: Sequence[Row], *, guessed: bool) -> list[Row]:
+    """How far each moment arm departs from where the ones before lead, and, of a muscle whose
+    attachments are ``guessed``, how far they went to both sides of zero.
+
+    The departure is the change of slope, from the last `JUMP` degrees (or the last step, where it
+    is longer) to those before, over `JUMP` degrees.
     """
     angles, values = (np.array([getattr(arm, key) for arm in arms]) for key in ("angle", "value"))
     found = []
     for k in range(1, len(arms)):
-        away = np.abs(angles[:k] - angles[k])
-        share = np.where(np.arange(k) == k - 1, JUMP / np.maximum(away, JUMP), away <= JUMP)
-        jump = float((np.abs(values[:k] - values[k]) * share).max())
-        sides = max(values[: k + 1].max(), 0.0), max(-values[: k + 1].min(), 0.0)
-        found += [
-            arms[k]._replace(quantity="moment_arm_jump", value=jump),
-            arms[k]._replace(quantity="moment_arm_reversal", value=float(min(sides))),
-        ]
+        middle = _before(angles, k)
+        first = _before(angles, middle)
+        if first < middle < k:
+            late = (values[k] - values[middle]) / (angles[k] - angles[middle])
+            early = (values[middle] - values[first]) / (angles[middle] - angles[first])
+            jump = JUMP * abs(float(late - early))
+            found.append(arms[k]._replace(quantity="moment_arm_jump", value=jump))
+        if guessed:
+            sides = max(values[: k + 1].max(), 0.0), max(-values[: k + 1].min(), 0.0)
+            reversal = float(min(sides))
+            found.append(arms[k]._replace(quantity="moment_arm_reversal", value=reversal))
     return found
+
+
+def _before(angles: Floats, k: int) -> int:
+    """The last of the angles before the k-th that is `JUMP` degrees away; k where there is none."""
+    away = np.flatnonzero(np.abs(angles[:k] - angles[k]) >= JUMP)
+    return int(away[-1]) if len(away) else k
 
 
 def _moments(scene, path, lengths):

@@ -12,7 +12,8 @@ from rbfmuscle.geometry.mesh_distance import Columns, MeshDistance
 from rbfmuscle.metrics.centreline import Centreline, split_ends
 from rbfmuscle.metrics.depths import BoneProbe, bone_depth, surface_depth
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
-from rbfmuscle.metrics.rows import moment_arms
+from rbfmuscle.metrics.quantities import Row
+from rbfmuscle.metrics.rows import _smoothness, moment_arms
 from rbfmuscle.run import simulate
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.objects import Attachment, Motion
@@ -172,7 +173,11 @@ def rod_muscle(mesh, length=100.0):
 
 
 BEND = {"bend": Coordinate()}
-JOINTS = [SimpleNamespace(name="joint", parent="trunk", child="limb", coordinates=BEND)]
+JOINTS = [
+    SimpleNamespace(
+        name="joint", parent="trunk", child="limb", coordinates=BEND, centre=np.zeros(3)
+    )
+]
 
 
 class TestLength:
@@ -260,6 +265,7 @@ class TestRows:
         bones[1].mesh.apply_translation([500, 0, 0])
         frames = [{"joint.bend": a} for a in (0.0, 0.1, 0.2)]
         parts = {"bones": bones, "couplings": [], "joints": JOINTS, "muscles": [rod_muscle(mesh)]}
+        parts |= {"guesses": [], "length": lambda millimetres: millimetres / 10.0}
         return SimpleNamespace(units="cm", motion=Motion(frames), **parts)
 
     def frame(self, scene, index):
@@ -339,3 +345,28 @@ def test_moment_arms_of_the_real_hip_have_the_right_signs_and_sum(hip_scene):
         change = -np.cumsum(0.5 * (arm[1:] + arm[:-1]) * np.diff(angle))
         # 6 degrees a frame: the one-sided arms at both ends err by half a step's change.
         assert np.abs(length[1:] - length[0] - change).max() <= 0.01 * length[0]
+
+
+def _arms(angles, values):
+    return [
+        Row(k, "knee", float(a), "m", "moment_arm", float(v), "mm")
+        for k, (a, v) in enumerate(zip(angles, values))
+    ]
+
+
+@pytest.mark.parametrize("step", [1.0, 2.0, 10.0])
+def test_a_moment_arm_jumps_where_its_slope_does_not_where_it_is_steep(step):
+    angles = np.arange(0.0, 91.0, step)
+    steep = _smoothness(_arms(angles, 60.0 - 2.0 * angles), guessed=False)
+    assert {row.quantity for row in steep} == {"moment_arm_jump"}
+    assert max(row.value for row in steep) == pytest.approx(0.0, abs=1e-9)
+    # A kink of 3 mm per degree at 40 degrees.
+    kinked = _smoothness(_arms(angles, 3.0 * np.maximum(angles - 40.0, 0.0)), guessed=False)
+    assert max(row.value for row in kinked) == pytest.approx(15.0)
+    assert next(row for row in kinked if row.value > 1e-9).angle >= 40.0
+
+
+def test_the_sign_of_a_moment_arm_is_judged_where_attachments_are_guessed():
+    rows = _smoothness(_arms(np.arange(0.0, 30.0, 2.0), np.linspace(20.0, -9.0, 15)), guessed=True)
+    sides = [row.value for row in rows if row.quantity == "moment_arm_reversal"]
+    assert sides[0] == 0.0 and sides[-1] == pytest.approx(9.0)
