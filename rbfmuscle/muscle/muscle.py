@@ -1,6 +1,7 @@
 """RBFMuscle: an implicit RBF surface whose centres move with an elastic solid."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -74,7 +75,7 @@ class RBFMuscle:
     """
 
     def __init__(self, muscle: Muscle, scene: Scene, options: RBFOptions | None = None) -> None:
-        muscle, _ = ordered_muscle(muscle)
+        given, (muscle, order) = muscle, ordered_muscle(muscle)
         self.name = muscle.name
         self.options = options or RBFOptions()
         self.rest = RestState.from_muscle(muscle, scene, self.options)
@@ -88,6 +89,11 @@ class RBFMuscle:
         self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
         embedding = partial(embed, self._lattice, self.frame)
         self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options, embedding)
+        # Where the shown mesh is the input mesh, its vertices as numbered there, and its faces.
+        self._input: Mesh | None = None
+        if not self.options.resolution and len(self.drawer.model.offset) == len(order):
+            faces = np.ascontiguousarray(given.mesh.faces, dtype=np.int64)
+            self._input = np.argsort(order), faces
         names = scene.holders(muscle)
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
         owner = attached_owner(self.model)
@@ -202,6 +208,9 @@ class RBFMuscle:
         quantities, notes = self.log.take()
         drawn.quantities.update(quantities)
         drawn.notes.extend(notes)
+        if self._input is not None and self.options.surface != "marching":
+            place, faces = self._input
+            drawn = replace(drawn, vertices=drawn.vertices[place], faces=faces)
         return drawn
 
 
