@@ -4,6 +4,7 @@ and a real leg.
 
 import json
 import shutil
+import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -295,22 +296,26 @@ def test_of_guesses_that_are_called_sure_at_most_one_in_fifty_is_wrong(leg_guess
     assert len(sure) > 30 and np.mean(np.array(sure) > 15.0) <= 0.02
 
 
-def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess):
-    """Beside the ends that carriers hold in data/leg; the quadriceps' goes on from the patella to
-    the tibia.
+def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess, leg_data):
+    """At the insertions of data/leg/tendons, which were read off the bones; that of the rectus
+    femoris goes on from the patella to the tibia.
     """
-    guess, facts, _ = leg_guess
+    guess, _, _ = leg_guess
     holds = [(m.muscle, hold) for m in guess.muscles for hold in m.holds if hold.tendon is not None]
-    gaps = {(muscle.name, hold.bone.name): hold.gap for muscle, hold in holds}
-    for carrier in facts["tendon_carriers"].values():
-        for name, bone in carrier["muscles"].items() if isinstance(carrier, dict) else ():
-            gap = next(
-                a["gap_mm"] for a in facts["muscles"][name]["attachments"] if a["bone"] == bone
-            )
-            if gap["least"] > 50.0:
-                # The patches were chosen by other rules, so their nearest vertices differ by some
-                # millimetres.
-                assert gaps[name, bone] == pytest.approx(gap["least"], abs=8.0), name
+    table = tomllib.loads((leg_data / "tendons" / "leg.toml").read_text(encoding="utf-8"))
+    true = {
+        (row["name"], held["bone"]): held["tendon"]["to"]
+        for row in table["muscle"]
+        for held in row["attach"]
+        if "tendon" in held
+    }
+    away = [
+        np.linalg.norm(hold.tendon.to - true[muscle.name, hold.tendon.bone.name])
+        for muscle, hold in holds
+        if (muscle.name, hold.tendon.bone.name) in true
+    ]
+    # The landmarks of one bone differ by millimetres from reader to reader.
+    assert len(away) > 20 and np.median(away) < 5.0 and np.percentile(away, 90) < 12.0
     (tendon,) = [hold.tendon for muscle, hold in holds if muscle.name == "rectus_femoris"]
     # In front of the patella: both poles and the front.
     assert tendon.bone.name == "tibia" and [bone.name for bone, _ in tendon.via] == ["patella"] * 3

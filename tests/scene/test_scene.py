@@ -86,7 +86,11 @@ class TestMistakes:
             ('{ bone = "upper"', '{ bone = "uper"', r"attach 1: .*'uper', did you mean 'upper'"),
             ("elbow.flexion", "elbo.flexion", r"'elbo.flexion', did you mean 'elbow"),
             ("[0, -2, 0]", "[0, 0, 0]", r"'elbow' axes flexion: must not be the zero vector"),
-            ("near = 4", f"near = 4, {BALL}", r"one of vertices, near and sphere, got near and"),
+            (
+                "near = 4",
+                f"near = 4, {BALL}",
+                r"one of vertices, near, sphere, points and colour, got near and",
+            ),
             ("near = 4", "near = 0.001", r"reaches no vertex .*, the nearest is .* away"),
             ('"lower.txt"', '"nowhere.txt"', r"nowhere.txt: cannot read it"),
             (
