@@ -21,7 +21,7 @@ from pictures import folder
 
 import rbfmuscle as rm
 from rbfmuscle.cli import main
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.run import Run
 
 out = folder("from_labels")
 VOXEL = 1.5
@@ -79,7 +79,7 @@ meshes.mkdir(exist_ok=True)
 for part in parts:
     part.mesh.export(meshes / f"{part.name}.ply")
 command("new", meshes, "--units", "mm", "--force")
-found = SavedRun(out / "run")
+found = Run.load(out / "run")
 true = rm.simulate(rm.Scene.load(meshes / "scene.toml"), frames="0:9:4")
 worst = 0.0
 for muscle in true:

@@ -1,4 +1,4 @@
-"""What the example scripts share: where their files go, and pictures of a saved run.
+"""What the example scripts share: where their files go, and pictures of a run.
 
 Not an example itself.
 """
@@ -7,8 +7,6 @@ import sys
 from pathlib import Path
 
 from rbfmuscle.report.render import render_run
-
-_SAVED = {}  # runs that were drawn already, and their folders
 
 
 def folder(name):
@@ -22,12 +20,7 @@ def folder(name):
 
 def draw(run, file, *, frame=None, views=("right", "back")):
     """Picture of a frame of a run, or of the folder of one."""
-    file = Path(file)
-    if not isinstance(run, Path) and id(run) not in _SAVED:
-        _SAVED[id(run)] = run, file.parent / f"run_{file.stem}"
-        run.save(_SAVED[id(run)][1], pictures=False)
-    saved = run if isinstance(run, Path) else _SAVED[id(run)][1]
-    render_run(saved, file, frame=frame, views=views)
+    render_run(run, file, frame=frame, views=views)
 
 
 def plot(file, draw_axes, *, size=(7.0, 3.6)):

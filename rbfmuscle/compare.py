@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rbfmuscle.experiments.comparison import add_distances, measure_run, write_tables
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.models import COMPARED, build_models, configure_scene, model_kind, model_title
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import run_folder
 from rbfmuscle.progress import stage
 from rbfmuscle.run import stream_run
@@ -147,7 +147,7 @@ def _measure(name, scene, folder, progress):
         build, shown = _surfaces(scene, [*coarse, last, *coarse[::-1]])
     again = {"build": build} | ({"turn": shown[len(coarse)], "end": shown[-1]} if coarse else {})
     with stage(f"{name}: measuring"):
-        return measure_run(SavedRun(folder), again)
+        return measure_run(RunData.load(folder), again)
 
 
 def _surfaces(scene, chosen):

@@ -45,11 +45,12 @@ from rbfmuscle.validation import (
 
 
 class MemorySink:
-    """Keeps the frames of a run and the rows of its metrics, as `RunWriter` writes them."""
+    """Keeps the frames, metrics and facts of a run, which `RunWriter` writes."""
 
     def __init__(self) -> None:
         self.frames: list[Frame] = []
         self.rows: list[Row] = []
+        self.info: dict[str, Any] = {}
 
     def write(self, frame: Frame, rows: Sequence[Row] = ()) -> None:
         """Keep a frame, and the rows of metrics that are complete by now."""
@@ -61,7 +62,8 @@ class MemorySink:
         self.rows.extend(rows)
 
     def write_info(self, info: dict[str, Any]) -> None:
-        """Nothing: the facts are the run's own."""
+        """Keep the facts, in place of those before."""
+        self.info = info
 
 
 class Recording:

@@ -103,12 +103,12 @@ def _open(path):
 
 def _open_runs(folder):
     """The run in a folder, or those of the models of a comparison, by name."""
-    from rbfmuscle.output.saved import SavedRun
+    from rbfmuscle.output.run_data import RunData
 
     inside = sorted(path.parent for path in folder.glob("*/run.json"))
     if (folder / "run.json").exists() or not inside:
-        return {folder.resolve().name: SavedRun(folder)}
-    return {path.name: SavedRun(path) for path in inside}
+        return {folder.resolve().name: RunData.load(folder)}
+    return {path.name: RunData.load(path) for path in inside}
 
 
 def _draw(opened, model, stops, path):
@@ -122,10 +122,10 @@ def _draw(opened, model, stops, path):
     if isinstance(opened, dict):
         _check_stops(stops, ["frame"])
         saved = next(iter(opened.values()))
-        frame = int(stops.get("frame", saved.frames[0]))
+        frame = int(stops.get("frame", saved.frame_numbers[0]))
     else:
-        saved, frame = simulate(_posed(opened, stops), model).saved, 1
-    render_run(saved.directory, path, frame=frame)
+        saved, frame = simulate(_posed(opened, stops), model), 1
+    render_run(saved, path, frame=frame)
 
 
 def _posed(scene, stops):

@@ -7,7 +7,7 @@ import numpy as np
 
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, unit_text
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import machine, versions, write_csv, write_json
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
@@ -101,7 +101,7 @@ _FROM_METRICS = [name for name, m in MEASURES.items() if m.against in (LAW, MESH
 _TIE = 1.05
 
 
-def measure_run(saved: SavedRun, extra: dict[str, Any]) -> dict[str, Any]:
+def measure_run(saved: RunData, extra: dict[str, Any]) -> dict[str, Any]:
     """Values of every measure but the distances for one model: muscle -> quantity -> value.
 
     Under ``"all"`` the worst over muscles, or the wall time. ``extra`` holds ``build`` [s], and
@@ -118,7 +118,7 @@ def measure_run(saved: SavedRun, extra: dict[str, Any]) -> dict[str, Any]:
         for name, frame, part in (("return", 0, "end"), ("step", -1, "turn")):
             if part in extra:
                 pair = surface_distance(
-                    *saved.surface(muscle, saved.frames[frame]), *extra[part][muscle]
+                    *saved.mesh(muscle, saved.frame_numbers[frame]), *extra[part][muscle]
                 )
                 values[f"{name}_rms"], values[f"{name}_max"] = pair
         found[muscle] = values
@@ -140,12 +140,10 @@ def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> No
     """Add the distances of each model's surfaces to those of the first, the worst of some poses of
     a folder's runs.
     """
-    first, *others = (SavedRun(folder / name) for name in results)
+    first, *others = (RunData.load(folder / name) for name in results)
     for found, run in zip(list(results.values())[1:], others):
         for muscle in first.muscles:
-            pairs = [
-                surface_distance(*first.surface(muscle, k), *run.surface(muscle, k)) for k in poses
-            ]
+            pairs = [surface_distance(*first.mesh(muscle, k), *run.mesh(muscle, k)) for k in poses]
             for name, values in zip(("distance_rms", "distance_max"), zip(*pairs)):
                 found[muscle][name] = max(values)
                 found[ALL][name] = max(found[ALL].get(name, 0.0), max(values))

@@ -1,4 +1,4 @@
-"""A saved run in other formats and units: files for each frame, or an animation in one file."""
+"""A run in other formats and units: files for each frame, or an animation in one file."""
 
 import re
 from collections.abc import Sequence
@@ -7,9 +7,10 @@ from pathlib import Path
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output.animation.gltf import animated_glb
+from rbfmuscle.output.animation.parts import Animation, read_animation
 from rbfmuscle.output.animation.usd import check_usd, write_usd
 from rbfmuscle.output.fibre_files import write_fibres
-from rbfmuscle.output.saved import MovingRun, SavedRun, read_moving
+from rbfmuscle.output.run_data import RunData, open_run
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import SolveError, UsageError
@@ -20,25 +21,25 @@ FORMATS = (*MESHES, "glb", "usd", "animated-glb")
 
 
 def export_run(
-    directory: str | Path,
+    run: RunData | str | Path,
     formats: list[str] | str,
     *,
     output: str | Path | None = None,
     units: str | None = None,
     frames: slice | None = None,
 ) -> list[Path]:
-    """Write the muscles and bones of a saved run in one or more formats; every file written.
+    """Write the muscles and bones of a run in one or more formats; every file written.
 
     Parameters
     ----------
-    directory : path
-        Folder of the run.
+    run : RunData or path
+        The run, or its folder.
     formats : str or list of str
         Of `FORMATS`. ``pvd`` is ``vtp`` and a collection over the frames; ``glb`` gives one file a
         frame, ``usd`` and ``animated-glb`` one of all frames.
     output : path, optional
-        ``DIR/export`` where not given; each format has its own folder there, in which an earlier
-        export is replaced. ``files.txt`` lists what was written.
+        ``DIR/export`` of a run in a folder where not given; each format has its own folder there,
+        in which an earlier export is replaced. ``files.txt`` lists what was written.
     units : {"m", "cm", "mm"}, optional
         The scene's unit where not given; metres for ``glb`` and ``animated-glb``, which know no
         other.
@@ -53,23 +54,25 @@ def export_run(
     SolveError, MissingPartError
         If a file cannot be written; if a format needs a package that is absent.
     """
-    saved = SavedRun(directory)
+    run = open_run(run)
     formats = [formats] if isinstance(formats, str) else list(formats)
     _check_words(formats, units)
-    chosen = saved.frames[frames] if frames is not None else saved.frames
-    if not chosen or not saved.has_surfaces():
-        raise UsageError(f"{directory} has no surfaces to export")
-    base = Path(output) if output is not None else saved.directory / "export"
+    chosen = run.frame_numbers[frames] if frames is not None else run.frame_numbers
+    if not chosen or not run.has_surfaces:
+        raise UsageError(f"{run.directory or 'the run'} has no surfaces to export")
+    if output is None and run.directory is None:
+        raise UsageError("the run is in memory; name the folder to export to")
+    base = Path(output) if output is not None else Path(run.directory or "", "export")
     folder = OutputFolder(base, "export", formats, beside=True)
     written: list[Path] = []
     try:
         with folder.staged(replaces=formats) as stage:
             for name in dict.fromkeys(formats):
-                unit = units or ("m" if "glb" in name else saved.units)
+                unit = units or ("m" if "glb" in name else run.units)
                 (stage / name).mkdir()
                 for part in [[frame] for frame in chosen] if name == "glb" else [chosen]:
-                    run = read_moving(saved, part, unit=unit)
-                    written += _export(run, stage / name, name, part)
+                    moving = read_animation(run, part, unit=unit)
+                    written += _export(moving, stage / name, name, part)
     except OSError as error:
         raise SolveError(f"cannot write to {base}: {error.strerror}") from None
     return [base / path.relative_to(stage) for path in written]
@@ -87,7 +90,7 @@ def _check_words(formats: Sequence[str], units: str | None) -> None:
         check_usd()
 
 
-def _export(run: MovingRun, folder: Path, name: str, frames: list[int]) -> list[Path]:
+def _export(run: Animation, folder: Path, name: str, frames: list[int]) -> list[Path]:
     """Write a run in one format, and return the files."""
     if name in MESHES:
         return _export_meshes(run, folder, name, frames)
@@ -107,7 +110,7 @@ def _file_name(name: str) -> str:
     return re.sub(r"[^\w .-]+", "_", name).strip(". ") or "run"
 
 
-def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -> list[Path]:
+def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -> list[Path]:
     written, suffix = [], "vtp" if name == "pvd" else name
     taken = {part.name.lower() for part in run.muscles}
     for group, parts in (("surfaces", run.muscles), ("bones", run.bones)):
@@ -127,7 +130,7 @@ def _export_meshes(run: MovingRun, folder: Path, name: str, frames: list[int]) -
     return written + (_export_fibres(run, folder, frames) if suffix == "vtp" else [])
 
 
-def _export_fibres(run: MovingRun, folder: Path, frames: list[int]) -> list[Path]:
+def _export_fibres(run: Animation, folder: Path, frames: list[int]) -> list[Path]:
     """Write the fibres of a run as polylines, and return the files."""
     written = []
     for part in run.fibres:

@@ -13,7 +13,7 @@ from rbfmuscle.experiments.comparison import MEASURES, best_models
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.run_data import RunData
 from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, limit_state
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.report import packed_scene
@@ -29,7 +29,7 @@ def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) ->
     """Write ``report.html`` of what `write_tables` found to the folder of its runs; raises
     SolveError.
     """
-    runs = {found["labels"][name]: SavedRun(folder / name) for name in found["models"]}
+    runs = {found["labels"][name]: RunData.load(folder / name) for name in found["models"]}
     page = _page(found, runs)
     if pictures:
         page.scene = packed_scene(runs)
@@ -38,7 +38,7 @@ def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) ->
     page.write(folder / "report.html")
 
 
-def _page(found: dict[str, Any], runs: Mapping[str, SavedRun]) -> Page:
+def _page(found: dict[str, Any], runs: Mapping[str, RunData]) -> Page:
     first = next(iter(runs.values()))
     failed = [f"{name} did not finish: {reason}" for name, reason in found["failed"].items()]
     counts = {"muscles": len(first.muscles), "frames": found["frames"], **found["machine"]}
@@ -102,7 +102,7 @@ def _measures(found: dict[str, Any]) -> Table:
     return Table(["", "against", *(found["labels"][name] for name in found["models"])], rows)
 
 
-def _plots(runs: Mapping[str, SavedRun]) -> list[str]:
+def _plots(runs: Mapping[str, RunData]) -> list[str]:
     """Moment arms, length and depths of each muscle, then the time; a line for each model, no plot
     of constants.
     """

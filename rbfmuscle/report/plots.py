@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.run_data import RunData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -203,7 +203,7 @@ def _svg(figure: "Figure", title: str) -> str:
     return text.replace("<svg", f'<svg role="img" aria-label="{escape(title)}"', 1)
 
 
-def motion_axis(saved: SavedRun) -> tuple[dict[int, float], str]:
+def motion_axis(saved: RunData) -> tuple[dict[int, float], str]:
     """Place of each frame on plots and their label: the only coordinate that moves, if one way, or
     frame numbers.
     """
@@ -215,11 +215,11 @@ def motion_axis(saved: SavedRun) -> tuple[dict[int, float], str]:
         name, track = next(iter(moving.items()))
         unit = units.get(name, "degree").strip() or "1"
         if np.all(np.diff(track) > 0) or np.all(np.diff(track) < 0):
-            return dict(zip(saved.frames, track.tolist())), f"{name} [{unit}]"
-    return {frame: float(frame) for frame in saved.frames}, "frame"
+            return dict(zip(saved.frame_numbers, track.tolist())), f"{name} [{unit}]"
+    return {frame: float(frame) for frame in saved.frame_numbers}, "frame"
 
 
-def arm_unit(saved: SavedRun, coordinate: str) -> str:
+def arm_unit(saved: RunData, coordinate: str) -> str:
     """Unit of the moment arms about a coordinate of a saved run."""
     return (
         "1"

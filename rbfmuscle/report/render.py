@@ -20,7 +20,7 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.jit import compiled
 from rbfmuscle.output import appearance as look
 from rbfmuscle.output.appearance import rgb, tendon_mesh
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.run_data import RunData, open_run
 from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
@@ -186,7 +186,7 @@ def _raster_loop(points, faces, shades, opacity, depth, image):
 
 
 def render_run(
-    directory: str | Path,
+    run: RunData | str | Path,
     output: str | Path,
     *,
     frame: int | None = None,
@@ -195,8 +195,8 @@ def render_run(
     most: int | None = None,
     seconds: float = 5.0,
 ) -> None:
-    """Draw a saved run to a picture (``.png``, one frame) or an animation (``.gif`` or ``.webp``,
-    all of them).
+    """Draw a run, or the one in a folder, to a picture (``.png``, one frame) or an animation
+    (``.gif`` or ``.webp``, all of them).
 
     ``frame`` is that of a picture, by default the last. ``views``, side by side, are of `VIEWS`, or
     "motion" for the plane of the motion; `USUAL_VIEWS` where not given. A view has ``area`` pixels.
@@ -204,42 +204,38 @@ def render_run(
     the folder holds nothing to draw, the suffix, frame or view is unknown, or another file is in
     the way.
     """
-    saved, output = SavedRun(directory), Path(output)
+    run = open_run(run)
+    output = Path(output)
     if output.suffix not in (".png", ".gif", ".webp"):
         raise UsageError(f"{output}: the suffix must be .png, .gif or .webp")
     check_picture(output)
-    if not saved.has_surfaces():
-        raise UsageError(f"{directory} has no surfaces to draw")
+    if not run.has_surfaces:
+        raise UsageError(f"{run.directory or 'the run'} has no surfaces to draw")
     if not 0.0 < seconds <= 3600.0:
         raise UsageError(f"an animation of {seconds:g} seconds; give up to 3600")
-    frame = saved.frames[-1] if frame is None else frame
-    if frame not in saved.frames:
-        ends = f"{saved.frames[0]} to {saved.frames[-1]}"
-        raise UsageError(f"frame {frame} was not written; the run has {ends}")
-    poses = [saved.poses[k] for k in saved.frames]
-    motion = look.motion_direction(poses, saved.body)
+    frame = run.frame(-1 if frame is None else frame).index
+    poses = [shown.poses for shown in run.frames]
+    motion = look.motion_direction(poses, run.body)
     directions: dict[str, Sequence[float] | Floats] = {**look.VIEWS, "motion": motion}
     for view in views or ():
         if view not in directions:
             raise UsageError(f"unknown view {view!r}; known: {', '.join(directions)}")
-    axes = {view: look.view_axes(directions[view], saved.body) for view in views or USUAL_VIEWS}
+    axes = {view: look.view_axes(directions[view], run.body) for view in views or USUAL_VIEWS}
     frames = (
-        [frame]
-        if output.suffix == ".png"
-        else chosen_frames(saved.frames, most or len(saved.frames))
+        [frame] if output.suffix == ".png" else chosen_frames(run.frame_numbers, most or len(run))
     )
-    save_images(_draw_views(saved, axes, frames, area), output, seconds)
+    save_images(_draw_views(run, axes, frames, area), output, seconds)
 
 
 def _draw_views(
-    run: SavedRun, axes: Mapping[str, Floats], frames: Sequence[int], area: float
+    run: RunData, axes: Mapping[str, Floats], frames: Sequence[int], area: float
 ) -> list[Image.Image]:
     """A picture of each frame: views of so many pixels side by side, with titles, caption and
     colours.
     """
-    some = {run.frames[0], run.frames[len(run.frames) // 2], run.frames[-1]}
+    some = {run.frames[k].index for k in (0, len(run) // 2, -1)}
     names = [*run.muscles, *run.tendons]
-    seen = np.concatenate([run.surface(name, k)[0][::3] for name in names for k in some])
+    seen = np.concatenate([run.mesh(name, k)[0][::3] for name in names for k in some])
     size = fitted_size(next(iter(axes.values())), seen, area)
     cameras, chips = [aim(view, seen, size) for view in axes.values()], run.colours
     if len(chips) > _MOST_CHIPS:
@@ -252,11 +248,11 @@ def _draw_views(
     return each(draw, frames)
 
 
-def _draw_frame(run: SavedRun, camera: Camera, frame: int) -> Integers:
+def _draw_frame(run: RunData, camera: Camera, frame: int) -> Integers:
     """Picture (h, w, 3) of a frame of a run."""
     colours = run.colours | dict.fromkeys(run.tendons, look.TENDON_COLOUR)
-    solids = [Solid(*run.surface(name, frame), colour) for name, colour in colours.items()]
-    for name, pose in run.poses[frame].items():
+    solids = [Solid(*run.mesh(name, frame), colour) for name, colour in colours.items()]
+    for name, pose in run.frame(frame).poses.items():
         vertices, faces = run.bone(name)
         solids.append(Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, look.BONE_COLOUR))
     return draw_solids(solids, camera)

@@ -25,7 +25,8 @@ from rbfmuscle.metrics.summary import (
     within,
 )
 from rbfmuscle.output.animation.page import pack_runs
-from rbfmuscle.output.saved import SavedRun, read_moving
+from rbfmuscle.output.animation.parts import read_animation
+from rbfmuscle.output.run_data import RunData
 from rbfmuscle.report.page import (
     BAD,
     GOOD,
@@ -40,6 +41,7 @@ from rbfmuscle.report.page import (
 from rbfmuscle.report.plots import Band, Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, render_run
 from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.simulation.frame import Event
 
 # What the rows beside the picture say, and the quantities that each holds to a limit.
 LIGHTS = {
@@ -78,34 +80,35 @@ def write_report(directory: str | Path, *, pictures: bool = True) -> None:
     """Write a saved run's ``report.html``, with ``pictures`` a moving scene and ``preview.webp``;
     raises SolveError.
     """
-    saved = SavedRun(directory)
+    directory = Path(directory)
+    saved = RunData.load(directory)
     page = _page(saved)
-    if not pictures or not saved.has_surfaces():
-        why = "they were switched off." if saved.has_surfaces() else "this run kept no surfaces."
+    if not pictures or not saved.has_surfaces:
+        why = "they were switched off." if saved.has_surfaces else "this run kept no surfaces."
         page.missing = f"No pictures: {why}"
     else:
         page.scene = packed_scene({"": saved})
         if len(saved.frames) > 1:
-            preview = saved.directory / "preview.webp"
-            render_run(
-                saved.directory, preview, views=["motion"], area=110_000, most=12, seconds=4.0
-            )
-    page.write(saved.directory / "report.html")
+            preview = directory / "preview.webp"
+            render_run(saved, preview, views=["motion"], area=110_000, most=12, seconds=4.0)
+    page.write(directory / "report.html")
 
 
-def packed_scene(runs: Mapping[str, SavedRun]) -> str:
+def packed_scene(runs: Mapping[str, RunData]) -> str:
     """Runs of one scene as data of a moving picture, of as many frames as a page holds."""
     first = next(iter(runs.values()))
     points = sum(
-        len(run.surface(name, run.frames[0])[0]) for run in runs.values() for name in run.muscles
+        len(run.mesh(name, run.frame_numbers[0])[0])
+        for run in runs.values()
+        for name in run.muscles
     )
-    frames = chosen_frames(first.frames, max(2, _MOST_POINTS // max(points, 1)))
+    frames = chosen_frames(first.frame_numbers, max(2, _MOST_POINTS // max(points, 1)))
     return pack_runs(
-        {title: read_moving(run, frames, unit=run.units) for title, run in runs.items()}
+        {title: read_animation(run, frames, unit=run.units) for title, run in runs.items()}
     )
 
 
-def _page(saved: SavedRun) -> Page:
+def _page(saved: RunData) -> Page:
     info = saved.info
     complete = info["status"] == "complete"
     answer, _, detail = info["verdict"].partition(". ")
@@ -131,7 +134,7 @@ def _page(saved: SavedRun) -> Page:
     )
 
 
-def _facts(saved: SavedRun) -> list[str]:
+def _facts(saved: RunData) -> list[str]:
     info = saved.info
     models = sorted({muscle["model"]["name"] for muscle in info["scene"]["muscles"]})
     median = (info.get("frame_time") or {}).get("median")
@@ -143,7 +146,7 @@ def _facts(saved: SavedRun) -> list[str]:
     return [f"model {', '.join(models)}", *kernel, *counts, *times]
 
 
-def _lights(saved: SavedRun) -> list[Light]:
+def _lights(saved: RunData) -> list[Light]:
     """A row for each of `LIGHTS`, then one for whatever else is beyond a limit."""
     known = {quantity for quantities in LIGHTS.values() for quantity in quantities}
     limits, missing = _limits(saved), saved.info.get("not_measured", [])
@@ -158,11 +161,11 @@ def _lights(saved: SavedRun) -> list[Light]:
     return found
 
 
-def _limits(saved: SavedRun) -> Limits:
+def _limits(saved: RunData) -> Limits:
     return Limits(saved.info["limits"], saved.info.get("fail_on", {}))
 
 
-def _light(saved: SavedRun, title: str, quantities: Sequence[str]) -> Light | None:
+def _light(saved: RunData, title: str, quantities: Sequence[str]) -> Light | None:
     """The worst of some quantities against their limits, over muscles and frames."""
     limits, found = _limits(saved), []
     for muscle, table in saved.info["muscles"].items():
@@ -197,7 +200,7 @@ def _title(name: str) -> str:
     return title if title.replace(" ", "_") == name else f"{title} ({name})"
 
 
-def _plots(saved: SavedRun) -> list[Section]:
+def _plots(saved: RunData) -> list[Section]:
     """Moment arms and lengths, then what else changes along the motion."""
     axis, label = motion_axis(saved)
     mechanics, errors = "Moment arms and lengths", "Errors and times over the motion"
@@ -225,7 +228,7 @@ def _plots(saved: SavedRun) -> list[Section]:
     ]
 
 
-def _bands(tracks: Sequence[Track], coordinate: str, label: str, saved: SavedRun) -> list[Band]:
+def _bands(tracks: Sequence[Track], coordinate: str, label: str, saved: RunData) -> list[Band]:
     """Published moment arms about a coordinate that alone moves, of the muscles of the tracks."""
     bands = []
     for track in tracks:
@@ -237,14 +240,14 @@ def _bands(tracks: Sequence[Track], coordinate: str, label: str, saved: SavedRun
     return bands
 
 
-def _fibre_arms(saved: SavedRun) -> list[str]:
+def _fibre_arms(saved: RunData) -> list[str]:
     """The coordinates about which fibres have moment arms."""
     names = saved.moment_arm_coordinates()
     quantity = "fibre_moment_arm_p50"
     return [c for c in names if any(len(saved.series(m, quantity, c)[0]) for m in saved.muscles)]
 
 
-def _fibre_plot(saved: SavedRun, coordinate: str, axis: Mapping[int, float], label: str) -> str:
+def _fibre_plot(saved: RunData, coordinate: str, axis: Mapping[int, float], label: str) -> str:
     """Moment arms of the fibres about a coordinate: each muscle's median and the band from the 5th
     to the 95th percentile, and dashed the published band of a muscle that has one.
     """
@@ -262,7 +265,7 @@ def _fibre_plot(saved: SavedRun, coordinate: str, axis: Mapping[int, float], lab
 
 
 def _tracks(
-    saved: SavedRun, quantity: str, factor: float, axis: Mapping[int, float], coordinate: str | None
+    saved: RunData, quantity: str, factor: float, axis: Mapping[int, float], coordinate: str | None
 ) -> list[Track]:
     """Lines of the muscles in the colours of the picture; of times without the first frame, and all
     together.
@@ -282,7 +285,7 @@ def _tracks(
     return tracks
 
 
-def _summary(saved: SavedRun) -> Table:
+def _summary(saved: RunData) -> Table:
     """A row for each muscle, those beyond most limits first."""
     muscles, limits = saved.info["muscles"], _limits(saved)
     values = limits.values
@@ -315,11 +318,11 @@ def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Limits) -> 
     return number_cell(facts["worst"], state=state) if state == BAD else number_cell(facts["worst"])
 
 
-def _events(events: Sequence[Sequence[Any]]) -> str:
+def _events(events: Sequence[Event]) -> str:
     """How many events of each kind, the commonest first, and the muscles that have most of them."""
     kinds: dict[str, Counter[str]] = {}
     for event in events:
-        kinds.setdefault(event[4], Counter()).update([event[1] or event[2]])
+        kinds.setdefault(event.action, Counter()).update([event.muscle or event.bone])
     texts = []
     for kind, found in sorted(kinds.items(), key=lambda row: -row[1].total()):
         most = ", ".join(f"{name} {count}" for name, count in found.most_common(6))

@@ -11,7 +11,7 @@ import numpy as np
 
 from rbfmuscle.metrics.depths import BoneProbe
 from rbfmuscle.output.appearance import VIEWS, view_axes
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.run_data import RunData
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SolveError
 from rbfmuscle.viewer.panel import Panel
@@ -33,12 +33,12 @@ FIELD_OF_VIEW = 0.5
 FIRST = (-1.4, 1.6, 0.5)  # Where the camera stands at first, along the body's axes.
 
 
-def show(shown: Scene | SavedRun, *, model: str | None = None) -> "Page":
-    """Show a scene or a saved run in a browser or a notebook.
+def show(shown: Scene | RunData, *, model: str | None = None) -> "Page":
+    """Show a scene or a run in a browser or a notebook.
 
     Parameters
     ----------
-    shown : Scene or SavedRun
+    shown : Scene or Run
     model : str, optional
         To begin with, in place of the scene's own.
 
@@ -57,7 +57,7 @@ def show(shown: Scene | SavedRun, *, model: str | None = None) -> "Page":
     >>> page.close()
     """
     return Page(
-        SavedSource({"run": shown}) if isinstance(shown, SavedRun) else LiveSource(shown, model)
+        SavedSource({"run": shown}) if isinstance(shown, RunData) else LiveSource(shown, model)
     )
 
 

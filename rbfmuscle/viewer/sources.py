@@ -15,7 +15,7 @@ from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.models import build_models, configure_scene, model_names
 from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.output.run_data import RunData
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -172,25 +172,24 @@ class SavedSource:
     no surfaces.
     """
 
-    def __init__(self, runs: dict[str, SavedRun]) -> None:
+    def __init__(self, runs: dict[str, RunData]) -> None:
         for saved in runs.values():
-            if not saved.has_surfaces():
-                raise UsageError(
-                    f"{saved.directory} has no surfaces to show; run it with output.surfaces"
-                )
+            if not saved.has_surfaces:
+                name = saved.directory or "the run"
+                raise UsageError(f"{name} has no surfaces to show; run it with output.surfaces")
         self.runs = runs
         self.choices = list(runs)
         first = next(iter(runs.values()))
-        self.title = str(first.directory)
+        self.title = str(first.directory or first.info["scene"]["name"])
         self.units = first.units
         self.body = first.body
         self.millimetre = 1.0 / MM_PER_UNIT[first.units]
         self.bones = {name: first.bone(name) for name in first.bones}
-        self.muscles = {name: first.surface(name, first.frames[0]) for name in first.muscles}
+        self.muscles = {name: first.mesh(name, first.frame_numbers[0]) for name in first.muscles}
         self.colours, self.rest = first.colours, SavedFigure(first).advance()
-        self.motion = [{"frame": float(frame)} for frame in first.frames]
+        self.motion = [{"frame": float(frame)} for frame in first.frame_numbers]
         self.controls = {
-            "frame": Control("Run", "frame", first.frames[0], first.frames[-1], first.frames[0])
+            "frame": Control("Run", "frame", *(first.frames[k].index for k in (0, -1, 0)))
         }
 
     def figure(self, choice: str) -> "SavedFigure":
@@ -203,14 +202,14 @@ class SavedFigure:
 
     near = True
 
-    def __init__(self, saved: SavedRun) -> None:
+    def __init__(self, saved: RunData) -> None:
         self.saved = saved
-        self.frame = saved.frames[0]
+        self.frame = saved.frame_numbers[0]
         self.pending = True
 
     def set(self, name: str, value: float) -> None:
         """Go to the frame nearest to a number."""
-        frame = min(self.saved.frames, key=lambda known: abs(known - value))
+        frame = min(self.saved.frame_numbers, key=lambda known: abs(known - value))
         self.pending, self.frame = self.pending or frame != self.frame, frame
 
     def rest(self) -> None:
@@ -221,16 +220,14 @@ class SavedFigure:
         saved = self.saved
         frame = self.frame
         self.pending = False
-        surfaces = {name: saved.surface(name, frame) for name in saved.muscles}
+        surfaces = {name: saved.mesh(name, frame) for name in saved.muscles}
         named = {name: tendon_name(name) for name in saved.muscles}
-        tendons = {
-            n: saved.surface(mesh, frame) for n, mesh in named.items() if mesh in saved.tendons
-        }
+        tendons = {n: saved.mesh(mesh, frame) for n, mesh in named.items() if mesh in saved.tendons}
         activation, depth = (
             self._known(quantity) for quantity in ("activation", "penetration_max")
         )
-        text, fibres = saved.caption(frame), dict(saved.fibres(frame))
-        return Picture(saved.poses[frame], surfaces, tendons, activation, depth, text, fibres)
+        text, fibres = saved.caption(frame), dict(saved.frame(frame).fibres)
+        return Picture(saved.frame(frame).poses, surfaces, tendons, activation, depth, text, fibres)
 
     def _known(self, quantity: str) -> dict[str, float]:
         series = {name: self.saved.series(name, quantity) for name in self.saved.muscles}

@@ -14,8 +14,7 @@ from blend_model import arm_files, arm_scene, use_blend_model
 from command_line import call
 
 from rbfmuscle.output.export import export_run
-from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.run import stream_run
+from rbfmuscle.run import Run, stream_run
 from rbfmuscle.validation import UsageError
 
 PROGRAM = [sys.executable, "-m", "rbfmuscle"]
@@ -74,9 +73,9 @@ cli.main()
         )
         assert "interrupted" in err and ("frames are kept in" in err) == (name == "write_vtp")
         if name == "write_vtp":
-            kept = SavedRun(out)
+            kept = Run.load(out)
             assert kept.info["status"] == "interrupted" and 2 <= len(kept.frames) < 60
-            assert {row.frame for row in kept.metrics} == set(kept.frames) and export_run(
+            assert {row.frame for row in kept.metrics} == set(kept.frame_numbers) and export_run(
                 out, ["stl"]
             )
 
@@ -151,12 +150,12 @@ class TestKilledRuns:
         return tmp_path / "killed"
 
     def test_its_frames_are_found_exported_and_rendered(self, killed, capsys):
-        saved, whole = SavedRun(killed), SavedRun(killed.parent / "whole")
+        saved, whole = Run.load(killed), Run.load(killed.parent / "whole")
         assert saved.info["status"] == "running"
-        assert saved.frames == [0, 1, 2, 3, 4, 5] and len(whole.frames) == 9
+        assert saved.frame_numbers == [0, 1, 2, 3, 4, 5] and len(whole.frames) == 9
         for mine, complete in zip(saved.info["frames"], whole.info["frames"]):
             assert mine["coordinates"] == pytest.approx(complete["coordinates"])
-        np.testing.assert_array_equal(saved.surface("biceps", 5)[0], whole.surface("biceps", 5)[0])
+        np.testing.assert_array_equal(saved.mesh("biceps", 5)[0], whole.mesh("biceps", 5)[0])
         code, _, err = call(capsys, "export", killed, "--format", "stl", "pvd")
         assert code == 0, err
         assert len(list((killed / "export" / "stl").glob("biceps_*.stl"))) == 6
@@ -169,10 +168,10 @@ class TestKilledRuns:
         (killed / "poses.csv").write_text(
             poses[: poses.rindex("\n", 0, -1) + 30]
         )  # within the last line
-        assert SavedRun(killed).frames == [0, 1, 2, 3, 4]
+        assert Run.load(killed).frame_numbers == [0, 1, 2, 3, 4]
         (killed / "poses.csv").write_text(poses)
         (killed / "surfaces" / "biceps_0003.vtp").unlink()
-        assert 3 not in SavedRun(killed).frames
+        assert 3 not in Run.load(killed).frame_numbers
         (killed / "poses.csv").write_text(poses.splitlines()[0] + "\n")
         with pytest.raises(UsageError, match="no surfaces"):
             export_run(killed, ["stl"])

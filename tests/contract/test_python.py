@@ -12,6 +12,7 @@ from conftest import ROOT
 
 import rbfmuscle as rm
 from rbfmuscle.metrics.quantities import Row
+from rbfmuscle.output.run_data import SceneMeshes
 
 SCRIPT = ROOT / "tests" / "data" / "user_script.py"
 
@@ -63,7 +64,7 @@ def test_run_answers_as_a_container(run):
         rm.UsageError, match=r"unknown muscle 'abducter', did you mean 'abductor'\?"
     ):
         run["abducter"]
-    with pytest.raises(rm.UsageError, match="frame 3 is out of range, the run has 3 frames"):
+    with pytest.raises(rm.UsageError, match="frame 3 was not written; the run has 0 to 2"):
         run["abductor"].surface(3)
 
 
@@ -79,12 +80,42 @@ def test_run_that_is_loaded_is_the_run_that_was_saved(run, loaded, tmp_path):
     np.testing.assert_array_equal(
         loaded.values("abductor", "length"), run.values("abductor", "length")
     )
-    assert "nope" not in loaded.frames[0].surfaces and loaded.save(loaded.saved.directory) is None
+    assert "nope" not in loaded.frames[0].surfaces and loaded.save(loaded.directory) is None
     assert run.info["times"]["wall"] == run.info["times"]["wall"]
     loaded.save(tmp_path / "copy")
     assert len(rm.Run.load(tmp_path / "copy")) == 3
     with pytest.raises(rm.UsageError, match="holds no run"):
         rm.Run.load(tmp_path)
+
+
+def test_run_in_memory_and_loaded_answer_alike(run, loaded):
+    assert {name for name in dir(run) if name[0] != "_"} == {
+        name for name in dir(loaded) if name[0] != "_"
+    }
+    assert (loaded.units, loaded.bones, loaded.colours) == (run.units, run.bones, run.colours)
+    assert loaded.frame_numbers == run.frame_numbers == [0, 1, 2]
+    assert loaded.metrics == run.metrics and loaded.events == run.events
+    assert loaded.caption(1) == run.caption(1)
+    for name in run.bones:
+        for mine, other in zip(run.bone(name), loaded.bone(name), strict=True):
+            np.testing.assert_allclose(other, mine, rtol=1e-6)  # files are in single precision
+
+
+def test_surface_in_another_unit(run, loaded):
+    for shown in (run, loaded):
+        wanted = 1e-3 * shown["abductor"].surface(1).vertices
+        np.testing.assert_allclose(shown["abductor"].surface(1, units="m").vertices, wanted)
+        with pytest.raises(rm.UsageError, match="units must be m, cm or mm, got 'inch'"):
+            shown["abductor"].surface(units="inch")
+
+
+def test_show_takes_a_run_in_memory_and_a_loaded_one(run, loaded):
+    for shown in (run, loaded):
+        page = rm.show(shown)
+        try:
+            assert page.address.startswith("http://127.0.0.1:")
+        finally:
+            page.close()
 
 
 def test_metrics_as_a_table_where_pandas_is_there(run, monkeypatch):
@@ -113,14 +144,14 @@ def test_values_are_of_known_names_and_moment_arms_of_one_coordinate(run, loaded
         for name in "ab"
         for k in range(2)
     ]
-    two = rm.Run([], rows)
-    two.info = {"scene": {"muscles": [{"name": "abductor"}]}}
+    meshes = SceneMeshes(run.scene)
+    two = rm.Run(run.info, [], rows, meshes)
     with pytest.raises(rm.UsageError, match=r"about hip\.a, hip\.b; name one with coordinate="):
         two.values("abductor", "moment_arm")
     assert two["abductor"].values("moment_arm", coordinate="hip.b").tolist() == [1.0, 2.0]
     with pytest.raises(rm.UsageError, match=r"no moment arm about 'hip\.c', did you mean"):
         two.values("abductor", "moment_arm", coordinate="hip.c")
-    about_one = rm.Run([], rows[:2])
+    about_one = rm.Run(run.info, [], rows[:2], meshes)
     assert about_one.values("abductor", "moment_arm").tolist() == [0.0, 1.0]
 
 

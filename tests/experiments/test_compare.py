@@ -11,8 +11,8 @@ from blend_model import BlendMuscle, arm_scene
 from rbfmuscle.compare import compare_models
 from rbfmuscle.experiments.comparison import MEASURES, best_models, describe
 from rbfmuscle.models import build_model
-from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.comparison_page import _values, shown
+from rbfmuscle.run import Run
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import UsageError
 
@@ -64,7 +64,7 @@ class TestComparison:
         folder, table = compared
         assert (table["models"], table["frames"], table["poses"]) == (["rbf", "pbd"], 4, [0, 1, 3])
         for model in table["models"]:
-            saved, found = SavedRun(folder / model), table["results"][model]
+            saved, found = Run.load(folder / model), table["results"][model]
             assert len(saved.frames) == 4
             for quantity in ("volume_error", "bone_penetration_max", "rest_error_rms"):
                 each = [saved.series(muscle, quantity)[1] for muscle in saved.muscles]
@@ -76,7 +76,7 @@ class TestComparison:
             assert found["all"]["time_frame_p95"] == np.percentile(walls["all"], 95)
             assert set(MEASURES) - set(found["all"]) <= {"distance_rms", "distance_max", "flicker"}
             assert 0 <= found["all"]["return_rms"] < 1.5
-        assert SavedRun(folder / "rbf").info["scene"]["muscles"][0]["model"]["centres"] == 100
+        assert Run.load(folder / "rbf").info["scene"]["muscles"][0]["model"]["centres"] == 100
 
     def test_files_hold_the_table_and_the_page_begins_with_the_answer(self, compared):
         folder, table = compared

@@ -124,7 +124,7 @@ def test_fibres_are_exported_and_drawn(run, tmp_path):
     place = tree["accessors"][primitive["attributes"]["POSITION"]]
     metres = 0.001 * run["strap"].fibres(0).reshape(-1, 3)
     np.testing.assert_allclose(place["max"], metres.max(axis=0), rtol=1e-6)
-    source = SavedSource({"run": rm.Run.load(tmp_path / "run").saved})
+    source = SavedSource({"run": rm.Run.load(tmp_path / "run")})
     picture = source.figure("run").advance()
     assert picture.fibres["strap"].points.shape == run["strap"].fibres(0).shape
 

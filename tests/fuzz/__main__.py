@@ -111,7 +111,7 @@ def read(path: Path, *, may_be_open: bool) -> int:
 def run(path: Path, output: Path, model: str | None) -> int:
     """Three frames by the command line itself, and a look at what it left."""
     from rbfmuscle.cli.app import run_command
-    from rbfmuscle.output.saved import SavedRun
+    from rbfmuscle.run import Run
 
     words = ["run", str(path), "-o", str(output), "--frames", "0:3", "--json"]
     shown = os.dup(1)
@@ -121,10 +121,10 @@ def run(path: Path, output: Path, model: str | None) -> int:
         sys.stdout.flush()
     os.dup2(shown, 1)
     if code == 0:
-        saved = SavedRun(output)
-        for muscle in saved.muscles if saved.has_surfaces() else []:
-            for frame in saved.frames:
-                harness.check_finite(saved.surface(muscle, frame)[0], f"{muscle} in frame {frame}")
+        saved = Run.load(output)
+        for muscle in saved.muscles if saved.has_surfaces else []:
+            for frame in saved.frame_numbers:
+                harness.check_finite(saved.mesh(muscle, frame)[0], f"{muscle} in frame {frame}")
         for row in saved.metrics:
             if row.quantity in FINITE:
                 harness.check_finite(

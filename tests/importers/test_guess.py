@@ -23,7 +23,7 @@ from rbfmuscle.importers.guess.landmarks import CONDYLE, fit_condyles
 from rbfmuscle.importers.guess.names import name_facts
 from rbfmuscle.importers.guess.orientation import HEADER, find_orientation
 from rbfmuscle.importers.guess.parts import Part
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.run import Run
 from rbfmuscle.scene.joints.tables import JointTable
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
@@ -384,12 +384,12 @@ def test_meshes_in_metres_make_a_scene_that_runs_and_an_unused_bone_is_in_the_ve
     run = ("run", scene, "-o", out, "--model", "pbd", "--frames", "0:5")
     code, printed, _ = call(capsys, *run)
     verdict = json.loads((out / "run.json").read_text(encoding="utf-8"))["verdict"]
-    assert code == 0 and f"verdict: {verdict}" in printed and len(SavedRun(out).frames) == 5
+    assert code == 0 and f"verdict: {verdict}" in printed and len(Run.load(out).frames) == 5
     assert "the bones, bones left out (sacrum) 1 at frame 0 (limit 0)" in verdict
     code, _, err = call(
         capsys, *run, "--set", "output.surfaces=false", "--fail-on", "bones_left_out"
     )
-    assert code == 6 and "bones_left_out = 1 > 0" in err and not SavedRun(out).has_surfaces()
+    assert code == 6 and "bones_left_out = 1 > 0" in err and not Run.load(out).has_surfaces
 
 
 def test_header_counts_and_bones_against_it_are_named(leg):

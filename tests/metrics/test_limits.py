@@ -20,8 +20,7 @@ from rbfmuscle.metrics.summary import (
     parse_limits,
     unmeasured,
 )
-from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.run import simulate, stream_run
+from rbfmuscle.run import Run, simulate, stream_run
 from rbfmuscle.validation import LimitExceededError, UsageError
 
 # Of issue and docs, in millimetres: what is just allowed, and what is not.
@@ -188,7 +187,7 @@ def test_overlap_and_ends_away_from_bones_are_seen_in_a_run(
     info = stream_run(scene, tmp_path, pictures=False)  # a warning by default
     found = {row[1]: row[2] for row in info["beyond"]}
     assert found[name] > least and LIMITS[name].title in info["verdict"]
-    assert SavedRun(tmp_path).info["verdict"] == info["verdict"]
+    assert Run.load(tmp_path).info["verdict"] == info["verdict"]
     with pytest.raises(LimitExceededError, match=name) as caught:
         stream_run(scene, tmp_path, fail_on="all", pictures=False)
     assert caught.value.exit_code == 6
@@ -210,7 +209,7 @@ def test_a_limit_that_cannot_be_measured_fails(monkeypatch, tmp_path):
     use_blend_model(monkeypatch)
     with pytest.raises(LimitExceededError, match="not measured: moment_arm") as caught:
         stream_run(arm_scene(end=0), tmp_path, fail_on="moment_arm=50", pictures=False)
-    info = SavedRun(tmp_path).info
+    info = Run.load(tmp_path).info
     assert info["fail_on"] == {"moment_arm": 50.0} and info["limits"]["moment_arm"] == 50.0
     assert info["not_measured"] == [[ALL, "moment_arm"]]
     assert info["verdict"] == caught.value.info["verdict"]

@@ -13,10 +13,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.output.animation import page
+from rbfmuscle.output.animation.parts import AnimatedMesh, Animation
 from rbfmuscle.output.export import export_run
-from rbfmuscle.output.saved import MovingPart, MovingRun, SavedRun
 from rbfmuscle.output.vtp import write_vtp
 from rbfmuscle.report.page import Page
+from rbfmuscle.run import Run
 from rbfmuscle.validation import MissingPartError, UsageError
 
 TOLERANCE = 1e-6  # [m]: what single precision holds at a metre, with room
@@ -31,11 +32,11 @@ def folder(arm_run):
 @pytest.fixture(scope="module")
 def truth(folder):
     """Vertices of everything in each frame [m], by (name, frame)."""
-    saved, found = SavedRun(folder), {}
-    for frame in saved.frames:
-        found["biceps", frame] = saved.surface("biceps", frame)[0] * 1e-3
+    saved, found = Run.load(folder), {}
+    for frame in saved.frame_numbers:
+        found["biceps", frame] = saved.mesh("biceps", frame)[0] * 1e-3
         for bone in saved.bones:
-            pose = saved.poses[frame][bone]
+            pose = saved.frame(frame).poses[bone]
             found[bone, frame] = (saved.bone(bone)[0] @ pose[:3, :3].T + pose[:3, 3]) * 1e-3
     return found
 
@@ -264,16 +265,16 @@ def moving():
     poses[:, :3, 3] = [[0.0, 10.0 * k, 0.0] for k in range(4)]
     corners, sides = np.array(box.vertices), [np.array(box.faces)]
     bones = [
-        MovingPart("shin", "#e9e0cd", [corners], sides, poses),
-        MovingPart("thigh", "#e9e0cd", [corners + 300], sides, poses[:1].repeat(4, 0)),
+        AnimatedMesh("shin", "#e9e0cd", [corners], sides, poses),
+        AnimatedMesh("thigh", "#e9e0cd", [corners + 300], sides, poses[:1].repeat(4, 0)),
     ]
     muscles = [
-        MovingPart("calf </script><b>", "#cc6677", shapes, [faces] * 4),
-        MovingPart("knee", "#cc6677", other, kinds),
+        AnimatedMesh("calf </script><b>", "#cc6677", shapes, [faces] * 4),
+        AnimatedMesh("knee", "#cc6677", other, kinds),
     ]
     times = np.array([2, 3, 4, 7]) / 24.0
     right = np.array([-1.0, 0.0, 0.0])
-    return MovingRun("knee & calf", "mm", times, False, CAPTIONS, muscles, bones, np.eye(3), right)
+    return Animation("knee & calf", "mm", times, False, CAPTIONS, muscles, bones, np.eye(3), right)
 
 
 @pytest.fixture(scope="module")

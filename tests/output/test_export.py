@@ -13,7 +13,6 @@ from rbfmuscle.cli.app import one_line
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.output.export import _file_name, export_run
-from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.output.vtp import read_vtp, write_vtp
 from rbfmuscle.output.writer import write_json
 from rbfmuscle.run import Run, simulate
@@ -81,10 +80,10 @@ class TestSaved:
 
     def test_no_run_is_said(self, tmp_path):
         with pytest.raises(UsageError, match="holds no run"):
-            SavedRun(tmp_path)
+            Run.load(tmp_path)
         (tmp_path / "run.json").write_text("{}")
         with pytest.raises(UsageError, match=r"not the run\.json"):
-            SavedRun(tmp_path)
+            Run.load(tmp_path)
 
 
 class TestHostileRuns:
@@ -107,7 +106,7 @@ class TestHostileRuns:
         change(info)
         (folder / "run.json").write_text(json.dumps(info))
         with pytest.raises(UsageError, match=r"not the run\.json") as caught:
-            SavedRun(folder)
+            Run.load(folder)
         assert word in str(caught.value)
 
     def test_messages_reach_the_terminal_without_control_characters(self):

@@ -7,8 +7,7 @@ import trimesh
 from blend_model import arm_scene, files_in, use_blend_model
 from run_folders import timeless
 
-from rbfmuscle.output.saved import SavedRun
-from rbfmuscle.run import simulate, stream_run
+from rbfmuscle.run import Run, simulate, stream_run
 from rbfmuscle.validation import LimitExceededError, SceneWarning, SolveError
 
 
@@ -69,7 +68,7 @@ class TestStream:
         use_blend_model(monkeypatch, fail_at=8)
         with pytest.raises(SolveError, match="planted"):
             stream_run(arm_scene(), tmp_path)
-        saved = SavedRun(tmp_path)
+        saved = Run.load(tmp_path)
         assert saved.info["status"] == "failed" and "planted" in saved.info["message"]
         use_blend_model(monkeypatch, fail_at=8)
         with pytest.raises(SolveError, match="planted") as caught:
@@ -88,13 +87,13 @@ class TestStream:
 
             with pytest.raises(type(error)):
                 stream_run(arm_scene(), tmp_path, progress=fail)
-            info = SavedRun(tmp_path).info
+            info = Run.load(tmp_path).info
             assert (info["status"], info["message"]) == (status, said)
 
     def test_limit_exceeded_after_everything_is_written(self, tmp_path):
         with pytest.raises(LimitExceededError, match="biceps: length"):
             stream_run(arm_scene(), tmp_path, fail_on="length=3")
-        assert SavedRun(tmp_path).info["status"] == "complete"
+        assert Run.load(tmp_path).info["status"] == "complete"
         stream_run(arm_scene(), tmp_path, fail_on=["length=300", "components"])
 
     def test_second_run_leaves_nothing_of_the_first(self, tmp_path):
@@ -118,4 +117,4 @@ class TestStream:
         monkeypatch.setattr(writer, "write_vtp", full)
         with pytest.raises(SolveError, match="frame 2: No space left"):
             stream_run(arm_scene(), tmp_path)
-        assert SavedRun(tmp_path).frames == [0, 1]
+        assert Run.load(tmp_path).frame_numbers == [0, 1]

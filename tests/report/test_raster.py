@@ -9,9 +9,8 @@ import trimesh
 import rbfmuscle as rm
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.output.appearance import VIEWS, motion_direction, view_axes
-from rbfmuscle.output.saved import SavedRun
 from rbfmuscle.report.render import Solid, aim, draw_solids, fitted_size
-from rbfmuscle.run import stream_run
+from rbfmuscle.run import Run, stream_run
 from rbfmuscle.scene.phantom import phantom_scene
 
 RED, BLUE = "#ff0000", "#0000ff"
@@ -143,7 +142,7 @@ def test_a_saved_run_knows_the_directions_that_its_bones_showed(tmp_path):
     scene = turned_scene(AXES["y up, as in OpenSim"])
     scene.joints, scene.motion = [], rm.Scene().motion
     stream_run(scene, tmp_path, model="pbd", settings={"output.report": False})
-    np.testing.assert_allclose(SavedRun(tmp_path).body, AXES["y up, as in OpenSim"].T, atol=1e-12)
+    np.testing.assert_allclose(Run.load(tmp_path).body, AXES["y up, as in OpenSim"].T, atol=1e-12)
     assert scene.superior is None  # the caller's scene is as it was
 
 

@@ -13,7 +13,7 @@ from toy_scene import held
 import rbfmuscle as rm
 from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.output.appearance import LONGEST_TAPER, TAPER, tendon_mesh
-from rbfmuscle.output.saved import SavedRun
+from rbfmuscle.run import Run
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.tendons import STIFFNESS_RATIO, TendonLine, taut_line
@@ -165,7 +165,7 @@ def test_a_drawn_tendon_tapers_smoothly_from_the_belly_to_its_own_radius(length,
 def test_a_notebook_shows_a_run_with_tendons_that_are_left_out_of_its_files_on_request(tmp_path):
     run = rm.simulate(arm().with_options({"output.tendons": False}))
     run.save(tmp_path, pictures=False)
-    assert not SavedRun(tmp_path).tendons and not list(tmp_path.glob("surfaces/*tendon*"))
+    assert not Run.load(tmp_path).tendons and not list(tmp_path.glob("surfaces/*tendon*"))
     for shown in (run, rm.Run.load(tmp_path)):
         assert "data:image/webp;base64," in shown._repr_html_()
 

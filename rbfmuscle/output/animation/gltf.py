@@ -14,8 +14,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.output.animation.parts import AnimatedFibres, AnimatedMesh, Animation
 from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
-from rbfmuscle.output.saved import MovingFibres, MovingPart, MovingRun
 from rbfmuscle.validation import UsageError
 
 _FLOAT, _INT = 5126, 5125
@@ -23,7 +23,7 @@ _VERTICES, _INDICES = 34962, 34963  # what a view is bound as
 _LINES = 1  # mode of a primitive
 
 
-def animated_glb(run: MovingRun) -> bytes:
+def animated_glb(run: Animation) -> bytes:
     """The content of an animated ``.glb``; UsageError if a muscle's surface has other vertices in
     other frames.
     """
@@ -45,7 +45,7 @@ def animated_glb(run: MovingRun) -> bytes:
     return file.content({"name": run.name, "nodes": [file.append("nodes", root)]})
 
 
-def _add_part(file: "_File", part: MovingPart) -> int:
+def _add_part(file: "_File", part: AnimatedMesh) -> int:
     """Number of a new node: a muscle has a morph target for each frame but the first, a bone a pose
     for each.
     """
@@ -69,7 +69,7 @@ def _add_part(file: "_File", part: MovingPart) -> int:
     return node
 
 
-def _add_fibres(file: "_File", fibres: MovingFibres) -> int:
+def _add_fibres(file: "_File", fibres: AnimatedFibres) -> int:
     """Number of a new node of lines, coloured by the stretch of the first frame."""
     first = fibres.lines[0]
     base = first.points.reshape(-1, 3)
@@ -152,7 +152,7 @@ class _File:
             entry |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self.append("accessors", entry)
 
-    def mesh(self, part: MovingPart, normals: Floats, targets: Sequence[Any]) -> int:
+    def mesh(self, part: AnimatedMesh, normals: Floats, targets: Sequence[Any]) -> int:
         """Number of a new mesh, that of the first frame, with a material of its own."""
         colour = [*linear_rgb(rgb(part.colour)).tolist(), 1.0]
         look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}

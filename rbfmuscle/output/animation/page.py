@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.output.animation.parts import FRAMES_A_SECOND, AnimatedMesh, Animation
 from rbfmuscle.output.appearance import VIEWS
-from rbfmuscle.output.saved import FRAMES_A_SECOND, MovingPart, MovingRun
 
 # Whole numbers of which the longest side of all that moves has so many: 0.03 mm of 900.
 _STEPS = 30_000
@@ -28,7 +28,7 @@ def scene_file(name: str) -> str:
     return (resources.files("rbfmuscle.output.animation") / name).read_text(encoding="utf-8")
 
 
-def pack_runs(runs: Mapping[str, MovingRun]) -> str:
+def pack_runs(runs: Mapping[str, Animation]) -> str:
     """JSON of runs of the same frames and bones, side by side, by what stands above each, for
     ``scene.js``.
     """
@@ -57,14 +57,14 @@ def pack_runs(runs: Mapping[str, MovingRun]) -> str:
 class _Packer:
     """Arrays on their way into one stream."""
 
-    def __init__(self, runs: Mapping[str, MovingRun]) -> None:
+    def __init__(self, runs: Mapping[str, Animation]) -> None:
         drawn = [part for run in runs.values() for part in (*run.bones, *run.muscles)]
         low = np.min([points.min(axis=0) for part in drawn for points in part.vertices], axis=0)
         high = np.max([points.max(axis=0) for part in drawn for points in part.vertices], axis=0)
         self.origin, self.step = low, float((high - low).max()) / _STEPS or 1.0
         self.parts: list[bytes] = []
 
-    def part(self, part: MovingPart, panel: int) -> dict[str, Any]:
+    def part(self, part: AnimatedMesh, panel: int) -> dict[str, Any]:
         """Take in a muscle or bone, in pieces: frames that follow each other and have the same
         triangles.
         """

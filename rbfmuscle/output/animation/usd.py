@@ -9,8 +9,13 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.output.animation.parts import (
+    FRAMES_A_SECOND,
+    AnimatedFibres,
+    AnimatedMesh,
+    Animation,
+)
 from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
-from rbfmuscle.output.saved import FRAMES_A_SECOND, MovingFibres, MovingPart, MovingRun
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingPartError
 
@@ -24,7 +29,7 @@ def check_usd() -> None:
         raise MissingPartError(message) from None
 
 
-def write_usd(path: Path, run: MovingRun) -> None:
+def write_usd(path: Path, run: Animation) -> None:
     """Write a run as one ``.usdc`` file; usd-core must be there (`check_usd`).
 
     Time codes count 24 a second. A surface that keeps its vertices has its topology once and its
@@ -63,7 +68,7 @@ def write_usd(path: Path, run: MovingRun) -> None:
     stage.GetRootLayer().Export(str(path))
 
 
-def _fill_curves(curves: Any, fibres: MovingFibres, codes: list[float]) -> None:
+def _fill_curves(curves: Any, fibres: AnimatedFibres, codes: list[float]) -> None:
     """Fibres get their points and their colours, by their stretch, at each time."""
     from pxr import UsdGeom, Vt
 
@@ -80,7 +85,7 @@ def _fill_curves(curves: Any, fibres: MovingFibres, codes: list[float]) -> None:
         colours.Set(Vt.Vec3fArray.FromNumpy(shades.astype(np.float32)), code)
 
 
-def _fill(mesh: Any, part: MovingPart, codes: list[float]) -> None:
+def _fill(mesh: Any, part: AnimatedMesh, codes: list[float]) -> None:
     """A muscle gets its points at each time, and its faces where they change; a bone its points
     once and its poses.
     """

@@ -1,0 +1,339 @@
+"""A run as data, in memory or in a folder: its facts, frames, metrics and meshes."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.metrics.quantities import ALL, Row
+from rbfmuscle.metrics.rows import moment_arms, reaches
+from rbfmuscle.output import appearance as look
+from rbfmuscle.output.run_folder import FolderMeshes, Mesh, read_run, tendon_muscles
+from rbfmuscle.scene.joints.tables import full_name
+from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Event, FibreLines, Frame
+from rbfmuscle.validation import UsageError, did_you_mean
+
+if TYPE_CHECKING:
+    import trimesh
+
+# Coordinates that a caption names at most.
+MOST_SHOWN = 4
+
+
+class SceneMeshes:
+    """Meshes that the frames of a run in memory do not hold, made from its scene.
+
+    `FolderMeshes` are those of a run in a folder. ``directory`` is the run's folder.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.directory: Path | None = None
+        self._bones = {bone.name: bone.mesh for bone in scene.bones}
+        self._muscles = {muscle.name: muscle for muscle in scene.muscles}
+
+    def bone(self, name: str) -> Mesh:
+        """A bone at rest."""
+        mesh = self._bones[name]
+        return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+    def tendons(self, muscle: str, frame: Frame) -> Mesh:
+        """All tendons of a muscle in a frame."""
+        mesh = look.tendon_mesh(self._muscles[muscle], frame.tendons)
+        if mesh is None:
+            raise UsageError(f"{muscle!r} has no tendon")
+        return mesh
+
+
+class RunData:
+    """A run as data: what reports, exports, pictures and viewers take.
+
+    ``len(run)`` is the number of its frames, ``run["extensor"]`` one muscle; iteration gives every
+    muscle.
+
+    Attributes
+    ----------
+    info : dict
+        What ``run.json`` holds.
+    frames : list of Frame
+        Those that were written, in their order.
+    metrics : list of Row
+        (frame, coordinate, angle [degree], muscle, quantity, value, unit), frame by frame.
+    directory : Path or None
+        The run's folder; None of a run in memory.
+    units : {"m", "cm", "mm"}
+        The scene's unit of length.
+    body : (3, 3) ndarray
+        Left, posterior and superior; x, y and z where they are not known.
+    muscles, bones, tendons : list of str
+        Names; those of tendons are of meshes, which `mesh` takes as it takes muscles.
+    groups, colours : dict of str to str
+        Of each muscle, as in pictures.
+    """
+
+    def __init__(
+        self,
+        info: dict[str, Any],
+        frames: list[Frame],
+        metrics: list[Row],
+        meshes: SceneMeshes | FolderMeshes,
+    ) -> None:
+        scene = info["scene"]
+        self.info = info
+        self.frames = frames
+        self.metrics = metrics
+        self.directory = meshes.directory
+        self.units: str = scene["units"]
+        self.body = body_axes(scene.get("superior"), scene.get("anterior"))
+        self.muscles: list[str] = [muscle["name"] for muscle in scene["muscles"]]
+        self.bones: list[str] = [bone["name"] for bone in scene["bones"]]
+        self.tendons = list(tendon_muscles(info))
+        self.groups = look.muscle_groups(info)
+        self.colours = look.muscle_colours(self.muscles, self.groups)
+        self._meshes = meshes
+        self._by_number = {frame.index: frame for frame in frames}
+
+    @classmethod
+    def load(cls, directory: str | Path) -> Self:
+        """Return the run in a folder, or raise UsageError if it holds none.
+
+        Of a run that was killed, or still goes on, it has the frames up to the last whole one.
+        """
+        return cls(*read_run(Path(directory)))
+
+    @property
+    def frame_numbers(self) -> list[int]:
+        """Numbers of the frames that were written."""
+        return list(self._by_number)
+
+    def frame(self, number: int) -> Frame:
+        """The frame of a number; of a negative one counted from the end."""
+        if number not in self._by_number and -len(self.frames) <= number < 0:
+            return self.frames[number]
+        if number not in self._by_number:
+            ends = f"{self.frames[0].index} to {self.frames[-1].index}" if self.frames else "none"
+            raise UsageError(f"frame {number} was not written; the run has {ends}")
+        return self._by_number[number]
+
+    @property
+    def has_surfaces(self) -> bool:
+        """Whether there is something to draw."""
+        return bool(self.frames) and bool(self.frames[0].surfaces)
+
+    def mesh(self, name: str, number: int) -> Mesh:
+        """Vertices and faces of a muscle, or of its tendons, in the frame of a number."""
+        self._require_surfaces()
+        frame = self.frame(number)
+        if name in self.tendons:
+            return self._meshes.tendons(tendon_muscles(self.info)[name], frame)
+        surface = frame.surfaces[name]
+        return surface.vertices, surface.faces
+
+    def bone(self, name: str) -> Mesh:
+        """Vertices and faces of a bone at rest."""
+        self._require_surfaces()
+        return self._meshes.bone(name)
+
+    def _require_surfaces(self) -> None:
+        if not self.has_surfaces:
+            raise UsageError(
+                f"{self.directory or 'the run'} has no surfaces: the run's scene had "
+                "output.surfaces = false"
+            )
+
+    @property
+    def events(self) -> list[Event]:
+        """Events of all frames, in their order."""
+        return [event for frame in self.frames for event in frame.events]
+
+    @property
+    def summary(self) -> dict[str, dict[str, Any]]:
+        """Nested dict: muscle -> quantity -> min, max, mean, median, worst."""
+        return self.info["muscles"]
+
+    @property
+    def verdict(self) -> str:
+        """Which muscles are within all limits, which not, and the worst value."""
+        return self.info["verdict"]
+
+    @property
+    def quantities(self) -> list[str]:
+        """Names of what was measured."""
+        return list(dict.fromkeys(row.quantity for row in self.metrics))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __contains__(self, muscle: object) -> bool:
+        return muscle in self.muscles
+
+    def __getitem__(self, muscle: str) -> MuscleRun:
+        """The `MuscleRun` of a muscle."""
+        if muscle not in self:
+            raise UsageError(f"unknown muscle {muscle!r}, {did_you_mean(muscle, self.muscles)}")
+        return MuscleRun(self, muscle)
+
+    def __iter__(self) -> Iterator[MuscleRun]:
+        """All muscles."""
+        return (MuscleRun(self, muscle) for muscle in self.muscles)
+
+    @cached_property
+    def _rows(self) -> dict[str, dict[str, list[Row]]]:
+        """Rows of the metrics by muscle and quantity: of dozens of muscles there are tens of
+        thousands.
+        """
+        found: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
+        for row in self.metrics:
+            found[row.muscle][row.quantity].append(row)
+        return {muscle: dict(quantities) for muscle, quantities in found.items()}
+
+    def series(
+        self, muscle: str, quantity: str, coordinate: str | None = None
+    ) -> tuple[Integers, Floats]:
+        """Numbers of the frames (n,) and values (n,) of a quantity of a muscle, of moment arms
+        those about a coordinate; empty where it was not measured.
+        """
+        rows = self._rows.get(muscle, {}).get(quantity, [])
+        found = [row for row in rows if coordinate in (None, row.coordinate)]
+        frames = np.array([row.frame for row in found], dtype=int)
+        return frames, np.array([row.value for row in found], dtype=float)
+
+    def values(self, muscle: str, quantity: str, *, coordinate: str | None = None) -> Floats:
+        """Values of a quantity over the frames, (n,) ndarray; of moment arms those about a
+        ``coordinate``, which must be named where the muscle has several. `series` gives the frames
+        with them.
+
+        UsageError if the run has no such muscle, quantity or coordinate.
+        """
+        found = self._rows.get(muscle)
+        if not found:
+            raise UsageError(
+                f"unknown muscle {muscle!r}, {did_you_mean(muscle, [*self.muscles, ALL])}"
+            )
+        if quantity not in found:
+            raise UsageError(
+                f"{quantity!r} was not measured of {muscle!r}, {did_you_mean(quantity, found)}"
+            )
+        if "moment_arm" in quantity:
+            _check_coordinate(found[quantity], coordinate)
+        elif coordinate is not None:
+            raise UsageError(f"{quantity!r} has no coordinate; only moment arms have")
+        return self.series(muscle, quantity, coordinate)[1]
+
+    def moment_arm_coordinates(self, muscle: str | None = None) -> list[str]:
+        """The coordinates that a muscle, or any, has moment arms about, in their order in
+        ``metrics.csv``.
+        """
+        rows = (
+            r for r in self.metrics if r.quantity == "moment_arm" and muscle in (None, r.muscle)
+        )
+        return list(dict.fromkeys(r.coordinate for r in rows))
+
+    def caption(self, number: int) -> str:
+        """Frame number, time and coordinates of a frame, as text; of many coordinates those that
+        move most.
+        """
+        rows, units = self.info["frames"], self.info["scene"].get("coordinate_units", {})
+        entry = next(row for row in rows if row["frame"] == number)
+        values = entry["coordinates"]
+        spans = {
+            name: np.ptp([row["coordinates"].get(name, 0.0) for row in rows]) for name in values
+        }
+        most = sorted(values, key=lambda name: -spans[name])[:MOST_SHOWN]
+        texts = [f"{n} {value:.4g}{units.get(n, '°')}" for n, value in values.items() if n in most]
+        clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
+        return ", ".join([f"frame {number}", *clock, *texts])
+
+    def __repr__(self) -> str:
+        return (
+            f"<Run of {self.info['scene']['name']!r}: {len(self)} frames, "
+            f"{', '.join(self.muscles)}>"
+        )
+
+
+def open_run(run: RunData | str | Path) -> RunData:
+    """A run as it is, or the one in a folder."""
+    return run if isinstance(run, RunData) else RunData.load(run)
+
+
+class MuscleRun:
+    """One muscle of a run."""
+
+    def __init__(self, run: RunData, name: str) -> None:
+        self.run = run
+        self.name = name
+
+    def surface(self, frame: int = -1, *, units: str | None = None) -> trimesh.Trimesh:
+        """Surface in a frame of the run: closed, faces outward, world coordinates.
+
+        ``frame`` is the number of a frame; negative counts from the end. ``units`` of length are
+        "m", "cm" or "mm", the scene's where not given.
+        """
+        import trimesh
+
+        vertices, faces = self.run.mesh(self.name, frame)
+        if units is not None and units not in MM_PER_UNIT:
+            raise UsageError(f"units must be m, cm or mm, got {units!r}")
+        scale = MM_PER_UNIT[self.run.units] / MM_PER_UNIT[units or self.run.units]
+        return trimesh.Trimesh(scale * vertices, faces, process=False)
+
+    def values(self, quantity: str, *, coordinate: str | None = None) -> Floats:
+        """Values of a quantity over the frames, (n,) ndarray; see `RunData.values`."""
+        return self.run.values(self.name, quantity, coordinate=coordinate)
+
+    def fibres(self, frame: int = -1) -> Floats:
+        """Points (N, k, 3) of the fibres in a frame of the run, each from origin to insertion with
+        its tendons [scene unit]; of a run whose scene had ``output.fibres``.
+        """
+        return self._fibres(self.run.frame(frame)).points
+
+    @property
+    def fibre_lengths(self) -> Floats:
+        """Length (frames, N) of each fibre with its tendons [scene unit]."""
+        return np.array([self._fibres(frame).lengths for frame in self.run.frames])
+
+    def moment_arms(self, coordinate: str) -> Floats:
+        """Moment arm (frames, N) of each fibre about a coordinate, of its full or its short name.
+
+        Minus the slope of the fibre's length [scene unit per radian, or 1 of a translation], see
+        `rbfmuscle.metrics.rows.moment_arms`; NaN where the coordinate does not move alone.
+        """
+        path = [frame.coordinates for frame in self.run.frames]
+        known = sorted({name for coordinates in path for name in coordinates})
+        name = full_name(coordinate, known, place="moment_arms")
+        scene = self.run.info["scene"]
+        reach = reaches(known, scene.get("coordinate_units", {}), scene["units"])
+        lengths = self.fibre_lengths
+        out = np.full(lengths.shape, np.nan)
+        for row, found in zip(out, moment_arms(path, lengths, reach)):
+            row[:] = found.get(name, np.nan)
+        return out
+
+    def _fibres(self, frame: Frame) -> FibreLines:
+        if self.name not in frame.fibres:
+            raise UsageError(
+                f"the run has no fibres of {self.name!r}; run it with output.fibres=32"
+            )
+        return frame.fibres[self.name]
+
+
+def _check_coordinate(rows: Sequence[Row], coordinate: str | None) -> None:
+    """Raise UsageError unless rows of moment arms are about one coordinate, or one is named."""
+    names = list(dict.fromkeys(row.coordinate for row in rows))
+    if coordinate is None and len(names) > 1:
+        raise UsageError(
+            f"{rows[0].muscle!r} has moment arms about {', '.join(names)}; name one with "
+            "coordinate="
+        )
+    if coordinate is not None and coordinate not in names:
+        raise UsageError(
+            f"{rows[0].muscle!r} has no moment arm about {coordinate!r}, "
+            f"{did_you_mean(coordinate, names)}"
+        )
