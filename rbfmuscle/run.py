@@ -20,10 +20,9 @@ from rbfmuscle.recording import MemorySink, Recording
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame
-from rbfmuscle.validation import MissingPartError, SolveError, UsageError, did_you_mean
+from rbfmuscle.validation import SolveError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    import pandas
     from matplotlib.axes import Axes
 
     import rbfmuscle
@@ -167,32 +166,46 @@ class Run(RunData):
         self._recording = recording
         self.scene = None if recording is None else recording.scene
 
-    def table(self) -> pandas.DataFrame:
-        """Return the metrics as a pandas DataFrame, or raise MissingPartError if pandas is not
-        installed.
-        """
-        try:
-            import pandas
-        except ImportError:
-            raise MissingPartError("run.table() needs pandas: pip install pandas") from None
-        return pandas.DataFrame(self.metrics, columns=list(Row._fields))
+    def plot(self, quantity: str = "penetration_max", *, coordinate: str | None = None) -> Axes:
+        """Plot a quantity of every muscle over the motion, and return the matplotlib Axes.
 
-    def plot(self, quantity: str = "penetration_max") -> Axes:
-        """Plot a quantity of every muscle over the motion, and return the matplotlib Axes."""
+        The axis is the only coordinate that moves [degree, or scene unit], if it moves one way,
+        else the number of the frame. Moment arms are those about ``coordinate``, or all.
+        """
         if quantity not in self.quantities:
             raise UsageError(
                 f"unknown quantity {quantity!r}, {did_you_mean(quantity, self.quantities)}"
             )
         from matplotlib import pyplot
 
+        from rbfmuscle.report.plots import motion_axis
+
+        place, label = motion_axis(self)
         rows = [row for row in self.metrics if row.quantity == quantity]
+        several = "moment_arm" in quantity and len({row.coordinate for row in rows}) > 1
         axes = pyplot.figure().add_subplot()
-        for muscle, coordinate in dict.fromkeys((row.muscle, row.coordinate) for row in rows):
-            track = [row for row in rows if (row.muscle, row.coordinate) == (muscle, coordinate)]
-            axes.plot([row.frame for row in track], [row.value for row in track], label=muscle)
-        axes.set(title=quantity, xlabel="frame", ylabel=rows[0].unit)
+        for muscle, about in self._tracks(quantity, coordinate):
+            frames, values = self.series(muscle, quantity, about)
+            name = f"{muscle}, {about}" if several and about else muscle
+            axes.plot([place[frame] for frame in frames.tolist()], values, label=name)
+        axes.set(title=quantity, xlabel=label, ylabel=rows[0].unit)
         axes.legend()
         return axes
+
+    def _tracks(self, quantity: str, coordinate: str | None) -> list[tuple[str, str | None]]:
+        """Muscle and coordinate of each line of a plot; no coordinate of what has none."""
+        rows = [row for row in self.metrics if row.quantity == quantity]
+        if "moment_arm" not in quantity:
+            if coordinate is not None:
+                raise UsageError(f"{quantity!r} has no coordinate; only moment arms have")
+            return [(muscle, None) for muscle in dict.fromkeys(row.muscle for row in rows)]
+        names = list(dict.fromkeys(row.coordinate for row in rows))
+        if coordinate is not None and coordinate not in names:
+            raise UsageError(
+                f"unknown coordinate {coordinate!r}, {did_you_mean(coordinate, names)}"
+            )
+        found = dict.fromkeys((row.muscle, row.coordinate) for row in rows)
+        return [(muscle, about) for muscle, about in found if coordinate in (None, about)]
 
     def save(self, directory: str | Path, *, pictures: bool = True) -> None:
         """Write what `stream_run` would have written; a run that was loaded is copied.

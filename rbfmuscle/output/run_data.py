@@ -14,6 +14,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.output import appearance as look
+from rbfmuscle.output.metrics_table import metrics_table
 from rbfmuscle.output.run_folder import FolderMeshes, Mesh, read_run, tendon_muscles
 from rbfmuscle.scene.joints.tables import full_name
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
@@ -22,6 +23,7 @@ from rbfmuscle.simulation.frame import Event, FibreLines, Frame
 from rbfmuscle.validation import UsageError, did_you_mean
 
 if TYPE_CHECKING:
+    import pandas
     import trimesh
 
 # Coordinates that a caption names at most.
@@ -167,6 +169,27 @@ class RunData:
     def quantities(self) -> list[str]:
         """Names of what was measured."""
         return list(dict.fromkeys(row.quantity for row in self.metrics))
+
+    @property
+    def coordinates(self) -> dict[str, Floats]:
+        """Values (frames,) of each coordinate [degree, of translations scene unit]; NaN where
+        unknown.
+        """
+        rows = [row["coordinates"] for row in self.info["frames"]]
+        names = sorted({name for row in rows for name in row})
+        return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
+
+    def table(self) -> pandas.DataFrame | np.ndarray:
+        """Return the metrics as one table, with the coordinates of each frame.
+
+        Returns
+        -------
+        pandas.DataFrame or structured ndarray
+            The array where pandas is not installed. Columns are ``frame``, each of `coordinates`
+            by its name, ``muscle``, ``quantity``, ``coordinate`` (that of a moment arm, else
+            empty), ``value`` and ``unit``.
+        """
+        return metrics_table(self.metrics, self.frame_numbers, self.coordinates)
 
     def __len__(self) -> int:
         return len(self.frames)

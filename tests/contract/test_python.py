@@ -118,16 +118,23 @@ def test_show_takes_a_run_in_memory_and_a_loaded_one(run, loaded):
             page.close()
 
 
-def test_metrics_as_a_table_where_pandas_is_there(run, monkeypatch):
+def test_table_has_the_coordinates_of_each_row(run, loaded, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(rm.MissingPartError, match="pip install pandas"):
-        run.table()
-    fake = types.SimpleNamespace(
-        DataFrame=lambda rows, columns: [dict(zip(columns, row)) for row in rows]
-    )
-    monkeypatch.setitem(sys.modules, "pandas", fake)
-    lengths = [row["value"] for row in run.table() if row["quantity"] == "length"]
-    assert lengths == list(run.values("abductor", "length"))
+    for shown in (run, loaded):
+        table = shown.table()
+        assert len(table) == len(run.metrics)
+        lengths = table[(table["quantity"] == "length") & (table["muscle"] == "abductor")]
+        np.testing.assert_array_equal(lengths["value"], run.values("abductor", "length"))
+        assert lengths["frame"].tolist() == [0, 1, 2] and set(lengths["unit"]) == {"mm"}
+        (moved,) = [name for name, x in shown.coordinates.items() if np.ptp(x) > 0]
+        np.testing.assert_allclose(lengths[moved], [0.0, 2.0, 4.0], atol=1e-12)  # degrees
+        np.testing.assert_allclose(
+            np.radians(shown.coordinates[moved]), [f.coordinates[moved] for f in run.frames]
+        )
+        arms = table[table["quantity"] == "moment_arm"]
+        assert set(arms["coordinate"]) == {moved} and set(lengths["coordinate"]) == {""}
+    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=dict))
+    assert tuple(run.table()) == table.dtype.names
 
 
 def test_values_are_of_known_names_and_moment_arms_of_one_coordinate(run, loaded):
@@ -161,6 +168,11 @@ def test_plot_shows_every_value(run):
     matplotlib.use("Agg")
     (line,) = run.plot("length").lines
     np.testing.assert_array_equal(line.get_ydata(), run.values("abductor", "length"))
+    (arms,) = run.plot("moment_arm").lines
+    np.testing.assert_allclose(arms.get_xdata(), [0.0, 2.0, 4.0], atol=1e-12)  # degrees
+    np.testing.assert_array_equal(arms.get_ydata(), run.values("abductor", "moment_arm"))
+    with pytest.raises(rm.UsageError, match=r"unknown coordinate 'hip\.twist'"):
+        run.plot("moment_arm", coordinate="hip.twist")
     with pytest.raises(rm.UsageError, match="did you mean 'length'"):
         run.plot("lenght")
 
