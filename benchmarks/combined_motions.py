@@ -79,7 +79,7 @@ def measure(scene: rm.Scene, model: str | None) -> tuple[list[tuple], float]:
             action: sum(e.count for e in run.events if e.muscle == name and e.action == action)
             for action in ("unresolved", "grazed", "held_back")
         }
-        euler = run.values(name, "euler")
+        euler = run.values(name, "euler_characteristic")
         worst = {
             q: abs(run.values(name, q)).max(initial=0.0) for q in WORST if q in run.summary[name]
         }

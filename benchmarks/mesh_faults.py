@@ -18,7 +18,7 @@ import numpy as np
 
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.metrics.depths import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.metrics.depths import BoneDistance, bone_depth, surface_depth
 from rbfmuscle.metrics.metrics import SurfaceForm
 from rbfmuscle.models import build_model, configure_scene
 from rbfmuscle.scene.scene import Scene
@@ -69,7 +69,7 @@ class Faults:
                 form["self_crossings"] > 0,
                 abs(volume / self.muscle.mesh.volume - 1.0),
                 away,
-                form["euler"] != 2,
+                form["euler_characteristic"] != 2,
             )
         )
 
@@ -100,7 +100,7 @@ def main():
         scene, parse_settings(given.set), model=given.model, frames=given.frames
     )
     faults = {muscle.name: Faults(muscle) for muscle in scene.muscles}
-    probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
+    probes = [BoneDistance(bone.name, bone.mesh) for bone in scene.bones]
     models = [build_model(muscle, scene, muscle.model) for muscle in scene.muscles]
     spent = 0.0
     start = time.process_time()

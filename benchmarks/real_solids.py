@@ -29,7 +29,7 @@ from rbfmuscle.run import simulate
 from rbfmuscle.scene.motion import bone_poses, interpolate
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
-from rbfmuscle.validation import MissingPartError, SolveError
+from rbfmuscle.validation import MissingDependencyError, SolveError
 
 ROOT = Path(__file__).resolve().parents[1]
 # Scene, muscle and edges of the tetrahedra [mm], each level; frames 15 and 30 are 30 and 60
@@ -71,7 +71,7 @@ def tetrahedra(mesh, edge):
     try:
         import pytetwild
     except ImportError as error:
-        raise MissingPartError(
+        raise MissingDependencyError(
             "pytetwild is not installed, which makes tetrahedra: pip install -e '.[fem]' in "
             "rbfmuscle's folder"
         ) from error

@@ -36,7 +36,7 @@ TOPICS = {
         "MeshError",
         "SolveError",
         "LimitExceededError",
-        "MissingPartError",
+        "MissingDependencyError",
         "NumericalWarning",
         "SceneWarning",
     ),

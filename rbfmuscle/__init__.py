@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene as Scene
     from rbfmuscle.validation import LimitExceededError as LimitExceededError
     from rbfmuscle.validation import MeshError as MeshError
-    from rbfmuscle.validation import MissingPartError as MissingPartError
+    from rbfmuscle.validation import MissingDependencyError as MissingDependencyError
     from rbfmuscle.validation import NumericalWarning as NumericalWarning
     from rbfmuscle.validation import RBFMuscleError as RBFMuscleError
     from rbfmuscle.validation import SceneError as SceneError
@@ -39,7 +39,7 @@ __version__ = "1.1.0"
 _ERRORS = (
     "LimitExceededError",
     "MeshError",
-    "MissingPartError",
+    "MissingDependencyError",
     "NumericalWarning",
     "RBFMuscleError",
     "SceneError",

@@ -58,7 +58,7 @@ class LimitExceededError(RBFMuscleError, RuntimeError):
     info: Any = None
 
 
-class MissingPartError(RBFMuscleError, ImportError):
+class MissingDependencyError(RBFMuscleError, ImportError):
     """An optional part (graphics, an extra) is missing (exit code 7)."""
 
     exit_code = 7

@@ -20,7 +20,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from rbfmuscle.validation import MissingPartError, SolveError
+from rbfmuscle.validation import MissingDependencyError, SolveError
 
 MOST_ITERATIONS = 60
 # A step that would lower the energy by a smaller share than this changes nothing that is looked at;
@@ -57,7 +57,7 @@ def _skfem():
     try:
         import skfem
     except ImportError as error:
-        raise MissingPartError(
+        raise MissingDependencyError(
             "solids of finite elements need scikit-fem: pip install -e '.[fem]' in "
             "rbfmuscle's folder"
         ) from error
@@ -152,7 +152,7 @@ class HexSolid:
 
     Raises
     ------
-    MissingPartError
+    MissingDependencyError
         If scikit-fem is not installed.
     """
 

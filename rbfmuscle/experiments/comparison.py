@@ -55,7 +55,7 @@ MEASURES = {
     "components": Measure(
         "pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"
     ),
-    "euler": Measure(
+    "euler_characteristic": Measure(
         "Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle", 2.0
     ),
     "self_crossings": Measure(

@@ -21,7 +21,7 @@ from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.writer import write_csv, write_json
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import MissingPartError, RBFMuscleError, SolveError, UsageError
+from rbfmuscle.validation import MissingDependencyError, RBFMuscleError, SolveError, UsageError
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -153,7 +153,7 @@ def _connect_cluster(address: str) -> "Client":
             "Dask is not installed, which --cluster needs: pip install -e '.[cluster]' in "
             "rbfmuscle's folder"
         )
-        raise MissingPartError(message) from error
+        raise MissingDependencyError(message) from error
     try:
         client = Client(address, timeout=CONNECT_WITHIN)
         client.wait_for_workers(2, timeout=CONNECT_WITHIN)

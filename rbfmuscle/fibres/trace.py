@@ -9,7 +9,7 @@ from rbfmuscle.fibres.flux import FluxField
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.tubes import distance_along, points_along
-from rbfmuscle.metrics.depths import BoneProbe
+from rbfmuscle.metrics.depths import BoneDistance
 
 POINTS = 25  # of a fibre, at even distances along it
 STEP = 0.5  # of a line that is traced, in cells
@@ -34,7 +34,7 @@ def trace_fibres(
     count: int,
     *,
     polylines: Sequence[Floats] | None = None,
-    bones: Sequence[BoneProbe] = (),
+    bones: Sequence[BoneDistance] = (),
 ) -> Traced:
     """Lines from origin to insertion along the flux between them, evenly by volume.
 
@@ -48,7 +48,7 @@ def trace_fibres(
         Of the lines; fewer come out where some do not reach both ends.
     polylines : sequence of (k, 3) ndarray, optional
         That the lines follow.
-    bones : sequence of BoneProbe
+    bones : sequence of BoneDistance
         At rest, of which all inner points of the lines stay out.
 
     Returns
@@ -152,7 +152,7 @@ def _even(line: Floats) -> Floats:
 
 
 def _kept_inside(
-    lines: Floats, mesh: MeshDistance, bones: Sequence[BoneProbe], depth: float
+    lines: Floats, mesh: MeshDistance, bones: Sequence[BoneDistance], depth: float
 ) -> Floats:
     """Lines (n, k, 3) smoothed, their inner points moved inside the muscle and out of bones."""
     inner = lines[:, 1:-1]

@@ -20,7 +20,7 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.jit import compiled
-from rbfmuscle.metrics.depths import BoneProbe, bones_about
+from rbfmuscle.metrics.depths import BoneDistance, bones_about
 from rbfmuscle.scene.joints.joint import Joint, all_coordinates, rigid_body
 from rbfmuscle.scene.objects import Attachment, Muscle
 from rbfmuscle.scene.scene import Scene
@@ -105,7 +105,7 @@ class Centreline:
         return float(distance_along(self.points(vertices, poses))[-1])
 
     def measure(
-        self, vertices: Floats, poses: dict[str, Floats], probes: list[BoneProbe]
+        self, vertices: Floats, poses: dict[str, Floats], probes: list[BoneDistance]
     ) -> tuple[float, float]:
         """Length of the line now, and over that of the shortest path, which begins beside it as in
         the last frame.
@@ -297,7 +297,7 @@ def _thickness(points: Floats, axis: Floats) -> float:
 
 def shortest_path(
     line: Floats,
-    probes: list[BoneProbe],
+    probes: list[BoneDistance],
     poses: dict[str, Floats],
     *,
     clearance: Floats,
@@ -337,7 +337,7 @@ def shortest_path(
 
 
 def _planes(
-    points: Floats, probes: list[BoneProbe], poses: dict[str, Floats], least: float
+    points: Floats, probes: list[BoneDistance], poses: dict[str, Floats], least: float
 ) -> tuple[Floats, Floats]:
     """Signed distance (n,) to the nearest bone and the unit normal (n, 3) of the plane that touches
     it there.

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import trimesh
 
 
-class BoneProbe(SolidDistance):
+class BoneDistance(SolidDistance):
     """One bone, prepared once in its own coordinates; it may have holes and several shells."""
 
     def __init__(self, name: str, mesh: "trimesh.Trimesh") -> None:
@@ -22,7 +22,7 @@ class BoneProbe(SolidDistance):
         self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
 
-def surface_depth(vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]) -> Floats:
+def surface_depth(vertices: Floats, probes: list[BoneDistance], poses: dict[str, Floats]) -> Floats:
     """Greatest depth (n,) of vertices (n, 3) in the bones, of poses (4, 4) by name; 0 where in none
     [scene unit].
     """
@@ -41,8 +41,8 @@ def inverse_pose(pose: Floats) -> Floats:
 
 
 def bones_about(
-    vertices: Floats, probes: list[BoneProbe], poses: dict[str, Floats]
-) -> list[BoneProbe]:
+    vertices: Floats, probes: list[BoneDistance], poses: dict[str, Floats]
+) -> list[BoneDistance]:
     """The bones whose boxes, where they are now, meet the box of the points (n, 3)."""
     if not probes or len(vertices) == 0:
         return []
@@ -56,7 +56,9 @@ def bones_about(
     return [probe for probe, near in zip(probes, met) if near]
 
 
-def bone_depth(surface: MeshDistance, probes: list[BoneProbe], poses: dict[str, Floats]) -> float:
+def bone_depth(
+    surface: MeshDistance, probes: list[BoneDistance], poses: dict[str, Floats]
+) -> float:
     """Greatest depth of any bone vertex in a closed, outward surface in the world, 0 where none is
     [scene unit].
     """

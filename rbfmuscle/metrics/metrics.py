@@ -14,7 +14,7 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import edge_lengths, label_sheets, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
-from rbfmuscle.metrics.depths import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.metrics.depths import BoneDistance, bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
 from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.guesses import doubtful
@@ -44,11 +44,11 @@ class MuscleMeasures:
     """
 
     def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
-        self.probes = [BoneProbe(bone.name, bone.mesh) for bone in scene.bones]
+        self.probes = [BoneDistance(bone.name, bone.mesh) for bone in scene.bones]
         surfaces = scene_surfaces(scene)
         mine = [muscle for muscle in scene.muscles if muscle.name in carried]
         self.trackers = {
-            muscle.name: _Tracker(muscle, scene, *carried[muscle.name]) for muscle in mine
+            muscle.name: MuscleMeasurer(muscle, scene, *carried[muscle.name]) for muscle in mine
         }
         for muscle in mine:
             self.trackers[muscle.name].first = {
@@ -78,7 +78,7 @@ class MuscleMeasures:
         return dict(zip(self.trackers, found))
 
 
-class _Tracker:
+class MuscleMeasurer:
     """What has to be kept of one muscle from frame to frame."""
 
     def __init__(self, muscle: Any, scene: Any, vertices: Floats, faces: Integers) -> None:
@@ -103,7 +103,7 @@ class _Tracker:
         self.offset: Floats | None = None
         self.near: Integers | None = None
 
-    def measure(self, frame: Frame, probes: list[BoneProbe]) -> dict[str, float]:
+    def measure(self, frame: Frame, probes: list[BoneDistance]) -> dict[str, float]:
         """What there is to measure of this muscle in a frame."""
         found = {**self.first, **self.at_rest}
         self.first, self.at_rest = {}, {}
@@ -168,7 +168,7 @@ class _Tracker:
         self,
         surface: ModelSurface,
         carried: Floats,
-        probes: list[BoneProbe],
+        probes: list[BoneDistance],
         poses: dict[str, Floats],
     ) -> None:
         """What is measured once, before the first frame, with all bones at rest.
@@ -257,15 +257,15 @@ class SurfaceForm:
         self._found: dict[str, float] = {}
 
     def measure(self, surface: "ModelSurface", *, same_faces: bool) -> dict[str, float]:
-        """``components``, ``euler`` and ``self_crossings``; ``same_faces`` where the last surface
-        had these faces.
+        """``components``, ``euler_characteristic`` and ``self_crossings``; ``same_faces`` where the
+        last surface had these faces.
         """
         vertices, faces = surface.vertices, np.asarray(surface.faces)
         if self._tree is None or not same_faces:
             self._tree = FaceTree(vertices, faces)
             label = label_sheets(faces, len(vertices))[1]
             self._found["components"] = len(np.unique(label[faces[:, 0]]))
-            self._found["euler"] = euler_characteristic(faces)
+            self._found["euler_characteristic"] = euler_characteristic(faces)
         drawn = surface.origin[0] if surface.origin is not None else surface
         if self._drawn is not drawn:
             self._found["self_crossings"] = int(self._tree.crossing(vertices).sum())

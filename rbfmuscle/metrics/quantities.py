@@ -43,7 +43,10 @@ QUANTITIES = {
         "greatest relative error of the volume of a region of the elastic solid",
     ),
     "components": ("1", "closed pieces of the surface"),
-    "euler": ("1", "Euler characteristic of the surface: 2 for a sphere, two less for each handle"),
+    "euler_characteristic": (
+        "1",
+        "Euler characteristic of the surface: 2 for a sphere, two less for each handle",
+    ),
     "self_crossings": ("1", "triangles of the surface that cross others of it"),
     "unfitted_fraction": (
         "1",
@@ -120,13 +123,13 @@ ALL = "all"
 
 
 class Row(NamedTuple):
-    """One line of ``metrics.csv``; the angle is in degrees, the value of a translation in scene
-    units.
+    """One line of ``metrics.csv``, where ``coordinate_value`` [degree, of a translation scene unit]
+    is the column ``angle``.
     """
 
     frame: int
     coordinate: str
-    angle: float
+    coordinate_value: float
     muscle: str
     quantity: str
     value: float

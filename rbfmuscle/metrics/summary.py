@@ -39,7 +39,7 @@ class Limits(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """Greatest allowed magnitude of a quantity (of those in `LEAST` the least), lengths in
+    """Greatest allowed magnitude of a quantity (of those in `LOWER_BOUNDS` the least), lengths in
     millimetres.
     """
 
@@ -67,7 +67,7 @@ LIMITS = {
         0.3, "overlap left at rest", "move muscle or bone apart: rbfmuscle check SCENE"
     ),
     "components": Limit(1.0, "pieces", f"{_LOOK}; {_MORE_CENTRES}"),
-    "euler": Limit(2.0, "Euler characteristic", f"{_LOOK}; {_MORE_CENTRES}"),
+    "euler_characteristic": Limit(2.0, "Euler characteristic", f"{_LOOK}; {_MORE_CENTRES}"),
     "self_crossings": Limit(
         0.0, "self-crossing triangles", "raise model.iterations, or use model pbd-converged"
     ),
@@ -100,7 +100,7 @@ LIMITS = {
     "bones_left_out": Limit(0.0, "bones left out", "repair their meshes and add them to the scene"),
 }
 # Quantities of which too little is wrong: their limit is the least allowed value.
-LEAST = {"euler"}
+LOWER_BOUNDS = {"euler_characteristic"}
 # Limits of the whole scene, measured under the muscle `ALL`; all others are of each muscle.
 OF_SCENE = ("bone_overlap", "joint_gap", "bones_left_out")
 # Limits that not every muscle has, and the quantity without which it has none: mesh models have no
@@ -114,7 +114,7 @@ NEEDS = {
     "moment_arm_jump": "moment_arm_jump",
     "moment_arm_reversal": "moment_arm_reversal",
 }
-COUNTS = ("components", "euler", "self_crossings", "tunnelled", "doubtful_guesses")
+COUNTS = ("components", "euler_characteristic", "self_crossings", "tunnelled", "doubtful_guesses")
 # An end without a tendon lies no farther from its bone than this share of the muscle's length.
 END_SHARE = 0.1
 # A muscle thinner than this [mm] may have this rest error [mm].
@@ -155,7 +155,7 @@ class Summary:
         worst and its frame.
 
         ``worst`` is the value of greatest magnitude, or the least where that is what is limited
-        (`LEAST`). A moment arm is named with its coordinate.
+        (`LOWER_BOUNDS`). A moment arm is named with its coordinate.
         """
         return {
             muscle: {
@@ -175,7 +175,9 @@ class Summary:
         known = np.isfinite(values)
         if known.any():
             finite = values[known]
-            worst = int(np.argmin(finite) if quantity in LEAST else np.argmax(np.abs(finite)))
+            worst = int(
+                np.argmin(finite) if quantity in LOWER_BOUNDS else np.argmax(np.abs(finite))
+            )
             facts |= {
                 "min": float(finite.min()),
                 "max": float(finite.max()),
@@ -254,11 +256,11 @@ def muscle_limit(quantity: str, limits: Limits, found: Mapping[str, Mapping[str,
     )
 
 
-def within(quantity: str, worst: float, limit: float) -> bool:
+def meets_limit(quantity: str, worst: float, limit: float) -> bool:
     """Whether a worst value keeps to a limit, which is the least allowed value for those in
-    `LEAST`; NaN does not.
+    `LOWER_BOUNDS`; NaN does not.
     """
-    return worst >= limit if quantity in LEAST else abs(worst) <= limit
+    return worst >= limit if quantity in LOWER_BOUNDS else abs(worst) <= limit
 
 
 def exceeded(table: Table, limits: Limits) -> list[tuple[str, str, float, float, int | None]]:
@@ -274,9 +276,9 @@ def exceeded(table: Table, limits: Limits) -> list[tuple[str, str, float, float,
             limit = muscle_limit(quantity, limits, quantities)
             worst = facts.get("worst")
             worst = math.nan if worst is None else worst  # as a file has it
-            if not within(quantity, worst, limit):
+            if not meets_limit(quantity, worst, limit):
                 found.append((muscle, name, worst, limit, facts.get("worst_frame")))
-    return sorted(found, key=lambda row: excess(*row[1:4]), reverse=True)
+    return sorted(found, key=lambda row: limit_ratio(*row[1:4]), reverse=True)
 
 
 def unmeasured(table: Table, limits: Limits) -> list[tuple[str, str]]:
@@ -302,12 +304,12 @@ def unmeasured(table: Table, limits: Limits) -> list[tuple[str, str]]:
     return found
 
 
-def excess(quantity: str, worst: float, limit: float) -> float:
+def limit_ratio(quantity: str, worst: float, limit: float) -> float:
     """How many times its limit a worst value is; of limits that cannot say so, 0 within and
     infinite beyond.
     """
-    if quantity in LEAST or limit <= 0 or not math.isfinite(worst):
-        return 0.0 if within(quantity, worst, limit) else math.inf
+    if quantity in LOWER_BOUNDS or limit <= 0 or not math.isfinite(worst):
+        return 0.0 if meets_limit(quantity, worst, limit) else math.inf
     return abs(worst) / limit
 
 
@@ -414,7 +416,7 @@ def require_limits(table: Table, limits: Limits) -> None:
     """
     failing = limits.failing()
     texts = [
-        f"{m}: {q} = {v:.4g} {'<' if q in LEAST else '>'} {limit:g} at frame {f}"
+        f"{m}: {q} = {v:.4g} {'<' if q in LOWER_BOUNDS else '>'} {limit:g} at frame {f}"
         for m, q, v, limit, f in exceeded(table, failing)
     ]
     missing = unmeasured(table, failing)

@@ -51,7 +51,7 @@ def export_run(
     UsageError
         If the folder holds no run, or a format or unit is unknown, or a surface does not keep its
         vertices, or the folder of a format holds anything but an earlier export.
-    SolveError, MissingPartError
+    SolveError, MissingDependencyError
         If a file cannot be written; if a format needs a package that is absent.
     """
     run = open_run(run)

@@ -67,7 +67,8 @@ class RunData:
     frames : list of Frame
         Those that were written, in their order.
     metrics : list of Row
-        (frame, coordinate, angle [degree], muscle, quantity, value, unit), frame by frame.
+        (frame, coordinate, coordinate_value [degree], muscle, quantity, value, unit), frame by
+        frame.
     directory : Path or None
         The run's folder; None of a run in memory.
     units : {"m", "cm", "mm"}

@@ -33,7 +33,7 @@ from rbfmuscle.validation import SolveError, UsageError
 TABLES = {
     "poses.csv": ("frame", "bone", *(f"m{i}{j}" for i in range(4) for j in range(4))),
     "events.csv": ("frame", "muscle", "bone", "count", "action"),
-    "metrics.csv": Row._fields,
+    "metrics.csv": tuple("angle" if x == "coordinate_value" else x for x in Row._fields),
 }
 
 LIGHT = 1600  # triangles of a bone that moves

@@ -14,7 +14,17 @@ from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.run_data import RunData
-from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, limit_state
+from rbfmuscle.report.page import (
+    BAD,
+    GOOD,
+    PLAIN,
+    Cell,
+    CheckRow,
+    Page,
+    Section,
+    Table,
+    limit_state,
+)
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.report import packed_scene
 
@@ -73,12 +83,12 @@ def _values(found: dict[str, Any], quantity: str) -> list[float | None]:
     return values if any(value is not None for value in values) else []
 
 
-def _light(found: dict[str, Any], quantity: str, limit: float | None) -> Light:
+def _light(found: dict[str, Any], quantity: str, limit: float | None) -> CheckRow:
     values = _values(found, quantity)
     cells = [Cell(shown(found, quantity, x), limit_state(quantity, x, limit)) for x in values]
     # A column of limits would be off a phone's screen.
     note = MEASURES[quantity].meaning if limit is None else f"limit {shown(found, quantity, limit)}"
-    return Light(MEASURES[quantity].title, cells, note=note)
+    return CheckRow(MEASURES[quantity].title, cells, note=note)
 
 
 def shown(found: dict[str, Any], quantity: str, value: float | None) -> str:

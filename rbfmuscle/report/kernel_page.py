@@ -16,7 +16,17 @@ from rbfmuscle.experiments.kernel_study import (
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.writer import json_text
-from rbfmuscle.report.page import BAD, GOOD, PLAIN, Cell, Light, Page, Section, Table, number_cell
+from rbfmuscle.report.page import (
+    BAD,
+    GOOD,
+    PLAIN,
+    Cell,
+    CheckRow,
+    Page,
+    Section,
+    Table,
+    number_cell,
+)
 from rbfmuscle.report.plots import Point, front_plot
 
 # Quantity: heading, factor.
@@ -109,7 +119,7 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
     )
 
 
-def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
+def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[CheckRow]:
     """Of one surface its best rows, each with whether it ties; of several what is recommended for
     each.
     """
@@ -128,7 +138,7 @@ def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[Light]:
     cells = [
         [number_cell(row["rms"], units, s), number_cell(cost(row), "s")] for _, row, s in chosen
     ]
-    return [Light(row_name(row), pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
+    return [CheckRow(row_name(row), pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
 
 
 def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rbfmuscle.folders import write_whole
-from rbfmuscle.metrics.summary import COUNTS, shown_number, within
+from rbfmuscle.metrics.summary import COUNTS, meets_limit, shown_number
 from rbfmuscle.validation import SolveError
 
 GOOD = "good"
@@ -38,7 +38,7 @@ class Table(NamedTuple):
     rows: Sequence[Sequence[Cell]]
 
 
-class Light(NamedTuple):
+class CheckRow(NamedTuple):
     """A row beside the picture: cells with their states, the limit, and a note below the title."""
 
     title: str
@@ -79,7 +79,7 @@ class Page:
     scene: str = ""
     plot: str = ""
     missing: str = ""
-    lights: Sequence[Light] = ()
+    lights: Sequence[CheckRow] = ()
     heads: Sequence[str] = ("worst",)
     sections: Sequence[Section] = ()
     footer: str = ""
@@ -99,11 +99,11 @@ class Page:
 
 
 def limit_state(quantity: str, value: float | None, limit: float | None) -> str:
-    """Light of a value: bad beyond its limit, near from four fifths of it (no count is), good, or
+    """State of a value: bad beyond its limit, near from four fifths of it (no count is), good, or
     plain without one.
     """
     if value is None or limit is None:
         return PLAIN
-    if not within(quantity, value, limit):
+    if not meets_limit(quantity, value, limit):
         return BAD
     return NEAR if quantity not in COUNTS and abs(value) > _NEAR_LIMIT * limit else GOOD

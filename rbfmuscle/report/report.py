@@ -14,15 +14,15 @@ from rbfmuscle.fibres.published import published_band
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import (
     COUNTS,
-    LEAST,
     LIMITS,
+    LOWER_BOUNDS,
     Limits,
     describe_unmeasured,
     exceeded,
-    excess,
+    limit_ratio,
+    meets_limit,
     muscle_limit,
     shown_number,
-    within,
 )
 from rbfmuscle.output.animation.page import pack_runs
 from rbfmuscle.output.animation.parts import read_animation
@@ -31,7 +31,7 @@ from rbfmuscle.report.page import (
     BAD,
     GOOD,
     Cell,
-    Light,
+    CheckRow,
     Page,
     Section,
     Table,
@@ -53,7 +53,12 @@ LIGHTS = {
         "tunnelled",
     ),
     "Is the scanned shape at rest": ("rest_error_rms",),
-    "Is one closed piece": ("components", "euler", "self_crossings", "unfitted_fraction"),
+    "Is one closed piece": (
+        "components",
+        "euler_characteristic",
+        "self_crossings",
+        "unfitted_fraction",
+    ),
     "Moves without jumps or bowing": ("flicker", "bowing"),
 }
 # Title, quantity, factor, unit (None: the scene's).
@@ -146,7 +151,7 @@ def _facts(saved: RunData) -> list[str]:
     return [f"model {', '.join(models)}", *kernel, *counts, *times]
 
 
-def _lights(saved: RunData) -> list[Light]:
+def _lights(saved: RunData) -> list[CheckRow]:
     """A row for each of `LIGHTS`, then one for whatever else is beyond a limit."""
     known = {quantity for quantities in LIGHTS.values() for quantity in quantities}
     limits, missing = _limits(saved), saved.info.get("not_measured", [])
@@ -156,7 +161,9 @@ def _lights(saved: RunData) -> list[Light]:
     found = [row for row in rows if row]
     if missing:
         found.append(
-            Light("Not measured", [Cell(str(len(missing)), BAD)], "", describe_unmeasured(missing))
+            CheckRow(
+                "Not measured", [Cell(str(len(missing)), BAD)], "", describe_unmeasured(missing)
+            )
         )
     return found
 
@@ -165,7 +172,7 @@ def _limits(saved: RunData) -> Limits:
     return Limits(saved.info["limits"], saved.info.get("fail_on", {}))
 
 
-def _light(saved: RunData, title: str, quantities: Sequence[str]) -> Light | None:
+def _light(saved: RunData, title: str, quantities: Sequence[str]) -> CheckRow | None:
     """The worst of some quantities against their limits, over muscles and frames."""
     limits, found = _limits(saved), []
     for muscle, table in saved.info["muscles"].items():
@@ -176,8 +183,8 @@ def _light(saved: RunData, title: str, quantities: Sequence[str]) -> Light | Non
                 limit = muscle_limit(name, limits, table)
                 near = (
                     0.0
-                    if name in COUNTS and within(name, worst, limit)
-                    else excess(name, worst, limit)
+                    if name in COUNTS and meets_limit(name, worst, limit)
+                    else limit_ratio(name, worst, limit)
                 )
                 found.append((near, muscle, name, worst, facts, limit))
     if not found:
@@ -187,9 +194,11 @@ def _light(saved: RunData, title: str, quantities: Sequence[str]) -> Light | Non
         facts["unit"],
         f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}",
     )
-    allowed = f"{'≥' if name in LEAST else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}"
+    allowed = (
+        f"{'≥' if name in LOWER_BOUNDS else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}"
+    )
     cells, note = [number_cell(worst, unit, limit_state(name, worst, limit))], _title(name)
-    return Light(title, cells, allowed, note + place if worst else note)
+    return CheckRow(title, cells, allowed, note + place if worst else note)
 
 
 def _title(name: str) -> str:
@@ -297,7 +306,11 @@ def _summary(saved: RunData) -> Table:
     head = ["muscle"]
     for name in used:
         unit = next(found[name]["unit"] for found in muscles.values() if name in found)
-        limit = "" if name not in values else f" ({'≥' if name in LEAST else '≤'} {values[name]:g})"
+        limit = (
+            ""
+            if name not in values
+            else f" ({'≥' if name in LOWER_BOUNDS else '≤'} {values[name]:g})"
+        )
         head.append(f"{name.replace('_', ' ')}{'' if unit == '1' else f' [{unit}]'}{limit}")
     rows = [
         [Cell(name), *(_cell(q, found, limits) for q in used)] for name, found in muscles.items()

@@ -7,7 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from rbfmuscle.experiments.sweep_run import LENGTHS
-from rbfmuscle.report.page import GOOD, NEAR, PLAIN, Cell, Light, Page, Section, Table, number_cell
+from rbfmuscle.report.page import (
+    GOOD,
+    NEAR,
+    PLAIN,
+    Cell,
+    CheckRow,
+    Page,
+    Section,
+    Table,
+    number_cell,
+)
 from rbfmuscle.report.plots import Point, front_plot
 
 ROUNDING = 1e-9  # errors below it are none
@@ -89,7 +99,7 @@ def _short(row: dict[str, Any]) -> str:
 
 def _lights(
     rows: list[dict[str, Any]], verdicts: list[dict[str, Any]], quantity: str
-) -> list[Light]:
+) -> list[CheckRow]:
     """Of each default: itself, what is quicker, what is more accurate; then the two ends of the
     front.
     """
@@ -112,10 +122,10 @@ def _lights(
     return [_light(by_key[key], title, quantity, state) for title, key, state in chosen if key]
 
 
-def _light(row: dict[str, Any], title: str, quantity: str, state: str) -> Light:
+def _light(row: dict[str, Any], title: str, quantity: str, state: str) -> CheckRow:
     unit = row["units"] if quantity in LENGTHS else ""
     cells = [number_cell(row[quantity], unit, state), number_cell(row["time_frame"], "s")]
-    return Light(title, cells, note="" if row["role"] == "default" else _short(row))
+    return CheckRow(title, cells, note="" if row["role"] == "default" else _short(row))
 
 
 def _points(rows: list[dict[str, Any]]) -> Table:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rbfmuscle.metrics.depths import BoneProbe
+from rbfmuscle.metrics.depths import BoneDistance
 from rbfmuscle.output.appearance import VIEWS, view_axes
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.scene.scene import Scene
@@ -81,7 +81,7 @@ class Page:
 
         self.source, (self.server, self.address) = source, served or open_server()
         self._probes = [
-            BoneProbe(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()
+            BoneDistance(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()
         ]
         self._wake = threading.Event()
         self._closed = False

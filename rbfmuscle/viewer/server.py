@@ -10,7 +10,7 @@ from collections.abc import Callable
 from types import FunctionType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from rbfmuscle.validation import MissingPartError, UsageError
+from rbfmuscle.validation import MissingDependencyError, UsageError
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -91,7 +91,7 @@ def open_server(port: int = 0) -> "tuple[ViserServer, str]":
     """Start a server on the loopback address, at any free port for 0; return it and its address
     with the token.
 
-    MissingPartError if viser does not let its requests be checked.
+    MissingDependencyError if viser does not let its requests be checked.
     """
     import viser
 
@@ -102,7 +102,7 @@ def open_server(port: int = 0) -> "tuple[ViserServer, str]":
         server = _gated_server(gate)(host=LOOPBACK, port=port, label="rbfmuscle", verbose=False)
     if gate.inner is None:
         server.stop()
-        raise MissingPartError(
+        raise MissingDependencyError(
             f"requests to viser {viser.__version__} cannot be checked; install another version"
         )
     # Software drawing takes long for shadows, and longer for light from an image.

@@ -11,7 +11,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
-from rbfmuscle.metrics.depths import BoneProbe, surface_depth
+from rbfmuscle.metrics.depths import BoneDistance, surface_depth
 from rbfmuscle.output.appearance import (
     BONE_COLOUR,
     LONG,
@@ -64,7 +64,7 @@ def vertex_values(
     name: str,
     picture: Picture,
     rest: Picture,
-    probes: list[BoneProbe],
+    probes: list[BoneDistance],
     other: Picture | None,
 ) -> Floats:
     """One number for each vertex of a muscle, NaN where it is not known; ``other`` is the model
@@ -164,7 +164,7 @@ class Side:
         self.frame.visible = figure is not None
         return True
 
-    def draw(self, look: Look, probes: list[BoneProbe], other: Picture | None) -> None:
+    def draw(self, look: Look, probes: list[BoneDistance], other: Picture | None) -> None:
         """Show the picture; ``other`` is that of the model beside this one."""
         from viser.transforms import SO3
 

@@ -6,7 +6,7 @@ import trimesh
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.solids import outer_surface
-from rbfmuscle.metrics.depths import BoneProbe
+from rbfmuscle.metrics.depths import BoneDistance
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.meshes.read import prepare_mesh
 
@@ -71,7 +71,7 @@ SHELLS = {
 def test_a_bone_is_solid_to_its_outer_surface_for_all(kind):
     mesh = SHELLS[kind]
     field = BoneSDF.from_mesh(mesh, cache=False)
-    bone, probe = Bone("femur", mesh), BoneProbe("femur", mesh)
+    bone, probe = Bone("femur", mesh), BoneDistance("femur", mesh)
     for distance in (bone.distances, probe.signed, field.distance):
         np.testing.assert_allclose(distance(ASKED), RIGHT, atol=FACETING)
     points = np.random.default_rng(0).uniform(-28, 28, (5000, 3))

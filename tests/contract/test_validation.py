@@ -29,7 +29,7 @@ CODES = {
     "MeshError": 4,
     "SolveError": 5,
     "LimitExceededError": 6,
-    "MissingPartError": 7,
+    "MissingDependencyError": 7,
 }
 NOT_FINITE = [np.insert(np.zeros((4, 3)), 3, value, axis=0) for value in (np.nan, np.inf, -np.inf)]
 TETRAHEDRON = np.vstack([np.zeros(3), np.eye(3)]), [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]

@@ -7,7 +7,7 @@ import trimesh
 from rbfmuscle.fibres.flux import FluxField
 from rbfmuscle.fibres.trace import trace_fibres
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.metrics.depths import BoneProbe
+from rbfmuscle.metrics.depths import BoneDistance
 
 LENGTH, SIDE = 60.0, 12.0
 
@@ -94,7 +94,7 @@ def test_fibres_between_two_aponeuroses_follow_polylines():
 def test_fibres_stay_in_the_muscle_and_out_of_bones():
     ball = trimesh.creation.icosphere(4, 4.0)
     ball.apply_translation([0.5 * LENGTH, -0.5 * SIDE, 0.0])
-    probe = BoneProbe("ball", ball)
+    probe = BoneDistance("ball", ball)
     mesh = MeshDistance(*bar())
     lines, _ = trace_fibres(mesh, caps(), 40, bones=[probe])
     inner = lines[:, 1:-1].reshape(-1, 3)

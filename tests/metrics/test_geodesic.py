@@ -9,18 +9,18 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.metrics.centreline import NODES, Centreline, shortest_path
-from rbfmuscle.metrics.depths import BoneProbe
+from rbfmuscle.metrics.depths import BoneDistance
 from rbfmuscle.scene.objects import Attachment
 
 RADIUS, FAR = 10.0, 25.0
 
 
 def ball():
-    return BoneProbe("ball", trimesh.creation.icosphere(5, RADIUS))
+    return BoneDistance("ball", trimesh.creation.icosphere(5, RADIUS))
 
 
 def pulley():
-    return BoneProbe("ball", trimesh.creation.cylinder(RADIUS, 80.0, sections=256))
+    return BoneDistance("ball", trimesh.creation.cylinder(RADIUS, 80.0, sections=256))
 
 
 def over_the_ball(height):

@@ -33,7 +33,7 @@ TABLE = {
     "flicker": (0.5, 0.51),
     "self_crossings": (0, 1),
     "components": (1, 2),
-    "euler": (2, 0),
+    "euler_characteristic": (2, 0),
     "bowing": (1.03, 1.04),
     "end_gap": (25.0, 25.1),
     "unfitted_fraction": (0.9, 1.0),
@@ -165,9 +165,11 @@ def test_limits_of_the_command_line_follow_the_unit():
     assert limits.values["penetration_max"] == pytest.approx(0.0001)
     assert limits.values["volume_error"] == 1e-9 and limits.values["flicker"] == 2.0
     assert limits.fail_on == {name: 2.0 if name == "flicker" else None for name in LIMITS}
-    asked = parse_limits("flicker=2,euler,length=9", arm_scene())
-    assert asked.fail_on == {"flicker": 2.0, "euler": None, "length": 9.0}
-    assert asked.failing() == Limits({"flicker": 2.0, "euler": 2.0, "length": 9.0}, asked.fail_on)
+    asked = parse_limits("flicker=2,euler_characteristic,length=9", arm_scene())
+    assert asked.fail_on == {"flicker": 2.0, "euler_characteristic": None, "length": 9.0}
+    assert asked.failing() == Limits(
+        {"flicker": 2.0, "euler_characteristic": 2.0, "length": 9.0}, asked.fail_on
+    )
     for text in ("penetration", "length", "volume_error=abc", "volume_error=-1"):
         with pytest.raises(UsageError):
             parse_limits(text, arm_scene())

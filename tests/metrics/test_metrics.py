@@ -10,7 +10,7 @@ import trimesh
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.mesh_distance import Columns, MeshDistance
 from rbfmuscle.metrics.centreline import Centreline, split_ends
-from rbfmuscle.metrics.depths import BoneProbe, bone_depth, surface_depth
+from rbfmuscle.metrics.depths import BoneDistance, bone_depth, surface_depth
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.metrics.rows import _smoothness, moment_arms
@@ -130,7 +130,7 @@ class TestPenetration:
         spike = trimesh.creation.cone(radius=1.0, height=6.0)  # apex at z = 6
         pose = np.eye(4)
         pose[:3, 3] = [3.3, 4.1, -9.0]  # apex at z = -3, that is 2 above the block's lower face
-        probes = [BoneProbe("spike", spike)]
+        probes = [BoneDistance("spike", spike)]
         assert surface_depth(np.array(block.vertices), probes, {"spike": pose}).max() == 0
         depth = bone_depth(MeshDistance(*arrays(block)), probes, {"spike": pose})
         assert depth == pytest.approx(2.0, abs=1e-9)
@@ -149,7 +149,7 @@ class TestMeshMeasures:
         moved = ModelSurface(folded.vertices + 5.0, one.faces, origin=(folded, np.eye(4)))
         form = SurfaceForm()
         found = [form.measure(s, same_faces=s is not other) for s in (one, folded, moved, other)]
-        assert [m["euler"] for m in found] == [2, 2, 2, 0]
+        assert [m["euler_characteristic"] for m in found] == [2, 2, 2, 0]
         assert found[0]["self_crossings"] == 0 < found[1]["self_crossings"]
         assert found[2] == found[1]
         assert found[3]["self_crossings"] == 0

@@ -208,7 +208,7 @@ def test_promises_hold_in_each_frame_of_a_combined_motion(muscle, ends, flicker,
     scene.muscles = [scene.muscle(muscle)]
     scene.set_motion(ramp=ramp(*ends, step=6))
     run = rm.simulate(scene)
-    assert (run.values(muscle, "euler") == 2).all()
+    assert (run.values(muscle, "euler_characteristic") == 2).all()
     assert run.values(muscle, "self_crossings").max() == 0
     assert abs(run.values(muscle, "volume_error")).max() < 1e-10
     assert run.values(muscle, "unfitted_fraction").max() < 0.1

@@ -18,7 +18,7 @@ from rbfmuscle.output.export import export_run
 from rbfmuscle.output.vtp import write_vtp
 from rbfmuscle.report.page import Page
 from rbfmuscle.run import Run
-from rbfmuscle.validation import MissingPartError, UsageError
+from rbfmuscle.validation import MissingDependencyError, UsageError
 
 TOLERANCE = 1e-6  # [m]: what single precision holds at a metre, with room
 TIMES = [1.0, 1.25, 2.0, 2.5, 3.0, 4.0, 4.25]
@@ -115,7 +115,9 @@ class TestUsd:
 def test_usd_without_its_package_is_one_line(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     monkeypatch.setitem(sys.modules, "pxr.Usd", None)
-    with pytest.raises(MissingPartError, match=r"usd-core: pip install -e '\.\[usd\]'") as told:
+    with pytest.raises(
+        MissingDependencyError, match=r"usd-core: pip install -e '\.\[usd\]'"
+    ) as told:
         export_run(folder, ["ply", "usd"], output=tmp_path)
     assert told.value.exit_code == 7
     assert not list(tmp_path.iterdir())

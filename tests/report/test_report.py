@@ -101,7 +101,7 @@ def test_lights_are_green_amber_from_four_fifths_and_red_beyond():
     states = [limit_state("flicker", v, 0.5) for v in (0.1, -0.4, 0.45, 0.5, -0.51, np.nan)]
     assert states == ["good", "good", "near", "near", "bad", "bad"]
     assert [limit_state("components", v, 1.0) for v in (1.0, 2.0)] == ["good", "bad"]
-    assert [limit_state("euler", v, 2.0) for v in (2.0, 0.0)] == ["good", "bad"]
+    assert [limit_state("euler_characteristic", v, 2.0) for v in (2.0, 0.0)] == ["good", "bad"]
     assert limit_state("flicker", 5.0, None) == limit_state("flicker", None, 1.0) == "plain"
 
 

@@ -8,7 +8,7 @@ import toy_scene
 import trimesh
 
 import rbfmuscle as rm
-from rbfmuscle.metrics.depths import BoneProbe
+from rbfmuscle.metrics.depths import BoneDistance
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession
 from rbfmuscle.viewer.panel import Panel
@@ -82,7 +82,7 @@ def test_stretch_of_a_ball_that_grew_and_its_depth_in_a_box():
     np.testing.assert_allclose(values, 0.2, atol=1e-12)
     bone = trimesh.creation.box(extents=(100.0, 100.0, 100.0))
     bone.apply_translation((0.0, 0.0, 58.0))  # its lower face cuts the ball 2 below the top
-    values = vertex_values("penetration", "ball", rest, rest, [BoneProbe("bone", bone)], None)
+    values = vertex_values("penetration", "ball", rest, rest, [BoneDistance("bone", bone)], None)
     np.testing.assert_allclose(values, np.maximum(vertices[:, 2] - 8.0, 0.0), atol=1e-9)
 
 

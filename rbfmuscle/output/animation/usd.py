@@ -17,16 +17,16 @@ from rbfmuscle.output.animation.parts import (
 )
 from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
 from rbfmuscle.scene.objects import MM_PER_UNIT
-from rbfmuscle.validation import MissingPartError
+from rbfmuscle.validation import MissingDependencyError
 
 
 def check_usd() -> None:
-    """Raise MissingPartError where the package that writes USD is absent."""
+    """Raise MissingDependencyError where the package that writes USD is absent."""
     try:
         import pxr.Usd  # noqa: F401
     except ImportError:
         message = "export to usd needs usd-core: pip install -e '.[usd]' in rbfmuscle's folder"
-        raise MissingPartError(message) from None
+        raise MissingDependencyError(message) from None
 
 
 def write_usd(path: Path, run: Animation) -> None:
