@@ -27,6 +27,7 @@ from rbfmuscle.metrics.summary import (
     unmeasured,
 )
 from rbfmuscle.models import build_models, configure_scene, kernel_names
+from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.writer import Neighbours, RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
@@ -50,7 +51,7 @@ class MemorySink:
     def __init__(self) -> None:
         self.frames: list[Frame] = []
         self.rows: list[Row] = []
-        self.info: dict[str, Any] = {}
+        self.info: RunInfo | None = None
 
     def write(self, frame: Frame, rows: Sequence[Row] = ()) -> None:
         """Keep a frame, and the rows of metrics that are complete by now."""
@@ -61,7 +62,7 @@ class MemorySink:
         """Keep the last rows."""
         self.rows.extend(rows)
 
-    def write_info(self, info: dict[str, Any]) -> None:
+    def write_info(self, info: RunInfo) -> None:
         """Keep the facts, in place of those before."""
         self.info = info
 
@@ -153,9 +154,9 @@ class Recording:
                 self._end = time.perf_counter()
                 sink.write_info(self.info())
 
-    def finish(self, writer: RunWriter, *, pictures: bool = True) -> dict[str, Any]:
+    def finish(self, writer: RunWriter, *, pictures: bool = True) -> RunInfo:
         """Write report and pictures of a run that is in a folder, then hold it to the limits that
-        it may fail on; what ``run.json`` holds.
+        it may fail on; its facts.
         """
         start = time.perf_counter()
         with timed(self.times, "report"), stage("drawing pictures"):
@@ -205,8 +206,8 @@ class Recording:
         self.summary.add(rows)
         return rows
 
-    def info(self, status: str | None = None) -> dict:
-        """What ``run.json`` holds by now."""
+    def info(self, status: str | None = None) -> RunInfo:
+        """The facts by now."""
         self.times["wall"] = (self._end or time.perf_counter()) - self._start
         table = self.summary.table()
         limits = self.limits

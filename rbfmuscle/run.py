@@ -12,6 +12,7 @@ from rbfmuscle.folders import LIST, read_list
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.export import export_run
+from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.run_data import RunData, SceneMeshes
 from rbfmuscle.output.run_folder import FolderMeshes
 from rbfmuscle.output.writer import RunWriter, run_folder
@@ -94,6 +95,7 @@ def simulate(
 def _kept_run(recording: Recording, memory: MemorySink) -> Run:
     """The run of which a sink holds the frames."""
     meshes = SceneMeshes(recording.scene)
+    assert memory.info is not None
     return Run(memory.info, memory.frames, memory.rows, meshes, recording=recording)
 
 
@@ -107,8 +109,8 @@ def stream_run(
     fail_on: str | Sequence[str] | None = None,
     pictures: bool = True,
     progress: Callable[[int, int], None] | None = None,
-) -> dict[str, Any]:
-    """Run a scene and write it to a folder frame by frame, and return what ``run.json`` holds.
+) -> RunInfo:
+    """Run a scene and write it to a folder frame by frame, and return its facts.
 
     Memory does not grow with the frames. The scene's ``output`` table says what is written;
     ``model``, ``settings``, ``frames`` and ``progress`` are as for `simulate`; ``fail_on`` are
@@ -124,7 +126,7 @@ def stream_run(
         If a frame cannot be solved or written; frames so far are kept.
     LimitExceededError
         If a limit of ``fail_on`` is exceeded, or was not measured; everything is written, and its
-        ``info`` is what ``run.json`` holds.
+        ``info`` is the `RunInfo`.
     """
     run_folder(directory)
     recording = Recording(scene, model=model, settings=settings, frames=frames, fail_on=fail_on)
@@ -155,7 +157,7 @@ class Run(RunData):
 
     def __init__(
         self,
-        info: dict[str, Any],
+        info: RunInfo,
         frames: list[Frame],
         metrics: list[Row],
         meshes: SceneMeshes | FolderMeshes,

@@ -51,7 +51,7 @@ class LimitExceededError(RBFMuscleError, RuntimeError):
     """A limit given with ``--fail-on`` was exceeded, or not measured (exit code 6); everything is
     written.
 
-    ``info`` is what ``run.json`` holds.
+    ``info`` is the `RunInfo`.
     """
 
     exit_code = 6

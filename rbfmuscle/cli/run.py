@@ -3,11 +3,14 @@
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rbfmuscle.cli.options import Frames, Json, Model, Output, SceneName, Settings, chosen_muscle
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import LimitExceededError, SolveError
+
+if TYPE_CHECKING:
+    from rbfmuscle.output.info import RunInfo
 
 
 def demo(
@@ -74,7 +77,7 @@ def run(
     if as_json:
         from rbfmuscle.output.writer import json_text
 
-        print(json_text({"directory": str(output), **info, **failed}))
+        print(json_text({"directory": str(output), **info.to_dict(), **failed}))
     else:
         _print_result(info, output, time.perf_counter() - start)
     if failed:
@@ -82,8 +85,8 @@ def run(
     return failed.get("exit_code", 0)
 
 
-def _print_result(info: dict[str, Any], output: Path, seconds: float) -> None:
-    print(f"verdict: {info['verdict']}")
+def _print_result(info: "RunInfo", output: Path, seconds: float) -> None:
+    print(f"verdict: {info.verdict}")
     report = output / "report.html"
     there = f"in {output}, open {report}" if report.exists() else f"in {output}"
-    print(f"{len(info['frames'])} frames in {seconds:.1f} s, {there}")
+    print(f"{len(info.frames)} frames in {seconds:.1f} s, {there}")

@@ -110,7 +110,7 @@ def measure_run(saved: RunData, extra: dict[str, Any]) -> dict[str, Any]:
     """
     found = {}
     for muscle in saved.muscles:
-        facts = saved.info["muscles"].get(muscle, {})
+        facts = saved.info.muscles.get(muscle, {})
         values = {q: facts[q]["worst"] for q in _FROM_METRICS if "worst" in facts.get(q, {})}
         times = saved.series(muscle, "time_frame")[1][1:]  # the first loads and compiles
         if len(times):
@@ -124,7 +124,8 @@ def measure_run(saved: RunData, extra: dict[str, Any]) -> dict[str, Any]:
         found[muscle] = values
     together = {}
     for name, measure in MEASURES.items():
-        worst = [values[name] for values in found.values() if values.get(name) is not None]
+        known = [values.get(name) for values in found.values()]
+        worst = [value for value in known if value is not None]
         together[name] = max(worst, key=lambda v: abs(v - measure.ideal), default=None)
     wall = saved.series(ALL, "time_frame")[1][1:]
     if len(wall):

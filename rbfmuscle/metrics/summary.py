@@ -5,9 +5,10 @@ its verdict.
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row
 from rbfmuscle.scene.check import MOST_ARTICULAR
@@ -15,8 +16,43 @@ from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import LimitExceededError, UsageError, did_you_mean
 
+
+class QuantityFacts(TypedDict, total=False):
+    """What a quantity of a muscle amounts to over the frames [``unit``]; None where it is NaN."""
+
+    unit: str
+    count: int
+    first: float | None
+    last: float | None
+    min: float
+    max: float
+    mean: float
+    median: float
+    worst: float | None
+    worst_frame: int
+
+
 # Of a run: muscle -> quantity -> facts, as `Summary.table` gives them.
-Table = Mapping[str, Mapping[str, Mapping[str, Any]]]
+Table = Mapping[str, Mapping[str, QuantityFacts]]
+
+
+class Exceedance(NamedTuple):
+    """A worst value beyond its limit [unit of ``metrics.csv``], and its frame; a moment arm is
+    named with its coordinate. The value is NaN (in files None) where it is unknown.
+    """
+
+    muscle: str
+    quantity: str
+    value: float | None
+    limit: float
+    frame: int | None
+
+
+class Unmeasured(NamedTuple):
+    """A limit without a value."""
+
+    muscle: str
+    quantity: str
 
 
 class Limits(NamedTuple):
@@ -150,7 +186,7 @@ class Summary:
             if quantity in found
         }
 
-    def table(self) -> dict[str, dict[str, dict[str, Any]]]:
+    def table(self) -> dict[str, dict[str, QuantityFacts]]:
         """Nested dict: muscle -> quantity -> unit, count, min, max, mean, median, first, last,
         worst and its frame.
 
@@ -239,16 +275,18 @@ def _in_unit(value, quantity, unit):
     return value / MM_PER_UNIT[unit] if QUANTITIES[quantity][0] == "length" else value
 
 
-def muscle_limit(quantity: str, limits: Limits, found: Mapping[str, Mapping[str, Any]]) -> float:
+def muscle_limit(quantity: str, limits: Limits, found: Mapping[str, QuantityFacts]) -> float:
     """Limit of one muscle: of defaults, thin ones and those bowed at rest have wider ones."""
     limit = limits.values[quantity]
     if limits.is_given(quantity):
         return limit
-    if quantity == "end_gap" and "length" in found:
-        return min(limit, END_SHARE * found["length"]["first"])
+    length = found.get("length", {}).get("first")
+    if quantity == "end_gap" and length is not None:
+        return min(limit, END_SHARE * length)
     if quantity == "rest_error_rms" and "thickness" in found:
         unit = found["thickness"]["unit"]
-        thin = found["thickness"]["first"] < _in_unit(THIN, "thickness", unit)
+        thickness = found["thickness"]["first"]
+        thin = thickness is not None and thickness < _in_unit(THIN, "thickness", unit)
         return _in_unit(THIN_REST_ERROR, quantity, unit) if thin else limit
     at_rest = found.get("bowing_at_rest", {}).get("first")
     return (
@@ -263,10 +301,8 @@ def meets_limit(quantity: str, worst: float, limit: float) -> bool:
     return worst >= limit if quantity in LOWER_BOUNDS else abs(worst) <= limit
 
 
-def exceeded(table: Table, limits: Limits) -> list[tuple[str, str, float, float, int | None]]:
-    """List of (muscle, quantity, worst value, limit, frame) beyond the limits; NaN counts as
-    beyond.
-    """
+def exceeded(table: Table, limits: Limits) -> list[Exceedance]:
+    """What is beyond the limits, the worst first; NaN counts as beyond."""
     found = []
     for muscle, quantities in table.items():
         for name, facts in quantities.items():
@@ -277,12 +313,16 @@ def exceeded(table: Table, limits: Limits) -> list[tuple[str, str, float, float,
             worst = facts.get("worst")
             worst = math.nan if worst is None else worst  # as a file has it
             if not meets_limit(quantity, worst, limit):
-                found.append((muscle, name, worst, limit, facts.get("worst_frame")))
-    return sorted(found, key=lambda row: limit_ratio(*row[1:4]), reverse=True)
+                found.append(Exceedance(muscle, name, worst, limit, facts.get("worst_frame")))
+    return sorted(found, key=_exceedance_ratio, reverse=True)
 
 
-def unmeasured(table: Table, limits: Limits) -> list[tuple[str, str]]:
-    """List of (muscle, quantity) for limits without a value; `ALL` where no muscle has one."""
+def _exceedance_ratio(row: Exceedance) -> float:
+    return limit_ratio(row.quantity, math.nan if row.value is None else row.value, row.limit)
+
+
+def unmeasured(table: Table, limits: Limits) -> list[Unmeasured]:
+    """The limits without a value; `ALL` where no muscle has one."""
     muscles = [name for name in table if name != ALL]
     found = []
     for quantity in limits.values:
@@ -300,7 +340,7 @@ def unmeasured(table: Table, limits: Limits) -> list[tuple[str, str]]:
             wanted = [] if having else [ALL]
         if limits.is_given(quantity) and not having:
             wanted = wanted or [ALL]
-        found += [(muscle, quantity) for muscle in wanted if muscle not in having]
+        found += [Unmeasured(muscle, quantity) for muscle in wanted if muscle not in having]
     return found
 
 

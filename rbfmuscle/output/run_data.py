@@ -6,16 +6,18 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import moment_arms, reaches
+from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.output import appearance as look
+from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.metrics_table import metrics_table
-from rbfmuscle.output.run_folder import FolderMeshes, Mesh, read_run, tendon_muscles
+from rbfmuscle.output.run_folder import FolderMeshes, Mesh, read_run
 from rbfmuscle.scene.joints.tables import full_name
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
 from rbfmuscle.scene.scene import Scene
@@ -62,7 +64,7 @@ class RunData:
 
     Attributes
     ----------
-    info : dict
+    info : RunInfo
         What ``run.json`` holds.
     frames : list of Frame
         Those that were written, in their order.
@@ -83,22 +85,22 @@ class RunData:
 
     def __init__(
         self,
-        info: dict[str, Any],
+        info: RunInfo,
         frames: list[Frame],
         metrics: list[Row],
         meshes: SceneMeshes | FolderMeshes,
     ) -> None:
-        scene = info["scene"]
+        scene = info.scene
         self.info = info
         self.frames = frames
         self.metrics = metrics
         self.directory = meshes.directory
-        self.units: str = scene["units"]
-        self.body = body_axes(scene.get("superior"), scene.get("anterior"))
-        self.muscles: list[str] = [muscle["name"] for muscle in scene["muscles"]]
-        self.bones: list[str] = [bone["name"] for bone in scene["bones"]]
-        self.tendons = list(tendon_muscles(info))
-        self.groups = look.muscle_groups(info)
+        self.units: str = scene.units
+        self.body = body_axes(scene.superior, scene.anterior)
+        self.muscles: list[str] = [muscle.name for muscle in scene.muscles]
+        self.bones: list[str] = [bone.name for bone in scene.bones]
+        self.tendons = list(info.tendon_muscles)
+        self.groups = look.muscle_groups(info.to_dict())
         self.colours = look.muscle_colours(self.muscles, self.groups)
         self._meshes = meshes
         self._by_number = {frame.index: frame for frame in frames}
@@ -135,7 +137,7 @@ class RunData:
         self._require_surfaces()
         frame = self.frame(number)
         if name in self.tendons:
-            return self._meshes.tendons(tendon_muscles(self.info)[name], frame)
+            return self._meshes.tendons(self.info.tendon_muscles[name], frame)
         surface = frame.surfaces[name]
         return surface.vertices, surface.faces
 
@@ -157,14 +159,14 @@ class RunData:
         return [event for frame in self.frames for event in frame.events]
 
     @property
-    def summary(self) -> dict[str, dict[str, Any]]:
+    def summary(self) -> dict[str, dict[str, QuantityFacts]]:
         """Nested dict: muscle -> quantity -> min, max, mean, median, worst."""
-        return self.info["muscles"]
+        return self.info.muscles
 
     @property
     def verdict(self) -> str:
         """Which muscles are within all limits, which not, and the worst value."""
-        return self.info["verdict"]
+        return self.info.verdict
 
     @property
     def quantities(self) -> list[str]:
@@ -176,7 +178,7 @@ class RunData:
         """Values (frames,) of each coordinate [degree, of translations scene unit]; NaN where
         unknown.
         """
-        rows = [row["coordinates"] for row in self.info["frames"]]
+        rows = [row.coordinates for row in self.info.frames]
         names = sorted({name for row in rows for name in row})
         return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
 
@@ -264,22 +266,18 @@ class RunData:
         """Frame number, time and coordinates of a frame, as text; of many coordinates those that
         move most.
         """
-        rows, units = self.info["frames"], self.info["scene"].get("coordinate_units", {})
-        entry = next(row for row in rows if row["frame"] == number)
-        values = entry["coordinates"]
-        spans = {
-            name: np.ptp([row["coordinates"].get(name, 0.0) for row in rows]) for name in values
-        }
+        rows = self.info.frames
+        units = self.info.scene.coordinate_units
+        entry = next(row for row in rows if row.frame == number)
+        values = entry.coordinates
+        spans = {name: np.ptp([row.coordinates.get(name, 0.0) for row in rows]) for name in values}
         most = sorted(values, key=lambda name: -spans[name])[:MOST_SHOWN]
         texts = [f"{n} {value:.4g}{units.get(n, '°')}" for n, value in values.items() if n in most]
-        clock = [f"{entry['time']:.4g} s"] if "time" in entry else []
+        clock = [] if entry.time is None else [f"{entry.time:.4g} s"]
         return ", ".join([f"frame {number}", *clock, *texts])
 
     def __repr__(self) -> str:
-        return (
-            f"<Run of {self.info['scene']['name']!r}: {len(self)} frames, "
-            f"{', '.join(self.muscles)}>"
-        )
+        return f"<Run of {self.info.scene.name!r}: {len(self)} frames, {', '.join(self.muscles)}>"
 
 
 def open_run(run: RunData | str | Path) -> RunData:
@@ -332,8 +330,8 @@ class MuscleRun:
         path = [frame.coordinates for frame in self.run.frames]
         known = sorted({name for coordinates in path for name in coordinates})
         name = full_name(coordinate, known, place="moment_arms")
-        scene = self.run.info["scene"]
-        reach = reaches(known, scene.get("coordinate_units", {}), scene["units"])
+        scene = self.run.info.scene
+        reach = reaches(known, scene.coordinate_units, scene.units)
         lengths = self.fibre_lengths
         out = np.full(lengths.shape, np.nan)
         for row, found in zip(out, moment_arms(path, lengths, reach)):

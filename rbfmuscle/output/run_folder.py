@@ -6,19 +6,18 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.fibre_files import SavedFibres
+from rbfmuscle.output.info import FORMAT, FrameInfo, RunInfo
 from rbfmuscle.output.vtp import read_vtp
-from rbfmuscle.scene.build import check_name
-from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
-from rbfmuscle.validation import UsageError
+from rbfmuscle.validation import SceneError, UsageError
 
 Mesh = tuple[Floats, Integers]
 Poses = dict[int, dict[str, Floats]]  # (4, 4) by frame and bone
@@ -64,57 +63,43 @@ def surface_file(directory: Path, name: str, frame: int) -> Path:
     return directory / "surfaces" / f"{name}_{frame:04d}.vtp"
 
 
-def read_info(directory: Path) -> dict[str, Any]:
-    """What ``run.json`` holds, checked; UsageError if it is missing or is none of a run's."""
+def read_info(directory: Path) -> RunInfo:
+    """What ``run.json`` holds; UsageError if it is missing, is none of a run's, or is newer."""
     path = directory / "run.json"
     try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-        _check_info(info)
+        table = json.loads(path.read_text(encoding="utf-8"))
     except OSError:
         message = f"{directory} holds no run (no run.json); give the folder of 'run -o'"
         raise UsageError(message) from None
-    except (ValueError, KeyError, TypeError) as error:
-        message = f"{path} is not the run.json of a run ({error!r}); run the scene again"
+    except ValueError as error:
+        raise UsageError(f"{path} is not the run.json of a run ({error})") from None
+    version = table.get("format", 0) if isinstance(table, dict) else 0
+    if isinstance(version, int) and version > FORMAT:
+        raise UsageError(
+            f"{path} has format {version}, of a newer rbfmuscle; this one reads up to {FORMAT}: "
+            "update rbfmuscle"
+        )
+    try:
+        return RunInfo.model_validate(table)
+    except (ValidationError, SceneError) as error:
+        first = error.errors()[0] if isinstance(error, ValidationError) else None
+        place = ".".join(map(str, first["loc"])) if first else ""
+        what = f"{place} = {first['input']!r}: {first['msg']}" if first else str(error)
+        message = f"{path} is not the run.json of a run ({what[:300]}); run the scene again"
         raise UsageError(message) from None
-    return info
 
 
-def read_run(directory: Path) -> tuple[dict[str, Any], list[Frame], list[Row], FolderMeshes]:
+def read_run(directory: Path) -> tuple[RunInfo, list[Frame], list[Row], FolderMeshes]:
     """Facts, frames, metrics and meshes of the run in a folder, UsageError if it holds none.
 
     The frames lack what no file holds: material surfaces, and times of single muscles.
     """
     info = read_info(directory)
     poses = _read_poses(directory)
-    if info.get("status") == "running":
-        info["frames"] = _whole_frames(info, directory, poses)
+    if info.status == "running":
+        info = info.replaced(frames=_whole_frames(info, directory, poses))
     frames = _read_frames(info, directory, poses)
     return info, frames, _read_metrics(directory), FolderMeshes(directory)
-
-
-def tendon_muscles(info: dict[str, Any]) -> dict[str, str]:
-    """Muscle of each mesh of tendons, by the name of the mesh."""
-    if not info["scene"]["output"].get("tendons"):
-        return {}
-    muscles = info["scene"]["muscles"]
-    held = [m["name"] for m in muscles if any("tendon" in end for end in m.get("attach", ()))]
-    return {tendon_name(name): name for name in held}
-
-
-def _check_info(info: Any) -> None:
-    """Raise ValueError where names in ``run.json``, which become those of files, can be none of a
-    run's.
-    """
-    scene = info["scene"]
-    for what in ("muscle", "bone"):
-        for item in scene[f"{what}s"]:
-            check_name(item["name"], what)
-    if scene["units"] not in MM_PER_UNIT:
-        raise ValueError(f"units {scene['units']!r}")
-    scene["output"]["surfaces"]
-    for frame in info["frames"]:
-        if type(frame["frame"]) is not int or frame["frame"] < 0:
-            raise ValueError(f"frame {frame['frame']!r}")
 
 
 def _read_table(directory: Path, name: str) -> list[list[str]]:
@@ -139,47 +124,46 @@ def _read_poses(directory: Path) -> Poses:
     return found
 
 
-def _whole_frames(info: dict[str, Any], directory: Path, poses: Poses) -> list[dict[str, Any]]:
+def _whole_frames(info: RunInfo, directory: Path, poses: Poses) -> list[FrameInfo]:
     """Entries of ``run.json`` for the frames of which every file is there."""
-    planned = info.get("planned", [])
-    scene = info["scene"]
-    bones = {bone["name"] for bone in scene["bones"]}
-    meshes = [*(muscle["name"] for muscle in scene["muscles"]), *tendon_muscles(info)]
-    if not scene["output"]["surfaces"]:
+    planned = info.planned
+    bones = {bone.name for bone in info.scene.bones}
+    meshes = [*(muscle.name for muscle in info.scene.muscles), *info.tendon_muscles]
+    if not info.scene.output.surfaces:
         meshes = []
     return [
-        {
-            "frame": frame,
-            "coordinates": planned[frame] if frame < len(planned) else {},
-            "wall": None,
-        }
+        FrameInfo(
+            frame=frame,
+            coordinates=planned[frame] if frame < len(planned) else {},
+            wall=None,
+        )
         for frame, placed in poses.items()
         if set(placed) >= bones
         and all(surface_file(directory, name, frame).is_file() for name in meshes)
     ]
 
 
-def _read_frames(info: dict[str, Any], directory: Path, poses: Poses) -> list[Frame]:
-    scene = info["scene"]
-    units = scene.get("coordinate_units", {})
-    muscles = [muscle["name"] for muscle in scene["muscles"]]
+def _read_frames(info: RunInfo, directory: Path, poses: Poses) -> list[Frame]:
+    scene = info.scene
+    units = scene.coordinate_units
+    muscles = [muscle.name for muscle in scene.muscles]
     events: dict[int, list[Event]] = {}
     for row in _read_table(directory, "events.csv"):
         event = Event(int(row[0]), row[1], row[2], int(row[3]), row[4])
         events.setdefault(event.frame, []).append(event)
     found = []
-    for entry in info["frames"]:
-        index = entry["frame"]
-        values = entry["coordinates"].items()
+    for entry in info.frames:
+        index = entry.frame
+        values = entry.coordinates.items()
         frame = Frame(
             index,
             {name: value if name in units else math.radians(value) for name, value in values},
             poses.get(index, {}),
-            FolderSurfaces(directory, muscles if scene["output"]["surfaces"] else [], index),
+            FolderSurfaces(directory, muscles if scene.output.surfaces else [], index),
             {},
             events.get(index, []),
             {},
-            entry["wall"],
+            math.nan if entry.wall is None else entry.wall,
             fibres=SavedFibres(directory, muscles, index),
         )
         found.append(frame)

@@ -23,6 +23,7 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.output.appearance import tendon_mesh
 from rbfmuscle.output.fibre_files import FOLDER, TABLE, begin_table, fibre_file, write_frame
+from rbfmuscle.output.info import FORMAT, RunInfo
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.scene import Scene
@@ -42,7 +43,6 @@ MESHES = ("surfaces", "bones")
 # Every file of a run, and every folder of its files.
 _COLLECTIONS = tuple(f"{name}.pvd" for name in MESHES)
 _PLACES = ("run.json", *TABLES, *PAGES, *MESHES, *_COLLECTIONS, FOLDER, TABLE)
-FORMAT = 2
 _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
 
 
@@ -108,17 +108,17 @@ class RunWriter:
                 f"cannot finish the tables in {self.directory}: {error.strerror}"
             ) from None
 
-    def write_info(self, info: dict[str, Any]) -> None:
+    def write_info(self, info: RunInfo) -> None:
         """Write ``run.json`` in one piece; while the run goes on with the coordinates of all frames
         to come.
         """
-        if info.get("status") == "running":
+        if info.status == "running":
             frames = self.scene.motion.frames
             planned = [
                 {name: shown_value(self.scene, name, x) for name, x in k.items()} for k in frames
             ]
-            info = {**info, "planned": planned}
-        write_json(self.directory / "run.json", info)
+            info = info.replaced(planned=planned)
+        write_json(self.directory / "run.json", info.to_dict())
 
     def _write(self, frame, rows):
         if self.meshes:
@@ -224,8 +224,8 @@ def json_text(data: Any) -> str:
 
 def build_info(
     scene: Scene, started: datetime, neighbours: "Neighbours", summary: dict[str, Any], **facts: Any
-) -> dict[str, Any]:
-    """Assemble ``run.json``; ``summary`` is from `Summary.table`.
+) -> RunInfo:
+    """Assemble the facts of a run; ``summary`` is from `Summary.table`.
 
     Other facts are kept as they are: ``status`` ("running", "complete", "interrupted" or "failed"),
     ``message`` (why it did not complete), ``options`` of the caller, ``kernels`` by muscle,
@@ -233,7 +233,7 @@ def build_info(
     for the default), ``verdict``, ``beyond`` (muscle, quantity, worst value, limit, frame),
     ``not_measured`` (muscle, quantity), ``frames`` (`frame_facts`).
     """
-    return {
+    table = {
         "format": FORMAT,
         "started": started.isoformat(timespec="seconds"),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -246,6 +246,8 @@ def build_info(
         "frame_time": summary.get(ALL, {}).get("time_frame"),
         **facts,
     }
+    # In memory as a reader of the file has them.
+    return RunInfo.model_validate_json(json_text(table))
 
 
 def frame_facts(scene: Scene, frame: Frame) -> dict:

@@ -54,7 +54,7 @@ def _page(found: dict[str, Any], runs: Mapping[str, RunData]) -> Page:
     counts = {"muscles": len(first.muscles), "frames": found["frames"], **found["machine"]}
     # Of the bowing each muscle has a limit of its own.
     limits, terms = (
-        first.info["limits"] | {"bowing": None},
+        first.info.limits | {"bowing": None},
         [(m.title, m.meaning) for m in MEASURES.values()],
     )
     return Page(

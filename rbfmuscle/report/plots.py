@@ -207,9 +207,10 @@ def motion_axis(saved: RunData) -> tuple[dict[int, float], str]:
     """Place of each frame on plots and their label: the only coordinate that moves, if one way, or
     frame numbers.
     """
-    rows, units = saved.info["frames"], saved.info["scene"].get("coordinate_units", {})
-    names = sorted({name for row in rows for name in row["coordinates"]})
-    tracks = {name: np.array([row["coordinates"].get(name, 0.0) for row in rows]) for name in names}
+    rows = saved.info.frames
+    units = saved.info.scene.coordinate_units
+    names = sorted({name for row in rows for name in row.coordinates})
+    tracks = {name: np.array([row.coordinates.get(name, 0.0) for row in rows]) for name in names}
     moving = {name: track for name, track in tracks.items() if np.ptp(track) > 1e-9}
     if len(moving) == 1:
         name, track = next(iter(moving.items()))
@@ -221,8 +222,4 @@ def motion_axis(saved: RunData) -> tuple[dict[int, float], str]:
 
 def arm_unit(saved: RunData, coordinate: str) -> str:
     """Unit of the moment arms about a coordinate of a saved run."""
-    return (
-        "1"
-        if saved.info["scene"].get("coordinate_units", {}).get(coordinate, "").strip()
-        else saved.units
-    )
+    return "1" if saved.info.scene.coordinate_units.get(coordinate, "").strip() else saved.units

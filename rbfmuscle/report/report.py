@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from rbfmuscle.metrics.summary import (
     LIMITS,
     LOWER_BOUNDS,
     Limits,
+    QuantityFacts,
     describe_unmeasured,
     exceeded,
     limit_ratio,
@@ -115,16 +115,16 @@ def packed_scene(runs: Mapping[str, RunData]) -> str:
 
 def _page(saved: RunData) -> Page:
     info = saved.info
-    complete = info["status"] == "complete"
-    answer, _, detail = info["verdict"].partition(". ")
+    complete = info.status == "complete"
+    answer, _, detail = info.verdict.partition(". ")
     if not complete:
-        answer, detail = f"the run ended early ({info['status']}): {info['message'] or ''}", ""
+        answer, detail = f"the run ended early ({info.status}): {info.message or ''}", ""
     terms = [(name, text) for name, (_, text) in QUANTITIES.items()]
     return Page(
-        info["scene"]["name"],
+        info.scene.name,
         _facts(saved),
         f"{answer[:1].upper()}{answer[1:].rstrip('.')}.",
-        GOOD if complete and not (info["beyond"] or info.get("not_measured")) else BAD,
+        GOOD if complete and not (info.beyond or info.not_measured) else BAD,
         detail=detail and f"{detail.rstrip('.')}.",
         lights=_lights(saved),
         sections=[
@@ -135,18 +135,18 @@ def _page(saved: RunData) -> Page:
             Section("Events", "each with its frame in events.csv", text=_events(saved.events)),
             Section("How to read this", text=_READING, terms=terms),
         ],
-        footer=", ".join(f"{name} {value}" for name, value in info["versions"].items()),
+        footer=", ".join(f"{name} {value}" for name, value in info.versions.items()),
     )
 
 
 def _facts(saved: RunData) -> list[str]:
     info = saved.info
-    models = sorted({muscle["model"]["name"] for muscle in info["scene"]["muscles"]})
-    median = (info.get("frame_time") or {}).get("median")
+    models = sorted({muscle.model.name for muscle in info.scene.muscles})
+    median = (info.frame_time or {}).get("median")
     numbers = {"muscle": len(saved.muscles), "frame": len(saved.frames)}
     counts = [f"{number} {word}{'' if number == 1 else 's'}" for word, number in numbers.items()]
-    times = [f"{shown_number(median, 's')} per frame", f"{info['times']['wall']:.1f} s in all"]
-    kernels = sorted(set(info.get("kernels", {}).values()))
+    times = [f"{shown_number(median, 's')} per frame", f"{info.times['wall']:.1f} s in all"]
+    kernels = sorted(set(info.kernels.values()))
     kernel = [f"kernel{'s' if len(kernels) > 1 else ''} {', '.join(kernels)}"] if kernels else []
     return [f"model {', '.join(models)}", *kernel, *counts, *times]
 
@@ -154,8 +154,8 @@ def _facts(saved: RunData) -> list[str]:
 def _lights(saved: RunData) -> list[CheckRow]:
     """A row for each of `LIGHTS`, then one for whatever else is beyond a limit."""
     known = {quantity for quantities in LIGHTS.values() for quantity in quantities}
-    limits, missing = _limits(saved), saved.info.get("not_measured", [])
-    beyond = {name.partition(":")[0] for _, name, *_ in exceeded(saved.info["muscles"], limits)}
+    limits, missing = _limits(saved), saved.info.not_measured
+    beyond = {name.partition(":")[0] for _, name, *_ in exceeded(saved.info.muscles, limits)}
     other = sorted((beyond | set(limits.fail_on)) - known)
     rows = [_light(saved, *row) for row in (*LIGHTS.items(), *((name, (name,)) for name in other))]
     found = [row for row in rows if row]
@@ -169,17 +169,18 @@ def _lights(saved: RunData) -> list[CheckRow]:
 
 
 def _limits(saved: RunData) -> Limits:
-    return Limits(saved.info["limits"], saved.info.get("fail_on", {}))
+    return Limits(saved.info.limits, saved.info.fail_on)
 
 
 def _light(saved: RunData, title: str, quantities: Sequence[str]) -> CheckRow | None:
     """The worst of some quantities against their limits, over muscles and frames."""
     limits, found = _limits(saved), []
-    for muscle, table in saved.info["muscles"].items():
+    for muscle, table in saved.info.muscles.items():
         for name in quantities:
             facts = table.get(name)
             if facts and name in limits.values and muscle != ALL:
-                worst = math.nan if facts.get("worst") is None else facts["worst"]
+                value = facts.get("worst")
+                worst = math.nan if value is None else value
                 limit = muscle_limit(name, limits, table)
                 near = (
                     0.0
@@ -221,7 +222,7 @@ def _plots(saved: RunData) -> list[Section]:
     for title, quantity, factor, unit, coordinate in [*arms, *((*panel, None) for panel in PANELS)]:
         tracks = _tracks(saved, quantity, factor, axis, coordinate)
         if tracks:
-            unit, limit = saved.units if unit is None else unit, saved.info["limits"].get(quantity)
+            unit, limit = saved.units if unit is None else unit, saved.info.limits.get(quantity)
             signed = any(np.nanmin(track.y) < 0.0 for track in tracks)
             limits = [factor * limit, -factor * limit][: 1 + signed] if limit else []
             zero = quantity != "length" and not signed
@@ -296,7 +297,7 @@ def _tracks(
 
 def _summary(saved: RunData) -> Table:
     """A row for each muscle, those beyond most limits first."""
-    muscles, limits = saved.info["muscles"], _limits(saved)
+    muscles, limits = saved.info.muscles, _limits(saved)
     values = limits.values
     used = [
         q
@@ -318,7 +319,7 @@ def _summary(saved: RunData) -> Table:
     return Table(head, sorted(rows, key=lambda row: -sum(cell.state == BAD for cell in row)))
 
 
-def _cell(name: str, found: Mapping[str, Mapping[str, Any]], limits: Limits) -> Cell:
+def _cell(name: str, found: Mapping[str, QuantityFacts], limits: Limits) -> Cell:
     facts = found.get(name)
     if not facts or facts.get("worst") is None:
         return Cell("–")

@@ -180,7 +180,7 @@ class SavedSource:
         self.runs = runs
         self.choices = list(runs)
         first = next(iter(runs.values()))
-        self.title = str(first.directory or first.info["scene"]["name"])
+        self.title = str(first.directory or first.info.scene.name)
         self.units = first.units
         self.body = first.body
         self.millimetre = 1.0 / MM_PER_UNIT[first.units]

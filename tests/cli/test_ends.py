@@ -74,7 +74,7 @@ cli.main()
         assert "interrupted" in err and ("frames are kept in" in err) == (name == "write_vtp")
         if name == "write_vtp":
             kept = Run.load(out)
-            assert kept.info["status"] == "interrupted" and 2 <= len(kept.frames) < 60
+            assert kept.info.status == "interrupted" and 2 <= len(kept.frames) < 60
             assert {row.frame for row in kept.metrics} == set(kept.frame_numbers) and export_run(
                 out, ["stl"]
             )
@@ -151,9 +151,9 @@ class TestKilledRuns:
 
     def test_its_frames_are_found_exported_and_rendered(self, killed, capsys):
         saved, whole = Run.load(killed), Run.load(killed.parent / "whole")
-        assert saved.info["status"] == "running"
+        assert saved.info.status == "running"
         assert saved.frame_numbers == [0, 1, 2, 3, 4, 5] and len(whole.frames) == 9
-        for mine, complete in zip(saved.info["frames"], whole.info["frames"]):
+        for mine, complete in zip(saved.info.frames, whole.info.frames):
             assert mine["coordinates"] == pytest.approx(complete["coordinates"])
         np.testing.assert_array_equal(saved.mesh("biceps", 5)[0], whole.mesh("biceps", 5)[0])
         code, _, err = call(capsys, "export", killed, "--format", "stl", "pvd")

@@ -81,7 +81,7 @@ def test_run_that_is_loaded_is_the_run_that_was_saved(run, loaded, tmp_path):
         loaded.values("abductor", "length"), run.values("abductor", "length")
     )
     assert "nope" not in loaded.frames[0].surfaces and loaded.save(loaded.directory) is None
-    assert run.info["times"]["wall"] == run.info["times"]["wall"]
+    assert run.info.times["wall"] == run.info.times["wall"]
     loaded.save(tmp_path / "copy")
     assert len(rm.Run.load(tmp_path / "copy")) == 3
     with pytest.raises(rm.UsageError, match="holds no run"):

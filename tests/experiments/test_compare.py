@@ -76,7 +76,7 @@ class TestComparison:
             assert found["all"]["time_frame_p95"] == np.percentile(walls["all"], 95)
             assert set(MEASURES) - set(found["all"]) <= {"distance_rms", "distance_max", "flicker"}
             assert 0 <= found["all"]["return_rms"] < 1.5
-        assert Run.load(folder / "rbf").info["scene"]["muscles"][0]["model"]["centres"] == 100
+        assert Run.load(folder / "rbf").info.scene.muscles[0].model.centres == 100
 
     def test_files_hold_the_table_and_the_page_begins_with_the_answer(self, compared):
         folder, table = compared

@@ -187,9 +187,9 @@ def test_overlap_and_ends_away_from_bones_are_seen_in_a_run(
     scene = scene.with_options({"contact.initial": "keep"})
     assert simulate(arm_scene(end=10)).values("biceps", name)[0] < least
     info = stream_run(scene, tmp_path, pictures=False)  # a warning by default
-    found = {row[1]: row[2] for row in info["beyond"]}
-    assert found[name] > least and LIMITS[name].title in info["verdict"]
-    assert Run.load(tmp_path).info["verdict"] == info["verdict"]
+    found = {row.quantity: row.value for row in info.beyond}
+    assert found[name] > least and LIMITS[name].title in info.verdict
+    assert Run.load(tmp_path).info.verdict == info.verdict
     with pytest.raises(LimitExceededError, match=name) as caught:
         stream_run(scene, tmp_path, fail_on="all", pictures=False)
     assert caught.value.exit_code == 6
@@ -202,7 +202,7 @@ def test_rest_is_measured_whatever_frames_are_asked_for(monkeypatch, tmp_path):
     for name in (*rest, "thickness"):
         assert len(part.values("biceps", name)) == 1
         assert part.values("biceps", name) == whole.values("biceps", name)
-    assert part.info["not_measured"] == [] and "Not measured" not in part.verdict
+    assert part.info.not_measured == [] and "Not measured" not in part.verdict
     for name in rest[:3]:  # the model shows the input mesh
         stream_run(arm_scene(), tmp_path, frames="1:2", fail_on=f"{name}=0.5", pictures=False)
 
@@ -212,10 +212,10 @@ def test_a_limit_that_cannot_be_measured_fails(monkeypatch, tmp_path):
     with pytest.raises(LimitExceededError, match="not measured: moment_arm") as caught:
         stream_run(arm_scene(end=0), tmp_path, fail_on="moment_arm=50", pictures=False)
     info = Run.load(tmp_path).info
-    assert info["fail_on"] == {"moment_arm": 50.0} and info["limits"]["moment_arm"] == 50.0
-    assert info["not_measured"] == [[ALL, "moment_arm"]]
-    assert info["verdict"] == caught.value.info["verdict"]
-    assert info["verdict"].endswith("Not measured: moment_arm")
+    assert info.fail_on == {"moment_arm": 50.0} and info.limits["moment_arm"] == 50.0
+    assert info.not_measured == [(ALL, "moment_arm")]
+    assert info.verdict == caught.value.info.verdict
+    assert info.verdict.endswith("Not measured: moment_arm")
 
 
 def test_a_joint_that_opens_is_measured_and_one_that_is_apart_at_rest_is_not():

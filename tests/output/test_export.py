@@ -13,6 +13,7 @@ from rbfmuscle.cli.app import one_line
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.output.export import _file_name, export_run
+from rbfmuscle.output.info import FORMAT
 from rbfmuscle.output.vtp import read_vtp, write_vtp
 from rbfmuscle.output.writer import write_json
 from rbfmuscle.run import Run, simulate
@@ -85,6 +86,16 @@ class TestSaved:
         with pytest.raises(UsageError, match=r"not the run\.json"):
             Run.load(tmp_path)
 
+    def test_newer_run_is_refused_with_one_line(self, arm_run, tmp_path):
+        folder = shutil.copytree(arm_run[1], tmp_path / "run")
+        info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        assert info["format"] == FORMAT
+        info["format"] = FORMAT + 1
+        (folder / "run.json").write_text(json.dumps(info))
+        with pytest.raises(UsageError, match="of a newer rbfmuscle; this one reads up to") as told:
+            Run.load(folder)
+        assert "\n" not in str(told.value)
+
 
 class TestHostileRuns:
     @pytest.mark.parametrize(
@@ -92,7 +103,7 @@ class TestHostileRuns:
         [
             (lambda info: info["scene"]["muscles"][0].update(name="../../victim"), "victim"),
             (lambda info: info["scene"]["bones"][0].update(name="a/b"), "a/b"),
-            (lambda info: info["scene"]["bones"][0].update(name=["a"]), "bone name"),
+            (lambda info: info["scene"]["bones"][0].update(name=["a"]), "bones.0.name"),
             (lambda info: info["scene"]["muscles"][0].update(name="<img src=x>"), "<img"),
             (lambda info: info["scene"].update(units="<b>"), "units"),
             (lambda info: info["frames"][0].update(frame="/../x"), "frame"),

@@ -69,7 +69,7 @@ class TestStream:
         with pytest.raises(SolveError, match="planted"):
             stream_run(arm_scene(), tmp_path)
         saved = Run.load(tmp_path)
-        assert saved.info["status"] == "failed" and "planted" in saved.info["message"]
+        assert saved.info.status == "failed" and "planted" in saved.info.message
         use_blend_model(monkeypatch, fail_at=8)
         with pytest.raises(SolveError, match="planted") as caught:
             simulate(arm_scene())
@@ -88,12 +88,12 @@ class TestStream:
             with pytest.raises(type(error)):
                 stream_run(arm_scene(), tmp_path, progress=fail)
             info = Run.load(tmp_path).info
-            assert (info["status"], info["message"]) == (status, said)
+            assert (info.status, info.message) == (status, said)
 
     def test_limit_exceeded_after_everything_is_written(self, tmp_path):
         with pytest.raises(LimitExceededError, match="biceps: length"):
             stream_run(arm_scene(), tmp_path, fail_on="length=3")
-        assert Run.load(tmp_path).info["status"] == "complete"
+        assert Run.load(tmp_path).info.status == "complete"
         stream_run(arm_scene(), tmp_path, fail_on=["length=300", "components"])
 
     def test_second_run_leaves_nothing_of_the_first(self, tmp_path):
@@ -101,7 +101,7 @@ class TestStream:
         info = stream_run(arm_scene(), tmp_path, frames=":1", settings={"output.surfaces": False})
         names = ["events.csv", "files.txt", "metrics.csv", "poses.csv", "run.json"]
         assert files_in(tmp_path) == names
-        assert info["muscles"]["biceps"]["volume_error"]["worst"] < 1e-9
+        assert info.muscles["biceps"]["volume_error"]["worst"] < 1e-9
 
     def test_disk_that_fills_up_keeps_the_frames(self, tmp_path, monkeypatch):
         import rbfmuscle.output.writer as writer

@@ -105,8 +105,8 @@ def read_animation(run: RunData, frames: list[int], *, unit: str) -> Animation:
         poses = np.array([run.frame(frame).poses[name] for frame in frames])
         poses[:, :3, 3] *= factor
         bones.append(AnimatedMesh(name, look.BONE_COLOUR, [vertices * factor], [faces], poses))
-    times = run.info["scene"].get("motion", {}).get("times")
-    name = str(run.info["scene"].get("name") or (run.directory.name if run.directory else "run"))
+    times = run.info.scene.motion.times
+    name = str(run.info.scene.name or (run.directory.name if run.directory else "run"))
     if times is not None and np.any(np.diff([times[k] for k in frames]) <= 0.0):
         times = None  # no animation: they stand still, or go backwards
     at = np.array([k / FRAMES_A_SECOND if times is None else times[k] for k in frames], dtype=float)

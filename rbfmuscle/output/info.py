@@ -1,0 +1,160 @@
+"""The facts of a run, as ``run.json`` holds them: checked when they are made and when they are
+read.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt
+
+from rbfmuscle.metrics.summary import Exceedance, QuantityFacts, Unmeasured
+from rbfmuscle.scene.build import check_name
+from rbfmuscle.scene.tendons import tendon_name
+
+# Version of ``run.json``: raised where readers of the one before would misread it.
+FORMAT = 2
+
+
+def _check_bone(name: str) -> str:
+    check_name(name, "bone")
+    return name
+
+
+def _check_muscle(name: str) -> str:
+    check_name(name, "muscle")
+    return name
+
+
+# Names become those of files.
+BoneName = Annotated[str, AfterValidator(_check_bone)]
+MuscleName = Annotated[str, AfterValidator(_check_muscle)]
+
+
+class Part(BaseModel):
+    """Facts whose further keys are kept as they are."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
+class BoneInfo(Part):
+    """A bone of the scene."""
+
+    name: BoneName
+
+
+class EndInfo(Part):
+    """An attachment of a muscle; ``tendon`` holds the keys of its tendon, where it has one."""
+
+    bone: str
+    tendon: object = None
+
+
+class ModelInfo(Part):
+    """The model of a muscle; further keys are its settings."""
+
+    name: str
+
+
+class MuscleInfo(Part):
+    """A muscle of the scene."""
+
+    name: MuscleName
+    model: ModelInfo
+    attach: list[EndInfo] = []
+
+
+class JointInfo(Part):
+    """A joint of the scene, between two bones."""
+
+    name: str
+    parent: str
+    child: str
+
+
+class OutputInfo(Part):
+    """What was written."""
+
+    surfaces: bool
+    tendons: bool = False
+
+
+class MotionInfo(Part):
+    """The motion; ``times`` (n,) of its frames [s], where it has any."""
+
+    times: list[float] | None = None
+
+
+class SceneInfo(Part):
+    """The scene as it was run; ``coordinate_units`` of what is not in degrees."""
+
+    name: str = ""
+    units: Literal["m", "cm", "mm"]
+    bones: list[BoneInfo]
+    joints: list[JointInfo] = []
+    muscles: list[MuscleInfo]
+    output: OutputInfo
+    motion: MotionInfo = MotionInfo()
+    superior: list[float] | None = None
+    anterior: list[float] | None = None
+    coordinate_units: dict[str, str] = {}
+
+
+class FrameInfo(Part):
+    """A written frame: coordinates [degree, of translations scene unit], wall time [s], and the
+    time of the motion [s] where it has one.
+    """
+
+    frame: NonNegativeInt = Field(strict=True)
+    coordinates: dict[str, float]
+    wall: float | None
+    time: float | None = None
+
+
+class RunInfo(Part):
+    """The facts of a run.
+
+    ``status`` is "running", "complete", "interrupted" or "failed", ``message`` why it did not
+    complete. ``times`` are those of the parts of the run [s], ``muscles`` and ``frame_time`` what
+    `Summary.table` gives. ``limits`` are in the scene's unit, ``fail_on`` those that it may fail
+    on (None: the default); ``beyond`` are values beyond a limit, ``not_measured`` limits without a
+    value, ``verdict`` the sentence about them. ``planned`` are the coordinates of all frames while
+    the run goes on.
+    """
+
+    format: int = 0
+    status: str = "complete"
+    message: str | None = None
+    scene: SceneInfo
+    options: dict[str, Any] = {}  # settings have values of any type
+    versions: dict[str, str] = {}
+    machine: dict[str, str | int | None] = {}
+    kernels: dict[str, str] = {}
+    times: dict[str, float] = {}
+    muscles: dict[str, dict[str, QuantityFacts]] = {}
+    frame_time: QuantityFacts | None = None
+    limits: dict[str, float] = {}
+    fail_on: dict[str, float | None] = {}
+    verdict: str = ""
+    beyond: list[Exceedance] = []
+    not_measured: list[Unmeasured] = []
+    frames: list[FrameInfo]
+    planned: list[dict[str, float]] = []
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``run.json`` holds."""
+        return self.model_dump(exclude_unset=True)
+
+    def replaced(self, **facts: object) -> "RunInfo":
+        """The facts with others in place of some."""
+        return self.model_copy(update=facts)
+
+    @property
+    def tendon_muscles(self) -> dict[str, str]:
+        """Muscle of each mesh of tendons, by the name of the mesh."""
+        if not self.scene.output.tendons:
+            return {}
+        held = [
+            muscle.name
+            for muscle in self.scene.muscles
+            if any("tendon" in end.model_fields_set for end in muscle.attach)
+        ]
+        return {tendon_name(name): name for name in held}
