@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import trimesh
 
 # Centres of each local fit of a muscle's field, and how many of these count as covered by it.
-PART, COVERED = 15, 8
+PART, COVERED = 24, 14
 # Part of the touching ball's radius that a step off the surface may use.
 SAFETY = 0.5
 
@@ -257,23 +257,23 @@ class FieldFit:
         return fitted
 
 
-def overlapping_parts(points: Floats) -> Integers:
-    """Parts (P, n) of points (K, 3): `PART` nearest to one of them, which comes first, or all where
+def overlapping_parts(points: Floats, part: int = PART, covered: int = COVERED) -> Integers:
+    """Parts (P, n) of points (K, 3): ``part`` nearest to one of them, which comes first, or all where
     there are few.
 
-    Every point is among the first `COVERED` of a part: the middle of the next is always the point
+    Every point is among the first ``covered`` of a part: the middle of the next is always the point
     without one that is farthest from the middles so far.
     """
-    if len(points) <= PART:
+    if len(points) <= part:
         return np.arange(len(points))[None]
-    near = cKDTree(points).query(points, PART)[1]
+    near = cKDTree(points).query(points, part)[1]
     away = np.linalg.norm(points - points.mean(axis=0), axis=1)
     middles: list[int] = []
     while (away >= 0.0).any():
         middles.append(int(np.argmax(away)))
         distance = np.linalg.norm(points - points[middles[-1]], axis=1)
         away = distance if len(middles) == 1 else np.minimum(away, distance)
-        away[near[middles[-1], :COVERED]] = away[middles[-1]] = -1.0
+        away[near[middles[-1], :covered]] = away[middles[-1]] = -1.0
     return np.asarray(near[middles])
 
 

@@ -19,6 +19,9 @@ from rbfmuscle.validation import SceneError
 
 # A patch smaller than the spacing of the centres still has to hold the muscle against turning.
 LEAST_ATTACHED = 4
+# Centres of a local fit of the cubic kernel, and how many of them count as covered: fits of half the
+# time. Other kernels break into more sheets with so few.
+SMALL = (15, 8)
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class RestState:
             frame.points(samples.points),
             samples.control_faces,
             fit,
-            overlapping_parts(centres.points),
+            overlapping_parts(centres.points, *(SMALL if fit.kernel.plain_cube else ())),
             held_by.bones,
             attached_bone,
             free,
