@@ -98,7 +98,8 @@ def _smoothness(arms: Sequence[Row], *, guessed: bool) -> list[Row]:
     The departure is the change of slope, from the last `JUMP` degrees (or the last step, where it
     is longer) to those before, over `JUMP` degrees.
     """
-    angles, values = (np.array([getattr(arm, key) for arm in arms]) for key in ("angle", "value"))
+    angles = np.array([arm.coordinate_value for arm in arms])
+    values = np.array([arm.value for arm in arms])
     found = []
     for k in range(1, len(arms)):
         middle = _before(angles, k)
