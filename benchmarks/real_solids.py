@@ -26,7 +26,8 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.run import simulate
-from rbfmuscle.scene.motion import bone_poses, interpolate
+from rbfmuscle.scene.frames import interpolate
+from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.validation import MissingDependencyError, SolveError

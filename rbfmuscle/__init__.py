@@ -8,18 +8,18 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from rbfmuscle import showing
+
 if TYPE_CHECKING:
     from rbfmuscle.bones.sdf import BoneSDF as BoneSDF
     from rbfmuscle.compare import compare_models as compare_models
     from rbfmuscle.experiments.kernel_study import study_kernels as study_kernels
     from rbfmuscle.experiments.wanted_error import reach_error as reach_error
     from rbfmuscle.implicit.field import RBFField as RBFField
-    from rbfmuscle.importers.guess.orientation import orient_scene as orient_scene
     from rbfmuscle.muscle.muscle import RBFMuscle as RBFMuscle
-    from rbfmuscle.report.render import draw_scene as draw_scene
-    from rbfmuscle.report.render import figure_html as figure_html
     from rbfmuscle.run import Run as Run
     from rbfmuscle.run import simulate as simulate
+    from rbfmuscle.scene.check import check_scene as check_scene
     from rbfmuscle.scene.phantom import phantom_scene as phantom_scene
     from rbfmuscle.scene.scene import Scene as Scene
     from rbfmuscle.validation import LimitExceededError as LimitExceededError
@@ -53,6 +53,7 @@ _HOME = {
     "RBFMuscle": "rbfmuscle.muscle.muscle",
     "Run": "rbfmuscle.run",
     "Scene": "rbfmuscle.scene.scene",
+    "check_scene": "rbfmuscle.scene.check",
     "compare_models": "rbfmuscle.compare",
     "phantom_scene": "rbfmuscle.scene.phantom",
     "reach_error": "rbfmuscle.experiments.wanted_error",
@@ -64,9 +65,6 @@ _HOME = {
 # For modules that may not import it themselves.
 _INNER = {
     "Page": "rbfmuscle.viewer.page",
-    "draw_scene": "rbfmuscle.report.render",
-    "figure_html": "rbfmuscle.report.render",
-    "orient_scene": "rbfmuscle.importers.guess.orientation",
 }
 
 __all__ = [*_HOME, "__version__"]
@@ -83,3 +81,20 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+def _show(shown: Scene, *, model: str | None = None) -> Page:
+    from rbfmuscle.viewer.page import show
+
+    return show(shown, model=model)
+
+
+def _picture(shown: Scene) -> str:
+    from rbfmuscle.importers.guess.orientation import orient_scene
+    from rbfmuscle.report.render import draw_scene, figure_html
+
+    oriented = orient_scene(shown.copy())
+    return figure_html(lambda file: draw_scene(oriented, file), repr(shown))
+
+
+showing.registered[:] = [showing.Views(_show, _picture)]

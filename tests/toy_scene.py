@@ -7,8 +7,9 @@ import trimesh
 from rbfmuscle.jit import compiled
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.tables import JointTable
-from rbfmuscle.scene.objects import Attachment, Motion, Muscle, SceneData
+from rbfmuscle.scene.objects import Attachment, Motion, Muscle
 from rbfmuscle.scene.options import ContactOptions, DetectOptions
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import ModelSurface, MuscleModel
 
 
@@ -239,7 +240,7 @@ def scene(fields, joints, muscles, frames, *, initial="keep", sliding=None, tunn
     parts = {"bones": bones, "joints": joints, "muscles": muscles}
     detect = None if tunnelling is None else DetectOptions(tunnelling=tunnelling)
     contact = ContactOptions(initial=initial)
-    return SceneData(
+    return Scene(
         "toy", **parts, motion=Motion(frames), contact=contact, sliding=sliding, detect=detect
     )
 

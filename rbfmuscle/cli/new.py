@@ -42,6 +42,7 @@ def new(
     from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
     from rbfmuscle.importers.guess.orientation import HEADER
     from rbfmuscle.importers.labels.read import read_labels
+    from rbfmuscle.scene.check import check_scene
 
     volume = _is_segmentation(source)
     if volume and units not in (None, "mm"):
@@ -68,7 +69,7 @@ def new(
     print(f"{output} written; check the lines marked GUESS")
     for doubt in guess.doubts():
         print(f"doubtful: {doubt}")
-    for finding in scene.check():
+    for finding in check_scene(scene):
         print(finding)
     if scene.guesses:
         print(

@@ -7,7 +7,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.objects import Muscle, SceneData
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 
 if TYPE_CHECKING:
     import trimesh
@@ -51,7 +52,7 @@ def articular_points(
     return {name: np.concatenate([np.empty((0, 3)), *parts]) for name, parts in found.items()}
 
 
-def scene_surfaces(scene: SceneData) -> dict[str, Floats]:
+def scene_surfaces(scene: Scene) -> dict[str, Floats]:
     """The same of a scene, by its joints that move."""
     meshes = {bone.name: bone.mesh for bone in scene.bones}
     joints = [
@@ -63,7 +64,7 @@ def scene_surfaces(scene: SceneData) -> dict[str, Floats]:
 
 
 def articular_share(
-    muscle: Muscle, scene: SceneData, surfaces: Mapping[str, Floats]
+    muscle: Muscle, scene: Scene, surfaces: Mapping[str, Floats]
 ) -> tuple[float, str]:
     """Greatest share of an attachment that lies on an articular surface, and its bone.
 

@@ -13,9 +13,9 @@ from pydantic import BeforeValidator, ValidationInfo
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.joints.joint import bones_between
+from rbfmuscle.scene.joints.joint import Joint, bones_between
 from rbfmuscle.scene.meshes.repair import ReadMesh
-from rbfmuscle.scene.objects import Attachment, LineTable, Muscle, SceneData, ViaTable, find_named
+from rbfmuscle.scene.objects import Attachment, LineTable, Muscle, ViaTable, find_named
 from rbfmuscle.scene.options import FileName, NotNegative, Positive, Table, Vector, in_folder
 from rbfmuscle.scene.picked import painted_vertices, picked_vertices, read_points
 from rbfmuscle.scene.tendons import BonePoint, TendonEnd
@@ -93,10 +93,8 @@ def resolve_attachments(
     return found
 
 
-def tendon_ends(muscle: Muscle, scene: SceneData) -> list[TendonEnd]:
-    """The ends of a muscle's belly that tendons hold, in the order of its attachments; the scene
-    has its joints.
-    """
+def tendon_ends(muscle: Muscle, bones: list[Bone], joints: list[Joint]) -> list[TendonEnd]:
+    """The ends of a muscle's belly that tendons hold, in the order of its attachments."""
     vertices = np.asarray(muscle.mesh.vertices, dtype=float)
     areas = vertex_areas(vertices, np.asarray(muscle.mesh.faces))
     ends = []
@@ -120,8 +118,8 @@ def tendon_ends(muscle: Muscle, scene: SceneData) -> list[TendonEnd]:
             end.other = [(widest.bone, np.average(vertices[patch], axis=0, weights=areas[patch]))]
         elif opposite is not None:
             end.other = opposite.line[::-1]
-        names = bones_between(scene.joints, [bone for bone, _ in (*end.other, *end.line)])
-        end.obstacles = [bone for bone in scene.bones if bone.name in names]
+        names = bones_between(joints, [bone for bone, _ in (*end.other, *end.line)])
+        end.obstacles = [bone for bone in bones if bone.name in names]
     for end, opposite in zip(ends, ends[::-1]):
         end.slack = 0.0 if held else opposite.length
     return ends

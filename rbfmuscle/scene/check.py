@@ -3,34 +3,21 @@ motion.
 """
 
 import itertools
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.build import validate
+from rbfmuscle.scene.extents import check_place, check_size
 from rbfmuscle.scene.guesses import doubtful
-from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.objects import Muscle, SceneData
-from rbfmuscle.validation import MeshError, RBFMuscleError, SceneError
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.validation import RBFMuscleError, SceneError
 
-Item: TypeAlias = Bone | Muscle | ReadMesh
-
-SMALLEST_MM = 2.0  # across: the bones of a mouse
-LARGEST_MM = 3000.0  # across: a person with arms raised
-FAR_AWAY = (
-    1.0  # a muscle further from the bones than this many diagonals of their box is in another frame
-)
-FARTHEST_CENTRE = (
-    1000.0  # the same for the centre of a joint: a nearly straight path has one far away
-)
 MOST_ARTICULAR = 0.5  # share of an attachment that may lie on an articular surface
 MOTION_SAMPLES = 10
 COUNTED_DEPTH_MM = 0.05  # bones that touch by less are not reported
@@ -48,7 +35,7 @@ class Finding:
         return f"{self.level}: {self.place}: {self.message}"
 
 
-def check_scene(scene: SceneData) -> list[Finding]:
+def check_scene(scene: Scene) -> list[Finding]:
     """Return all findings about a scene, the first error among them, the worst first; nothing is
     solved or changed.
     """
@@ -70,7 +57,7 @@ def check_scene(scene: SceneData) -> list[Finding]:
     try:
         findings += bone_findings(bone_collisions(scene), scene.units)
         check_extents(scene)
-        validate(scene)
+        scene.validate()
     except RBFMuscleError as error:
         findings.append(Finding("error", scene.name, str(error)))
     return sort_findings(findings)
@@ -111,64 +98,13 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
     return sorted(findings, key=lambda finding: ("error", "warning", "note").index(finding.level))
 
 
-def check_extents(scene: SceneData) -> None:
+def check_extents(scene: Scene) -> None:
     """Raise MeshError for a mesh whose size or place shows a wrong unit or another frame."""
     for bone in scene.bones:
-        check_size(scene, "bone", bone.name, bone)
+        check_size("bone", bone.name, bone, scene.units)
     for muscle in scene.muscles:
-        check_size(scene, "muscle", muscle.name, muscle)
-        check_place(scene, muscle.name, muscle)
-
-
-def check_size(scene: SceneData, kind: str, name: str, item: Item) -> None:
-    """Raise MeshError for a mesh smaller than a mouse's or larger than a person's."""
-    size = float(np.linalg.norm(np.ptp(item.mesh.vertices, axis=0)))
-    millimetres = size / scene.length(1.0)
-    if not SMALLEST_MM <= millimetres <= LARGEST_MM:
-        best = 10.0 ** round(math.log10(300.0 / max(millimetres, 1e-12)))
-        raise MeshError(
-            f"{kind} {name!r} ({item.source or 'built in code'}) is {size:.4g} {scene.units} "
-            "across, which "
-            f"cannot be right; correct the scene's units, or set its scale ({best:g} times the "
-            "present one would "
-            f"make it {millimetres * best:.4g} mm)"
-        )
-
-
-def check_place(scene: SceneData, name: str, muscle: Item) -> None:
-    """Raise MeshError for a muscle that lies far away from all bones."""
-    away, size = _away_from_bones(scene, *muscle.mesh.bounds)
-    if away > FAR_AWAY * size:
-        raise MeshError(
-            f"muscle {name!r} ({muscle.source or 'built in code'}) lies {away:.4g} {scene.units} "
-            "away from "
-            "all bones; bring the meshes into one frame and unit (scale)"
-        )
-
-
-def check_centre(scene: SceneData, name: str, centre: Floats) -> None:
-    """Raise SceneError for a joint whose centre lies so far from all bones that poses lose their
-    digits.
-    """
-    away, size = _away_from_bones(scene, centre, centre)
-    if away > FARTHEST_CENTRE * size:
-        raise SceneError(
-            f"joint {name!r}: centre {np.asarray(centre).tolist()} lies {away:.4g} {scene.units} "
-            "away from all bones; "
-            f"correct it, it is in the scene's unit ({scene.units})"
-        )
-
-
-def _away_from_bones(scene, low, high):
-    """Distance of a box from that of all bones, and the diagonal of that; no distance without
-    bones.
-    """
-    if not scene.bones:
-        return 0.0, 0.0
-    corners = np.concatenate([bone.mesh.bounds for bone in scene.bones])
-    least, most = corners.min(axis=0), corners.max(axis=0)
-    away = np.maximum(least - high, low - most).clip(min=0)
-    return float(np.linalg.norm(away)), float(np.linalg.norm(most - least))
+        check_size("muscle", muscle.name, muscle, scene.units)
+        check_place(muscle.name, muscle, scene.bones, scene.units)
 
 
 def _rest_overlaps(scene):
@@ -193,7 +129,7 @@ def _rest_overlaps(scene):
     return findings
 
 
-def check_initial(scene: SceneData) -> None:
+def check_initial(scene: Scene) -> None:
     """Raise SceneError if a muscle lies mostly inside a bone.
 
     With ``initial = "error"`` a muscle may not lie in a bone at all.
@@ -215,7 +151,7 @@ def _depths(points, bone):
 
 
 def bone_collisions(
-    scene: SceneData, frames: Iterable[int] | None = None
+    scene: Scene, frames: Iterable[int] | None = None
 ) -> list[tuple[int, str, str, float]]:
     """Return where a motion drives bones into each other, as (frame, bone, other, depth [scene
     unit]).
@@ -231,7 +167,7 @@ def bone_collisions(
     return found
 
 
-def sampled_frames(scene: SceneData) -> list[int]:
+def sampled_frames(scene: Scene) -> list[int]:
     """About ten frames along a motion, the first and the last among them."""
     chosen = np.linspace(0, len(scene.motion) - 1, MOTION_SAMPLES).round().astype(int)
     return [int(frame) for frame in np.unique(chosen)]

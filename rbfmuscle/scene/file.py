@@ -1,31 +1,16 @@
 """The scene file: its tables, and the scene that they describe."""
 
-import hashlib
 import os
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.attachments import AttachTable
-from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.build import add_bone, add_muscle, place_coupling, place_joint, validate
-from rbfmuscle.scene.check import check_centre, check_place, check_size
-from rbfmuscle.scene.guesses import find_guesses
-from rbfmuscle.scene.joints.joint import all_coordinates
-from rbfmuscle.scene.joints.tables import (
-    CouplingTable,
-    JointTable,
-    coupling_row,
-    joint_row,
-    make_coupling,
-)
-from rbfmuscle.scene.meshes.read import read_mesh
-from rbfmuscle.scene.motion import make_motion, unit_sign
-from rbfmuscle.scene.objects import Muscle, SceneData
+from rbfmuscle.scene.joints.tables import CouplingTable, JointTable
 from rbfmuscle.scene.options import (
     Axis,
     ContactOptions,
@@ -38,9 +23,8 @@ from rbfmuscle.scene.options import (
     Table,
     check_plain,
 )
-from rbfmuscle.validation import MeshError, SceneError, shown, shown_path
+from rbfmuscle.validation import SceneError, shown, shown_path
 
-S = TypeVar("S", bound=SceneData)
 # A scene file is a page or two; long lists of vertices belong into files of their own.
 LARGEST_FILE = 4_000_000
 
@@ -56,6 +40,15 @@ class SceneTable(Table):
     notes: list[str] = Field(default=[])
     superior: Axis | None = None
     anterior: Axis | None = None
+
+    @model_validator(mode="after")
+    def _check_directions(self) -> Self:
+        up, front = self.superior, self.anterior
+        if (up is None) != (front is None) or (
+            up and front and np.abs(np.cross(up, front)).max() < 1e-9
+        ):
+            raise ValueError("give superior and anterior, of different directions, or neither")
+        return self
 
 
 class BoneTable(Table):
@@ -135,75 +128,16 @@ def _read_toml(path):
         raise SceneError(f"{path}: not valid TOML: {shown(str(error))}{quotes}") from None
 
 
-def load_scene(cls: type[S], path: str | Path, *, skeleton: bool = False) -> S:
-    """Return the scene (of class ``cls``) of a TOML file; its paths are relative to the file.
-
-    Parameters
-    ----------
-    path : path
-    skeleton : bool
-        Accept a scene without muscles; it can be looked at, not run.
-
-    Raises
-    ------
-    SceneError
-        If the file, or a name or value in it, is wrong; the message names it and the remedy.
-    MeshError
-        If a mesh cannot be used.
-    """
-    path = Path(path)
-    tables = read_scene_file(path)
-    scene = cls(tables.scene.name or path.stem, units=tables.scene.units, path=path)
-    scene.guesses = find_guesses(path.read_text(encoding="utf-8"))
-    try:
-        _fill(scene, tables)
-        return scene if skeleton and not scene.muscles else validate(scene)
-    except (SceneError, MeshError) as error:
-        raise type(error)(f"{path}: {error}") from None
-
-
-def _fill(scene: SceneData, tables: SceneFile) -> None:
-    about = tables.scene
-    up, front = about.superior, about.anterior
-    if (up is None) != (front is None) or (
-        up and front and np.abs(np.cross(up, front)).max() < 1e-9
-    ):
-        raise SceneError("[scene]: give superior and anterior, of different directions, or neither")
-    scene.left_out = about.left_out
-    scene.doubts = about.doubts
-    scene.notes = about.notes
-    scene.superior = about.superior
-    scene.anterior = about.anterior
-    for bone in tables.bone:
-        add_bone(scene, bone.name, bone.mesh, scale=bone.scale)
-        if bone.mesh is not None:
-            check_size(scene, "bone", bone.name, scene.bones[-1])
-    for joint in tables.joint:
-        place_joint(scene, joint.joint())
-        check_centre(scene, joint.name, scene.joints[-1].centre)
-    for coupling in tables.coupling:
-        place_coupling(scene, make_coupling(coupling, scene.joints))
-    for muscle in tables.muscle:
-        _add_muscle(scene, muscle, tables.defaults)
-    scene.motion = make_motion(scene, tables.motion)
-    scene.contact, scene.sliding = tables.contact, tables.sliding
-    scene.detect, scene.output = tables.detect, tables.output
-
-
-def _add_muscle(scene, muscle, defaults):
+def given_muscle(muscle: MuscleTable, defaults: DefaultsTable) -> dict[str, Any]:
+    """What the file gives of a muscle, by key, with the defaults that it does not give itself."""
     given = {
         key: getattr(table, key) for table in (defaults, muscle) for key in table.model_fields_set
     }
-    scale = given.get("scale", 1.0)
-    read = read_mesh(muscle.mesh, name=muscle.name, scale=scale)
-    check_size(scene, "muscle", muscle.name, read)
-    check_place(scene, muscle.name, read)
-    model, default = given.get("model", "rbf"), defaults.model
-    if (
-        isinstance(model, dict) and "name" not in model
-    ):  # some options of the default model are changed
+    model = given.get("model", "rbf")
+    if isinstance(model, dict) and "name" not in model:  # some options of the default's change
+        default = defaults.model
         model = {**(default if isinstance(default, dict) else {"name": default}), **model}
-    add_muscle(scene, **given | {"mesh": read, "model": model})
+    return given | {"model": model}
 
 
 def _place(location, data):
@@ -230,63 +164,3 @@ def _place(location, data):
         else:
             words.append(part)
     return " ".join(words)
-
-
-def describe_scene(scene: SceneData) -> dict[str, Any]:
-    """Return the scene as plain data for ``run.json``: names, counts, options, sources and
-    hashes.
-    """
-    units = {name: unit_sign(scene, name) for name in all_coordinates(scene.joints)}
-    motion = scene.motion.options.model_dump(mode="json", by_alias=True, exclude_none=True)
-    times = {} if scene.motion.times is None else {"times": scene.motion.times}
-    return {
-        "name": scene.name,
-        "units": scene.units,
-        "file": str(scene.path) if scene.path else None,
-        "superior": scene.superior,
-        "anterior": scene.anterior,
-        "bones": [{"name": bone.name, **_describe_mesh(bone)} for bone in scene.bones],
-        "links": list(scene.links),
-        "left_out": list(scene.left_out),
-        "doubts": list(scene.doubts),
-        "guesses": [guess._asdict() for guess in scene.guesses],
-        "notes": list(scene.notes),
-        "joints": [joint_row(joint) for joint in scene.joints],
-        "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
-        "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},
-        "motion": {**motion, "frames": len(scene.motion), **times},
-        "muscles": [_describe_muscle(muscle) for muscle in scene.muscles],
-        "contact": scene.contact.model_dump(),
-        "sliding": scene.sliding.model_dump() if scene.sliding else None,
-        "detect": scene.detect.model_dump() if scene.detect else None,
-        "output": scene.output.model_dump(),
-    }
-
-
-def _describe_muscle(muscle: Muscle) -> dict[str, Any]:
-    keys = muscle.contraction
-    return {
-        "name": muscle.name,
-        "model": {"name": muscle.model, **muscle.options},
-        "attach": [
-            {"bone": held.bone, "vertices": len(held.vertices)}
-            | ({} if held.tendon is None else {"tendon": held.tendon.model_dump()})
-            for held in muscle.attachments
-        ],
-        "fibres": len(muscle.fibres) if muscle.fibres else 0,
-        **({} if keys is None else keys.model_dump(exclude_none=True)),
-        **_describe_mesh(muscle),
-    }
-
-
-def _describe_mesh(item: Bone | Muscle) -> dict[str, Any]:
-    vertices = np.ascontiguousarray(item.mesh.vertices, dtype=np.float64)
-    faces = np.ascontiguousarray(item.mesh.faces, dtype=np.int64)
-    return {
-        "mesh": item.source,
-        "vertices": len(vertices),
-        "triangles": len(faces),
-        "volume": float(item.mesh.volume),
-        "sha256": hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest(),
-        "mended": list(item.notes),
-    }

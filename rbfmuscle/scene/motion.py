@@ -1,69 +1,20 @@
-"""From joint coordinates to the poses of bones: ramps, waypoints and OpenSim motion files."""
+"""From joint coordinates to the poses of bones; coordinates as files and tables show them."""
 
-import itertools
 import math
 from collections.abc import Mapping
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.joints.joint import (
-    Coordinate,
-    all_coordinates,
-    joint_poses,
-    joint_values,
-    resolve,
-)
-from rbfmuscle.scene.joints.tables import FACTORS, full_name
-from rbfmuscle.scene.motion_file import read_motion_file
-from rbfmuscle.scene.objects import Motion, SceneData
-from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions
+from rbfmuscle.scene.joints.joint import all_coordinates, joint_poses, joint_values, resolve
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError, did_you_mean
 
 SHIFT_LEVER = 50.0  # lever [mm] at which a shift of a joint is counted as a turn
-NOT_MOVED = 1e-9  # A locked coordinate may be given, at its rest value.
-# Share of a turn [radian] or of a length that rounding may take a coordinate beyond its range.
-RANGE_TOLERANCE = 1e-6
 
 
-def make_motion(scene: SceneData, options: MotionOptions) -> Motion:
-    """The motion that ``[motion]`` asks of a scene's joints.
-
-    SceneError on an unknown coordinate, too many frames, or a file that cannot be read.
-    """
-    facts = all_coordinates(scene.joints)
-    followers = {coupling.coordinate for coupling in scene.couplings}
-    times, notes = None, []
-    if options.file is not None:
-        frames, times, notes = read_motion_file(
-            options.file, facts, followers, metre=scene.length(1000.0)
-        )
-    else:
-        frames = _asked_frames(options, facts)
-        _refuse_followers(frames, followers, facts)
-    frames = [_with_rest(frame, facts, followers) for frame in frames]
-    notes += _range_notes(frames, facts)
-    frames = [
-        {name: facts[name].honoured(value) for name, value in frame.items()} for frame in frames
-    ]
-    return Motion(frames, options=options, times=times, notes=notes)
-
-
-def slice_motion(motion: Motion, frames: slice) -> Motion:
-    """Return the motion of the frames in a slice, as ``frames[A:B:S]`` does."""
-    chosen = motion.frames[frames]
-    if not chosen:
-        text = f"{frames.start}:{frames.stop}:{frames.step}".replace("None", "")
-        raise SceneError(f"frames {text} selects none of the {len(motion)} frames of the motion")
-    times = None if motion.times is None else motion.times[frames]
-    progress = motion.progress[frames]
-    return Motion(
-        chosen, options=motion.options, times=times, progress=progress, notes=motion.notes
-    )
-
-
-def rest_coordinates(scene: SceneData) -> dict[str, float]:
+def rest_coordinates(scene: Scene) -> dict[str, float]:
     """Return the coordinates that follow no other and whose rest value is not zero [radian or scene
     unit].
     """
@@ -77,20 +28,12 @@ def rest_coordinates(scene: SceneData) -> dict[str, float]:
     return {name: value for name, value in rest.items() if value and name not in followers}
 
 
-def completed(scene: SceneData, coordinates: Mapping[str, float]) -> dict[str, float]:
+def completed(scene: Scene, coordinates: Mapping[str, float]) -> dict[str, float]:
     """Return coordinates with those that are absent at rest added, where rest is not zero."""
     return {**rest_coordinates(scene), **coordinates}
 
 
-def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> dict[str, float]:
-    """Return the values between two tables by name, linear in each; t = 0 gives ``before``, an
-    absent one is 0.
-    """
-    names = [*before, *(name for name in after if name not in before)]
-    return {name: (1 - t) * before.get(name, 0.0) + t * after.get(name, 0.0) for name in names}
-
-
-def bone_poses(scene: SceneData, coordinates: dict[str, float]) -> Poses:
+def bone_poses(scene: Scene, coordinates: dict[str, float]) -> Poses:
     """Return the pose (4, 4) of every bone, and of every end of a muscle that a tendon holds: rest
     -> world.
 
@@ -109,7 +52,7 @@ def bone_poses(scene: SceneData, coordinates: dict[str, float]) -> Poses:
 
 
 def step_angle(
-    scene: SceneData, before: dict[str, float], after: dict[str, float], *, shifts: bool = True
+    scene: Scene, before: dict[str, float], after: dict[str, float], *, shifts: bool = True
 ) -> float:
     """Return the largest turn of a bone against its parent between two sets of coordinates
     [radian].
@@ -141,114 +84,19 @@ def turned_angle(rotations: Floats) -> Floats:
     return np.arctan2(length, np.trace(rotations, axis1=-2, axis2=-1) - 1.0)
 
 
-def shown_value(scene: SceneData, name: str, value: float) -> float:
+def shown_value(scene: Scene, name: str, value: float) -> float:
     """Return a coordinate's value as files and tables show it: degrees, or scene units as it is."""
     return math.degrees(value) if unit_sign(scene, name) == "°" else value
 
 
-def inner_value(scene: SceneData, name: str, value: float) -> float:
+def inner_value(scene: Scene, name: str, value: float) -> float:
     """Return a coordinate's value [radian or scene unit] from what files and tables show."""
     return math.radians(value) if unit_sign(scene, name) == "°" else value
 
 
-def unit_sign(scene: SceneData, name: str) -> str:
+def unit_sign(scene: Scene, name: str) -> str:
     """Return what follows a coordinate's value in text: the sign for degrees, the scene's unit, or
     nothing.
     """
-    facts = all_coordinates(scene.joints).get(name)
-    return {"translation": f" {scene.units}", "coupled": ""}.get(facts.motion if facts else "", "°")
-
-
-def _asked_frames(options, facts):
-    """Frames of a ramp or of waypoints; the rest pose alone without either."""
-
-    def named(table):
-        return {
-            full_name(name, list(facts), place="[motion]"): value for name, value in table.items()
-        }
-
-    if options.ramp is not None:
-        ramps = named(options.ramp)
-        starts = {name: ramp.start for name, ramp in ramps.items() if ramp.start is not None}
-        stops = [starts, {name: ramp.end for name, ramp in ramps.items()}]
-        return _frames_between(stops, list(ramps), [ramp.step for ramp in ramps.values()], facts)
-    if options.waypoints is not None:
-        stops = [named(stop) for stop in options.waypoints]
-        names = list(dict.fromkeys(itertools.chain(*stops)))
-        return _frames_between(stops, names, options.step or 1.0, facts)
-    return [{}]
-
-
-def _frames_between(stops, names, steps, facts):
-    """Frames from stop to stop [degree or scene unit] in whole steps; the coordinate that needs
-    most sets the pace.
-    """
-    table = np.array([[stop.get(name, np.nan) for name in names] for stop in stops]).reshape(
-        len(stops), -1
-    )
-    factors = np.array([FACTORS[facts[name].motion] for name in names])
-    for column, name in enumerate(
-        names
-    ):  # what a stop does not mention stays where it was, at rest at first
-        held = facts[name].rest / factors[column]
-        for row in range(len(stops)):
-            held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
-    rows = [table[0]]
-    with np.errstate(over="ignore"):
-        paces = (np.abs(np.diff(table, axis=0)) / steps).max(axis=1, initial=0.0)
-        count = np.ceil(paces).sum()
-    if not count <= MAX_FRAMES:
-        raise SceneError(
-            f"[motion]: about {count:.3g} frames, more than {MAX_FRAMES}: a step is too small for "
-            "its range; "
-            "make the step larger or the range smaller"
-        )
-    for pace, (before, after) in zip(paces.tolist(), itertools.pairwise(table)):
-        # At whole steps, then the end: 2.5 steps give 0.4, 0.8, 1 of the path.
-        marks = [*(k / pace for k in range(1, math.ceil(pace - 1e-9))), 1.0] if pace else []
-        rows.extend(before + t * (after - before) for t in marks)
-    return [dict(zip(names, (row * factors).tolist())) for row in rows]
-
-
-def _refuse_followers(frames, followers, facts):
-    for name in dict.fromkeys(name for frame in frames for name in frame):
-        if name in followers:
-            raise SceneError(
-                f"[motion]: {name!r} follows other coordinates by a coupling, move those"
-            )
-        rest = facts[name].rest
-        if facts[name].locked and any(
-            abs(frame.get(name, rest) - rest) > NOT_MOVED for frame in frames
-        ):
-            raise SceneError(
-                f"[motion]: {name!r} is locked, unlock it in its joint or leave it out"
-            )
-
-
-def _with_rest(frame, facts, followers):
-    """The frame without followers; coordinates that it does not mention are at rest."""
-    unsaid = {
-        n: c.rest for n, c in facts.items() if n not in frame and n not in followers and c.rest
-    }
-    return {**unsaid, **{name: value for name, value in frame.items() if name not in followers}}
-
-
-def _range_notes(frames: list[dict[str, float]], facts: dict[str, Coordinate]) -> list[str]:
-    notes = []
-    for name, coordinate in facts.items():
-        if coordinate.range is None or coordinate.locked:
-            continue
-        low, high = coordinate.range
-        beyond = [max(low - frame[name], frame[name] - high) for frame in frames if name in frame]
-        beyond = [
-            excess for excess in beyond if excess > RANGE_TOLERANCE * max(1.0, abs(low), abs(high))
-        ]
-        if beyond:
-            what = "is cut to" if coordinate.clamped else "leaves"
-            low, high, most = (x / FACTORS[coordinate.motion] for x in (low, high, max(beyond)))
-            notes.append(
-                f"coordinate {name!r} {what} its range {low:.6g} to {high:.6g} in {len(beyond)} "
-                f"of {len(frames)} "
-                f"frames, by up to {most:.3g}"
-            )
-    return notes
+    coordinate = all_coordinates(scene.joints).get(name)
+    return "°" if coordinate is None else coordinate.unit_sign(scene.units)

@@ -1,12 +1,10 @@
-"""What a scene is made of: bones, joints, muscles, a motion and settings, all of it data."""
+"""What a scene is made of: muscles with their attachments, a motion, and names."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import KW_ONLY, dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
@@ -14,24 +12,16 @@ from pydantic import Field
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.guesses import Guess
-from rbfmuscle.scene.joints.joint import Coupling, Joint
-from rbfmuscle.scene.options import (
-    ContactOptions,
-    DetectOptions,
-    MotionOptions,
-    OutputOptions,
-    SlidingOptions,
-    Table,
-    Vector,
-)
-from rbfmuscle.scene.tendons import TendonEnd
-from rbfmuscle.validation import SceneError, did_you_mean
+from rbfmuscle.scene.joints.joint import Joint
+from rbfmuscle.scene.options import MotionOptions, Table, Vector
+from rbfmuscle.scene.tendons import TendonEnd, tendon_name
+from rbfmuscle.validation import SceneError, did_you_mean, shown
 
 if TYPE_CHECKING:
     import trimesh
 
 MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
+_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
 
 
 class ViaTable(Table):
@@ -124,97 +114,6 @@ class Motion:
         return len(self.frames)
 
 
-@dataclass(eq=False, repr=False)
-class SceneData:
-    """The data of a scene; the class for users is `rbfmuscle.scene.scene.Scene`.
-
-    Attributes
-    ----------
-    units : {"mm", "cm", "m"}
-        Unit of every length in the scene.
-    couplings : list of Coupling
-        Coordinates that follow others.
-    links : list of str
-        Bones without a mesh, which carry joints only.
-    path : pathlib.Path or None
-        The file it was loaded from.
-    left_out : list of str
-        Bones of which no mesh could be used; they count in the verdict of a run.
-    doubts : list of str
-        What makes the scene another one than its source, in sentences; warnings of a check, and in
-        the verdict of a run.
-    guesses : list of Guess
-        Lines of the file that are marked GUESS; the doubtful ones count in the verdict of a run.
-    notes : list of str
-        What was assumed about the data or left out, for `check` to repeat.
-    superior, anterior : list of float or None
-        Anatomical directions (3,) at rest: those of the file, or found from the bones before a run
-        or a picture.
-    """
-
-    name: str = "scene"
-    _: KW_ONLY
-    units: str = "mm"
-    bones: list[Bone] = field(default_factory=list)
-    joints: list[Joint] = field(default_factory=list)
-    couplings: list[Coupling] = field(default_factory=list)
-    links: list[str] = field(default_factory=list)
-    muscles: list[Muscle] = field(default_factory=list)
-    motion: Motion = field(default_factory=Motion)
-    contact: ContactOptions = field(default_factory=ContactOptions)
-    sliding: SlidingOptions | None = None
-    detect: DetectOptions | None = None
-    output: OutputOptions = field(default_factory=OutputOptions)
-    path: Path | None = None
-    left_out: list[str] = field(default_factory=list)
-    doubts: list[str] = field(default_factory=list)
-    guesses: list[Guess] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    superior: list[float] | None = None
-    anterior: list[float] | None = None
-
-    def __post_init__(self) -> None:
-        if self.units not in MM_PER_UNIT:
-            raise SceneError(f"units must be m, cm or mm, got {self.units!r}")
-
-    def length(self, millimetres: float) -> float:
-        """Return a length given in millimetres in the scene's unit."""
-        return millimetres / MM_PER_UNIT[self.units]
-
-    @property
-    def body(self) -> Floats:
-        """Left, posterior and superior (3, 3); x, y and z where the directions are not known."""
-        return body_axes(self.superior, self.anterior)
-
-    def bone(self, name: str) -> Bone:
-        """Return the bone of that name, or raise SceneError naming the nearest."""
-        return find_named(self.bones, name, "bone")
-
-    def muscle(self, name: str) -> Muscle:
-        """Return the muscle of that name, or raise SceneError naming the nearest."""
-        return find_named(self.muscles, name, "muscle")
-
-    def holders(self, muscle: Muscle) -> list[str]:
-        """Names of the bones, then of the ends that tendons of a muscle hold."""
-        return [*(bone.name for bone in self.bones), *(end.name for end in muscle.tendons)]
-
-    def copy(self) -> Self:
-        """Return a copy whose lists and tables are its own; meshes are shared."""
-        other = copy.copy(self)
-        lists = ("bones", "joints", "couplings", "links", "left_out", "doubts", "guesses", "notes")
-        for name in lists:
-            setattr(other, name, list(getattr(self, name)))
-        other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
-        return other
-
-    def __repr__(self) -> str:
-        muscles = (
-            ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles) or "no muscles"
-        )
-        counts = f"{len(self.bones)} bones, {muscles}, {len(self.motion)} frames"
-        return f"<Scene {self.name!r}, {self.units}: {counts}>"
-
-
 def body_axes(superior: Sequence[float] | None, anterior: Sequence[float] | None) -> Floats:
     """Left, posterior and superior (3, 3) of a body with these directions; x, y and z where one is
     None.
@@ -234,3 +133,57 @@ def find_named(items: list[Any], name: str, what: str, *, place: str = "") -> An
             return item
     hint = did_you_mean(name, [item.name for item in items])
     raise SceneError(f"{place}unknown {what} {name!r}, {hint}")
+
+
+def check_file_names(bones: list[Bone], muscles: list[Muscle]) -> None:
+    """Raise SceneError if two meshes of a run would have one file."""
+    names = {muscle.name.lower(): muscle.name for muscle in muscles}
+    for muscle in muscles:
+        other = names.get(tendon_name(muscle.name).lower())
+        if muscle.tendons and other is not None:
+            raise SceneError(
+                f"muscle {other!r} has the name of the tendons of {muscle.name!r}; choose another"
+            )
+    stems = {bone.name.lower() for bone in bones}
+    for bone in bones:
+        stem, _, number = bone.name.lower().rpartition("_")
+        if stem in stems and len(number) >= 4 and number.isdecimal():
+            raise SceneError(
+                f"bone {bone.name!r} has the name of a frame of bone {stem!r}; choose another"
+            )
+
+
+def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[str, dict[str, Any]]:
+    """Return (name, options) of a model given as a name or as a table with ``name``."""
+    if isinstance(model, str):
+        return model, {}
+    if isinstance(model, dict):
+        options = dict(model)
+        name = options.pop("name", "rbf")
+        if isinstance(name, str):
+            return name, options
+    raise SceneError(f"{place}: model must be a name or a table with a name, got {shown(model)}")
+
+
+def check_name(name: object, what: str) -> None:
+    """Raise SceneError if a name is no name for a file."""
+    if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
+        allowed = "letters, digits, '_' and '-' only (it becomes a file name)"
+        raise SceneError(f"{what} name {shown(repr(name))} may hold {allowed}")
+
+
+def check_new_name(items: Sequence[Bone | Joint | Muscle], name: str, what: str) -> None:
+    """Raise SceneError if a name is no name for a file, or taken, in letters of another case
+    too.
+    """
+    check_name(name, what)
+    if name == "all":
+        raise SceneError(f"{what} name 'all' stands for the whole scene in tables, choose another")
+    same = [item.name for item in items if item.name.lower() == name.lower()]
+    if name in same:
+        raise SceneError(f"{what} {name!r} is given twice")
+    if same and what != "joint":
+        raise SceneError(
+            f"{what} {name!r} differs from {same[0]!r} in case alone, and their files would be one "
+            "on some systems; choose another name"
+        )

@@ -1,31 +1,89 @@
-"""`Scene`: the data of a scene with the functions that load, build, check and change it as
-methods.
-"""
+"""`Scene`: bones, joints, muscles, a motion and settings; from a file, or built in code."""
 
 from __future__ import annotations
 
+import copy
 import html
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self, TypeAlias
 
-from rbfmuscle.scene import build
-from rbfmuscle.scene.check import check_scene
-from rbfmuscle.scene.file import describe_scene, load_scene
-from rbfmuscle.scene.objects import SceneData
-from rbfmuscle.scene.settings import change_scene
+import numpy as np
+from numpy.typing import ArrayLike
 
-if TYPE_CHECKING:
-    import rbfmuscle
+from rbfmuscle import showing
+from rbfmuscle.geometry.arrays import Floats, MeshLike
+from rbfmuscle.scene import settings as changes
+from rbfmuscle.scene.activation.contraction import resolve_contraction
+from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
+from rbfmuscle.scene.attachments import AttachTable, resolve_attachments, tendon_ends
+from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.extents import check_centre, check_place, check_size
+from rbfmuscle.scene.file import SceneFile, given_muscle, read_scene_file
+from rbfmuscle.scene.frames import make_motion, slice_motion
+from rbfmuscle.scene.guesses import Guess, find_guesses
+from rbfmuscle.scene.joints.joint import Coupling, Joint, all_coordinates, check_tree, ordered
+from rbfmuscle.scene.joints.tables import (
+    CouplingTable,
+    JointTable,
+    coupling_row,
+    joint_row,
+    make_coupling,
+)
+from rbfmuscle.scene.meshes.read import as_mesh, read_fibres, read_mesh
+from rbfmuscle.scene.meshes.repair import ReadMesh
+from rbfmuscle.scene.objects import (
+    MM_PER_UNIT,
+    Attachment,
+    Motion,
+    Muscle,
+    body_axes,
+    check_file_names,
+    check_new_name,
+    find_named,
+    split_model,
+)
+from rbfmuscle.scene.options import (
+    ContactOptions,
+    DetectOptions,
+    MotionOptions,
+    OutputOptions,
+    SlidingOptions,
+)
+from rbfmuscle.scene.record import record_mesh, record_muscle
+from rbfmuscle.validation import MeshError, SceneError, UsageError, did_you_mean
+
+MeshInput: TypeAlias = str | Path | ReadMesh | MeshLike
 
 
-class Scene(SceneData):
-    """Bones, joints, muscles, a motion and the settings of a simulation; attributes as of
-    `SceneData`.
+@dataclass(eq=False, repr=False)
+class Scene:
+    """Bones, joints, muscles, a motion and the settings of a simulation.
 
-    Parameters
+    Attributes
     ----------
     name : str
     units : {"mm", "cm", "m"}
         Unit of every length in the scene.
+    couplings : list of Coupling
+        Coordinates that follow others.
+    links : list of str
+        Bones without a mesh, which carry joints only.
+    path : pathlib.Path or None
+        The file it was loaded from.
+    left_out : list of str
+        Bones of which no mesh could be used; they count in the verdict of a run.
+    doubts : list of str
+        What makes the scene another one than its source, in sentences; warnings of a check, and in
+        the verdict of a run.
+    guesses : list of Guess
+        Lines of the file that are marked GUESS; the doubtful ones count in the verdict of a run.
+    notes : list of str
+        What was assumed about the data or left out, for a check to repeat.
+    superior, anterior : list of float or None
+        Anatomical directions (3,) at rest: those of the file, or found from the bones before a run
+        or a picture.
 
     Examples
     --------
@@ -36,29 +94,385 @@ class Scene(SceneData):
     ['upper']
     """
 
-    load = classmethod(load_scene)
-    add_bone = build.add_bone
-    add_joint = build.add_joint
-    place_joint = build.place_joint
-    add_coupling = build.add_coupling
-    place_coupling = build.place_coupling
-    add_muscle = build.add_muscle
-    set_motion = build.set_motion
-    validate = build.validate
-    check = check_scene
-    with_options = change_scene
-    resolved = describe_scene
+    name: str = "scene"
+    _: KW_ONLY
+    units: str = "mm"
+    bones: list[Bone] = field(default_factory=list)
+    joints: list[Joint] = field(default_factory=list)
+    couplings: list[Coupling] = field(default_factory=list)
+    links: list[str] = field(default_factory=list)
+    muscles: list[Muscle] = field(default_factory=list)
+    motion: Motion = field(default_factory=Motion)
+    contact: ContactOptions = field(default_factory=ContactOptions)
+    sliding: SlidingOptions | None = None
+    detect: DetectOptions | None = None
+    output: OutputOptions = field(default_factory=OutputOptions)
+    path: Path | None = None
+    left_out: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    guesses: list[Guess] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    superior: list[float] | None = None
+    anterior: list[float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.units not in MM_PER_UNIT:
+            raise SceneError(f"units must be m, cm or mm, got {self.units!r}")
+
+    @classmethod
+    def load(cls, path: str | Path, *, skeleton: bool = False) -> Self:
+        """Return the scene of a TOML file; its paths are relative to the file.
+
+        Parameters
+        ----------
+        path : path
+        skeleton : bool
+            Accept a scene without muscles; it can be looked at, not run.
+
+        Raises
+        ------
+        SceneError
+            If the file, or a name or value in it, is wrong; the message names it and the remedy.
+        MeshError
+            If a mesh cannot be used.
+        """
+        path = Path(path)
+        tables = read_scene_file(path)
+        scene = cls(tables.scene.name or path.stem, units=tables.scene.units, path=path)
+        try:
+            scene.guesses = find_guesses(path.read_text(encoding="utf-8"))
+            scene._fill(tables)
+            return scene if skeleton and not scene.muscles else scene.validate()
+        except (SceneError, MeshError) as error:
+            raise type(error)(f"{path}: {error}") from None
+
+    def _fill(self, tables: SceneFile) -> None:
+        about = tables.scene
+        self.left_out = about.left_out
+        self.doubts = about.doubts
+        self.notes = about.notes
+        self.superior = about.superior
+        self.anterior = about.anterior
+        for bone in tables.bone:
+            self.add_bone(bone.name, bone.mesh, scale=bone.scale)
+            if bone.mesh is not None:
+                check_size("bone", bone.name, self.bones[-1], self.units)
+        for joint in tables.joint:
+            self.add_joint(joint.joint())
+            check_centre(joint.name, self.joints[-1].centre, self.bones, self.units)
+        for coupling in tables.coupling:
+            self.add_coupling(make_coupling(coupling, self.joints))
+        for muscle in tables.muscle:
+            given = given_muscle(muscle, tables.defaults)
+            read = read_mesh(muscle.mesh, name=muscle.name, scale=given.get("scale", 1.0))
+            check_size("muscle", muscle.name, read, self.units)
+            check_place(muscle.name, read, self.bones, self.units)
+            self.add_muscle(**given | {"mesh": read})
+        self._move(tables.motion)
+        self.contact = tables.contact
+        self.sliding = tables.sliding
+        self.detect = tables.detect
+        self.output = tables.output
+
+    def add_bone(self, name: str, mesh: MeshInput | None = None, *, scale: float = 1.0) -> Self:
+        """Add a bone and return the scene.
+
+        Parameters
+        ----------
+        name : str
+        mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh, optional
+            Mended where that is safe; holes are kept, with a note. A bone without one carries
+            joints only.
+        scale : float
+            Factor from the mesh's unit to the scene's.
+        """
+        check_new_name(self.bones, name, "bone")
+        if name in self.links:
+            raise SceneError(f"bone {name!r} is given twice")
+        if mesh is None:
+            self.links.append(name)
+        else:
+            read = as_mesh(mesh, name, scale, may_be_open=True)
+            self.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
+        return self
+
+    def add_joint(
+        self,
+        joint: str | Joint,
+        parent: str = "",
+        child: str = "",
+        centre: ArrayLike | None = None,
+        axes: Mapping[str, ArrayLike] | None = None,
+        **keys: Any,
+    ) -> Self:
+        """Add a joint, a ball where no ``type`` is given, and return the scene.
+
+        Parameters
+        ----------
+        joint : str or Joint
+            Its name; a `Joint` is complete and takes nothing else.
+        parent, child : str
+            The child bone moves; a bone may be the child of one joint.
+        centre : (3,) array_like
+        axes : dict of str -> (3,) array_like
+            Axis of each coordinate, in any length.
+        **keys
+            Any other key of ``[[joint]]`` [degree, scene unit]: ``type``, ``coordinates``,
+            ``rotations``, ...
+        """
+        if isinstance(joint, str):
+            row = {"name": joint, "parent": parent, "child": child, "centre": centre}
+            row |= {"axes": axes and dict(axes)} | keys
+            joint = JointTable.build(row, place=f"joint {joint!r}: ").joint()
+        check_new_name(self.joints, joint.name, "joint")
+        for bone in (joint.parent, joint.child):
+            if bone not in self.links:
+                find_named(self.bones, bone, "bone", place=f"joint {joint.name!r}: ")
+        check_tree(self.joints, joint)
+        self.joints.append(joint)
+        for muscle in self.muscles:
+            muscle.tendons = tendon_ends(muscle, self.bones, self.joints)
+        return self
+
+    def add_coupling(
+        self, coordinate: str | Coupling, of: Sequence[str] = (), **function: Any
+    ) -> Self:
+        """Let a coordinate follow others by a function, as in ``[[coupling]]``, and return the
+        scene.
+
+        Parameters
+        ----------
+        coordinate : str or Coupling
+            Its name; a `Coupling` is complete and takes nothing else.
+        of : list of str
+        **function
+            One of ``constant``, ``linear``, ``polynomial``, ``piecewise`` and ``spline`` [degree,
+            scene unit].
+        """
+        if isinstance(coordinate, str):
+            row = {"coordinate": coordinate, "of": list(of), **function}
+            table = CouplingTable.build(row, place=f"coupling of {coordinate!r}: ")
+            coordinate = make_coupling(table, self.joints)
+        self.couplings = ordered([*self.couplings, coordinate])
+        return self
+
+    def add_muscle(
+        self,
+        name: str,
+        mesh: MeshInput,
+        *,
+        attach: Sequence[Attachment | AttachTable | dict[str, Any]] = (),
+        model: dict[str, Any] | str = "rbf",
+        fibres: str | Path | Sequence[ArrayLike] | None = None,
+        scale: float = 1.0,
+        **contraction: Any,
+    ) -> Self:
+        """Add a muscle and return the scene.
+
+        Parameters
+        ----------
+        name : str
+        mesh : path, trimesh.Trimesh, (vertices, faces) or ReadMesh
+            Closed; mended where that is safe.
+        attach : list of Attachment or dict
+            A dict holds ``bone`` and one of ``vertices`` (indices or a file), ``near`` (distance)
+            and ``sphere`` (``centre``, ``radius``); a ``tendon`` (``to``, ``via``) where the mesh
+            ends short of the bone.
+        model : str or dict
+            A model's name, or a table with ``name`` and the model's own options.
+        fibres : path or list of (k, 3) array_like, optional
+        scale : float
+            Factor from the mesh's unit to the scene's; fibres are scaled alike.
+        **contraction
+            ``activation``, ``fibre_stretch_at_rest``, ``tendon``.
+        """
+        check_new_name(self.muscles, name, "muscle")
+        read = as_mesh(mesh, name, scale, may_be_open=False)
+        model_name, options = split_model(model, place=f"muscle {name!r}")
+        attachments = resolve_attachments(attach, read, self.bones, muscle=name)
+        lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
+        keys = contraction_keys(contraction, muscle=name)
+        muscle = Muscle(
+            name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys
+        )
+        muscle.tendons = tendon_ends(muscle, self.bones, self.joints)
+        self.muscles.append(muscle)
+        return self
+
+    def set_motion(self, *, folder: Path | None = None, **options: Any) -> Self:
+        """Set the motion from the keys of ``[motion]`` (angles in degrees) and return the scene.
+
+        Parameters
+        ----------
+        folder : path, optional
+            What a relative ``file`` is relative to.
+        **options
+            ``ramp``, ``waypoints`` with ``step``, or ``file``.
+        """
+        return self._move(MotionOptions.build(options, place="[motion] ", folder=folder))
+
+    def _move(self, options: MotionOptions) -> Self:
+        metre = self.length(1000.0)
+        self.motion = make_motion(options, self.joints, self.couplings, metre=metre)
+        return self
+
+    def validate(self) -> Self:
+        """Return the scene, or raise SceneError if it cannot be simulated: no bones, no muscles,
+        loose muscles.
+        """
+        for what in ("bones", "muscles"):
+            if not getattr(self, what):
+                raise SceneError(f"scene {self.name!r} has no {what}, add a [[{what[:-1]}]]")
+        check_file_names(self.bones, self.muscles)
+        known = all_coordinates(self.joints)
+        for name in (name for frame in self.motion.frames for name in frame):
+            if name not in known:
+                hint = did_you_mean(name, sorted(known))
+                raise SceneError(f"[motion]: unknown coordinate {name!r}, {hint}")
+        for muscle in self.muscles:
+            place = f"muscle {muscle.name!r}"
+            bones = sorted({a.bone for a in muscle.attachments})
+            if not bones:
+                raise SceneError(f"{place} has no attachment, give attach a place on two bones")
+            if len(bones) == 1:
+                words = f"is attached to {bones[0]!r} only, give attach a second bone"
+                raise SceneError(f"{place} {words}")
+            if muscle.contraction is not None:
+                resolve_contraction(muscle)
+        return self
+
+    def with_options(
+        self,
+        settings: Mapping[str, Any] | None = None,
+        *,
+        model: str | dict[str, Any] | None = None,
+        frames: slice | str | None = None,
+    ) -> Self:
+        """Return a copy with other settings, another model or other frames; meshes are shared.
+
+        Parameters
+        ----------
+        settings : mapping, optional
+            Dotted keys with their values: ``{"model.centres": 200, "contact.substep_angle": 1}``.
+            ``model`` and ``model.KEY`` change every muscle, ``muscle.NAME.model.KEY`` one; so do
+            the keys of contraction. ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and
+            ``output.KEY`` change a table, one that the scene lacks is switched on. ``motion.step``
+            changes the step of every ramp, ``motion.ramp.NAME.COORDINATE.KEY`` one key of one.
+            Whole models come first, as another model drops the settings of the one before.
+        model : str or dict, optional
+            For every muscle. Options of another model are dropped.
+        frames : slice or str, optional
+            Which frames of the motion, as a slice or "A:B:S".
+
+        Raises
+        ------
+        UsageError
+            If a key is unknown, with the nearest right one, or a value is not allowed.
+        """
+        changed = self.copy()
+        settings = settings or {}
+        try:
+            if model is not None:
+                changes.set_models(changed.muscles, model)
+            for key in sorted(settings, key=lambda key: not changes.chooses_model(key)):
+                value = settings[key]
+                changed._set(key, value.item() if isinstance(value, np.generic) else value)
+            if frames is not None:
+                chosen = changes.parse_slice(frames) if isinstance(frames, str) else frames
+                changed.motion = slice_motion(changed.motion, chosen)
+        except SceneError as error:
+            raise UsageError(str(error)) from None
+        return changed
+
+    def _set(self, key: str, value: object) -> None:
+        """Set one dotted key, in place."""
+        head, _, rest = key.partition(".")
+        muscles = self.muscles
+        if head == "muscle":
+            name, head, rest = changes.split_muscle_key(key)
+            muscles = [self.muscle(name)]
+        if head == "model" or head in KEYS:
+            changes.set_on_muscles(muscles, head, rest, value, key)
+        elif head not in changes.TABLES:
+            raise SceneError(f"{key}: unknown setting, {did_you_mean(head, changes.HEADS)}")
+        elif not rest:
+            raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
+        elif head == "motion":
+            folder = self.path.parent if self.path else None
+            self._move(changes.changed_motion(self.motion.options, rest, value, key, folder))
+        else:
+            table = changes.changed_table(head, getattr(self, head), rest, value, key)
+            setattr(self, head, table)
+
+    def resolved(self) -> dict[str, Any]:
+        """Return the scene as plain data for ``run.json``: names, counts, options, sources and
+        hashes.
+        """
+        known = all_coordinates(self.joints)
+        units = {name: coordinate.unit_sign(self.units) for name, coordinate in known.items()}
+        motion = self.motion.options.model_dump(mode="json", by_alias=True, exclude_none=True)
+        times = {} if self.motion.times is None else {"times": self.motion.times}
+        return {
+            "name": self.name,
+            "units": self.units,
+            "file": str(self.path) if self.path else None,
+            "superior": self.superior,
+            "anterior": self.anterior,
+            "bones": [{"name": bone.name, **record_mesh(bone)} for bone in self.bones],
+            "links": list(self.links),
+            "left_out": list(self.left_out),
+            "doubts": list(self.doubts),
+            "guesses": [guess._asdict() for guess in self.guesses],
+            "notes": list(self.notes),
+            "joints": [joint_row(joint) for joint in self.joints],
+            "couplings": [coupling_row(coupling, self.joints) for coupling in self.couplings],
+            "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},
+            "motion": {**motion, "frames": len(self.motion), **times},
+            "muscles": [record_muscle(muscle) for muscle in self.muscles],
+            "contact": self.contact.model_dump(),
+            "sliding": self.sliding.model_dump() if self.sliding else None,
+            "detect": self.detect.model_dump() if self.detect else None,
+            "output": self.output.model_dump(),
+        }
+
+    def length(self, millimetres: float) -> float:
+        """Return a length given in millimetres in the scene's unit."""
+        return millimetres / MM_PER_UNIT[self.units]
+
+    @property
+    def body(self) -> Floats:
+        """Left, posterior and superior (3, 3); x, y and z where the directions are not known."""
+        return body_axes(self.superior, self.anterior)
+
+    def bone(self, name: str) -> Bone:
+        """Return the bone of that name, or raise SceneError naming the nearest."""
+        return find_named(self.bones, name, "bone")
+
+    def muscle(self, name: str) -> Muscle:
+        """Return the muscle of that name, or raise SceneError naming the nearest."""
+        return find_named(self.muscles, name, "muscle")
+
+    def holders(self, muscle: Muscle) -> list[str]:
+        """Names of the bones, then of the ends that tendons of a muscle hold."""
+        return [*(bone.name for bone in self.bones), *(end.name for end in muscle.tendons)]
+
+    def copy(self) -> Self:
+        """Return a copy whose lists and tables are its own; meshes are shared."""
+        other = copy.copy(self)
+        lists = ("bones", "joints", "couplings", "links", "left_out", "doubts", "guesses", "notes")
+        for name in lists:
+            setattr(other, name, list(getattr(self, name)))
+        other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
+        return other
+
+    def show(self, *, model: str | None = None) -> showing.ShownPage:
+        """Show the scene in a browser or a notebook, to be moved by hand; see `rbfmuscle.show`."""
+        return showing.registered[0].show(self, model=model)
+
+    def __repr__(self) -> str:
+        muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles)
+        counts = f"{len(self.bones)} bones, {muscles or 'no muscles'}, {len(self.motion)} frames"
+        return f"<Scene {self.name!r}, {self.units}: {counts}>"
 
     def _repr_html_(self) -> str:
-        import rbfmuscle
-
-        if not self.bones:
-            return html.escape(repr(self))
-        oriented = rbfmuscle.orient_scene(self.copy())
-        return rbfmuscle.figure_html(lambda file: rbfmuscle.draw_scene(oriented, file), repr(self))
-
-    def show(self, *, model: str | None = None) -> rbfmuscle.Page:
-        """Show the scene in a browser or a notebook, to be moved by hand; see `rbfmuscle.show`."""
-        import rbfmuscle  # Scenes know nothing of viewers; the facade does.
-
-        return rbfmuscle.show(self, model=model)
+        return showing.registered[0].picture(self) if self.bones else html.escape(repr(self))

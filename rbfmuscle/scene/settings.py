@@ -3,71 +3,24 @@
 """
 
 import tomllib
-from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
-
-import numpy as np
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
-from rbfmuscle.scene.build import split_model
-from rbfmuscle.scene.motion import make_motion, slice_motion
-from rbfmuscle.scene.objects import Muscle, SceneData
+from rbfmuscle.scene.objects import Muscle, split_model
 from rbfmuscle.scene.options import (
     DetectOptions,
     MotionOptions,
     SlidingOptions,
+    Table,
     check_plain,
     set_dotted,
 )
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
-S = TypeVar("S", bound=SceneData)
 TABLES = ("contact", "sliding", "detect", "output", "motion")
 HEADS = ("model", "muscle", *KEYS, *TABLES)
-
-
-def change_scene(
-    scene: S,
-    settings: Mapping[str, Any] | None = None,
-    *,
-    model: str | dict[str, Any] | None = None,
-    frames: slice | str | None = None,
-) -> S:
-    """Return a copy of a scene with other settings, another model or other frames; meshes are
-    shared.
-
-    Parameters
-    ----------
-    settings : mapping, optional
-        Dotted keys with their values: ``{"model.centres": 200, "contact.substep_angle": 1}``.
-        ``model`` and ``model.KEY`` change every muscle, ``muscle.NAME.model.KEY`` one; so do the
-        keys of contraction. ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and ``output.KEY``
-        change a table, one that the scene lacks is switched on. ``motion.step`` changes the step of
-        every ramp, ``motion.ramp.NAME.COORDINATE.KEY`` one key of one. Whole models come first, as
-        another model drops the settings of the one before.
-    model : str or dict, optional
-        For every muscle. Options of another model are dropped.
-    frames : slice or str, optional
-        Which frames of the motion, as a slice or "A:B:S".
-
-    Raises
-    ------
-    UsageError
-        If a key is unknown, with the nearest right one, or a value is not allowed.
-    """
-    changed, settings = scene.copy(), settings or {}
-    try:
-        if model is not None:
-            _set_models(changed.muscles, model)
-        for key in sorted(settings, key=lambda key: not chooses_model(key)):
-            value = settings[key]
-            _apply(changed, key, value.item() if isinstance(value, np.generic) else value)
-        if frames is not None:
-            chosen = parse_slice(frames) if isinstance(frames, str) else frames
-            changed.motion = slice_motion(changed.motion, chosen)
-    except SceneError as error:
-        raise UsageError(str(error)) from None
-    return changed
 
 
 def chooses_model(key: str) -> bool:
@@ -75,45 +28,36 @@ def chooses_model(key: str) -> bool:
     return key == "model" or (key.startswith("muscle.") and key.endswith(".model"))
 
 
-def _apply(scene, key, value):
-    head, _, rest = key.partition(".")
-    muscles, folder = scene.muscles, scene.path.parent if scene.path else None
-    if head == "muscle":
-        name, _, inner = rest.partition(".")
-        head, _, rest = inner.partition(".")
-        muscles = [scene.muscle(name)]
-        if head != "model" and head not in KEYS:
-            allowed = f"its model (muscle.{name}.model.KEY) and {', '.join(KEYS)}"
-            raise SceneError(f"{key}: of a muscle {allowed} can be set")
+def split_muscle_key(key: str) -> tuple[str, str, str]:
+    """Name, head and rest of a key ``muscle.NAME.HEAD.REST``."""
+    _, _, inner = key.partition(".")
+    name, _, inner = inner.partition(".")
+    head, _, rest = inner.partition(".")
+    if head != "model" and head not in KEYS:
+        allowed = f"its model (muscle.{name}.model.KEY) and {', '.join(KEYS)}"
+        raise SceneError(f"{key}: of a muscle {allowed} can be set")
+    return name, head, rest
+
+
+def set_on_muscles(muscles: Sequence[Muscle], head: str, rest: str, value: Any, place: str) -> None:
+    """Set a model, an option of it, or a key of contraction of muscles, in place."""
     if head == "model" and not rest:
-        _set_models(muscles, value)
+        set_models(muscles, value)
     elif head == "model":
         for muscle in muscles:
-            set_dotted(muscle.options, rest, value, place=key)
-    elif head in KEYS:
+            set_dotted(muscle.options, rest, value, place=place)
+    else:
         for muscle in muscles:
             _set_contraction(muscle, head, rest, value)
-    elif head not in TABLES:
-        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, HEADS)}")
-    elif not rest:
-        raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
-    elif head == "motion":
-        values = _changed_motion(scene.motion.options, rest, value, key)
-        options = MotionOptions.build(values, place=f"{key}: motion ", folder=folder)
-        scene.motion = make_motion(scene, options)
-    else:
-        table = getattr(scene, head) or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
-        values = table.model_dump(by_alias=True, exclude_unset=True)
-        set_dotted(values, rest, value, place=key)
-        setattr(scene, head, table.build(values, place=f"{key}: "))
 
 
-def _set_models(muscles: Sequence[Muscle], model: str | dict[str, Any]) -> None:
+def set_models(muscles: Sequence[Muscle], model: str | dict[str, Any]) -> None:
     """Give muscles another model; options of a different model are dropped."""
     name, options = split_model(model, place="model")
     for muscle in muscles:
         kept = muscle.options if muscle.model == name else {}
-        muscle.model, muscle.options = name, kept | options
+        muscle.model = name
+        muscle.options = kept | options
 
 
 def _set_contraction(muscle, key, rest, value):
@@ -124,8 +68,18 @@ def _set_contraction(muscle, key, rest, value):
     muscle.contraction = contraction_keys(given, muscle=muscle.name)
 
 
-def _changed_motion(options, rest, value, key):
-    """Values of a motion's table with one key changed; names of coordinates hold full stops."""
+def changed_table(head: str, table: Table | None, rest: str, value: object, place: str) -> Table:
+    """A table of settings with one key changed; one that the scene lacks begins with defaults."""
+    table = table or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
+    values = table.model_dump(by_alias=True, exclude_unset=True)
+    set_dotted(values, rest, value, place=place)
+    return table.build(values, place=f"{place}: ")
+
+
+def changed_motion(
+    options: MotionOptions, rest: str, value: Any, key: str, folder: Path | None
+) -> MotionOptions:
+    """The table of a motion with one key changed; names of coordinates hold full stops."""
     values = options.model_dump(by_alias=True, exclude_unset=True)
     if rest == "step" and options.ramp is not None:
         for ramp in values["ramp"].values():
@@ -138,7 +92,7 @@ def _changed_motion(options, rest, value, key):
         ramps[name][last] = value
     else:
         values[rest] = value
-    return values
+    return MotionOptions.build(values, place=f"{key}: motion ", folder=folder)
 
 
 def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:

@@ -10,7 +10,8 @@ from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.scene.motion import bone_poses, completed, interpolate, rest_coordinates
+from rbfmuscle.scene.frames import interpolate
+from rbfmuscle.scene.motion import bone_poses, completed, rest_coordinates
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses

@@ -73,7 +73,7 @@ class FrameLoop:
             for model, contacts in zip(models, _obstacles(scene, models, fields))
         ]
         self.here: dict[str, float] = {}
-        self.activations = Activations(scene)
+        self.activations = Activations(scene.muscles, scene.motion)
         for stepper in self.steppers:
             if scene.sliding is None and not stepper.contracts:
                 stepper.carrier = RigidTransport(scene.muscle(stepper.name), scene)

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.scene.motion import interpolate, shown_value, step_angle, unit_sign
+from rbfmuscle.scene.frames import interpolate
+from rbfmuscle.scene.motion import shown_value, step_angle, unit_sign
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.contact import BoneContacts

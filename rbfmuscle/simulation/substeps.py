@@ -10,10 +10,10 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.jit import compiled, inner
+from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.joints.joint import Coordinate, all_coordinates
 from rbfmuscle.scene.motion import (
     bone_poses,
-    interpolate,
     rest_coordinates,
     step_angle,
 )

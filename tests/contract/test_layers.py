@@ -8,7 +8,17 @@ from graphlib import CycleError, TopologicalSorter
 import pytest
 from conftest import ROOT
 
-NAMES = ("cache", "child", "folders", "geometry", "interruption", "jit", "progress", "validation")
+NAMES = (
+    "cache",
+    "child",
+    "folders",
+    "geometry",
+    "interruption",
+    "jit",
+    "progress",
+    "showing",
+    "validation",
+)
 LEAVES = tuple(f"rbfmuscle.{name}" for name in NAMES)
 CORE = (*LEAVES, "rbfmuscle.bones", "rbfmuscle.scene", "rbfmuscle.simulation")
 MEASURED = (
@@ -24,6 +34,7 @@ ALLOWED = {
     "rbfmuscle.validation": (),
     "rbfmuscle.jit": (),
     "rbfmuscle.progress": (),
+    "rbfmuscle.showing": (),
     "rbfmuscle.cache": ("rbfmuscle.geometry",),
     "rbfmuscle.child": ("rbfmuscle.child", "rbfmuscle.validation"),
     "rbfmuscle.folders": ("rbfmuscle.validation",),

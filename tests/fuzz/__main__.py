@@ -73,6 +73,7 @@ KINDS = ("scene", "mesh", "frames")
 def load(path: Path) -> int:
     """Read a scene with all that belongs to it, look it over, and prove its meshes."""
     from rbfmuscle.models import check_models
+    from rbfmuscle.scene.check import check_scene
     from rbfmuscle.scene.scene import Scene
     from rbfmuscle.simulation.substeps import check_substeps
     from rbfmuscle.validation import RBFMuscleError
@@ -80,7 +81,7 @@ def load(path: Path) -> int:
     try:
         scene = Scene.load(path)
         check_models(scene)
-        scene.check()
+        check_scene(scene)
         check_substeps(scene)
     except RBFMuscleError as error:
         return harness.tell(error)

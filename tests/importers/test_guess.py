@@ -24,6 +24,7 @@ from rbfmuscle.importers.guess.names import name_facts
 from rbfmuscle.importers.guess.orientation import HEADER, find_orientation
 from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.run import Run
+from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.joints.tables import JointTable
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
@@ -114,7 +115,7 @@ def test_what_is_written_loads_and_has_the_phantoms_joint(tmp_path, units, optio
     _phantom_meshes(tmp_path, **options)
     guess = guess_scene(tmp_path, units, tmp_path)
     scene = _write(guess, tmp_path / "scene.toml")
-    assert all(finding.level != "error" for finding in scene.check())
+    assert all(finding.level != "error" for finding in check_scene(scene))
     true = phantom_scene().joints[0].centre * options.get("scale", 1.0)
     if options.get("mirror"):
         true = true * [-1, 1, 1]

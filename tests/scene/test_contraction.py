@@ -32,7 +32,7 @@ def test_fibres_of_a_mesh_are_slack_pull_or_yield_by_the_law():
 
 def test_sub_steps_follow_activation_and_settle_where_bones_stand_still():
     made = scene(activation=[0.0, 0.55])
-    activations = Activations(made)
+    activations = Activations(made.muscles, made.motion)
     here = made.motion.frames[0]
     assert activations.refine(0, [here]) == ([here], [])
     stops, values = activations.refine(4, [here])

@@ -11,7 +11,7 @@ import trimesh
 from conftest import ROOT
 
 from rbfmuscle.importers.toml_text import attachment_file
-from rbfmuscle.scene.check import bone_collisions, check_initial
+from rbfmuscle.scene.check import bone_collisions, check_initial, check_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_settings, parse_slice
 from rbfmuscle.validation import SceneError, UsageError
@@ -258,7 +258,7 @@ class TestCheck:
         scene.muscles[0].mesh.apply_translation(
             [0, 0, -4]
         )  # 1 mm into the bones in the middle of each
-        (note, *_) = [f for f in scene.check() if "start inside" in f.message]
+        (note, *_) = [f for f in check_scene(scene) if "start inside" in f.message]
         # The free ones over the lower arm, whose top and end are at z = 10 and x = 10.
         x, _, z = scene.muscles[0].mesh.vertices.T
         deep = np.minimum(10.0 - z, x - 10.0)[(z < 10.0) & (x > 10.0)].max()

@@ -24,6 +24,27 @@ def placed(scene, bend, turn=0.0):
     return poses[END], poses.tendons[END].points, poses
 
 
+@pytest.mark.parametrize("joints_last", [False, True])
+def test_a_tendon_keeps_off_the_bones_between_its_ends_whenever_their_joints_are_added(joints_last):
+    scene = rm.Scene("arm", units="mm")
+    for name, middle in (("trunk", 60.0), ("limb", -65.0), ("wedge", 0.0)):
+        mesh = trimesh.creation.cylinder(4.0, 8.0 if name == "wedge" else 100.0)
+        scene.add_bone(name, mesh.apply_translation([0.0, 0.0, middle]))
+    joints = [("upper", "trunk", "wedge"), ("lower", "wedge", "limb")]
+    belly = trimesh.creation.capsule(70.0, 9.0).apply_translation([0.0, -20.0, 15.0])
+    z = belly.vertices[:, 2]
+    attach = held(trunk=z > z.max() - 6.0, limb=z < z.min() + 6.0)
+    attach[1]["tendon"] = {"to": [0.0, -8.0, -70.0]}
+    steps = [
+        lambda: [scene.add_joint(*names, type="fixed") for names in joints],
+        lambda: scene.add_muscle("strap", belly, attach=attach),
+    ]
+    for step in reversed(steps) if joints_last else steps:
+        step()
+    (end,) = scene.muscles[0].tendons
+    assert [bone.name for bone in end.obstacles] == ["trunk", "limb", "wedge"]
+
+
 def test_a_bent_joint_takes_the_end_along_the_straight_line_at_the_tendons_length():
     scene = arm()
     np.testing.assert_allclose(placed(scene, 0.0)[0], np.eye(4), atol=1e-12)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.check import (
+from rbfmuscle.scene.extents import (
     FAR_AWAY,
     FARTHEST_CENTRE,
     LARGEST_MM,
@@ -55,20 +55,19 @@ class TestPlaces:
         beyond = pytest.raises((MeshError, SceneError), match=words)
         with nullcontext() if share < 1.0 else beyond:
             if muscle:
-                check_place(scene, "it", Bone("it", ball))
+                check_place("it", Bone("it", ball), scene.bones, scene.units)
             else:
-                check_centre(scene, "it", place)
+                check_centre("it", place, scene.bones, scene.units)
 
     @pytest.mark.parametrize("units", UNITS)
     def test_size_is_judged_in_millimetres_whatever_the_unit(self, units):
-        scene = Scene("size", units=units)
         for share, fine in ((1.02, True), (0.98, False)):
             for millimetres in (share * SMALLEST_MM, LARGEST_MM / share):
                 side = millimetres * UNITS[units] / math.sqrt(3.0)
                 box = trimesh.creation.box((side, side, side))
                 refused = pytest.raises(MeshError, match=rf"bone 'b' .* {units} across")
                 with nullcontext() if fine else refused:
-                    check_size(scene, "bone", "b", Bone("b", box))
+                    check_size("bone", "b", Bone("b", box), units)
 
 
 @settings(max_examples=60, deadline=None)

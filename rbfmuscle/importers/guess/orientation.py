@@ -1,16 +1,13 @@
 """Which way is up and forwards: from the bones themselves, or from a volume's header."""
 
 from dataclasses import dataclass, field
-from typing import TypeVar
 
 import numpy as np
 
 from rbfmuscle.importers.guess.landmarks import Frame, across, femur_frame, long_axis, unit
 from rbfmuscle.importers.guess.names import name_facts
 from rbfmuscle.importers.guess.parts import Part
-from rbfmuscle.scene.objects import SceneData
-
-S = TypeVar("S", bound=SceneData)
+from rbfmuscle.scene.scene import Scene
 
 AGREE = 45.0  # directions of bones and header that differ by more than this [degree] are named
 # Scans are saved along the body: an axis of the coordinates within this [degree] of what a thigh
@@ -78,7 +75,7 @@ def find_orientation(bones: list[Part], header: Orientation | None = None) -> Or
     return Orientation(header.superior, header.anterior, source=header.source, doubts=doubts)
 
 
-def orient_scene(scene: S) -> S:
+def orient_scene(scene: Scene) -> Scene:
     """Give a scene the directions that its bones show, by their names and shapes, where its file
     has none.
     """

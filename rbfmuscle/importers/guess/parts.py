@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.importers.guess.names import MuscleFacts, name_facts
-from rbfmuscle.scene.check import LARGEST_MM, SMALLEST_MM
+from rbfmuscle.scene.extents import LARGEST_MM, SMALLEST_MM
 from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES, read_file
 from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.validation import MeshError, UsageError

@@ -68,12 +68,12 @@ def import_osim(
     for joint, backward in walk.steps:
         parent, child = (joint.child, joint.parent) if backward else (joint.parent, joint.child)
         placed = joint.moved(places[joint.parent] @ joint.parent_frame)
-        scene.place_joint(replace(placed, parent=parent, child=child, backward=backward))
+        scene.add_joint(replace(placed, parent=parent, child=child, backward=backward))
     known = all_coordinates(scene.joints)
     for coupling in model.couplings:
         missing = [n for n in (coupling.coordinate, *coupling.of) if n not in known]
         if not missing:
-            scene.place_coupling(coupling)
+            scene.add_coupling(coupling)
         elif coupling.coordinate in known:
             scene.doubts.append(f"{coupling.coordinate} does not follow {missing[0]}, not taken")
     scene.doubts += model.doubts

@@ -17,8 +17,8 @@ from rbfmuscle.scene.activation.keys import (
     ContractionTable,
     TendonTable,
 )
-from rbfmuscle.scene.motion import interpolate
-from rbfmuscle.scene.objects import Motion, Muscle, SceneData
+from rbfmuscle.scene.frames import interpolate
+from rbfmuscle.scene.objects import Motion, Muscle
 from rbfmuscle.validation import SceneError, did_you_mean
 
 # A fibre that lies farther outside than this share of the muscle's diagonal is one of another
@@ -103,11 +103,9 @@ class Activations:
     window does, overrides the scene's own curves.
     """
 
-    def __init__(self, scene: SceneData) -> None:
-        contracting = [muscle for muscle in scene.muscles if muscle.contraction is not None]
-        self.curves = {
-            muscle.name: activation_curve(muscle, scene.motion) for muscle in contracting
-        }
+    def __init__(self, muscles: list[Muscle], motion: Motion) -> None:
+        contracting = [muscle for muscle in muscles if muscle.contraction is not None]
+        self.curves = {muscle.name: activation_curve(muscle, motion) for muscle in contracting}
         self.here = dict.fromkeys(self.curves, 0.0)
         self.target: dict[str, float] = {}
 

@@ -75,6 +75,12 @@ class Coordinate:
             return min(max(value, self.range[0]), self.range[1])
         return value
 
+    def unit_sign(self, length: str) -> str:
+        """Return what follows its value in text: the sign for degrees, the unit of length, or
+        nothing.
+        """
+        return {"translation": f" {length}", "coupled": ""}.get(self.motion, "°")
+
 
 @dataclass(frozen=True)
 class TransformAxis:
@@ -242,6 +248,23 @@ def ordered(couplings: list[Coupling]) -> list[Coupling]:
             f"coupling of {ring[0]!r} follows itself; leave one of the ring out"
         ) from None
     return [by_name[name] for name in order if name in by_name]
+
+
+def check_tree(joints: Sequence[Joint], joint: Joint) -> None:
+    """Raise SceneError if the bones would be no tree with one more joint."""
+    parents = {other.child: other.parent for other in joints}
+    if joint.child in parents:
+        raise SceneError(
+            f"joint {joint.name!r}: bone {joint.child!r} is already the child of another joint"
+        )
+    ancestor: str | None = joint.parent
+    while ancestor is not None:
+        if ancestor == joint.child:
+            raise SceneError(
+                f"joint {joint.name!r}: {joint.child!r} would hang on itself, joints must form a "
+                "tree"
+            )
+        ancestor = parents.get(ancestor)
 
 
 def joint_poses(

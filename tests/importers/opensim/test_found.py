@@ -25,6 +25,7 @@ from osim_text import (
 import rbfmuscle as rm
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import import_osim, write_scene
+from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.joints.joint import joint_poses, rotation_about
 
 
@@ -81,7 +82,7 @@ class TestRoots:
         scene = rm.Scene.load(
             write_scene(import_osim(tmp_path / "m.osim"), tmp_path / "s"), skeleton=True
         )
-        warned = [f.message for f in scene.check() if f.level == "warning"]
+        warned = [f.message for f in check_scene(scene) if f.level == "warning"]
         assert [message.split("'")[1] for message in warned] == ["upper", "alone"]
         check_written(tmp_path, {"knee.knee_q": 0.9, "root.root_q": -0.3})
 

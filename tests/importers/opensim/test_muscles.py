@@ -10,6 +10,7 @@ from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import import_osim, write_scene
 from rbfmuscle.importers.opensim.tubes import make_tube
 from rbfmuscle.importers.opensim.xml import read_xml
+from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
 
@@ -78,7 +79,7 @@ def test_muscles_of_published_models_are_written_and_load(osim_data, tmp_path):
     scene = Scene.load(write_scene(found, tmp_path))
     scene = scene.with_options({"motion.file": str(path.parent / "leg69_IK_swing.mot")})
     assert len(scene.muscles) == 9 and scene.superior == [0.0, 1.0, 0.0]
-    assert all(finding.level != "error" for finding in scene.check())
+    assert all(finding.level != "error" for finding in check_scene(scene))
     for known, muscle in zip(model.muscles, scene.muscles):
         assert muscle.mesh.volume == pytest.approx(known.volume), known.name
 
