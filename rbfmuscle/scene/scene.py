@@ -52,6 +52,7 @@ from rbfmuscle.scene.options import (
     SlidingOptions,
 )
 from rbfmuscle.scene.record import record_mesh, record_muscle
+from rbfmuscle.scene.save import SceneFiles
 from rbfmuscle.validation import MeshError, SceneError, UsageError, did_you_mean
 
 MeshInput: TypeAlias = str | Path | ReadMesh | MeshLike
@@ -173,6 +174,41 @@ class Scene:
         self.sliding = tables.sliding
         self.detect = tables.detect
         self.output = tables.output
+
+    def save(self, path: str | Path) -> Path:
+        """Write the scene as a TOML file that loads as the same scene, and return its path.
+
+        Meshes, lists of attached vertices, fibres and a motion's file go into a new folder
+        ``NAME_files`` beside it; nothing that exists is replaced.
+
+        Raises
+        ------
+        UsageError
+            If the file or the folder is there already.
+        SceneError
+            If the frames of the motion were not made from the keys of ``[motion]``.
+        """
+        motion = self.copy()._move(self.motion.options).motion
+        if list(motion.frames) != list(self.motion.frames):
+            raise SceneError(
+                "the frames of the motion are not those of its table [motion]; give it by "
+                "set_motion before the scene is saved"
+            )
+        files = SceneFiles(Path(path))
+        about: dict[str, Any] = {"format": 1, "name": self.name, "units": self.units}
+        for key in ("left_out", "doubts", "notes", "superior", "anterior"):
+            about |= {key: getattr(self, key)} if getattr(self, key) else {}
+        tables = [("[scene]", about)]
+        tables += [("[[bone]]", files.bone(bone)) for bone in self.bones]
+        tables += [("[[bone]]", {"name": name}) for name in self.links]
+        tables += [("[[joint]]", joint_row(joint)) for joint in self.joints]
+        tables += [("[[coupling]]", coupling_row(one, self.joints)) for one in self.couplings]
+        tables += [("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles]
+        for key in changes.TABLES:
+            table = getattr(self, key) if key != "motion" else self.motion.options
+            tables += [] if table is None else [(f"[{key}]", files.table(table))]
+        files.write(tables, self.guesses)
+        return files.path
 
     def add_bone(self, name: str, mesh: MeshInput | None = None, *, scale: float = 1.0) -> Self:
         """Add a bone and return the scene.

@@ -21,11 +21,11 @@ from rbfmuscle.importers.guess.frames import bone_frames
 from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
 from rbfmuscle.importers.guess.parts import Part, Parts, read_parts
-from rbfmuscle.importers.toml_text import attachment_file, table_text
 from rbfmuscle.scene.articular import articular_points
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.guesses import DOUBTFUL
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.toml_text import attachment_file, table_text
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
 _TAIL = """[contact]

@@ -13,13 +13,13 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.importers.opensim.model import ModelMesh, OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.tubes import TUBE_MODEL, make_tube
-from rbfmuscle.importers.toml_text import attachment_file, table_text
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.meshes.formats import ALL, MESH_SUFFIXES, read_part
 from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.toml_text import attachment_file, table_text
 from rbfmuscle.validation import MeshError, SceneError, check_mesh
 
 WIDEST = 3.0  # a mesh wider than this [m] is a floor or a wall, not a bone

@@ -1,0 +1,112 @@
+"""A scene as a TOML file, its meshes, lists of vertices and fibres in a folder beside it."""
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.guesses import Guess
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.options import Table
+from rbfmuscle.scene.toml_text import attachment_file, table_text
+from rbfmuscle.validation import UsageError
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+class SceneFiles:
+    """The files of one scene, each written when its table is made; paths are relative to it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.folder = path.with_name(f"{path.stem}_files")
+        if path.suffix != ".toml":
+            raise UsageError(f"{path}: the name of a scene file ends in .toml")
+        for taken in (path, self.folder):
+            if taken.exists():
+                raise UsageError(f"{taken} is there already; choose another name")
+        self.folder.mkdir(parents=True)
+
+    def bone(self, bone: Bone) -> dict[str, Any]:
+        """``[[bone]]``, its mesh written."""
+        return {"name": bone.name, "mesh": self._mesh("bones", bone.name, bone.mesh)}
+
+    def muscle(self, muscle: Muscle) -> dict[str, Any]:
+        """``[[muscle]]``, its mesh, attached vertices and fibres written."""
+        row: dict[str, Any] = {
+            "name": muscle.name,
+            "mesh": self._mesh("muscles", muscle.name, muscle.mesh),
+            "model": {"name": muscle.model, **muscle.options},
+            "attach": [],
+        }
+        for number, held in enumerate(muscle.attachments, 1):
+            file = self._new(attachment_file(f"{muscle.name}.{number}", held.bone))
+            np.savetxt(file, held.vertices, fmt="%d")
+            entry: dict[str, Any] = {"bone": held.bone, "vertices": self._relative(file)}
+            if held.tendon is not None:
+                entry["tendon"] = held.tendon.model_dump(exclude_unset=True)
+            row["attach"].append(entry)
+        if muscle.fibres:
+            file = self._new(f"fibres/{muscle.name}.json")
+            lines = [np.asarray(line).tolist() for line in muscle.fibres]
+            file.write_text(json.dumps({"polylines": lines}), encoding="utf-8")
+            row["fibres"] = self._relative(file)
+        if muscle.contraction is not None:
+            row |= muscle.contraction.model_dump(exclude_unset=True)
+        return row
+
+    def table(self, table: Table) -> dict[str, Any]:
+        """A table of settings; the file of a motion is copied."""
+        row = table.model_dump(by_alias=True, exclude_unset=True, exclude_none=True)
+        if "file" in row:
+            file = self._new(row["file"].name)
+            shutil.copyfile(row["file"], file)
+            row["file"] = self._relative(file)
+        return row
+
+    def write(
+        self, tables: Sequence[tuple[str, Mapping[str, Any]]], guesses: Sequence[Guess]
+    ) -> None:
+        """Write the file itself from the heads and rows of its tables; lines that are guesses are
+        marked.
+        """
+        parts = []
+        for head, row in tables:
+            name = row.get("name")
+            about = [g for g in guesses if g.table == head.strip("[]") and g.name in ("", name)]
+            said = [f"GUESS {guess.confidence}: {guess.text}" for guess in about]
+            keys = [key for key, value in row.items() if not isinstance(value, list)]
+            parts.append(table_text(head, row, dict(zip(keys, said))))
+        self.path.write_text("\n".join(parts), encoding="utf-8")
+
+    def _new(self, name: str) -> Path:
+        file = self.folder / name
+        file.parent.mkdir(exist_ok=True)
+        return file
+
+    def _relative(self, file: Path) -> str:
+        return file.relative_to(self.path.parent).as_posix()
+
+    def _mesh(self, folder: str, name: str, mesh: "trimesh.Trimesh") -> str:
+        """Write a PLY file in double precision, which trimesh does not, and return its name."""
+        file = self._new(f"{folder}/{name}.ply")
+        faces = np.zeros(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+        faces["count"] = 3
+        faces["corners"] = mesh.faces
+        head = [
+            "ply",
+            "format binary_little_endian 1.0",
+            f"element vertex {len(mesh.vertices)}",
+            *(f"property double {axis}" for axis in "xyz"),
+            f"element face {len(faces)}",
+            "property list uchar int vertex_indices",
+            "end_header\n",
+        ]
+        vertices = np.asarray(mesh.vertices, dtype="<f8")
+        file.write_bytes("\n".join(head).encode() + vertices.tobytes() + faces.tobytes())
+        return self._relative(file)

@@ -1,0 +1,109 @@
+"""A scene that is saved loads as the same scene."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from command_line import call
+
+import rbfmuscle as rm
+from rbfmuscle.scene.guesses import Guess
+from rbfmuscle.scene.objects import Motion
+
+FROM_FILES = ("file", "mesh", "mended")  # what the record of a scene says of where its files lie
+
+
+def built():
+    """An elbow and one muscle."""
+    scene = rm.Scene("arm", units="mm")
+    for name, middle in (("upper", -50.0), ("lower", 50.0)):
+        box = trimesh.creation.box((80, 20, 20)).apply_translation([middle, 0, 0])
+        scene.add_bone(name, box)
+    scene.add_joint("elbow", "upper", "lower", (0, 0, 0), {"flexion": (0, -1, 0)})
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    mesh.apply_scale([60, 10, 8]).apply_translation([0, 0, 20])
+    attach = [{"bone": "upper", "near": 4}, {"bone": "lower", "near": 4}]
+    return scene.add_muscle("biceps", mesh, attach=attach)
+
+
+def rich():
+    """A scene with a part of every sort, at coordinates that single precision would round."""
+    scene = built()
+    scene.bones[0].mesh.vertices += 1e-9
+    scene.add_bone("tip")
+    scene.add_joint(
+        "wrist", "lower", "tip", type="slider", centre=[90, 0, 0], axes={"x": [1, 0, 0]}
+    )
+    scene.add_coupling("wrist.x", ["elbow.flexion"], linear=[0.125, 0.0])
+    biceps = scene.muscles[0]
+    line = np.array([[-40.0, 0.1, 20.0], [40.0, 0.2, 20.0]])
+    vertices = biceps.mesh.vertices[:, 0]
+    attach = [
+        {"bone": "upper", "vertices": np.flatnonzero(vertices < -50)},
+        {
+            "bone": "lower",
+            "vertices": np.flatnonzero(vertices > 50),
+            "tendon": {"to": [70.0, 0.0, 11.0], "via": [{"bone": "lower", "point": [65, 0, 18]}]},
+        },
+    ]
+    raised = biceps.mesh.copy().apply_translation([0, 0, 30])
+    keys = {"activation": [0.0, 0.5], "fibre_stretch_at_rest": 1.1}
+    scene.add_muscle("second", raised, attach=attach, model={"name": "rbf", "centres": 90}, **keys)
+    scene.muscles[0].fibres = [line]
+    scene.set_motion(ramp={"elbow.flexion": {"from": 0, "to": 30, "step": 10}})
+    scene = scene.with_options({"detect.tunnelling.angle": 120.0, "sliding.threshold": 1.5})
+    scene.doubts = ["a doubt"]
+    scene.guesses = [
+        Guess("joint", "wrist", 0.5, "its axis"),
+        Guess("muscle", "second", 0.4, "its end"),
+    ]
+    return scene
+
+
+def facts(value):
+    """The record of a scene without what says where its files lie."""
+    if isinstance(value, dict):
+        return {key: facts(item) for key, item in value.items() if key not in FROM_FILES}
+    return [facts(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def test_a_saved_scene_loads_as_the_same_scene(tmp_path):
+    scene = rich()
+    again = rm.Scene.load(scene.save(tmp_path / "arm.toml"))
+    assert facts(again.resolved()) == facts(json.loads(json.dumps(scene.resolved())))
+    assert again.motion.frames == scene.motion.frames
+    for ours, theirs in zip(scene.muscles, again.muscles, strict=True):
+        for one, other in zip(ours.attachments, theirs.attachments, strict=True):
+            assert np.array_equal(one.vertices, other.vertices)
+    assert np.array_equal(again.muscles[0].fibres, scene.muscles[0].fibres)
+    (end,) = again.muscle("second").tendons
+    assert end.length == scene.muscle("second").tendons[0].length
+
+
+def test_a_saved_scene_reaches_the_command_line_and_replaces_nothing(tmp_path, capsys):
+    path = rm.phantom_scene(spacing=6.0).save(tmp_path / "hip.toml")
+    code, out, _ = call(capsys, "check", path)
+    assert code == 0 and "extensor" in out
+    text = path.read_text()
+    with pytest.raises(rm.UsageError, match="is there already"):
+        rm.Scene("other").save(path)
+    assert path.read_text() == text
+
+
+def test_frames_of_no_table_and_files_of_another_kind_are_refused(tmp_path):
+    scene = built()
+    scene.motion = Motion([{}, {"elbow.flexion": 0.1}])
+    with pytest.raises(rm.SceneError, match="set_motion"):
+        scene.save(tmp_path / "arm.toml")
+    with pytest.raises(rm.UsageError, match=r"ends in \.toml"):
+        built().save(tmp_path / "arm.json")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_open_bones_stay_open(tmp_path):
+    scene = built()
+    box = trimesh.creation.box((40, 40, 40)).apply_translation([0, 0, 90])
+    scene.add_bone("shell", trimesh.Trimesh(box.vertices, box.faces[2:]))
+    again = rm.Scene.load(scene.save(tmp_path / "arm.toml"))
+    assert [bone.closed for bone in again.bones] == [bone.closed for bone in scene.bones]
