@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.check import check_scene as check_scene
     from rbfmuscle.scene.phantom import phantom_scene as phantom_scene
     from rbfmuscle.scene.scene import Scene as Scene
+    from rbfmuscle.sweeping import sweep as sweep
     from rbfmuscle.validation import LimitExceededError as LimitExceededError
     from rbfmuscle.validation import MeshError as MeshError
     from rbfmuscle.validation import MissingDependencyError as MissingDependencyError
@@ -60,6 +61,7 @@ _HOME = {
     "show": "rbfmuscle.viewer.page",
     "simulate": "rbfmuscle.run",
     "study_kernels": "rbfmuscle.experiments.kernel_study",
+    "sweep": "rbfmuscle.sweeping",
     **dict.fromkeys(_ERRORS, "rbfmuscle.validation"),
 }
 # For modules that may not import it themselves.

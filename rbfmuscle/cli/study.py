@@ -13,11 +13,10 @@ from cyclopts import Parameter
 
 from rbfmuscle.cli.options import Frames, Model, Output, SceneName, Settings, Texts, chosen_muscle
 from rbfmuscle.progress import Progress
-from rbfmuscle.validation import SolveError, UsageError, did_you_mean
+from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
-    from rbfmuscle.run import Run
-    from rbfmuscle.scene.scene import Scene
+    pass
 
 
 def compare(
@@ -234,16 +233,12 @@ def sweep(
         The error on the axis of the Pareto front; the other axis is time.
     """
     from rbfmuscle import interruption
-    from rbfmuscle.experiments.sweep import parse_grid, plan_sweep
-    from rbfmuscle.experiments.sweep_run import VALUES, run_sweep
+    from rbfmuscle.experiments.sweep import parse_grid
     from rbfmuscle.models import configure_scene
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
+    from rbfmuscle.sweeping import sweep as run_scenes
 
-    if error not in VALUES:
-        raise UsageError(f"unknown quantity {error!r}, {did_you_mean(error, VALUES)}")
-    if jobs is not None and jobs < 1:
-        raise UsageError(f"--jobs must be 1 or more, got {jobs}")
     axes, changes = parse_grid(grid or []), parse_settings(settings)
     if not scenes or (len(scenes) == 1 and not axes):
         raise UsageError(
@@ -251,14 +246,17 @@ def sweep(
         )
     opened = {name: open_scene(path) for name, path in _names(scenes).items()}
     loaded = {name: configure_scene(each, changes, model=model) for name, each in opened.items()}
-    points = plan_sweep(loaded, axes, frames=frames, reference=parse_settings(reference))
-    for point in points:  # a mistyped key is reported now, not after the first point
-        configure_scene(loaded[point.scene], point.settings, frames=frames)
-    options: dict[str, Any] = {"frames": frames, "jobs": jobs, "cluster": cluster}
-    progress = Progress(f"sweep of {len(points)} points", what="point")
+    options: dict[str, Any] = {
+        "frames": frames,
+        "reference": parse_settings(reference),
+        "jobs": jobs,
+        "cluster": cluster,
+        "error": error,
+    }
+    progress = Progress("sweep", what="point")
     with progress, interruption.keeping(lambda: f"finished points are kept in {output}"):
-        run_sweep(run_point, loaded, points, output, progress=progress, **options)
-    _finish(points, output, {name: scene.units for name, scene in loaded.items()}, error)
+        table = run_scenes(loaded, axes, output, progress=progress, **options)
+    _finish(table, output)
 
 
 def _names(scenes):
@@ -270,19 +268,7 @@ def _names(scenes):
     raise UsageError("scenes of a sweep need different names, or folders of different names")
 
 
-def run_point(scene: Scene, settings: dict[str, Any], frames: str | None) -> Run:
-    """One run of a sweep, in memory; module-level, so that it can be sent to other processes."""
-    from rbfmuscle.run import simulate
-
-    return simulate(scene, settings=settings, frames=frames)
-
-
-def _finish(points, output, units, error):
-    from rbfmuscle.experiments.sweep_run import write_table
-    from rbfmuscle.report.sweep_page import write_page
-
-    table = write_table(points, output, units, quantity=error)
-    write_page(table, output)
+def _finish(table, output):
     for verdict in table["verdicts"]:
         print(verdict["text"])
     print(

@@ -38,6 +38,12 @@ class Finding:
 def check_scene(scene: Scene) -> list[Finding]:
     """Return all findings about a scene, the first error among them, the worst first; nothing is
     solved or changed.
+
+    Examples
+    --------
+    >>> from rbfmuscle import check_scene, phantom_scene
+    >>> [finding for finding in check_scene(phantom_scene()) if finding.level == "error"]
+    []
     """
     items: list[Bone | Muscle] = [*scene.bones, *scene.muscles]
     findings = [Finding("note", item.name, note) for item in items for note in item.notes]

@@ -55,6 +55,7 @@ ALLOWED = {
     "rbfmuscle.recording": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models"),
     "rbfmuscle.run": (*ABOVE, "rbfmuscle.recording"),
     "rbfmuscle.compare": (*ABOVE, "rbfmuscle.models", "rbfmuscle.run"),
+    "rbfmuscle.sweeping": (*ABOVE, "rbfmuscle.models", "rbfmuscle.run"),
     "rbfmuscle.paths": (*ABOVE, "rbfmuscle.importers", "rbfmuscle.models"),
     "rbfmuscle.cli": (
         *ABOVE,
@@ -63,6 +64,7 @@ ALLOWED = {
         "rbfmuscle.run",
         "rbfmuscle.compare",
         "rbfmuscle.paths",
+        "rbfmuscle.sweeping",
         "rbfmuscle.viewer",
         "rbfmuscle.cli",
     ),

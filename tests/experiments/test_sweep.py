@@ -16,7 +16,7 @@ from blend_model import arm_files, arm_scene, use_blend_model
 
 import rbfmuscle as rm
 from rbfmuscle.cli.app import run_command as command
-from rbfmuscle.cli.study import _names, run_point
+from rbfmuscle.cli.study import _names
 from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep, scene_content
 from rbfmuscle.experiments.sweep_run import (
     SweepFolder,
@@ -27,6 +27,7 @@ from rbfmuscle.experiments.sweep_run import (
     write_table,
 )
 from rbfmuscle.report.sweep_page import write_page
+from rbfmuscle.sweeping import run_point
 from rbfmuscle.validation import UsageError
 
 GRID = ["model.centres=40,60", "model.resolution=16,24"]
