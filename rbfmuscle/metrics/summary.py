@@ -313,13 +313,8 @@ def exceeded(table: Table, limits: Limits) -> list[Exceedance]:
             worst = facts.get("worst")
             worst = math.nan if worst is None else worst  # as a file has it
             if not meets_limit(quantity, worst, limit):
-<<<<<<< HEAD
                 found.append(Exceedance(muscle, name, worst, limit, facts.get("worst_frame")))
     return sorted(found, key=_exceedance_ratio, reverse=True)
-=======
-                found.append((muscle, name, worst, limit, facts.get("worst_frame")))
-    return sorted(found, key=lambda row: limit_ratio(*row[1:4]), reverse=True)
->>>>>>> 881cdae4 (Name metrics, limits and errors by the field's words)
 
 
 def _exceedance_ratio(row: Exceedance) -> float:
