@@ -258,8 +258,8 @@ class FieldFit:
 
 
 def overlapping_parts(points: Floats, part: int = PART, covered: int = COVERED) -> Integers:
-    """Parts (P, n) of points (K, 3): ``part`` nearest to one of them, which comes first, or all where
-    there are few.
+    """Parts (P, n) of points (K, 3): the ``part`` nearest to one of them, which comes first, or all
+    where there are few.
 
     Every point is among the first ``covered`` of a part: the middle of the next is always the point
     without one that is farthest from the middles so far.

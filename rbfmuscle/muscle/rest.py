@@ -19,8 +19,8 @@ from rbfmuscle.validation import SceneError
 
 # A patch smaller than the spacing of the centres still has to hold the muscle against turning.
 LEAST_ATTACHED = 4
-# Centres of a local fit of the cubic kernel, and how many of them count as covered: fits of half the
-# time. Other kernels break into more sheets with so few.
+# Centres of a local fit of the cubic kernel, and how many of them count as covered: half the time
+# of the usual parts. Other kernels break into more sheets with so few.
 SMALL = (15, 8)
 
 
