@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
+from rbfmuscle.implicit.field import FieldFit, RBFField
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import choose_centres, place_points
 from rbfmuscle.scene.ends import ordered_muscle
@@ -19,9 +19,6 @@ from rbfmuscle.validation import SceneError
 
 # A patch smaller than the spacing of the centres still has to hold the muscle against turning.
 LEAST_ATTACHED = 4
-# Centres of a local fit of the cubic kernel, and how many of them count as covered: half the time
-# of the usual parts. Other kernels break into more sheets with so few.
-SMALL = (15, 8)
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ class RestState:
             frame.points(samples.points),
             samples.control_faces,
             fit,
-            overlapping_parts(centres.points, *(SMALL if fit.kernel.plain_cube else ())),
+            fit.parts(centres.points),
             held_by.bones,
             attached_bone,
             free,

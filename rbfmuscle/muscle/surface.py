@@ -46,7 +46,7 @@ BLOWN = 1e-3  # the same of the material blown up to its volume, whose last digi
 NEWTON, LEVELS, LIFTS, MEET = 6, 20, 2, 4  # rounds, at most
 # What crosses is taken back towards the material by a share of the way as long as that helps, then
 # smoothed by some sweeps; rounds, at most, and in how many of them the region grows by a ring.
-BACK, TRIED, SWEEPS, ROUNDS, GROWTH = 0.2, 10, 1, 40, 6
+BACK, TRIED, SWEEPS, ROUNDS, GROWTH = 0.2, 10, 1, 60, 6
 # All of that is done up to so many times, as the way back to the volume can make triangles cross.
 AGAIN = 4
 # Outcomes.
