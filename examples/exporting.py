@@ -19,7 +19,7 @@ draw(out / "run", out / "exported.png")
 for path in sorted((out / "run").iterdir()):
     print(path.name)
 
-# The same from the command line: rbfmuscle export run --format stl glb --units m
+# The same from the command line: rbfmuscle export run --format stl,glb --units m
 written = export_run(out / "run", ["stl", "glb"], output=out / "meshes", units="m")
 print(len(written), "files, for instance", ", ".join(sorted({path.suffix for path in written})))
 

@@ -13,7 +13,7 @@ from rbfmuscle.cli import main
 
 out = folder("sweep")
 words = ["sweep", "phantom", "-o", str(out / "sweep"), "--frames", "0:16:5"]
-words += ["--grid", "model.centres=60,120,240", "model.resolution=32,48"]
+words += ["--grid", "model.centres=60,120,240", "--grid", "model.resolution=32,48"]
 print("$ rbfmuscle", *words, flush=True)
 try:
     main(words)

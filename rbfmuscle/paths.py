@@ -4,7 +4,7 @@ well they hold.
 
 import csv
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -18,8 +18,7 @@ from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
 from rbfmuscle.scene.joints.functions import exponents
 from rbfmuscle.scene.joints.joint import all_coordinates
-from rbfmuscle.scene.joints.tables import full_name
-from rbfmuscle.scene.motion import bone_poses, inner_value
+from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
@@ -37,6 +36,7 @@ MOST_COORDINATES = 6  # OpenSim's function takes up to six coordinates
 FOLDS = 5  # parts of the poses that are left out in turn to choose the order
 
 Ranges = dict[str, tuple[float, float]]
+Row = dict[str, str | int | float]
 
 
 @dataclass
@@ -51,26 +51,6 @@ class Samples:
     lengths: np.ndarray  # (n,) [scene unit]
     arms: np.ndarray  # (n, d) [scene unit]
     unsettled: int = 0  # poses at which it had not settled after `MOST_SOLVES`
-
-
-def parse_ranges(scene: Scene, texts: list[str]) -> Ranges:
-    """Return the ranges that --range asks for, by full name [radian or scene unit]."""
-    known, found = list(all_coordinates(scene.joints)), {}
-    for text in texts:
-        name, _, ends = text.partition("=")
-        try:
-            low, high = (float(end) for end in ends.split(":"))
-        except ValueError:
-            form = "COORDINATE=LOW:HIGH, for instance hip.flexion=0:60"
-            raise UsageError(f"--range {text!r} is not {form}") from None
-        try:
-            full = full_name(name, known, place="--range")
-        except SceneError as error:
-            raise UsageError(str(error)) from None
-        if not -np.inf < low < high < np.inf:
-            raise UsageError(f"--range {text!r}: the range must go upwards between two numbers")
-        found[full] = (inner_value(scene, full, low), inner_value(scene, full, high))
-    return found
 
 
 def sample_muscles(
@@ -273,9 +253,17 @@ def paths_folder(directory: Path) -> OutputFolder:
     return OutputFolder(directory, "paths", ("paths.xml", "errors.csv"))
 
 
-def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[str]:
-    """Fit every muscle, write the files, and return lines that say how well the fits hold where
-    they were not made.
+def report_fits(
+    scene: Scene,
+    sampled: list[Samples],
+    directory: Path,
+    *,
+    targets: Mapping[str, str] | None = None,
+) -> tuple[list[Row], list[str]]:
+    """Fit every muscle and write the files; how well the fits hold where they were not made, as
+    rows of ``errors.csv`` and as lines.
+
+    ``targets`` are those of `write_paths`.
     """
     fitted = []
     lines = []
@@ -296,13 +284,13 @@ def report_fits(scene: Scene, sampled: list[Samples], directory: Path) -> list[s
             + (f"; at {found.unsettled} poses it did not settle" if found.unsettled else "")
         )
     with paths_folder(directory).staged() as stage:
-        write_paths(stage / "paths.xml", fitted, scene.length(1000.0), turning)
+        write_paths(stage / "paths.xml", fitted, scene.length(1000.0), turning, targets or {})
         with (stage / "errors.csv").open("w", encoding="utf-8", newline="") as out:
             writer = csv.DictWriter(out, fieldnames=list(errors[0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(errors)
     file = directory / "paths.xml"
-    return [
+    return errors, [
         *lines,
         f"{file}: {len(fitted)} paths; OpenSim puts them in by their names, /forceset/MUSCLE",
     ]
@@ -412,12 +400,17 @@ def _solve(rows, wanted):
 
 
 def write_paths(
-    file: Path, fitted: list[FittedPath], metre: float, turning: dict[str, bool]
+    file: Path,
+    fitted: list[FittedPath],
+    metre: float,
+    turning: dict[str, bool],
+    targets: Mapping[str, str],
 ) -> None:
     """Write paths as the set of ``FunctionBasedPath`` that OpenSim loads.
 
     ``metre`` is its length in scene units; ``turning`` says which coordinates are no shifts, which
-    are in metres there.
+    are in metres there. ``targets`` are the paths of coordinates in the OpenSim model; the others
+    have the names of the scene.
     """
     add = ElementTree.SubElement
     root = ElementTree.Element("OpenSimDocument", Version="40600")
@@ -430,7 +423,8 @@ def write_paths(
         numbers = path.coefficients * np.prod(units**powers, axis=1) / metre
         item = add(objects, "FunctionBasedPath", name=f"/forceset/{path.muscle}")
         function = add(add(item, "length_function"), "MultivariatePolynomialFunction")
-        names = ["/jointset/" + name.replace(".", "/", 1) for name in path.coordinates]
+        own = {name: "/jointset/" + name.replace(".", "/", 1) for name in path.coordinates}
+        names = [targets.get(name, own[name]) for name in path.coordinates]
         add(item, "coordinate_paths").text = " ".join(names)
         add(function, "coefficients").text = " ".join(repr(float(value)) for value in numbers)
         add(function, "dimension").text = str(len(path.coordinates))

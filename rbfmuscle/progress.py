@@ -24,6 +24,7 @@ class Progress:
     """
 
     shown: ClassVar[Progress | None] = None
+    quiet: ClassVar[bool] = False  # nothing is shown
 
     def __init__(self, title: str, what: str = "frame") -> None:
         self.title, self.what = title, what
@@ -34,7 +35,7 @@ class Progress:
     def __enter__(self) -> Progress:
         if Progress.shown is None:
             Progress.shown = self
-            self.bar = _bar() if sys.stderr.isatty() else None
+            self.bar = _bar() if sys.stderr.isatty() and not Progress.quiet else None
             if self.bar is not None:
                 self.bar.start()
                 self.bar.add_task(self.title, total=None)
@@ -56,7 +57,7 @@ class Progress:
                 completed=done,
                 total=total,
             )
-        else:
+        elif not Progress.quiet:
             print(
                 f"{self.title}: {text} ({self.last - self.begun:.0f} s)",
                 file=sys.stderr,

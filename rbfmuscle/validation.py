@@ -2,7 +2,7 @@
 
 import difflib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +59,13 @@ class LimitExceededError(RBFMuscleError, RuntimeError):
 
 
 class MissingDependencyError(RBFMuscleError, ImportError):
-    """An optional part (graphics, an extra) is missing (exit code 7)."""
+    """An optional part (graphics, an extra) is missing (exit code 7).
+
+    ``written`` are files that did not need it.
+    """
 
     exit_code = 7
+    written: Sequence[Path] = ()
 
 
 class NotFiniteError(ValueError):

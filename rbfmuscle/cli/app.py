@@ -12,25 +12,28 @@ import os
 import sys
 import warnings
 
-from cyclopts import App, CycloptsError, Group
+from cyclopts import App, CycloptsError, Group, UnusedCliTokensError
 
 from rbfmuscle import __version__
-from rbfmuscle.cli.check import check, plan
-from rbfmuscle.cli.look import export, render, view
+from rbfmuscle.cli.check import check
+from rbfmuscle.cli.look import export, render, report, view
 from rbfmuscle.cli.new import import_, new
+from rbfmuscle.cli.paths import paths
+from rbfmuscle.cli.printing import USUAL, Printing, one_line
 from rbfmuscle.cli.run import demo, run
-from rbfmuscle.cli.study import compare, kernels, paths, sweep
+from rbfmuscle.cli.study import compare, kernels, sweep
 from rbfmuscle.interruption import INTERRUPTED
+from rbfmuscle.progress import Progress
 from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError
 
-LONGEST_LINE = 1000  # characters of a message: what a hostile file holds is not all shown
-
 GROUPS = {
-    "Start": (demo, new, import_, check, plan),
+    "Start": (demo, new, import_, check),
     "Run": (run, export),
     "Study": (compare, kernels, sweep, paths),
-    "Look": (view, render),
+    "Look": (view, render, report),
 }
+# Commands that there were, and what replaces them.
+REPLACED = {"plan": "check SCENE --plan"}
 app = App(
     name="rbfmuscle",
     help="Muscles as implicit RBF surfaces that move with the bones.",
@@ -76,8 +79,17 @@ def _run(arguments, as_json):
     try:
         action, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False)
     except CycloptsError as error:
+        if arguments[0] in REPLACED:
+            instead = f"use 'rbfmuscle {REPLACED[arguments[0]]}'"
+            return _fail(f"there is no command {arguments[0]!r}; {instead}", 2, as_json)
         command = f"{arguments[0]} " if arguments[0] in app else ""
-        return _fail(one_line(error), 2, as_json, hint=f"; try 'rbfmuscle {command}--help'")
+        message = one_line(error)
+        if isinstance(error, UnusedCliTokensError):
+            words = ", ".join(map(repr, error.unused_tokens))
+            message = f"unexpected {words}; lists are written with commas, as a,b"
+        return _fail(message, 2, as_json, hint=f"; try 'rbfmuscle {command}--help'")
+    given = (value for value in bound.arguments.values() if isinstance(value, Printing))
+    Progress.quiet = next(given, USUAL).quiet
     try:
         code = action(*bound.args, **bound.kwargs)
     except KeyboardInterrupt as error:
@@ -102,13 +114,6 @@ def _fail(message, code, as_json=False, *, hint=""):
     if as_json:
         print(json.dumps({"error": message, "exit_code": code}))
     return code
-
-
-def one_line(error: object) -> str:
-    """Return a message as one line without control characters, shortened if it is very long."""
-    text = " ".join(str(error).split())
-    text = "".join(char if char.isprintable() else "?" for char in text)
-    return text if len(text) <= LONGEST_LINE else f"{text[: LONGEST_LINE - 60]} ... {text[-50:]}"
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None):

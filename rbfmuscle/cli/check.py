@@ -1,19 +1,24 @@
-"""``rbfmuscle check`` and ``rbfmuscle plan``: a scene file and what a run of it would build,
-nothing solved.
-"""
+"""``rbfmuscle check``: a scene file, and what a run of it would build; nothing solved."""
 
-import json
 import logging
 import sys
 from time import perf_counter
+from typing import Any
 
-from rbfmuscle.cli.options import Flag, Json, SceneName
+from rbfmuscle.cli.options import Flag, SceneName
+from rbfmuscle.cli.printing import USUAL, Printing, print_result
 from rbfmuscle.progress import Progress, stage
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import SceneError, UsageError
 
 
 def check(
-    scene: SceneName, *, picture: Flag = False, fields: Flag = False, as_json: Json = False
+    scene: SceneName,
+    *,
+    picture: Flag = False,
+    fields: Flag = False,
+    plan: Flag = False,
+    time: Flag = False,
+    printing: Printing = USUAL,
 ) -> int:
     """Check a scene file and its meshes; nothing is solved.
 
@@ -23,38 +28,62 @@ def check(
         Draw attachments, tendons and joint axes to a PNG beside the scene file.
     fields
         Measure the bones' distance fields against exact distances.
+    plan
+        List what a run would build: contact pairs, unknowns, sub-steps.
+    time
+        With --plan: also build the muscles, solve two frames after the first, and extrapolate to
+        the whole motion.
     """
+    if time and not plan:
+        raise UsageError("--time measures what --plan lists; give check SCENE --plan --time")
+    facts: dict[str, Any] = {}
     with Progress(f"check {scene.name}"):
         if picture:
-            from rbfmuscle.report.render import check_picture, draw_scene
+            from rbfmuscle.report.render import check_picture
 
             check_picture(scene.with_suffix(".png"))
         loaded, findings = _findings(scene)
-        errors = {}
+        usable = bool(loaded.bones) and not any(f.level == "error" for f in findings)
         if fields:
-            from rbfmuscle.bones.errors import measure_field
-            from rbfmuscle.bones.sdf import BoneSDF
-
-            with stage("errors of the bones' fields"):
-                errors = {
-                    b.name: measure_field(BoneSDF.from_mesh(b.mesh, name=b.name))
-                    for b in loaded.bones
-                }
-        drawn = {}
+            facts["fields"] = _measure_fields(loaded)
+        if plan and usable:
+            facts["plan"] = _plan(loaded, time)
         if picture:
-            drawn = {"picture": str(scene.with_suffix(".png"))}
-            with stage("drawing the picture"):
-                draw_scene(loaded, scene.with_suffix(".png"))
-    usable = bool(loaded.bones) and not any(finding.level == "error" for finding in findings)
-    if as_json:
-        facts = {"scene": loaded.resolved(), "findings": [vars(finding) for finding in findings]}
-        print(json.dumps(facts | drawn | ({"fields": errors} if errors else {}), indent=1))
-    else:
-        of_fields = [_describe_field(name, found, loaded.units) for name, found in errors.items()]
-        print("\n".join([*_scene_lines(loaded), *of_fields, *map(str, findings), *drawn.values()]))
+            facts["picture"] = _draw(loaded, scene.with_suffix(".png"))
+    lines = [*_scene_lines(loaded), *map(str, findings), *_more_lines(facts, loaded.units)]
+    facts |= {"scene": loaded.resolved(), "findings": [vars(finding) for finding in findings]}
+    print_result(printing, facts, lines)
+    if not printing.as_json:
         last = f"usable; next: rbfmuscle run {scene} -o results" if usable else "not usable"
         print(last, file=sys.stderr)
     return 0 if usable else SceneError.exit_code
+
+
+def _measure_fields(scene):
+    from rbfmuscle.bones.errors import measure_field
+    from rbfmuscle.bones.sdf import BoneSDF
+
+    with stage("errors of the bones' fields"):
+        return {
+            bone.name: measure_field(BoneSDF.from_mesh(bone.mesh, name=bone.name))
+            for bone in scene.bones
+        }
+
+
+def _draw(scene, path):
+    from rbfmuscle.report.render import draw_scene
+
+    with stage("drawing the picture"):
+        draw_scene(scene, path)
+    return str(path)
+
+
+def _more_lines(facts, units):
+    """Lines of what was asked for besides the check itself."""
+    for name, found in facts.get("fields", {}).items():
+        yield _describe_field(name, found, units)
+    yield from _plan_lines(facts["plan"]) if "plan" in facts else ()
+    yield from [facts["picture"]] if "picture" in facts else ()
 
 
 def _findings(path):
@@ -135,29 +164,17 @@ def _scene_lines(scene):
         )
 
 
-def plan(scene: SceneName, *, time: Flag = False, as_json: Json = False) -> None:
-    """List what a run of the scene would build, without building it.
-
-    Parameters
-    ----------
-    time
-        Also build the muscles, solve two frames after the first, and extrapolate to the whole
-        motion.
-    """
-    from rbfmuscle.models import check_models, solved_points
-    from rbfmuscle.scene.phantom import open_scene
+def _plan(scene, timed):
+    from rbfmuscle.models import solved_points
     from rbfmuscle.simulation.plan import plan_scene
 
-    with Progress(f"plan {scene.name}"):
-        loaded = open_scene(scene)
-        check_models(loaded)
-        made = plan_scene(loaded)
-        for muscle, facts in zip(loaded.muscles, made["muscles"]):
-            facts["points"] = solved_points(muscle, loaded)
-        if time:
-            with stage("solving two frames"):
-                made["time"] = _measure_time(loaded)
-    print(json.dumps(made, indent=1) if as_json else "\n".join(_lines(made)))
+    made = plan_scene(scene)
+    for muscle, facts in zip(scene.muscles, made["muscles"]):
+        facts["points"] = solved_points(muscle, scene)
+    if timed:
+        with stage("solving two frames"):
+            made["time"] = _measure_time(scene)
+    return made
 
 
 def _measure_time(scene):
@@ -176,7 +193,7 @@ def _measure_time(scene):
     return {"build": build, "frame": frame, "total": build + frame * (count - 1)}
 
 
-def _lines(made):
+def _plan_lines(made):
     yield f"{made['frames']} frames in {made['substeps']} sub-steps"
     for muscle in made["muscles"]:
         yield (

@@ -1,5 +1,5 @@
-"""``rbfmuscle view``, ``render`` and ``export``: a scene or a run in the browser, in pictures and
-other formats.
+"""``rbfmuscle view``, ``render``, ``report`` and ``export``: a scene or a run in the browser, in
+pictures, on its page and in other formats.
 """
 
 import math
@@ -10,16 +10,22 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from rbfmuscle.cli.options import Model, Texts
+from rbfmuscle.cli.options import FailOn, Model, OwnFolder, Pairs, RunFolder, split_list
+from rbfmuscle.cli.printing import USUAL, Printing, print_result
 from rbfmuscle.progress import Progress, stage
-from rbfmuscle.validation import UsageError, did_you_mean
+from rbfmuscle.validation import (
+    LimitExceededError,
+    MissingDependencyError,
+    UsageError,
+    did_you_mean,
+)
 
 
 def view(
     scene: Annotated[Path, Parameter(name=["scene", "--scene"])],
     *,
     model: Model = None,
-    at: Texts = None,
+    at: Pairs = None,
     colour: Literal["group", "activation", "stretch", "penetration"] = "group",
     browser: bool = True,
     port: int = 0,
@@ -35,7 +41,7 @@ def view(
         comparison.
     at
         Where to begin: COORDINATE=DEGREES, for instance hip.flexion=60; may be repeated. For a
-        saved run: frame=N.
+        saved run: frame=N, where -1 is the last.
     colour
         What muscles are coloured by at first, in the browser.
     browser
@@ -69,6 +75,9 @@ def view(
         with stage("building"):
             source = SavedSource(opened) if isinstance(opened, dict) else LiveSource(opened, model)
             _check_stops(stops, source.controls)
+            if isinstance(opened, dict) and stops.get("frame", 0.0) < 0.0:
+                shown = next(iter(opened.values())).frame(int(stops["frame"]))
+                stops["frame"] = float(shown.index)
             Page(source, at=stops, colour=colour, served=(server, address))
     threading.Event().wait()
 
@@ -143,66 +152,118 @@ def _posed(scene, stops):
 
 
 def export(
-    directory: Path,
+    directory: RunFolder,
     *,
-    formats: Annotated[list[str], Parameter(name="--format", negative="", consume_multiple=True)],
-    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    formats: Annotated[str, Parameter(name="--format")],
+    output: OwnFolder = None,
     units: str | None = None,
     frames: str | None = None,
-) -> None:
+    fps: float | None = None,
+    printing: Printing = USUAL,
+) -> int:
     """Write the surfaces of a run in other formats and units.
 
     Parameters
     ----------
-    directory
-        Folder of the run.
     formats
-        pvd, vtp, ply, stl, obj or glb: files for each frame; animated-glb (Blender) or usd: all
-        frames in one animated file. Several may be given.
+        Formats, separated by commas. pvd, vtp, ply, stl, obj or glb: files for each frame;
+        animated-glb (Blender) or usd: all frames in one animated file.
     output
         Folder to write to, DIR/export by default.
     units
         m, cm or mm; the scene's by default (glb, animated-glb: m).
     frames
         Some of the written frames, FIRST:END:STEP as a Python slice.
+    fps
+        Frames per second of animated-glb and usd; by default the times of the motion's file, or 24.
     """
     with Progress(f"export {directory}"):
         from rbfmuscle.output.export import export_run
         from rbfmuscle.scene.settings import parse_slice
 
         chosen = parse_slice(frames) if frames is not None else None
-        written = export_run(directory, formats, output=output, units=units, frames=chosen)
+        names, failed = split_list(formats), None
+        try:
+            written = export_run(
+                directory, names, output=output, units=units, frames=chosen, fps=fps
+            )
+        except MissingDependencyError as error:
+            written, failed = error.written, error
+            if not written:
+                raise
     folders = sorted({str(path.parent) for path in written})
-    print(f"{len(written)} files in {', '.join(folders)}" if len(written) > 1 else written[0])
+    several = f"{len(written)} files in {', '.join(folders)}"
+    facts = {"files": [str(path) for path in written]}
+    lines = [several if len(written) > 1 else str(written[0])]
+    return print_result(printing, facts, lines, error=failed)
 
 
 def render(
-    directory: Path,
+    directory: RunFolder,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     frame: int | None = None,
-    view: Annotated[list[str] | None, Parameter(negative="")] = None,
+    view: str | None = None,
     seconds: float = 5.0,
-) -> None:
+    printing: Printing = USUAL,
+) -> int:
     """Draw a run: a picture (.png) or an animation (.gif, .webp).
 
     Parameters
     ----------
-    directory
-        Folder of the run.
     output
         File to draw.
     frame
-        Frame of a picture; the last one by default.
+        Frame of a picture; -1, the last one, by default.
     view
-        front, back, left, right, top, bottom or motion (in its plane); may be repeated; front,
-        right and back by default.
+        Views, separated by commas: front, back, left, right, top, bottom or motion (in its plane);
+        front, right and back by default.
     seconds
         Length of an animation.
     """
     with Progress(f"render {directory}"):
         from rbfmuscle.report.render import render_run
 
+        views = split_list(view) or None
         with stage("drawing pictures"):
-            render_run(directory, output, frame=frame, views=view, seconds=seconds)
-    print(output)
+            render_run(directory, output, frame=frame, views=views, seconds=seconds)
+    return print_result(printing, {"file": str(output)}, [str(output)])
+
+
+def report(
+    directory: Annotated[Path, Parameter(help="Folder of the run, or of a comparison.")],
+    *,
+    fail_on: FailOn = None,
+    pictures: bool = True,
+    printing: Printing = USUAL,
+) -> int:
+    """Write the page of a run or a comparison again, for instance after a change of limits.
+
+    Parameters
+    ----------
+    pictures
+        Draw pictures and the animation.
+    """
+    with Progress(f"report {directory}"), stage("drawing pictures" if pictures else "writing"):
+        from rbfmuscle.report.redraw import redraw_comparison, redraw_run
+
+        failed = None
+        if (directory / "comparison.json").exists():
+            if fail_on is not None:
+                raise UsageError(
+                    "--fail-on is for a run; give the folder of a model of the comparison"
+                )
+            facts = redraw_comparison(directory, pictures=pictures)
+        else:
+            try:
+                facts = redraw_run(directory, fail_on=fail_on, pictures=pictures).to_dict()
+            except LimitExceededError as error:
+                facts, failed = error.info.to_dict(), error
+    return print_result(printing, facts, _report_lines(directory, facts), error=failed)
+
+
+def _report_lines(directory, facts):
+    from rbfmuscle.cli.verdict import verdict_lines
+
+    yield from [facts["answer"]] if "answer" in facts else verdict_lines(directory)
+    yield f"open {directory / 'report.html'}"

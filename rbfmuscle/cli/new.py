@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from rbfmuscle.cli.options import Force, Output
+from rbfmuscle.cli.options import Force, Output, OwnFolder
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.validation import MeshError, UsageError
 
@@ -18,7 +18,7 @@ def new(
     *,
     units: Literal["mm", "cm", "m"] | None = None,
     labels: Path | None = None,
-    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    output: OwnFolder = None,
     force: Force = False,
 ) -> None:
     """Write a commented scene file for a folder of meshes or a volume of labels.
@@ -36,8 +36,7 @@ def new(
         Names of a segmentation's labels: JSON, CSV, TSV or ITK-SNAP's descriptions, or a known
         table, as totalsegmentator, musclemap-thigh.
     output
-        Scene file (.toml) to write, or a folder for scene.toml; the folder of the meshes by
-        default.
+        Folder for scene.toml; the folder of the meshes by default.
     """
     from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
     from rbfmuscle.importers.guess.orientation import HEADER
@@ -53,7 +52,9 @@ def new(
         raise UsageError(
             f"--labels names the labels of a segmentation, {source} is a folder of meshes"
         )
-    output = _scene_file(output, _beside(source, output) if volume else source)
+    if output is not None and output.suffix.lower() == ".toml":
+        raise UsageError(f"--output {output}: give a folder, scene.toml is written to it")
+    output = (output or (_beside(source) if volume else source)) / "scene.toml"
     out = _new_folder(output, force)
     base = output.parent
     read = read_labels(source, names=labels) if volume else guess_scene(source, units, base)
@@ -120,12 +121,6 @@ def import_(
     print(f"next: rbfmuscle check {written}, then rbfmuscle run {written} -o out")
 
 
-def _scene_file(output, folder):
-    """The scene file to write: an ``output`` that does not end in .toml is a folder."""
-    output = output or folder
-    return output if output.suffix.lower() == ".toml" else output / "scene.toml"
-
-
 def _new_folder(file, force):
     """The folder of a new scene file, in which the user's meshes may be; with ``force`` the file
     and what an earlier ``new`` wrote may be replaced.
@@ -146,10 +141,8 @@ def _is_segmentation(source):
     return not meshes and any(is_volume(path) for path in files)
 
 
-def _beside(source, output):
-    """Folder of the scene of a segmentation."""
-    if output is not None:
-        return _scene_file(output, None).parent
+def _beside(source):
+    """Folder of the scene of a segmentation, where none is given."""
     name = source.name.split(".")[0] or "scene"
     return source / "scene" if source.is_dir() else source.parent / f"{name}_scene"
 

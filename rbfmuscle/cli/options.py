@@ -1,5 +1,6 @@
 """Options that several commands take."""
 
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +13,9 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
 SceneName = Annotated[Path, Parameter(help='Scene file (TOML), or "phantom" for the embedded hip.')]
+RunFolder = Annotated[Path, Parameter(help="Folder of the run.")]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Folder for the results.")]
+OwnFolder = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 Model = Annotated[
     str | None,
     Parameter(
@@ -32,15 +35,50 @@ Frames = Annotated[
     str | None,
     Parameter(help="Frames FIRST:END:STEP of the motion, as a Python slice: END not included."),
 ]
-Json = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON and nothing else.")]
+Muscles = Annotated[
+    str | None, Parameter(help="Muscles of the scene, separated by commas; all by default.")
+]
+FailOn = Annotated[
+    str | None,
+    Parameter(
+        help="Limits, separated by commas: a value beyond one of them, or none at all, makes the "
+        "exit code 6. For instance volume_error=0.001,penetration_max, or all."
+    ),
+]
+Jobs = Annotated[int | None, Parameter(help="Threads to use; as many as cores by default.")]
 Flag = Annotated[bool, Parameter(negative="")]
 Force = Annotated[bool, Parameter(negative="", help="Replace a scene file that exists.")]
-Texts = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
+# KEY=VALUE, once each time that the option is given.
+Pairs = Annotated[list[str] | None, Parameter(negative="")]
 
 
-def chosen_muscle(scene: "Scene", name: str) -> "Muscle":
-    """The muscle that ``--muscle`` names; UsageError if there is none."""
+def split_list(text: str | None) -> list[str]:
+    """Words of a list, which commas separate; each once."""
+    words = (word.strip() for word in (text or "").split(","))
+    return list(dict.fromkeys(word for word in words if word))
+
+
+def chosen_muscles(scene: "Scene", names: str | None) -> "list[Muscle]":
+    """The muscles that ``--muscles`` names, all where it is not given; UsageError if there is no
+    such muscle.
+    """
+    if names is None:
+        return scene.muscles
     try:
-        return scene.muscle(name)
+        found = [scene.muscle(name) for name in split_list(names)]
     except SceneError as error:
-        raise UsageError(f"--muscle: {error}") from None
+        raise UsageError(f"--muscles: {error}") from None
+    if not found:
+        raise UsageError("--muscles names no muscle; leave it out for all")
+    return found
+
+
+def threads(jobs: int | None) -> AbstractContextManager[None]:
+    """Context in which loops use as many threads as ``--jobs`` says."""
+    if jobs is None:
+        return nullcontext()
+    if jobs < 1:
+        raise UsageError(f"--jobs must be 1 or more, got {jobs}")
+    from rbfmuscle.experiments.sweep_run import threads_limited
+
+    return threads_limited(jobs)

@@ -1,16 +1,24 @@
 """``rbfmuscle run`` and ``rbfmuscle demo``: a scene through its motion, into a folder."""
 
-import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rbfmuscle.cli.options import Frames, Json, Model, Output, SceneName, Settings, chosen_muscle
+from rbfmuscle.cli.options import (
+    FailOn,
+    Frames,
+    Jobs,
+    Model,
+    Muscles,
+    Output,
+    SceneName,
+    Settings,
+    chosen_muscles,
+    threads,
+)
+from rbfmuscle.cli.printing import USUAL, Printing, print_result
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import LimitExceededError, SolveError
-
-if TYPE_CHECKING:
-    from rbfmuscle.output.info import RunInfo
 
 
 def demo(
@@ -18,10 +26,13 @@ def demo(
     output: Output = Path("demo_output"),
     model: Model = None,
     frames: Frames = None,
-    as_json: Json = False,
+    fail_on: FailOn = None,
+    jobs: Jobs = None,
+    printing: Printing = USUAL,
 ) -> int:
-    """Run the embedded hip: no data, no network."""
-    return run(Path("phantom"), output=output, model=model, frames=frames, as_json=as_json)
+    """Run the embedded hip: no data, no network. The same as `run phantom`."""
+    options: dict[str, Any] = {"model": model, "frames": frames, "fail_on": fail_on}
+    return run(Path("phantom"), output=output, jobs=jobs, printing=printing, **options)
 
 
 def run(
@@ -30,20 +41,19 @@ def run(
     output: Output,
     model: Model = None,
     settings: Settings = None,
-    muscle: str | None = None,
+    muscles: Muscles = None,
     frames: Frames = None,
-    fail_on: str | None = None,
-    as_json: Json = False,
+    fail_on: FailOn = None,
+    jobs: Jobs = None,
+    printing: Printing = USUAL,
 ) -> int:
     """Run a scene through its motion and write surfaces, metrics and a report.
 
     Parameters
     ----------
-    muscle
-        Name of one muscle to simulate, without the others and without [sliding]; all by default.
-    fail_on
-        Limits, by commas: a value beyond one of them, or none at all, makes the exit code 6. For
-        instance volume_error=0.001,penetration_max, or all.
+    muscles
+        Muscles to simulate, separated by commas, without the others and without [sliding]; all by
+        default.
     """
     from rbfmuscle import interruption
 
@@ -58,35 +68,31 @@ def run(
         progress(count, total)
         interruption.check()
 
-    with Progress(scene.stem) as progress, interruption.keeping(kept):
+    failed = None
+    with Progress(scene.stem) as progress, interruption.keeping(kept), threads(jobs):
         from rbfmuscle.run import stream_run
         from rbfmuscle.scene.phantom import open_scene
         from rbfmuscle.scene.settings import parse_settings
 
         changes, loaded = parse_settings(settings), open_scene(scene)
-        if muscle is not None:
-            loaded.muscles, loaded.sliding = [chosen_muscle(loaded, muscle)], None
+        if muscles is not None:
+            loaded.muscles, loaded.sliding = chosen_muscles(loaded, muscles), None
         options: dict[str, Any] = {"model": model, "frames": frames, "fail_on": fail_on}
-        failed: dict[str, Any] = {}
         try:
             info = stream_run(loaded, output, settings=changes, progress=advance, **options)
         except SolveError as error:
             raise SolveError("; ".join(filter(None, [str(error), kept()]))) from None
         except LimitExceededError as error:
-            info, failed = error.info, {"error": str(error), "exit_code": error.exit_code}
-    if as_json:
-        from rbfmuscle.output.writer import json_text
-
-        print(json_text({"directory": str(output), **info.to_dict(), **failed}))
-    else:
-        _print_result(info, output, time.perf_counter() - start)
-    if failed:
-        print(f"rbfmuscle: {failed['error']}", file=sys.stderr)
-    return failed.get("exit_code", 0)
+            info, failed = error.info, error
+    facts = {"directory": str(output), **info.to_dict()}
+    seconds = time.perf_counter() - start
+    return print_result(printing, facts, _lines(output, len(info.frames), seconds), error=failed)
 
 
-def _print_result(info: "RunInfo", output: Path, seconds: float) -> None:
-    print(f"verdict: {info.verdict}")
+def _lines(output, frames, seconds):
+    from rbfmuscle.cli.verdict import verdict_lines
+
+    yield from verdict_lines(output)
     report = output / "report.html"
     there = f"in {output}, open {report}" if report.exists() else f"in {output}"
-    print(f"{len(info.frames)} frames in {seconds:.1f} s, {there}")
+    yield f"{frames} frames in {seconds:.1f} s, {there}"

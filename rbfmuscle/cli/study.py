@@ -1,22 +1,31 @@
-"""``rbfmuscle compare``, ``kernels``, ``sweep`` and ``paths``: models, kernels, settings, and paths
-for OpenSim.
-"""
+"""``rbfmuscle compare``, ``kernels`` and ``sweep``: models, kernels and settings."""
 
 from __future__ import annotations
 
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from rbfmuscle.cli.options import Frames, Model, Output, SceneName, Settings, Texts, chosen_muscle
+from rbfmuscle.cli.options import (
+    FailOn,
+    Frames,
+    Jobs,
+    Model,
+    Muscles,
+    Output,
+    Pairs,
+    SceneName,
+    Settings,
+    chosen_muscles,
+    split_list,
+    threads,
+)
+from rbfmuscle.cli.printing import USUAL, Printing, one_line, print_result
 from rbfmuscle.progress import Progress
-from rbfmuscle.validation import SolveError, UsageError
-
-if TYPE_CHECKING:
-    pass
+from rbfmuscle.validation import LimitExceededError, SolveError, UsageError
 
 
 def compare(
@@ -26,8 +35,11 @@ def compare(
     models: str | None = None,
     settings: Settings = None,
     frames: Frames = None,
+    fail_on: FailOn = None,
+    jobs: Jobs = None,
     pictures: bool = True,
-) -> None:
+    printing: Printing = USUAL,
+) -> int:
     """Run models on one scene: the same motion, contacts and measures; tables, report, pictures.
 
     Each model's run is in a folder of its own; MODEL:KEY=VALUE is a setting for one model.
@@ -36,23 +48,26 @@ def compare(
     ----------
     models
         Models, separated by commas, for instance rbf,pbd; distances are measured to the first. By
-        default rbf, the mesh models and pbd-converged, which takes long: it sweeps
-        until no vertex moves.
+        default rbf, the mesh models and pbd-converged, which takes long: it sweeps until no vertex
+        moves.
     pictures
         Draw pictures and the animation.
     """
     from rbfmuscle import interruption
     from rbfmuscle.compare import compare_models
+    from rbfmuscle.metrics.summary import parse_limits
     from rbfmuscle.models import COMPARED
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
 
-    names = [name.strip() for name in (models or "").split(",") if name.strip()] or list(COMPARED)
-    changes = parse_settings(settings)
+    names = split_list(models) or list(COMPARED)
+    changes, loaded = parse_settings(settings), open_scene(scene)
+    limits = parse_limits(fail_on, loaded)
     kept = f"finished runs are kept in {output}"
     with (
         Progress("compare") as progress,
         interruption.keeping(lambda: kept if output.exists() else ""),
+        threads(jobs),
     ):
 
         def advance(model, done, total):
@@ -62,51 +77,74 @@ def compare(
             interruption.check()
 
         options: dict[str, Any] = {"frames": frames, "settings": changes, "pictures": pictures}
-        table = compare_models(open_scene(scene), output, names, progress=advance, **options)
-    _print_table(table, output)
-    if table["failed"]:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in table["failed"].items())
-        raise SolveError(f"{reasons}; the other models are in {output}")
+        table = compare_models(loaded, output, names, progress=advance, **options)
+    error = _failure(table, output) or _excess(table, output, limits)
+    return print_result(printing, table, _table_lines(table, output), error=error)
 
 
-def _print_table(table, output):
+def _failure(table, output):
+    """The error that some models could not be solved; None where all were."""
+    if not table["failed"]:
+        return None
+    reasons = "; ".join(f"{name}: {reason}" for name, reason in table["failed"].items())
+    return SolveError(f"{reasons}; the other models are in {output}")
+
+
+def _excess(table, output, limits):
+    """The error that a run is beyond a limit of ``--fail-on``; None where none is."""
+    from rbfmuscle.metrics.summary import Summary, require_limits
+    from rbfmuscle.output.run_data import RunData
+
+    texts = []
+    for name in table["models"] if limits.fail_on else ():
+        summary = Summary()
+        summary.add(RunData.load(output / name).metrics)
+        try:
+            require_limits(summary.table(), limits)
+        except LimitExceededError as error:
+            texts.append(f"{name}: {error}")
+    return LimitExceededError("; ".join(texts)) if texts else None
+
+
+def _table_lines(table, output):
     from rbfmuscle.report.comparison_page import LIGHTS, shown
 
-    print(" " * 24 + "".join(f"{name:>18}" for name in table["models"]))
-    for quantity in LIGHTS:
-        values = [table["results"][name]["all"].get(quantity) for name in table["models"]]
-        print(
-            f"{quantity:24}" + "".join(f"{shown(table, quantity, value):>18}" for value in values)
-        )
-    print(table["answer"])
-    print(f"{table['frames']} frames, in {output}, open {output / 'report.html'}")
+    # As many columns as a terminal holds stand beside each other.
+    for k in range(0, len(table["models"]), 3):
+        names = table["models"][k : k + 3]
+        yield " " * 24 + "".join(f"{name:>18}" for name in names)
+        for quantity in LIGHTS:
+            values = [table["results"][name]["all"].get(quantity) for name in names]
+            cells = [f"{shown(table, quantity, value):>18}" for value in values]
+            yield f"{quantity:24}" + "".join(cells)
+    yield table["answer"]
+    yield f"{table['frames']} frames, in {output}, open {output / 'report.html'}"
 
 
 def kernels(
     source: str,
     *,
     output: Output,
-    names: Annotated[Texts, Parameter(name="--kernels")] = None,
-    centres: Texts = None,
-    muscle: str | None = None,
+    names: Annotated[str | None, Parameter(name="--kernels")] = None,
+    centres: str = "150,300",
+    muscles: Muscles = None,
     placement: str = "fitted",
     resolution: int = 0,
     units: str = "",
     error: float | None = None,
-) -> None:
-    """Rank kernels, shape parameters and numbers of centres on a surface, or on each muscle of a
-    scene.
+    jobs: Jobs = None,
+    printing: Printing = USUAL,
+) -> int:
+    """Rank kernels, shape parameters and numbers of centres on a surface or a scene's muscles.
 
     Parameters
     ----------
     source
         A mesh (STL, OBJ, PLY, VTK, VTP), a scene file, or ``phantom``.
     names
-        Kernels; all by default. Separate them by commas or blanks.
+        Kernels, separated by commas; all by default.
     centres
-        Numbers of centres; 150 and 300 by default. Separate them by commas or blanks.
-    muscle
-        Name of one muscle of a scene; all by default.
+        Numbers of centres, separated by commas.
     placement
         Places of the centres: fitted (moved off the surface until the whole surface is met) or
         greedy (on it).
@@ -120,55 +158,59 @@ def kernels(
     """
     from rbfmuscle.report.kernel_page import kernels_folder
 
-    counts = _split(centres) or ["150", "300"]
-    if not all(count.isdecimal() and int(count) >= 8 for count in counts):
-        raise UsageError(f"--centres must be whole numbers of 8 and more, got {' '.join(counts)!r}")
-    meshes, units = _meshes(source, muscle, units)
+    counts = split_list(centres)
+    if not counts or not all(count.isdecimal() and int(count) >= 8 for count in counts):
+        raise UsageError(f"--centres must be whole numbers of 8 and more, got {centres!r}")
+    meshes, units = _meshes(source, muscles, units)
     kernels_folder(output)
-    options: dict[str, Any] = {"kernels": _split(names), "placement": placement}
-    if error is None:
+    options: dict[str, Any] = {"kernels": split_list(names) or None, "placement": placement}
+    with threads(jobs):
+        if error is not None:
+            return _find_wanted(meshes, output, error, options, units, printing)
         options |= {"centres": [int(c) for c in counts], "units": units, "resolution": resolution}
-        _study(meshes, output, options)
-    else:
-        _find_wanted(meshes, output, error, options, units)
+        return _study(meshes, output, options, printing)
 
 
-def _split(texts):
-    """What stands between commas and blanks; None where nothing does."""
-    return [part for text in texts or [] for part in text.split(",") if part] or None
-
-
-def _meshes(source, muscle, units):
-    """Meshes by name, and their unit: of a scene the named muscle, or every one."""
+def _meshes(source, muscles, units):
+    """Meshes by name, and their unit: of a scene the named muscles, or every one."""
     from rbfmuscle.scene.meshes.read import read_mesh
     from rbfmuscle.scene.phantom import PHANTOM, open_scene
 
     if source != PHANTOM and Path(source).suffix.lower() != ".toml":
+        if muscles is not None:
+            raise UsageError(f"--muscles names muscles of a scene, {source} is a mesh")
         return {Path(source).stem: read_mesh(source).mesh}, units
     scene = open_scene(source)
-    chosen = [chosen_muscle(scene, muscle)] if muscle else scene.muscles
-    return {each.name: each.mesh for each in chosen}, scene.units
+    return {each.name: each.mesh for each in chosen_muscles(scene, muscles)}, scene.units
 
 
-def _study(meshes, output, options):
-    from rbfmuscle.experiments.kernel_study import describe, row_toml, study_kernels
-    from rbfmuscle.report.kernel_page import answer, write_studies
+def _study(meshes, output, options, printing):
+    from rbfmuscle.experiments.kernel_study import study_kernels
+    from rbfmuscle.report.kernel_page import write_studies
 
     studies = {}
     for name, mesh in meshes.items():
         with Progress(f"kernels of {name}", what="fit") as bar:
             studies[name] = study_kernels(mesh, **options, progress=bar)
     write_studies(studies, output)
+    facts = json.loads((output / "kernels.json").read_text(encoding="utf-8"))
+    return print_result(printing, facts, _study_lines(studies, output))
+
+
+def _study_lines(studies, output):
+    from rbfmuscle.experiments.kernel_study import describe, row_toml
+    from rbfmuscle.report.kernel_page import answer
+
     for name, study in studies.items():
         if study.recommended is not None:
-            print(f"{name}: {describe(study.rows)}")
-            print(f"to paste at the end of its [[muscle]]:\n\n{row_toml(study.recommended)}\n")
+            yield f"{name}: {describe(study.rows)}"
+            yield f"to paste at the end of its [[muscle]]:\n\n{row_toml(study.recommended)}\n"
     if len(studies) > 1 or not next(iter(studies.values())).recommended:
-        print(answer(studies))
-    print(f"all rows: open {output / 'kernels.html'}")
+        yield answer(studies)
+    yield f"all rows: open {output / 'kernels.html'}"
 
 
-def _find_wanted(meshes, output, error, options, units):
+def _find_wanted(meshes, output, error, options, units, printing):
     """Find, print and write what reaches an error; where it is not reached, that is said."""
     from rbfmuscle.experiments.kernel_study import row_toml
     from rbfmuscle.experiments.wanted_error import reach_error
@@ -191,25 +233,31 @@ def _find_wanted(meshes, output, error, options, units):
         }
     with kernels_folder(output).staged() as stage:
         (stage / "error.json").write_text(json_text(facts), encoding="utf-8")
-    print("\n".join(found["said"] for found in facts.values()))
-    print(f"all that was tried in {output / 'error.json'}")
+    return print_result(printing, facts, _wanted_lines(facts, output))
+
+
+def _wanted_lines(facts, output):
+    for found in facts.values():
+        yield found["said"]
+    yield f"all that was tried in {output / 'error.json'}"
     for name, found in facts.items():
         if found["reached"]:
-            print(f"\nto paste at the end of the [[muscle]] {json.dumps(name)}:\n\n{found['toml']}")
+            yield f"\nto paste at the end of the [[muscle]] {json.dumps(name)}:\n\n{found['toml']}"
 
 
 def sweep(
     *scenes: str,
     output: Output,
-    grid: Texts = None,
+    grid: Pairs = None,
     model: Model = None,
     settings: Settings = None,
     frames: Frames = None,
-    reference: Texts = None,
+    reference: Pairs = None,
     jobs: int | None = None,
     cluster: str | None = None,
     error: str = "error_rms",
-) -> None:
+    printing: Printing = USUAL,
+) -> int:
     """Run scenes under a grid of settings: errors, time per frame, Pareto front.
 
     Points that are already done in the folder are not run again.
@@ -219,10 +267,11 @@ def sweep(
     scenes
         Scene files (TOML), or "phantom" for the embedded hip.
     grid
-        KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300.
+        KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300; may be
+        repeated.
     reference
-        KEY=VALUE settings of the reference that errors are measured against; by default the finest
-        values of the grid.
+        KEY=VALUE of the reference that errors are measured against; may be repeated; by default the
+        finest values of the grid.
     jobs
         Points that run at the same time; as many as cores by default. Each gets cores / jobs
         threads.
@@ -256,7 +305,7 @@ def sweep(
     progress = Progress("sweep", what="point")
     with progress, interruption.keeping(lambda: f"finished points are kept in {output}"):
         table = run_scenes(loaded, axes, output, progress=progress, **options)
-    _finish(table, output)
+    return _finish(table, output, printing)
 
 
 def _names(scenes):
@@ -268,64 +317,16 @@ def _names(scenes):
     raise UsageError("scenes of a sweep need different names, or folders of different names")
 
 
-def _finish(table, output):
-    for verdict in table["verdicts"]:
-        print(verdict["text"])
-    print(
-        f"{table['done']} points done, {table['failed']} failed, in {output}, open "
-        f"{output}/sweep.html"
-    )
+def _finish(table, output, printing):
     bad = [row for row in table["rows"] if row["status"] != "done"]
     for row in bad[:5]:
-        print(
-            f"rbfmuscle: {row['scene']} {row['label']}: {row['error'] or row['status']}",
-            file=sys.stderr,
-        )
-    if bad:
-        remedy = "the others are kept, the same command runs these again"
-        raise SolveError(f"{len(bad)} of {len(table['rows'])} points failed; {remedy}")
-
-
-def paths(
-    scene: SceneName,
-    *,
-    output: Output,
-    samples: int = 120,
-    muscles: str | None = None,
-    fibres: int = 0,
-    ranges: Annotated[list[str] | None, Parameter(name="--range", negative="")] = None,
-    model: Model = None,
-    settings: Settings = None,
-) -> None:
-    """Sample a muscle's lengths and moment arms over its coordinates and fit a path that OpenSim
-    loads.
-
-    Parameters
-    ----------
-    samples
-        Poses for each muscle, of which every fifth is held out of the fit.
-    muscles
-        Names, separated by commas; all by default.
-    fibres
-        Of each muscle, for each of which a path is fitted, in place of one for the muscle.
-    ranges
-        COORDINATE=LOW:HIGH in degrees or scene units; else the coordinate's range, or what the
-        motion covers.
-    """
-    from rbfmuscle.models import configure_scene
-    from rbfmuscle.paths import parse_ranges, paths_folder, report_fits, sample_muscles
-    from rbfmuscle.scene.phantom import open_scene
-    from rbfmuscle.scene.settings import parse_settings
-
-    if samples < 10:
-        raise UsageError(f"--samples {samples} is too few to fit anything, give 10 or more")
-    loaded = configure_scene(open_scene(scene), parse_settings(settings), model=model)
-    if muscles is not None:
-        loaded.muscles = [
-            chosen_muscle(loaded, name.strip()) for name in dict.fromkeys(muscles.split(","))
-        ]
-    given = parse_ranges(loaded, ranges or [])
-    paths_folder(output)
-    with Progress(loaded.name, "pose") as progress:
-        sampled = sample_muscles(loaded, given, samples=samples, fibres=fibres, progress=progress)
-    print("\n".join(report_fits(loaded, sampled, output)))
+        reason = one_line(row["error"] or row["status"])
+        print(f"rbfmuscle: {row['scene']} {row['label']}: {reason}", file=sys.stderr)
+    remedy = "the others are kept, the same command runs these again"
+    failed = SolveError(f"{len(bad)} of {len(table['rows'])} points failed; {remedy}")
+    lines = [
+        *(verdict["text"] for verdict in table["verdicts"]),
+        f"{table['done']} points done, {table['failed']} failed, in {output}, open "
+        f"{output}/sweep.html",
+    ]
+    return print_result(printing, table, lines, error=failed if bad else None)

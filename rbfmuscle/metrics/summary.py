@@ -397,23 +397,20 @@ def _worst_and_remedies(found, table, left_out):
     remedies: dict[str, str] = {}
     for row in named:
         if row[1].partition(":")[0] in LIMITS:
-            remedy = _remedy(row, table)
+            remedy = find_remedy(row, table)
             remedies.setdefault(remedy, remedy.replace("FRAME", str(row[4])))
-    values = "; ".join(_describe_excess(row, table, left_out) for row in named)
+    values = "; ".join(describe_excess(row, table, left_out) for row in named)
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
     to_do = f". What to do: {'; '.join(remedies.values())}" if remedies else ""
     return f". Worst: {values}{more}{to_do}"
 
 
-def _remedy(row, table):
+def find_remedy(row: Exceedance, table: Table) -> str:
     """What to do about one excess; smaller steps do not mend an overlap of the meshes at rest."""
     muscle, quantity, _, limit, _ = row
     overlap = table[muscle].get("initial_overlap", {}).get("worst")
-    at_rest = (
-        quantity in ("penetration_max", "bone_penetration_max")
-        and overlap is not None
-        and overlap > limit
-    )
+    depth = quantity in ("penetration_max", "bone_penetration_max")
+    at_rest = depth and overlap is not None and overlap > limit
     return LIMITS["initial_overlap" if at_rest else quantity.partition(":")[0]].remedy
 
 
@@ -422,7 +419,8 @@ def _listed(names):
     return f"{', '.join(names[:MOST_NAMED])}{more}"
 
 
-def _describe_excess(row, table, left_out):
+def describe_excess(row: Exceedance, table: Table, left_out: Sequence[str] = ()) -> str:
+    """One value beyond its limit, in words; bones ``left_out``."""
     muscle, quantity, worst, limit, frame = row
     unit = table[muscle][quantity]["unit"]
     value = shown_number(worst, unit)

@@ -2,7 +2,10 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers
@@ -13,11 +16,12 @@ from rbfmuscle.output.fibre_files import write_fibres
 from rbfmuscle.output.run_data import RunData, open_run
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
-from rbfmuscle.validation import SolveError, UsageError
+from rbfmuscle.validation import MissingDependencyError, SolveError, UsageError
 
 # One file a muscle (or bone) and frame.
 MESHES = ("pvd", "vtp", "ply", "stl", "obj")
-FORMATS = (*MESHES, "glb", "usd", "animated-glb")
+ANIMATIONS = ("animated-glb", "usd")
+FORMATS = (*MESHES, "glb", *ANIMATIONS)
 
 
 def export_run(
@@ -27,6 +31,7 @@ def export_run(
     output: str | Path | None = None,
     units: str | None = None,
     frames: slice | None = None,
+    fps: float | None = None,
 ) -> list[Path]:
     """Write the muscles and bones of a run in one or more formats; every file written.
 
@@ -45,40 +50,69 @@ def export_run(
         other.
     frames : slice, optional
         Of the written frames; all where not given.
+    fps : float, optional
+        Frames of the motion per second in ``animated-glb`` and ``usd``; where not given, the times
+        of the motion's file, or 24.
 
     Raises
     ------
     UsageError
         If the folder holds no run, or a format or unit is unknown, or a surface does not keep its
         vertices, or the folder of a format holds anything but an earlier export.
-    SolveError, MissingDependencyError
-        If a file cannot be written; if a format needs a package that is absent.
+    SolveError
+        If a file cannot be written.
+    MissingDependencyError
+        If a format needs a package that is absent; the other formats are written, and its
+        ``written`` are their files.
     """
     run = open_run(run)
-    formats = [formats] if isinstance(formats, str) else list(formats)
-    _check_words(formats, units)
+    formats = list(dict.fromkeys([formats] if isinstance(formats, str) else formats))
+    _check_words(formats, units, fps)
     chosen = run.frame_numbers[frames] if frames is not None else run.frame_numbers
     if not chosen or not run.has_surfaces:
         raise UsageError(f"{run.directory or 'the run'} has no surfaces to export")
     if output is None and run.directory is None:
         raise UsageError("the run is in memory; name the folder to export to")
+    missing = _missing_part(formats)
+    if missing is not None:
+        formats.remove("usd")
+    if missing is not None and not formats:
+        raise missing
     base = Path(output) if output is not None else Path(run.directory or "", "export")
     folder = OutputFolder(base, "export", formats, beside=True)
     written: list[Path] = []
     try:
         with folder.staged(replaces=formats) as stage:
-            for name in dict.fromkeys(formats):
+            for name in formats:
                 unit = units or ("m" if "glb" in name else run.units)
                 (stage / name).mkdir()
                 for part in [[frame] for frame in chosen] if name == "glb" else [chosen]:
                     moving = read_animation(run, part, unit=unit)
+                    if fps is not None and name in ANIMATIONS:
+                        moving = replace(moving, times=np.array(part) / fps)
                     written += _export(moving, stage / name, name, part)
     except OSError as error:
         raise SolveError(f"cannot write to {base}: {error.strerror}") from None
-    return [base / path.relative_to(stage) for path in written]
+    files = [base / path.relative_to(stage) for path in written]
+    if missing is not None:
+        missing.written = files
+        raise missing
+    return files
 
 
-def _check_words(formats: Sequence[str], units: str | None) -> None:
+def _missing_part(formats: Sequence[str]) -> MissingDependencyError | None:
+    """What a package lacks that one of the formats needs."""
+    try:
+        if "usd" in formats:
+            check_usd()
+    except MissingDependencyError as error:
+        return error
+    return None
+
+
+def _check_words(formats: Sequence[str], units: str | None, fps: float | None) -> None:
+    if not formats:
+        raise UsageError(f"no format is given; known: {', '.join(FORMATS)}")
     for name in formats:
         if name not in FORMATS:
             raise UsageError(f"unknown format {name!r}; known: {', '.join(FORMATS)}")
@@ -86,8 +120,10 @@ def _check_words(formats: Sequence[str], units: str | None) -> None:
             raise UsageError(f"{name} is in metres by its standard; leave out --units {units}")
     if units is not None and units not in MM_PER_UNIT:
         raise UsageError(f"units must be m, cm or mm, got {units!r}")
-    if "usd" in formats:
-        check_usd()
+    if fps is not None and not set(formats) & set(ANIMATIONS):
+        raise UsageError(f"--fps is for {' and '.join(ANIMATIONS)} alone")
+    if fps is not None and not 0.0 < fps <= 1000.0:
+        raise UsageError(f"--fps must be a number from 0 to 1000, got {fps:g}")
 
 
 def _export(run: Animation, folder: Path, name: str, frames: list[int]) -> list[Path]:
@@ -118,11 +154,14 @@ def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -
         same = {p.name for p in parts if group == "bones" and p.name.lower() in taken}
         stems = {p.name: f"{p.name}.bone" if p.name in same else p.name for p in parts}
         collection = Collection(folder / f"{group}.pvd") if name == "pvd" else None
+        files: dict[str, str] = {}
         for k, frame in enumerate(frames):
-            files = {p.name: f"{stems[p.name]}_{frame:04d}.{suffix}" for p in parts}
-            for part in parts:
+            # A bone that never moves is written once, under the first frame's number.
+            moved = [p for p in parts if k == 0 or p.poses is None or p.moves]
+            files |= {p.name: f"{stems[p.name]}_{frame:04d}.{suffix}" for p in moved}
+            for part in moved:
                 write_mesh(folder / files[part.name], *part.mesh(k))
-            written += [folder / file for file in files.values()]
+            written += [folder / files[part.name] for part in moved]
             if collection is not None:
                 collection.add(run.times[k] if run.timed else frame, list(files.items()))
         if collection is not None:

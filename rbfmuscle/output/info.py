@@ -87,8 +87,10 @@ class SceneInfo(Part):
     """The scene as it was run; ``coordinate_units`` of what is not in degrees."""
 
     name: str = ""
+    file: str | None = None
     units: Literal["m", "cm", "mm"]
     bones: list[BoneInfo]
+    left_out: list[str] = []
     joints: list[JointInfo] = []
     muscles: list[MuscleInfo]
     output: OutputInfo

@@ -105,7 +105,11 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
     hint = f"distances in {units or 'mesh units'}"
     return Page(
         f"Kernels for {surfaces}",
-        [f"{kernels} kernels", f"{counts} centres", *["every muscle; --muscle for one"][:several]],
+        [
+            f"{kernels} kernels",
+            f"{counts} centres",
+            *["every muscle; --muscles for some"][:several],
+        ],
         answer(studies),
         GOOD if found else BAD,
         plot=_plot(studies, units),

@@ -198,7 +198,8 @@ def render_run(
     """Draw a run, or the one in a folder, to a picture (``.png``, one frame) or an animation
     (``.gif`` or ``.webp``, all of them).
 
-    ``frame`` is that of a picture, by default the last. ``views``, side by side, are of `VIEWS`, or
+    ``frame`` is that of a picture: its number, or from the end of those that were written if it is
+    negative; by default the last. ``views``, side by side, are of `VIEWS`, or
     "motion" for the plane of the motion; `USUAL_VIEWS` where not given. A view has ``area`` pixels.
     An animation of so many ``seconds`` has at ``most`` so many frames, chosen evenly. UsageError if
     the folder holds nothing to draw, the suffix, frame or view is unknown, or another file is in

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import numba
 import numpy as np
 import pytest
 import trimesh
@@ -15,6 +16,7 @@ from command_line import call
 import rbfmuscle as rm
 from rbfmuscle.cli.app import GROUPS
 from rbfmuscle.cli.check import _measure_time
+from rbfmuscle.cli.options import threads
 from rbfmuscle.scene.check import check_extents
 from rbfmuscle.validation import MeshError
 
@@ -40,8 +42,8 @@ class TestRun:
         command = ("run", folder / "arm.toml", "-o", tmp_path / "out", "--frames", "0:1")
         code, out, err = call(capsys, *command)
         said = json.loads((tmp_path / "out" / "run.json").read_text(encoding="utf-8"))["verdict"]
-        assert code == 0 and "frame 1 of 1" in err and out.startswith(f"verdict: {said}\n")
-        assert said.startswith("every muscle is within all limits in every frame")
+        assert code == 0 and "frame 1 of 1" in err and said.startswith("every muscle is within all")
+        assert out.startswith("verdict: every muscle is within all limits in every frame\n")
         mesh = trimesh.load(folder / "biceps.ply", process=False)
         vertices = np.array(mesh.vertices)
         middle = np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).argmin()
@@ -51,7 +53,7 @@ class TestRun:
         (folder / "spike.toml").write_text(scene.replace("biceps.ply", "spike.ply"))
         code, out, _ = call(capsys, "run", folder / "spike.toml", *command[2:-1], "0:3")
         assert code == 0 and re.search(
-            r"verdict: biceps is not within all limits. Worst: biceps, ", out
+            r"^verdict: biceps is not within all limits\n  biceps, .* at frame \d", out
         )
 
     def test_limit_that_fails_ends_with_verdict_folder_and_the_whole_json(
@@ -61,7 +63,7 @@ class TestRun:
         words = ("run", folder / "arm.toml", "-o", out, "--frames", "0:1", "--model", "pbd")
         code, said, err = call(capsys, *words, *limits)
         written = json.loads((out / "run.json").read_text(encoding="utf-8"))
-        assert code == 6 and said.startswith(f"verdict: {written['verdict']}\n")
+        assert code == 6 and said.startswith("verdict: biceps is not within")
         assert "1 frames in" in said and f"in {out}" in said and "biceps: length = " in err
         assert written["fail_on"] == {"length": 3.0} and written["limits"]["length"] == 3.0
         assert "length" in written["verdict"]
@@ -92,22 +94,20 @@ class TestRun:
 
     def test_one_muscle_alone(self, folder, tmp_path, capsys):
         command = ("run", "phantom", "-o", tmp_path / "o", "--model", "pbd", "--frames", "0:1")
-        code, _, _ = call(capsys, *command, "--muscle", "extensor", "--set", "sliding.threshold=2")
+        code, _, _ = call(capsys, *command, "--muscles", "extensor", "--set", "sliding.threshold=2")
         info = json.loads((tmp_path / "o" / "run.json").read_text(encoding="utf-8"))
         assert code == 0 and list(info["muscles"]) == ["extensor"] and info["kernels"] == {}
-        code, _, err = call(capsys, *command, "--muscle", "extenso")
-        assert code == 2 and "did you mean 'extensor'?" in one_line(err)
+        code, _, err = call(capsys, *command, "--muscles", "extensor,abducto")
+        assert code == 2 and "did you mean 'abductor'?" in one_line(err)
 
     def test_export_of_a_run(self, folder, tmp_path, capsys):
         call(capsys, "run", folder / "arm.toml", "-o", tmp_path / "o", "--frames", "0:1")
-        code, out, _ = call(
-            capsys, "export", tmp_path / "o", "--format", "stl", "obj", "--units", "m"
-        )
+        code, out, _ = call(capsys, "export", tmp_path / "o", "--format", "stl,obj", "--units", "m")
         folders = [tmp_path / "o" / "export" / name for name in ("obj", "stl")]
         written = [path for folder in folders for path in folder.iterdir()]
         assert code == 0 and out == f"{len(written)} files in {folders[0]}, {folders[1]}\n"
         assert folders[1] / "biceps_0000.stl" in written
-        both = call(capsys, "export", tmp_path / "o", "--format", "glb", "animated-glb")[1]
+        both = call(capsys, "export", tmp_path / "o", "--format", "glb,animated-glb")[1]
         assert (
             both.startswith("2 files in ")
             and call(capsys, "export", tmp_path / "o", "--format", "step")[0] == 2
@@ -152,6 +152,15 @@ class TestErrors:
         ("arguments", "code", "words"),
         [
             ("rum", 2, "run"),
+            ("plan arm.toml", 2, "there is no command 'plan'; use 'rbfmuscle check SCENE --plan'"),
+            ("run arm.toml -o o --muscle biceps", 2, "Did you mean --muscles?"),
+            ("run arm.toml -o o --muscles ,", 2, "--muscles names no muscle"),
+            ("run arm.toml -o o --jobs 0", 2, "--jobs must be 1 or more"),
+            ("export a --format stl obj", 2, "unexpected 'obj'; lists are written with commas"),
+            ("check arm.toml --time", 2, "--time measures what --plan lists"),
+            ("kernels biceps.ply -o o --muscles a", 2, "biceps.ply is a mesh"),
+            ("new meshes -o o/scene.toml", 2, "give a folder"),
+            ("report nowhere", 2, "holds no run"),
             ("run arm.toml", 2, "--output"),
             ("run none.toml -o o", 3, "none.toml: no such scene file"),
             ("check mesh.toml", 4, "for.ply: no such mesh file, did you mean 'fore.ply'"),
@@ -233,6 +242,29 @@ class TestOtherCommands:
             assert found == pytest.approx(
                 {"build": build, "frame": frame, "total": build + 10 * frame}
             )
+
+    def test_check_lists_what_a_run_would_build(self, folder, capsys):
+        words = ("check", folder / "arm.toml", "--plan")
+        code, out, _ = call(capsys, *words)
+        assert code == 0 and "5 frames in 5 sub-steps" in out and "joint elbow" in out
+        assert re.search(r"muscle biceps: rbf, .* can meet ", out) and "expected time" not in out
+        plan = json.loads(call(capsys, *words, "--time", "--json")[1])["plan"]
+        assert plan["frames"] == 5 and set(plan["time"]) == {"build", "frame", "total"}
+
+    def test_comparison_fails_on_the_limits_of_its_models(self, folder, tmp_path, capsys):
+        words = ("compare", folder / "arm.toml", "-o", tmp_path / "c", "--models", "pbd,xpbd")
+        limits = ("--frames", "0:2", "--no-pictures", "--fail-on", "length=3")
+        code, out, err = call(capsys, *words, *limits, "--json", "--quiet")
+        found = json.loads(out)
+        assert code == 6 == found["exit_code"] and found["models"] == ["pbd", "xpbd"]
+        assert "pbd: biceps: length" in found["error"] and "xpbd: biceps: length" in one_line(err)
+        (tmp_path / "c" / "report.html").unlink()
+        assert call(capsys, "report", tmp_path / "c", "--no-pictures")[0] == 0
+        assert (tmp_path / "c" / "report.html").exists()
+
+    def test_jobs_are_threads(self):
+        with threads(1):
+            assert numba.get_num_threads() == 1
 
     def test_help_lists_the_commands_in_four_groups(self, capsys):
         assert call(capsys)[0] == 2

@@ -97,7 +97,9 @@ class TestOutputs:
     @pytest.mark.skipif(
         not os.path.exists("/dev/full"), reason="needs /dev/full to play a full disk"
     )
-    @pytest.mark.parametrize("words", [["check"], ["plan"], ["check", "--json"]], ids=" ".join)
+    @pytest.mark.parametrize(
+        "words", [["check"], ["check", "--plan"], ["check", "--json"]], ids=" ".join
+    )
     def test_full_standard_output_is_one_line(self, tmp_path, words):
         scene = write_scene(tmp_path, end=2)
         with open("/dev/full", "w") as full:

@@ -20,7 +20,7 @@ COMMANDS = {
     "wanted": "kernels biceps.ply -o OUT --kernels cubic --error 2",
     "sweep": "sweep arm.toml -o OUT --jobs 1 --grid contact.substep_angle=1,2",
     "paths": "paths arm.toml -o OUT --samples 10 --range elbow.flexion=0:8",
-    "export": "export a_run -o OUT --format pvd obj animated-glb",
+    "export": "export a_run -o OUT --format pvd,obj,animated-glb",
     "import": "import small.osim -o OUT",
     "import again": "import small.osim -o OUT --force",
     "new": "new meshes -o OUT",

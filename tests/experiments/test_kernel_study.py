@@ -142,7 +142,7 @@ def test_wrong_requests_are_answered(ellipsoid):
 def test_command_ranks_and_prints(tmp_path, capsys):
     words = [
         "phantom",
-        "--muscle",
+        "--muscles",
         "adductor_posterior",
         "--kernels",
         "cubic,quintic",

@@ -194,7 +194,7 @@ def _hostile(tmp_path):
 
 def test_hostile_volumes_end_in_one_line_and_code_4(tmp_path, capsys):
     for path, words in _hostile(tmp_path):
-        code, out, err = call(capsys, "new", path, "-o", tmp_path / "out" / "scene.toml")
+        code, out, err = call(capsys, "new", path, "-o", tmp_path / "out")
         assert code == 4 and out == "", (path.name, err)
         assert len(err.strip().splitlines()) == 1 and path.name in err and words in err, (
             path.name,

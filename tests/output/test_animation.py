@@ -13,6 +13,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.output.animation import page
+from rbfmuscle.output.animation.gltf import _key_name
 from rbfmuscle.output.animation.parts import AnimatedMesh, Animation
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.vtp import write_vtp
@@ -112,7 +113,7 @@ class TestUsd:
         assert len(numbers.Get(1)) != len(numbers.Get(6))
 
 
-def test_usd_without_its_package_is_one_line(folder, tmp_path, monkeypatch):
+def test_usd_without_its_package_is_one_line_after_the_others(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     monkeypatch.setitem(sys.modules, "pxr.Usd", None)
     with pytest.raises(
@@ -120,7 +121,10 @@ def test_usd_without_its_package_is_one_line(folder, tmp_path, monkeypatch):
     ) as told:
         export_run(folder, ["ply", "usd"], output=tmp_path)
     assert told.value.exit_code == 7
-    assert not list(tmp_path.iterdir())
+    assert set(told.value.written) == set((tmp_path / "ply").iterdir()) != set()
+    with pytest.raises(MissingDependencyError):
+        export_run(folder, "usd", output=tmp_path / "alone")
+    assert not (tmp_path / "alone").exists()
 
 
 def read_glb(path):
@@ -195,6 +199,27 @@ class TestAnimatedGlb:
             vertices, _, _ = morphed(tree, numbers, name, frame)
             up = np.column_stack([expected[:, 0], expected[:, 2], -expected[:, 1]])
             np.testing.assert_allclose(vertices, up, rtol=0, atol=TOLERANCE)
+
+    def test_shape_keys_have_the_captions_of_their_frames(self, folder, tmp_path):
+        (path,) = export_run(folder, "animated-glb", output=tmp_path, frames=slice(1, None, 2))
+        tree, _ = read_glb(path)
+        (mesh,) = [mesh for mesh in tree["meshes"] if mesh["name"] == "biceps"]
+        saved = Run.load(folder)
+        assert mesh["extras"]["targetNames"] == [saved.caption(3), saved.caption(5)]
+        assert len(_key_name("°" * 40).encode()) == 62  # Blender keeps 63 bytes
+
+    def test_frames_per_second_are_those_asked_for(self, folder, tmp_path):
+        for fps, wanted in ((None, 24.0), (30.0, 30.0)):
+            out = tmp_path / str(fps)
+            (path,) = export_run(
+                folder, "animated-glb", output=out, frames=slice(1, None, 2), fps=fps
+            )
+            tree, numbers = read_glb(path)
+            times = numbers(tree["animations"][0]["samplers"][0]["input"])[:, 0]
+            np.testing.assert_allclose(times, np.array([0, 2, 4]) / wanted, rtol=1e-6)
+        for wrong in ({"formats": "ply", "fps": 30.0}, {"formats": "usd", "fps": 0.0}):
+            with pytest.raises(UsageError, match="--fps"):
+                export_run(folder, output=tmp_path / "no", **wrong)
 
     def test_changing_surface_is_refused_with_a_remedy(self, changing, tmp_path):
         with pytest.raises(UsageError, match=r"'biceps' do not; run with surface = 'material'"):

@@ -9,7 +9,7 @@ import pyvista
 import trimesh
 from blend_model import arm_files
 
-from rbfmuscle.cli.app import one_line
+from rbfmuscle.cli.printing import one_line
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.output.export import _file_name, export_run

@@ -34,7 +34,7 @@ def animated_glb(run: Animation) -> bytes:
             "do not; "
             "run with surface = 'material', or export to usd, pvd or glb"
         )
-    file = _File()
+    file = _File([_key_name(caption) for caption in run.captions])
     if len(run.times) > 1:
         file.times = file.add(run.times[:, None] - run.times[0], "SCALAR", bounds=True)
     children = [_add_part(file, part) for part in (*run.bones, *run.muscles)]
@@ -43,6 +43,11 @@ def animated_glb(run: Animation) -> bytes:
     left, posterior, superior = run.body  # glTF looks at what faces +z, with y up
     root["rotation"] = _quaternions(np.stack([left, superior, -posterior])[None])[0].tolist()
     return file.content({"name": run.name, "nodes": [file.append("nodes", root)]})
+
+
+def _key_name(caption: str) -> str:
+    """The caption of a frame as the name of a shape key, of which Blender keeps 63 bytes."""
+    return caption.encode()[:63].decode(errors="ignore")
 
 
 def _add_part(file: "_File", part: AnimatedMesh) -> int:
@@ -114,9 +119,12 @@ def _quaternions(rotations):
 
 
 class _File:
-    """The content of a glTF file: the binary part and the lists that describe it."""
+    """The content of a glTF file: the binary part and the lists that describe it; ``names`` are
+    those of the frames.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = names
         self.parts: list[bytes] = []
         self.size, self.times = 0, 0
         keys = "bufferViews", "accessors", "meshes", "materials", "nodes"
@@ -169,7 +177,7 @@ class _File:
         if targets:
             primitive["targets"] = list(targets)
             entry["weights"] = [0.0] * len(targets)
-            entry["extras"] = {"targetNames": [f"frame {k}" for k in range(1, len(targets) + 1)]}
+            entry["extras"] = {"targetNames": list(self.names[1:])}
         return self.append("meshes", entry)
 
     def animate(self, node: int, path: str, values: int) -> None:

@@ -5,13 +5,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from rbfmuscle.cli.paths import parse_ranges, parse_targets
 from rbfmuscle.paths import (
     SHIFT,
     FittedPath,
     Samples,
     exponents,
     fit_path,
-    parse_ranges,
     report_fits,
     sample_muscles,
     write_paths,
@@ -61,14 +61,15 @@ def test_fit_over_a_shift_does_not_depend_on_the_unit(unit):
 
 def test_file_is_in_metres_with_terms_in_the_order_of_opensim(tmp_path):
     assert exponents(2, 2).tolist() == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [2, 0]]
+    turning = {"ankle.angle": True, "rail.s": False}
     path = FittedPath("soleus", ("ankle.angle", "rail.s"), 1, np.array([300.0, 2.0, -40.0]))
-    write_paths(tmp_path / "p.xml", [path], 1000.0, {"ankle.angle": True, "rail.s": False})
+    write_paths(tmp_path / "p.xml", [path], 1000.0, turning, {"rail.s": "/jointset/r/t"})
     root = ElementTree.parse(tmp_path / "p.xml").getroot()
     item = root.find(".//FunctionBasedPath")
     assert item.get("name") == "/forceset/soleus"
     assert item.find("coordinate_paths").text.split() == [
         "/jointset/ankle/angle",
-        "/jointset/rail/s",
+        "/jointset/r/t",
     ]
     assert [float(x) for x in root.find(".//coefficients").text.split()] == pytest.approx(
         [0.3, 2.0, -0.04]
@@ -80,7 +81,7 @@ def test_opensim_loads_the_file_and_gives_the_same_numbers(tmp_path):
     pytest.importorskip("opensim.simulation")
     osim = pytest.importorskip("opensim")
     path = fit_path("m", ("a.x", "b.y"), *made())
-    write_paths(tmp_path / "p.xml", [path], 1000.0, {"a.x": True, "b.y": True})
+    write_paths(tmp_path / "p.xml", [path], 1000.0, {"a.x": True, "b.y": True}, {})
     model = osim.Model()
     parent = model.getGround()
     coordinates = []
@@ -149,7 +150,7 @@ def test_poses_that_fail_are_left_out_and_too_many_are_refused(tmp_path, scene):
     values, lengths, arms = made(20)
     lengths[3] = arms[4] = np.nan
     found = Samples("m", ("hip.flexion", "hip.adduction"), values, lengths, arms)
-    assert "2 poses could not be solved" in report_fits(scene, [found], tmp_path)[0]
+    assert "2 poses could not be solved" in report_fits(scene, [found], tmp_path)[1][0]
     lengths[:15] = np.nan
     with pytest.raises(SolveError, match="15 of 20 poses failed"):
         report_fits(scene, [found], tmp_path)
@@ -160,3 +161,15 @@ def test_ranges_are_checked(scene):
     for text in ("flexion", "flexion=1", "flexion=9:1", "flexion=a:b", "flexion=0:inf", "foo=0:1"):
         with pytest.raises(UsageError, match="--range"):
             parse_ranges(scene, [text])
+
+
+def test_names_of_the_opensim_model_are_checked(scene):
+    given = ["flexion=hip_r/hip_flexion_r", "hip.adduction=hip_r/add"]
+    assert parse_targets(scene, given) == {
+        "hip.flexion": "/jointset/hip_r/hip_flexion_r",
+        "hip.adduction": "/jointset/hip_r/add",
+    }
+    wrong = (["flexion"], ["flexion=a"], ["flexion=a b/c"], ["foo=a/b"])
+    for texts in (*wrong, ["flexion=a/b", "adduction=a/b"]):
+        with pytest.raises(UsageError, match="--coordinate"):
+            parse_targets(scene, texts)

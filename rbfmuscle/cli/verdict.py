@@ -1,0 +1,54 @@
+"""The verdict of a run on a terminal: the count, the worst, what to do, where to look."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import fill, shorten
+
+from rbfmuscle.metrics.summary import (
+    LIMITS,
+    Summary,
+    describe_excess,
+    describe_unmeasured,
+    find_remedy,
+)
+from rbfmuscle.output.run_data import RunData
+from rbfmuscle.scene.phantom import PHANTOM
+
+MOST = 3  # values beyond limits, and remedies, that are named
+WIDTH = 80
+LONGEST = 140  # characters about what was not measured or is doubtful: two lines
+
+
+def verdict_lines(directory: Path) -> Iterator[str]:
+    """Lines about a run in a folder, at most `WIDTH` characters each where no name is longer."""
+    saved = RunData.load(directory)
+    info, summary = saved.info, Summary()
+    summary.add(saved.metrics)
+    table = summary.table()
+    yield _wrapped("verdict: ", info.verdict.partition(". ")[0])
+    # The worst of each muscle first, then whatever else is beyond a limit.
+    first = {row.muscle: row for row in reversed(info.beyond)}.values()
+    named = sorted(info.beyond, key=lambda row: row not in first)[:MOST]
+    for row in named:
+        yield _wrapped("  ", describe_excess(row, table, info.scene.left_out))
+    if len(info.beyond) > len(named):
+        yield f"  and {len(info.beyond) - len(named)} more values beyond their limits"
+    missing = info.not_measured
+    if missing:
+        yield _wrapped("not measured: ", shorten(describe_unmeasured(missing), LONGEST))
+    doubts = info.verdict.partition(". Doubtful: ")[2]
+    if doubts:
+        yield _wrapped("doubtful: ", shorten(doubts, LONGEST))
+    known = [row for row in named if row.quantity.partition(":")[0] in LIMITS]
+    parts = [part for row in known for part in find_remedy(row, table).split("; ")]
+    # Where to look is said below, for all of them.
+    own = [part for part in dict.fromkeys(parts) if "rbfmuscle render" not in part]
+    for part in own[:MOST]:
+        yield _wrapped("what to do: ", part.replace("SCENE", info.scene.file or PHANTOM))
+    if named and saved.has_surfaces and named[0].frame is not None:
+        frame = named[0].frame
+        yield f"where to look: rbfmuscle render {directory} --frame {frame} -o frame.png"
+
+
+def _wrapped(head: str, text: str) -> str:
+    return fill(head + text, WIDTH, subsequent_indent="    ", break_on_hyphens=False)

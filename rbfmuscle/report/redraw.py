@@ -1,0 +1,91 @@
+"""Write the report of a saved run or comparison again, after a change of limits or texts."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rbfmuscle.folders import OutputFolder
+from rbfmuscle.metrics.summary import (
+    Limits,
+    Summary,
+    describe_verdict,
+    exceeded,
+    parse_limits,
+    require_limits,
+    unmeasured,
+)
+from rbfmuscle.output.info import RunInfo
+from rbfmuscle.output.run_data import RunData
+from rbfmuscle.output.writer import PAGES, run_folder, write_json
+from rbfmuscle.report.comparison_page import write_page
+from rbfmuscle.report.report import write_report
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.validation import LimitExceededError, UsageError
+
+DOUBTFUL = ". Doubtful: "  # what a verdict says after its limits
+
+
+def redraw_run(
+    directory: str | Path, *, fail_on: str | None = None, pictures: bool = True
+) -> RunInfo:
+    """Hold a saved run to limits again and write its pages; what ``run.json`` then holds.
+
+    ``fail_on`` are limits as for `parse_limits`, those that the run had where not given;
+    ``pictures`` are those of the report and the preview.
+
+    Raises
+    ------
+    UsageError
+        If the folder holds no run that has ended, or a file that is not the run's is in the way.
+    LimitExceededError
+        If a limit of ``fail_on`` is exceeded, or was not measured; everything is written, and its
+        ``info`` is what ``run.json`` holds.
+    """
+    directory = Path(directory)
+    saved = RunData.load(directory)
+    info = saved.info
+    if info.status == "running":
+        raise UsageError(f"{directory} holds a run that has not ended; run the scene again")
+    folder = run_folder(directory)
+    limits = _limits(saved, fail_on)
+    summary = Summary()
+    summary.add(saved.metrics)
+    table = summary.table()
+    # What was doubtful in the scene stays so.
+    doubts = "".join(info.verdict.partition(DOUBTFUL)[1:])
+    info = info.replaced(
+        limits=dict(limits.values),
+        fail_on=dict(limits.fail_on),
+        verdict=describe_verdict(table, limits, info.scene.left_out) + doubts,
+        beyond=exceeded(table, limits),
+        not_measured=unmeasured(table, limits),
+    )
+    drawn = pictures and saved.has_surfaces and len(saved.frames) > 1
+    folder.add(*(PAGES if drawn else PAGES[:1]))
+    write_json(directory / "run.json", info.to_dict())
+    write_report(directory, pictures=pictures)
+    try:
+        require_limits(table, limits)
+    except LimitExceededError as error:
+        error.info = info
+        raise
+    return info
+
+
+def redraw_comparison(directory: Path, *, pictures: bool = True) -> dict[str, Any]:
+    """Write the page of a comparison again; what ``comparison.json`` holds."""
+    OutputFolder(directory, "compare", ["report.html"])
+    path = directory / "comparison.json"
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        write_page(directory, found, pictures=pictures)
+    except (ValueError, KeyError, TypeError) as error:
+        message = f"{path} is not that of a comparison ({error!r}); compare the models again"
+        raise UsageError(message) from None
+    return found
+
+
+def _limits(saved: RunData, fail_on: str | None) -> Limits:
+    given = saved.info.fail_on
+    texts = [name if value is None else f"{name}={value!r}" for name, value in given.items()]
+    return parse_limits(texts if fail_on is None else fail_on, Scene(units=saved.units))
