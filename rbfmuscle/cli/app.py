@@ -100,6 +100,8 @@ def _run(arguments, as_json):
         asked = f" ({one_line(error)})" if str(error) else ""
         message = f"not enough memory{asked}; take fewer centres, coarser cells or smaller meshes"
         return _fail(message, SolveError.exit_code, as_json)
+    finally:
+        Progress.quiet = False
     return code if isinstance(code, int) else 0
 
 
