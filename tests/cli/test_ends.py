@@ -156,9 +156,9 @@ class TestKilledRuns:
         assert saved.info.status == "running"
         assert saved.frame_numbers == [0, 1, 2, 3, 4, 5] and len(whole.frames) == 9
         for mine, complete in zip(saved.info.frames, whole.info.frames):
-            assert mine["coordinates"] == pytest.approx(complete["coordinates"])
+            assert mine.coordinates == pytest.approx(complete.coordinates)
         np.testing.assert_array_equal(saved.mesh("biceps", 5)[0], whole.mesh("biceps", 5)[0])
-        code, _, err = call(capsys, "export", killed, "--format", "stl", "pvd")
+        code, _, err = call(capsys, "export", killed, "--format", "stl,pvd")
         assert code == 0, err
         assert len(list((killed / "export" / "stl").glob("biceps_*.stl"))) == 6
         code, _, err = call(capsys, "render", killed, "-o", killed / "last.png", "--view", "front")

@@ -363,7 +363,7 @@ def test_a_moment_arm_jumps_where_its_slope_does_not_where_it_is_steep(step):
     # A kink of 3 mm per degree at 40 degrees.
     kinked = _smoothness(_arms(angles, 3.0 * np.maximum(angles - 40.0, 0.0)), guessed=False)
     assert max(row.value for row in kinked) == pytest.approx(15.0)
-    assert next(row for row in kinked if row.value > 1e-9).angle >= 40.0
+    assert next(row for row in kinked if row.value > 1e-9).coordinate_value >= 40.0
 
 
 def test_the_sign_of_a_moment_arm_is_judged_where_attachments_are_guessed():
