@@ -32,7 +32,7 @@ def step(action):
     stepper = MuscleStepper(
         model, BoneContacts(names, list(fields.values()), contact_bone=model.contact_bone), scene
     )
-    stepper.step(rest, turned)
+    stepper.step(stepper.path(rest, turned))
     _, events, _ = stepper.collect()
     for event in events:
         print(f"{action:8} {event.count:4} points at the {event.bone}: {event.action}")

@@ -253,8 +253,9 @@ def _draw_frame(run: RunData, camera: Camera, frame: int) -> Integers:
     """Picture (h, w, 3) of a frame of a run."""
     colours = run.colours | dict.fromkeys(run.tendons, look.TENDON_COLOUR)
     solids = [Solid(*run.mesh(name, frame), colour) for name, colour in colours.items()]
-    for name, pose in run.frame(frame).poses.items():
-        vertices, faces = run.bone(name)
+    poses = run.frame(frame).poses
+    for name in run.bones:
+        (vertices, faces), pose = run.bone(name), poses[name]
         solids.append(Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, look.BONE_COLOUR))
     return draw_solids(solids, camera)
 

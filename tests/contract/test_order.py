@@ -81,8 +81,8 @@ def test_shapes_do_not_depend_on_the_order_of_anything(model):
     other, places = shuffled(scene)
     found, again = shapes(scene), shapes(other)
     for name, one in found.items():
-        # A mesh model keeps the numbers of its input mesh.
-        two = again[name] if model == "rbf" else again[name][places[name]]
+        # Surfaces keep the numbers of the input mesh.
+        two = again[name][places[name]]
         assert np.abs(one - two).max() < 1e-9 * np.ptp(one, axis=0).max()
 
 

@@ -385,7 +385,8 @@ def test_meshes_in_metres_make_a_scene_that_runs_and_an_unused_bone_is_in_the_ve
     run = ("run", scene, "-o", out, "--model", "pbd", "--frames", "0:5")
     code, printed, _ = call(capsys, *run)
     verdict = json.loads((out / "run.json").read_text(encoding="utf-8"))["verdict"]
-    assert code == 0 and f"verdict: {verdict}" in printed and len(Run.load(out).frames) == 5
+    assert code == 0 and printed.startswith("verdict: 0 of 2 muscles are within all limits")
+    assert len(Run.load(out).frames) == 5
     assert "the bones, bones left out (sacrum) 1 at frame 0 (limit 0)" in verdict
     code, _, err = call(
         capsys, *run, "--set", "output.surfaces=false", "--fail-on", "bones_left_out"

@@ -144,7 +144,7 @@ def test_empty_masks_are_counted_and_named_and_the_scene_and_check_repeat_it(tmp
     for name in masks:
         image = nibabel.load(folder / f"{name}.nii.gz")
         write_nifti(folder / f"{name}.nii.gz", np.asarray(image.dataobj), unit="unknown")
-    code, out, _ = call(capsys, "new", folder, "-o", tmp_path / "o" / "scene.toml")
+    code, out, _ = call(capsys, "new", folder, "-o", tmp_path / "o")
     words = "2 of 5 masks are empty: femur_left, hip_left"
     assert code == 0 and out.count(words) == 1
     scene = (tmp_path / "o" / "scene.toml").read_text()

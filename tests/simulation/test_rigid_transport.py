@@ -110,8 +110,10 @@ def test_muscles_side_by_side_in_any_order_are_what_they_are_alone():
     for order in (muscles, muscles[::-1]):
         together = _run(_arm(path, muscles=order), "rbf")[-1]
         for name, one in alone.items():
-            np.testing.assert_array_equal(
-                one.surfaces[name].vertices, together.surfaces[name].vertices
+            # To rounding: the bones' arrays lie elsewhere, and sums of products may be grouped
+            # otherwise.
+            np.testing.assert_allclose(
+                one.surfaces[name].vertices, together.surfaces[name].vertices, rtol=0.0, atol=1e-9
             )
             assert one.work[name] == together.work[name]
 
