@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, direction_loop
+from rbfmuscle.bones.broad_phase import direction_loop
 from rbfmuscle.bones.query import FieldData, query_loop
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.jit import compiled
@@ -152,39 +152,3 @@ def query_bone(bones, b, pose, points, reach, distance, gradient):
     query_loop(points, placed, reach, bones.sizes[b], distance, gradient, field_of(bones, b))
     if len(gradient) > 0:
         direction_loop(points, gradient, pose, bones.boxes[b])
-
-
-@compiled(error_model="numpy")
-def nearest_bone(bones, poses, points, reach, distance, gradient, which):
-    """Distance (n,) to the nearest bone in poses (b, 4, 4), its gradient (n, 3) and number (n,).
-
-    Where all bones are farther than ``reach`` (n,) it is a lower bound beyond that, infinity where
-    no bone is there at all, the gradient zero and the number -1.
-    """
-    distance[:] = np.inf
-    gradient[:] = 0.0
-    which[:] = -1
-    box = np.empty((2, 3))
-    box_loop(points, np.ones(len(points), np.bool_), box)
-    farthest = 0.0
-    for i in range(len(reach)):
-        farthest = max(farthest, reach[i])
-    one, way, limit = np.empty(len(points)), np.empty((len(points), 3)), np.empty(len(points))
-    for b in range(len(poses)):
-        apart = boxes_apart(box, poses[b], bones.boxes[b])
-        if apart > farthest:
-            for i in range(len(points)):
-                if apart < distance[i]:
-                    distance[i] = apart
-            continue
-        for i in range(len(points)):
-            # No farther than what was found: elsewhere a lower bound will do.
-            limit[i] = min(distance[i], reach[i])
-        query_bone(bones, b, poses[b], points, limit, one, way)
-        for i in range(len(points)):
-            if one[i] < distance[i]:
-                distance[i] = one[i]
-                inside = one[i] <= reach[i]
-                which[i] = b if inside else -1
-                for a in range(3):
-                    gradient[i, a] = way[i, a] if inside else 0.0

@@ -2,8 +2,6 @@
 loops.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
@@ -22,19 +20,6 @@ def rigid_fit(points: Floats, targets: Floats) -> Floats:
         transform[:3, :3] = vt.T @ mirror @ u.T
     transform[:3, 3] = aim - transform[:3, :3] @ middle
     return transform
-
-
-def smooth_displacement(rest: Floats, points: Floats, smooth: Callable[[Floats], None]) -> Floats:
-    """The shape at rest, moved as the points on the whole, and deformed as they are where that is
-    smooth, (n, 3).
-
-    ``smooth`` smooths, in place, what the points do beside the rigid motion.
-    """
-    motion = rigid_fit(rest, points)
-    moved = rest @ motion[:3, :3].T + motion[:3, 3]
-    beside = points - moved
-    smooth(beside)
-    return moved + beside
 
 
 def turned_quaternions(quaternions: Floats, rotation: Floats) -> Floats:

@@ -42,11 +42,6 @@ def _vertex_normal_loop(vertices, faces, normals):
             normals[v, k] /= max(length, 1e-300)
 
 
-def touching_faces(faces: Integers, marked: Booleans) -> Booleans:
-    """Mask (m,) of the triangles with a corner among the marked vertices (n,)."""
-    return marked[faces[:, 0]] | marked[faces[:, 1]] | marked[faces[:, 2]]
-
-
 def unique_edges(faces: Integers) -> Integers:
     """Edges of a triangle mesh, (e, 2), each once, its lesser vertex first.
 

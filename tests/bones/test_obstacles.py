@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from trimesh.transformations import rotation_matrix
 
-from rbfmuscle.bones.obstacles import nearest_bone, query_bone, stack_bones
+from rbfmuscle.bones.obstacles import query_bone, stack_bones
 from rbfmuscle.bones.sdf import BoneSDF
 
 
@@ -32,21 +32,3 @@ def test_each_bone_answers_as_its_own_field(bones):
         assert np.allclose(distance, wanted, rtol=0.0, atol=1e-12)
         # The field's gradient has the length that single precision gives it, here it is one.
         assert np.allclose(gradient, slope, rtol=0.0, atol=1e-7)
-
-
-@pytest.mark.parametrize("limit", [np.inf, 6.0, -1.0])
-def test_nearest_bone_is_the_least_distance_within_reach(bones, limit):
-    fields, poses, points = bones
-    distance, gradient = np.empty(len(points)), np.empty_like(points)
-    which = np.empty(len(points), np.int64)
-    reach = np.full(len(points), limit)
-    nearest_bone(stack_bones(fields), poses, points, reach, distance, gradient, which)
-    every = np.array([field.distance(points, pose) for field, pose in zip(fields, poses)])
-    inside = every.min(axis=0) <= limit
-    assert 0 < inside.sum() <= len(points)
-    assert np.array_equal(which >= 0, inside)
-    assert np.array_equal(which[inside], every.argmin(axis=0)[inside])
-    assert np.allclose(distance[inside], every.min(axis=0)[inside], rtol=0.0, atol=1e-12)
-    assert (distance[~inside] > limit).all()
-    assert (distance[~inside] <= every.min(axis=0)[~inside] + 1e-5).all()
-    assert np.allclose(np.linalg.norm(gradient, axis=1), inside)
