@@ -50,7 +50,7 @@ def apart(one, two):
 
 def vertices(frame):
     """Material vertices by muscle."""
-    return {name: np.asarray(found) for name, (found, _) in frame.carried.items()}
+    return {name: np.asarray(found) for name, (found, _) in frame.material_meshes.items()}
 
 
 def timed(path, model):

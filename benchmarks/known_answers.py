@@ -60,7 +60,7 @@ class Played:
 
     @property
     def carried(self):
-        return self.frame.carried[self.muscle.name]
+        return self.frame.material_meshes[self.muscle.name]
 
     def lines(self):
         """Centreline at rest and now."""
@@ -99,7 +99,7 @@ def wrapped(over, model, spacing):
     )
     angle = math.radians(TURNS[over])
     added, lifted = wrapped_path(angle, bar=STRIPS[over])
-    places = played.carried[0]
+    places = played.material_meshes[0]
     return wrapped_strip_errors(angle, over, added, lifted, DRUM_RADIUS, *played.lines(), places)
 
 
@@ -245,7 +245,7 @@ def flexed(model, *, spacing=3.0, substep=2.0):
     found = []
     lengths = []
     for frame in simulate_frames(scene, [built]):
-        mesh = frame.carried[MUSCLE]
+        mesh = frame.material_meshes[MUSCLE]
         lengths.append(path_length(centreline(scene.muscles[0], scene, rest, mesh, frame.poses)))
         found.append((frame.surfaces[MUSCLE], mesh[0], lengths[-1] - lengths[0]))
     return found[1:]

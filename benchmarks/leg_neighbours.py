@@ -65,7 +65,7 @@ class Bench:
         """A loop at rest."""
         for model, state in zip(self.models, self.rest):
             model.restore(state)
-        return FrameLoop(self.scenes[sliding], self.models, fields=self.fields)
+        return FrameLoop(self.scenes[sliding], self.models, bone_sdfs=self.fields)
 
     @property
     def path(self):
@@ -162,9 +162,9 @@ def holders(scene, models, surfaces):
     """
     found = {}
     for model in models:
-        names = np.array([*scene.holders(scene.muscle(model.name)), ""])
+        names = np.array([*scene.attachment_frames(scene.muscle(model.name)), ""])
         nearest = cKDTree(model.contact_points()).query(surfaces[model.name][0])[1]
-        found[model.name] = names[np.asarray(model.contact_bone)[nearest]]
+        found[model.name] = names[np.asarray(model.attached_bone)[nearest]]
     return found
 
 

@@ -78,7 +78,7 @@ def ends(scene, pose, others, settings):
         model = RBFMuscle(muscle, part, RBFOptions(**{**muscle.options, **settings}))
         last = len(part.motion.frames) - 1
         (frame,) = simulate_frames(part, [model], surfaces=False, written={last})
-        found[name] = frame.carried[muscle.name][0] / part.length(1.0)
+        found[name] = frame.material_meshes[muscle.name][0] / part.length(1.0)
     return found, time.process_time() - start
 
 

@@ -101,7 +101,7 @@ class Experiment:
     def run(self, method, substeps):
         """Angles of the first penetration and tunnelling, and the worst of everything else."""
         model = build_model(self.scene.muscles[0], self.scene, method)
-        contacts = BoneContacts(self.names, self.fields, contact_bone=model.contact_bone)
+        contacts = BoneContacts(self.names, self.fields, attached_bone=model.attached_bone)
         record = Record(model, self.probes)
         here = {self.coordinate: 0.0}
         for coordinates in self.scene.motion.frames:
@@ -142,7 +142,7 @@ class Record:
         self.depth = self.bone_depth = self.volume = self.seconds = 0.0
         self.ratio, self.frames = [np.inf, 0.0], 0
         rest, self.edges = model.rest, model.rest.topology.edges
-        self.free = model.contact_bone < 0
+        self.free = model.attached_bone < 0
         self.lengths = self.edge_lengths(rest.vertices)
 
     def edge_lengths(self, points):

@@ -118,7 +118,7 @@ for action, title in (("report", "tunnelled"), ("substep", "corrected")):
     model = build_model(muscle, scene, "pbd")
     names = [bone.name for bone in scene.bones]
     stepper = MuscleStepper(
-        model, BoneContacts(names, fields, contact_bone=model.contact_bone), scene
+        model, BoneContacts(names, fields, attached_bone=model.attached_bone), scene
     )
     stepper.step(rest, turned)
     remaining[action] = {event.action for event in stepper.collect()[1]}

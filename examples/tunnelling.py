@@ -30,7 +30,7 @@ def step(action):
     model = build_model(muscle, scene, "pbd")
     names = list(fields)
     stepper = MuscleStepper(
-        model, BoneContacts(names, list(fields.values()), contact_bone=model.contact_bone), scene
+        model, BoneContacts(names, list(fields.values()), attached_bone=model.attached_bone), scene
     )
     stepper.step(stepper.path(rest, turned))
     _, events, _ = stepper.collect()

@@ -71,8 +71,8 @@ class PBDMuscle:
         self.size = diameter(self.rest.vertices)
         self.still = method.tolerance * self.size
         self.log = SolveLog(solver_residual=0.0)
-        self.detail = 0.0
-        self.contact_bone = _bone_numbers(self.rest, scene.holders(muscle))
+        self.contact_spacing = 0.0
+        self.attached_bone = _bone_numbers(self.rest, scene.attachment_frames(muscle))
         self.contact = ContactConstraint(reach=scene.length(REACH))
         self.finishing_reach, self.depth = scene.length(FINISHING_REACH), scene.length(DEPTH)
         self.points = self.rest.vertices.copy()
@@ -122,7 +122,7 @@ class PBDMuscle:
         if self.fibres is not None:
             self.fibres.activate(activation)
 
-    def make_room(self, contacts: BoneContacts) -> None:
+    def separate_neighbours(self, contacts: BoneContacts) -> None:
         """Nothing: `solve` moves vertices out of neighbours all the way."""
 
     def transform(self, motion: np.ndarray) -> None:
@@ -160,7 +160,10 @@ class PBDMuscle:
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The mesh as it is now."""
         quantities, notes = self.log.take()
-        quantities |= {"solver_penetration_max": self.penetration, "sweeps": float(self.swept)}
+        quantities |= {
+            "solver_penetration_max": self.penetration,
+            "solver_sweeps": float(self.swept),
+        }
         return ModelSurface(*self.material_mesh(), quantities, notes)
 
     def volume(self) -> float:

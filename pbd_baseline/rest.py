@@ -97,7 +97,7 @@ def _to_insertion(muscle, scene, place, mesh):
     faces, bones, weights = mesh
     if ends is None:
         return np.ones(len(weights))
-    first, last = ({a.holder for a in end} for end in ends)
+    first, last = ({a.attachment_frame for a in end} for end in ends)
     if not first & last:
         return weights[:, [bone in last for bone in bones]].sum(axis=1)
     patches = [np.unique(place[np.concatenate([a.vertices for a in end])]) for end in ends]
@@ -113,10 +113,10 @@ def _renumbered(muscle):
     place = np.argsort(order, kind="stable")
     vertices = np.ascontiguousarray(muscle.mesh.vertices, dtype=np.float64)[order]
     faces = _sorted_faces(place[np.asarray(muscle.mesh.faces)])
-    bones = list(dict.fromkeys(attachment.holder for attachment in muscle.attachments))
+    bones = list(dict.fromkeys(attachment.attachment_frame for attachment in muscle.attachments))
     attached_bone = np.full(len(vertices), -1)
     for attachment in muscle.attachments:
-        attached_bone[place[attachment.vertices]] = bones.index(attachment.holder)
+        attached_bone[place[attachment.vertices]] = bones.index(attachment.attachment_frame)
     return order, vertices, faces, bones, attached_bone
 
 

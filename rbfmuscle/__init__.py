@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rbfmuscle.validation import SceneWarning as SceneWarning
     from rbfmuscle.validation import SolveError as SolveError
     from rbfmuscle.validation import UsageError as UsageError
-    from rbfmuscle.viewer.page import Page as Page
+    from rbfmuscle.viewer.page import ViewerPage as ViewerPage
     from rbfmuscle.viewer.page import show as show
 
 __version__ = "1.1.0"
@@ -66,7 +66,7 @@ _HOME = {
 }
 # For modules that may not import it themselves.
 _INNER = {
-    "Page": "rbfmuscle.viewer.page",
+    "ViewerPage": "rbfmuscle.viewer.page",
 }
 
 __all__ = [*_HOME, "__version__"]
@@ -85,7 +85,7 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-def _show(shown: Scene, *, model: str | None = None) -> Page:
+def _show(shown: Scene, *, model: str | None = None) -> ViewerPage:
     from rbfmuscle.viewer.page import show
 
     return show(shown, model=model)

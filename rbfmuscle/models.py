@@ -23,7 +23,7 @@ class ModelKind(NamedTuple):
     ``build`` makes the model of a muscle of a scene from the checked table of its settings,
     ``options`` is that table's class, ``points`` says in words what the model solves for, building
     nothing. ``title`` is its name in tables and pictures, with ``{}`` for its number of sweeps,
-    ``sweeps``.
+    ``solver_sweeps``.
     """
 
     # Both take the options' own class, which a type of a function cannot say.
@@ -200,4 +200,4 @@ def _check_muscle(muscle: Muscle) -> None:
 
 def _read_options(muscle: Muscle, kind: ModelKind, table: Mapping[str, object]) -> Table:
     """The checked settings of a muscle's model."""
-    return kind.options.build(table, place=f"muscle {muscle.name!r}: model: ")
+    return kind.options.build(table, context=f"muscle {muscle.name!r}: model: ")

@@ -152,7 +152,7 @@ def _measured(scene, models, gauges, poses):
         for model, state in zip(models, rest):
             model.restore(state)
         try:
-            loop = FrameLoop(scene, models, fields=fields, surfaces=False)
+            loop = FrameLoop(scene, models, bone_sdfs=fields, surfaces=False)
             loop.activations.target = loop.activations.at(0)  # the same in all solves
             yield _row(loop, gauges, pose)
         except SolveError:
@@ -162,11 +162,11 @@ def _measured(scene, models, gauges, poses):
 def _row(loop, gauges, pose):
     """Length and arms of the gauges at a pose, and whether they did not settle, (n, 2 + d)."""
     here, arms = _settled(loop, gauges, pose), []
-    facts = all_coordinates(loop.scene.joints)
+    known = all_coordinates(loop.scene.joints)
     for name, value in pose.items():
-        turns = facts[name].motion != "translation"
+        turns = known[name].motion != "translation"
         step = math.radians(STEP) if turns else loop.scene.length(STEP)
-        ends = [facts[name].honoured(value + side * step) for side in (-1.0, 1.0)]
+        ends = [known[name].clamped_value(value + side * step) for side in (-1.0, 1.0)]
         below, above = (_settled(loop, gauges, {**pose, name: end}) for end in ends)
         arms.append(-(above - below) / (ends[1] - ends[0]))
     capped = [any(key[2] == "iteration_cap" for key in s.events) for s in loop.steppers]
@@ -204,11 +204,11 @@ def _poses(ranges, samples):
 
 def _groups(scene):
     """Muscles by the coordinates that they depend on; those of a group are sampled together."""
-    facts, followers = (
+    known, followers = (
         all_coordinates(scene.joints),
         {coupling.coordinate for coupling in scene.couplings},
     )
-    free = [name for name, fact in facts.items() if name not in followers and not fact.locked]
+    free = [name for name, fact in known.items() if name not in followers and not fact.locked]
     groups = {}
     for muscle in scene.muscles:
         bones = sorted({bone for attachment in muscle.attachments for bone in attachment.bones})
@@ -227,7 +227,7 @@ def _moves(scene, bones, name):
     """Whether a coordinate moves some bones against each other, from where all others rest."""
     fact, places = all_coordinates(scene.joints)[name], []
     for value in (fact.rest, fact.rest + 0.1, fact.rest - 0.1):
-        poses = bone_poses(scene, {name: fact.honoured(value)})
+        poses = bone_poses(scene, {name: fact.clamped_value(value)})
         back = np.linalg.inv(poses[bones[0]])
         places.append([back @ poses[bone] for bone in bones])
     return np.ptp(np.array(places), axis=0).max() > 1e-6
@@ -239,7 +239,7 @@ def _range(scene, name, given):
     fact = all_coordinates(scene.joints)[name]
     for ends in (given.get(name), fact.range, (min(moved, default=0.0), max(moved, default=0.0))):
         if ends is not None and ends[0] < ends[1]:
-            low, high = (fact.honoured(end) for end in ends)
+            low, high = (fact.clamped_value(end) for end in ends)
             if low == high:
                 raise UsageError(
                     f"--range {name}: it lies outside the range that clamps the coordinate"

@@ -70,8 +70,8 @@ class MemorySink:
 class Recording:
     """One run of a scene: its models through the frame loop, measured and clocked, into a sink.
 
-    ``model``, ``settings`` and ``frames`` are those of `configure_scene`; ``fields`` of the bones,
-    by name, stand in place of `BoneSDF`; ``fail_on`` are the limits of `parse_limits`.
+    ``model``, ``settings`` and ``frames`` are those of `configure_scene`; ``bone_sdfs``, by
+    bone, stand in place of `BoneSDF`; ``fail_on`` are the limits of `parse_limits`.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Recording:
         model: str | dict[str, Any] | None = None,
         settings: Mapping[str, Any] | None = None,
         frames: slice | str | None = None,
-        fields: Mapping[str, BoneField] | None = None,
+        bone_sdfs: Mapping[str, BoneField] | None = None,
         fail_on: str | Sequence[str] | None = None,
     ) -> None:
         self.started = datetime.now(UTC)
@@ -90,10 +90,10 @@ class Recording:
         scene = configure_scene(scene, settings, model=model, frames=frames)
         self.scene = orient_scene(scene.validate())
         self.limits: Limits = parse_limits(fail_on, self.scene)
-        if fields is not None and set(fields) != {bone.name for bone in scene.bones}:
+        if bone_sdfs is not None and set(bone_sdfs) != {bone.name for bone in scene.bones}:
             bones = ", ".join(bone.name for bone in scene.bones)
             raise UsageError(
-                f"fields must name each bone ({bones}), got {', '.join(fields) or 'none'}"
+                f"bone_sdfs must name each bone ({bones}), got {', '.join(bone_sdfs) or 'none'}"
             )
         self.options = {
             "model": model,
@@ -115,7 +115,7 @@ class Recording:
             carried = {model.name: model.material_mesh() for model in self._models}
             self._measures = MuscleMeasures(self.scene, carried)
             self._bundles = build_bundles(self.scene, self._models)
-        self._fields = fields
+        self._fields = bone_sdfs
 
     def feed(
         self, sink: RunWriter | MemorySink, *, progress: Callable[[int, int], None] | None = None
@@ -180,7 +180,7 @@ class Recording:
         """
         with stage("solving the first frame"):
             with timed(self.times, "simulate"):
-                loop = FrameLoop(self.scene, self._models, fields=self._fields)
+                loop = FrameLoop(self.scene, self._models, bone_sdfs=self._fields)
                 surfaces, poses = loop.at_rest()
             with timed(self.times, "metrics"):
                 carried = {m.name: m.material_mesh()[0] for m in self._models}
@@ -223,7 +223,9 @@ class Recording:
             times=self.times,
             limits=limits.values,
             fail_on=limits.fail_on,
-            verdict=_with_doubts(describe_verdict(table, limits, self.scene.left_out), self.scene),
+            verdict=_with_doubts(
+                describe_verdict(table, limits, self.scene.missing_bones), self.scene
+            ),
             beyond=exceeded(table, limits),
             not_measured=unmeasured(table, limits),
             frames=self.written,
@@ -268,8 +270,8 @@ def _check_skeleton(scene: Scene) -> dict[int, Found]:
         events.append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))
         values["bone_overlap"] = max(values.get("bone_overlap", 0.0), depth)
     events, values = found.setdefault(0, ([], {}))
-    events.extend(Event(0, "", name, 1, "bone_left_out") for name in scene.left_out)
-    values["bones_left_out"] = float(len(scene.left_out))
+    events.extend(Event(0, "", name, 1, "missing_bone") for name in scene.missing_bones)
+    values["missing_bones"] = float(len(scene.missing_bones))
     if doubts := doubtful(scene.guesses, "joint"):
         values["doubtful_guesses"] = float(len(doubts))
     opened = scene.length(LIMITS["joint_gap"].value)

@@ -36,7 +36,7 @@ def simulate(
     settings: Mapping[str, Any] | None = None,
     frames: slice | str | None = None,
     progress: Callable[[int, int], None] | bool | None = None,
-    fields: Mapping[str, BoneField] | None = None,
+    bone_sdfs: Mapping[str, BoneField] | None = None,
 ) -> Run:
     """Run a scene through its motion and keep every frame in memory.
 
@@ -53,7 +53,7 @@ def simulate(
     progress : callable or bool, optional
         Called as ``progress(done, total)`` after each frame; ``True`` shows on stderr what goes on,
         compiling and building included.
-    fields : mapping of str to BoneField, optional
+    bone_sdfs : mapping of str to BoneField, optional
         Distance fields of the bones, by the bone's name; `BoneSDF` where not given.
 
     Returns
@@ -80,9 +80,9 @@ def simulate(
     if progress is True:
         with Progress(scene.name) as shown:
             return simulate(
-                scene, model, settings=settings, frames=frames, progress=shown, fields=fields
+                scene, model, settings=settings, frames=frames, progress=shown, bone_sdfs=bone_sdfs
             )
-    recording = Recording(scene, model=model, settings=settings, frames=frames, fields=fields)
+    recording = Recording(scene, model=model, settings=settings, frames=frames, bone_sdfs=bone_sdfs)
     memory = MemorySink()
     try:
         recording.feed(memory, progress=progress or None)
@@ -234,7 +234,7 @@ class Run(RunData):
         names = [formats] if isinstance(formats, str) else list(formats)
         return export_run(self, names, output=directory, units=units)
 
-    def show(self) -> rbfmuscle.Page:
+    def show(self) -> rbfmuscle.ViewerPage:
         """Show the frames in a browser or a notebook; see `rbfmuscle.show`."""
         import rbfmuscle
 

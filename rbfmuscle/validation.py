@@ -102,16 +102,16 @@ def shown_path(path: str | os.PathLike[str]) -> str:
     return shown(str(path), longest=400)
 
 
-def read_text(path: Path, *, place: str) -> str:
+def read_text(path: Path, *, context: str) -> str:
     """Return the text of a file that a scene names, or raise SceneError that begins with
     ``place``.
     """
     if not os.path.isfile(path):
-        raise SceneError(f"{place}{shown_path(path)}: cannot read it: no such file")
+        raise SceneError(f"{context}{shown_path(path)}: cannot read it: no such file")
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
-        raise SceneError(f"{place}{path}: cannot read it: {error.strerror}") from None
+        raise SceneError(f"{context}{path}: cannot read it: {error.strerror}") from None
 
 
 def check_points(points: ArrayLike, *, name: str = "points") -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ class BlendMuscle(ToyMuscle):
     fail_at = None
 
     def _prepare(self):
-        held = [np.flatnonzero(self.contact_bone == k) for k in range(len(self.names))]
+        held = [np.flatnonzero(self.attached_bone == k) for k in range(len(self.names))]
         bones = [k for k, vertices in enumerate(held) if len(vertices)]
         self.weights = np.zeros((len(self.rest), len(self.names)))
         self.weights[:, bones] = harmonic_weights(self.rest, self.faces, [held[k] for k in bones])

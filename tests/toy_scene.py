@@ -126,9 +126,9 @@ class ToyMuscle(MuscleModel):
         self.names = [bone.name for bone in scene.bones]
         self.rest = np.array(muscle.mesh.vertices, dtype=float)
         self.faces = np.array(muscle.mesh.faces)
-        self.contact_bone, self.detail = np.full(len(self.rest), -1), 0.0
+        self.attached_bone, self.contact_spacing = np.full(len(self.rest), -1), 0.0
         for attachment in muscle.attachments:
-            self.contact_bone[attachment.vertices] = self.names.index(attachment.bone)
+            self.attached_bone[attachment.vertices] = self.names.index(attachment.bone)
         self.sweeps = sweeps
         self.reach = reach or 0.1 * np.ptp(self.rest, axis=0).max()
         self.x, self.target = self.rest.copy(), self.rest.copy()
@@ -143,9 +143,9 @@ class ToyMuscle(MuscleModel):
         ):
             laplacian[a, b] = laplacian[b, a] = -1
         laplacian -= np.diag(laplacian.sum(axis=1))
-        free, held = np.flatnonzero(self.contact_bone < 0), np.flatnonzero(self.contact_bone >= 0)
+        free, held = np.flatnonzero(self.attached_bone < 0), np.flatnonzero(self.attached_bone >= 0)
         inner = laplacian[np.ix_(free, free)]
-        self.weights = np.eye(len(self.names))[self.contact_bone]
+        self.weights = np.eye(len(self.names))[self.attached_bone]
         self.weights[free] = -np.linalg.solve(
             inner, laplacian[np.ix_(free, held)] @ self.weights[held]
         )
@@ -227,7 +227,7 @@ def joint(name, parent, child, centre, **axes):
         "centre": list(map(float, centre)),
         "axes": axes,
     }
-    return JointTable.build(row, place="toy ").joint()
+    return JointTable.build(row, context="toy ").joint()
 
 
 def muscle(name, mesh, attachments, **options):

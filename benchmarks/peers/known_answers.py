@@ -153,7 +153,7 @@ def stretched_bar_errors(stretch, bar, rest, frame):
         ends; ``volume``: of the surface against the closed form.
     """
     name = next(iter(frame.surfaces))
-    skin, (places, _) = frame.surfaces[name], frame.carried[name]
+    skin, (places, _) = frame.surfaces[name], frame.material_meshes[name]
     start, length = -0.5 * bar.length, stretch * bar.length
     stations = start + length * np.linspace(0.25, 0.75, 21)
     found = [section(skin.vertices, skin.faces, (x, 0, 0), (1, 0, 0)) for x in stations]

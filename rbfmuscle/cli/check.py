@@ -15,7 +15,7 @@ def check(
     scene: SceneName,
     *,
     picture: Flag = False,
-    fields: Flag = False,
+    sdf: Flag = False,
     plan: Flag = False,
     time: Flag = False,
     printing: Printing = USUAL,
@@ -26,7 +26,7 @@ def check(
     ----------
     picture
         Draw attachments, tendons and joint axes to a PNG beside the scene file.
-    fields
+    sdf
         Measure the bones' distance fields against exact distances.
     plan
         List what a run would build: contact pairs, unknowns, sub-steps.
@@ -44,8 +44,8 @@ def check(
             check_picture(scene.with_suffix(".png"))
         loaded, findings = _findings(scene)
         usable = bool(loaded.bones) and not any(f.level == "error" for f in findings)
-        if fields:
-            facts["fields"] = _measure_fields(loaded)
+        if sdf:
+            facts["sdf"] = _measure_fields(loaded)
         if plan and usable:
             facts["plan"] = _plan(loaded, time)
         if picture:
@@ -80,7 +80,7 @@ def _draw(scene, path):
 
 def _more_lines(facts, units):
     """Lines of what was asked for besides the check itself."""
-    for name, found in facts.get("fields", {}).items():
+    for name, found in facts.get("sdf", {}).items():
         yield _describe_field(name, found, units)
     yield from _plan_lines(facts["plan"]) if "plan" in facts else ()
     yield from [facts["picture"]] if "picture" in facts else ()

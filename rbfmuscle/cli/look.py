@@ -69,7 +69,7 @@ def view(
         if browser:
             webbrowser.open(address)
         opened = _open(scene)
-        from rbfmuscle.viewer.page import Page
+        from rbfmuscle.viewer.page import ViewerPage
         from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
         with stage("building"):
@@ -78,7 +78,7 @@ def view(
             if isinstance(opened, dict) and stops.get("frame", 0.0) < 0.0:
                 shown = next(iter(opened.values())).frame(int(stops["frame"]))
                 stops["frame"] = float(shown.index)
-            Page(source, at=stops, colour=colour, served=(server, address))
+            ViewerPage(source, at=stops, colour=colour, served=(server, address))
     threading.Event().wait()
 
 

@@ -112,7 +112,8 @@ def import_(
     for doubt in scene.doubts:
         print(f"doubtful: {doubt}")
     counts = (
-        f"{len(scene.bones)} bones, {len(scene.links)} without a mesh, {len(scene.joints)} joints"
+        f"{len(scene.bones)} bones, {len(scene.meshless_bones)} without a mesh, "
+        f"{len(scene.joints)} joints"
     )
     print(
         f"{written}: {counts}, {len(scene.couplings)} couplings, {len(scene.muscles)} muscles "

@@ -107,11 +107,11 @@ def parse_targets(scene: "Scene", texts: list[str]) -> dict[str, str]:
     return found
 
 
-def _full_name(scene, name, place):
+def _full_name(scene, name, context):
     from rbfmuscle.scene.joints.joint import all_coordinates
     from rbfmuscle.scene.joints.tables import full_name
 
     try:
-        return full_name(name, list(all_coordinates(scene.joints)), place=place)
+        return full_name(name, list(all_coordinates(scene.joints)), context=context)
     except SceneError as error:
         raise UsageError(str(error)) from None

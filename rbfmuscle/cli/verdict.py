@@ -30,7 +30,7 @@ def verdict_lines(directory: Path) -> Iterator[str]:
     first = {row.muscle: row for row in reversed(info.beyond)}.values()
     named = sorted(info.beyond, key=lambda row: row not in first)[:MOST]
     for row in named:
-        yield _wrapped("  ", describe_excess(row, table, info.scene.left_out))
+        yield _wrapped("  ", describe_excess(row, table, info.scene.missing_bones))
     if len(info.beyond) > len(named):
         yield f"  and {len(info.beyond) - len(named)} more values beyond their limits"
     missing = info.not_measured

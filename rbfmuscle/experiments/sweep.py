@@ -62,7 +62,7 @@ def parse_grid(texts: Sequence[str]) -> Grid:
             parts = tomllib.loads(f"value = [{values}]")["value"]
         except tomllib.TOMLDecodeError:
             parts = [
-                parse_value(part.strip(), place=key) for part in values.split(",") if part.strip()
+                parse_value(part.strip(), context=key) for part in values.split(",") if part.strip()
             ]
         if key in (*FINER_UP, *FINER_DOWN) and not all(
             isinstance(part, int | float) for part in parts

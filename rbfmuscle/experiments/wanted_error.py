@@ -28,7 +28,7 @@ STEP, POWER = 0.04, 1.4
 
 
 @dataclass
-class WantedError:
+class CentreSearchResult:
     """What `reach_error` found.
 
     ``row`` is as in `KernelStudy.rows`: the one that reached the ``wanted`` error, else that of the
@@ -65,7 +65,7 @@ def reach_error(
     kernels: Sequence[str] | None = None,
     placement: str = FITTED,
     progress: OnProgress | None = None,
-) -> WantedError:
+) -> CentreSearchResult:
     """Find the fewest centres, 20 to 1000, the kernel and its setting that meet a surface to a
     wanted error.
 
@@ -159,7 +159,7 @@ class _Search:
                 count = round(count * float(np.clip(factor, 0.4, 2.5)) * beyond)
             count = int(np.clip(count, low + 1, high - 1)) if high > low + 1 else high
 
-    def result(self) -> WantedError:
+    def result(self) -> CentreSearchResult:
         """The row of fewest centres that reaches the error, or that of the smallest error."""
         found = min(self.found.values(), key=_error) if self.best is None else self.found[self.best]
         if not found.row["unfit"]:
@@ -167,7 +167,9 @@ class _Search:
         tried = [
             {"kernel": k, "centres": n, "error": _error(one)} for (k, n), one in self.found.items()
         ]
-        return WantedError(self.best is not None, found.row, _error(found), self.error, tried)
+        return CentreSearchResult(
+            self.best is not None, found.row, _error(found), self.error, tried
+        )
 
 
 def _error(found: kernel_study.Measured) -> float:

@@ -36,7 +36,7 @@ class FibreBundle:
         ends = (patches[0][0], patches[1][0])
         traced = trace_fibres(mesh, ends, count, polylines=muscle.fibres, bones=near)
         self.rest = traced.lines
-        self.holders = [a.holder for group in groups for a in group]
+        self.holders = [a.attachment_frame for group in groups for a in group]
         first = patches[0][1][traced.ends[:, 0]]
         last = len(groups[0]) + patches[1][1][traced.ends[:, 1]]
         self._held = np.stack([first, last], axis=1)  # place in holders of each end

@@ -69,7 +69,7 @@ class Centreline:
         rest = np.asarray(muscle.mesh.vertices, dtype=float)
         areas = vertex_areas(rest, np.asarray(muscle.mesh.faces))
         self.ends: list[End] = [
-            [(a.holder, rest[a.vertices], areas[a.vertices]) for a in group]
+            [(a.attachment_frame, rest[a.vertices], areas[a.vertices]) for a in group]
             for group in split_ends(muscle, joints, moving)
         ]
         sides = _sides(muscle, self.ends, vertices)
@@ -165,9 +165,9 @@ def split_ends(
 
 def moving_joints(scene: Scene) -> set[str]:
     """Names of the joints that a scene's motion moves, those that follow others among them."""
-    facts = all_coordinates(scene.joints)
+    known = all_coordinates(scene.joints)
     names = {
-        name for frame in scene.motion.frames for name, x in frame.items() if x != facts[name].rest
+        name for frame in scene.motion.frames for name, x in frame.items() if x != known[name].rest
     }
     for coupling in scene.couplings:  # in an order in which what they follow is known
         if names & set(coupling.of):

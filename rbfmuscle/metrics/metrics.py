@@ -25,7 +25,7 @@ Values = dict[str, float]
 
 _FROM_MODEL = (
     "solver_penetration_max",
-    "sweeps",
+    "solver_sweeps",
     "solver_residual",
     "solid_volume_error",
     "unfitted_fraction",
@@ -89,7 +89,9 @@ class MuscleMeasurer:
         self.edges = _edge_operator(vertices, faces)
         #: What is measured once, with the first frame.
         self.first: dict[str, float] = {}
-        self.ends = [attachment.holder for attachment in muscle.attachments if attachment.tendon]
+        self.ends = [
+            attachment.attachment_frame for attachment in muscle.attachments if attachment.tendon
+        ]
         self.contracts = muscle.contraction is not None
         moving = moving_joints(scene)
         self.line = None
@@ -111,7 +113,7 @@ class MuscleMeasurer:
         points = np.concatenate([np.empty((0, 3)), *lines])
         depth = surface_depth(points, probes, frame.poses)
         found["tendon_depth"] = float(depth.max(initial=0.0))
-        carried, surface = frame.carried[self.name][0], frame.surfaces.get(self.name)
+        carried, surface = frame.material_meshes[self.name][0], frame.surfaces.get(self.name)
         if surface is not None:
             found.update(self._of_surface(surface, carried, probes, frame.poses))
             found.update({q: surface.quantities[q] for q in _FROM_MODEL if q in surface.quantities})

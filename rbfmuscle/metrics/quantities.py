@@ -32,7 +32,7 @@ QUANTITIES = {
         "length",
         "deepest of the model's points inside a bone, before the cut along bones",
     ),
-    "sweeps": ("1", "sweeps of the last solve of a mesh model"),
+    "solver_sweeps": ("1", "sweeps of the last solve of a mesh model"),
     "solver_residual": (
         "1",
         "how far the last iteration of the last solve would have moved a point, of the muscle's "
@@ -112,7 +112,7 @@ QUANTITIES = {
         "1",
         "doubtful guesses of the file about the muscle, under 'all' about joints; first frame",
     ),
-    "bones_left_out": ("1", "bones of which no mesh could be used; muscle 'all', first frame"),
+    "missing_bones": ("1", "bones of which no mesh could be used; muscle 'all', first frame"),
     "time": ("s", "time of the frame in the motion file; muscle 'all'"),
     "time_solve": ("s", "prediction, solution and contacts"),
     "time_fit": ("s", "fit of the field"),

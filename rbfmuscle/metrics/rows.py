@@ -69,8 +69,8 @@ def moment_arm_rows(
         along = np.array([found.get(index, math.nan) for index in path])
         for moments, row in _moments(scene, path, along):
             rows.append(row._replace(muscle=muscle, value=float(moments)))
-    facts = all_coordinates(scene.joints)
-    turning = [row for row in rows if facts[row.coordinate].motion == "rotation"]
+    known = all_coordinates(scene.joints)
+    turning = [row for row in rows if known[row.coordinate].motion == "rotation"]
     guessed = {guess.name for guess in scene.guesses if guess.table == "muscle"}
     for arms in _by_muscle(turning):
         rows += _smoothness(arms, guessed=arms[0].muscle in guessed)
@@ -124,8 +124,8 @@ def _before(angles: Floats, k: int) -> int:
 
 def _moments(scene, path, lengths):
     """Moment arms along a path, each with a row that says where, as `moment_arms` finds them."""
-    facts = all_coordinates(scene.joints)
-    shifts = {name for name, fact in facts.items() if fact.motion == "translation"}
+    known = all_coordinates(scene.joints)
+    shifts = {name for name, fact in known.items() if fact.motion == "translation"}
     names = {name for coordinates in path.values() for name in coordinates}
     reach = reaches(names, shifts, scene.units)
     found = moment_arms(list(path.values()), lengths, reach)

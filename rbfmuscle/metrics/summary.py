@@ -133,12 +133,12 @@ LIMITS = {
     ),
     "bone_overlap": Limit(0.0, "bones in each other", _JOINT),
     "joint_gap": Limit(5.0, "joint that opens", _JOINT),
-    "bones_left_out": Limit(0.0, "bones left out", "repair their meshes and add them to the scene"),
+    "missing_bones": Limit(0.0, "bones left out", "repair their meshes and add them to the scene"),
 }
 # Quantities of which too little is wrong: their limit is the least allowed value.
 LOWER_BOUNDS = {"euler_characteristic"}
 # Limits of the whole scene, measured under the muscle `ALL`; all others are of each muscle.
-OF_SCENE = ("bone_overlap", "joint_gap", "bones_left_out")
+OF_SCENE = ("bone_overlap", "joint_gap", "missing_bones")
 # Limits that not every muscle has, and the quantity without which it has none: mesh models have no
 # level set, muscles with one attachment no centreline.
 NEEDS = {
@@ -353,9 +353,9 @@ def limit_ratio(quantity: str, worst: float, limit: float) -> float:
     return abs(worst) / limit
 
 
-def describe_verdict(table: Table, limits: Limits, left_out: Sequence[str] = ()) -> str:
+def describe_verdict(table: Table, limits: Limits, missing_bones: Sequence[str] = ()) -> str:
     """Which muscles are within all limits, the worst of the others, what to do, and what was not
-    measured; bones ``left_out``.
+    measured; bones ``missing_bones``.
     """
     muscles, found = [name for name in table if name != ALL], exceeded(table, limits)
     missing = unmeasured(table, limits)
@@ -376,7 +376,7 @@ def describe_verdict(table: Table, limits: Limits, left_out: Sequence[str] = ())
         text = f"{count}; {_listed(wrong)} {'is' if len(wrong) == 1 else 'are'} not"
     text += "; the bones are not" if any(row[0] == ALL for row in found) and not wrong else ""
     if found:
-        text += _worst_and_remedies(found, table, left_out)
+        text += _worst_and_remedies(found, table, missing_bones)
     return f"{text}. Not measured: {describe_unmeasured(missing)}" if missing and muscles else text
 
 
@@ -390,7 +390,7 @@ def describe_unmeasured(missing: Sequence[tuple[str, str]]) -> str:
     return "; ".join(texts[:MOST_NAMED]) + more
 
 
-def _worst_and_remedies(found, table, left_out):
+def _worst_and_remedies(found, table, missing_bones):
     # The worst of each muscle first, then whatever else is beyond a limit.
     first = {row[0]: row for row in reversed(found)}.values()
     named = sorted(found, key=lambda row: row not in first)[:MOST_NAMED]
@@ -399,7 +399,7 @@ def _worst_and_remedies(found, table, left_out):
         if row[1].partition(":")[0] in LIMITS:
             remedy = find_remedy(row, table)
             remedies.setdefault(remedy, remedy.replace("FRAME", str(row[4])))
-    values = "; ".join(describe_excess(row, table, left_out) for row in named)
+    values = "; ".join(describe_excess(row, table, missing_bones) for row in named)
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
     to_do = f". What to do: {'; '.join(remedies.values())}" if remedies else ""
     return f". Worst: {values}{more}{to_do}"
@@ -419,8 +419,8 @@ def _listed(names):
     return f"{', '.join(names[:MOST_NAMED])}{more}"
 
 
-def describe_excess(row: Exceedance, table: Table, left_out: Sequence[str] = ()) -> str:
-    """One value beyond its limit, in words; bones ``left_out``."""
+def describe_excess(row: Exceedance, table: Table, missing_bones: Sequence[str] = ()) -> str:
+    """One value beyond its limit, in words; bones ``missing_bones``."""
     muscle, quantity, worst, limit, frame = row
     unit = table[muscle][quantity]["unit"]
     value = shown_number(worst, unit)
@@ -428,7 +428,7 @@ def describe_excess(row: Exceedance, table: Table, left_out: Sequence[str] = ())
     quantity, _, coordinate = quantity.partition(":")
     title = LIMITS[quantity].title if quantity in LIMITS else quantity
     title += f" ({coordinate})" if coordinate else ""
-    title += f" ({_listed(left_out)})" if quantity == "bones_left_out" else ""
+    title += f" ({_listed(missing_bones)})" if quantity == "missing_bones" else ""
     return f"{place}, {title} {value} at frame {frame} (limit {limit:.3g})"
 
 

@@ -6,7 +6,7 @@ kept, by
     G_ij = (n_i · n_j) w_i A⁻¹ w_j - ρ_i · ρ_j,    ρ_i = Σ_k w_ik n_i · (L⁻¹ A⁻¹ g)_k,
 
 the Schur complement of the volumes (`global_step.py`), w_i the shape functions of point i. Contact
-forces λ, 0 <= λ_i <= λ_max, give every contact the motion that it needs, G λ >= need, where they
+forces λ, 0 <= λ_i <= λ_max, give every contact the motion that it needs, G λ >= rhs, where they
 are not at λ_max, and none where there is more room than that. A contact that yields adds to G_ii.
 """
 
@@ -94,7 +94,7 @@ def _answer(i, near, metric, answers):
 
 
 @inner(error_model="numpy")
-def _schur(start, numbers, normal, answers, rows, gram, own):
+def _schur(start, numbers, normal, answers, rows, delassus, own):
     """Rows ρ and entries of G of the contacts from ``start`` on; ``own`` is its diagonal."""
     for c in range(start, len(numbers)):
         n = normal[c]
@@ -106,51 +106,51 @@ def _schur(start, numbers, normal, answers, rows, gram, own):
             value *= n[0] * normal[d, 0] + n[1] * normal[d, 1] + n[2] * normal[d, 2]
             for r in range(rows.shape[1]):
                 value -= rows[c, r] * rows[d, r]
-            gram[c, d] = value
-            gram[d, c] = value
-        own[c] = gram[c, c]
+            delassus[c, d] = value
+            delassus[d, c] = value
+        own[c] = delassus[c, c]
 
 
 @compiled(error_model="numpy")
-def solve_forces(gram, need, force, sweeps, tolerance, most):
-    """Contact forces with 0 <= force <= most and gram · force >= need where force < most.
+def solve_forces(delassus, rhs, force, sweeps, tolerance, most):
+    """Contact forces with 0 <= force <= most and delassus · force >= rhs where force < most.
 
     By projected Gauss-Seidel from a first guess, in place, until no gap moves by more than the
-    tolerance; returns whether it came to that. ``gram`` (c, c) is the motion at contact i for a
-    unit force at contact j, ``need`` (c,) the motion that each asks for.
+    tolerance; returns whether it came to that. ``delassus`` (c, c) is the motion at contact i for a
+    unit force at contact j, ``rhs`` (c,) the motion that each asks for.
     """
-    lacking = need.copy()
-    for c in range(len(need)):
+    residual = rhs.copy()
+    for c in range(len(rhs)):
         if force[c] != 0.0:
-            for d in range(len(need)):
-                lacking[d] -= gram[c, d] * force[c]
+            for d in range(len(rhs)):
+                residual[d] -= delassus[c, d] * force[c]
     for _ in range(sweeps):
         largest = 0.0
-        for c in range(len(need)):
-            change = min(max(0.0, force[c] + lacking[c] / gram[c, c]), most[c]) - force[c]
+        for c in range(len(rhs)):
+            change = min(max(0.0, force[c] + residual[c] / delassus[c, c]), most[c]) - force[c]
             if change != 0.0:
                 force[c] += change
-                largest = max(largest, abs(change) * gram[c, c])
-                for d in range(len(need)):
-                    lacking[d] -= gram[c, d] * change
+                largest = max(largest, abs(change) * delassus[c, c])
+                for d in range(len(rhs)):
+                    residual[d] -= delassus[c, d] * change
         if largest < tolerance:
             return True
     return False
 
 
 @compiled(error_model="numpy")
-def deepest(lacking, is_chosen, tolerance, most):
+def deepest(residual, is_chosen, tolerance, most):
     """Contacts, not yet chosen, that lack the most motion, deepest first; of equals the first."""
     found = np.empty(most, np.int64)
     count = 0
-    for c in range(len(lacking)):
-        if not lacking[c] > tolerance or is_chosen[c]:
+    for c in range(len(residual)):
+        if not residual[c] > tolerance or is_chosen[c]:
             continue
-        if count == most and lacking[c] <= lacking[found[count - 1]]:
+        if count == most and residual[c] <= residual[found[count - 1]]:
             continue
         count = min(count + 1, most)
         place = count - 1
-        while place > 0 and lacking[found[place - 1]] < lacking[c]:
+        while place > 0 and residual[found[place - 1]] < residual[c]:
             found[place] = found[place - 1]
             place -= 1
         found[place] = c
@@ -178,16 +178,16 @@ def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
 
 
 @inner(error_model="numpy")
-def _find_lacking(touch, need, near, push, lacking):
+def _find_residual(touch, rhs, near, push, residual):
     """Motion that each contact still needs after a push of the nodes."""
-    for c in range(len(need)):
-        i, value, normal = touch.point[c], need[c], touch.normal[c]
+    for c in range(len(rhs)):
+        i, value, normal = touch.point[c], rhs[c], touch.normal[c]
         for k in range(near.columns.shape[1]):
             j = near.columns[i, k]
             value -= near.shares[i, k] * (
                 normal[0] * push[j, 0] + normal[1] * push[j, 1] + normal[2] * push[j, 2]
             )
-        lacking[c] = value
+        residual[c] = value
 
 
 @compiled(error_model="numpy")
@@ -199,14 +199,14 @@ def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
     until none is left; forces solve the complementarity problem on it.
     """
     count = len(touch.point)
-    need, force, lacking = np.empty(count), np.empty(count), np.empty(count)
+    rhs, force, residual = np.empty(count), np.empty(count), np.empty(count)
     is_chosen, total = np.zeros(count, np.bool_), 0
     for c in range(count):
         i = touch.point[c]
-        need[c] = -touch.gap[c]
+        rhs[c] = -touch.gap[c]
         for a in range(3):
-            need[c] -= touch.normal[c, a] * motion[i, a]
-        lacking[c] = need[c]
+            rhs[c] -= touch.normal[c, a] * motion[i, a]
+        residual[c] = rhs[c]
         force[c] = forces[i, touch.source[c]]
         is_chosen[c] = force[c] > 0.0
         total += is_chosen[c]
@@ -217,10 +217,10 @@ def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
     chosen, numbers = np.empty(room, np.int64), np.empty(room, np.int64)
     chosen[:total] = np.flatnonzero(is_chosen)
     normal, wants, strength = np.empty((room, 3)), np.empty(room), np.empty(room)
-    rows, gram, own = np.empty((room, len(taken))), np.empty((room, room)), np.empty(room)
+    rows, delassus, own = np.empty((room, len(taken))), np.empty((room, room)), np.empty(room)
     most = np.empty(room)
     for turn in range(ROUNDS):
-        added = deepest(lacking, is_chosen, tolerance, BATCH)
+        added = deepest(residual, is_chosen, tolerance, BATCH)
         for c in added:
             is_chosen[c] = True
             chosen[total] = c
@@ -231,24 +231,24 @@ def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
             c = chosen[k]
             numbers[k] = _answer(touch.point[c], near, metric, answers)
             normal[k] = touch.normal[c]
-            wants[k] = need[c]
+            wants[k] = rhs[c]
             strength[k] = force[c]
             most[k] = law.most[c]
         some, ways = numbers[:total], normal[:total]
-        _schur(done, some, ways, answers, rows, gram, own)
+        _schur(done, some, ways, answers, rows, delassus, own)
         done, least = total, 0.0
         for k in range(done):
             least = max(least, 1e-7 * abs(own[k]))
         for k in range(done):
-            gram[k, k] = own[k] + least + law.yielding[chosen[k]]
+            delassus[k, k] = own[k] + least + law.yielding[chosen[k]]
         found = strength[:total]
-        settled = solve_forces(gram, wants[:total], found, SWEEPS, 0.1 * tolerance, most)
+        settled = solve_forces(delassus, wants[:total], found, SWEEPS, 0.1 * tolerance, most)
         _push_nodes(ways, found, some, rows, answers, metric, push, taken)
         capped = not settled
         if len(added) == 0:
             break
-        _find_lacking(touch, need, near, push, lacking)
-        capped |= turn == ROUNDS - 1 and lacking.max() > tolerance
+        _find_residual(touch, rhs, near, push, residual)
+        capped |= turn == ROUNDS - 1 and residual.max() > tolerance
     for k in range(total):
         forces[touch.point[chosen[k]], touch.source[chosen[k]]] = strength[k]
     return Push(push, taken, capped)

@@ -245,7 +245,7 @@ class SurfaceBuilder:
                 field,
                 points=now.points,
                 resolution=resolution,
-                cut=_BoneCut(contacts, reach) if contacts.names else None,
+                clip_distance=_BoneCut(contacts, reach) if contacts.names else None,
                 volume=self.rest.mesh_volume,
                 level=float(self.state.level[0]),
                 axes=axes,

@@ -38,7 +38,7 @@ from rbfmuscle.simulation.frame import Mesh, ModelSurface, SolveLog
 
 # Neighbours meet a muscle at contact points so far apart, of the side of a lattice cell, which has
 # three nodes on it.
-DETAIL = 0.3
+CONTACT_SPACING = 0.3
 
 
 class RBFMuscle:
@@ -94,11 +94,11 @@ class RBFMuscle:
         if not self.options.resolution and len(self.drawer.model.offset) == len(order):
             faces = np.ascontiguousarray(given.mesh.faces, dtype=np.int64)
             self._input = np.argsort(order), faces
-        names = scene.holders(muscle)
+        names = scene.attachment_frames(muscle)
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
         owner = attached_owner(self.model)
-        self.detail = DETAIL * self.model.side
-        self.contact_bone = np.where(owner < 0, -1, numbers[owner])
+        self.contact_spacing = CONTACT_SPACING * self.model.side
+        self.attached_bone = np.where(owner < 0, -1, numbers[owner])
         self._meshes = {
             bone.name: (np.asarray(bone.mesh.vertices), np.asarray(bone.mesh.faces))
             for bone in scene.bones
@@ -139,7 +139,7 @@ class RBFMuscle:
             solid_volume_error=report.volume_error,
         )
 
-    def make_room(self, contacts: BoneContacts) -> None:
+    def separate_neighbours(self, contacts: BoneContacts) -> None:
         """Move what is shown out of the planes of neighbours."""
         self.state, _ = self._settled(contacts, room=True)
 
@@ -186,7 +186,7 @@ class RBFMuscle:
         3).
         """
         columns = self.model.embedding.columns
-        return turned_normals(self.state.shown, columns, self._normals_at, self.rest.normals)
+        return turned_normals(self.state.lifted_nodes, columns, self._normals_at, self.rest.normals)
 
     def field(self) -> RBFField:
         """The RBF field through the present centres."""
@@ -195,15 +195,15 @@ class RBFMuscle:
     def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
         """What gives the present places (n, 3) of points (n, 3) of the muscle at rest."""
         embedding = embed(self._lattice, self.frame, points)
-        return lambda: carry(embedding, self.state.shown)
+        return lambda: carry(embedding, self.state.lifted_nodes)
 
     def carried_mesh(self) -> Mesh:
         """The shown mesh where the solid carries it."""
-        return carry(self.drawer.model.embedding, self.state.shown), self.drawer.model.faces
+        return carry(self.drawer.model.embedding, self.state.lifted_nodes), self.drawer.model.faces
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lies in the way."""
-        now = Placement(self.points, self.normals(), self.contact_points(), self.state.shown)
+        now = Placement(self.points, self.normals(), self.contact_points(), self.state.lifted_nodes)
         drawn = self.drawer.draw(now, contacts)
         quantities, notes = self.log.take()
         drawn.quantities.update(quantities)

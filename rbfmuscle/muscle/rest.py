@@ -100,9 +100,11 @@ class _Attachment:
         centres: np.ndarray,
         samples: np.ndarray,
     ) -> None:
-        names = sorted(scene.holders(muscle))
+        names = sorted(scene.attachment_frames(muscle))
         patches = [np.asarray(attachment.vertices) for attachment in muscle.attachments]
-        numbers = np.array([names.index(attachment.holder) for attachment in muscle.attachments])
+        numbers = np.array(
+            [names.index(attachment.attachment_frame) for attachment in muscle.attachments]
+        )
         owner = np.full(len(frame.local), -1)
         for number, patch in zip(numbers, patches):
             owner[patch] = number

@@ -54,7 +54,7 @@ class RoundedBones(NamedTuple):
 
 
 def round_bones(
-    fields: Mapping[str, BoneField],
+    bone_sdfs: Mapping[str, BoneField],
     frame: RestFrame,
     spacing: float,
     meshes: Mapping[str, tuple[Floats, Integers]],
@@ -66,7 +66,7 @@ def round_bones(
     """
     edge = ROUNDING * spacing
     edges = []
-    for name, field in fields.items():
+    for name, field in bone_sdfs.items():
         thickness = bone_thickness(field, *meshes[name], edge) if name in meshes else edge
         edges.append(max(thickness, LEAST_ROUNDING * edge))
     return _with_room(np.array(edges, dtype=np.float64), frame.origin, frame.axes, FIRST_ROOM)

@@ -75,7 +75,7 @@ class Settled(NamedTuple):
     """What a solve changes of a `SolidState`, fields as there."""
 
     nodes: np.ndarray
-    shown: np.ndarray
+    lifted_nodes: np.ndarray
     points: np.ndarray
     rotations: np.ndarray
     stretches: np.ndarray
@@ -140,9 +140,9 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     memory = no_memory(MEMORY, y.size + len(pressure), y.size)
     limit, most = _limits(given, state)
     least, status, done, caps, residual = np.inf, DONE, 0, 0, 0.0
-    shown = y
+    lifted_nodes = y
     if room:
-        shown = y + _push_out(given, near, metric, answers, y, np.inf)
+        lifted_nodes = y + _push_out(given, near, metric, answers, y, np.inf)
     while not room:
         step = _iterate(given, y, pressure, push, local, metric, near, answers)
         moved = step.moved
@@ -172,13 +172,13 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
             answers = no_answers(near, metric)
             push[:] = 0.0
     _note_forces(near, forces)
-    shown, left = _lifted(given, shown, metric, near, answers)
-    points = place_points(model, shown, state.points)
+    lifted_nodes, left = _lifted(given, lifted_nodes, metric, near, answers)
+    points = place_points(model, lifted_nodes, state.points)
     rotations, stretches = local.rotations, local.stretches
     if room:
         rotations, stretches = state.rotations, state.stretches
-    found = Settled(y, shown, points, rotations, stretches, pressure, forces)
-    report = Report(status, done, residual, _volume_error(model.cells, shown), caps + left)
+    found = Settled(y, lifted_nodes, points, rotations, stretches, pressure, forces)
+    report = Report(status, done, residual, _volume_error(model.cells, lifted_nodes), caps + left)
     return found, report
 
 
@@ -281,18 +281,18 @@ def _ways(near, y, new, push, margin):
     obstacles: half as far again as they go in the step with the last push on top, and a margin.
     """
     nodes, count = len(y), len(near.which)
-    ways = np.empty((nodes, 9))
+    displacements = np.empty((nodes, 9))
     for n in range(nodes):
         for a in range(3):
-            ways[n, a] = y[n, a]
-            ways[n, 3 + a] = new[n, a] - y[n, a]
-            ways[n, 6 + a] = push[n, a]
+            displacements[n, a] = y[n, a]
+            displacements[n, 3 + a] = new[n, a] - y[n, a]
+            displacements[n, 6 + a] = push[n, a]
     here, motion, reach = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
     total = np.empty(9)
     for s in range(count):
         total[:] = 0.0
         for k in range(near.columns.shape[1]):
-            way, share = ways[near.columns[s, k]], near.shares[s, k]
+            way, share = displacements[near.columns[s, k]], near.shares[s, k]
             for a in range(9):
                 total[a] += share * way[a]
         square = 0.0

@@ -26,7 +26,7 @@ class SolidState(NamedTuple):
     """
 
     nodes: np.ndarray  # (N, 3)
-    shown: np.ndarray  # (N, 3)
+    lifted_nodes: np.ndarray  # (N, 3)
     points: np.ndarray  # (n, 3) contact points, carried by the shown nodes or fixed to a bone
     rotations: np.ndarray  # (Q, 4) unit quaternions
     stretches: np.ndarray  # (Q,) of slack fibres
@@ -114,7 +114,7 @@ def predict(model: SolidModel, state: SolidState, before: Floats, after: Floats)
     nodes, start, points, pressures, anchors, step = _predicted(model, state, before, after)
     return state._replace(
         nodes=nodes,
-        shown=start,
+        lifted_nodes=start,
         points=points,
         pressures=pressures,
         anchors=anchors,
@@ -174,7 +174,7 @@ def transform(state: SolidState, motion: Floats) -> SolidState:
     turned, shift = np.ascontiguousarray(motion[:3, :3].T), motion[:3, 3]
     return state._replace(
         nodes=state.nodes @ turned + shift,
-        shown=state.shown @ turned + shift,
+        lifted_nodes=state.lifted_nodes @ turned + shift,
         points=state.points @ turned + shift,
         rotations=turned_quaternions(state.rotations, motion[:3, :3]),
         anchors=state.anchors @ turned + shift,

@@ -90,7 +90,7 @@ class SceneInfo(Part):
     file: str | None = None
     units: Literal["m", "cm", "mm"]
     bones: list[BoneInfo]
-    left_out: list[str] = []
+    missing_bones: list[str] = []
     joints: list[JointInfo] = []
     muscles: list[MuscleInfo]
     output: OutputInfo

@@ -329,7 +329,7 @@ class MuscleRun:
         """
         path = [frame.coordinates for frame in self.run.frames]
         known = sorted({name for coordinates in path for name in coordinates})
-        name = full_name(coordinate, known, place="moment_arms")
+        name = full_name(coordinate, known, context="moment_arms")
         scene = self.run.info.scene
         reach = reaches(known, scene.coordinate_units, scene.units)
         lengths = self.fibre_lengths

@@ -20,7 +20,7 @@ from rbfmuscle.report.page import (
     PLAIN,
     Cell,
     CheckRow,
-    Page,
+    ReportPage,
     Section,
     Table,
     limit_state,
@@ -48,7 +48,7 @@ def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) ->
     page.write(folder / "report.html")
 
 
-def _page(found: dict[str, Any], runs: Mapping[str, RunData]) -> Page:
+def _page(found: dict[str, Any], runs: Mapping[str, RunData]) -> ReportPage:
     first = next(iter(runs.values()))
     failed = [f"{name} did not finish: {reason}" for name, reason in found["failed"].items()]
     counts = {"muscles": len(first.muscles), "frames": found["frames"], **found["machine"]}
@@ -57,7 +57,7 @@ def _page(found: dict[str, Any], runs: Mapping[str, RunData]) -> Page:
         first.info.limits | {"bowing": None},
         [(m.title, m.meaning) for m in MEASURES.values()],
     )
-    return Page(
+    return ReportPage(
         f"{found['scene']}: models compared",
         [f"{counts[what]} {what}" for what in ("muscles", "frames", "threads")],
         " ".join([found["answer"], *failed]),

@@ -22,7 +22,7 @@ from rbfmuscle.report.page import (
     PLAIN,
     Cell,
     CheckRow,
-    Page,
+    ReportPage,
     Section,
     Table,
     number_cell,
@@ -94,7 +94,7 @@ def answer(studies: Mapping[str, KernelStudy]) -> str:
     )
 
 
-def _page(studies: Mapping[str, KernelStudy]) -> Page:
+def _page(studies: Mapping[str, KernelStudy]) -> ReportPage:
     several, rows = len(studies) > 1, [row for study in studies.values() for row in study.rows]
     units = next(iter(studies.values())).units
     surfaces = f"all {len(studies)} muscles" if several else next(iter(studies)).replace("_", " ")
@@ -103,7 +103,7 @@ def _page(studies: Mapping[str, KernelStudy]) -> Page:
     found = {name: study.recommended for name, study in studies.items() if study.recommended}
     code = "\n\n".join(f"# {name}\n{row_toml(row)}" for name, row in found.items())
     hint = f"distances in {units or 'mesh units'}"
-    return Page(
+    return ReportPage(
         f"Kernels for {surfaces}",
         [
             f"{kernels} kernels",

@@ -63,7 +63,7 @@ class Section(NamedTuple):
 
 
 @dataclass
-class Page:
+class ReportPage:
     """What a page says, in its order.
 
     The ``answer`` is one sentence, ``detail`` stands below it. ``scene``, from `pack_runs`, moves;

@@ -56,7 +56,7 @@ def redraw_run(
     info = info.replaced(
         limits=dict(limits.values),
         fail_on=dict(limits.fail_on),
-        verdict=describe_verdict(table, limits, info.scene.left_out) + doubts,
+        verdict=describe_verdict(table, limits, info.scene.missing_bones) + doubts,
         beyond=exceeded(table, limits),
         not_measured=unmeasured(table, limits),
     )

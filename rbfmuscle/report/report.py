@@ -32,7 +32,7 @@ from rbfmuscle.report.page import (
     GOOD,
     Cell,
     CheckRow,
-    Page,
+    ReportPage,
     Section,
     Table,
     limit_state,
@@ -113,14 +113,14 @@ def packed_scene(runs: Mapping[str, RunData]) -> str:
     )
 
 
-def _page(saved: RunData) -> Page:
+def _page(saved: RunData) -> ReportPage:
     info = saved.info
     complete = info.status == "complete"
     answer, _, detail = info.verdict.partition(". ")
     if not complete:
         answer, detail = f"the run ended early ({info.status}): {info.message or ''}", ""
     terms = [(name, text) for name, (_, text) in QUANTITIES.items()]
-    return Page(
+    return ReportPage(
         info.scene.name,
         _facts(saved),
         f"{answer[:1].upper()}{answer[1:].rstrip('.')}.",

@@ -13,7 +13,7 @@ from rbfmuscle.report.page import (
     PLAIN,
     Cell,
     CheckRow,
-    Page,
+    ReportPage,
     Section,
     Table,
     number_cell,
@@ -44,7 +44,7 @@ def write_page(found: dict[str, Any], directory: str | Path) -> None:
     verdicts, inside = found["verdicts"], inside_grid(rows)
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     judged = PLAIN if inside or not verdicts else GOOD if all(v["near"] for v in verdicts) else NEAR
-    Page(
+    ReportPage(
         f"Sweep of {', '.join(scenes)}"[:120],
         [
             f"{found[status]} points {status}"

@@ -70,21 +70,28 @@ def resolve_attachments(
     """
     found = []
     for number, entry in enumerate(attach):
-        place = f"muscle {muscle!r} attach {number + 1}: "
+        context = f"muscle {muscle!r} attach {number + 1}: "
         if not isinstance(entry, AttachTable):
             row = vars(entry) if isinstance(entry, Attachment) else entry
-            entry = AttachTable.build({k: v for k, v in row.items() if k != "holder"}, place=place)
-        bone = find_named(bones, entry.bone, "bone", place=place)
-        holder = "" if entry.tendon is None else f"{muscle} tendon {number + 1} to {bone.name}"
+            entry = AttachTable.build(
+                {k: v for k, v in row.items() if k != "attachment_frame"}, context=context
+            )
+        bone = find_named(bones, entry.bone, "bone", context=context)
+        attachment_frame = (
+            "" if entry.tendon is None else f"{muscle} tendon {number + 1} to {bone.name}"
+        )
         held = Attachment(
-            bone.name, np.unique(_select(entry, read, bone, place)), entry.tendon, holder
+            bone.name,
+            np.unique(_select(entry, read, bone, context)),
+            entry.tendon,
+            attachment_frame,
         )
         for name in held.bones:
-            find_named(bones, name, "bone", place=f"{place}tendon: ")
+            find_named(bones, name, "bone", context=f"{context}tendon: ")
         found.append(held)
     for first, second in itertools.combinations(found, 2):
         shared = np.intersect1d(first.vertices, second.vertices)
-        if first.holder != second.holder and len(shared):
+        if first.attachment_frame != second.attachment_frame and len(shared):
             raise SceneError(
                 f"muscle {muscle!r}: {len(shared)} vertices (first: {shared[0]}) are attached "
                 "to both "
@@ -108,7 +115,7 @@ def tendon_ends(muscle: Muscle, bones: list[Bone], joints: list[Joint]) -> list[
             thin = float(np.sqrt(THIN * section / np.pi))
             radii = radius, min(thin, radius)
             patch = vertices[attachment.vertices[:: -(-len(attachment.vertices) // PATCH)]]
-            ends.append(TendonEnd(attachment.holder, patch, middle, radii, line))
+            ends.append(TendonEnd(attachment.attachment_frame, patch, middle, radii, line))
     held = [attachment for attachment in muscle.attachments if attachment.tendon is None]
     widest = max(held, key=lambda attachment: areas[attachment.vertices].sum(), default=None)
     for end in ends:
@@ -145,23 +152,23 @@ def _patch(points: Floats, areas: Floats, towards: Floats) -> tuple[Floats, floa
     return middle, float(np.sqrt(2.0 * np.average(away**2, weights=areas)))
 
 
-def _select(table, read, bone, place):
+def _select(table, read, bone, context):
     given = [key for key in _WAYS if getattr(table, key) is not None]
     if len(given) != 1:
         raise SceneError(
-            f"{place}give one of {', '.join(_WAYS[:-1])} and {_WAYS[-1]}, got "
+            f"{context}give one of {', '.join(_WAYS[:-1])} and {_WAYS[-1]}, got "
             f"{' and '.join(given) or 'none'}"
         )
     if table.vertices is not None:
-        kept = read.vertex_map[_listed(table.vertices, len(read.vertex_map), place)]
+        kept = read.vertex_map[_listed(table.vertices, len(read.vertex_map), context)]
         if not (kept >= 0).any():
-            raise SceneError(f"{place}none of its vertices is part of the mended surface")
+            raise SceneError(f"{context}none of its vertices is part of the mended surface")
         return kept[kept >= 0]
     points = np.asarray(read.mesh.vertices)
     if table.points is not None:
-        return picked_vertices(read_points(table.points, place=place), points, place=place)
+        return picked_vertices(read_points(table.points, context=context), points, context=context)
     if table.colour is not None:
-        return painted_vertices(table.colour, read, place=place)
+        return painted_vertices(table.colour, read, context=context)
     if table.sphere is not None:
         distance = np.linalg.norm(points - table.sphere.centre, axis=1)
         limit, what = table.sphere.radius, "sphere.radius"
@@ -171,28 +178,31 @@ def _select(table, read, bone, place):
     chosen = np.flatnonzero(distance <= limit)
     if len(chosen) == 0:
         raise SceneError(
-            f"{place}{what} = {limit:g} reaches no vertex of the muscle, "
+            f"{context}{what} = {limit:g} reaches no vertex of the muscle, "
             f"the nearest is {distance.min():.4g} away; raise it"
         )
     return chosen
 
 
-def _listed(listed: Path | list[int], count: int, place: str) -> Integers:
-    """Vertex numbers of a list or of a text file, below ``count``; ``place`` begins each
+def _listed(listed: Path | list[int], count: int, context: str) -> Integers:
+    """Vertex numbers of a list or of a text file, below ``count``; ``context`` begins each
     message.
     """
     numbers = listed if isinstance(listed, list) else []
     if isinstance(listed, Path):
-        words, place = read_text(listed, place=place).split(), f"{place}{shown_path(listed)}: "
+        words, context = (
+            read_text(listed, context=context).split(),
+            f"{context}{shown_path(listed)}: ",
+        )
         for word in words:
             try:
                 numbers.append(int(word))
             except ValueError:
-                raise SceneError(f"{place}{shown(repr(word))} is not a vertex number") from None
+                raise SceneError(f"{context}{shown(repr(word))} is not a vertex number") from None
     if not numbers:
-        raise SceneError(f"{place}no vertex numbers")
+        raise SceneError(f"{context}no vertex numbers")
     for number in numbers:
         if not 0 <= number < count:
             words = f"out of range, the mesh has vertices 0 to {count - 1}"
-            raise SceneError(f"{place}vertex {shown(number)} is {words}")
+            raise SceneError(f"{context}vertex {shown(number)} is {words}")
     return np.array(numbers, dtype=np.int64)

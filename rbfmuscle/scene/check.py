@@ -51,12 +51,12 @@ def check_scene(scene: Scene) -> list[Finding]:
     opened = "the bone is open, its inside follows from winding numbers"
     unusable = "no mesh of this bone could be used: muscles pass through it"
     findings += [Finding("warning", bone.name, opened) for bone in scene.bones if not bone.closed]
-    findings += [Finding("warning", name, unusable) for name in scene.left_out]
+    findings += [Finding("warning", name, unusable) for name in scene.missing_bones]
     findings += [Finding("warning", scene.name, doubt) for doubt in scene.doubts]
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
     findings += _rest_overlaps(scene)
     findings += _guess_findings(scene)
-    if scene.links and not scene.bones:
+    if scene.meshless_bones and not scene.bones:
         words = "no bone has a mesh, so nothing can be run; give the bones meshes"
         return sort_findings([*findings, Finding("note", scene.name, words)])
     findings += _attachment_findings(scene)

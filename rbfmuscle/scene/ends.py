@@ -27,7 +27,7 @@ def ordered_muscle(muscle: Muscle) -> tuple[Muscle, Integers]:
         replace(attachment, vertices=np.sort(place[attachment.vertices]))
         for attachment in muscle.attachments
     ]
-    ends.sort(key=lambda attachment: (attachment.holder, attachment.vertices.tolist()))
+    ends.sort(key=lambda attachment: (attachment.attachment_frame, attachment.vertices.tolist()))
     return replace(muscle, mesh=mesh, attachments=ends), order
 
 

@@ -35,7 +35,7 @@ class SceneTable(Table):
     format: Literal[1]
     name: str | None = None
     units: Literal["m", "cm", "mm"]
-    left_out: list[str] = Field(default=[])
+    missing_bones: list[str] = Field(default=[])
     doubts: list[str] = Field(default=[])
     notes: list[str] = Field(default=[])
     superior: Axis | None = None
@@ -98,9 +98,11 @@ def read_scene_file(path: Path) -> SceneFile:
     SceneError names the file, the table, the key, the value and what is right.
     """
     data = _read_toml(path)
-    check_plain(data, place=f"{path}: ")
-    place, folder = f"{path}: ", path.parent
-    return SceneFile.build(data, place=place, folder=folder, name_row=lambda at: _place(at, data))
+    check_plain(data, context=f"{path}: ")
+    context, folder = f"{path}: ", path.parent
+    return SceneFile.build(
+        data, context=context, folder=folder, name_row=lambda at: _place(at, data)
+    )
 
 
 def _read_toml(path):

@@ -24,18 +24,19 @@ def make_motion(
 
     SceneError on an unknown coordinate, too many frames, or a file that cannot be read.
     """
-    facts = all_coordinates(joints)
+    known = all_coordinates(joints)
     followers = {coupling.coordinate for coupling in couplings}
     times, notes = None, []
     if options.file is not None:
-        frames, times, notes = read_motion_file(options.file, facts, followers, metre=metre)
+        frames, times, notes = read_motion_file(options.file, known, followers, metre=metre)
     else:
-        frames = _asked_frames(options, facts)
-        _refuse_followers(frames, followers, facts)
-    frames = [_with_rest(frame, facts, followers) for frame in frames]
-    notes += _range_notes(frames, facts)
+        frames = _asked_frames(options, known)
+        _refuse_followers(frames, followers, known)
+    frames = [_with_rest(frame, known, followers) for frame in frames]
+    notes += _range_notes(frames, known)
     frames = [
-        {name: facts[name].honoured(value) for name, value in frame.items()} for frame in frames
+        {name: known[name].clamped_value(value) for name, value in frame.items()}
+        for frame in frames
     ]
     return Motion(frames, options=options, times=times, notes=notes)
 
@@ -61,38 +62,38 @@ def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> 
     return {name: (1 - t) * before.get(name, 0.0) + t * after.get(name, 0.0) for name in names}
 
 
-def _asked_frames(options, facts):
+def _asked_frames(options, known):
     """Frames of a ramp or of waypoints; the rest pose alone without either."""
 
     def named(table):
         return {
-            full_name(name, list(facts), place="[motion]"): value for name, value in table.items()
+            full_name(name, list(known), context="[motion]"): value for name, value in table.items()
         }
 
     if options.ramp is not None:
         ramps = named(options.ramp)
         starts = {name: ramp.start for name, ramp in ramps.items() if ramp.start is not None}
         stops = [starts, {name: ramp.end for name, ramp in ramps.items()}]
-        return _frames_between(stops, list(ramps), [ramp.step for ramp in ramps.values()], facts)
+        return _frames_between(stops, list(ramps), [ramp.step for ramp in ramps.values()], known)
     if options.waypoints is not None:
         stops = [named(stop) for stop in options.waypoints]
         names = list(dict.fromkeys(itertools.chain(*stops)))
-        return _frames_between(stops, names, options.step or 1.0, facts)
+        return _frames_between(stops, names, options.step or 1.0, known)
     return [{}]
 
 
-def _frames_between(stops, names, steps, facts):
+def _frames_between(stops, names, steps, known):
     """Frames from stop to stop [degree or scene unit] in whole steps; the coordinate that needs
     most sets the pace.
     """
     table = np.array([[stop.get(name, np.nan) for name in names] for stop in stops]).reshape(
         len(stops), -1
     )
-    factors = np.array([FACTORS[facts[name].motion] for name in names])
+    factors = np.array([FACTORS[known[name].motion] for name in names])
     for column, name in enumerate(
         names
     ):  # what a stop does not mention stays where it was, at rest at first
-        held = facts[name].rest / factors[column]
+        held = known[name].rest / factors[column]
         for row in range(len(stops)):
             held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
     rows = [table[0]]
@@ -112,14 +113,14 @@ def _frames_between(stops, names, steps, facts):
     return [dict(zip(names, (row * factors).tolist())) for row in rows]
 
 
-def _refuse_followers(frames, followers, facts):
+def _refuse_followers(frames, followers, known):
     for name in dict.fromkeys(name for frame in frames for name in frame):
         if name in followers:
             raise SceneError(
                 f"[motion]: {name!r} follows other coordinates by a coupling, move those"
             )
-        rest = facts[name].rest
-        if facts[name].locked and any(
+        rest = known[name].rest
+        if known[name].locked and any(
             abs(frame.get(name, rest) - rest) > NOT_MOVED for frame in frames
         ):
             raise SceneError(
@@ -127,17 +128,17 @@ def _refuse_followers(frames, followers, facts):
             )
 
 
-def _with_rest(frame, facts, followers):
+def _with_rest(frame, known, followers):
     """The frame without followers; coordinates that it does not mention are at rest."""
     unsaid = {
-        n: c.rest for n, c in facts.items() if n not in frame and n not in followers and c.rest
+        n: c.rest for n, c in known.items() if n not in frame and n not in followers and c.rest
     }
     return {**unsaid, **{name: value for name, value in frame.items() if name not in followers}}
 
 
-def _range_notes(frames: list[dict[str, float]], facts: dict[str, Coordinate]) -> list[str]:
+def _range_notes(frames: list[dict[str, float]], known: dict[str, Coordinate]) -> list[str]:
     notes = []
-    for name, coordinate in facts.items():
+    for name, coordinate in known.items():
         if coordinate.range is None or coordinate.locked:
             continue
         low, high = coordinate.range

@@ -6,7 +6,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.joints.joint import all_coordinates, joint_poses, joint_values, resolve
+from rbfmuscle.scene.joints.joint import (
+    all_coordinates,
+    coordinate_values,
+    joint_poses,
+    joint_values,
+)
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError, did_you_mean
@@ -18,13 +23,13 @@ def rest_coordinates(scene: Scene) -> dict[str, float]:
     """Return the coordinates that follow no other and whose rest value is not zero [radian or scene
     unit].
     """
-    facts, followers = (
+    known, followers = (
         all_coordinates(scene.joints),
         {coupling.coordinate for coupling in scene.couplings},
     )
-    if not any(coordinate.rest for coordinate in facts.values()):
+    if not any(coordinate.rest for coordinate in known.values()):
         return {}
-    rest = resolve({}, facts, scene.couplings)
+    rest = coordinate_values({}, known, scene.couplings)
     return {name: value for name, value in rest.items() if value and name not in followers}
 
 

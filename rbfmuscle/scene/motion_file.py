@@ -19,22 +19,22 @@ IN_DEGREES = dict.fromkeys(("yes", "true", "1"), math.pi / 180) | dict.fromkeys(
 
 
 def read_motion_file(
-    path: Path, facts: dict[str, Coordinate], followers: set[str], *, metre: float
+    path: Path, known: dict[str, Coordinate], followers: set[str], *, metre: float
 ) -> tuple[list[dict[str, float]], list[float] | None, list[str]]:
     """Frames, times [s] (None without a column ``time``) and notes of an OpenSim motion file.
 
     It holds a header up to ``endheader``, column names and rows of numbers. Angles are turned from
     degrees where the header says ``inDegrees=yes``, lengths from metres, ``metre`` scene units
-    each; numbers of coordinates that are neither are taken as they are, as OpenSim does. ``facts``
+    each; numbers of coordinates that are neither are taken as they are, as OpenSim does. ``known``
     are the scene's coordinates by full name; columns of ``followers``, which follow others, are not
     used.
     """
     header, labels, values = _read_storage(path)
     if len(values) > MAX_FRAMES:
         raise SceneError(f"[motion]: {path} has {len(values)} rows, more than {MAX_FRAMES}")
-    columns, unknown = _match_columns(path, labels, list(facts))
+    columns, unknown = _match_columns(path, labels, list(known))
     if not columns:
-        names = ", ".join(list(facts)[:20]) or "no joints"
+        names = ", ".join(list(known)[:20]) or "no joints"
         raise SceneError(f"[motion]: {path} has none of the scene's coordinates ({names})")
     used = [*columns.values(), *([labels.index("time")] if "time" in labels else [])]
     bad = np.argwhere(~np.isfinite(values[:, used]))
@@ -47,18 +47,18 @@ def read_motion_file(
     notes += _storage_notes(path, header, unknown, len(values))
     if "time" in labels:
         notes += _time_notes(path, values[:, labels.index("time")])
-    turns = {name: column for name, column in columns.items() if facts[name].motion == "rotation"}
+    turns = {name: column for name, column in columns.items() if known[name].motion == "rotation"}
     if factor == 1.0:
         tracks = {name: values[:, column] for name, column in turns.items()}
-        notes += _degree_notes(path, facts, tracks)
+        notes += _degree_notes(path, known, tracks)
     units = {"rotation": factor, "translation": metre, "coupled": 1.0}
     tracks = {}
     for name, column in columns.items():
-        if name in followers or facts[name].locked:
+        if name in followers or known[name].locked:
             why = "follows other coordinates" if name in followers else "is locked"
             notes.append(f"{path}: the column of {name!r} is not used, the coordinate {why}")
         else:
-            tracks[name] = (values[:, column] * units[facts[name].motion]).tolist()
+            tracks[name] = (values[:, column] * units[known[name].motion]).tolist()
     frames = [{name: track[row] for name, track in tracks.items()} for row in range(len(values))]
     return frames, values[:, labels.index("time")].tolist() if "time" in labels else None, notes
 
@@ -86,11 +86,11 @@ def _time_notes(path, times):
     return [f"{path}: {len(back)} times do not increase, {words}; each row is a frame all the same"]
 
 
-def _degree_notes(path, facts, tracks):
+def _degree_notes(path, known, tracks):
     """A question where angles that are read as radians can only be degrees."""
     for name, track in tracks.items():
         most = float(np.abs(track).max())
-        ends = facts[name].range or (-TURN, TURN)
+        ends = known[name].range or (-TURN, TURN)
         if most > min(TURN, max(math.pi, 1.5 * max(map(abs, ends)))):
             what = f"{name} reaches {most:.4g} radians, {most / TURN:.3g} turns"
             return [f"{path}: {what}: does the file mean degrees (inDegrees=yes)?"]
@@ -119,7 +119,7 @@ def _read_storage(path: Path) -> tuple[dict[str, str], list[str], Floats]:
     """Header (lower case), labels of the columns, and values (rows, columns) of an OpenSim storage
     file.
     """
-    lines = read_text(path, place="[motion]: ").splitlines()
+    lines = read_text(path, context="[motion]: ").splitlines()
     end = next(
         (row for row, line in enumerate(lines) if line.strip().lower() == "endheader"), len(lines)
     )

@@ -44,17 +44,17 @@ class LineTable(Table):
 class Attachment:
     """Vertices (n,) of a muscle's mesh that move with a bone.
 
-    ``tendon`` joins them to it where they end short of it. ``holder`` is the name, among the poses,
-    of what they move with: the bone, or the end of the tendon.
+    ``tendon`` joins them to it where they end short of it. ``attachment_frame`` is the name,
+    among the poses, of what they move with: the bone, or the end of the tendon.
     """
 
     bone: str
     vertices: Integers = field(repr=False)
     tendon: LineTable | None = None
-    holder: str = ""
+    attachment_frame: str = ""
 
     def __post_init__(self) -> None:
-        self.holder = self.holder or self.bone
+        self.attachment_frame = self.attachment_frame or self.bone
 
     @property
     def bones(self) -> list[str]:
@@ -126,13 +126,13 @@ def body_axes(superior: Sequence[float] | None, anterior: Sequence[float] | None
     return np.stack([left, np.cross(up, left), up])
 
 
-def find_named(items: list[Any], name: str, what: str, *, place: str = "") -> Any:
+def find_named(items: list[Any], name: str, what: str, *, context: str = "") -> Any:
     """Return the item of that name, or raise SceneError naming the nearest."""
     for item in items:
         if item.name == name:
             return item
     hint = did_you_mean(name, [item.name for item in items])
-    raise SceneError(f"{place}unknown {what} {name!r}, {hint}")
+    raise SceneError(f"{context}unknown {what} {name!r}, {hint}")
 
 
 def check_file_names(bones: list[Bone], muscles: list[Muscle]) -> None:
@@ -153,7 +153,7 @@ def check_file_names(bones: list[Bone], muscles: list[Muscle]) -> None:
             )
 
 
-def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[str, dict[str, Any]]:
+def split_model(model: dict[str, Any] | str, *, context: str) -> tuple[str, dict[str, Any]]:
     """Return (name, options) of a model given as a name or as a table with ``name``."""
     if isinstance(model, str):
         return model, {}
@@ -162,7 +162,7 @@ def split_model(model: dict[str, Any] | str, *, place: str) -> tuple[str, dict[s
         name = options.pop("name", "rbf")
         if isinstance(name, str):
             return name, options
-    raise SceneError(f"{place}: model must be a name or a table with a name, got {shown(model)}")
+    raise SceneError(f"{context}: model must be a name or a table with a name, got {shown(model)}")
 
 
 def check_name(name: object, what: str) -> None:

@@ -64,23 +64,23 @@ def _check_length(vector):
 Axis = Annotated[Vector, AfterValidator(_check_length)]
 
 
-def check_plain(value: object, *, place: str, depth: int = 0) -> None:
+def check_plain(value: object, *, context: str, depth: int = 0) -> None:
     """Raise SceneError where TOML holds what no key can mean: deep nesting, vast integers, nan or
     inf.
     """
     if depth > DEEPEST:
-        raise SceneError(f"{shown(place)}: tables or lists are nested more than {DEEPEST} deep")
+        raise SceneError(f"{shown(context)}: tables or lists are nested more than {DEEPEST} deep")
     if isinstance(value, (dict, list)):
         dot = "." if depth else ""
         for key, item in value.items() if isinstance(value, dict) else enumerate(value, 1):
             if not isinstance(item, str):
-                check_plain(item, place=f"{place}{dot}{shown(str(key))}", depth=depth + 1)
+                check_plain(item, context=f"{context}{dot}{shown(str(key))}", depth=depth + 1)
     elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
         raise SceneError(
-            f"{place}: a whole number must be at most 2^53 in size, got {shown(value)}"
+            f"{context}: a whole number must be at most 2^53 in size, got {shown(value)}"
         )
     elif isinstance(value, float) and not math.isfinite(value):
-        raise SceneError(f"{place}: must be a finite number, got {value}")
+        raise SceneError(f"{context}: must be a finite number, got {value}")
 
 
 class Table(BaseModel):
@@ -108,11 +108,11 @@ class Table(BaseModel):
         cls,
         values: Mapping[str, Any],
         *,
-        place: str,
+        context: str,
         folder: Path | None = None,
         name_row: Callable[[tuple[str | int, ...]], str] | None = None,
     ) -> Self:
-        """Return the table made from a mapping, or raise SceneError that begins with ``place``.
+        """Return the table made from a mapping, or raise SceneError that begins with ``context``.
 
         Relative names of files are relative to ``folder``; ``name_row`` turns pydantic's location
         into words.
@@ -120,18 +120,18 @@ class Table(BaseModel):
         try:
             return cls.model_validate(values, context={"folder": folder})
         except ValidationError as error:
-            raise SceneError(f"{place}{_describe_error(error, name_row)}") from None
+            raise SceneError(f"{context}{_describe_error(error, name_row)}") from None
 
 
-def set_dotted(table: dict[str, Any], key: str, value: object, *, place: str) -> None:
-    """Set the dotted ``key`` of nested tables, in place; ``place`` begins the message where a value
-    is no table.
+def set_dotted(table: dict[str, Any], key: str, value: object, *, context: str) -> None:
+    """Set the dotted ``key`` of nested tables, in place; ``context`` begins the message where a
+    value is no table.
     """
     *parents, last = key.split(".")
     for parent in parents:
         inner = table.get(parent, {})
         if not isinstance(inner, dict):
-            raise SceneError(f"{place}: {parent!r} is not a table")
+            raise SceneError(f"{context}: {parent!r} is not a table")
         table[parent] = dict(inner)
         table = table[parent]
     table[last] = value

@@ -69,11 +69,11 @@ class Scene:
         Unit of every length in the scene.
     couplings : list of Coupling
         Coordinates that follow others.
-    links : list of str
+    meshless_bones : list of str
         Bones without a mesh, which carry joints only.
     path : pathlib.Path or None
         The file it was loaded from.
-    left_out : list of str
+    missing_bones : list of str
         Bones of which no mesh could be used; they count in the verdict of a run.
     doubts : list of str
         What makes the scene another one than its source, in sentences; warnings of a check, and in
@@ -101,7 +101,7 @@ class Scene:
     bones: list[Bone] = field(default_factory=list)
     joints: list[Joint] = field(default_factory=list)
     couplings: list[Coupling] = field(default_factory=list)
-    links: list[str] = field(default_factory=list)
+    meshless_bones: list[str] = field(default_factory=list)
     muscles: list[Muscle] = field(default_factory=list)
     motion: Motion = field(default_factory=Motion)
     contact: ContactOptions = field(default_factory=ContactOptions)
@@ -109,7 +109,7 @@ class Scene:
     detect: DetectOptions | None = None
     output: OutputOptions = field(default_factory=OutputOptions)
     path: Path | None = None
-    left_out: list[str] = field(default_factory=list)
+    missing_bones: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     guesses: list[Guess] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -149,7 +149,7 @@ class Scene:
 
     def _fill(self, tables: SceneFile) -> None:
         about = tables.scene
-        self.left_out = about.left_out
+        self.missing_bones = about.missing_bones
         self.doubts = about.doubts
         self.notes = about.notes
         self.superior = about.superior
@@ -196,11 +196,11 @@ class Scene:
             )
         files = SceneFiles(Path(path))
         about: dict[str, Any] = {"format": 1, "name": self.name, "units": self.units}
-        for key in ("left_out", "doubts", "notes", "superior", "anterior"):
+        for key in ("missing_bones", "doubts", "notes", "superior", "anterior"):
             about |= {key: getattr(self, key)} if getattr(self, key) else {}
         tables = [("[scene]", about)]
         tables += [("[[bone]]", files.bone(bone)) for bone in self.bones]
-        tables += [("[[bone]]", {"name": name}) for name in self.links]
+        tables += [("[[bone]]", {"name": name}) for name in self.meshless_bones]
         tables += [("[[joint]]", joint_row(joint)) for joint in self.joints]
         tables += [("[[coupling]]", coupling_row(one, self.joints)) for one in self.couplings]
         tables += [("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles]
@@ -223,10 +223,10 @@ class Scene:
             Factor from the mesh's unit to the scene's.
         """
         check_new_name(self.bones, name, "bone")
-        if name in self.links:
+        if name in self.meshless_bones:
             raise SceneError(f"bone {name!r} is given twice")
         if mesh is None:
-            self.links.append(name)
+            self.meshless_bones.append(name)
         else:
             read = as_mesh(mesh, name, scale, may_be_open=True)
             self.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
@@ -259,11 +259,11 @@ class Scene:
         if isinstance(joint, str):
             row = {"name": joint, "parent": parent, "child": child, "centre": centre}
             row |= {"axes": axes and dict(axes)} | keys
-            joint = JointTable.build(row, place=f"joint {joint!r}: ").joint()
+            joint = JointTable.build(row, context=f"joint {joint!r}: ").joint()
         check_new_name(self.joints, joint.name, "joint")
         for bone in (joint.parent, joint.child):
-            if bone not in self.links:
-                find_named(self.bones, bone, "bone", place=f"joint {joint.name!r}: ")
+            if bone not in self.meshless_bones:
+                find_named(self.bones, bone, "bone", context=f"joint {joint.name!r}: ")
         check_tree(self.joints, joint)
         self.joints.append(joint)
         for muscle in self.muscles:
@@ -287,7 +287,7 @@ class Scene:
         """
         if isinstance(coordinate, str):
             row = {"coordinate": coordinate, "of": list(of), **function}
-            table = CouplingTable.build(row, place=f"coupling of {coordinate!r}: ")
+            table = CouplingTable.build(row, context=f"coupling of {coordinate!r}: ")
             coordinate = make_coupling(table, self.joints)
         self.couplings = ordered([*self.couplings, coordinate])
         return self
@@ -324,7 +324,7 @@ class Scene:
         """
         check_new_name(self.muscles, name, "muscle")
         read = as_mesh(mesh, name, scale, may_be_open=False)
-        model_name, options = split_model(model, place=f"muscle {name!r}")
+        model_name, options = split_model(model, context=f"muscle {name!r}")
         attachments = resolve_attachments(attach, read, self.bones, muscle=name)
         lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
         keys = contraction_keys(contraction, muscle=name)
@@ -345,7 +345,7 @@ class Scene:
         **options
             ``ramp``, ``waypoints`` with ``step``, or ``file``.
         """
-        return self._move(MotionOptions.build(options, place="[motion] ", folder=folder))
+        return self._move(MotionOptions.build(options, context="[motion] ", folder=folder))
 
     def _move(self, options: MotionOptions) -> Self:
         metre = self.length(1000.0)
@@ -455,8 +455,8 @@ class Scene:
             "superior": self.superior,
             "anterior": self.anterior,
             "bones": [{"name": bone.name, **record_mesh(bone)} for bone in self.bones],
-            "links": list(self.links),
-            "left_out": list(self.left_out),
+            "meshless_bones": list(self.meshless_bones),
+            "missing_bones": list(self.missing_bones),
             "doubts": list(self.doubts),
             "guesses": [guess._asdict() for guess in self.guesses],
             "notes": list(self.notes),
@@ -488,14 +488,23 @@ class Scene:
         """Return the muscle of that name, or raise SceneError naming the nearest."""
         return find_named(self.muscles, name, "muscle")
 
-    def holders(self, muscle: Muscle) -> list[str]:
+    def attachment_frames(self, muscle: Muscle) -> list[str]:
         """Names of the bones, then of the ends that tendons of a muscle hold."""
         return [*(bone.name for bone in self.bones), *(end.name for end in muscle.tendons)]
 
     def copy(self) -> Self:
         """Return a copy whose lists and tables are its own; meshes are shared."""
         other = copy.copy(self)
-        lists = ("bones", "joints", "couplings", "links", "left_out", "doubts", "guesses", "notes")
+        lists = (
+            "bones",
+            "joints",
+            "couplings",
+            "meshless_bones",
+            "missing_bones",
+            "doubts",
+            "guesses",
+            "notes",
+        )
         for name in lists:
             setattr(other, name, list(getattr(self, name)))
         other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]

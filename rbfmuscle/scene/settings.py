@@ -39,13 +39,15 @@ def split_muscle_key(key: str) -> tuple[str, str, str]:
     return name, head, rest
 
 
-def set_on_muscles(muscles: Sequence[Muscle], head: str, rest: str, value: Any, place: str) -> None:
+def set_on_muscles(
+    muscles: Sequence[Muscle], head: str, rest: str, value: Any, context: str
+) -> None:
     """Set a model, an option of it, or a key of contraction of muscles, in place."""
     if head == "model" and not rest:
         set_models(muscles, value)
     elif head == "model":
         for muscle in muscles:
-            set_dotted(muscle.options, rest, value, place=place)
+            set_dotted(muscle.options, rest, value, context=context)
     else:
         for muscle in muscles:
             _set_contraction(muscle, head, rest, value)
@@ -53,7 +55,7 @@ def set_on_muscles(muscles: Sequence[Muscle], head: str, rest: str, value: Any, 
 
 def set_models(muscles: Sequence[Muscle], model: str | dict[str, Any]) -> None:
     """Give muscles another model; options of a different model are dropped."""
-    name, options = split_model(model, place="model")
+    name, options = split_model(model, context="model")
     for muscle in muscles:
         kept = muscle.options if muscle.model == name else {}
         muscle.model = name
@@ -64,16 +66,16 @@ def _set_contraction(muscle, key, rest, value):
     given = {} if muscle.contraction is None else muscle.contraction.model_dump(exclude_unset=True)
     if rest and not isinstance(given.get(key), dict):
         given[key] = {}
-    set_dotted(given, f"{key}.{rest}" if rest else key, value, place=key)
+    set_dotted(given, f"{key}.{rest}" if rest else key, value, context=key)
     muscle.contraction = contraction_keys(given, muscle=muscle.name)
 
 
-def changed_table(head: str, table: Table | None, rest: str, value: object, place: str) -> Table:
+def changed_table(head: str, table: Table | None, rest: str, value: object, context: str) -> Table:
     """A table of settings with one key changed; one that the scene lacks begins with defaults."""
     table = table or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
     values = table.model_dump(by_alias=True, exclude_unset=True)
-    set_dotted(values, rest, value, place=place)
-    return table.build(values, place=f"{place}: ")
+    set_dotted(values, rest, value, context=context)
+    return table.build(values, context=f"{context}: ")
 
 
 def changed_motion(
@@ -92,7 +94,7 @@ def changed_motion(
         ramps[name][last] = value
     else:
         values[rest] = value
-    return MotionOptions.build(values, place=f"{key}: motion ", folder=folder)
+    return MotionOptions.build(values, context=f"{key}: motion ", folder=folder)
 
 
 def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:
@@ -104,22 +106,22 @@ def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:
         key, equals, value = (part.strip() for part in text.partition("="))
         if not equals or not key:
             raise UsageError(f"{text!r} is not KEY=VALUE, for instance model.centres=200")
-        found[key] = parse_value(value, place=key)
+        found[key] = parse_value(value, context=key)
     return found
 
 
-def parse_value(text: str, *, place: str) -> dict[str, Any] | int | str:
+def parse_value(text: str, *, context: str) -> dict[str, Any] | int | str:
     """Return the value of a TOML literal (number, true, list, table), or the text itself.
 
     NaN, infinity, numbers beyond 2^53 and deep nesting raise a UsageError that begins with
-    ``place``.
+    ``context``.
     """
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         return text
     try:
-        check_plain(value, place=place)
+        check_plain(value, context=context)
     except SceneError as error:
         raise UsageError(str(error)) from None
     return value

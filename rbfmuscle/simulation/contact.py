@@ -74,13 +74,13 @@ class BoneContacts:
     """The obstacles of one muscle, in one pose.
 
     ``fields`` has one entry for each bone of the scene, None where the muscle cannot reach it;
-    muscles may share fields. ``contact_bone`` (n,) holds the bone that each contact point is
+    muscles may share fields. ``attached_bone`` (n,) holds the bone that each contact point is
     attached to, -1 where it is free; attached points take no contact. ``reached`` lists the bones
     that have a field, ``boxes`` (r, 2, 3) has theirs at rest and ``placed`` (r, 4, 4) their poses.
     """
 
     def __init__(
-        self, names: list[str], fields: list[Any], *, contact_bone: ArrayLike | None = None
+        self, names: list[str], fields: list[Any], *, attached_bone: ArrayLike | None = None
     ) -> None:
         if len(names) != len(fields):
             raise ValueError(
@@ -92,8 +92,8 @@ class BoneContacts:
         self._row = {b: row for row, b in enumerate(self.reached)}
         boxes = [self.fields[b].bounds for b in self.reached]
         self.boxes = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3)
-        self.contact_bone = (
-            None if contact_bone is None else np.asarray(contact_bone, dtype=np.int64)
+        self.attached_bone = (
+            None if attached_bone is None else np.asarray(attached_bone, dtype=np.int64)
         )
         self.move(AtRest((name, np.eye(4)) for name in self.names))
         self.allowed: dict[int, Floats] = {}
@@ -272,13 +272,13 @@ class BoneContacts:
 
     def free(self, count: int) -> Booleans:
         """Mask (n,) of the contact points that are attached to no bone."""
-        if self.contact_bone is None:
+        if self.attached_bone is None:
             return np.ones(count, dtype=np.bool_)
-        if len(self.contact_bone) != count:
+        if len(self.attached_bone) != count:
             raise ValueError(
-                f"half-spaces need all {len(self.contact_bone)} contact points, got {count}"
+                f"half-spaces need all {len(self.attached_bone)} contact points, got {count}"
             )
-        return self.contact_bone < 0
+        return self.attached_bone < 0
 
     def stacked(self, poses: Mapping[str, Floats]) -> Floats:
         """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""

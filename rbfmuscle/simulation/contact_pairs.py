@@ -35,7 +35,10 @@ def swept_boxes(
     """
     there = np.linalg.inv(np.array([[pose[name] for pose in poses] for name in bones]))
     held = np.array(
-        [[pose[name] for pose in poses] for name in {a.holder for a in muscle.attachments}]
+        [
+            [pose[name] for pose in poses]
+            for name in {a.attachment_frame for a in muscle.attachments}
+        ]
     )
     bounds = np.asarray(muscle.mesh.bounds, dtype=np.float64)
     boxes = moved_box(bounds, there[:, None] @ held)

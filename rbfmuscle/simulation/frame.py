@@ -87,7 +87,7 @@ class Frame:
     surfaces: Mapping[str, ModelSurface] = field(
         repr=False
     )  # by muscle; empty where none were asked for
-    carried: dict = field(
+    material_meshes: dict = field(
         repr=False
     )  # (vertices, faces) by muscle: material surfaces of constant topology
     events: list  # since the frame written before
@@ -135,10 +135,10 @@ class MuscleModel(Protocol):
     """The interface of a muscle to the frame loop."""
 
     name: str
-    contact_bone: np.ndarray  # (n,) bone that a contact point is attached to, -1 where it is free
+    attached_bone: np.ndarray  # (n,) bone that a contact point is attached to, -1 where it is free
     # length over which it bends as a whole: neighbours meet it at points so far apart; 0 for all
     # points
-    detail: float
+    contact_spacing: float
 
     def contact_points(self) -> np.ndarray:
         """Present contact points (n, 3); their number and order never change."""
@@ -149,7 +149,7 @@ class MuscleModel(Protocol):
     def solve(self, contacts: BoneContacts) -> None:
         """Solve for equilibrium under the model's constraints and these contacts."""
 
-    def make_room(self, contacts: BoneContacts) -> None:
+    def separate_neighbours(self, contacts: BoneContacts) -> None:
         """Move what is shown out of neighbours, by planes at where these are now; nothing where
         `solve` does that.
         """

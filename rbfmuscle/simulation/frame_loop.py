@@ -35,7 +35,7 @@ class FrameLoop:
         Its motion only determines which bones and neighbours a muscle can meet.
     models : iterable of MuscleModel
         In their rest state.
-    fields : mapping of str to BoneField, optional
+    bone_sdfs : mapping of str to BoneField, optional
         Distance fields of the bones; built for the bones in reach where not given.
     surfaces : bool
         Whether surfaces are extracted.
@@ -61,7 +61,7 @@ class FrameLoop:
         scene: Scene,
         models: Iterable[MuscleModel],
         *,
-        fields: Mapping[str, BoneField] | None = None,
+        bone_sdfs: Mapping[str, BoneField] | None = None,
         surfaces: bool = True,
     ) -> None:
         models = list(models)
@@ -70,13 +70,13 @@ class FrameLoop:
         self._poses = PoseCache(scene)
         self.steppers = [
             MuscleStepper(model, contacts, scene, poses=self._poses)
-            for model, contacts in zip(models, _obstacles(scene, models, fields))
+            for model, contacts in zip(models, _obstacles(scene, models, bone_sdfs))
         ]
         self.here: dict[str, float] = {}
         self.activations = Activations(scene.muscles, scene.motion)
         for stepper in self.steppers:
             if scene.sliding is None and not stepper.contracts:
-                stepper.carrier = RigidTransport(scene.muscle(stepper.name), scene)
+                stepper.rigid_transport = RigidTransport(scene.muscle(stepper.name), scene)
         self._next_index = 0
         self._wall = 0.0
         self._blas = ThreadpoolController().select(user_api="blas").lib_controllers
@@ -119,7 +119,7 @@ class FrameLoop:
             if self.surfaces and self._sliding is None:
                 # No muscle waits for another: each thread takes one through all its sub-steps.
                 drawn = each(
-                    lambda stepper: stepper.go(*paths[stepper.name]).surface(), self.steppers
+                    lambda stepper: stepper.advance(*paths[stepper.name]).surface(), self.steppers
                 )
             else:
                 self._solve(paths)
@@ -165,21 +165,23 @@ class FrameLoop:
         paths: dict[str, Path] = {}
         for stepper in self.steppers:
             stepper.frame = self._next_index
-            paths[stepper.name] = [here, *stepper.cut.split(here, self.here)], []
-        if any(stepper.carrier is None for stepper in self.steppers):
+            paths[stepper.name] = [here, *stepper.substeps.split(here, self.here)], []
+        if any(stepper.rigid_transport is None for stepper in self.steppers):
             # Muscles that slide or contract share the sub-steps of the one that has the most.
             stops = max((stops for stops, _ in paths.values()), key=len)
             shared = self.activations.refine(self._next_index, stops)
-            paths |= {stepper.name: shared for stepper in self.steppers if stepper.carrier is None}
+            paths |= {
+                stepper.name: shared for stepper in self.steppers if stepper.rigid_transport is None
+            }
         self._next_index += 1
         return paths
 
     def _solve(self, paths: dict[str, Path]) -> None:
         """Advance all muscles through their sub-steps."""
         if self._sliding is None:
-            each(lambda stepper: stepper.go(*paths[stepper.name]), self.steppers)
+            each(lambda stepper: stepper.advance(*paths[stepper.name]), self.steppers)
         elif self.steppers:
-            self._sliding.go(*paths[self.steppers[0].name])
+            self._sliding.advance(*paths[self.steppers[0].name])
 
     def _frame(self, drawn: list[ModelSurface]) -> Frame:
         """The present frame, with its surfaces, if any were drawn."""
@@ -217,14 +219,14 @@ def simulate_frames(
     *,
     surfaces: bool = True,
     written: Collection[int] | None = None,
-    fields: Mapping[str, BoneField] | None = None,
+    bone_sdfs: Mapping[str, BoneField] | None = None,
 ) -> Iterator[Frame]:
     """Run models, from their rest state, through a scene's motion and yield its frames one by one.
 
     Only frames whose index is in ``written`` are yielded, all where it is None. Frames yielded
     before an interrupt or an error stay valid. Raises as `FrameLoop` does.
     """
-    loop = FrameLoop(scene, models, fields=fields, surfaces=surfaces)
+    loop = FrameLoop(scene, models, bone_sdfs=bone_sdfs, surfaces=surfaces)
     for index, coordinates in enumerate(scene.motion.frames):
         if written is None or index in written:
             yield loop.advance(coordinates)
@@ -237,7 +239,7 @@ def solve_pose(
     models: Collection[MuscleModel],
     coordinates: Mapping[str, float],
     *,
-    fields: Mapping[str, BoneField] | None = None,
+    bone_sdfs: Mapping[str, BoneField] | None = None,
 ) -> Frame:
     """Solve one pose [radian] straight from rest, so that the shapes depend on the pose alone.
 
@@ -246,7 +248,7 @@ def solve_pose(
     """
     rest = [model.snapshot() for model in models]
     try:
-        return FrameLoop(scene, models, fields=fields).advance(coordinates)
+        return FrameLoop(scene, models, bone_sdfs=bone_sdfs).advance(coordinates)
     finally:
         for model, state in zip(models, rest):
             model.restore(state)
@@ -254,26 +256,29 @@ def solve_pose(
                 model.activate(0.0)
 
 
-def _obstacles(scene, models, fields):
+def _obstacles(scene, models, bone_sdfs):
     """One BoneContacts for each model, with fields of the bones that it can reach.
 
     A field covers the reach of all muscles of the scene, so that it does not depend on which are
     simulated.
     """
-    regions = find_contact_pairs(scene) if fields is None else None
+    regions = find_contact_pairs(scene) if bone_sdfs is None else None
     here = {model.name for model in models}
     if regions is not None:
         met = {bone for muscle, bone in regions if muscle in here}
-        fields = build_fields(scene, {pair: box for pair, box in regions.items() if pair[1] in met})
+        bone_sdfs = build_fields(
+            scene, {pair: box for pair, box in regions.items() if pair[1] in met}
+        )
     names = [bone.name for bone in scene.bones]
     # One set of arrays, of which each muscle takes its bones.
-    order = [name for name in names if isinstance(fields.get(name), BoneSDF)]
-    stack = stack_bones([fields[name] for name in order])
+    order = [name for name in names if isinstance(bone_sdfs.get(name), BoneSDF)]
+    stack = stack_bones([bone_sdfs[name] for name in order])
     for model in models:
         reached = [
-            fields.get(n) if regions is None or (model.name, n) in regions else None for n in names
+            bone_sdfs.get(n) if regions is None or (model.name, n) in regions else None
+            for n in names
         ]
-        contacts = BoneContacts(names, reached, contact_bone=model.contact_bone)
+        contacts = BoneContacts(names, reached, attached_bone=model.attached_bone)
         met = [names[b] for b in contacts.reached]
         if set(met) <= set(order):
             contacts.bones = pick_bones(stack, [order.index(name) for name in met])

@@ -29,16 +29,16 @@ class LiveSession:
     as `live_fields` builds them.
     """
 
-    def __init__(self, scene: Scene, *, fields: Mapping[str, BoneField] | None = None) -> None:
+    def __init__(self, scene: Scene, *, bone_sdfs: Mapping[str, BoneField] | None = None) -> None:
         self.scene, self.limits = scene, coordinate_limits(scene)
-        self.fields = live_fields(scene) if fields is None else fields
-        facts = all_coordinates(scene.joints)
-        self.rest = {name: facts[name].rest for name in self.limits}
+        self.bone_sdfs = live_fields(scene) if bone_sdfs is None else bone_sdfs
+        known = all_coordinates(scene.joints)
+        self.rest = {name: known[name].rest for name in self.limits}
         self.here, self.target = dict(self.rest), dict(self.rest)
         self.activation = {m.name: 0.0 for m in scene.muscles if m.contraction is not None}
         #: A shift counts as the turn that moves a place at this lever as far.
         self._lever = {
-            n: scene.length(SHIFT_LEVER) if facts[n].motion == "translation" else 1.0
+            n: scene.length(SHIFT_LEVER) if known[n].motion == "translation" else 1.0
             for n in self.rest
         }
         self._loop: FrameLoop | None = None
@@ -92,7 +92,7 @@ class LiveSession:
         `reset` goes back to rest.
         """
         if self._loop is None:
-            self._loop = FrameLoop(_wide_scene(self.scene), self.models, fields=self.fields)
+            self._loop = FrameLoop(_wide_scene(self.scene), self.models, bone_sdfs=self.bone_sdfs)
         self._loop.surfaces = surfaces
         active = self._loop.activations
         reach = 1.0 if stride == math.inf else STEP
@@ -121,17 +121,19 @@ def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
     """
     followers = {coupling.coordinate for coupling in scene.couplings}
     limits = {}
-    for name, facts in all_coordinates(scene.joints).items():
-        if name in followers or facts.locked:
+    for name, coordinate in all_coordinates(scene.joints).items():
+        if name in followers or coordinate.locked:
             continue
         free = (
-            scene.length(FREE_RANGE) if facts.motion == "translation" else math.radians(FREE_RANGE)
+            scene.length(FREE_RANGE)
+            if coordinate.motion == "translation"
+            else math.radians(FREE_RANGE)
         )
-        values = [frame.get(name, facts.rest) for frame in scene.motion.frames]
-        low, high = min([facts.rest - free, *values]), max([facts.rest + free, *values])
-        if facts.range is not None and facts.range[0] < facts.range[1]:
-            low = max(low, min(facts.range[0], facts.rest))
-            high = min(high, max(facts.range[1], facts.rest))
+        values = [frame.get(name, coordinate.rest) for frame in scene.motion.frames]
+        low, high = min([coordinate.rest - free, *values]), max([coordinate.rest + free, *values])
+        if coordinate.range is not None and coordinate.range[0] < coordinate.range[1]:
+            low = max(low, min(coordinate.range[0], coordinate.rest))
+            high = min(high, max(coordinate.range[1], coordinate.rest))
         limits[name] = (low, high)
     return limits
 
@@ -143,8 +145,8 @@ def live_fields(scene: Scene) -> Mapping[str, BoneField]:
 
 def _wide_scene(scene: Scene) -> Scene:
     """The scene with a motion that takes each coordinate to its limits."""
-    facts, limits = all_coordinates(scene.joints), coordinate_limits(scene)
-    rest, stops = {name: facts[name].rest for name in limits}, [{}]
+    known, limits = all_coordinates(scene.joints), coordinate_limits(scene)
+    rest, stops = {name: known[name].rest for name in limits}, [{}]
     for name, ends in limits.items():
         stops += [{name: value} for end in ends for value in np.linspace(rest[name], end, 4)[1:]]
     wide = copy.copy(scene)

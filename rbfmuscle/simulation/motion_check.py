@@ -101,7 +101,7 @@ def _patches(muscle: Muscle) -> dict[str, Floats]:
     """Attached vertices by bone, thinned."""
     found: dict[str, list[np.ndarray]] = {}
     for attachment in muscle.attachments:
-        found.setdefault(attachment.holder, []).append(attachment.vertices)
+        found.setdefault(attachment.attachment_frame, []).append(attachment.vertices)
     thinned = {}
     for bone, parts in found.items():
         index = np.unique(np.concatenate(parts))

@@ -187,7 +187,7 @@ class NeighbourSurface(MovingSurface):
         super().__init__(*model.material_mesh(), reach)
         self.shown: MovingSurface = self
         self.contact = cKDTree(model.contact_points()).query(self.vertices)[1]
-        self.fixed = np.asarray(model.contact_bone)[self.contact] >= 0
+        self.fixed = np.asarray(model.attached_bone)[self.contact] >= 0
         #: Change of the coordinates in the last sub-step, and a mean of how far solves moved points
         #: and vertices.
         self._change: dict[str, float] = {}

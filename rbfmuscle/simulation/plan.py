@@ -43,14 +43,14 @@ def _count_substeps(muscle: Muscle, scene: Scene, bones: list[str], poses: PoseC
     """Sub-steps in which the motion requires a muscle to be solved."""
     always = scene.sliding is not None or muscle.contraction is not None
     cut = SubSteps(scene, muscle, bones=bones, poses=poses)
-    carrier = RigidTransport(muscle, scene)
+    rigid_transport = RigidTransport(muscle, scene)
     count = 0
     here = rest_coordinates(scene)
-    carrier.solved = poses(here)
+    rigid_transport.solved = poses(here)
     for frame in scene.motion.frames:
         there = completed(scene, frame)
         for stop in cut.split(here, there):
-            if always or not carrier.keeps_shape(poses(stop)):
-                count, carrier.solved = count + 1, poses(stop)
+            if always or not rigid_transport.keeps_shape(poses(stop)):
+                count, rigid_transport.solved = count + 1, poses(stop)
         here = there
     return count

@@ -52,7 +52,7 @@ class RigidTransport:
         self.clear = scene.length(CLEAR)
         held: dict[str, list[np.ndarray]] = {}
         for attachment in muscle.attachments:
-            held.setdefault(attachment.holder, []).append(attachment.vertices)
+            held.setdefault(attachment.attachment_frame, []).append(attachment.vertices)
         parts = {name: np.concatenate(found) for name, found in held.items()}
         self.names = sorted(parts, key=lambda name: -len(parts[name]))
         self._corners = {name: frame.corners(parts[name]) for name in self.names}

@@ -79,7 +79,9 @@ class Sliding:
         stepper.contacts.neighbours += [link.push, link.pull]
         stepper.contacts.beside.append(link)
 
-    def go(self, stops: Sequence[Coordinates], activations: Sequence[Mapping[str, float]]) -> None:
+    def advance(
+        self, stops: Sequence[Coordinates], activations: Sequence[Mapping[str, float]]
+    ) -> None:
         """Solve all muscles at the coordinates of the sub-steps; the first of them are the present
         ones.
 
@@ -171,7 +173,7 @@ class Sliding:
         with stepper.timed("sliding"):
             for link in self.links[stepper.name]:
                 link.update(relink=False)
-            stepper.model.make_room(stepper.contacts)
+            stepper.model.separate_neighbours(stepper.contacts)
 
     def _measure(self, stepper):
         with stepper.timed("sliding"):
@@ -183,7 +185,7 @@ def _stride(stepper, stops):
     count = len(stops) - 1
     if stepper.contracts or count < 2:
         return 1
-    return max(1, count // max(1, len(stepper.cut.split(stops[0], stops[-1]))))
+    return max(1, count // max(1, len(stepper.substeps.split(stops[0], stops[-1]))))
 
 
 def sliding_pairs(scene: Scene, names: list[str], reach: float) -> set[frozenset[str]]:

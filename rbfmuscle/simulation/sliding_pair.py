@@ -84,7 +84,7 @@ class SlidingPair:
         # In the muscle's own frame, so that it does not depend on where the scene lies.
         frame = RestFrame(own.points)
         places = frame.size * frame.local
-        chosen = _nearest_by_cell(places[at], apart, stepper.model.detail)
+        chosen = _nearest_by_cell(places[at], apart, stepper.model.contact_spacing)
         #: Contact points that meet the neighbour, and which of them it holds.
         self.at, apart = at[chosen], apart[chosen]
         self.held = np.zeros(len(self.at), dtype=bool)

@@ -60,8 +60,9 @@ class _Stage:
 class MuscleStepper:
     """Advances one model through sub-steps, against obstacles of its own.
 
-    ``cut`` gives sub-steps by the relative motion of the bones that the muscle meets; ``carrier``
-    moves the muscle rigidly where it need not be solved, None where it is always solved.
+    ``substeps`` gives sub-steps by the relative motion of the bones that the muscle meets;
+    ``rigid_transport`` moves the muscle rigidly where it need not be solved, None where it is
+    always solved.
     """
 
     def __init__(
@@ -84,8 +85,8 @@ class MuscleStepper:
         self.frame, self.solves = 0, 0
         self.contracts = scene.muscle(self.name).contraction is not None
         met = [contacts.names[b] for b in contacts.reached]
-        self.cut = SubSteps(scene, scene.muscle(self.name), bones=met, poses=self.poses)
-        self.carrier: RigidTransport | None = None
+        self.substeps = SubSteps(scene, scene.muscle(self.name), bones=met, poses=self.poses)
+        self.rigid_transport: RigidTransport | None = None
         self._path: Path
         self._saved: Any = None
         # The surface since the last solve, where later ones are that one moved rigidly.
@@ -98,7 +99,7 @@ class MuscleStepper:
         """Add the time spent inside to ``time_<stage>``."""
         return _Stage(self.times, f"time_{stage}")
 
-    def go(
+    def advance(
         self, stops: list[dict[str, float]], activations: Sequence[Mapping[str, float]] = ()
     ) -> MuscleStepper:
         """Advance through a list of coordinates, the present ones first; ``activations`` by muscle
@@ -107,7 +108,7 @@ class MuscleStepper:
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
             self.set_activation(activation or {})
             path = self.path(before, after)
-            if self.carrier is None or not self.carrier.try_carry(
+            if self.rigid_transport is None or not self.rigid_transport.try_carry(
                 self.model, self.contacts, path.old, path.new
             ):
                 self.step(path)
@@ -144,8 +145,8 @@ class MuscleStepper:
             crossings = self._crossings(path, self._saved[1])
             if crossings:
                 self._correct(path, crossings)
-        if self.carrier is not None:
-            self.carrier.solved = path.new
+        if self.rigid_transport is not None:
+            self.rigid_transport.solved = path.new
 
     def solve(self, coordinates: Mapping[str, float]) -> None:
         """Solve; raise SolveError with muscle, mesh, frame and coordinates where that fails or is
@@ -171,13 +172,15 @@ class MuscleStepper:
         """The surface of the present state: the earlier one, moved, where the muscle was not solved
         since and has no neighbours that slide.
         """
-        carrier = self.carrier
+        rigid_transport = self.rigid_transport
         with self.timed("surface"):
             if self._shown is not None and not self.contacts.beside:
-                return self._shown.moved(np.eye(4) if carrier is None else carrier.since)
+                return self._shown.moved(
+                    np.eye(4) if rigid_transport is None else rigid_transport.since
+                )
             self._shown = self.model.surface(self.contacts)
-        if carrier is not None:
-            carrier.since = np.eye(4)
+        if rigid_transport is not None:
+            rigid_transport.since = np.eye(4)
         return self._shown
 
     def report(self, bone: str, count: int, action: str) -> None:
@@ -195,7 +198,7 @@ class MuscleStepper:
         events = [
             Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()
         ]
-        moved = self.carrier is not None and self.carrier.collect()
+        moved = self.rigid_transport is not None and self.rigid_transport.collect()
         self.times = {}
         self.events = {}
         self.solves = 0

@@ -57,7 +57,7 @@ class SubSteps:
         self._rest = rest_coordinates(scene)
         muscles = scene.muscles if muscle is None else [muscle]
         attachments = [(part, attachment) for part in muscles for attachment in part.attachments]
-        own = [attachment.holder for _, attachment in attachments]
+        own = [attachment.attachment_frame for _, attachment in attachments]
         self._facts = all_coordinates(scene.joints)
         #: The bones that count, and the coordinates that move them against each other. A muscle's
         #: are seen from the
@@ -78,7 +78,11 @@ class SubSteps:
             frames[part.name].corners(attachment.vertices) for part, attachment in attachments
         ]
         sizes = [diameter(np.asarray(part.mesh.vertices)) for part, _ in attachments]
-        ends = {attachment.holder for _, attachment in attachments if attachment.tendon is not None}
+        ends = {
+            attachment.attachment_frame
+            for _, attachment in attachments
+            if attachment.tendon is not None
+        }
         # Those from which attached points are seen; behind them come the bones that guide tendons.
         self._seen = len(self.bones)
         self.bones = [*dict.fromkeys([*self.bones, *guides])]
@@ -298,19 +302,19 @@ def path_angle(
     scene: Scene,
     before: Coordinates,
     after: Coordinates,
-    facts: Mapping[str, Coordinate] | None = None,
+    known: Mapping[str, Coordinate] | None = None,
 ) -> float:
     """How far the bones turn from one set of coordinates to another [radian].
 
     Angles count as they are given; where other coordinates move too, the path is followed in a few
     pieces.
     """
-    facts = all_coordinates(scene.joints) if facts is None else facts
+    known = all_coordinates(scene.joints) if known is None else known
     changes = {k: abs(after.get(k, 0.0) - before.get(k, 0.0)) for k in {*before, *after}}
     angle = max(
-        (change for k, change in changes.items() if facts[k].motion == "rotation"), default=0.0
+        (change for k, change in changes.items() if known[k].motion == "rotation"), default=0.0
     )
-    if not any(change for k, change in changes.items() if facts[k].motion != "rotation"):
+    if not any(change for k, change in changes.items() if known[k].motion != "rotation"):
         return angle
     stops = [interpolate(before, after, k / PIECES) for k in range(PIECES + 1)]
     return max(

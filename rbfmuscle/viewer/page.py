@@ -16,7 +16,7 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SolveError
 from rbfmuscle.viewer.panel import Panel
 from rbfmuscle.viewer.server import open_server
-from rbfmuscle.viewer.side import Look, Side
+from rbfmuscle.viewer.side import ModelView, ViewSettings
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ FIELD_OF_VIEW = 0.5
 FIRST = (-1.4, 1.6, 0.5)  # Where the camera stands at first, along the body's axes.
 
 
-def show(shown: Scene | RunData, *, model: str | None = None) -> "Page":
+def show(shown: Scene | RunData, *, model: str | None = None) -> "ViewerPage":
     """Show a scene or a run in a browser or a notebook.
 
     Parameters
@@ -44,7 +44,7 @@ def show(shown: Scene | RunData, *, model: str | None = None) -> "Page":
 
     Returns
     -------
-    Page
+    ViewerPage
         Shown by a notebook as the last value of a cell; elsewhere open its ``address``. ``close()``
         ends it.
 
@@ -56,12 +56,12 @@ def show(shown: Scene | RunData, *, model: str | None = None) -> "Page":
     True
     >>> page.close()
     """
-    return Page(
+    return ViewerPage(
         SavedSource({"run": shown}) if isinstance(shown, RunData) else LiveSource(shown, model)
     )
 
 
-class Page:
+class ViewerPage:
     """A scene or saved runs in a browser; a notebook shows it where it is the value of a cell.
 
     ``at`` are controls that begin elsewhere than at rest, ``colour`` is of `COLOURINGS`, ``served``
@@ -89,8 +89,8 @@ class Page:
         self._cost = 0.0
         self._message = "Building the models …"
         self._place = 0
-        self._shown: Look | None = None
-        self.sides = [Side(self.server, f"/{name}", source) for name in ("first", "second")]
+        self._shown: ViewSettings | None = None
+        self.sides = [ModelView(self.server, f"/{name}", source) for name in ("first", "second")]
         self.panel = Panel(self.server, source, at or {}, colour, self._touch)
         self.panel.rest.on_click(lambda _: self._touch(rest=True))
         self.panel.view.on_click(
@@ -115,7 +115,7 @@ class Page:
             self.server.stop()
 
     def __repr__(self) -> str:
-        return f"<Page of {self.source.title!r} at {self.address}>"
+        return f"<ViewerPage of {self.source.title!r} at {self.address}>"
 
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.address}" width="100%" height="640" style="border:0"></iframe>'
@@ -219,7 +219,7 @@ class Page:
                 side.figure.rest()
         return False
 
-    def _draw(self, sides: list[Side], look: Look) -> None:
+    def _draw(self, sides: list[ModelView], look: ViewSettings) -> None:
         with self.server.atomic():
             for side, other in zip(sides, sides[::-1] if len(sides) > 1 else [None]):
                 side.draw(look, self._probes, None if other is None else other.picture)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rbfmuscle.output.appearance import VIEWS
-from rbfmuscle.viewer.side import COLOURINGS, Look, Side, legend
+from rbfmuscle.viewer.side import COLOURINGS, ModelView, ViewSettings, legend
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 WIDTH = 350  # [pixel]
@@ -85,7 +85,7 @@ class Panel:
             with gui.add_folder(title, expand_by_default=False):
                 self.eyes |= {name: self._watch(gui.add_checkbox(name, True)) for name in names}
 
-    def look(self) -> Look:
+    def look(self) -> ViewSettings:
         """All that decides how a picture is shown."""
         cut = None
         if self.cut.value != "none":
@@ -96,14 +96,14 @@ class Panel:
             cut = axis, float(points.min() + self.place.value * np.ptp(points))
         hidden = frozenset(name for name, eye in self.eyes.items() if not eye.value)
         others = *(model.value for model in self.models), self.quantity.value
-        return Look(self.colour.value, hidden, cut, others)
+        return ViewSettings(self.colour.value, hidden, cut, others)
 
     def move_to(self, values: dict[str, float]) -> None:
         """Set controls."""
         for name, value in values.items():
             self.controls[name].value = value
 
-    def write(self, sides: list[Side], texts: list[str]) -> None:
+    def write(self, sides: list[ModelView], texts: list[str]) -> None:
         """Write the scale of the colours, the numbers of all muscles and texts."""
         colouring, units = COLOURINGS[self.colour.value], html.escape(self.source.units)
         bar = "" if colouring is None else legend(colouring, units, self.source.millimetre)
@@ -129,7 +129,7 @@ class Panel:
             f"{'<br>'.join(html.escape(text) for text in texts if text)}</div>"
         )
 
-    def plot_on(self, sides: list[Side]) -> None:
+    def plot_on(self, sides: list[ModelView]) -> None:
         """Go on with the plot of the quantity; begin anew where other lines are asked for."""
         from viser import uplot
 

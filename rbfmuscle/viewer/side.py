@@ -48,7 +48,7 @@ COLOURINGS = {
 }
 
 
-class Look(NamedTuple):
+class ViewSettings(NamedTuple):
     """Colouring, hidden muscles and bones, axis and place [scene unit] of a cut, choices that ask
     for a new picture.
     """
@@ -125,7 +125,7 @@ def _make_matt(tree: Any) -> None:
     tree["meshes"][0]["primitives"][0]["material"] = 0
 
 
-class Side:
+class ModelView:
     """A model, or a run, under a node of a viser server; in metres, as the browser shows nothing
     far away.
 
@@ -164,7 +164,7 @@ class Side:
         self.frame.visible = figure is not None
         return True
 
-    def draw(self, look: Look, probes: list[BoneDistance], other: Picture | None) -> None:
+    def draw(self, look: ViewSettings, probes: list[BoneDistance], other: Picture | None) -> None:
         """Show the picture; ``other`` is that of the model beside this one."""
         from viser.transforms import SO3
 
@@ -203,7 +203,7 @@ class Side:
             # The inside is seen in a cut alone, and software drawing pays for it.
             node.side = "front" if look.cut is None else "double"
 
-    def _draw_fibres(self, look: Look) -> None:
+    def _draw_fibres(self, look: ViewSettings) -> None:
         """Show fibres as lines where they are asked for, coloured by their stretch."""
         for name, fibres in self.picture.fibres.items():
             shown = look.colour == "fibres" and name not in look.hidden

@@ -89,7 +89,7 @@ class LiveSource:
         self.colours = muscle_colours(list(self.muscles), groups)
         coarse = {name: clustered(*mesh, REST_TRIANGLES) for name, mesh in self.muscles.items()}
         self.rest = Picture(bone_poses(scene, {}), coarse, {}, {}, {}, "")
-        session = LiveSession(scene, fields={})
+        session = LiveSession(scene, bone_sdfs={})
         self.controls = {
             name: _coordinate(scene, name, (*limits, session.rest[name]))
             for name, limits in session.limits.items()
@@ -110,7 +110,7 @@ class LiveSource:
     def figure(self, choice: str) -> "LiveFigure":
         """A model of every muscle, at rest."""
         scene = self.scene if choice == self.choices[0] else self.scene.with_options(model=choice)
-        return LiveFigure(LiveSession(scene, fields=self.fields), build_models(scene))
+        return LiveFigure(LiveSession(scene, bone_sdfs=self.fields), build_models(scene))
 
 
 def _coordinate(scene: Scene, name: str, numbers: tuple[float, ...]) -> Control:
@@ -157,7 +157,9 @@ class LiveFigure:
         """
         frame = self.session.advance(self.stride, surfaces=not coarse)
         self._unfinished = coarse
-        surfaces = {n: (s.vertices, s.faces) for n, s in frame.surfaces.items()} or frame.carried
+        surfaces = {
+            n: (s.vertices, s.faces) for n, s in frame.surfaces.items()
+        } or frame.material_meshes
         depths = {n: s.quantities.get("solver_penetration_max") for n, s in frame.surfaces.items()}
         meshes = {m.name: tendon_mesh(m, frame.tendons) for m in self.session.scene.muscles}
         tendons = {name: mesh for name, mesh in meshes.items() if mesh is not None}

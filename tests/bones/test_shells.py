@@ -90,10 +90,10 @@ def test_what_is_ignored_or_joined_is_said_and_beside_stays():
         ((ball(20), ball(12, (0, 0, 15))), "2 parts overlap, joined"),
     ):
         mesh = together(*shells)
-        read = prepare_mesh(mesh.vertices, mesh.faces, place="a", name="b", may_be_open=True)
+        read = prepare_mesh(mesh.vertices, mesh.faces, context="a", name="b", may_be_open=True)
         assert any(words in note for note in read.notes), read.notes
     beside = together(ball(20), ball(12, inward=True), sesamoid)
-    read = prepare_mesh(beside.vertices, beside.faces, place="a", name="b", may_be_open=True)
+    read = prepare_mesh(beside.vertices, beside.faces, context="a", name="b", may_be_open=True)
     assert read.mesh.volume == pytest.approx(ball(20).volume + sesamoid.volume, rel=1e-9)
     assert Bone("foot", read.mesh).distances([[0, 40, 0]]) == pytest.approx(-5, abs=FACETING)
 

@@ -30,7 +30,7 @@ DATA = ROOT / "tests" / "data" / "contraction_spindle.npz"
 
 
 def carried(run, frame):
-    return run.frames[frame].carried[MUSCLE][0]
+    return run.frames[frame].material_meshes[MUSCLE][0]
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -41,7 +41,9 @@ def test_activation_zero_changes_nothing_to_the_last_digit(model):
     phantom.muscles[0].contraction = ContractionTable(activation=0.0)
     active = rm.simulate(phantom, model=model)
     for one, other in zip(plain.frames, active.frames):
-        assert np.array_equal(one.carried["extensor"][0], other.carried["extensor"][0])
+        assert np.array_equal(
+            one.material_meshes["extensor"][0], other.material_meshes["extensor"][0]
+        )
         assert np.array_equal(
             one.surfaces["extensor"].vertices, other.surfaces["extensor"].vertices
         )
@@ -68,7 +70,7 @@ def test_snapshot_holds_the_activation():
     scene = spindle_scene(model="rbf", frames=2, spacing=6.0)
     model = build_model(scene.muscles[0], scene, "rbf")
     names = [bone.name for bone in scene.bones]
-    contacts = BoneContacts(names, [None] * len(names), contact_bone=model.contact_bone)
+    contacts = BoneContacts(names, [None] * len(names), attached_bone=model.attached_bone)
 
     def solved():
         model.predict(contacts.poses, contacts.poses)

@@ -16,10 +16,12 @@ from rbfmuscle.implicit.extraction.surface import Grid, LevelSet
 CENTRE = np.array([1.0, 2.0, 3.0])
 
 
-def extract_surface(field, *, cut=None, **options):
+def extract_surface(field, *, clip_distance=None, **options):
     """The library's, of formulas too."""
-    field, cut = (Formula(part) if inspect.isfunction(part) else part for part in (field, cut))
-    return extraction.extract_surface(field, cut=cut, **options)
+    field, clip_distance = (
+        Formula(part) if inspect.isfunction(part) else part for part in (field, clip_distance)
+    )
+    return extraction.extract_surface(field, clip_distance=clip_distance, **options)
 
 
 def sphere(radius=50.0, centre=CENTRE):
@@ -84,7 +86,7 @@ def test_any_pattern_of_signs_gives_a_closed_manifold(seed):
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.3])
 def test_mesh_gets_the_wanted_volume(factor, cut):
     wanted = factor * 4 / 3 * np.pi * 50.0**3
-    surface = extract_surface(sphere(), points=on_sphere(), volume=wanted, cut=cut)
+    surface = extract_surface(sphere(), points=on_sphere(), volume=wanted, clip_distance=cut)
     mesh = check_closed(surface)
     assert mesh.volume == pytest.approx(wanted, rel=1e-9)
     value = sphere()(surface.vertices) - surface.level

@@ -352,7 +352,7 @@ def test_nothing_is_left_behind_that_does_not_load(tmp_path):
     dot.export(tmp_path / "sacrum.ply")
     dot.export(tmp_path / "gracilis.ply")
     guess = guess_scene(tmp_path, None, tmp_path)
-    assert guess.parts.left_out == ["sacrum"] and "sacrum.ply" in guess.parts.unusable
+    assert guess.parts.missing_bones == ["sacrum"] and "sacrum.ply" in guess.parts.unusable
     guess.muscles[0].holds[0].vertices = guess.muscles[0].holds[1].vertices
     name = guess.muscles[0].muscle.name
     scene = _write(guess, tmp_path / "scene.toml")
@@ -389,9 +389,9 @@ def test_meshes_in_metres_make_a_scene_that_runs_and_an_unused_bone_is_in_the_ve
     assert len(Run.load(out).frames) == 5
     assert "the bones, bones left out (sacrum) 1 at frame 0 (limit 0)" in verdict
     code, _, err = call(
-        capsys, *run, "--set", "output.surfaces=false", "--fail-on", "bones_left_out"
+        capsys, *run, "--set", "output.surfaces=false", "--fail-on", "missing_bones"
     )
-    assert code == 6 and "bones_left_out = 1 > 0" in err and not Run.load(out).has_surfaces
+    assert code == 6 and "missing_bones = 1 > 0" in err and not Run.load(out).has_surfaces
 
 
 def test_header_counts_and_bones_against_it_are_named(leg):

@@ -42,7 +42,7 @@ TABLE = {
     "tunnelled": (0, 1),
     "bone_overlap": (0.0, 0.06),
     "joint_gap": (5.0, 5.1),
-    "bones_left_out": (0, 1),
+    "missing_bones": (0, 1),
     "tendon_depth": (0.3, 0.31),
     "articular_share": (0.5, 0.51),
     "moment_arm_jump": (10.0, 10.1),

@@ -289,7 +289,7 @@ class TestRows:
         moved.poses = {name: move @ pose for name, pose in moved.poses.items()}
         vertices = trimesh.transform_points(frame.surfaces["rod"].vertices, move)
         moved.surfaces = {"rod": ModelSurface(vertices, frame.surfaces["rod"].faces, {})}
-        moved.carried = {"rod": (vertices, frame.carried["rod"][1])}
+        moved.material_meshes = {"rod": (vertices, frame.material_meshes["rod"][1])}
         before, after = (measures.measure(each)["rod"] for each in (frame, moved))
         for name in ("volume", "penetration_max", "penetration_fraction", "length", "components"):
             assert after[name] == pytest.approx(before[name], rel=1e-8)

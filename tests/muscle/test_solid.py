@@ -51,7 +51,7 @@ class Bar:
         )
         self.model = model if tension else model._replace(end=np.full_like(model.end, -1))
         self.state = rest_state(model)
-        self.contacts = BoneContacts([], [], contact_bone=owner)
+        self.contacts = BoneContacts([], [], attached_bone=owner)
         self.rounded = round_bones({}, frame, 1.0, {})
         self.poses = np.array([np.eye(4), np.eye(4)])
 
@@ -320,7 +320,7 @@ def test_one_pose_has_one_shape(name):
         scene.set_motion(waypoints=waypoints, step=step)
         last = len(scene.motion.frames) - 1
         (frame,) = simulate_frames(scene, build_models(scene), surfaces=False, written={last})
-        found.append(frame.carried[name][0])
+        found.append(frame.material_meshes[name][0])
     # mm; the requirement is 0.2, measured 0.04.
     assert max(np.sqrt(((a - b) ** 2).sum(axis=1).mean()) for a in found for b in found) < 0.1
 

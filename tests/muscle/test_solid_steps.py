@@ -79,12 +79,12 @@ def test_one_contact_takes_its_share_up_to_the_greatest_force():
 
 def test_contact_forces_and_gaps_are_complementary(rng):
     root = rng.normal(size=(6, 6))
-    gram = root @ root.T + 3.0 * np.eye(6)
+    delassus = root @ root.T + 3.0 * np.eye(6)
     need = rng.normal(size=6)
     force = np.zeros(6)
-    assert solve_forces(gram, need, force, 1000, 1e-12, np.full(6, np.inf))
-    assert not solve_forces(gram, need, np.zeros(6), 1, 1e-12, np.full(6, np.inf))
-    slack = gram @ force - need
+    assert solve_forces(delassus, need, force, 1000, 1e-12, np.full(6, np.inf))
+    assert not solve_forces(delassus, need, np.zeros(6), 1, 1e-12, np.full(6, np.inf))
+    slack = delassus @ force - need
     assert slack.min() > -1e-10 and force.min() >= 0.0 and abs(slack @ force) < 1e-10
 
 
@@ -177,13 +177,13 @@ def test_responses_are_those_of_the_inverse_and_their_gram_is_symmetric(rng, cel
     assert sound
     factor = np.tril(metric.factor)
     response = np.einsum("ro,oan->ran", factor, metric.response)
-    gram = factor @ factor.T - np.diag([0.3, 2.0])
+    delassus = factor @ factor.T - np.diag([0.3, 2.0])
     for r in range(2):
         force, motion = np.zeros((5, 3)), rng.normal(size=(5, 3))
         press(np.eye(2)[r], given, gradient, force)
         np.testing.assert_allclose(response[r].T, inverse @ force, atol=1e-12)
         swollen = swell(np.ascontiguousarray(response[r].T), given, gradient)
-        np.testing.assert_allclose(gram[r], swollen, rtol=2e-9)
+        np.testing.assert_allclose(delassus[r], swollen, rtol=2e-9)
         # Pressing and swelling are transposes.
         assert np.vdot(force, motion) == pytest.approx(swell(motion, given, gradient)[r])
     # Twice the same region, that gives way the wrong way, has no factor.
@@ -207,12 +207,12 @@ def test_embedded_points_and_their_mobility(rng, system):
 @pytest.mark.parametrize("yielding", [0.0, 0.03])
 def test_contact_meets_the_laws_and_keeps_every_region(rng, system, yielding):
     """Complementarity of gaps and forces, two regions, pressures whitened: responses have the
-    identity as gram.
+    identity as delassus.
     """
     pulls = rng.normal(size=(2, CENTRES, 3))
     moved = np.einsum("ij,rja->ria", system.inverse, pulls)
-    gram = np.einsum("ria,sia->rs", pulls, moved)
-    factor = np.linalg.cholesky(gram)
+    delassus = np.einsum("ria,sia->rs", pulls, moved)
+    factor = np.linalg.cholesky(delassus)
     response = np.ascontiguousarray(np.einsum("rs,sia->rai", np.linalg.inv(factor), moved))
     metric = Metric(system.inverse, response, factor)
     s, near = system.touch, system.near

@@ -17,7 +17,7 @@ from rbfmuscle.output.animation.gltf import _key_name
 from rbfmuscle.output.animation.parts import AnimatedMesh, Animation
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.vtp import write_vtp
-from rbfmuscle.report.page import Page
+from rbfmuscle.report.page import ReportPage
 from rbfmuscle.run import Run
 from rbfmuscle.validation import MissingDependencyError, UsageError
 
@@ -307,7 +307,7 @@ def moving():
 @pytest.fixture(scope="module")
 def written(moving, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "knee.html"
-    Page("knee & calf", [], "", scene=page.pack_runs({"": moving})).write(path)
+    ReportPage("knee & calf", [], "", scene=page.pack_runs({"": moving})).write(path)
     return path
 
 

@@ -32,7 +32,7 @@ class Rig:
             self.model = PBDMuscle(muscle, self.scene, settings, method=method)
         names = [bone.name for bone in self.scene.bones]
         fields = [BoneSDF.from_mesh(bone.mesh, cache=False) for bone in self.scene.bones]
-        self.contacts = BoneContacts(names, fields, contact_bone=self.model.contact_bone)
+        self.contacts = BoneContacts(names, fields, attached_bone=self.model.attached_bone)
         self.at = self.poses(0.0)
 
     def poses(self, degrees):
@@ -77,7 +77,7 @@ def test_xpbd_does_not_depend_on_the_number_of_iterations():
 def test_sweeps_go_on_until_no_vertex_moves_by_more_than_the_tolerance(method):
     rig = Rig(method, tolerance=1e-5)
     rig.go(*range(2, 22, 2))
-    found = rig.model.surface(rig.contacts).quantities["sweeps"]
+    found = rig.model.surface(rig.contacts).quantities["solver_sweeps"]
     points, still = rig.model.points, rig.model.still
     before, rig.model.still = points.copy(), 1e-300
     assert 3 < found < 2000

@@ -11,7 +11,7 @@ from PIL import Image
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import muscle_groups
 from rbfmuscle.report import render
-from rbfmuscle.report.page import Cell, Page, Section, Table, limit_state
+from rbfmuscle.report.page import Cell, ReportPage, Section, Table, limit_state
 from rbfmuscle.report.report import write_report
 from rbfmuscle.validation import UsageError
 
@@ -108,6 +108,6 @@ def test_lights_are_green_amber_from_four_fifths_and_red_beyond():
 def test_names_stay_text(tmp_path):
     table = Table(["<b>"], [[Cell("<b>one")]])
     sections = [Section("<b>", table=table), Section("empty")]
-    Page("<b>", ["<b>"], "<b>", sections=sections).write(tmp_path / "a.html")
+    ReportPage("<b>", ["<b>"], "<b>", sections=sections).write(tmp_path / "a.html")
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "<b>" not in text and "&lt;b&gt;one" in text and "empty" not in text

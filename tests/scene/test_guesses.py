@@ -40,17 +40,17 @@ def test_picked_points_are_read_as_other_programs_write_them(tmp_path, head):
     lines = [("," if comma else " ").join(map(str, row)) for row in rows]
     file = tmp_path / "picked.csv"
     file.write_text(head + "\n".join(lines), encoding="utf-8")
-    np.testing.assert_array_equal(read_points(file, place=""), points)
+    np.testing.assert_array_equal(read_points(file, context=""), points)
 
 
 def test_picked_points_hold_the_vertices_about_them_and_no_other_muscle():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=5.0)
     points = 5.0 * np.array([[0, 0, 1], [0.2, 0, 0.98], [0, 0.2, 0.98]])
-    held = picked_vertices(points, ball.vertices, place="")
+    held = picked_vertices(points, ball.vertices, context="")
     away = np.linalg.norm(ball.vertices[held][:, None] - points, axis=2).min(axis=1)
     assert len(held) > 3 and away.max() < 0.6 * 1.05
     with pytest.raises(SceneError, match="away from the muscle"):
-        picked_vertices(points * 1000.0, ball.vertices, place="")
+        picked_vertices(points * 1000.0, ball.vertices, context="")
 
 
 def test_a_head_is_articular_and_a_far_end_is_not():

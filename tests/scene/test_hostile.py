@@ -148,7 +148,7 @@ class TestMeshes:
         for columns in ((34.0 + 0 * x, y, z), (34.0 + 0 * x, 34.0 + 0 * x, z), (x, y, folded)):
             with pytest.raises(MeshError, match="passes through itself"):
                 prepare_mesh(
-                    np.column_stack(columns), np.array(MESH.faces), place="a.ply", name="a"
+                    np.column_stack(columns), np.array(MESH.faces), context="a.ply", name="a"
                 )
 
     @pytest.mark.parametrize("value", [1e300, -1e38, np.nan, np.inf])
@@ -156,12 +156,12 @@ class TestMeshes:
         vertices = np.array(MESH.vertices)
         vertices[5, 1] = value
         with pytest.raises(MeshError, match=r"vertices are (further away|not finite).*number 5"):
-            prepare_mesh(vertices, np.array(MESH.faces), place="a.ply", name="a")
+            prepare_mesh(vertices, np.array(MESH.faces), context="a.ply", name="a")
 
     def test_surface_that_crosses_itself_a_little_is_noted(self):
         vertices = np.array(MESH.vertices)
         vertices[:40] += np.random.default_rng(1).normal(size=(40, 3)) * 6
-        notes = prepare_mesh(vertices, np.array(MESH.faces), place="", name="").notes
+        notes = prepare_mesh(vertices, np.array(MESH.faces), context="", name="").notes
         assert any("passes through itself" in note for note in notes)
 
     @pytest.mark.parametrize("kind", [0, 1, 2], ids=["points", "edges", "lines"])

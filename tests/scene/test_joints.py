@@ -13,7 +13,7 @@ from toy_scene import held
 
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.joints.functions import Linear, PiecewiseLinear, Polynomial, Spline
-from rbfmuscle.scene.joints.joint import KINDS, all_coordinates, resolve
+from rbfmuscle.scene.joints.joint import KINDS, all_coordinates, coordinate_values
 from rbfmuscle.scene.joints.tables import JointTable, joint_row
 from rbfmuscle.scene.motion import bone_poses, step_angle, turned_angle
 from rbfmuscle.scene.objects import Motion
@@ -173,9 +173,9 @@ class TestCoordinates:
         assert turned_angle(poses["d"][:3, :3]) == pytest.approx(
             4.0 * DEG
         )  # 5, of which 1 is at rest
-        assert resolve({}, all_coordinates(scene.joints), scene.couplings)["z.z"] == pytest.approx(
-            1.0 * DEG
-        )
+        assert coordinate_values({}, all_coordinates(scene.joints), scene.couplings)[
+            "z.z"
+        ] == pytest.approx(1.0 * DEG)
         with pytest.raises(SceneError, match="follows itself"):
             scene.add_coupling("x", ["z"])
         with pytest.raises(SceneError, match="follows other coordinates"):
@@ -196,7 +196,7 @@ class TestCoordinates:
             pair(axes={"q": (0, 0, 1)}, backward=True),
         ]
         for scene in scenes:
-            again = JointTable.build(joint_row(scene.joints[0]), place="").joint()
+            again = JointTable.build(joint_row(scene.joints[0]), context="").joint()
             other = Scene("other").add_bone("a", BOX).add_bone("b", BOX).add_joint(again)
             names = again.coordinates
             q = {f"j.{name}": 0.1 * (k + 1) for k, name in enumerate(names)}

@@ -176,7 +176,7 @@ class TestFileNames:
 
     def test_names_that_stay_apart_are_taken(self):
         scene = Scene(units="mm").add_bone("rib").add_bone("rib_1").add_bone("rib_x001")
-        assert scene.links == ["rib", "rib_1", "rib_x001"]
+        assert scene.meshless_bones == ["rib", "rib_1", "rib_x001"]
         # Of muscle and bone: a_b and c, a and b_c.
         assert attachment_file("a_b", "c") != attachment_file("a", "b_c")
 

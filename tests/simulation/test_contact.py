@@ -40,7 +40,7 @@ def _literal(contacts, poses, points, reach):
 @pytest.mark.parametrize("reach", [0.5, 3.0, 100.0])
 def test_half_spaces_are_all_pairs_nearer_than_reach(reach):
     attached = np.where(np.arange(400) % 3 == 0, 0, -1)  # which take no contact
-    contacts, poses = _pair(contact_bone=attached)
+    contacts, poses = _pair(attached_bone=attached)
     points, rng = _points(), np.random.default_rng(1)
     for _ in range(10):  # later calls rely on distances known from the earlier ones
         every = _literal(contacts, poses, points, reach)
@@ -54,7 +54,7 @@ def test_half_spaces_are_all_pairs_nearer_than_reach(reach):
 
 
 def test_planes_of_neighbours_come_behind_those_of_bones():
-    contacts, _ = _pair(contact_bone=np.full(400, -1))
+    contacts, _ = _pair(attached_bone=np.full(400, -1))
     points, rng = _points(), np.random.default_rng(4)
     bones = len(contacts.half_spaces(points, 0.5).index)
     contacts.neighbours = [Planes(), Planes(3.0)]
@@ -127,15 +127,15 @@ def test_kept_overlap_is_no_contact_and_deeper_is():
     ]
     made = scene(fields, [], [muscle("belly", mesh, ends)], [{}], initial="keep")
     model = ToyMuscle(made.muscles[0], made)
-    contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=model.contact_bone)
+    contacts = BoneContacts(list(fields), list(fields.values()), attached_bone=model.attached_bone)
     stepper = MuscleStepper(model, contacts, made)
     points = model.contact_points().copy()
     # Free points alone count.
     depth = stepper.contacts.depths(points)[0]
-    assert depth.max() == pytest.approx(2.0, abs=1e-9) and not depth[model.contact_bone >= 0].any()
+    assert depth.max() == pytest.approx(2.0, abs=1e-9) and not depth[model.attached_bone >= 0].any()
     resolve_initial_overlap(stepper)
     assert stepper.contacts.half_spaces(points, 0.5).gap.min() >= -1e-12
     assert stepper.contacts.half_spaces(points - [0, 0, 0.1], 0.5).gap.min() == pytest.approx(-0.1)
-    (frame,) = simulate_frames(made, [model], fields=fields)
+    (frame,) = simulate_frames(made, [model], bone_sdfs=fields)
     assert [event.action for event in frame.events] == ["overlap_kept"]
     assert np.array_equal(model.contact_points(), model.rest)

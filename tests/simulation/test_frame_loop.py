@@ -105,7 +105,7 @@ def test_failing_solve_keeps_the_frames(monkeypatch, count, breaks, error, messa
     parts = [_Breaking(made.muscles[0], made) for _ in range(count)]
     frames = []
     with pytest.raises(error, match=message):
-        for frame in simulate_frames(made, parts, fields=fields):
+        for frame in simulate_frames(made, parts, bone_sdfs=fields):
             frames.append(frame)
     assert [frame.index for frame in frames] == [0, 1, 2]
 
@@ -113,21 +113,21 @@ def test_failing_solve_keeps_the_frames(monkeypatch, count, breaks, error, messa
 def test_leaving_early_begins_no_frame_and_an_overlap_is_refused():
     made, fields = hinged_scene([0, 10, 20], initial="error")
     parts = [ToyMuscle(made.muscles[0], made) for _ in range(2)]
-    course = simulate_frames(made, parts, fields=fields)
+    course = simulate_frames(made, parts, bone_sdfs=fields)
     next(course)
     course.close()
     assert parts[0].solves == 0
     made.muscles[0].mesh.apply_translation([0, -4.0, 0])
     with pytest.raises(SceneError, match="overlaps bone 'trunk' at rest"):
-        FrameLoop(made, [ToyMuscle(made.muscles[0], made) for _ in range(3)], fields=fields)
+        FrameLoop(made, [ToyMuscle(made.muscles[0], made) for _ in range(3)], bone_sdfs=fields)
 
 
 def test_frames_that_are_skipped_leave_the_muscle_where_shown_ones_would():
     made, fields = hinged_scene([0, 10, 20, 30], tunnelling=TunnellingOptions())
     shown, skipping = (ToyMuscle(made.muscles[0], made) for _ in range(2))
-    loop = FrameLoop(made, [shown], fields=fields)
+    loop = FrameLoop(made, [shown], bone_sdfs=fields)
     frames = [loop.advance(coordinates) for coordinates in made.motion.frames]
-    loop = FrameLoop(made, [skipping], fields=fields)
+    loop = FrameLoop(made, [skipping], bone_sdfs=fields)
     for coordinates in made.motion.frames[:-1]:
         loop.skip(coordinates)
     last = loop.advance(made.motion.frames[-1])

@@ -149,4 +149,6 @@ def test_a_pose_is_the_same_whatever_was_solved_before(model):
     again = solve_pose(scene, models, POSE)
     (alone, _) = simulate_frames(scene, build_models(scene))
     for frame in (again, alone):
-        np.testing.assert_array_equal(frame.carried["extensor"][0], first.carried["extensor"][0])
+        np.testing.assert_array_equal(
+            frame.material_meshes["extensor"][0], first.material_meshes["extensor"][0]
+        )

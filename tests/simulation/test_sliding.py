@@ -25,7 +25,7 @@ def _model(mesh):
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     return SimpleNamespace(
         vertices=vertices,
-        contact_bone=np.full(len(vertices), -1),
+        attached_bone=np.full(len(vertices), -1),
         contact_points=lambda: vertices,
         material_mesh=lambda: (vertices, faces),
     )
@@ -79,14 +79,14 @@ def test_surface_follows_the_model_and_asks_only_what_it_is_asked():
 def _run(angles, sliding, **options):
     made, fields = toy.neighbour_scene(angles, sliding=sliding, **options)
     parts = toy.neighbour_parts(made)
-    return list(simulate_frames(made, parts.values(), fields=fields)), parts
+    return list(simulate_frames(made, parts.values(), bone_sdfs=fields)), parts
 
 
 def _overlap(parts):
     """Deepest free point of either muscle in the other."""
     deepest = 0.0
     for one, two in (("lower", "upper"), ("upper", "lower")):
-        points = parts[one].x[parts[one].contact_bone < 0]
+        points = parts[one].x[parts[one].attached_bone < 0]
         distance = igl.signed_distance(points, parts[two].x, parts[two].faces)[0]
         deepest = max(deepest, -distance.min())
     return deepest
@@ -184,7 +184,9 @@ def test_drawn_surfaces_yield_by_half_of_their_overlap():
     made, fields = toy.neighbour_scene([{}], sliding=SlidingOptions(), gap=-0.6)
     steppers = []
     for part in [toy.ToyMuscle(m, made) for m in made.muscles]:
-        contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=part.contact_bone)
+        contacts = BoneContacts(
+            list(fields), list(fields.values()), attached_bone=part.attached_bone
+        )
         steppers.append(MuscleStepper(part, contacts, made))
     Sliding(made, steppers).finish_frame()
     for stepper, other in (steppers, steppers[::-1]):
@@ -227,8 +229,8 @@ def test_points_near_a_bone_may_be_held_there(monkeypatch):
         )
         part = toy.ToyMuscle(made.muscles[0], made)
         near = fields["plate"].distance(part.rest) < 2.0
-        list(simulate_frames(made, [part], fields=fields))
-        return fields["plate"].distance(part.x[near & (part.contact_bone < 0)]).max()
+        list(simulate_frames(made, [part], bone_sdfs=fields))
+        return fields["plate"].distance(part.x[near & (part.attached_bone < 0)]).max()
 
     assert lifted(None) > 3.5
     assert lifted(SlidingOptions(bones=True)) < 3.2
@@ -257,7 +259,7 @@ def _spike_into_a_belly(sliding):
     frames = [{"hinge.press": np.radians(angle)} for angle in range(0, 9, 2)]
     made = toy.scene(fields, [hinge], muscles, frames, sliding=sliding)
     parts = toy.neighbour_parts(made)
-    list(simulate_frames(made, parts.values(), fields=fields))
+    list(simulate_frames(made, parts.values(), bone_sdfs=fields))
     return -igl.signed_distance(parts["spike"].x, parts["belly"].x, parts["belly"].faces)[0].min()
 
 

@@ -108,7 +108,7 @@ def test_paths_that_are_called_clear_neither_touch_nor_turn(step):
 def test_angle_test_alone_decides_where_it_is_asked_for():
     start = np.array([[-1.1, 0.0, 0.0], [-1.1, 0.5, 0.0], [-1.1, 1.1, 0.0]])
     end = start * [-1.0, 1.0, 1.0]
-    contacts = BoneContacts(["bone"], [cylinder(1.0)], contact_bone=np.full(3, -1))
+    contacts = BoneContacts(["bone"], [cylinder(1.0)], attached_bone=np.full(3, -1))
     poses = {"bone": np.eye(4)}, {"bone": np.eye(4)}
     contacts.move(poses[1])
     found = {}
@@ -172,7 +172,7 @@ def _swing(action):
     made = scene(fields, [hinge], [muscle("bag", mesh, ends)], [{}], tunnelling=options)
     model = ToyMuscle(made.muscles[0], made)
     model.reach = 15.0
-    contacts = BoneContacts(list(fields), list(fields.values()), contact_bone=model.contact_bone)
+    contacts = BoneContacts(list(fields), list(fields.values()), attached_bone=model.attached_bone)
     stepper = MuscleStepper(model, contacts, made)
     start = model.x.copy()
     before, after = {"hinge.turn": 0.0}, {"hinge.turn": np.radians(40)}

@@ -16,7 +16,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import rbfmuscle as rm
-from rbfmuscle.viewer.page import Page
+from rbfmuscle.viewer.page import ViewerPage
 from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.sources import LiveSource
 
@@ -28,7 +28,7 @@ SLOW = 120  # A busy machine may take this long [s].
 @pytest.fixture(scope="module")
 def page():
     scene = rm.phantom_scene(end=8.0, step=2.0, spacing=6.0)
-    made = Page(LiveSource(scene, "pbd"))
+    made = ViewerPage(LiveSource(scene, "pbd"))
     yield made
     made.close()
 
@@ -107,7 +107,7 @@ def test_dragging_a_slider_moves_number_muscles_and_picture_and_a_reload_keeps_t
     assert 21 < value < 27
     wait_for(lambda: abs(degrees(page) - value) < 1e-6, SLOW)
     assert changed(before, canvas(tab)) > 0.01
-    tab.call("Page.reload")
+    tab.call("ViewerPage.reload")
     wait_for(lambda: (tab.slider(FLEXION) or [None])[0] == value and "extensor" in tab.text(), SLOW)
 
 

@@ -19,7 +19,7 @@ from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture
 @pytest.fixture
 def figure():
     scene, fields = toy_scene.hinged_scene([0, 20, 40])
-    session = LiveSession(scene, fields=fields)
+    session = LiveSession(scene, bone_sdfs=fields)
     return LiveFigure(session, [toy_scene.ToyMuscle(m, scene) for m in scene.muscles])
 
 
@@ -52,7 +52,7 @@ def test_control_moves_the_muscle_by_sub_steps(figure):
 def test_live_equals_a_run(figure):
     scene, fields = toy_scene.hinged_scene([0, 2, 4, 6])
     models = [toy_scene.ToyMuscle(m, scene) for m in scene.muscles]
-    run = list(simulate_frames(scene, models, fields=fields))
+    run = list(simulate_frames(scene, models, bone_sdfs=fields))
     go(figure)
     figure.set("hinge.bend", 6.0)
     picture, _ = go(figure)

@@ -20,14 +20,14 @@ class Projector:
     def __init__(
         self,
         field: Field,
-        cut: ClipDistance | None,
+        clip_distance: ClipDistance | None,
         vertices: Floats,
         spacing: float,
         near_cut: Booleans,
     ) -> None:
         self.vertices, self.spacing = vertices, spacing
         self._field = field
-        self._cut = cut
+        self._clip_distance = clip_distance
         self._near_cut = near_cut
         self.slope = np.zeros(len(vertices))
         self._direction = np.zeros_like(vertices)
@@ -42,7 +42,7 @@ class Projector:
             self.slope[todo] = 1.0 / np.sqrt(square)
             self._direction[todo] = gradient / square[:, None]
             step = (level - f)[:, None] * self._direction[todo]
-            if self._cut is not None:
+            if self._clip_distance is not None:
                 self._turn_to_cut(todo, (f - level) * self.slope[todo], step, on_field)
             length = np.sqrt(np.einsum("nd,nd->n", step, step))
             share = np.minimum(1.0, self.spacing / np.maximum(length, 1e-300))
@@ -60,10 +60,10 @@ class Projector:
         surface.
         """
         rows = np.flatnonzero(self._near_cut[todo])
-        if self._cut is None or len(rows) == 0:
+        if self._clip_distance is None or len(rows) == 0:
             return
         where = self.vertices[todo[rows]]
-        distance, outward = self._cut.value_and_gradient_below(where, -height[rows])
+        distance, outward = self._clip_distance.value_and_gradient_below(where, -height[rows])
         on_cut = height[rows] < -distance
         on_field[todo[rows]] = ~on_cut
         step[rows[on_cut]] = _way_out(distance[on_cut], outward[on_cut])
@@ -99,11 +99,13 @@ class Projector:
                 push_off_loop(self.vertices, faces, grid, pose, tolerance, moved)
             rows = np.flatnonzero(moved)
             self._hold(rows)
-            if self._cut is None or len(rows) == 0:
+            if self._clip_distance is None or len(rows) == 0:
                 break
             # What was pushed off one bone vertex must not end in the bone beside it.
             where = self.vertices[rows]
-            distance, outward = self._cut.value_and_gradient_below(where, np.zeros(len(rows)))
+            distance, outward = self._clip_distance.value_and_gradient_below(
+                where, np.zeros(len(rows))
+            )
             inside = distance < 0.0
             self.vertices[rows[inside]] += _way_out(distance[inside], outward[inside])
 

@@ -108,12 +108,12 @@ class LevelSet:
     inside.
     """
 
-    def __init__(self, grid: Grid, field: Field, cut: ClipDistance | None = None) -> None:
+    def __init__(self, grid: Grid, field: Field, clip_distance: ClipDistance | None = None) -> None:
         self.grid = grid
         self.field = field
-        self.cut = cut
+        self.clip_distance = clip_distance
         self._f = grid.evaluate(field)
-        self._c = None if cut is None else grid.evaluate(cut)
+        self._c = None if clip_distance is None else grid.evaluate(clip_distance)
 
     def march(self, level: float) -> tuple[Floats, Integers]:
         """Vertices (n, 3) in grid coordinates and outward triangles (m, 3), if any, closed but on
@@ -209,7 +209,7 @@ def extract_surface(
     *,
     points: ArrayLike,
     resolution: int = 48,
-    cut: ClipDistance | None = None,
+    clip_distance: ClipDistance | None = None,
     volume: float | None = None,
     level: float = 0.0,
     axes: ArrayLike | None = None,
@@ -237,7 +237,9 @@ def extract_surface(
     padding, most = 3, int(resolution) // 2
     while True:
         grid = Grid.around(points, resolution=resolution, padding=padding, axes=axes)
-        surface = _reach_volume(LevelSet(grid, field, cut), points, target, level, obstacles or [])
+        surface = _reach_volume(
+            LevelSet(grid, field, clip_distance), points, target, level, obstacles or []
+        )
         if surface is not None:
             return surface
         if padding >= most:
@@ -261,9 +263,9 @@ def _reach_volume(
         near_cut = np.zeros(
             len(vertices), dtype=np.bool_
         )  # what a shift by a cell may bring to the cut
-        if level_set.cut is not None:
-            near_cut = np.asarray(level_set.cut(vertices) < NEAR_CUT * spacing)
-        projector = Projector(level_set.field, level_set.cut, vertices, spacing, near_cut)
+        if level_set.clip_distance is not None:
+            near_cut = np.asarray(level_set.clip_distance(vertices) < NEAR_CUT * spacing)
+        projector = Projector(level_set.field, level_set.clip_distance, vertices, spacing, near_cut)
         projector.project(level)
         step = 0.0 if target is None else projector.volume_step(faces, target)
         for _ in range(4):

@@ -240,9 +240,9 @@ def _head(guess):
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
     row = {"format": 1, "name": name, "units": parts.units}
     comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
-    if parts.left_out:
-        row["left_out"] = parts.left_out
-        comments["left_out"] = (
+    if parts.missing_bones:
+        row["missing_bones"] = parts.missing_bones
+        comments["missing_bones"] = (
             "bones whose meshes cannot be used; every run counts them as beyond its limits"
         )
     if parts.notes:

@@ -80,7 +80,7 @@ class Part:
 class Parts:
     """What is in a folder, and the unit of its lengths.
 
-    ``unusable`` gives reasons by file, ``left_out`` names those that are no muscles;
+    ``unusable`` gives reasons by file, ``missing_bones`` names those that are no muscles;
     ``notes`` name what was left out, misspelt or made coarser, and the unit where it was guessed.
     """
 
@@ -88,7 +88,7 @@ class Parts:
     bones: list[Part] = field(default_factory=list)
     muscles: list[Part] = field(default_factory=list)
     unusable: dict[str, str] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
+    missing_bones: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -119,7 +119,7 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
             )
         except MeshError as error:
             found.unusable[path.name] = str(error).removeprefix(f"{path}: ")
-            found.left_out += [stem] if tissue != "muscle" else []
+            found.missing_bones += [stem] if tissue != "muscle" else []
             continue
         if facts.part:
             part.doubt = (
@@ -160,7 +160,7 @@ def _sort_unknown(found, unknown):
 def _can_be_muscle(part):
     """Whether a mesh is one closed surface."""
     try:
-        prepare_mesh(part.mesh.vertices, part.mesh.faces, place=part.file, name=part.name)
+        prepare_mesh(part.mesh.vertices, part.mesh.faces, context=part.file, name=part.name)
     except MeshError:
         return False
     return True
@@ -209,7 +209,7 @@ def _read_part(path, stem, mesh, base, names, facts, found, *, closed):
         words = f"{len(faces)} triangles, made coarser to about {MOST_TRIANGLES}"
         found.notes.append(f"{path.name}: {words}")
         vertices, faces = clustered(vertices, faces, MOST_TRIANGLES)
-    read = prepare_mesh(vertices, faces, place=str(path), name=stem, may_be_open=not closed)
+    read = prepare_mesh(vertices, faces, context=str(path), name=stem, may_be_open=not closed)
     read.notes[:0] = mesh.notes
     file = os.path.relpath(path, base).replace(os.sep, "/")
     return Part(name, file, read, facts.bone, facts.side, facts=facts.muscle, coarse=coarse)
@@ -239,7 +239,7 @@ def _leave_out_wrong_sizes(found):
         if not SMALLEST_MM <= bone.size / found.millimetre <= LARGEST_MM:
             words = f"it is {bone.size:.4g} {found.units} across"
             found.bones.remove(bone)
-            found.left_out.append(bone.name)
+            found.missing_bones.append(bone.name)
             found.unusable[Path(bone.file).name] = words
     if not found.bones:
         raise UsageError(f"{bone.file} cannot be a bone: {words}; correct --units")

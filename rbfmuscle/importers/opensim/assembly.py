@@ -68,14 +68,14 @@ def _meet_welds(model):
     rings = [joints_between(walk, weld.parent, weld.child) for weld in model.welds]
     welds = [weld for weld, ring in zip(model.welds, rings) if ring]
     followers = {coupling.coordinate for coupling in model.couplings}
-    facts = model.coordinates()
+    known = model.coordinates()
     wanted = {name for ring in rings for name in _moving(ring)}
     for coupling in reversed(model.couplings):
         wanted |= set(coupling.of) if coupling.coordinate in wanted else set()
-    names = [n for n in facts if n in wanted and n not in followers and not facts[n].locked]
+    names = [n for n in known if n in wanted and n not in followers and not known[n].locked]
     if not welds:
         return
-    start = np.array([facts[name].rest for name in names])
+    start = np.array([known[name].rest for name in names])
 
     def apart(values):
         places = model.transforms(dict(zip(names, values.tolist())), welds=False)

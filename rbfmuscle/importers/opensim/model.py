@@ -9,7 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.scene.joints.joint import Coordinate, Coupling, Joint, all_coordinates, resolve
+from rbfmuscle.scene.joints.joint import (
+    Coordinate,
+    Coupling,
+    Joint,
+    all_coordinates,
+    coordinate_values,
+)
 from rbfmuscle.scene.joints.tables import full_name
 
 GROUND = "ground"
@@ -146,9 +152,9 @@ class OsimModel:
         """Every coordinate's value by its full name; bare names may be given where one joint has
         them.
         """
-        facts = self.coordinates()
-        asked = {full_name(n, list(facts), place="pose"): v for n, v in (values or {}).items()}
-        return resolve(asked, facts, self.couplings)
+        known = self.coordinates()
+        asked = {full_name(n, list(known), context="pose"): v for n, v in (values or {}).items()}
+        return coordinate_values(asked, known, self.couplings)
 
     def transforms(
         self, values: Mapping[str, float] | None = None, *, welds: bool = True

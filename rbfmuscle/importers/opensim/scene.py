@@ -63,7 +63,7 @@ def import_osim(
             notes += [f"body {body!r}: {note}" for note in meshes[body].notes]
         else:
             scene.add_bone(body)
-            scene.left_out += [body] if any(mesh.body == body for mesh in model.meshes) else []
+            scene.missing_bones += [body] if any(mesh.body == body for mesh in model.meshes) else []
     walk = model.walk()
     for joint, backward in walk.steps:
         parent, child = (joint.child, joint.parent) if backward else (joint.parent, joint.child)
@@ -157,7 +157,9 @@ def _body_meshes(
         faces = np.concatenate([part[1] + start for part, start in zip(found, starts)])
         source = ", ".join(part[2] for part in found)
         try:
-            meshes[body] = prepare_mesh(vertices, faces, place=source, name=body, may_be_open=True)
+            meshes[body] = prepare_mesh(
+                vertices, faces, context=source, name=body, may_be_open=True
+            )
         except MeshError as error:
             notes.append(f"body {body!r}: its meshes are not taken: {error}")
             continue
@@ -199,7 +201,7 @@ def write_scene(found: Imported, directory: Path, *, force: bool = False) -> Pat
     """
     directory, scene = Path(directory), found.scene
     facts = {"format": 1, "name": scene.name, "units": scene.units}
-    facts |= {"left_out": scene.left_out} if scene.left_out else {}
+    facts |= {"missing_bones": scene.missing_bones} if scene.missing_bones else {}
     facts |= {"doubts": scene.doubts} if scene.doubts else {}
     facts |= {"superior": scene.superior, "anterior": scene.anterior}
     with scene_folder(directory, force=force).staged(replaces=()) as stage:
@@ -209,7 +211,8 @@ def write_scene(found: Imported, directory: Path, *, force: bool = False) -> Pat
         parts = [_head(found), table_text("[scene]", facts)]
         parts += [table_text("[[bone]]", row) for row in bones]
         parts += [
-            table_text("[[bone]]   # no mesh: joints only", {"name": name}) for name in scene.links
+            table_text("[[bone]]   # no mesh: joints only", {"name": name})
+            for name in scene.meshless_bones
         ]
         parts += [table_text("[[joint]]", joint_row(joint)) for joint in scene.joints]
         parts += [

@@ -62,17 +62,19 @@ def _tendon(muscle: Muscle, given: TendonTable | None) -> Booleans:
     free = np.ones(len(muscle.mesh.vertices), dtype=bool)
     if given is None:
         return ~free
-    place = f"muscle {muscle.name!r} tendon"
+    context = f"muscle {muscle.name!r} tendon"
     bones = [attachment.bone for attachment in muscle.attachments]
     if given.at is not None and given.at not in bones:
-        raise SceneError(f"{place}: not attached to {given.at!r}, {did_you_mean(given.at, bones)}")
+        raise SceneError(
+            f"{context}: not attached to {given.at!r}, {did_you_mean(given.at, bones)}"
+        )
     start = np.concatenate([a.vertices for a in muscle.attachments if given.at in (None, a.bone)])
     tendon = _along_surface(muscle.mesh, start) <= given.length
     free[np.concatenate([a.vertices for a in muscle.attachments])] = False
     if not (free & ~tendon).any():
-        raise SceneError(f"{place}: covers all of the muscle, leave a belly that can contract")
+        raise SceneError(f"{context}: covers all of the muscle, leave a belly that can contract")
     if not (free & tendon).any():
-        raise SceneError(f"{place}: holds no vertex beyond the attachments, make it longer")
+        raise SceneError(f"{context}: holds no vertex beyond the attachments, make it longer")
     return tendon
 
 

@@ -51,7 +51,7 @@ def contraction_keys(given: Mapping[str, Any], *, muscle: str) -> ContractionTab
     given.
     """
     found = {key: value for key, value in given.items() if value is not None}
-    return ContractionTable.build(found, place=f"muscle {muscle!r} ") if found else None
+    return ContractionTable.build(found, context=f"muscle {muscle!r} ") if found else None
 
 
 class Contraction(NamedTuple):

@@ -67,7 +67,7 @@ class Coordinate:
     clamped: bool = False  # cut to the range; others may leave it, which is reported
     locked: bool = False  # stays at rest whatever is asked of it
 
-    def honoured(self, value: float) -> float:
+    def clamped_value(self, value: float) -> float:
         """Return what the coordinate becomes when ``value`` is asked of it."""
         if self.locked:
             return self.rest
@@ -206,13 +206,13 @@ def rotation_about(axis: ArrayLike, angle: float, centre: np.ndarray) -> np.ndar
 def all_coordinates(joints: list[Joint]) -> dict[str, Coordinate]:
     """Return every coordinate by its full name "joint.coordinate", in order."""
     return {
-        f"{joint.name}.{name}": facts
+        f"{joint.name}.{name}": coordinate
         for joint in joints
-        for name, facts in joint.coordinates.items()
+        for name, coordinate in joint.coordinates.items()
     }
 
 
-def resolve(
+def coordinate_values(
     asked: dict[str, float], coordinates: dict[str, Coordinate], couplings: list[Coupling]
 ) -> dict[str, float]:
     """Return the value that every coordinate takes when some are asked for, by the same names
@@ -222,8 +222,8 @@ def resolve(
     ones are at rest.
     """
     values = {
-        n: facts.honoured(asked[n]) if n in asked else facts.rest
-        for n, facts in coordinates.items()
+        n: coordinate.clamped_value(asked[n]) if n in asked else coordinate.rest
+        for n, coordinate in coordinates.items()
     }
     for coupling in couplings:  # in an order in which what they follow is known
         values[coupling.coordinate] = coupling.function(*(values[name] for name in coupling.of))
@@ -308,8 +308,8 @@ def bones_between(joints: list[Joint], bones: list[str]) -> set[str]:
 def joint_values(
     joints: list[Joint], couplings: list[Coupling], coordinates: dict[str, float]
 ) -> dict[str, dict[str, float]]:
-    """Return the values that `resolve` gives, by joint and bare name."""
-    values = resolve(coordinates, all_coordinates(joints), couplings)
+    """Return the values that `coordinate_values` gives, by joint and bare name."""
+    values = coordinate_values(coordinates, all_coordinates(joints), couplings)
     return {
         joint.name: {name: values[f"{joint.name}.{name}"] for name in joint.coordinates}
         for joint in joints

@@ -61,30 +61,30 @@ class FunctionTable(Table):
     piecewise: PointsTable | None = None
     spline: PointsTable | None = None
 
-    def function(self, inputs: list[str], output: str, *, place: str) -> Function:
+    def function(self, inputs: list[str], output: str, *, context: str) -> Function:
         """Return the function in inner units; ``inputs`` and ``output`` are kinds of motion, keys
         of `FACTORS`.
         """
         given = [name for name in FUNCTIONS if getattr(self, name) is not None]
         count, points = len(inputs), self.piecewise or self.spline
         if len(given) > 1:
-            raise SceneError(f"{place}: give one function, not {' and '.join(given)}")
+            raise SceneError(f"{context}: give one function, not {' and '.join(given)}")
         found: Function
         if self.constant is not None:
             found = Linear((), self.constant)
         elif count != 1 and (self.polynomial or points):
-            raise SceneError(f"{place}: {given[0]} is of 1 coordinate, {count} are given")
+            raise SceneError(f"{context}: {given[0]} is of 1 coordinate, {count} are given")
         elif self.polynomial is not None:
             found = Polynomial(tuple(self.polynomial))
         elif self.terms is not None:
-            found = _multivariate(self.terms, count, place)
+            found = _multivariate(self.terms, count, context)
         elif points is not None:
             found = (Spline if self.spline else PiecewiseLinear)(tuple(points.x), tuple(points.y))
         else:
             *slopes, constant = self.linear or [1.0, 0.0]
             if len(slopes) != count:
                 needed = f"a slope for each of {count} coordinates and a constant"
-                raise SceneError(f"{place}: linear needs {needed}, got {self.linear}")
+                raise SceneError(f"{context}: linear needs {needed}, got {self.linear}")
             found = Linear(tuple(slopes), constant)
         return found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
 
@@ -94,11 +94,11 @@ class FunctionTable(Table):
         return 1.0 if plain else (self.linear or [0.0])[0]
 
 
-def _multivariate(terms, count, place):
+def _multivariate(terms, count, context):
     for term in terms:
         if len(term) != count + 1 or any(power < 0 or power % 1 for power in term[1:]):
             needed = f"a coefficient and the whole powers of {count} coordinates"
-            raise SceneError(f"{place}: each of terms is {needed}, got {term}")
+            raise SceneError(f"{context}: each of terms is {needed}, got {term}")
     return Multivariate(tuple((c, *map(int, powers)) for c, *powers in terms))
 
 
@@ -154,38 +154,38 @@ class JointTable(Table):
 
     def joint(self) -> Joint:
         """Return the joint that the table describes, or raise SceneError naming it."""
-        place = f"joint {self.name!r}"
+        context = f"joint {self.name!r}"
         if self.centre is None and self.type != "fixed":
-            raise SceneError(f"{place}: centre is missing, give the joint's place at rest")
+            raise SceneError(f"{context}: centre is missing, give the joint's place at rest")
         if (self.radii or self.arc) and (self.type != "custom" or len(self.rotations) != 3):
-            raise SceneError(f"{place}: radii and arc need type 'custom' with three rotations")
+            raise SceneError(f"{context}: radii and arc need type 'custom' with three rotations")
         groups: dict[Any, list[AxisTable]] = {
             "rotation": self.rotations,
             "translation": self.translations,
         }
         if self.type != "custom":
-            groups = self._axes_of_kind(place)
+            groups = self._axes_of_kind(context)
         elif self.axes:
             raise SceneError(
-                f"{place}: a custom joint has rotations and translations instead of axes"
+                f"{context}: a custom joint has rotations and translations instead of axes"
             )
         tables = [(sort, table) for sort, group in groups.items() for table in group]
         named = dict.fromkeys(name for _, table in tables for name in table.coordinates)
         for name in self.coordinates:
             if name not in named:
                 hint = did_you_mean(name, list(named))
-                raise SceneError(f"{place}: coordinate {name!r} moves nothing, {hint}")
+                raise SceneError(f"{context}: coordinate {name!r} moves nothing, {hint}")
         slopes = [(sort, table.coordinates, table.slope()) for sort, table in tables]
         coordinates = {}
         for name in named:
             motion, table = motion_of(name, slopes), self.coordinates.get(name, CoordinateTable())
             if self.type != "custom" and table.motion not in (None, motion):
-                raise SceneError(f"{place}: {name!r} is a {motion} here, not a {table.motion}")
+                raise SceneError(f"{context}: {name!r} is a {motion} here, not a {table.motion}")
             coordinates[name] = table.coordinate(motion)
 
         def axis(motion, number, table):
             inputs = [coordinates[name].motion for name in table.coordinates]
-            function = table.function(inputs, motion, place=f"{place}: {motion} {number}")
+            function = table.function(inputs, motion, context=f"{context}: {motion} {number}")
             return TransformAxis(unit(table.axis), tuple(table.coordinates), function)
 
         turns, shifts = (
@@ -205,21 +205,21 @@ class JointTable(Table):
         motions = coordinates, turns, shifts, self.type, self.backward
         return Joint(self.name, *bones, centre, *motions, radii, self.arc)
 
-    def _axes_of_kind(self, place):
+    def _axes_of_kind(self, context):
         """Tables of the rotations and of the translations that the kind has, each of one
         coordinate.
         """
         kind = KINDS[self.type]
         if self.rotations or self.translations:
             raise SceneError(
-                f"{place}: rotations and translations belong to type 'custom', give axes"
+                f"{context}: rotations and translations belong to type 'custom', give axes"
             )
         axes = self.axes or dict(zip(self.coordinates, [*kind.rotations, *kind.translations]))
         count = len(axes) or len(self.coordinates)
         if not kind.least <= count <= kind.most:
             words = f"{kind.least}" if kind.least == kind.most else f"{kind.least} to {kind.most}"
             words = f"{words} coordinates, {count} are given; name them in axes"
-            raise SceneError(f"{place}: a {self.type} joint has {words}")
+            raise SceneError(f"{context}: a {self.type} joint has {words}")
         tables = [AxisTable(axis=list(axis), coordinates=[name]) for name, axis in axes.items()]
         turning = count if self.type == "ball" else len(kind.rotations)
         return {"rotation": tables[:turning], "translation": tables[turning:]}
@@ -238,25 +238,27 @@ def unit(axis: list[float]) -> tuple[float, float, float]:
     return x, y, z
 
 
-def full_name(name: str, known: list[str], *, place: str) -> str:
+def full_name(name: str, known: list[str], *, context: str) -> str:
     """Return "joint.coordinate"; a bare coordinate may stand for the only joint that has it."""
     if name in known:
         return name
     owners = [full for full in known if full.split(".", 1)[1] == name]
     if len(owners) == 1:
         return owners[0]
-    raise SceneError(f"{place}: unknown coordinate {name!r}, {did_you_mean(name, known)}")
+    raise SceneError(f"{context}: unknown coordinate {name!r}, {did_you_mean(name, known)}")
 
 
 def make_coupling(table: CouplingTable, joints: list[Joint]) -> Coupling:
     """Return the coupling that a table describes, names in full."""
     coordinates = all_coordinates(joints)
     known = list(coordinates)
-    target = full_name(table.coordinate, known, place="coupling")
-    place = f"coupling of {target!r}"
-    of = tuple(full_name(name, known, place=place) for name in table.of)
+    target = full_name(table.coordinate, known, context="coupling")
+    context = f"coupling of {target!r}"
+    of = tuple(full_name(name, known, context=context) for name in table.of)
     motions: list[Any] = [coordinates[name].motion for name in of]
-    return Coupling(target, of, table.function(motions, coordinates[target].motion, place=place))
+    return Coupling(
+        target, of, table.function(motions, coordinates[target].motion, context=context)
+    )
 
 
 def joint_row(joint: Joint) -> dict:
@@ -273,7 +275,10 @@ def joint_row(joint: Joint) -> dict:
     elif joint.coordinates:
         axes = zip(joint.coordinates, (*joint.rotations, *joint.translations))
         row["axes"] = {name: list(axis.direction) for name, axis in axes}
-    tables = {name: _coordinate_row(facts, joint.kind) for name, facts in joint.coordinates.items()}
+    tables = {
+        name: _coordinate_row(coordinate, joint.kind)
+        for name, coordinate in joint.coordinates.items()
+    }
     if joint.kind == "custom" or any(tables.values()):
         row["coordinates"] = tables
     if joint.backward:
@@ -287,20 +292,20 @@ def joint_row(joint: Joint) -> dict:
 
 def coupling_row(coupling: Coupling, joints: list[Joint]) -> dict:
     """Return a coupling as the plain table that makes it again."""
-    facts = all_coordinates(joints)
-    inputs = [facts[name].motion for name in coupling.of]
-    function = _function_row(coupling.function, inputs, facts[coupling.coordinate].motion)
+    known = all_coordinates(joints)
+    inputs = [known[name].motion for name in coupling.of]
+    function = _function_row(coupling.function, inputs, known[coupling.coordinate].motion)
     return {"coordinate": coupling.coordinate, "of": list(coupling.of), **function}
 
 
-def _coordinate_row(facts, kind):
-    factor = FACTORS[facts.motion]
-    row: dict[str, Any] = {"motion": facts.motion} if kind == "custom" else {}
-    if facts.rest:
-        row["rest"] = facts.rest / factor
-    if facts.range is not None:
-        row["range"] = [end / factor for end in facts.range]
-    row.update({key: True for key in ("clamped", "locked") if getattr(facts, key)})
+def _coordinate_row(coordinate, kind):
+    factor = FACTORS[coordinate.motion]
+    row: dict[str, Any] = {"motion": coordinate.motion} if kind == "custom" else {}
+    if coordinate.rest:
+        row["rest"] = coordinate.rest / factor
+    if coordinate.range is not None:
+        row["range"] = [end / factor for end in coordinate.range]
+    row.update({key: True for key in ("clamped", "locked") if getattr(coordinate, key)})
     return row
 
 

@@ -44,7 +44,7 @@ def read_mesh(
     with np.errstate(over="ignore", invalid="ignore"):
         vertices = part.vertices * scale
     read = prepare_mesh(
-        vertices, part.faces, place=str(path), name=name or path.stem, may_be_open=may_be_open
+        vertices, part.faces, context=str(path), name=name or path.stem, may_be_open=may_be_open
     )
     read.notes[:0] = part.notes
     read.source = str(path)
@@ -67,20 +67,20 @@ def as_mesh(
         return read_mesh(mesh, name=name, scale=scale, may_be_open=may_be_open)
     vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
     vertices = np.asarray(vertices, dtype=np.float64) * scale
-    place = f"mesh {name!r}"
+    context = f"mesh {name!r}"
     return prepare_mesh(
-        vertices, np.asarray(faces), place=place, name=name, may_be_open=may_be_open
+        vertices, np.asarray(faces), context=context, name=name, may_be_open=may_be_open
     )
 
 
 def prepare_mesh(
-    vertices: Floats, faces: Integers, *, place: str, name: str, may_be_open: bool = False
+    vertices: Floats, faces: Integers, *, context: str, name: str, may_be_open: bool = False
 ) -> ReadMesh:
-    """Return the ReadMesh of given arrays, mended like a file's; ``place`` begins each message."""
+    """Return the ReadMesh of given arrays, mended like a file's; ``context`` begins messages."""
     vertices, faces = np.asarray(vertices), np.asarray(faces)
     if not len(vertices) or not len(faces):
         raise MeshError(
-            f"{place}: the mesh is empty ({len(vertices)} vertices, {len(faces)} triangles)"
+            f"{context}: the mesh is empty ({len(vertices)} vertices, {len(faces)} triangles)"
         )
     used = np.zeros(len(vertices), dtype=bool)
     used[faces[(faces >= 0) & (faces < len(vertices))]] = True
@@ -92,14 +92,14 @@ def prepare_mesh(
         bad = np.flatnonzero(wrong.any(axis=1))
         if len(bad):
             raise MeshError(
-                f"{place}: {len(bad)} vertices are {words}, the first is number {bad[0]} "
+                f"{context}: {len(bad)} vertices are {words}, the first is number {bad[0]} "
                 f"{vertices[bad[0]].tolist()}; correct the scale, or export the mesh again"
             )
     try:
         vertices, faces = check_mesh(vertices, faces, name=name)
     except MeshError as error:
-        raise MeshError(f"{place}: {error}") from None
-    return repair(vertices, faces, place=place, may_be_open=may_be_open)
+        raise MeshError(f"{context}: {error}") from None
+    return repair(vertices, faces, context=context, may_be_open=may_be_open)
 
 
 def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Floats]:
@@ -108,33 +108,33 @@ def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Fl
 
     A JSON file holds ``{"polylines": [[[x, y, z], ...], ...]}`` or that list alone.
     """
-    place = f"muscle {muscle!r} fibres"
+    context = f"muscle {muscle!r} fibres"
     if isinstance(fibres, (str, Path)):
-        place, fibres = f"{place}: {fibres}", _read_lines(Path(fibres), f"{place}: ")
+        context, fibres = f"{context}: {fibres}", _read_lines(Path(fibres), f"{context}: ")
     lines = []
     for number, line in enumerate(fibres):
         try:
             points = check_points(line, name=f"polyline {number}")
         except (ValueError, TypeError) as error:
-            raise SceneError(f"{place}: {error}") from None
+            raise SceneError(f"{context}: {error}") from None
         kept = np.append(True, np.diff(points, axis=0).any(axis=1))[: len(points)]
         points = points[kept]  # none twice in a row
         if len(points) < 2:
             words = f"polyline {number} has {len(points)} points, a fibre needs two or more"
-            raise SceneError(f"{place}: {words}")
+            raise SceneError(f"{context}: {words}")
         lines.append(points * scale)
     if not lines:
-        raise SceneError(f"{place}: no polylines")
+        raise SceneError(f"{context}: no polylines")
     return lines
 
 
-def _read_lines(path, place):
-    text = read_text(path, place=place)
+def _read_lines(path, context):
+    text = read_text(path, context=context)
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise SceneError(f"{place}{path}: not JSON ({shown(str(error))})") from None
+        raise SceneError(f"{context}{path}: not JSON ({shown(str(error))})") from None
     lines = found.get("polylines") if isinstance(found, dict) else found
     if not isinstance(lines, list):
-        raise SceneError(f"{place}{path}: needs a list 'polylines'")
+        raise SceneError(f"{context}{path}: needs a list 'polylines'")
     return lines

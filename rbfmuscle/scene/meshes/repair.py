@@ -49,8 +49,10 @@ class ReadMesh:
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
-def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool = False) -> ReadMesh:
-    """Return the mesh closed, manifold and outward, with notes of what was done; ``place`` begins
+def repair(
+    vertices: Floats, faces: Integers, *, context: str, may_be_open: bool = False
+) -> ReadMesh:
+    """Return the mesh closed, manifold and outward, with notes of what was done; ``context`` begins
     each message.
 
     Holes and several parts are kept where it ``may_be_open`` (bones), and refused by a MeshError
@@ -67,7 +69,7 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
         _merge_equal(state)
         _drop_fins(state)
     if len(state.faces) == 0:
-        raise MeshError(f"{place}: nothing is left of the mesh without degenerate triangles")
+        raise MeshError(f"{context}: nothing is left of the mesh without degenerate triangles")
     _drop_crumbs(state)
     outer = outer_surface(vertices, state.faces)
     parts = int(_parts(outer.faces).max()) + 1
@@ -79,13 +81,13 @@ def repair(vertices: Floats, faces: Integers, *, place: str, may_be_open: bool =
     if not _is_closed(state.faces):
         if may_be_open:
             _drop_crowded(state)
-        _fill_holes(state, place)
-    _orient(state, place)
-    _check_closed(state, place, may_be_open)
+        _fill_holes(state, context)
+    _orient(state, context)
+    _check_closed(state, context, may_be_open)
     return state
 
 
-def _check_closed(state, place, may_be_open):
+def _check_closed(state, context, may_be_open):
     """Refuse or note holes, several parts and a surface without an inside."""
     edges, uses, _ = _edges(state.faces)
     border = edges[uses == 1]
@@ -97,27 +99,27 @@ def _check_closed(state, place, may_be_open):
             f"{z:.4g}))"
         )
         if not may_be_open:
-            raise MeshError(f"{place}: {words}; close its holes")
+            raise MeshError(f"{context}: {words}; close its holes")
         state.notes.append(words)
     elif not may_be_open:
         sizes = np.sort(np.bincount(_parts(state.faces)))[::-1]
         if len(sizes) > 1:
             raise MeshError(
-                f"{place}: the surface has {len(sizes)} separate parts (triangles: "
+                f"{context}: the surface has {len(sizes)} separate parts (triangles: "
                 f"{', '.join(map(str, sizes[:5]))}); a muscle is one closed surface, split or "
                 "join them"
             )
-        _check_inside(state, place)
+        _check_inside(state, context)
 
 
-def _check_inside(state, place):
+def _check_inside(state, context):
     """Refuse or note a surface that is closed and has no inside: flat or twisted, judged over all
     of its area.
     """
     wrong, volume = _twisted_share(state.mesh), float(_cones(state.vertices, state.faces).sum())
     if wrong > MOST_TWISTED:
         raise MeshError(
-            f"{place}: the surface is flat or passes through itself, {100 * wrong:.0f} % of it "
+            f"{context}: the surface is flat or passes through itself, {100 * wrong:.0f} % of it "
             "does not bound its "
             f"inside, so its volume ({volume:.4g}) means nothing; repair it, for instance by "
             "remeshing"
@@ -224,7 +226,7 @@ def _drop_crumbs(state):
         )
 
 
-def _fill_holes(state, place):
+def _fill_holes(state, context):
     """Close each hole whose rim is short, or of one or two missing triangles, by a fan about its
     centre.
     """
@@ -232,7 +234,7 @@ def _fill_holes(state, place):
     bad = edges[count > 2]
     if len(bad):
         raise MeshError(
-            f"{place}: {len(bad)} edges belong to more than two triangles (first: vertices "
+            f"{context}: {len(bad)} edges belong to more than two triangles (first: vertices "
             f"{bad[0, 0]} and "
             f"{bad[0, 1]}); make the surface manifold, for instance by remeshing"
         )
@@ -292,7 +294,7 @@ def _agree(faces):
     return not (sides[1:] == sides[:-1]).any()
 
 
-def _orient(state, place):
+def _orient(state, context):
     """Make neighbouring faces agree, then turn what was mended, or the whole, outward; consistent
     cavities stay.
     """
@@ -303,7 +305,7 @@ def _orient(state, place):
         oriented, part = igl.bfs_orient(faces)
         if not _agree(oriented):
             raise MeshError(
-                f"{place}: the surface has one side only (no consistent orientation); remesh it"
+                f"{context}: the surface has one side only (no consistent orientation); remesh it"
             )
     turned = (oriented != faces).any(axis=1)
     turned ^= (np.bincount(part, weights=turned) * 2 > np.bincount(part))[part]

@@ -137,4 +137,4 @@ def test_a_body_keeps_the_meshes_that_can_be_read_beside_one_that_cannot(small):
     assert sum("body 'thigh': mesh 'bad.obj' is not taken" in note for note in found.notes) == 1
     (small.parent / "wedge.obj").write_text(torn)
     scene = import_osim(small).scene
-    assert not scene.bones and "thigh" in scene.left_out
+    assert not scene.bones and "thigh" in scene.missing_bones
