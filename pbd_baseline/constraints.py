@@ -7,7 +7,6 @@ a vertex is held.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -100,7 +99,7 @@ class VolumeConstraint:
             points += step * ((self.rest - self.volume(points)) / slope)
 
     def restore(
-        self, points: Floats, direction: Floats, *, clear_way: Callable[..., Any] | None = None
+        self, points: Floats, direction: Floats, *, clear_way: Callable[..., object] | None = None
     ) -> float:
         """Move points along a direction (n, 3) until the volume is the rest volume; return the
         factor s.

@@ -4,7 +4,6 @@ muscle.
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -130,11 +129,11 @@ class PBDMuscle:
         self.points[:] = self.points @ motion[:3, :3].T + motion[:3, 3]
         self.shape.transform(motion)
 
-    def snapshot(self) -> Any:
+    def snapshot(self) -> tuple[np.ndarray, np.ndarray | None, float, float]:
         """Everything that :meth:`restore` needs."""
         return self.points.copy(), self.shape.snapshot(), self.time, self.penetration
 
-    def restore(self, state: Any) -> None:
+    def restore(self, state: tuple[np.ndarray, np.ndarray | None, float, float]) -> None:
         """Go back to a snapshot."""
         points, shape, self.time, self.penetration = state
         self.points[:] = points

@@ -1,6 +1,6 @@
 """What gives a mesh muscle its shape: one class for each method of the paper."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
@@ -57,7 +57,7 @@ class Shape:
         """What the shape remembers from sweep to sweep; None where that is nothing."""
         return None
 
-    def restore(self, state: Any) -> None:
+    def restore(self, state: Floats | None) -> None:
         """Go back to a snapshot."""
 
     def _swelling(self, points: np.ndarray) -> np.ndarray:
@@ -164,7 +164,7 @@ class RotatingShape(Shape):
         """The rotations."""
         return self.arap.quaternions.copy()
 
-    def restore(self, state: Any) -> None:
+    def restore(self, state: Floats | None) -> None:
         """Go back to the rotations of a snapshot."""
         self.arap.quaternions[:] = state
 

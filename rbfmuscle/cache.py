@@ -13,11 +13,12 @@ import os
 import tempfile
 import time
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from threading import Lock
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
 
@@ -54,7 +55,7 @@ def cache_path() -> Path:
     )
 
 
-def content_key(vertices: Floats, faces: Integers, options: tuple[Any, ...]) -> str:
+def content_key(vertices: Floats, faces: Integers, options: tuple[object, ...]) -> str:
     """Name of an entry: a digest of the mesh and of all options that shape the field."""
     digest = hashlib.sha256(repr((VERSION, np.dtype(float).byteorder, options)).encode())
     for array in (vertices, faces):
@@ -87,12 +88,12 @@ def load_arrays(key: str) -> dict[str, Array] | None:
     return arrays
 
 
-def store_arrays(key: str, arrays: dict[str, Any]) -> None:
+def store_arrays(key: str, arrays: Mapping[str, ArrayLike]) -> None:
     """Keep arrays under a name; a cache that cannot be written is reported in the log and does no
     harm.
     """
     folder = cache_path()
-    entry: dict[str, Any] = {
+    entry: dict[str, Array] = {
         "key": np.array(key),
         **{k: np.asarray(a, order="C") for k, a in arrays.items()},
     }
@@ -101,7 +102,7 @@ def store_arrays(key: str, arrays: dict[str, Any]) -> None:
         handle, name = tempfile.mkstemp(prefix=key, suffix=PART, dir=folder)
         try:
             with os.fdopen(handle, "wb") as file:
-                np.savez(file, **entry)
+                np.savez(file, allow_pickle=False, **entry)
             Path(name).replace(folder / (key + SUFFIX))
         except BaseException:
             Path(name).unlink(missing_ok=True)

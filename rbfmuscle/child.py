@@ -13,7 +13,7 @@ import sys
 import threading
 import traceback
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO
 
 
 def start_child(module: str, threads: int) -> subprocess.Popen[bytes]:
@@ -31,7 +31,7 @@ def start_child(module: str, threads: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, process_group=0)
 
 
-def send(pipe: BinaryIO | Any, what: Any) -> None:
+def send(pipe: IO[bytes], what: object) -> None:
     """Pickle an object into a pipe."""
     pickle.dump(what, pipe, protocol=pickle.HIGHEST_PROTOCOL)
     pipe.flush()
@@ -55,7 +55,7 @@ class Outbox:
         os.dup2(2, 1)
         self._lock = threading.Lock()
 
-    def put(self, what: Any) -> None:
+    def put(self, what: object) -> None:
         """Send a message; end the process where nobody reads."""
         try:
             with self._lock:
@@ -67,14 +67,14 @@ class Outbox:
             os._exit(1)
 
 
-def listen() -> queue.Queue[Any]:
+def listen() -> queue.Queue[object]:
     """Return a queue of the messages on standard input; the process ends when its parent does."""
-    words: queue.Queue[Any] = queue.Queue()
+    words: queue.Queue[object] = queue.Queue()
     threading.Thread(target=_listen, args=(words,), daemon=True).start()
     return words
 
 
-def _listen(words: queue.Queue[Any]) -> None:
+def _listen(words: queue.Queue[object]) -> None:
     try:
         while True:
             words.put(pickle.load(sys.stdin.buffer))

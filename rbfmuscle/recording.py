@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
-from typing import Any
 
 from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.geometry.arrays import Floats
@@ -78,8 +77,8 @@ class Recording:
         self,
         scene: Scene,
         *,
-        model: str | dict[str, Any] | None = None,
-        settings: Mapping[str, Any] | None = None,
+        model: str | dict[str, object] | None = None,
+        settings: Mapping[str, object] | None = None,
         frames: slice | str | None = None,
         bone_sdfs: Mapping[str, BoneField] | None = None,
         fail_on: str | Sequence[str] | None = None,

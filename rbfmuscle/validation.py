@@ -44,7 +44,7 @@ class SolveError(RBFMuscleError, RuntimeError):
     """A frame could not be solved; frames so far are kept (exit code 5), in memory as ``run``."""
 
     exit_code = 5
-    run: Any = None
+    run: Any = None  # a Run, of a package above this one
 
 
 class LimitExceededError(RBFMuscleError, RuntimeError):
@@ -55,7 +55,7 @@ class LimitExceededError(RBFMuscleError, RuntimeError):
     """
 
     exit_code = 6
-    info: Any = None
+    info: Any = None  # a RunInfo, of a package above this one
 
 
 class MissingDependencyError(RBFMuscleError, ImportError):
@@ -150,7 +150,7 @@ def check_values(values: ArrayLike, count: int, *, name: str = "values") -> NDAr
     return values
 
 
-def check_finite(array: NDArray[Any], *, name: str) -> None:
+def check_finite(array: NDArray[np.generic], *, name: str) -> None:
     """Raise NotFiniteError (a ValueError) naming the first row that holds NaN or infinity."""
     if not np.isfinite(array).all():
         row = int(np.argwhere(~np.isfinite(array))[0][0])

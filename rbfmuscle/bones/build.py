@@ -6,7 +6,7 @@ block's edge, in the inner band.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class _Builder:
         exact: ExactDistance,
         origin: Floats,
         unit: float,
-        inside: Any,
+        inside: Callable[[Floats], Booleans] | None,
         doubtful: Booleans | None,
     ) -> None:
         self.exact = exact
@@ -81,7 +81,7 @@ class _Builder:
         self.length = self.rows = 0
         self.sound = True
 
-    def nodes(self, index: Array, edge: float, near: Array | None = None) -> Any:
+    def nodes(self, index: Array, edge: float, near: Array | None = None) -> _Nodes:
         """Exact distances at lattice points ``index`` (n, 3) times ``edge``; ``near`` names a near
         record.
         """
@@ -107,7 +107,7 @@ class _Builder:
         low: Integers,
         edge: float,
         ids: Array,
-        corners: Any,
+        corners: _Nodes,
         centres: Array | None,
         *,
         probe: bool = True,
@@ -147,7 +147,7 @@ def build_cells(
     spacing: float,
     band: float,
     *,
-    inside: Callable[..., Any] | None = None,
+    inside: Callable[[Floats], Booleans] | None = None,
     region: Floats | None = None,
     doubtful: Booleans | None = None,
 ) -> tuple[FieldData, bool]:

@@ -3,7 +3,7 @@
 import json
 from functools import cache
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 
@@ -29,10 +29,17 @@ class Band(NamedTuple):
     source: str
 
 
+class _Table(TypedDict):
+    """``published.json``: by kind of motion and muscle the angles and both ends of the band."""
+
+    hip: dict[str, dict[str, dict[str, list[float]]]]
+    source: str
+
+
 @cache
-def _table() -> dict[str, Any]:
+def _table() -> "_Table":
     text = (files("rbfmuscle.fibres") / "published.json").read_text(encoding="utf-8")
-    found: dict[str, Any] = json.loads(text)
+    found: _Table = json.loads(text)
     return found
 
 
@@ -56,7 +63,7 @@ def published_band(muscle: str, coordinate: str) -> Band | None:
         plain = plain.removesuffix(end)
     if _JOINT not in joint.split("_") or kind is None:
         return None
-    band = _table()[_JOINT][kind].get(_MUSCLES.get(plain, plain))
+    band = _table()["hip"][kind].get(_MUSCLES.get(plain, plain))
     if band is None:
         return None
     angle, least, greatest = (np.array(band[key]) for key in ("angle", "least", "greatest"))

@@ -10,7 +10,7 @@ methods based on partition of unity"). Its time grows as the number of centres d
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -249,15 +249,24 @@ class FieldFit:
         for each point, and normals only as good as finite differences.
         """
         parts = self.parts(centres) if parts is None else parts
-        how: dict[str, Any] = {
-            "kernel": self.kernel,
-            "epsilon": self.epsilon,
-            "condition": self.condition,
-        }
         if self.kernel.hermite:
-            return RBFField.fit_hermite(centres, normals, parts=parts, **how)
-        three = np.hstack([parts + k * len(centres) for k in range(3)])
-        fitted = RBFField.fit(*off_surface_points(centres, normals), parts=three, **how)
+            return RBFField.fit_hermite(
+                centres,
+                normals,
+                kernel=self.kernel,
+                epsilon=self.epsilon,
+                condition=self.condition,
+                parts=parts,
+            )
+        points, values = off_surface_points(centres, normals)
+        fitted = RBFField.fit(
+            points,
+            values,
+            kernel=self.kernel,
+            epsilon=self.epsilon,
+            condition=self.condition,
+            parts=np.hstack([parts + k * len(centres) for k in range(3)]),
+        )
         if self.kernel.has_epsilon:
             _warn_if_narrow(fitted, centres, normals)
         return fitted

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -18,8 +17,9 @@ from rbfmuscle.metrics.depths import BoneDistance, bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
 from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.guesses import doubtful
+from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.frame import Frame, ModelSurface
+from rbfmuscle.simulation.frame import Frame, Mesh, ModelSurface
 
 Values = dict[str, float]
 
@@ -43,7 +43,7 @@ class MuscleMeasures:
     no surfaces.
     """
 
-    def __init__(self, scene: Scene, carried: dict[str, Any]) -> None:
+    def __init__(self, scene: Scene, carried: Mapping[str, Mesh]) -> None:
         self.probes = [BoneDistance(bone.name, bone.mesh) for bone in scene.bones]
         surfaces = scene_surfaces(scene)
         mine = [muscle for muscle in scene.muscles if muscle.name in carried]
@@ -81,7 +81,7 @@ class MuscleMeasures:
 class MuscleMeasurer:
     """What has to be kept of one muscle from frame to frame."""
 
-    def __init__(self, muscle: Any, scene: Any, vertices: Floats, faces: Integers) -> None:
+    def __init__(self, muscle: Muscle, scene: Scene, vertices: Floats, faces: Integers) -> None:
         self.name = muscle.name
         self.mesh = muscle.mesh
         self.attachments = muscle.attachments

@@ -3,7 +3,7 @@ directions.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
@@ -45,37 +45,53 @@ TAPER = 2.5
 LONGEST_TAPER = 0.6
 
 
-def muscle_groups(info: Mapping[str, Any]) -> dict[str, str]:
-    """Group of each muscle in what ``run.json`` holds, by the joints that it crosses.
+class Link(Protocol):
+    """A joint between two bones, by their names."""
 
-    Joints that carry a single bone without another joint (a patella, a tendon's end) are left out;
-    a muscle that crosses no other belongs to the bone that it lies along.
+    @property
+    def name(self) -> str:
+        """The joint's."""
+
+    @property
+    def parent(self) -> str:
+        """The bone that moves the other."""
+
+    @property
+    def child(self) -> str:
+        """The bone that is moved."""
+
+
+def muscle_groups(joints: Sequence[Link], held: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Group of each muscle by the joints that it crosses.
+
+    ``held`` names the bones that each muscle is attached to, once for each attachment. Joints that
+    carry a single bone without another joint (a patella, a tendon's end) are left out; a muscle
+    that crosses no other belongs to the bone that it lies along.
     """
-    joints = info["scene"].get("joints", [])
-    above = {joint["child"]: joint for joint in joints}
-    carrying = {joint["parent"] for joint in joints}
+    above = {joint.child: joint.parent for joint in joints}
+    carrying = set(above.values())
 
     def chain(bone: str) -> list[str]:
         found = []
         while bone in above and bone not in found:
             found.append(bone)
-            bone = above[bone]["parent"]
+            bone = above[bone]
         return [*found, bone]
 
     groups = {}
-    for muscle in info["scene"]["muscles"]:
-        chains = [chain(part["bone"]) for part in muscle.get("attach", [])]
+    for muscle, bones in held.items():
+        chains = [chain(bone) for bone in bones]
         crossed = {
             bone for one in chains for bone in one if any(bone not in other for other in chains)
         }
-        names = [joint["name"] for joint in joints if joint["child"] in crossed & carrying]
+        names = [joint.name for joint in joints if joint.child in crossed & carrying]
         if len(joints) == 1 and crossed:
-            names = [joints[0]["name"]]
+            names = [joints[0].name]
         shared = [
             bone for bone in (chains[0] if chains else []) if all(bone in one for one in chains)
         ]
         along = f"along {shared[0]}" if shared else "without a joint"
-        groups[muscle["name"]] = f"across {', '.join(names)}" if names else along
+        groups[muscle] = f"across {', '.join(names)}" if names else along
     return groups
 
 

@@ -100,7 +100,9 @@ class RunData:
         self.muscles: list[str] = [muscle.name for muscle in scene.muscles]
         self.bones: list[str] = [bone.name for bone in scene.bones]
         self.tendons = list(info.tendon_muscles)
-        self.groups = look.muscle_groups(info.to_dict())
+        self.groups = look.muscle_groups(
+            scene.joints, {muscle.name: [a.bone for a in muscle.attach] for muscle in scene.muscles}
+        )
         self.colours = look.muscle_colours(self.muscles, self.groups)
         self._meshes = meshes
         self._by_number = {frame.index: frame for frame in frames}

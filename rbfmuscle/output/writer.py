@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.quantities import ALL, Row
+from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.output.appearance import tendon_mesh
 from rbfmuscle.output.fibre_files import FOLDER, TABLE, begin_table, fibre_file, write_frame
 from rbfmuscle.output.info import FORMAT, RunInfo
@@ -84,7 +84,7 @@ class RunWriter:
             message = f"cannot write to {self.directory}: {error.strerror}; choose another folder"
             raise UsageError(message) from None
 
-    def write(self, frame: Frame, rows: Sequence[Any] = ()) -> None:
+    def write(self, frame: Frame, rows: Sequence[Sequence[object]] = ()) -> None:
         """Write one frame, and the rows of metrics that are complete; SolveError if the disk
         refuses.
         """
@@ -99,7 +99,7 @@ class RunWriter:
             ) from None
         self.count += 1
 
-    def close(self, rows: Sequence[Any] = ()) -> None:
+    def close(self, rows: Sequence[Sequence[object]] = ()) -> None:
         """Write the last rows of metrics; after a frame that could not be written, nothing."""
         try:
             write_csv(self.directory / "metrics.csv", () if self._failed else rows, mode="a")
@@ -194,13 +194,13 @@ def _frame_end(frame: int) -> str:
     return f"_{frame:04d}"
 
 
-def write_csv(path: Path, rows: Iterable[Sequence[Any]], *, mode: str = "w") -> None:
+def write_csv(path: Path, rows: Iterable[Sequence[object]], *, mode: str = "w") -> None:
     """Write rows to a CSV file, or add them in mode "a"."""
     with path.open(mode, encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 
 
-def write_json(path: Path, data: dict[str, Any]) -> None:
+def write_json(path: Path, data: dict[str, object]) -> None:
     """Write JSON in one move, so that whoever reads it finds the old or the new; NaN and infinity
     become null.
     """
@@ -210,20 +210,24 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
         raise SolveError(f"cannot write {path}: {error.strerror}") from None
 
 
-def json_text(data: Any) -> str:
+def json_text(data: object) -> str:
     """JSON that every reader takes: NaN and infinity become null, what has no form in JSON its
     text.
     """
     from pydantic_core import to_json
 
-    def plain(value: Any) -> Any:
+    def plain(value: object) -> object:
         return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else str(value)
 
     return to_json(data, indent=1, inf_nan_mode="null", fallback=plain).decode()
 
 
 def build_info(
-    scene: Scene, started: datetime, neighbours: "Neighbours", summary: dict[str, Any], **facts: Any
+    scene: Scene,
+    started: datetime,
+    neighbours: "Neighbours",
+    summary: dict[str, dict[str, QuantityFacts]],
+    **facts: object,
 ) -> RunInfo:
     """Assemble the facts of a run; ``summary`` is from `Summary.table`.
 
@@ -279,13 +283,11 @@ class Neighbours:
             widest, there = max((widest, there), (gap, frame.index), key=lambda found: found[0])
             self.pairs[pair] = deepest, at, widest, there
 
-    def table(self) -> list[dict[str, Any]]:
+    def table(self) -> list[dict[str, object]]:
         """Pairs of neighbours, the deepest overlap first [scene unit]."""
         names = ("overlap_max", "overlap_frame", "gap_rms", "gap_frame")
-        found = [
-            {"muscles": list(pair), **dict(zip(names, worst))} for pair, worst in self.pairs.items()
-        ]
-        return sorted(found, key=lambda row: -row["overlap_max"])
+        ordered = sorted(self.pairs.items(), key=lambda found: -found[1][0])
+        return [{"muscles": list(pair), **dict(zip(names, worst))} for pair, worst in ordered]
 
 
 def versions() -> dict[str, str]:
@@ -298,7 +300,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def machine() -> dict[str, Any]:
+def machine() -> dict[str, object]:
     """What the times belong to."""
     import numba
 
@@ -312,7 +314,7 @@ def machine() -> dict[str, Any]:
     }
 
 
-def input_hashes(scene: Scene) -> dict[str, Any]:
+def input_hashes(scene: Scene) -> dict[str, object]:
     """SHA-256 of the scene file and of the meshes and motion that it names; files that are gone are
     left out.
     """

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import (
@@ -72,7 +71,7 @@ def redraw_run(
     return info
 
 
-def redraw_comparison(directory: Path, *, pictures: bool = True) -> dict[str, Any]:
+def redraw_comparison(directory: Path, *, pictures: bool = True) -> dict[str, object]:
     """Write the page of a comparison again; what ``comparison.json`` holds."""
     OutputFolder(directory, "compare", ["report.html"])
     path = directory / "comparison.json"

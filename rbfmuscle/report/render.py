@@ -8,7 +8,7 @@ import io
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
@@ -272,7 +272,7 @@ def save_images(images: Sequence[Image.Image], path: Path, seconds: float) -> No
     """
     size = images[0].width, max(image.height for image in images)
     sheets = [ImageOps.pad(image, size, color="white", centering=(0, 0)) for image in images]
-    kind: dict[str, Any] = {"quality": 82, "method": 2} if path.suffix == ".webp" else {}
+    kind: dict[str, object] = {"quality": 82, "method": 2} if path.suffix == ".webp" else {}
     if len(sheets) > 1:
         pauses = [max(20, int(1000 * seconds / len(sheets)))] * (len(sheets) - 1) + [900]
         kind |= {"save_all": True, "append_images": sheets[1:], "duration": pauses, "loop": 0}
@@ -297,13 +297,13 @@ def _comment(image: Image.Image) -> str:
     return comment.decode("utf-8", "replace") if isinstance(comment, bytes) else ""
 
 
-def _save_picture(image: Image.Image, path: Path, **options: Any) -> None:
+def _save_picture(image: Image.Image, path: Path, **options: object) -> None:
     """Write a picture, marked as ours, in one move; raises SolveError if it fails."""
     check_picture(path)
     content, kind = io.BytesIO(), path.suffix[1:]
     exif = Image.Exif()
     exif[_SOFTWARE_TAG] = _SOFTWARE
-    mark: dict[str, Any] = {"comment": _SOFTWARE} if kind == "gif" else {"exif": exif}
+    mark: dict[str, object] = {"comment": _SOFTWARE} if kind == "gif" else {"exif": exif}
     image.save(content, format=kind, **mark, **options)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -5,7 +5,6 @@ A right hip in millimetres with the joint's centre at the origin: +x medial, +y 
 
 import functools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -64,7 +63,7 @@ def pelvis_distance(points: Floats) -> Floats:
 
 
 @functools.cache
-def bone_meshes(spacing: float = 3.5) -> dict[str, Any]:
+def bone_meshes(spacing: float = 3.5) -> dict[str, object]:
     """Vertices and faces of both bones, by name."""
     return {
         "pelvis": solid_mesh(pelvis_distance, (-45, -75, -120), (115, 110, 165), spacing),
@@ -74,7 +73,7 @@ def bone_meshes(spacing: float = 3.5) -> dict[str, Any]:
 
 # The first is long and wraps the back of the hip; the second is a fan; the last two lie 1.2 mm
 # apart.
-ADDUCTOR: dict[str, Any] = {"radius": 220, "width": 14, "thickness": 9, "twist": (0.29, 0.045)}
+ADDUCTOR = functools.partial(Tube, radius=220, width=14, thickness=9, twist=(0.29, 0.045))
 MUSCLES = {
     "extensor": Tube(
         ((8.2, 45.5, 76.1), (-46, 52.5, -36), (-43, 18, -137)),
@@ -94,11 +93,9 @@ MUSCLES = {
         spread=1.6,
         twist=(0.04, -0.6),
     ),
-    "adductor_anterior": Tube(
-        ((66.4, -42, -44), (23.2, -14, -125.1), (-20.3, -13.5, -211.9)), **ADDUCTOR
-    ),
-    "adductor_posterior": Tube(
-        ((49.7, -14.8, -66.6), (6.5, 13.2, -147.7), (-38.7, 14.2, -234.6)), **ADDUCTOR
+    "adductor_anterior": ADDUCTOR(((66.4, -42, -44), (23.2, -14, -125.1), (-20.3, -13.5, -211.9))),
+    "adductor_posterior": ADDUCTOR(
+        ((49.7, -14.8, -66.6), (6.5, 13.2, -147.7), (-38.7, 14.2, -234.6))
     ),
 }
 # Muscle vertices within the first and last parts of the axis, and this near to the bone [mm], are

@@ -1,7 +1,6 @@
 """What ``run.json`` says of the parts of a scene."""
 
 import hashlib
-from typing import Any
 
 import numpy as np
 
@@ -9,7 +8,7 @@ from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.objects import Muscle
 
 
-def record_muscle(muscle: Muscle) -> dict[str, Any]:
+def record_muscle(muscle: Muscle) -> dict[str, object]:
     """A muscle by its name, options, attachments in numbers, and mesh."""
     keys = muscle.contraction
     return {
@@ -26,7 +25,7 @@ def record_muscle(muscle: Muscle) -> dict[str, Any]:
     }
 
 
-def record_mesh(item: Bone | Muscle) -> dict[str, Any]:
+def record_mesh(item: Bone | Muscle) -> dict[str, object]:
     """Source, size and hash of a mesh."""
     vertices = np.ascontiguousarray(item.mesh.vertices, dtype=np.float64)
     faces = np.ascontiguousarray(item.mesh.faces, dtype=np.int64)

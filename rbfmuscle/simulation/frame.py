@@ -46,7 +46,7 @@ class ModelSurface:
     )  # (bone, count, action), turned into events of the frame
     # An earlier ModelSurface and the rigid motion (4, 4) since, where the muscle moved rigidly;
     # else None.
-    origin: Any = field(default=None, repr=False)
+    origin: "tuple[ModelSurface, np.ndarray] | None" = field(default=None, repr=False)
 
     def moved(self, motion: np.ndarray) -> "ModelSurface":
         """The surface after a rigid motion (4, 4), which took no time."""
@@ -157,7 +157,7 @@ class MuscleModel(Protocol):
     def transform(self, motion: np.ndarray) -> None:
         """Move the whole muscle rigidly by (4, 4)."""
 
-    def snapshot(self) -> Any:
+    def snapshot(self) -> Any:  # each model's own state
         """The state, for :meth:`restore`."""
 
     def restore(self, state: Any) -> None:

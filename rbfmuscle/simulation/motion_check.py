@@ -4,8 +4,8 @@ close together.
 
 import itertools
 import math
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,7 +70,7 @@ def check_motion(scene: Scene) -> list[Fault]:
 
 
 def _followed(
-    scene: Scene, muscle: Muscle, extent: float, poses: list[Any]
+    scene: Scene, muscle: Muscle, extent: float, poses: Sequence[Mapping[str, Floats]]
 ) -> Iterator[tuple[tuple[str, str], Floats, np.ndarray]]:
     """For an attachment and a bone, or two attachments: a value (1 + p,) along the motion, and
     where it is bad.

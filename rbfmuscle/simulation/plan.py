@@ -1,7 +1,5 @@
 """What a run of a scene would build and solve, without building it."""
 
-from typing import Any
-
 import numpy as np
 
 from rbfmuscle.scene.motion import completed, rest_coordinates
@@ -12,7 +10,7 @@ from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 
 
-def plan_scene(scene: Scene) -> dict[str, Any]:
+def plan_scene(scene: Scene) -> dict[str, object]:
     """Frames, sub-steps, muscles and fields of a run, by these names.
 
     Muscles have the ``bones`` within reach and the ``substeps`` in which they are solved, fields
@@ -20,13 +18,20 @@ def plan_scene(scene: Scene) -> dict[str, Any]:
     comes near a muscle is not foreseen: the muscle may then be solved in more sub-steps.
     """
     regions, poses = find_contact_pairs(scene), PoseCache(scene)
-    muscles: list[dict[str, Any]] = []
+    muscles: list[dict[str, object]] = []
+    counts: list[int] = []
     fields = []
     for muscle in scene.muscles:
         bones = [bone for name, bone in regions if name == muscle.name]
-        facts = {"name": muscle.name, "model": muscle.model, "vertices": len(muscle.mesh.vertices)}
+        counts.append(_count_substeps(muscle, scene, bones, poses))
         muscles.append(
-            {**facts, "bones": bones, "substeps": _count_substeps(muscle, scene, bones, poses)}
+            {
+                "name": muscle.name,
+                "model": muscle.model,
+                "vertices": len(muscle.mesh.vertices),
+                "bones": bones,
+                "substeps": counts[-1],
+            }
         )
     for name, box in bone_regions(regions).items():
         mesh = scene.bone(name).mesh
@@ -35,7 +40,7 @@ def plan_scene(scene: Scene) -> dict[str, Any]:
         wide = extent > 0.0  # a bone may be flat
         share = float(np.prod(reached[wide] / extent[wide]))
         fields.append({"bone": name, "triangles": len(mesh.faces), "share": share})
-    most = max((muscle["substeps"] for muscle in muscles), default=0)
+    most = max(counts, default=0)
     return {"frames": len(scene.motion), "substeps": most, "muscles": muscles, "fields": fields}
 
 

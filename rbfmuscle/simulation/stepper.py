@@ -6,10 +6,11 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.motion import shown_value, step_angle, unit_sign
 from rbfmuscle.scene.scene import Scene
@@ -88,7 +89,8 @@ class MuscleStepper:
         self.substeps = SubSteps(scene, scene.muscle(self.name), bones=met, poses=self.poses)
         self.rigid_transport: RigidTransport | None = None
         self._path: Path
-        self._saved: Any = None
+        # The model and its contact points before the sub-step, where it may be taken back.
+        self._saved: tuple[object, Floats]
         # The surface since the last solve, where later ones are that one moved rigidly.
         self._shown: ModelSurface | None = None
         # Whether points crossed a bone in this frame or the last that no step resolved: halving is

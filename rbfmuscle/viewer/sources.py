@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_si
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
-from rbfmuscle.simulation.frame import FibreLines
+from rbfmuscle.simulation.frame import FibreLines, MuscleModel
 from rbfmuscle.simulation.live import LiveSession, live_fields
 from rbfmuscle.validation import UsageError
 
@@ -79,13 +79,8 @@ class LiveSource:
             }
             for items in (scene.bones, scene.muscles)
         )
-        held = [
-            {"name": m.name, "attach": [{"bone": a.bone} for a in m.attachments]}
-            for m in scene.muscles
-        ]
-        groups = muscle_groups(
-            {"scene": {"joints": list(map(vars, scene.joints)), "muscles": held}}
-        )
+        held = {m.name: [a.bone for a in m.attachments] for m in scene.muscles}
+        groups = muscle_groups(scene.joints, held)
         self.colours = muscle_colours(list(self.muscles), groups)
         coarse = {name: clustered(*mesh, REST_TRIANGLES) for name, mesh in self.muscles.items()}
         self.rest = Picture(bone_poses(scene, {}), coarse, {}, {}, {}, "")
@@ -123,7 +118,7 @@ def _coordinate(scene: Scene, name: str, numbers: tuple[float, ...]) -> Control:
 class LiveFigure:
     """New models of a session's muscles that follow coordinates set by hand."""
 
-    def __init__(self, session: LiveSession, models: list[Any]) -> None:
+    def __init__(self, session: LiveSession, models: list[MuscleModel]) -> None:
         self.session, self._unfinished = session, True
         self._bundles = build_bundles(session.scene, models)
         self.stride = math.radians(session.scene.contact.substep_angle)

@@ -106,7 +106,7 @@ def test_chords_do_not_cut_across_a_convex_bone():
     bone = sphere(15.0, CENTRE + [50.0, 0, 0])
     depths = []
     for obstacles in (None, [(PointGrid.of(np.array(ball.vertices)), np.eye(4))]):
-        options = {"cut": bone, "obstacles": obstacles, "volume": 5e5, "resolution": 32}
+        options = {"clip_distance": bone, "obstacles": obstacles, "volume": 5e5, "resolution": 32}
         surface = extract_surface(sphere(), points=on_sphere(), **options)
         assert check_closed(surface).volume == pytest.approx(5e5, rel=1e-9)
         assert bone(surface.vertices).min() > -0.1

@@ -10,6 +10,7 @@ from PIL import Image
 
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import muscle_groups
+from rbfmuscle.output.info import JointInfo
 from rbfmuscle.report import render
 from rbfmuscle.report.page import Cell, ReportPage, Section, Table, limit_state
 from rbfmuscle.report.report import write_report
@@ -65,7 +66,10 @@ def test_muscles_are_grouped_by_the_joints_that_they_cross():
         "ankle": "tibia foot",
         "cap": "femur patella",
     }
-    joints = [{"name": n, **dict(zip(("parent", "child"), b.split()))} for n, b in chain.items()]
+    joints = [
+        JointInfo(name=name, parent=bones.split()[0], child=bones.split()[1])
+        for name, bones in chain.items()
+    ]
     groups = {
         "pelvis femur": "across hip",
         "pelvis tibia": "across hip, knee",
@@ -73,8 +77,7 @@ def test_muscles_are_grouped_by_the_joints_that_they_cross():
         "femur foot": "across knee",
     }
     for bones, group in groups.items():
-        muscle = {"name": "one", "attach": [{"bone": bone} for bone in bones.split()]}
-        assert muscle_groups({"scene": {"joints": joints, "muscles": [muscle]}}) == {"one": group}
+        assert muscle_groups(joints, {"one": bones.split()}) == {"one": group}
 
 
 @pytest.mark.parametrize(

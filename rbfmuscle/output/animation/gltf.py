@@ -7,8 +7,7 @@ frame, whose weights go from 0 to 1 and back one after the other.
 
 import json
 import struct
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -39,7 +38,7 @@ def animated_glb(run: Animation) -> bytes:
         file.times = file.add(run.times[:, None] - run.times[0], "SCALAR", bounds=True)
     children = [_add_part(file, part) for part in (*run.bones, *run.muscles)]
     children += [_add_fibres(file, fibres) for fibres in run.fibres]
-    root: dict[str, Any] = {"name": run.name, "children": children}
+    root: dict[str, object] = {"name": run.name, "children": children}
     left, posterior, superior = run.body  # glTF looks at what faces +z, with y up
     root["rotation"] = _quaternions(np.stack([left, superior, -posterior])[None])[0].tolist()
     return file.content({"name": run.name, "nodes": [file.append("nodes", root)]})
@@ -60,7 +59,7 @@ def _add_part(file: "_File", part: AnimatedMesh) -> int:
         moved, turned = vertices - base, vertex_normals(vertices, faces) - normals
         position = file.add(moved, "VEC3", target=_VERTICES, bounds=True)
         targets.append({"POSITION": position, "NORMAL": file.add(turned, "VEC3", target=_VERTICES)})
-    entry: dict[str, Any] = {"name": part.name, "mesh": file.mesh(part, normals, targets)}
+    entry: dict[str, object] = {"name": part.name, "mesh": file.mesh(part, normals, targets)}
     node = file.append("nodes", entry)
     if targets:
         weights = np.eye(len(part.vertices))[:, 1:]
@@ -79,7 +78,7 @@ def _add_fibres(file: "_File", fibres: AnimatedFibres) -> int:
     first = fibres.lines[0]
     base = first.points.reshape(-1, 3)
     colours = linear_rgb(stretch_colours(first.local_stretch)).reshape(-1, 3)
-    primitive: dict[str, Any] = {
+    primitive: dict[str, object] = {
         "mode": _LINES,
         "attributes": {
             "POSITION": file.add(base, "VEC3", target=_VERTICES, bounds=True),
@@ -95,7 +94,7 @@ def _add_fibres(file: "_File", fibres: AnimatedFibres) -> int:
         }
         for lines in fibres.lines[1:]
     ]
-    entry: dict[str, Any] = {"name": fibres.name, "primitives": [primitive]}
+    entry: dict[str, object] = {"name": fibres.name, "primitives": [primitive]}
     if targets:
         primitive["targets"] = targets
         entry["weights"] = [0.0] * len(targets)
@@ -128,11 +127,11 @@ class _File:
         self.parts: list[bytes] = []
         self.size, self.times = 0, 0
         keys = "bufferViews", "accessors", "meshes", "materials", "nodes"
-        self.lists: dict[str, list[Any]] = {key: [] for key in keys}
-        self.samplers: list[Any] = []
-        self.channels: list[Any] = []
+        self.lists: dict[str, list[object]] = {key: [] for key in keys}
+        self.samplers: list[object] = []
+        self.channels: list[object] = []
 
-    def append(self, key: str, entry: dict[str, Any]) -> int:
+    def append(self, key: str, entry: Mapping[str, object]) -> int:
         """Number of a new entry of a list."""
         self.lists[key].append(entry)
         return len(self.lists[key]) - 1
@@ -160,7 +159,7 @@ class _File:
             entry |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self.append("accessors", entry)
 
-    def mesh(self, part: AnimatedMesh, normals: Floats, targets: Sequence[Any]) -> int:
+    def mesh(self, part: AnimatedMesh, normals: Floats, targets: Sequence[object]) -> int:
         """Number of a new mesh, that of the first frame, with a material of its own."""
         colour = [*linear_rgb(rgb(part.colour)).tolist(), 1.0]
         look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}
@@ -173,7 +172,7 @@ class _File:
             "indices": self.add(part.faces[0].reshape(-1, 1), "SCALAR", target=_INDICES),
             "material": self.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
         }
-        entry: dict[str, Any] = {"name": part.name, "primitives": [primitive]}
+        entry: dict[str, object] = {"name": part.name, "primitives": [primitive]}
         if targets:
             primitive["targets"] = list(targets)
             entry["weights"] = [0.0] * len(targets)
@@ -187,10 +186,10 @@ class _File:
             {"sampler": len(self.samplers) - 1, "target": {"node": node, "path": path}}
         )
 
-    def content(self, scene: dict[str, Any]) -> bytes:
+    def content(self, scene: dict[str, object]) -> bytes:
         """The whole file."""
         asset = {"version": "2.0", "generator": "rbfmuscle"}
-        tree: dict[str, Any] = {"asset": asset, "scene": 0, "scenes": [scene], **self.lists}
+        tree: dict[str, object] = {"asset": asset, "scene": 0, "scenes": [scene], **self.lists}
         tree["buffers"] = [{"byteLength": self.size}]
         if self.channels:
             tree["animations"] = [

@@ -11,7 +11,6 @@ import zlib
 from collections.abc import Mapping
 from importlib import resources
 from itertools import groupby
-from typing import Any
 
 import numpy as np
 
@@ -64,7 +63,7 @@ class _Packer:
         self.origin, self.step = low, float((high - low).max()) / _STEPS or 1.0
         self.parts: list[bytes] = []
 
-    def part(self, part: AnimatedMesh, panel: int) -> dict[str, Any]:
+    def part(self, part: AnimatedMesh, panel: int) -> dict[str, object]:
         """Take in a muscle or bone, in pieces: frames that follow each other and have the same
         triangles.
         """
@@ -72,7 +71,7 @@ class _Packer:
         for _, group in groupby(range(len(part.faces)), key=lambda k: id(part.faces[k])):
             frames = list(group)
             pieces.append(self._piece([part.vertices[k] for k in frames], part.faces[frames[0]]))
-        entry: dict[str, Any] = {"name": part.name, "panel": panel, "pieces": pieces}
+        entry: dict[str, object] = {"name": part.name, "panel": panel, "pieces": pieces}
         entry |= {"colour": part.colour, "group": part.group}
         if part.poses is not None:
             poses = part.poses[: None if part.moves else 1, :3].round(6)

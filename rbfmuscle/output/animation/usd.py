@@ -4,7 +4,7 @@ as rigid bodies.
 
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from rbfmuscle.output.animation.parts import (
 from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingDependencyError
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdGeom
 
 
 def check_usd() -> None:
@@ -68,7 +71,7 @@ def write_usd(path: Path, run: Animation) -> None:
     stage.GetRootLayer().Export(str(path))
 
 
-def _fill_curves(curves: Any, fibres: AnimatedFibres, codes: list[float]) -> None:
+def _fill_curves(curves: "UsdGeom.BasisCurves", fibres: AnimatedFibres, codes: list[float]) -> None:
     """Fibres get their points and their colours, by their stretch, at each time."""
     from pxr import UsdGeom, Vt
 
@@ -85,7 +88,7 @@ def _fill_curves(curves: Any, fibres: AnimatedFibres, codes: list[float]) -> Non
         colours.Set(Vt.Vec3fArray.FromNumpy(shades.astype(np.float32)), code)
 
 
-def _fill(mesh: Any, part: AnimatedMesh, codes: list[float]) -> None:
+def _fill(mesh: "UsdGeom.Mesh", part: AnimatedMesh, codes: list[float]) -> None:
     """A muscle gets its points at each time, and its faces where they change; a bone its points
     once and its poses.
     """
@@ -116,7 +119,7 @@ def _fill(mesh: Any, part: AnimatedMesh, codes: list[float]) -> None:
             _set(place, Gf.Matrix4d(pose.T), [code] if part.moves else [], first=k == 0)
 
 
-def _set(attribute: Any, value: Any, at: list[float], *, first: bool) -> None:
+def _set(attribute: "Usd.Attribute", value: object, at: list[float], *, first: bool) -> None:
     """Give an attribute a value at time codes; without any, or of the first frame, as its default
     too.
     """

@@ -40,7 +40,8 @@ def read_polydata(path: str | Path) -> PolyData:
     """Return what a ``.vtk``, ``.vtp`` or ``.ply`` file holds; strips are split into triangles."""
     with _LOCK:
         child = _child(os.getpid())
-        assert child.stdout is not None  # start_child asks for a pipe
+        assert child.stdin is not None  # start_child asks for pipes
+        assert child.stdout is not None
         late = threading.Timer(PATIENCE, child.kill)
         late.daemon = True
         late.start()
@@ -131,7 +132,7 @@ def _answer() -> None:
     while True:
         path = asked.get()
         try:
-            arrays = _read(path)
+            arrays = _read(str(path))
         except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
             text = " ".join(str(error).split())[:200] or type(error).__name__
             arrays = (np.array(text),)

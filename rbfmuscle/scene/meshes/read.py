@@ -6,10 +6,11 @@ became.
 """
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.scene.meshes.formats import read_part
@@ -102,7 +103,9 @@ def prepare_mesh(
     return repair(vertices, faces, context=context, may_be_open=may_be_open)
 
 
-def read_fibres(fibres: Any, *, scale: float = 1.0, muscle: str = "") -> list[Floats]:
+def read_fibres(
+    fibres: str | Path | Iterable[ArrayLike], *, scale: float = 1.0, muscle: str = ""
+) -> list[Floats]:
     """Return fibres as a list of (k, 3) arrays in scene units, ``scale`` from the unit of a file or
     of given arrays.
 
