@@ -131,13 +131,16 @@ class PBDMuscle:
 
     def snapshot(self) -> tuple[np.ndarray, np.ndarray | None, float, float]:
         """Everything that :meth:`restore` needs."""
-        return self.points.copy(), self.shape.snapshot(), self.time, self.penetration
+        active = 0.0 if self.fibres is None else self.fibres.activation
+        state = self.points.copy(), self.shape.snapshot(), self.time, self.penetration
+        return *state, self.log.state, active
 
     def restore(self, state: tuple[np.ndarray, np.ndarray | None, float, float]) -> None:
         """Go back to a snapshot."""
-        points, shape, self.time, self.penetration = state
+        points, shape, self.time, self.penetration, self.log.state, active = state
         self.points[:] = points
         self.shape.restore(shape)
+        self.activate(active)
 
     def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces, numbered as in the muscle's mesh but for the order of the faces."""

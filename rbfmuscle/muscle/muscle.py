@@ -34,7 +34,7 @@ from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame import Mesh, ModelSurface, SolveLog
+from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
 
 # Neighbours meet a muscle at contact points so far apart, of the side of a lattice cell, which has
 # three nodes on it.
@@ -166,14 +166,15 @@ class RBFMuscle:
         """Go along with a rigid motion (4, 4), as the muscle is."""
         self.state = transform(self.state, motion)
 
-    def snapshot(self) -> tuple[SolidState, SurfaceState]:
+    def snapshot(self) -> tuple[SolidState, SurfaceState, LogState]:
         """Everything that :meth:`restore` needs."""
-        return self.state, self.drawer.snapshot()
+        return self.state, self.drawer.snapshot(), self.log.state
 
-    def restore(self, state: tuple[SolidState, SurfaceState]) -> None:
+    def restore(self, state: tuple[SolidState, SurfaceState, LogState]) -> None:
         """Go back to a snapshot."""
-        self.drawer.restore(state[1])
-        self._take(state[0])
+        solid, surface, self.log.state = state
+        self.drawer.restore(surface)
+        self._take(solid)
 
     def _take(self, state: SolidState) -> None:
         """Take a state of the solid, and the stiffness that goes with its activation."""

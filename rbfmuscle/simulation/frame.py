@@ -105,30 +105,39 @@ class Frame:
     fibres: Mapping[str, FibreLines] = field(default_factory=dict, repr=False)
 
 
+class LogState(NamedTuple):
+    """What a `SolveLog` holds: the greatest of each quantity, how often a solve ended at a cap, and
+    whether these were taken.
+    """
+
+    worst: Mapping[str, float]
+    capped: int
+    taken: bool
+
+
 class SolveLog:
     """How the solves of a model ended since its last drawing, for the quantities and notes of its
-    surface; ``at_rest`` are the quantities before any solve.
+    surface; ``at_rest`` are the quantities before any solve. Its ``state`` is never changed in
+    place: it is its own snapshot.
     """
 
     def __init__(self, **at_rest: float) -> None:
-        self._worst = dict(at_rest)
-        self._capped, self._taken = 0, False
+        self.state = LogState(at_rest, 0, False)
 
     def add(self, *, caps: int, **quantities: float) -> None:
         """Count a solve: how often it ended at a cap, and its ``solver_residual`` and others, of
         which the greatest are kept.
         """
-        if self._taken:
-            self._worst, self._taken = {}, False
-        self._capped += caps
+        worst = {} if self.state.taken else dict(self.state.worst)
         for name, value in quantities.items():
-            self._worst[name] = float(np.fmax(value, self._worst.get(name, 0.0)))
+            worst[name] = float(np.fmax(value, worst.get(name, 0.0)))
+        self.state = LogState(worst, self.state.capped + caps, False)
 
     def take(self) -> tuple[dict[str, float], list[tuple[str, int, str]]]:
         """Quantities and notes for a `ModelSurface`."""
-        notes = [("", self._capped, "iteration_cap")] if self._capped else []
-        self._capped, self._taken = 0, True
-        return dict(self._worst), notes
+        worst, capped, _ = self.state
+        self.state = LogState(worst, 0, True)
+        return dict(worst), [("", capped, "iteration_cap")] if capped else []
 
 
 class MuscleModel(Protocol):

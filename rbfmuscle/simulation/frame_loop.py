@@ -3,6 +3,7 @@
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import NamedTuple
 
 from threadpoolctl import ThreadpoolController
 
@@ -19,11 +20,21 @@ from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
 from rbfmuscle.simulation.overlap import resolve_initial_overlap
 from rbfmuscle.simulation.rigid_transport import RigidTransport
-from rbfmuscle.simulation.sliding import Sliding
-from rbfmuscle.simulation.stepper import MuscleStepper
+from rbfmuscle.simulation.sliding import Sliding, SlidingState
+from rbfmuscle.simulation.stepper import MuscleStepper, StepperState
 from rbfmuscle.simulation.substeps import PoseCache
 
 Path = tuple[list[dict[str, float]], list[dict[str, float]]]
+
+
+class LoopState(NamedTuple):
+    """What changes of a `FrameLoop` from frame to frame."""
+
+    here: dict[str, float]
+    activations: dict[str, float]
+    next_index: int
+    steppers: list[StepperState]
+    sliding: SlidingState | None
 
 
 class FrameLoop:
@@ -83,6 +94,22 @@ class FrameLoop:
         with self.working():
             each(resolve_initial_overlap, self.steppers)
             self._sliding = None if scene.sliding is None else Sliding(scene, self.steppers)
+
+    def snapshot(self) -> LoopState:
+        """The state between two frames, for :meth:`restore`; times are none of it."""
+        steppers = [stepper.snapshot() for stepper in self.steppers]
+        sliding = None if self._sliding is None else self._sliding.snapshot()
+        return LoopState(self.here, self.activations.here, self._next_index, steppers, sliding)
+
+    def restore(self, state: LoopState) -> None:
+        """Return to a snapshot, which stays valid: what is asked for from here on comes out alike
+        to the bit.
+        """
+        self.here, self.activations.here, self._next_index, steppers, sliding = state
+        for stepper, known in zip(self.steppers, steppers):
+            stepper.restore(known)
+        if self._sliding is not None and sliding is not None:
+            self._sliding.restore(sliding)
 
     def at_rest(self) -> tuple[dict[str, ModelSurface], Poses]:
         """Surfaces of the muscles before the first frame, by muscle, and the poses of the bones
@@ -252,8 +279,6 @@ def solve_pose(
     finally:
         for model, state in zip(models, rest):
             model.restore(state)
-            if scene.muscle(model.name).contraction is not None:
-                model.activate(0.0)
 
 
 def _obstacles(scene, models, bone_sdfs):

@@ -14,7 +14,7 @@ from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Frame, MuscleModel
-from rbfmuscle.simulation.frame_loop import FrameLoop
+from rbfmuscle.simulation.frame_loop import FrameLoop, LoopState
 from rbfmuscle.validation import UsageError
 
 # Range of a coordinate around rest where the scene's motion does not exceed it [degree, mm].
@@ -41,20 +41,23 @@ class LiveSession:
             n: scene.length(SHIFT_LEVER) if known[n].motion == "translation" else 1.0
             for n in self.rest
         }
-        self._loop: FrameLoop | None = None
+        self._loop: FrameLoop
+        self._start: LoopState
 
     def use(self, models: list[MuscleModel]) -> None:
-        """Start these models, in their rest state, from the rest pose; the target stays."""
-        self.models, self._rest = models, [model.snapshot() for model in models]
-        self.reset()
+        """Start these models, in their rest state, from the rest pose; the target stays.
+
+        Raises as `FrameLoop` does.
+        """
+        self.models = models
+        self._loop = FrameLoop(_wide_scene(self.scene), models, bone_sdfs=self.bone_sdfs)
+        self._start = self._loop.snapshot()
+        self.here = dict(self.rest)
 
     def reset(self) -> None:
         """Return models and bones to rest; the target stays."""
-        for model, state in zip(self.models, self._rest):
-            model.restore(state)
-            if model.name in self.activation:
-                model.activate(0.0)
-        self.here, self._loop = dict(self.rest), None
+        self._loop.restore(self._start)
+        self.here = dict(self.rest)
 
     def set(self, name: str, angle: float) -> None:
         """Give a coordinate a new target [radian], kept within its limits."""
@@ -78,7 +81,7 @@ class LiveSession:
         """Whether no coordinate is farther than ``stride`` [radian] from its target, no activation
         than ``step``.
         """
-        active = self._loop.activations.here if self._loop else dict.fromkeys(self.activation, 0.0)
+        active = self._loop.activations.here
         near = self._farthest() <= stride
         return near and all(
             abs(value - active[name]) <= step for name, value in self.activation.items()
@@ -91,8 +94,6 @@ class LiveSession:
         activation by more than a sub-step's. Raises SolveError if a muscle cannot be solved;
         `reset` goes back to rest.
         """
-        if self._loop is None:
-            self._loop = FrameLoop(_wide_scene(self.scene), self.models, bone_sdfs=self.bone_sdfs)
         self._loop.surfaces = surfaces
         active = self._loop.activations
         reach = 1.0 if stride == math.inf else STEP

@@ -158,6 +158,14 @@ class MovingSurface:
         return index[near], distance[near], normal[near], nearest[near]
 
 
+class NeighbourState(NamedTuple):
+    """What a `NeighbourSurface` keeps from sub-step to sub-step; nothing is changed in place."""
+
+    change: dict[str, float]  # of the coordinates in the last sub-step
+    # Mean of how far solves moved contact points and vertices; empty before the first.
+    correction: list[Floats]
+
+
 class NeighbourSurface(MovingSurface):
     """Signed distance to a model's material mesh, and to the mesh that shows it.
 
@@ -188,11 +196,19 @@ class NeighbourSurface(MovingSurface):
         self.shown: MovingSurface = self
         self.contact = cKDTree(model.contact_points()).query(self.vertices)[1]
         self.fixed = np.asarray(model.attached_bone)[self.contact] >= 0
-        #: Change of the coordinates in the last sub-step, and a mean of how far solves moved points
-        #: and vertices.
-        self._change: dict[str, float] = {}
-        self._correction: list[Floats] = []
+        self.state = NeighbourState({}, [])
         self.refresh()
+
+    def snapshot(self) -> tuple[NeighbourState, MovingSurface, Floats]:
+        """The state and the surface that is shown, for :meth:`restore`."""
+        return self.state, self.shown, self.shown.vertices
+
+    def restore(self, state: tuple[NeighbourState, MovingSurface, Floats]) -> None:
+        """Return to a snapshot; the model has."""
+        self.state, self.shown, vertices = state
+        self.refresh()
+        if self.shown is not self:
+            self.shown.move(vertices)
 
     def show(self, mesh: Mesh) -> None:
         """Take the vertices and faces of the mesh that is shown."""
@@ -207,9 +223,9 @@ class NeighbourSurface(MovingSurface):
         For a path from coordinates to others the prediction is extrapolated by the last
         corrections.
         """
-        self._predicted = self._present()
-        share = MOMENTUM * self._share(_change(*path)) if path and self._correction else 0.0
-        ahead = [here + share * moved for here, moved in zip(self._predicted, self._correction)]
+        self._predicted, correction = self._present(), self.state.correction
+        share = MOMENTUM * self._share(_change(*path)) if path and correction else 0.0
+        ahead = [here + share * moved for here, moved in zip(self._predicted, correction)]
         self.points, vertices = map(np.ascontiguousarray, ahead if share else self._predicted)
         self.move(vertices)
         #: Box of the contact points.
@@ -221,12 +237,13 @@ class NeighbourSurface(MovingSurface):
         """
         change = _change(*path)
         found = [solved - predicted for solved, predicted in zip(self._present(), self._predicted)]
-        if self._correction:
+        if self.state.correction:
             old = MEMORY * self._share(change)
             found = [
-                (1.0 - MEMORY) * new + old * before for new, before in zip(found, self._correction)
+                (1.0 - MEMORY) * new + old * before
+                for new, before in zip(found, self.state.correction)
             ]
-        self._change, self._correction = change, found
+        self.state = NeighbourState(change, found)
 
     def _present(self) -> list[Floats]:
         """Contact points and vertices now."""
@@ -236,8 +253,9 @@ class NeighbourSurface(MovingSurface):
         """Share of the last correction in another change of coordinates: 1 for the same, 0 across
         or back.
         """
-        square = sum(value**2 for value in self._change.values())
-        along = sum(value * self._change.get(name, 0.0) for name, value in change.items())
+        last = self.state.change
+        square = sum(value**2 for value in last.values())
+        along = sum(value * last.get(name, 0.0) for name, value in change.items())
         return min(max(along / square, 0.0), 1.0) if square else 0.0
 
     def apart(self, other: NeighbourSurface, reach: float) -> bool:

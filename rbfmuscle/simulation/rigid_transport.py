@@ -36,6 +36,14 @@ class MuscleStatus(NamedTuple):
     substeps: int  # number in which it was solved
 
 
+class RigidState(NamedTuple):
+    """What changes of a `RigidTransport`."""
+
+    solved: Mapping[str, Floats] | None
+    since: Floats  # (4, 4)
+    moved: bool
+
+
 class RigidTransport:
     """Moves one muscle rigidly where its bones do; for a muscle that neither slides on neighbours
     nor contracts.
@@ -93,6 +101,14 @@ class RigidTransport:
         if moves:
             self.since, self.moved = motion @ self.since, True
         return True
+
+    def snapshot(self) -> RigidState:
+        """The state, for :meth:`restore`."""
+        return RigidState(self.solved, self.since, self.moved)
+
+    def restore(self, state: RigidState) -> None:
+        """Return to a snapshot."""
+        self.solved, self.since, self.moved = state
 
     def collect(self) -> bool:
         """Whether the muscle was moved since the last call."""

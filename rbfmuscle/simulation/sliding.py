@@ -13,18 +13,36 @@ threads.
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
-from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
-from rbfmuscle.simulation.sliding_pair import BoneLink, SlidingLimits, SlidingPair
+from rbfmuscle.simulation.neighbour_surface import (
+    MovingSurface,
+    NeighbourState,
+    NeighbourSurface,
+)
+from rbfmuscle.simulation.sliding_pair import BoneLink, LinkState, SlidingLimits, SlidingPair
 from rbfmuscle.simulation.stepper import MuscleStepper, Path
 from rbfmuscle.validation import SceneError
 
 Coordinates = dict[str, float]
+
+
+class SlidingState(NamedTuple):
+    """What `Sliding` keeps from frame to frame: how each pair is linked, which have not met, and
+    where the muscles were moved by their solves.
+    """
+
+    links: dict[str, list[tuple[SlidingPair, LinkState]]]
+    bone_links: dict[str, list[Booleans]]
+    apart: list[tuple[MuscleStepper, MuscleStepper]]
+    surfaces: dict[str, tuple[NeighbourState, MovingSurface, Floats]]
+    pairs: dict[tuple[str, str], tuple[float, float]]
 
 
 class Sliding:
@@ -37,7 +55,8 @@ class Sliding:
     def __init__(self, scene: Scene, steppers: list[MuscleStepper]) -> None:
         assert scene.sliding is not None
         limits = SlidingLimits(scene.sliding, scene)
-        self.steppers, self.pairs = steppers, {}
+        self.steppers = steppers
+        self.pairs: dict[tuple[str, str], tuple[float, float]] = {}
         self.links: dict[str, list[SlidingPair]] = {stepper.name: [] for stepper in steppers}
         self.bone_links: dict[str, list[BoneLink]] = {stepper.name: [] for stepper in steppers}
         pairs = sliding_pairs(scene, [stepper.name for stepper in steppers], limits.reach)
@@ -136,6 +155,33 @@ class Sliding:
         )
         for act in (find_planes, MuscleStepper.correct, learn):
             each(act, due)
+
+    def snapshot(self) -> SlidingState:
+        """The state, for :meth:`restore`."""
+        return SlidingState(
+            {
+                name: [(link, link.state) for link in links]
+                for name, links in self.links.items()
+            },
+            {name: [link.linked for link in links] for name, links in self.bone_links.items()},
+            list(self.apart),
+            {name: surface.snapshot() for name, surface in self.surfaces.items()},
+            self.pairs,
+        )
+
+    def restore(self, state: SlidingState) -> None:
+        """Return to a snapshot, which stays valid; the steppers have."""
+        self.apart = list(state.apart)
+        self.pairs = state.pairs
+        for name, known in state.links.items():
+            self.links[name] = [link for link, _ in known]
+            for link, linked in known:
+                link.state = linked
+        for name, held in state.bone_links.items():
+            for bone_link, linked_points in zip(self.bone_links[name], held):
+                bone_link.linked = linked_points
+        for name, surface in state.surfaces.items():
+            self.surfaces[name].restore(surface)
 
     def refresh(self, stepper: MuscleStepper, path: Path | None = None) -> None:
         """Update a muscle's surface from its present state, extrapolated for a path."""

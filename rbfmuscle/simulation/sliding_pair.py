@@ -4,11 +4,11 @@ them.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.simulation.contact import Planes
 from rbfmuscle.simulation.neighbour_surface import Found, NeighbourSurface
@@ -51,6 +51,13 @@ _FAR: Found = (
 )
 
 
+class LinkState(NamedTuple):
+    """What changes of a `SlidingPair` from frame to frame."""
+
+    linked: Booleans  # (n,) which of its points are held at the neighbour
+    least: float  # distance of its points from the neighbour when last measured
+
+
 class SlidingPair:
     """The linked points of one muscle at one neighbour, and their planes.
 
@@ -89,15 +96,14 @@ class SlidingPair:
         self.at, apart = at[chosen], apart[chosen]
         self.held = np.zeros(len(self.at), dtype=bool)
         self.held[_nearest_by_cell(places[self.at], apart, SPARSE * own.edge)] = True
-        #: Which of them are linked, and how far each may be from the neighbour.
-        self.linked = apart < min(
-            limits.threshold + min(BETWEEN * own.edge, limits.threshold), limits.reach
-        )
-        self.hold = np.where(self.linked, np.maximum(apart, 0.0) + limits.strip, limits.hold)
+        near = limits.threshold + min(BETWEEN * own.edge, limits.threshold)
+        linked = apart < min(near, limits.reach)
+        #: Which of them are linked, never changed in place, and how far each may be from the
+        #: neighbour.
+        self.state = LinkState(linked, np.inf)
+        self.hold = np.where(linked, np.maximum(apart, 0.0) + limits.strip, limits.hold)
         #: Those that touch the neighbour at rest, and how far they are from it there.
         self.touching = np.flatnonzero(apart < limits.threshold)
-        #: Least distance of its points from the neighbour, when last measured.
-        self.least = np.inf
         self.gap = apart[self.touching]
         area = self.free.sum() / max(1, len(self.at))
         self.push = Planes(YIELDS / area)
@@ -110,13 +116,22 @@ class SlidingPair:
         self._from: Integers | None = None
         self._fixed_from: Integers | None = None
 
+    @property
+    def linked(self) -> Booleans:
+        """Which of the points are linked."""
+        return self.state.linked
+
+    def _link(self, linked: Booleans) -> None:
+        self.state = self.state._replace(linked=linked)
+
     def update(self, *, relink: bool = True) -> None:
         """Recompute the planes from the surfaces as last refreshed, and, with ``relink``, which
         points are linked.
         """
         limits, points = self.limits, self.own.points
         if self.other.apart(self.own, limits.reach):
-            self.linked &= not relink
+            if relink:
+                self._link(np.zeros_like(self.linked))
             self.push.clear()
             self.pull.clear()
             return
@@ -124,8 +139,9 @@ class SlidingPair:
         if relink:
             far = np.ones(len(self.at), dtype=bool)
             far[index] = distance > self.hold[index] + limits.release
-            self.linked &= ~far
-            self.linked[index[distance < limits.threshold]] = True
+            linked = self.linked & ~far
+            linked[index[distance < limits.threshold]] = True
+            self._link(linked)
         share = np.where(self.other.fixed[nearest], 1.0, 0.5)
         own = self.at[index], np.maximum(share * distance, -limits.most), normal
         # Planes that keep the muscle out: at its own points, and at attached points of the
@@ -171,9 +187,10 @@ class SlidingPair:
         apart = np.full(len(self.at), self.limits.reach)
         index, now, _, _ = self._near()
         apart[index] = now
-        self.least = float(now.min(initial=np.inf))
+        least = float(now.min(initial=np.inf))
+        self.state = self.state._replace(least=least)
         opened = np.maximum(apart[self.touching] - np.maximum(self.gap, 0.0), 0.0)
-        return max(0.0, -self.least), len(opened), float((opened**2).sum())
+        return max(0.0, -least), len(opened), float((opened**2).sum())
 
     def excess(self, points: Floats) -> Floats:
         """How far (n,) points (n, 3) of the drawn muscle are to move inwards: half of the way out
@@ -182,7 +199,7 @@ class SlidingPair:
         limits = self.limits
         found = np.zeros(len(points))
         shown = self.other.shown
-        if self.least > limits.clear + self.own.edge:
+        if self.state.least > limits.clear + self.own.edge:
             return found
         near = np.flatnonzero(shown.boxed(points, limits.clear))
         index, distance, _, _ = shown.query(points[near], limits.deep)
@@ -220,7 +237,10 @@ def _nearest_by_cell(points: Floats, distance: Floats, size: float) -> Integers:
 
 
 class BoneLink:
-    """Points near a bone at rest, linked to it; the bone's own contact keeps them out."""
+    """Points near a bone at rest, linked to it; the bone's own contact keeps them out.
+
+    ``linked`` says which are, and is never changed in place.
+    """
 
     def __init__(self, stepper: MuscleStepper, bone_index: int, limits: SlidingLimits) -> None:
         self.stepper = stepper
@@ -237,7 +257,9 @@ class BoneLink:
         index = np.flatnonzero(self.linked)
         distance, normal = self.stepper.contacts.distance_and_direction(points[index], self.bone)
         held = distance <= limits.hold + limits.release
-        self.linked[index[~held]] = False
+        linked = self.linked.copy()
+        linked[index[~held]] = False
+        self.linked = linked
         index = index[held]
         distance = distance[held]
         normal = normal[held]

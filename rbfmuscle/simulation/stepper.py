@@ -15,9 +15,9 @@ from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.motion import shown_value, step_angle, unit_sign
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import BoneContacts, Planes
 from rbfmuscle.simulation.frame import Event, ModelSurface, MuscleModel
-from rbfmuscle.simulation.rigid_transport import MuscleStatus, RigidTransport
+from rbfmuscle.simulation.rigid_transport import MuscleStatus, RigidState, RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 from rbfmuscle.simulation.tunnelling import (
     find_crossings,
@@ -42,6 +42,21 @@ class Path(NamedTuple):
     after: dict[str, float]
     old: Poses
     new: Poses
+
+
+class StepperState(NamedTuple):
+    """What changes of a muscle, its obstacles and its events between sub-steps."""
+
+    model: Any
+    poses: dict[str, Floats]
+    neighbours: tuple[Planes, ...]
+    beside: tuple[Any, ...]  # sliding pairs, as the contacts have them
+    rigid_transport: RigidState | None
+    shown: ModelSurface | None
+    events: dict[tuple[int, str, str], int]
+    frame: int
+    solves: int
+    unresolved: bool
 
 
 class _Stage:
@@ -209,6 +224,36 @@ class MuscleStepper:
             events,
             MuscleStatus("solved" if solves else "carried" if moved else "skipped", solves),
         )
+
+    def snapshot(self) -> StepperState:
+        """The state, for :meth:`restore`; times are none of it."""
+        contacts, rigid_transport = self.contacts, self.rigid_transport
+        return StepperState(
+            self.model.snapshot(),
+            contacts.poses,
+            tuple(contacts.neighbours),
+            tuple(contacts.beside),
+            None if rigid_transport is None else rigid_transport.snapshot(),
+            self._shown,
+            dict(self.events),
+            self.frame,
+            self.solves,
+            self._unresolved,
+        )
+
+    def restore(self, state: StepperState) -> None:
+        """Return to a snapshot, which stays valid."""
+        self.model.restore(state.model)
+        self.contacts.move(state.poses)
+        self.contacts.neighbours = list(state.neighbours)
+        self.contacts.beside = list(state.beside)
+        if self.rigid_transport is not None and state.rigid_transport is not None:
+            self.rigid_transport.restore(state.rigid_transport)
+        self._shown = state.shown
+        self.events = dict(state.events)
+        self.frame = state.frame
+        self.solves = state.solves
+        self._unresolved = state.unresolved
 
     def _predict(self):
         path = self._path

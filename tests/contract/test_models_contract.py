@@ -13,9 +13,9 @@ from rbfmuscle.models import build_model, model_names
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Motion
-from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
+from rbfmuscle.scene.options import DetectOptions, SlidingOptions, TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame_loop import simulate_frames
+from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 
 paper_models.register()
 MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", *paper_models.KINDS)
@@ -26,7 +26,7 @@ def test_every_name_is_tested():
     assert set(MODELS) == {name.removesuffix("-converged") for name in model_names()}
 
 
-def _scene(angles, *, units="mm", overlap=0.0):
+def _scene(angles, *, units="mm", overlap=0.0, subdivisions=4):
     """An elbow: a fixed ball that a strap runs over, and an arm that turns about the ball's
     middle."""
     k = {"mm": 1.0, "m": 1e-3}[units]
@@ -37,7 +37,8 @@ def _scene(angles, *, units="mm", overlap=0.0):
     scene.add_bone("trunk", ball)
     scene.add_bone("arm", arm.subdivide().subdivide())
     scene.add_joint("hinge", "trunk", "arm", np.zeros(3), {"bend": [0, 0, -1]})
-    mesh = trimesh.creation.icosphere(subdivisions=4).apply_scale(np.array([50.0, 7.0, 7.0]) * k)
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    mesh.apply_scale(np.array([50.0, 7.0, 7.0]) * k)
     mesh.apply_translation(np.array([0.0, 22.5 - overlap, 0.0]) * k)
     x = mesh.vertices[:, 0]
     scene.add_muscle("strap0", mesh, attach=held(trunk=x < -40 * k, arm=x > 40 * k))
@@ -100,6 +101,39 @@ def test_rest_is_a_rest_and_restore_brings_a_snapshot_back(name):
     for _ in range(2):
         part.restore(state)
         assert np.allclose(go(stops[1], stops[2]), first, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ("rbf", "pbd", "arap-volume"))
+def test_restored_loop_of_neighbours_goes_on_to_the_bit(name):
+    """Two straps, one on the other, of which one contracts, with the tunnelling test."""
+    scene = _scene([0], subdivisions=3)
+    above = scene.muscles[0].mesh.copy().apply_translation([0.0, 14.3, 0.0])
+    x = above.vertices[:, 0]
+    scene.add_muscle("strap1", above, attach=held(trunk=x < -40, arm=x > 40), activation=0.0)
+    scene.sliding = SlidingOptions()
+    scene.detect = DetectOptions(tunnelling=TunnellingOptions())
+    loop = FrameLoop(scene, [build_model(muscle, scene, name) for muscle in scene.muscles])
+
+    def go(bend, activation):
+        loop.activations.target = {"strap1": activation}
+        frame = loop.advance({"hinge.bend": np.radians(bend)})
+        quantities = [
+            {k: v for k, v in shown.quantities.items() if not k.startswith("time_")}
+            for shown in frame.surfaces.values()
+        ]
+        shapes = [shown.vertices for shown in frame.surfaces.values()]
+        return shapes, [quantities, frame.events, frame.neighbours, frame.activations, frame.work]
+
+    stops = (6, 0.2), (10, 0.5)
+    go(3, 0.1)
+    state = loop.snapshot()
+    first = [go(*stop) for stop in stops]
+    assert first[0][1][2]  # they meet
+    loop.restore(state)
+    for stop, (shapes, facts) in zip(stops, first):
+        again, said = go(*stop)
+        np.testing.assert_array_equal(again, shapes)
+        assert said == facts
 
 
 @pytest.mark.parametrize("name", MODELS)

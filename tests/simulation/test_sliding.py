@@ -13,7 +13,7 @@ from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.options import SlidingOptions
 from rbfmuscle.simulation import sliding_pair as links
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame_loop import simulate_frames
+from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
 from rbfmuscle.simulation.sliding import Sliding, sliding_pairs
 from rbfmuscle.simulation.stepper import MuscleStepper
@@ -108,6 +108,39 @@ def test_pressed_muscles_do_not_overlap_and_both_give_way(pressed):
     assert "time_sliding" in frames[-1].times["upper"]
     for name in ("lower", "upper"):
         assert np.linalg.norm(parts[name].x - alone[name].x, axis=1).max() > 0.1
+
+
+@pytest.mark.parametrize("gap", [1.0, 5.0])
+def test_restored_loop_goes_on_to_the_bit(monkeypatch, gap):
+    """Linked from the start, or linked after the snapshot; what is pulled away is released."""
+    monkeypatch.setattr(links, "RELEASE", 0.1)
+    made, fields = toy.neighbour_scene([{}], gap, sliding=SlidingOptions(bones=True))
+    parts = toy.neighbour_parts(made)
+    loop = FrameLoop(made, parts.values(), bone_sdfs=fields)
+    angles = [{"press": 2}, {"press": 9}, {"press": 9, "roll": 4}, {"lift": 8}]
+    stops = [{f"hinge.{name}": np.radians(a) for name, a in angle.items()} for angle in angles]
+
+    def go(stops):
+        """What frames show, and the neighbours that act in them."""
+        frames = [loop.advance(stop) for stop in stops]
+        planes = [len(stepper.contacts.neighbours) for stepper in loop.steppers]
+        return [(f.surfaces, f.neighbours, f.events, f.index) for f in frames], planes
+
+    go(stops[:1])
+    state = loop.snapshot()
+    first, planes = go(stops[1:])
+    assert first[0][1] and first[0][1] != first[1][1] and first[-1][1] != first[1][1]
+    for _ in range(2):
+        loop.restore(state)
+        again, there = go(stops[1:])
+        assert there == planes
+        for (shown, *rest), (wanted, *others) in zip(again, first):
+            assert rest == others
+            for name in parts:
+                np.testing.assert_array_equal(shown[name].vertices, wanted[name].vertices)
+    loop.restore(state)
+    before = sum(len(stepper.contacts.beside) for stepper in loop.steppers)
+    assert before == (2 if gap == 1.0 else 0)
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
