@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.folders import OutputFolder
+from rbfmuscle.geometry.tubes import line_length, points_along, tube_mesh
 from rbfmuscle.importers.guess.attachments import Ends
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
@@ -46,7 +47,9 @@ from rbfmuscle.validation import UsageError
         ),
         ("addmagDist_r", "muscle", "adductor magnus", "r"),
         ("VHM_Left_Cartilage_TibialMedial_smooth", "other", "", "l"),
-        ("quadriceps_tendon", "other", "", ""),
+        ("quadriceps_tendon", "tendon", "", ""),
+        ("hamstring_origin", "tendon", "", ""),
+        ("gasmed_l", "muscle", "gastrocnemius medial", "l"),
         ("iliac_artery_left", "other", "", "l"),
         ("Segment_1", "", "", ""),
     ],
@@ -322,6 +325,31 @@ def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess, leg_data):
     assert tendon.bone.name == "tibia" and [bone.name for bone, _ in tendon.via] == ["patella"] * 3
     ligament = np.linalg.norm(tendon.to - tendon.via[-1][1])
     assert 40.0 < ligament < 65.0  # 53 to 55 mm by data/leg/README.md, between other points
+
+
+def test_tendons_with_meshes_are_tendons_and_those_of_no_use_are_named(leg, tmp_path):
+    """A tube of radius 3 mm from the semitendinosus past a corner to the tibia."""
+    source, _ = leg
+    for name in ("bones/pelvis", "bones/femur", "bones/tibia", "muscles/semitendinosus"):
+        shutil.copy(source / f"{name}.ply", tmp_path)
+    shutil.copy(source / "bones" / "extensor_tendons.ply", tmp_path)
+    shutil.copy(source / "bones" / "hamstring_origin.ply", tmp_path)
+    corners = np.array([[-601.7, -381.9, 562.1], [-580.0, -409.0, 472.4], [-596.9, -436.6, 441.1]])
+    line = points_along(corners, np.linspace(0.0, line_length(corners), 60))
+    trimesh.Trimesh(*tube_mesh(line, np.full(60, 3.0))).export(tmp_path / "SemitendinosusSehne.ply")
+    guess = guess_scene(tmp_path, None, tmp_path)
+    (muscle,) = guess.muscles
+    hold = next(hold for hold in muscle.holds if hold.tendon is not None)
+    assert muscle.muscle.name == "semitendinosus" and hold.tendon.bone.name == "tibia"
+    # The tube's end is not at one point, and its middles are means over a part of it.
+    assert np.linalg.norm(hold.tendon.to - corners[-1]) < 5.0
+    assert min(np.linalg.norm(at - corners[1]) for _, at in hold.tendon.via) < 6.0
+    starts = muscle.muscle.points[hold.vertices]
+    assert np.linalg.norm(starts.mean(axis=0) - corners[0]) < 8.0
+    reasons = guess.parts.unusable
+    assert "no muscle here has that name" in reasons["extensor_tendons.ply"]
+    assert "at most 15 mm are believed" in reasons["hamstring_origin.ply"]
+    assert any("hamstring_origin.ply is not used" in note for note in guess.parts.notes)
 
 
 def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_path):

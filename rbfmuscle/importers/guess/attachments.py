@@ -9,18 +9,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import combinations
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.importers.guess.anatomy import JointGuess
 from rbfmuscle.importers.guess.ends import Ends
-from rbfmuscle.importers.guess.frames import PELVIS, BoneFrame
+from rbfmuscle.importers.guess.frames import PELVIS
 from rbfmuscle.importers.guess.landmarks import unit
 from rbfmuscle.importers.guess.parts import Part
-from rbfmuscle.importers.guess.sites import Site, anatomy_of, find_site, sites_on, whole_bone
-from rbfmuscle.scene.bone import Bone
+from rbfmuscle.importers.guess.sites import Site, anatomy_of, sites_on, whole_bone
+from rbfmuscle.importers.guess.skeleton import Skeleton
+from rbfmuscle.importers.guess.tendons import (
+    REACHES,
+    BonePlace,
+    TendonGuess,
+    see_tendon,
+    tendon_by_mesh,
+    tendon_to_site,
+    via_places,
+)
 
 # A site nearer than this [mm] is touched; the patch is what lies within TOUCH of the nearest.
 NEAR, TOUCH = 6.0, 3.0
@@ -41,25 +50,10 @@ FAR_FROM_PATELLA = 5.0  # the same at the patella, where the tendon takes the mu
 LONG = 100.0  # a tendon longer than this [mm] is less sure
 # How much of a muscle is held where bones that are not here would hold it along its length.
 UPPER = 0.25
-# The muscle whose tendon is drawn on, in front of the patella and along its ligament; the patella's
-# poles and front.
-ALONG_LIGAMENT = "rectus femoris"
-POLES = "patella_base", "patella_front", "patella_apex"
-CLEAR = 1.5  # via points lie so far out of bones [mm]
 # Confidence where a muscle touches its site, lies beside it, has a tendon, a long one; where its
 # site is not known; where a bone stands for one that is not here; where not even its bones are.
 TOUCHES, BESIDE, TENDON, LONG_TENDON = 1.0, 0.9, 0.8, 0.7
 NO_SITE, STAND_IN, NO_BONE, NO_NAME = 0.5, 0.4, 0.2, 0.4
-
-
-class TendonGuess(NamedTuple):
-    """Bone and place (3,) of a tendon's insertion; (bone, place) of its via points from the muscle
-    on [scene unit].
-    """
-
-    bone: Part
-    to: np.ndarray
-    via: tuple[tuple[Part, np.ndarray], ...] = ()
 
 
 @dataclass
@@ -97,30 +91,6 @@ class MuscleGuess:
         self.doubted = True
 
 
-class Skeleton(NamedTuple):
-    """What muscles are held by; ``bodies`` gives of bones that move as one the one that stands for
-    all, ``frames`` and ``articular`` their axes and the points (n, 3) of their joints' surfaces.
-    """
-
-    bones: dict[Part, Bone]
-    bodies: dict[Part, Part]
-    joints: list[JointGuess]
-    millimetre: float
-    frames: dict[Part, list[BoneFrame]]
-    articular: dict[Part, np.ndarray]
-
-    def frame(self, bone: Part, points: np.ndarray) -> BoneFrame | None:
-        """The frame of a bone that is nearest to some points (n, 3), of several."""
-        here = points.mean(axis=0)
-        frames = self.frames.get(bone, [])
-        return min(frames, key=lambda f: np.linalg.norm(f.origin - here), default=None)
-
-    def site(self, name: str, bone: Part, points: np.ndarray) -> Site | None:
-        """A site on a bone, for a muscle of these points (n, 3); None without landmarks."""
-        frame = self.frame(bone, points)
-        return frame and find_site(name, bone, frame, self.articular[bone])
-
-
 class Place(NamedTuple):
     """A bone, the end of the muscle that it holds, the sites there, none where they are not known,
     the first place that the tendon passes, and whether the bone stands for one that is not here.
@@ -129,7 +99,7 @@ class Place(NamedTuple):
     bone: Part
     end: int
     sites: tuple[Site, ...] = ()
-    via: tuple[tuple[Part, np.ndarray], ...] = ()
+    via: tuple[BonePlace, ...] = ()
     stands_in: bool = False
 
 
@@ -191,7 +161,7 @@ def _named_places(guess, distances, ends, skeleton):
                     guess.doubt(STAND_IN, f"no {kinds[0]} is here, the {bone.name} stands for it")
                 names = sites_on(getattr(known, side), bone) if known else ()
                 sites = (skeleton.site(name, bone, muscle.points) for name in names)
-                via = _via(known, muscle, skeleton) if names and side == "insertion" else ()
+                via = via_places(known, muscle, skeleton) if names and side == "insertion" else ()
                 chosen[bone] = Place(bone, 0, tuple(filter(None, sites)), via, stands_in)
         groups.append(chosen)
 
@@ -220,9 +190,7 @@ def _best_of(kinds, muscle, distances):
     """The bone to hold at: of the first class that is there, on the muscle's side, the nearest."""
     for kind in kinds:
         here = [bone for bone in distances if bone.kind == kind]
-        fitting = [
-            bone for bone in here if not bone.side or not muscle.side or bone.side == muscle.side
-        ]
+        fitting = [bone for bone in here if _same_side(bone, muscle)]
         if fitting:
             return min(fitting, key=lambda bone: distances[bone].min())
     return None
@@ -264,6 +232,9 @@ def _aim(points, along, bone):
 def _hold(place, distance, ends, muscle, skeleton):
     """What a bone holds of an end."""
     bone, millimetre = place.bone, skeleton.millimetre
+    by_tendon = _hold_by_tendon(place, ends, muscle, skeleton)
+    if by_tendon is not None:
+        return by_tendon
     points = muscle.points
     sites = place.sites or (whole_bone(bone, skeleton.articular[bone]),)
     near = cKDTree(np.concatenate([site.points for site in sites])).query(points)[0] / millimetre
@@ -286,10 +257,35 @@ def _hold(place, distance, ends, muscle, skeleton):
         if place.stands_in:
             hold.vertices = np.flatnonzero(ends.along(place.end) <= UPPER)
         elif gap > far:
-            _add_tendon(hold, place, muscle, skeleton)
+            end = muscle.points[hold.vertices].mean(axis=0)
+            hold.tendon = tendon_to_site(bone, place.sites, place.via, end, muscle, skeleton)
+            hold.confidence = TENDON if hold.gap < LONG else LONG_TENDON
     if not place.sites:
         hold.confidence = min(hold.confidence, NO_SITE)
     return hold
+
+
+def _hold_by_tendon(place, ends, muscle, skeleton):
+    """What a tendon that has a mesh holds of an end, None where there is none."""
+    if muscle.facts is None or place.stands_in:
+        return None
+    for part in skeleton.tendons:
+        if muscle.facts.name not in part.tendon_of or not _same_side(part, muscle):
+            continue
+        tendon = see_tendon(part, muscle)
+        begins = tendon.begins[ends.along(place.end)[tendon.begins] <= UPPER]
+        away = float(skeleton.bones[place.bone].distances(tendon.end[None])[0])
+        if len(begins) < FEWEST or max(tendon.gap, away) > REACHES * skeleton.millimetre:
+            continue
+        reason = f"where {Path(part.file).stem} begins, which ends on the {place.bone.name}"
+        gap = tendon.gap / skeleton.millimetre
+        guess = tendon_by_mesh(tendon, place.bone, skeleton)
+        return AttachmentGuess(place.bone, begins, gap, reason, BESIDE, guess)
+    return None
+
+
+def _same_side(one, other):
+    return not one.side or not other.side or one.side == other.side
 
 
 def _touching(distance, along):
@@ -317,56 +313,6 @@ def _end(near, ends, place, muscle, millimetre):
         chosen = np.flatnonzero(ends.away[place.end] <= share)
         near = ends.away[place.end]
     return chosen if len(chosen) >= FEWEST else np.sort(np.argsort(near, kind="stable")[:FEWEST])
-
-
-def _add_tendon(hold, place, muscle, skeleton):
-    """A tendon to the nearest landmark of the site, or to the nearest place of the bone, past the
-    places that anatomy names.
-    """
-    end = muscle.points[hold.vertices].mean(axis=0)
-    last = place.via[-1][1] if place.via else end
-    ends = [site.nearest(last) for site in place.sites] or [place.bone.points]
-    points = np.vstack(ends)
-    to = points[np.argmin(((points - last) ** 2).sum(axis=1))]
-    to = _out_of_bones(to, hold.bone, skeleton)
-    hold.tendon = TendonGuess(hold.bone, to, place.via)
-    if hold.bone.kind == "patella" and muscle.facts.name == ALONG_LIGAMENT:
-        hold.tendon = _past_patella(hold.bone, muscle, skeleton) or hold.tendon
-    hold.confidence = TENDON if hold.gap < LONG else LONG_TENDON
-
-
-def _past_patella(patella, muscle, skeleton):
-    """A tendon in front of a patella that follows its knee, on along its ligament to the tibia;
-    else None.
-    """
-    follows = {j.child: j.parent for j in skeleton.joints if j.ligament is not None}
-    shins = {j.parent: j.child for j in skeleton.joints if j.child.kind == "tibia"}
-    tibia = shins.get(follows.get(patella))
-    tuberosity = tibia and skeleton.site("tibial_tuberosity", tibia, muscle.points)
-    if tuberosity is None:
-        return None
-    poles = [skeleton.site(name, patella, muscle.points).core[0] for name in POLES]
-    via = tuple((patella, _out_of_bones(pole, patella, skeleton)) for pole in poles)
-    return TendonGuess(tibia, _out_of_bones(tuberosity.core[0], tibia, skeleton), via)
-
-
-def _via(known, muscle, skeleton):
-    """(bone, place) that the tendon of an insertion passes, out of the bones."""
-    found = []
-    for name in known.via:
-        bones = [b for b in skeleton.bones if sites_on((name,), b)]
-        bones = [b for b in bones if not b.side or not muscle.side or b.side == muscle.side]
-        sites = ((b, skeleton.site(name, b, muscle.points)) for b in bones)
-        bone, site = next(((b, s) for b, s in sites if s is not None), (None, None))
-        if site is not None:
-            found.append((bone, _out_of_bones(site.core[0], bone, skeleton)))
-    return tuple(found)
-
-
-def _out_of_bones(point, bone, skeleton):
-    """A place (3,) of a bone's surface, moved out of it by `CLEAR`."""
-    nearest = np.argmin(((bone.faces[0] - point) ** 2).sum(axis=1))
-    return point + CLEAR * skeleton.millimetre * bone.faces[1][nearest]
 
 
 def _disjoint(holds, distances):

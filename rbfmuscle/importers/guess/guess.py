@@ -11,16 +11,13 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
-from rbfmuscle.importers.guess.attachments import (
-    FEWEST,
-    MuscleGuess,
-    Skeleton,
-    guess_attachments,
-)
+from rbfmuscle.importers.guess.attachments import FEWEST, MuscleGuess, guess_attachments
 from rbfmuscle.importers.guess.frames import bone_frames
 from rbfmuscle.importers.guess.joints import guess_joints
 from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
 from rbfmuscle.importers.guess.parts import Part, Parts, read_parts
+from rbfmuscle.importers.guess.skeleton import Skeleton
+from rbfmuscle.importers.guess.tendons import unused_tendons
 from rbfmuscle.scene.articular import articular_points
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.guesses import DOUBTFUL
@@ -96,6 +93,7 @@ def guess_scene(
         guess.muscles = [
             guess_attachments(muscle, skeleton, named=False) for muscle in parts.muscles
         ]
+    _say_unused(guess, skeleton)
     for muscle in guess.muscles:
         _leave_caps(muscle, (capped or {}).get(Path(muscle.muscle.file).stem))
     order = [root, *(joint.child for joint in joints)]
@@ -118,7 +116,18 @@ def _skeleton(guess, bodies, millimetre):
         millimetre,
         bone_frames(bones, joints, guess.orientation, millimetre),
         {bone: surfaces[bone.name] for bone in bones},
+        guess.parts.tendons,
     )
+
+
+def _say_unused(guess, skeleton):
+    """Name tendons of no use."""
+    holds = [hold for muscle in guess.muscles for hold in muscle.holds if hold.tendon is not None]
+    used = {hold.tendon.mesh for hold in holds}
+    parts = guess.parts
+    unused = unused_tendons(parts.tendons, parts.muscles, used, skeleton)
+    parts.unusable |= unused
+    parts.notes += [f"{file} is not used: {reason}" for file, reason in unused.items()]
 
 
 def _leave_caps(muscle, capped):

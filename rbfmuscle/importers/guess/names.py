@@ -1,4 +1,5 @@
-"""What names of meshes and labels mean: bone, muscle or other tissue, which one, and of which side.
+"""What names of meshes and labels mean: bone, muscle, tendon or other tissue, which one, and of
+which side.
 
 A name is split at capitals, digits and signs; words are brought to one form, those written together
 are taken apart, and unknown ones may be misspelt. The table is ``names.toml``, with its sources.
@@ -15,7 +16,6 @@ from typing import NamedTuple
 # Fewest letters of a word that may be misspelt, and how much of it must agree with a known one
 # (`difflib`'s ratio).
 FEWEST, LIKE = 5, 0.8
-PARTS = ("origin", "insertion", "attachment", "enthesis")  # of a muscle
 MIDLINE = ("sacrum", "vertebra", "sternum", "skull", "mandible")
 _SIGNS = str.maketrans(
     {"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "é": "e", "è": "e", "ô": "o", "â": "a"}
@@ -39,8 +39,9 @@ class MuscleFacts:
 class NameFacts:
     """What a name says.
 
-    ``tissue`` is ``"bone"``, ``"muscle"``, ``"other"`` or empty; ``bone`` the class of bone;
-    ``side`` is ``"l"``, ``"r"`` or empty; ``spelling`` says what misspelt words were taken for.
+    ``tissue`` is ``"bone"``, ``"muscle"``, ``"tendon"``, ``"other"`` or empty; ``bone`` the class
+    of bone; ``side`` is ``"l"``, ``"r"`` or empty; ``spelling`` says what misspelt words were taken
+    for; ``tendon_of`` are the muscles of a tendon, or of a part at the end of muscles.
     """
 
     tissue: str = ""
@@ -48,7 +49,7 @@ class NameFacts:
     muscle: MuscleFacts | None = None
     side: str = ""
     spelling: str = ""
-    part: str = ""  # the word that makes a muscle's name that of a part of one
+    tendon_of: tuple[str, ...] = ()
 
 
 class _Table(NamedTuple):
@@ -61,6 +62,9 @@ class _Table(NamedTuple):
     other: set[str]
     bones: dict[tuple, str]
     muscles: dict[tuple, MuscleFacts]
+    ends: set[str]
+    shared: dict[tuple, tuple[str, ...]]
+    groups: dict[str, tuple[str, ...]]
     known: set[str]
 
 
@@ -79,10 +83,20 @@ def _table():
     muscles = {}
     for line in table["muscles"]["table"].strip().splitlines():
         names, *places = (part.strip() for part in line.split(";"))
-        for name in names.split(","):
-            muscles[key(name)] = MuscleFacts(name.strip(), *map(_places, places))
-    known = {word for name in (*bones, *muscles) for word in name} | other | {*forms, *words}
-    return _Table(sides, forms, other, bones, muscles, known)
+        for one in names.split(","):
+            first, *more = (name.strip() for name in one.split("="))
+            for name in (first, *more):
+                muscles[key(name)] = MuscleFacts(first, *map(_places, places))
+    ends = {word for words in table["ends"].values() for word in words.split()}
+    shared = {key(name): _listed(found) for name, found in table["shared"].items()}
+    groups = {name: _listed(found) for name, found in table["groups"].items()}
+    known = {word for name in (*bones, *muscles, *shared) for word in name}
+    known |= other | ends | {*forms, *words}
+    return _Table(sides, forms, other, bones, muscles, ends, shared, groups, known)
+
+
+def _listed(text):
+    return tuple(name.strip() for name in text.split(","))
 
 
 def _places(text):
@@ -98,6 +112,11 @@ def name_facts(name: str) -> NameFacts:
     bone, muscle = _longest(words, table.bones), _longest(words, table.muscles)
     if any(word in table.other and word not in (muscle or ()) for word in words):
         return NameFacts("other", side=side)
+    shared = _longest(words, table.shared)
+    if shared or table.ends.intersection(words):
+        name = table.muscles[muscle].name if muscle else ""
+        of = (name, *table.groups.get(name, ())) if name else table.shared.get(shared, ())
+        return NameFacts("tendon", side=side, tendon_of=of)
     says_bone, says_muscle = "bone" in words, "muscle" in words
     if bone is not None and muscle is not None:
         more = says_muscle or len(muscle) > len(bone) or set(bone) <= set(muscle)
@@ -109,8 +128,7 @@ def name_facts(name: str) -> NameFacts:
         f"{wrong!r} read as {right!r}" for wrong, right in spelling.items() if right in used
     )
     side = "" if kind in MIDLINE else side
-    part = next((word for word in words if word in PARTS), "") if muscle else ""
-    return NameFacts(tissue, kind, table.muscles[muscle] if muscle else None, side, shown, part)
+    return NameFacts(tissue, kind, table.muscles[muscle] if muscle else None, side, shown)
 
 
 def _longest(words, table):

@@ -1,4 +1,4 @@
-"""The meshes of a folder, sorted into bones and muscles; the unit of their lengths."""
+"""The meshes of a folder, sorted into bones, muscles and tendons; the unit of their lengths."""
 
 import os
 import re
@@ -20,6 +20,7 @@ from rbfmuscle.validation import MeshError, UsageError
 # Folders below the one that is given, as people sort their meshes.
 FOLDERS = {"bones": "bone", "bone": "bone", "knochen": "bone", "os": "bone"}
 FOLDERS |= {"muscles": "muscle", "muscle": "muscle", "muskeln": "muscle"}
+FOLDERS |= {"tendons": "tendon", "tendon": "tendon", "sehnen": "tendon"}
 MILLIMETRE = {"mm": 1.0, "cm": 0.1, "m": 0.001}
 # Length of a bone [mm] by its class, and of the largest one where none is known, from child to
 # large adult.
@@ -40,6 +41,7 @@ class Part:
     side: str = ""  # "l", "r" or empty
     doubt: str = ""  # what speaks for a bone or a muscle where the name does not
     facts: MuscleFacts | None = None
+    tendon_of: tuple[str, ...] = ()  # muscles of which it is a tendon by its name
     coarse: bool = False  # whether the mesh was made coarser than its file
     frame: Any = None  # directions of a femur, a Frame
 
@@ -87,6 +89,7 @@ class Parts:
     units: str = ""
     bones: list[Part] = field(default_factory=list)
     muscles: list[Part] = field(default_factory=list)
+    tendons: list[Part] = field(default_factory=list)
     unusable: dict[str, str] = field(default_factory=dict)
     missing_bones: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -98,8 +101,8 @@ class Parts:
 
 
 def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
-    """Bones and muscles of a folder, and of its folders ``bones`` and ``muscles``; files relative
-    to ``base``.
+    """Bones, muscles and tendons of a folder, and of its folders ``bones``, ``muscles`` and
+    ``tendons``; files relative to ``base``.
 
     Where no unit is given it is the one in which the bones have the size that they have in people.
     """
@@ -112,22 +115,19 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
         if facts.tissue == "other":
             other.append(path.name)
             continue
-        tissue = facts.tissue if path.parent == folder else FOLDERS[path.parent.name.lower()]
+        tissue = _tissue(facts, path.parent, folder)
         try:
             part = _read_part(
                 path, stem, mesh, base, names, facts, found, closed=tissue == "muscle"
             )
         except MeshError as error:
             found.unusable[path.name] = str(error).removeprefix(f"{path}: ")
-            found.missing_bones += [stem] if tissue != "muscle" else []
+            found.missing_bones += [stem] if tissue in ("bone", "") else []
             continue
-        if facts.part:
-            part.doubt = (
-                f"a muscle by its name, of which {facts.part!r} says that it is a part of one"
-            )
         if facts.spelling:
             found.notes.append(f"{path.name}: {facts.spelling}")
-        {"bone": found.bones, "muscle": found.muscles, "": unknown}[tissue].append(part)
+        kinds = {"bone": found.bones, "muscle": found.muscles, "tendon": found.tendons}
+        kinds.get(tissue, unknown).append(part)
     if other:
         found.notes.append(f"left out, neither bone nor muscle: {', '.join(other)}")
     _sort_unknown(found, unknown)
@@ -145,6 +145,13 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
     found.units = units or _guess_units(found)
     _leave_out_wrong_sizes(found)
     return found
+
+
+def _tissue(facts, parent, folder):
+    """What a mesh is: a tendon by its name, else by the folder that it is in, else by its name."""
+    if facts.tissue == "tendon" or parent == folder:
+        return facts.tissue
+    return FOLDERS[parent.name.lower()]
 
 
 def _sort_unknown(found, unknown):
@@ -167,7 +174,7 @@ def _can_be_muscle(part):
 
 
 def _find_meshes(folder):
-    """Mesh files of a folder and of its folders for bones and muscles, in order."""
+    """Mesh files of a folder and of its folders for bones, muscles and tendons, in order."""
     if not folder.is_dir():
         raise UsageError(f"{folder} is no folder; give the folder of the meshes")
     inner = [
@@ -212,7 +219,9 @@ def _read_part(path, stem, mesh, base, names, facts, found, *, closed):
     read = prepare_mesh(vertices, faces, context=str(path), name=stem, may_be_open=not closed)
     read.notes[:0] = mesh.notes
     file = os.path.relpath(path, base).replace(os.sep, "/")
-    return Part(name, file, read, facts.bone, facts.side, facts=facts.muscle, coarse=coarse)
+    part = Part(name, file, read, facts.bone, facts.side, facts=facts.muscle, coarse=coarse)
+    part.tendon_of = facts.tendon_of or ((facts.muscle.name,) if facts.muscle else ())
+    return part
 
 
 def _guess_units(found):
