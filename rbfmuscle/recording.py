@@ -19,6 +19,7 @@ from rbfmuscle.metrics.summary import (
     LIMITS,
     Limits,
     Summary,
+    Table,
     describe_verdict,
     exceeded,
     parse_limits,
@@ -222,13 +223,19 @@ class Recording:
             times=self.times,
             limits=limits.values,
             fail_on=limits.fail_on,
-            verdict=_with_doubts(
-                describe_verdict(table, limits, self.scene.missing_bones), self.scene
-            ),
+            verdict=self._verdict(table),
             beyond=exceeded(table, limits),
             not_measured=unmeasured(table, limits),
             frames=self.written,
         )
+
+    def _verdict(self, table: Table) -> str:
+        """What the run is worth: where it failed, of how many frames that holds."""
+        verdict = describe_verdict(table, self.limits, self.scene.missing_bones)
+        if self.status == "failed" and self.written:
+            count = f"{len(self.written)} of {len(self.scene.motion)} frames"
+            verdict = f"the run stopped after {count}; in these {verdict}"
+        return _with_doubts(verdict, self.scene)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from rbfmuscle.recording import MemorySink, Recording
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame
-from rbfmuscle.validation import SolveError, UsageError, did_you_mean
+from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -131,7 +132,13 @@ def stream_run(
     run_folder(directory)
     recording = Recording(scene, model=model, settings=settings, frames=frames, fail_on=fail_on)
     writer = RunWriter(directory, recording.scene)
-    recording.feed(writer, progress=progress)
+    try:
+        recording.feed(writer, progress=progress)
+    except SolveError:
+        if recording.written:  # what is kept is shown as far as that works
+            with suppress(RBFMuscleError):
+                recording.finish(writer, pictures=pictures)
+        raise
     return recording.finish(writer, pictures=pictures)
 
 

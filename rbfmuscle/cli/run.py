@@ -18,7 +18,7 @@ from rbfmuscle.cli.options import (
 )
 from rbfmuscle.cli.printing import USUAL, Printing, print_result
 from rbfmuscle.progress import Progress
-from rbfmuscle.validation import LimitExceededError, SolveError
+from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError
 
 
 def demo(
@@ -68,8 +68,9 @@ def run(
         progress(count, total)
         interruption.check()
 
-    failed = None
+    failed: RBFMuscleError | None = None
     with Progress(scene.stem) as progress, interruption.keeping(kept), threads(jobs):
+        from rbfmuscle.output.run_data import RunData
         from rbfmuscle.run import stream_run
         from rbfmuscle.scene.phantom import open_scene
         from rbfmuscle.scene.settings import parse_settings
@@ -81,7 +82,10 @@ def run(
         try:
             info = stream_run(loaded, output, settings=changes, progress=advance, **options)
         except SolveError as error:
-            raise SolveError("; ".join(filter(None, [str(error), kept()]))) from None
+            failed = SolveError("; ".join(filter(None, [str(error), kept()])))
+            if not done:
+                raise failed from None
+            info = RunData.load(output).info
         except LimitExceededError as error:
             info, failed = error.info, error
     facts = {"directory": str(output), **info.to_dict()}

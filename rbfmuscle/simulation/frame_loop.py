@@ -192,7 +192,7 @@ class FrameLoop:
         paths: dict[str, Path] = {}
         for stepper in self.steppers:
             stepper.frame = self._next_index
-            paths[stepper.name] = [here, *stepper.substeps.split(here, self.here)], []
+            paths[stepper.name] = [here, *stepper.split(here, self.here)], []
         if any(stepper.rigid_transport is None for stepper in self.steppers):
             # Muscles that slide or contract share the sub-steps of the one that has the most.
             stops = max((stops for stops, _ in paths.values()), key=len)

@@ -8,6 +8,7 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import bone_regions, find_contact_pairs
 from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
+from rbfmuscle.validation import SceneError
 
 
 def plan_scene(scene: Scene) -> dict[str, object]:
@@ -52,9 +53,13 @@ def _count_substeps(muscle: Muscle, scene: Scene, bones: list[str], poses: PoseC
     count = 0
     here = rest_coordinates(scene)
     rigid_transport.solved = poses(here)
-    for frame in scene.motion.frames:
+    for index, frame in enumerate(scene.motion.frames):
         there = completed(scene, frame)
-        for stop in cut.split(here, there):
+        try:
+            stops = cut.split(here, there)
+        except SceneError as error:
+            raise SceneError(f"muscle {muscle.name!r}, frame {index}: {error}") from None
+        for stop in stops:
             if always or not rigid_transport.keeps_shape(poses(stop)):
                 count, rigid_transport.solved = count + 1, poses(stop)
         here = there

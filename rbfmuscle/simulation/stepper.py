@@ -24,7 +24,7 @@ from rbfmuscle.simulation.tunnelling import (
     one_sided_planes,
     only_grazed,
 )
-from rbfmuscle.validation import NotFiniteError, SolveError
+from rbfmuscle.validation import NotFiniteError, SceneError, SolveError
 
 # Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's
 # field.
@@ -115,6 +115,13 @@ class MuscleStepper:
     def timed(self, stage: str) -> _Stage:
         """Add the time spent inside to ``time_<stage>``."""
         return _Stage(self.times, f"time_{stage}")
+
+    def split(self, before: dict[str, float], after: dict[str, float]) -> list[dict[str, float]]:
+        """Coordinates of the sub-steps to the next frame; SolveError where there are too many."""
+        try:
+            return self.substeps.split(before, after)
+        except SceneError as error:
+            raise SolveError(f"{self._place(after)}: {error}") from None
 
     def advance(
         self, stops: list[dict[str, float]], activations: Sequence[Mapping[str, float]] = ()

@@ -15,7 +15,9 @@ from rbfmuscle.scene.joints.joint import Coordinate, all_coordinates
 from rbfmuscle.scene.motion import (
     bone_poses,
     rest_coordinates,
+    shown_value,
     step_angle,
+    unit_sign,
 )
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
@@ -29,8 +31,11 @@ TRAVEL = 1.0 / 27.0
 # A tendon's end asks for at most so many times the sub-steps that the bones themselves need: where
 # it jumps, no number of them would do.
 FINER = 8.0
-# Sub-steps that one coordinate may take in a motion.
+# Sub-steps that one coordinate may take in a motion, and a muscle in one frame: 90 degrees
+# take 45, the end of a tendon 8 times that.
 MOST_SUBSTEPS = 100_000
+MOST_IN_FRAME = 2000
+LOOKED_INTO = 64  # where it is about as many, it is first found whether smaller ones are shorter
 # Pieces in which a path is followed to see how far it turns the bones.
 PIECES = 8
 
@@ -95,7 +100,7 @@ class SubSteps:
 
     def split(self, before: Coordinates, after: Coordinates) -> list[Coordinates]:
         """Coordinates of the sub-steps to the next frame, ``before`` left out; empty where nothing
-        moves.
+        moves. SceneError says why there would be more than `MOST_IN_FRAME`.
         """
         before, after = {**self._rest, **before}, {**self._rest, **after}
         moving = [k for k in {*before, *after} if before.get(k, 0.0) != after.get(k, 0.0)]
@@ -116,19 +121,69 @@ class SubSteps:
             1, math.ceil(path_angle(self.scene, start, after, self._facts) / self.limit - 1e-9)
         )
         while True:
-            if count > MOST_SUBSTEPS:
-                whose = "" if self._muscle is None else f" for muscle {self._muscle.name!r}"
-                ways = ", ".join(f"{k} {before.get(k, 0.0):.4g} to {after[k]:.4g}" for k in after)
-                raise SceneError(
-                    f"[motion]: the way {ways} (radian or scene unit) takes more than "
-                    f"{MOST_SUBSTEPS} sub-steps{whose}; make its step or the angles smaller"
-                )
+            if count > MOST_IN_FRAME:
+                raise SceneError(self._too_many(start, after))
             stops = [interpolate(before, after, k / count) for k in range(count + 1)]
             poses = [self._matrices(stop) for stop in stops]
-            excess = max(map(self._excess, poses[:-1], poses[1:]))
-            if excess <= 1.0 + 1e-9:
+            excess = list(map(self._excess, poses[:-1], poses[1:]))
+            most = max(excess)
+            if most <= 1.0 + 1e-9:
                 return stops[1:]
-            count = max(count + 1, math.ceil(count * min(excess, 4.0)))
+            worst = excess.index(most)
+            if count * most > LOOKED_INTO:
+                self._halve(stops[worst], stops[worst + 1], MOST_IN_FRAME / count)
+            count = max(count + 1, math.ceil(count * min(most, 4.0)))
+
+    def _halve(self, before, after, most):
+        """Halve a step, always the half that asks for more, until it is short enough; SceneError
+        where that takes more than ``most`` parts. It is found at once where a bone jumps.
+        """
+        parts = 1
+        whole = before, after
+        while True:
+            middle = interpolate(before, after, 0.5)
+            halves = [(before, middle), (middle, after)]
+            values = [self._excess(*map(self._matrices, half)) for half in halves]
+            parts *= 2
+            before, after = halves[int(np.argmax(values))]
+            if max(values) <= 1.0 + 1e-9:
+                return
+            if parts > most:
+                raise SceneError(self._too_many(*whole))
+
+    def _too_many(self, before, after):
+        """What moves too far from one set of coordinates to another, and what may be wrong."""
+        moving = [k for k in after if before.get(k, 0.0) != after[k]]
+        way = ", ".join(
+            f"{k} {shown_value(self.scene, k, before.get(k, 0.0)):.6g} to "
+            f"{shown_value(self.scene, k, after[k]):.6g}{unit_sign(self.scene, k)}"
+            for k in moving
+        )
+        old, new = self._matrices(before), self._matrices(after)
+        bone, seen, far = self._farthest(old, new)
+        moved = f"{bone} moves by {far:.4g} {self.scene.units}{seen and f' against {seen}'}"
+        return (
+            f"more than {MOST_IN_FRAME} sub-steps in one frame: between {way} {moved}, and a "
+            f"sub-step may move it by {self._travel.min(initial=np.inf):.3g} (1/27 of a muscle's "
+            f"size) and turn it by {math.degrees(self.limit):.3g} deg; correct the joints that "
+            "move it or take frames closer together"
+        )
+
+    def _farthest(self, old, new):
+        """Of a step between poses (b, 4, 4): what holds the attached points that move farthest, the
+        bone from which they are seen, and how far.
+        """
+        found = ("a bone", "", 0.0)
+        for owner, corners in zip(self._owner, self._corners):
+            for seen in range(self._seen):
+                ways = [
+                    corners @ to[:3, :3].T + to[:3, 3]
+                    for to in (np.linalg.inv(pose[seen]) @ pose[owner] for pose in (old, new))
+                ]
+                far = float(np.linalg.norm(ways[1] - ways[0], axis=1).max())
+                if far > found[2] and not self._is_end[[owner, seen]].any():
+                    found = (self.bones[owner], self.bones[seen], far)
+        return found
 
     def estimate(self, name: str, changes: Floats) -> float:
         """About how many sub-steps some changes of one coordinate take, from a small probe at rest;
@@ -153,6 +208,8 @@ class SubSteps:
         for cell in range(math.floor(low / self.limit + 1e-9), math.ceil(high / self.limit - 1e-9)):
             # The whole cell decides how it is split, also where the path takes only a part of it.
             ends = [{**before, name: self.limit * (cell + k)} for k in range(2)]
+            if len(found) > MOST_IN_FRAME:
+                raise SceneError(self._too_many(before, after))
             found.append(ends[0][name])
             found += [stop[name] for stop in self._even_stops(*ends)]
         margin = 1e-6 * self.limit

@@ -12,10 +12,14 @@ import numpy as np
 import pytest
 from blend_model import arm_files, arm_scene, use_blend_model
 from command_line import call
+from tendon_scene import arm
 
 from rbfmuscle.output.export import export_run
 from rbfmuscle.run import Run, stream_run
-from rbfmuscle.validation import UsageError
+from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.substeps import SubSteps
+from rbfmuscle.validation import SceneError, UsageError
 
 PROGRAM = [sys.executable, "-m", "rbfmuscle"]
 
@@ -177,3 +181,55 @@ class TestKilledRuns:
         (killed / "poses.csv").write_text(poses.splitlines()[0] + "\n")
         with pytest.raises(UsageError, match="no surfaces"):
             export_run(killed, ["stl"])
+
+
+def jumping_arm(folder):
+    """The scene file of an arm whose table takes the limb 3 m away at 10.5 degrees, as one does
+    whose unit is wrong.
+    """
+    made = arm("pbd")
+    angles = [*range(11), 11, 20]  # a spline through few points would swing before the jump
+    spline = {"x": angles, "y": [3000.0 * (angle > 10) for angle in angles]}
+    made.joints.clear()
+    made.add_joint(
+        "elbow",
+        "trunk",
+        "limb",
+        type="custom",
+        centre=[0, 0, 0],
+        rotations=[{"axis": [-1, 0, 0], "coordinates": ["bend"], "linear": [1, 0]}],
+        translations=[{"axis": [0, 0, -1], "coordinates": ["bend"], "spline": spline}],
+    )
+    made.set_motion(ramp={"elbow.bend": {"to": 16, "step": 4}})
+    return made.save(folder / "arm.toml")
+
+
+def test_a_jump_of_the_bones_is_named_at_once_and_the_frames_before_it_are_kept(tmp_path, capsys):
+    jumping_arm(tmp_path)
+    scene, out = tmp_path / "arm.toml", tmp_path / "out"
+    asked = []
+    made = Scene.load(scene)
+
+    def poses(coordinates):
+        asked.append(coordinates)
+        return bone_poses(made, dict(coordinates))
+
+    with pytest.raises(SceneError, match=r"trunk moves by .* against limb"):
+        cut = SubSteps(made, made.muscles[0], bones=["limb"], poses=poses)
+        cut.split(*made.motion.frames[2:4])
+    assert len(asked) < 200  # a fraction of a second
+    code, _, err = call(capsys, "check", scene, "--plan")
+    assert code == 3
+    for words in ("muscle 'strap', frame 3", "more than 2000 sub-steps", "limb", "elbow.bend"):
+        assert words in err
+    code, printed, err = call(capsys, "run", scene, "-o", out)
+    assert code == 5 and "muscle 'strap', frame 3 (elbow.bend = 12 deg)" in err
+    assert f"3 frames are kept in {out}" in err
+    assert printed.startswith("verdict: the run stopped after 3 of 5 frames; in these")
+    kept = Run.load(out)
+    assert kept.info.status == "failed" and kept.frame_numbers == [0, 1, 2]
+    assert (out / "report.html").exists()
+    code, printed, _ = call(capsys, "run", scene, "-o", tmp_path / "again", "--json")
+    facts = json.loads(printed)
+    assert code == facts["exit_code"] == 5 and "sub-steps" in facts["error"]
+    assert len(facts["frames"]) == 3 and "the run stopped" in facts["verdict"]

@@ -119,6 +119,7 @@ class TestMotions:
         monkeypatch.setattr(substeps, "MOST_SUBSTEPS", 5)
         with pytest.raises(SceneError, match="more than 5"):
             check_substeps(phantom_scene())
+        monkeypatch.setattr(substeps, "MOST_IN_FRAME", 5)
         with pytest.raises(SceneError, match="more than 5"):
             substeps.SubSteps(phantom_scene()).split({}, {"hip.flexion": 0.5, "hip.adduction": 0.5})
 
