@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.attachments import AttachTable
 from rbfmuscle.scene.joints.tables import CouplingTable, JointTable
+from rbfmuscle.scene.meshes.transform import MeshTransform
 from rbfmuscle.scene.options import (
     Axis,
     ContactOptions,
@@ -18,7 +19,6 @@ from rbfmuscle.scene.options import (
     FileName,
     MotionOptions,
     OutputOptions,
-    Positive,
     SlidingOptions,
     Table,
     check_plain,
@@ -51,19 +51,17 @@ class SceneTable(Table):
         return self
 
 
-class BoneTable(Table):
+class BoneTable(MeshTransform):
     """``[[bone]]``."""
 
     name: str
     mesh: FileName | None = None
-    scale: Positive = 1.0
 
 
-class DefaultsTable(ContractionTable):
+class DefaultsTable(ContractionTable, MeshTransform):
     """``[defaults]``: any key of a muscle, for all that do not give it themselves."""
 
     model: Any = "rbf"
-    scale: Positive = 1.0
     attach: list[AttachTable] = Field(default_factory=list)
     fibres: FileName | None = None
 

@@ -33,6 +33,7 @@ from rbfmuscle.scene.joints.tables import (
 )
 from rbfmuscle.scene.meshes.read import as_mesh, read_fibres, read_mesh
 from rbfmuscle.scene.meshes.repair import ReadMesh
+from rbfmuscle.scene.meshes.transform import MeshTransform, TransformInput, mesh_transform
 from rbfmuscle.scene.objects import (
     MM_PER_UNIT,
     Attachment,
@@ -155,7 +156,7 @@ class Scene:
         self.superior = about.superior
         self.anterior = about.anterior
         for bone in tables.bone:
-            self.add_bone(bone.name, bone.mesh, scale=bone.scale)
+            self.add_bone(**{key: getattr(bone, key) for key in bone.model_fields_set})
             if bone.mesh is not None:
                 check_size("bone", bone.name, self.bones[-1], self.units)
         for joint in tables.joint:
@@ -165,7 +166,8 @@ class Scene:
             self.add_coupling(make_coupling(coupling, self.joints))
         for muscle in tables.muscle:
             given = given_muscle(muscle, tables.defaults)
-            read = read_mesh(muscle.mesh, name=muscle.name, scale=given.get("scale", 1.0))
+            lies = MeshTransform(**{k: given[k] for k in MeshTransform.model_fields if k in given})
+            read = read_mesh(muscle.mesh, name=muscle.name, transform=lies)
             check_size("muscle", muscle.name, read, self.units)
             check_place(muscle.name, read, self.bones, self.units)
             self.add_muscle(**given | {"mesh": read})
@@ -210,7 +212,15 @@ class Scene:
         files.write(tables, self.guesses)
         return files.path
 
-    def add_bone(self, name: str, mesh: MeshInput | None = None, *, scale: float = 1.0) -> Self:
+    def add_bone(
+        self,
+        name: str,
+        mesh: MeshInput | None = None,
+        *,
+        scale: float = 1.0,
+        mirror: str | None = None,
+        transform: TransformInput = None,
+    ) -> Self:
         """Add a bone and return the scene.
 
         Parameters
@@ -221,14 +231,19 @@ class Scene:
             joints only.
         scale : float
             Factor from the mesh's unit to the scene's.
+        mirror : {"x", "y", "z"}, optional
+            Coordinate of which the sign is changed, after the scale.
+        transform : (4, 4) array_like or dict, optional
+            Then applied; a dict holds ``rotate`` and ``translate``, as in ``[[bone]]``.
         """
         check_new_name(self.bones, name, "bone")
+        lies = mesh_transform(scale, mirror, transform, context=f"bone {name!r}: ")
         if name in self.meshless_bones:
             raise SceneError(f"bone {name!r} is given twice")
         if mesh is None:
             self.meshless_bones.append(name)
         else:
-            read = as_mesh(mesh, name, scale, may_be_open=True)
+            read = as_mesh(mesh, name, lies, may_be_open=True)
             self.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
         return self
 
@@ -301,6 +316,8 @@ class Scene:
         model: dict[str, Any] | str = "rbf",
         fibres: str | Path | Sequence[ArrayLike] | None = None,
         scale: float = 1.0,
+        mirror: str | None = None,
+        transform: TransformInput = None,
         **contraction: Any,
     ) -> Self:
         """Add a muscle and return the scene.
@@ -317,16 +334,17 @@ class Scene:
         model : str or dict
             A model's name, or a table with ``name`` and the model's own options.
         fibres : path or list of (k, 3) array_like, optional
-        scale : float
-            Factor from the mesh's unit to the scene's; fibres are scaled alike.
+        scale, mirror, transform
+            Where the mesh and the fibres lie, as for a bone.
         **contraction
             ``activation``, ``fibre_stretch_at_rest``, ``tendon``.
         """
         check_new_name(self.muscles, name, "muscle")
-        read = as_mesh(mesh, name, scale, may_be_open=False)
+        lies = mesh_transform(scale, mirror, transform, context=f"muscle {name!r}: ")
+        read = as_mesh(mesh, name, lies, may_be_open=False)
         model_name, options = split_model(model, context=f"muscle {name!r}")
         attachments = resolve_attachments(attach, read, self.bones, muscle=name)
-        lines = None if fibres is None else read_fibres(fibres, scale=scale, muscle=name)
+        lines = None if fibres is None else read_fibres(fibres, transform=lies, muscle=name)
         keys = contraction_keys(contraction, muscle=name)
         muscle = Muscle(
             name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys

@@ -159,10 +159,7 @@ class Sliding:
     def snapshot(self) -> SlidingState:
         """The state, for :meth:`restore`."""
         return SlidingState(
-            {
-                name: [(link, link.state) for link in links]
-                for name, links in self.links.items()
-            },
+            {name: [(link, link.state) for link in links] for name, links in self.links.items()},
             {name: [link.linked for link in links] for name, links in self.bone_links.items()},
             list(self.apart),
             {name: surface.snapshot() for name, surface in self.surfaces.items()},

@@ -179,7 +179,7 @@ def _joint(scene, rng):
             "child": pick(rng, ["upper", "lower", "muscle", ""]),
             "parent": pick(rng, ["upper", "lower"]),
         },
-        {"type": pick(rng, ["hinge", "slider", "free", "fixed", "custom", "ball", "bal", 3])},
+        {"type": pick(rng, ["hinge", "slide", "free", "weld", "custom", "ball", "bal", 3])},
     )
     _update(scene, rng, "joint", changes)
     if rng.random() < 0.2:

@@ -83,7 +83,7 @@ class TestFunctions:
 
 
 class TestKinds:
-    @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"custom", "fixed"}))
+    @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"custom", "weld"}))
     def test_each_coordinate_turns_or_shifts_along_its_axis(self, kind):
         facts = KINDS[kind]
         directions = [*facts.rotations, *facts.translations]
@@ -98,6 +98,43 @@ class TestKinds:
                 assert pose[:3, :3] @ centre + pose[:3, 3] == pytest.approx(centre)
             else:
                 assert pose[:3] == pytest.approx(np.column_stack([np.eye(3), 0.4 * np.array(axis)]))
+
+    @pytest.mark.parametrize(
+        ("kind", "axes"),
+        [
+            ("hinge", {"p": (0.3, -2.0, 0.7)}),
+            ("universal", {"p": (0, 1, 0), "q": (1, 0, 0.2)}),
+            ("ball", {"p": (0, 1, 0), "q": (1, 0, 0.2), "r": (0, 0.1, 1)}),
+        ],
+    )
+    def test_kind_by_the_number_of_turns_is_that_kind_to_the_bit(self, kind, axes):
+        """The last named turns first; the same by a custom joint."""
+        q = dict(zip((f"j.{name}" for name in axes), (0.3, -0.5, 0.9)))
+        turns = [{"axis": axis, "coordinates": [name]} for name, axis in axes.items()]
+        rows = [{"axes": axes}, {"axes": axes, "type": kind}]
+        rows.append({"type": "custom", "rotations": turns})
+        first, *others = (bone_poses(pair(**row), q)["b"] for row in rows)
+        assert all(np.array_equal(first, other) for other in others)
+        assert pair(axes=axes).joints[0].kind == kind
+        steps = [
+            Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis)).as_matrix()
+            for angle, axis in zip(q.values(), axes.values())
+        ]
+        product = np.linalg.multi_dot([np.eye(3), *steps]) if len(steps) > 1 else steps[0]
+        assert first[:3, :3] == pytest.approx(product, abs=1e-15)
+
+    def test_six_turns_of_a_custom_joint(self):
+        axes = np.random.default_rng(3).normal(size=(6, 3))
+        turns = [{"axis": list(axis), "coordinates": [n]} for n, axis in zip("abcdef", axes)]
+        scene = pair(type="custom", rotations=turns)
+        pose = bone_poses(scene, {f"j.{n}": 0.1 * (k + 1) for k, n in enumerate("abcdef")})["b"]
+        product = np.linalg.multi_dot(
+            [
+                Rotation.from_rotvec(0.1 * (k + 1) * axis / np.linalg.norm(axis)).as_matrix()
+                for k, axis in enumerate(axes)
+            ]
+        )
+        assert pose[:3, :3] == pytest.approx(product, abs=1e-14)
 
     def test_free_joint_is_body_fixed_turns_after_a_shift(self):
         scene = pair(type="free", coordinates={name: {} for name in "abcxyz"})
@@ -118,6 +155,19 @@ class TestKinds:
             (
                 {"type": "custom", "axes": {"q": (1, 0, 0)}},
                 "rotations and translations instead of axes",
+            ),
+            ({"type": "ball", "axes": {"q": (1, 0, 0)}}, "a ball joint has 3 coordinates, 1 are"),
+            (
+                {"axes": dict(zip("abcd", itertools.repeat((1, 0, 0))))},
+                "give its type; without one, one to three axes",
+            ),
+            (
+                {
+                    "type": "custom",
+                    "rotations": [{"axis": [1, 0, 0]}] * 5,
+                    "translations": [{"axis": [1, 0, 0]}] * 2,
+                },
+                "at most 6 axes",
             ),
             (turning(linear=[1.0]), "linear needs a slope"),
             ({**Q, "coordinates": {"q": {"range": [3, 1]}}}, "range must go upwards"),
@@ -191,8 +241,9 @@ class TestCoordinates:
         scenes = [
             knee(rest=-33.3),
             pair(axes={"flexion": (-1, 0, 0), "turn": (0.2, 0.3, 0.9)}),
+            pair(type="custom", rotations=[{"axis": (0, 0, 1), "coordinates": ["q"]}] * 4),
             pair(type="planar", coordinates={"r": {"rest": 3.0}, "x": {}, "y": {"rest": 2.5}}),
-            pair(type="fixed", centre=None),
+            pair(type="weld", centre=None),
             pair(axes={"q": (0, 0, 1)}, backward=True),
         ]
         for scene in scenes:
@@ -208,7 +259,7 @@ class TestCoordinates:
 
     def test_a_pure_shift_is_cut_into_steps_and_reached(self):
         mesh = trimesh.creation.icosphere(subdivisions=2).apply_scale([30, 4, 4])
-        scene = pair(centre=(0, 0, 0), type="slider", axes={"s": (1, 0, 0)})
+        scene = pair(centre=(0, 0, 0), type="slide", axes={"s": (1, 0, 0)})
         x = mesh.vertices[:, 0]
         scene.add_muscle("m", mesh, attach=held(a=x < -20, b=x > 20))
         scene.motion = Motion([{"j.s": 0.0}, {"j.s": 40.0}])
@@ -226,5 +277,5 @@ def test_step_angle_counts_turns_and_shifts():
     scene = knee()
     turn = step_angle(scene, {"j.q": 0.0}, {"j.q": -0.1}, shifts=False)
     assert turn == pytest.approx(0.1, rel=1e-9)
-    slide = pair(type="slider", axes={"s": (0, 1, 0)})
+    slide = pair(type="slide", axes={"s": (0, 1, 0)})
     assert step_angle(slide, {}, {"j.s": 5.0}) == pytest.approx(0.1)

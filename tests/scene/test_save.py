@@ -32,9 +32,7 @@ def rich():
     scene = built()
     scene.bones[0].mesh.vertices += 1e-9
     scene.add_bone("tip")
-    scene.add_joint(
-        "wrist", "lower", "tip", type="slider", centre=[90, 0, 0], axes={"x": [1, 0, 0]}
-    )
+    scene.add_joint("wrist", "lower", "tip", type="slide", centre=[90, 0, 0], axes={"x": [1, 0, 0]})
     scene.add_coupling("wrist.x", ["elbow.flexion"], linear=[0.125, 0.0])
     biceps = scene.muscles[0]
     line = np.array([[-40.0, 0.1, 20.0], [40.0, 0.2, 20.0]])

@@ -36,7 +36,7 @@ def test_a_tendon_keeps_off_the_bones_between_its_ends_whenever_their_joints_are
     attach = held(trunk=z > z.max() - 6.0, limb=z < z.min() + 6.0)
     attach[1]["tendon"] = {"to": [0.0, -8.0, -70.0]}
     steps = [
-        lambda: [scene.add_joint(*names, type="fixed") for names in joints],
+        lambda: [scene.add_joint(*names, type="weld") for names in joints],
         lambda: scene.add_muscle("strap", belly, attach=attach),
     ]
     for step in reversed(steps) if joints_last else steps:

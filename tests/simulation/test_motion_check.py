@@ -49,7 +49,7 @@ def test_end_driven_into_a_bone_is_found_with_depth_and_frame():
 def test_ends_taken_apart_or_brought_together(far, how):
     scene = _scene([0])
     scene.joints.clear()
-    scene.add_joint("slide", "block", "arm", (0, 0, 0), {"out": (1, 0, 0)}, type="slider")
+    scene.add_joint("slide", "block", "arm", (0, 0, 0), {"out": (1, 0, 0)}, type="slide")
     scene.motion = Motion([{"slide.out": far * k / 10} for k in range(11)])
     (one,) = check_motion(scene)
     assert one.frame == 10 and one.bones == ("block", "arm")

@@ -21,25 +21,25 @@ from rbfmuscle.importers.guess.parts import Part
 
 # Class of bone: its possible parents, the likeliest first, and the kind of joint between.
 PARENTS = {
-    "ilium": (("pelvis", "fixed"), ("sacrum", "fixed")),
-    "ischium": (("ilium", "fixed"), ("pelvis", "fixed")),
-    "pubis": (("ilium", "fixed"), ("pelvis", "fixed")),
-    "pelvis": (("pelvis", "fixed"), ("sacrum", "fixed")),
-    "sacrum": (("pelvis", "fixed"), ("ilium", "fixed")),
+    "ilium": (("pelvis", "weld"), ("sacrum", "weld")),
+    "ischium": (("ilium", "weld"), ("pelvis", "weld")),
+    "pubis": (("ilium", "weld"), ("pelvis", "weld")),
+    "pelvis": (("pelvis", "weld"), ("sacrum", "weld")),
+    "sacrum": (("pelvis", "weld"), ("ilium", "weld")),
     "femur": (("pelvis", "ball"), ("ilium", "ball"), ("ischium", "ball")),
     "patella": (("femur", "hinge"),),
     "tibia": (("femur", "hinge"),),
-    "fibula": (("tibia", "fixed"), ("femur", "hinge")),
+    "fibula": (("tibia", "weld"), ("femur", "hinge")),
     "talus": (("tibia", "hinge"), ("fibula", "hinge")),
-    "calcaneus": (("talus", "fixed"), ("tibia", "hinge")),
-    "foot": (("calcaneus", "fixed"), ("talus", "fixed"), ("foot", "fixed"), ("tibia", "hinge")),
-    "vertebra": (("vertebra", "fixed"), ("sacrum", "fixed"), ("pelvis", "fixed")),
-    "scapula": (("clavicle", "fixed"), ("rib", "fixed"), ("sternum", "fixed")),
-    "clavicle": (("sternum", "fixed"), ("rib", "fixed")),
+    "calcaneus": (("talus", "weld"), ("tibia", "hinge")),
+    "foot": (("calcaneus", "weld"), ("talus", "weld"), ("foot", "weld"), ("tibia", "hinge")),
+    "vertebra": (("vertebra", "weld"), ("sacrum", "weld"), ("pelvis", "weld")),
+    "scapula": (("clavicle", "weld"), ("rib", "weld"), ("sternum", "weld")),
+    "clavicle": (("sternum", "weld"), ("rib", "weld")),
     "humerus": (("scapula", "ball"),),
     "ulna": (("humerus", "hinge"),),
-    "radius": (("ulna", "fixed"), ("humerus", "hinge")),
-    "hand": (("radius", "ball"), ("ulna", "ball"), ("hand", "fixed")),
+    "radius": (("ulna", "weld"), ("humerus", "hinge")),
+    "hand": (("radius", "ball"), ("ulna", "ball"), ("hand", "weld")),
 }
 ROOTS = ("pelvis", "ilium", "sacrum", "scapula", "rib", "vertebra", "femur", "humerus", "tibia")
 # Class of the child: name of its joint with one of its parents above.
@@ -63,7 +63,7 @@ class JointGuess:
 
     parent: Part
     child: Part
-    kind: str  # "ball", "hinge", "custom" (the patella) or "fixed"
+    kind: str  # "ball", "hinge", "custom" (the patella) or "weld"
     centre: np.ndarray  # (3,) [scene unit]
     axes: dict[str, np.ndarray]  # (3,) by coordinate
     confidence: (
@@ -99,7 +99,7 @@ class JointGuess:
             "child": self.child.name,
         }
         row["type"] = self.kind
-        if self.kind == "fixed":
+        if self.kind == "weld":
             return row
         row["centre"] = rounded(self.centre, 6)
         if not self.tables:

@@ -84,7 +84,7 @@ def guess_scene(
     guess = SceneGuess(folder, parts, root, joints, orientation)
     bodies = {bone: bone for bone in bones}
     for joint in joints:  # parents come before their children
-        if joint.kind == "fixed":
+        if joint.kind == "weld":
             bodies[joint.child] = bodies[joint.parent]
     skeleton = _skeleton(guess, bodies, millimetre)
     guess.muscles = [guess_attachments(muscle, skeleton) for muscle in parts.muscles]
@@ -104,7 +104,7 @@ def guess_scene(
 
 def _skeleton(guess, bodies, millimetre):
     bones, joints = guess.parts.bones, guess.joints
-    moving = [j for j in joints if j.kind != "fixed"]
+    moving = [j for j in joints if j.kind != "weld"]
     meetings = [
         (j.parent.name, j.child.name, j.centre if j.kind == "ball" else None) for j in moving
     ]

@@ -128,7 +128,7 @@ def _likelihood(parent, child):
 def _name(joint, bones):
     """The anatomical name where the joint is one, with its side where the scene has both."""
     name, child = JOINTS.get(joint.child.kind), joint.child
-    if name is None or joint.parent.kind not in dict(PARENTS[child.kind]) or joint.kind == "fixed":
+    if name is None or joint.parent.kind not in dict(PARENTS[child.kind]) or joint.kind == "weld":
         return f"{child.name}_joint"
     sides = [bone.side for bone in bones if bone.kind == child.kind]
     if len(sides) == 1:
@@ -156,7 +156,7 @@ def _fit(parent, child, millimetre, area):
     hinge = next(iter(hinges), None)
     fits_hinge = hinge is not None and hinge.misfit < HINGE_MISFIT * hinge.radii[0]
     gap = faces[0].gap
-    kind = named or ("ball" if fits_ball else "hinge" if fits_hinge and gap >= BOUND else "fixed")
+    kind = named or ("ball" if fits_ball else "hinge" if fits_hinge and gap >= BOUND else "weld")
     if kind == "ball":
         sure = 1.0 - 0.5 * ball.misfit / (BALL_MISFIT * ball.radii[0]) if fits_ball else 0.1
         share = 100 * min(ball.cover, 1.0)
@@ -179,7 +179,7 @@ def _fit(parent, child, millimetre, area):
     why = f"they are {gap:.2g} mm apart, "
     why += "bound all over" if gap < BOUND else "neither ball nor hinge fits"
     return JointGuess(
-        parent, child, "fixed", middle, {}, 0.8 if gap < BOUND else 0.6 if named else 0.4, why
+        parent, child, "weld", middle, {}, 0.8 if gap < BOUND else 0.6 if named else 0.4, why
     )
 
 

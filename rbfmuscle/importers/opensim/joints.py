@@ -24,7 +24,7 @@ from rbfmuscle.validation import SceneError
 
 # What OpenSim calls otherwise than our table of joints; where both have one, its coordinates are in
 # the same order.
-RENAMED = {"weld": "fixed", "pin": "hinge", "gimbal": "ball"}
+RENAMED = {"slider": "slide", "pin": "hinge", "gimbal": "ball"}
 # Joints that become custom ones: turns about these axes, which carry the child over a surface.
 CARRYING = {"ellipsoid": (X, Y, Z), "scapulothoracic": (X, Y, Z), "constantcurvature": (X, Z, Y)}
 QUARTER = frame_at((0.0, 0.0, 0.0), (0.0, 0.0, 0.5 * math.pi))
@@ -274,7 +274,7 @@ def read_constraints(reading: Reading, constraints: list[Node]) -> None:
             taken = [joint.name for joint in (*model.joints, *model.welds)]
             name = new_name(node.name or node.tag.lower(), taken)
             (parent, first), (child, second) = ends
-            weld = ModelJoint(name, parent, child, np.zeros(3), {}, kind="fixed")
+            weld = ModelJoint(name, parent, child, np.zeros(3), {}, kind="weld")
             weld.parent_frame, weld.child_frame = first, second
             model.welds.append(weld)
         else:

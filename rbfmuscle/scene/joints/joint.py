@@ -26,28 +26,26 @@ Z = (0.0, 0.0, 1.0)
 
 
 class Kind(NamedTuple):
-    """What a kind of joint fixes: the axes of its coordinates, turning ones first.
-
-    ``most`` says how many there may be where their number is free.
-    """
+    """What a kind of joint fixes: the axes of its coordinates, turning ones first."""
 
     rotations: tuple = ()
     translations: tuple = ()
-    least: int = 0
-    most: int = 0
 
 
-# All that is known of a kind stands here; files, code, messages and tests read this table.
+# All that is known of a kind stands here; files, code, messages and tests read this table. What a
+# custom joint has is given with it.
 KINDS = {
-    "fixed": Kind(),
-    "hinge": Kind((Z,), (), 1, 1),
-    "slider": Kind((), (X,), 1, 1),
-    "universal": Kind((X, Y), (), 2, 2),
-    "ball": Kind((X, Y, Z), (), 1, 6),
-    "planar": Kind((Z,), (X, Y), 3, 3),
-    "free": Kind((X, Y, Z), (X, Y, Z), 6, 6),
-    "custom": Kind((), (), 0, 6),
+    "weld": Kind(),
+    "hinge": Kind((Z,)),
+    "slide": Kind((), (X,)),
+    "universal": Kind((X, Y)),
+    "ball": Kind((X, Y, Z)),
+    "planar": Kind((Z,), (X, Y)),
+    "free": Kind((X, Y, Z), (X, Y, Z)),
+    "custom": Kind(),
 }
+MOST_AXES = 6  # of a custom joint
+BY_TURNS = ("weld", "hinge", "universal", "ball")  # where no type is given, by the number of axes
 
 IDENTITY = Linear((1.0,))
 
@@ -108,7 +106,7 @@ class Joint:
     coordinates: dict[str, Coordinate]
     rotations: tuple[TransformAxis, ...] = ()  # the first is the outermost
     translations: tuple[TransformAxis, ...] = ()
-    kind: str = "ball"  # a key of KINDS
+    kind: str = "custom"  # a key of KINDS
     backward: bool = False  # written from child to parent: its motion is inverted
     # What the third axis carries as the joint turns: a point of an ellipsoid with these radii along
     # the three axes, where its normal is that axis; or the end of an arc of this length.

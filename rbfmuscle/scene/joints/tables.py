@@ -19,8 +19,10 @@ from rbfmuscle.scene.joints.functions import (
     Spline,
 )
 from rbfmuscle.scene.joints.joint import (
+    BY_TURNS,
     IDENTITY,
     KINDS,
+    MOST_AXES,
     Coordinate,
     Coupling,
     Joint,
@@ -140,13 +142,13 @@ class JointTable(Table):
     name: str
     parent: str
     child: str
-    type: Literal["fixed", "hinge", "slider", "universal", "ball", "planar", "free", "custom"] = (
-        "ball"
-    )
+    type: (
+        Literal["weld", "hinge", "slide", "universal", "ball", "planar", "free", "custom"] | None
+    ) = None
     centre: Vector | None = None
     axes: dict[str, Axis] | None = None
     coordinates: dict[str, CoordinateTable] = Field(default_factory=dict)
-    rotations: list[AxisTable] = Field(default_factory=list, max_length=3)
+    rotations: list[AxisTable] = Field(default_factory=list, max_length=MOST_AXES)
     translations: list[AxisTable] = Field(default_factory=list, max_length=3)
     backward: bool = False
     radii: Vector | None = None
@@ -155,20 +157,12 @@ class JointTable(Table):
     def joint(self) -> Joint:
         """Return the joint that the table describes, or raise SceneError naming it."""
         context = f"joint {self.name!r}"
-        if self.centre is None and self.type != "fixed":
+        kind = self.type or self._kind_by_turns(context)
+        if self.centre is None and kind != "weld":
             raise SceneError(f"{context}: centre is missing, give the joint's place at rest")
-        if (self.radii or self.arc) and (self.type != "custom" or len(self.rotations) != 3):
+        if (self.radii or self.arc) and (kind != "custom" or len(self.rotations) != 3):
             raise SceneError(f"{context}: radii and arc need type 'custom' with three rotations")
-        groups: dict[Any, list[AxisTable]] = {
-            "rotation": self.rotations,
-            "translation": self.translations,
-        }
-        if self.type != "custom":
-            groups = self._axes_of_kind(context)
-        elif self.axes:
-            raise SceneError(
-                f"{context}: a custom joint has rotations and translations instead of axes"
-            )
+        groups = self._axes_of_kind(kind, context)
         tables = [(sort, table) for sort, group in groups.items() for table in group]
         named = dict.fromkeys(name for _, table in tables for name in table.coordinates)
         for name in self.coordinates:
@@ -179,7 +173,7 @@ class JointTable(Table):
         coordinates = {}
         for name in named:
             motion, table = motion_of(name, slopes), self.coordinates.get(name, CoordinateTable())
-            if self.type != "custom" and table.motion not in (None, motion):
+            if kind != "custom" and table.motion not in (None, motion):
                 raise SceneError(f"{context}: {name!r} is a {motion} here, not a {table.motion}")
             coordinates[name] = table.coordinate(motion)
 
@@ -192,36 +186,50 @@ class JointTable(Table):
             tuple(axis(motion, number, table) for number, table in enumerate(group, 1))
             for motion, group in groups.items()
         )
-        return self._made(coordinates, turns, shifts)
+        return self._made(kind, coordinates, turns, shifts)
 
-    def _made(self, coordinates, turns, shifts):
-        """The joint of these coordinates, rotations and translations."""
+    def _made(self, kind, coordinates, turns, shifts):
+        """The joint of this kind, these coordinates, rotations and translations."""
         centre = np.array(self.centre or (0.0, 0.0, 0.0))
         radii = None
         if self.radii is not None:
             x, y, z = self.radii
             radii = x, y, z
         bones = self.parent, self.child
-        motions = coordinates, turns, shifts, self.type, self.backward
+        motions = coordinates, turns, shifts, kind, self.backward
         return Joint(self.name, *bones, centre, *motions, radii, self.arc)
 
-    def _axes_of_kind(self, context):
-        """Tables of the rotations and of the translations that the kind has, each of one
-        coordinate.
+    def _kind_by_turns(self, context):
+        """The kind where none is given: of one to three axes, each of which is turned about."""
+        count = len(self.axes or self.coordinates)
+        if self.rotations or self.translations or not 0 < count < len(BY_TURNS):
+            words = "one to three axes make a hinge, universal or ball joint"
+            raise SceneError(f"{context}: give its type; without one, {words}")
+        return BY_TURNS[count]
+
+    def _axes_of_kind(self, kind, context):
+        """Tables of the rotations and of the translations of a kind; each is of one coordinate
+        but in a custom joint.
         """
-        kind = KINDS[self.type]
+        if kind == "custom":
+            if self.axes:
+                words = "a custom joint has rotations and translations instead of axes"
+                raise SceneError(f"{context}: {words}")
+            if len(self.rotations) + len(self.translations) > MOST_AXES:
+                raise SceneError(f"{context}: a custom joint has at most {MOST_AXES} axes")
+            return {"rotation": self.rotations, "translation": self.translations}
         if self.rotations or self.translations:
             raise SceneError(
                 f"{context}: rotations and translations belong to type 'custom', give axes"
             )
-        axes = self.axes or dict(zip(self.coordinates, [*kind.rotations, *kind.translations]))
+        usual = [*KINDS[kind].rotations, *KINDS[kind].translations]
+        axes = self.axes or dict(zip(self.coordinates, usual))
         count = len(axes) or len(self.coordinates)
-        if not kind.least <= count <= kind.most:
-            words = f"{kind.least}" if kind.least == kind.most else f"{kind.least} to {kind.most}"
-            words = f"{words} coordinates, {count} are given; name them in axes"
-            raise SceneError(f"{context}: a {self.type} joint has {words}")
+        if count != len(usual):
+            words = f"{len(usual)} coordinates, {count} are given; name them in axes"
+            raise SceneError(f"{context}: a {kind} joint has {words}")
         tables = [AxisTable(axis=list(axis), coordinates=[name]) for name, axis in axes.items()]
-        turning = count if self.type == "ball" else len(kind.rotations)
+        turning = len(KINDS[kind].rotations)
         return {"rotation": tables[:turning], "translation": tables[turning:]}
 
 
@@ -264,9 +272,8 @@ def make_coupling(table: CouplingTable, joints: list[Joint]) -> Coupling:
 def joint_row(joint: Joint) -> dict:
     """Return a joint as the plain table that makes it again [degree, scene unit]."""
     row: dict[str, Any] = {"name": joint.name, "parent": joint.parent, "child": joint.child}
-    if joint.kind != "ball":
-        row["type"] = joint.kind
-    if joint.kind != "fixed":
+    row["type"] = joint.kind
+    if joint.kind != "weld":
         row["centre"] = joint.centre.tolist()
     if joint.kind == "custom":
         for motion, axes in (("rotation", joint.rotations), ("translation", joint.translations)):

@@ -15,62 +15,72 @@ from numpy.typing import ArrayLike
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.scene.meshes.formats import read_part
 from rbfmuscle.scene.meshes.repair import ReadMesh, repair
+from rbfmuscle.scene.meshes.transform import MeshTransform
 from rbfmuscle.validation import (
     MeshError,
     SceneError,
     check_mesh,
     check_points,
-    check_positive,
     read_text,
     shown,
 )
 
 # In any unit: beyond it, squares of squares of lengths leave the range in which volumes are exact.
 LARGEST_COORDINATE = 1e12
+IN_PLACE = MeshTransform()
 
 
 def read_mesh(
-    path: str | Path, *, name: str | None = None, scale: float = 1.0, may_be_open: bool = False
+    path: str | Path,
+    *,
+    name: str | None = None,
+    transform: MeshTransform = IN_PLACE,
+    may_be_open: bool = False,
 ) -> ReadMesh:
     """Read a surface mesh (``.stl``, ``.obj``, ``.ply``, ``.vtk``, ``.vtp``, or one of several in a
     file as ``FILE#NAME``) and mend what is safe to mend.
 
-    ``name`` is what messages call it, the file's stem by default; ``scale`` takes the file's unit
-    to the scene's. Holes that cannot be closed safely are kept, with a note, where it
+    ``name`` is what messages call it, the file's stem by default; ``transform`` says where it lies
+    in the scene. Holes that cannot be closed safely are kept, with a note, where it
     ``may_be_open`` (bones). MeshError if the file is missing, unreadable or empty, or the surface
     cannot be made closed and manifold.
     """
     path = Path(path)
     part = read_part(path)
-    with np.errstate(over="ignore", invalid="ignore"):
-        vertices = part.vertices * scale
+    vertices, faces = _placed(part.vertices, part.faces, transform)
     read = prepare_mesh(
-        vertices, part.faces, context=str(path), name=name or path.stem, may_be_open=may_be_open
+        vertices, faces, context=str(path), name=name or path.stem, may_be_open=may_be_open
     )
     read.notes[:0] = part.notes
     read.source = str(path)
     return read
 
 
+def _placed(vertices, faces, transform):
+    """Vertices and triangles of a file in the scene."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        vertices = transform.points(vertices)
+    return vertices, faces[:, ::-1] if transform.turns_inside_out else faces
+
+
 def as_mesh(
-    mesh: str | Path | ReadMesh | MeshLike, name: str, scale: float, *, may_be_open: bool
+    mesh: str | Path | ReadMesh | MeshLike,
+    name: str,
+    transform: MeshTransform,
+    *,
+    may_be_open: bool,
 ) -> ReadMesh:
     """Return the ReadMesh of a path, a trimesh.Trimesh, (vertices, faces) or of what is read
     already.
     """
     if isinstance(mesh, ReadMesh):
         return mesh
-    try:
-        scale = check_positive(scale, name="scale")
-    except (ValueError, TypeError) as error:
-        raise SceneError(f"{name!r}: {error}") from None
     if isinstance(mesh, (str, Path)):
-        return read_mesh(mesh, name=name, scale=scale, may_be_open=may_be_open)
+        return read_mesh(mesh, name=name, transform=transform, may_be_open=may_be_open)
     vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
-    vertices = np.asarray(vertices, dtype=np.float64) * scale
-    context = f"mesh {name!r}"
+    vertices, faces = _placed(np.asarray(vertices, dtype=np.float64), np.asarray(faces), transform)
     return prepare_mesh(
-        vertices, np.asarray(faces), context=context, name=name, may_be_open=may_be_open
+        vertices, faces, context=f"mesh {name!r}", name=name, may_be_open=may_be_open
     )
 
 
@@ -104,10 +114,13 @@ def prepare_mesh(
 
 
 def read_fibres(
-    fibres: str | Path | Iterable[ArrayLike], *, scale: float = 1.0, muscle: str = ""
+    fibres: str | Path | Iterable[ArrayLike],
+    *,
+    transform: MeshTransform = IN_PLACE,
+    muscle: str = "",
 ) -> list[Floats]:
-    """Return fibres as a list of (k, 3) arrays in scene units, ``scale`` from the unit of a file or
-    of given arrays.
+    """Return fibres as a list of (k, 3) arrays in the scene, ``transform`` saying where those of
+    a file, or given arrays, lie.
 
     A JSON file holds ``{"polylines": [[[x, y, z], ...], ...]}`` or that list alone.
     """
@@ -125,7 +138,7 @@ def read_fibres(
         if len(points) < 2:
             words = f"polyline {number} has {len(points)} points, a fibre needs two or more"
             raise SceneError(f"{context}: {words}")
-        lines.append(points * scale)
+        lines.append(transform.points(points))
     if not lines:
         raise SceneError(f"{context}: no polylines")
     return lines
