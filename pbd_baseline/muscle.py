@@ -4,6 +4,7 @@ muscle.
 
 import math
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame import Mesh, ModelSurface, SolveLog
+from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
 
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
@@ -32,6 +33,17 @@ FINISHING_ROUNDS = 4
 DEPTH = 0.05
 # Motion that makes the time of one XPBD step [radian].
 STEP_ANGLE = math.radians(2.0)
+
+
+class PBDState(NamedTuple):
+    """What changes of a mesh muscle; ``shape`` is what its method remembers, None for nothing."""
+
+    points: np.ndarray  # (n, 3)
+    shape: np.ndarray | None
+    time: float
+    penetration: float
+    log: LogState
+    activation: float
 
 
 class PBDMuscle:
@@ -129,18 +141,25 @@ class PBDMuscle:
         self.points[:] = self.points @ motion[:3, :3].T + motion[:3, 3]
         self.shape.transform(motion)
 
-    def snapshot(self) -> tuple[np.ndarray, np.ndarray | None, float, float]:
+    def snapshot(self) -> PBDState:
         """Everything that :meth:`restore` needs."""
-        active = 0.0 if self.fibres is None else self.fibres.activation
-        state = self.points.copy(), self.shape.snapshot(), self.time, self.penetration
-        return *state, self.log.state, active
+        return PBDState(
+            self.points.copy(),
+            self.shape.snapshot(),
+            self.time,
+            self.penetration,
+            self.log.state,
+            0.0 if self.fibres is None else self.fibres.activation,
+        )
 
-    def restore(self, state: tuple[np.ndarray, np.ndarray | None, float, float]) -> None:
+    def restore(self, state: PBDState) -> None:
         """Go back to a snapshot."""
-        points, shape, self.time, self.penetration, self.log.state, active = state
-        self.points[:] = points
-        self.shape.restore(shape)
-        self.activate(active)
+        self.points[:] = state.points
+        self.shape.restore(state.shape)
+        self.time = state.time
+        self.penetration = state.penetration
+        self.log.state = state.log
+        self.activate(state.activation)
 
     def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces, numbered as in the muscle's mesh but for the order of the faces."""

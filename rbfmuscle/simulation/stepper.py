@@ -47,10 +47,10 @@ class Path(NamedTuple):
 class StepperState(NamedTuple):
     """What changes of a muscle, its obstacles and its events between sub-steps."""
 
-    model: Any
+    model: object
     poses: dict[str, Floats]
     neighbours: tuple[Planes, ...]
-    beside: tuple[Any, ...]  # sliding pairs, as the contacts have them
+    beside: tuple[object, ...]  # sliding pairs, as the contacts have them
     rigid_transport: RigidState | None
     shown: ModelSurface | None
     events: dict[tuple[int, str, str], int]

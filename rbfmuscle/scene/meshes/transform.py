@@ -86,8 +86,8 @@ class MeshTransform(Table):
 
 
 def mesh_transform(
-    scale: float, mirror: str | None, transform: TransformInput, *, place: str
+    scale: float, mirror: str | None, transform: TransformInput, *, context: str
 ) -> MeshTransform:
-    """The checked keys; SceneError that begins with ``place`` where one is wrong."""
+    """The checked keys; SceneError that begins with ``context`` where one is wrong."""
     given = {"scale": scale, "mirror": mirror, "transform": transform}
     return MeshTransform.build(given, context=context)
