@@ -18,6 +18,7 @@ import igl
 import numba
 import numpy as np
 import trimesh
+from evidence import write_evidence
 from peers.detectors import TreeDetector, VoxelDetector
 from peers.serendipity import SerendipityField
 from peers.spline import SplineField
@@ -63,7 +64,7 @@ def judge(points, vertices, faces):
 
 
 def accuracy(field, vertices, faces):
-    """Errors in mm and degrees as a line of text."""
+    """RMS and greatest error [mm], wrong signs [%], median and 99 % of the direction [degree]."""
     near = points_near(vertices, faces, ACCURACY, 1.0)
     exact, _ = judge(near, vertices, faces)
     found = field.distance(near)
@@ -76,24 +77,40 @@ def accuracy(field, vertices, faces):
         np.linalg.norm(gradient, axis=1), 1e-300
     )
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    return (
-        f"{np.sqrt(np.mean(error**2)):9.5f} {np.abs(error).max():8.3f} {100 * wrong:9.4f} "
-        f"{np.median(angle):8.3f} {np.percentile(angle, 99):7.2f}"
-    )
+    size = np.abs(error)
+    found = np.sqrt(np.mean(size**2)), size.max(), 100 * wrong, *np.percentile(angle, [50, 99])
+    return [float(x) for x in found]
+
+
+COLUMNS = [
+    "field",
+    "build [s]",
+    "memory [MB]",
+    "value [ns]",
+    "with gradient [ns]",
+    "RMS [mm]",
+    "worst [mm]",
+    "wrong sign [%]",
+    "direction, median [°]",
+    "99 % [°]",
+]
 
 
 def row(name, field, build, vertices, faces, count=SPEED):
-    """One field's line of the table."""
+    """One field's line of the table, printed, and in the order of `COLUMNS`."""
     points = points_near(vertices, faces, count, 1.0, seed=2)
     ordered = points[np.lexsort(np.floor(points / 4.0).T)]
     value = on_one_thread(lambda: field.distance(points)) / count
     both = on_one_thread(lambda: field.distance_and_gradient(points)) / count
     coherent = on_one_thread(lambda: field.distance_and_gradient(ordered)) / count
+    rms, worst, wrong, middle, wide = accuracy(field, vertices, faces)
     print(
         f"{name:22s} {build:7.3f} {field.memory / 1e6:7.1f} {1e9 * value:7.0f} {1e9 * both:7.0f} "
-        f"{1e9 * coherent:7.0f} {accuracy(field, vertices, faces)}",
+        f"{1e9 * coherent:7.0f} {rms:9.5f} {worst:8.3f} {wrong:9.4f} {middle:8.3f} {wide:7.2f}",
         flush=True,
     )
+    times = [build, field.memory / 1e6, 1e9 * value, 1e9 * both]
+    return [name, *times, rms, worst, wrong, middle, wide]
 
 
 def bone_table(name, mesh):
@@ -111,20 +128,20 @@ def bone_table(name, mesh):
         f"{'':22s} {'s':>7s} {'MB':>7s} {'ns':>7s} {'ns':>7s} {'ns':>7s} {'mm':>9s} {'mm':>8s} "
         f"{'% wrong':>9s}"
     )
-    build, field = least(lambda: BoneSDF.from_mesh((vertices, faces), cache=False))
-    row("BoneSDF", field, build, vertices, faces)
-    build, dense = least(lambda: SerendipityField.from_mesh(mesh, cells=64), 1)
-    row("serendipity 64^3", dense, build, vertices, faces)
+    surface = vertices, faces
+    build, field = least(lambda: BoneSDF.from_mesh(surface, cache=False))
+    rows = [row("BoneSDF", field, build, *surface)]
     cells = int((field.memory / FLOAT / 7.0) ** (1 / 3))
     build, dense = least(lambda: SerendipityField.from_mesh(mesh, cells=cells), 1)
-    row(f"serendipity {cells}^3", dense, build, vertices, faces)
+    rows.append(row(f"serendipity {cells}³", dense, build, *surface))
     build, dense = least(lambda: SplineField.from_mesh(mesh, nodes=field.memory // FLOAT), 1)
-    row("tricubic B-spline", dense, build, vertices, faces)
+    rows.append(row("tricubic B-spline", dense, build, *surface))
     build, voxels = least(lambda: VoxelDetector.from_mesh(mesh), 1)
-    row("voxels 64^3", voxels, build, vertices, faces, SPEED // 10)
-    build, tree = least(lambda: TreeDetector.from_mesh((vertices, faces)))
-    row("exact tree", tree, build, vertices, faces, SPEED // 10)
+    rows.append(row("voxels 64³", voxels, build, *surface, SPEED // 10))
+    build, tree = least(lambda: TreeDetector.from_mesh(surface))
+    rows.append(row("exact tree", tree, build, *surface, SPEED // 10))
     exact_tools(mesh, vertices, faces)
+    return rows
 
 
 def exact_tools(mesh, vertices, faces):
@@ -167,6 +184,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", default=os.environ.get("RBFMUSCLE_DATA", "../shared/data"))
     parser.add_argument("--bones", nargs="*", default=["femur", "pelvis"])
+    parser.add_argument("-o", "--output", help="file of evidence for the pages, of the first bone")
     arguments = parser.parse_args()
     folder = Path(arguments.data) / "hip"
     shapes = {
@@ -177,7 +195,11 @@ def main():
     if folder.is_dir():
         for name in arguments.bones:
             mesh = trimesh.load(folder / f"{name}.ply", process=False)
-            bone_table(name, mesh)
+            rows = bone_table(name, mesh)
+            if arguments.output:
+                command = ["benchmarks/bench_sdf.py", "--bones", name]
+                write_evidence(arguments.output, command, rows, COLUMNS)
+                return
             build_stages(mesh)
     for name, mesh in shapes.items():
         bone_table(name, mesh)

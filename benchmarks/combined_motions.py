@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from evidence import write_evidence
 
 import rbfmuscle as rm
 from rbfmuscle.scene.phantom import phantom_scene
@@ -64,6 +65,17 @@ def walk(stops: int, seed: int = SEED) -> list[dict]:
             here[name] = float(np.clip(here[name] + rng.uniform(-FARTHEST, FARTHEST), low, high))
         path.append({f"hip.{name}": angle for name, angle in here.items()})
     return path
+
+
+# Column of the table: quantity.
+QUANTITY_OF = {
+    "surface in bones": "penetration_max",
+    "bones in the muscle": "bone_penetration_max",
+    "flicker": "flicker",
+    "crossing triangles": "self_crossings",
+    "without a fit": "unfitted_fraction",
+}
+COLUMNS = ["muscle", *QUANTITY_OF, "points beyond a bone"]
 
 
 def measure(scene: rm.Scene, model: str | None) -> tuple[list[tuple], float]:
@@ -128,6 +140,7 @@ def main() -> None:
     parser.add_argument(
         "--seeds", nargs="*", type=int, help="random walks of these seeds, and nothing else"
     )
+    parser.add_argument("-o", "--output", type=Path, help="file of evidence for the pages")
     arguments = parser.parse_args()
     scene = (
         phantom_scene() if arguments.scene == "phantom" else rm.Scene.load(Path(arguments.scene))
@@ -145,11 +158,27 @@ def main() -> None:
             }
             for seed in arguments.seeds
         }
+    found = []
     for title, motion in motions.items():
         moved = scene.copy()
         moved.set_motion(**motion)
         rows, spent = measure(moved, arguments.model)
         show(title, len(moved.motion), rows, spent)
+        found += rows
+    if arguments.output:
+        command = ["benchmarks/combined_motions.py", arguments.scene, "--seeds"]
+        command += map(str, arguments.seeds or [])
+        write_evidence(arguments.output, command, worst_by_muscle(found), COLUMNS)
+
+
+def worst_by_muscle(rows: list[tuple]) -> list[list]:
+    """Worst figures of each muscle over all motions, in the order of `COLUMNS`."""
+    out = []
+    for muscle in dict.fromkeys(row[0] for row in rows):
+        own = [row for row in rows if row[0] == muscle]
+        worst = [max(float(row[4].get(name, 0.0)) for row in own) for name in QUANTITY_OF.values()]
+        out.append([muscle, *worst, sum(row[5]["unresolved"] for row in own)])
+    return out
 
 
 if __name__ == "__main__":

@@ -53,7 +53,12 @@ def provenance(command):
     }
 
 
-def write_evidence(path, command, rows, **more):
-    """Write the rows of a table, and whatever else it needs, with where they come from."""
-    text = json.dumps({**provenance(command), **more, "rows": rows}, indent=1)
+def write_evidence(path, command, rows, columns=None):
+    """Write the rows of a table with where they come from.
+
+    With ``columns``, the heads of the table, rows are lists of texts and numbers, None for an empty
+    cell; without them a function of ``docs/figures.py`` draws the table.
+    """
+    heads = {"columns": columns} if columns else {}
+    text = json.dumps({**provenance(command), **heads, "rows": rows}, indent=1)
     Path(path).write_text(text + "\n", encoding="utf-8")

@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from evidence import write_evidence
 from peers.fibre_material import PassiveFibres
 from peers.finite_element import HexSolid, brick_grid, follow, nearest_bone
 from scipy.spatial import cKDTree
@@ -253,6 +254,21 @@ def distances(model, kept, *, settings=None):
     return rows
 
 
+def rows_of(path):
+    """Distances of every model to the reference [mm], of the RBF model with more nodes too."""
+    kept, rows = np.load(path), []
+    for title, model, settings in (
+        ("rbf", "rbf", {}),
+        *((f"rbf, {n} nodes", "rbf", {"model.nodes": n}) for n in (300, 600)),
+        *((name, name, {}) for name in COMPARED if name != "rbf"),
+    ):
+        found = distances(model, kept, settings)
+        rows.append([title, *(x for _, rms, worst, _ in found for x in (rms, worst))])
+        print(*rows[-1], flush=True)
+    heads = [f"{angle:g}°, {what}" for angle in kept["angles"] for what in ("RMS", "greatest")]
+    return rows, ["model", *heads]
+
+
 def compare(path):
     """Print the distance of every model to the reference."""
     kept = np.load(path)
@@ -277,8 +293,13 @@ def main():
     parser.add_argument(
         "--fibre-ratio", type=float, default=1.0, help="Young's modulus along fibres over across"
     )
+    parser.add_argument("-o", "--output", type=Path, help="file of evidence for the pages")
     given = parser.parse_args()
-    if given.action == "solve":
+    if given.output:
+        write_evidence(
+            given.output, ["benchmarks/fe_reference.py", "compare"], *rows_of(given.file)
+        )
+    elif given.action == "solve":
         solve(given.file, tuple(given.cells), given.fibre_ratio)
     else:
         compare(given.file)

@@ -15,10 +15,9 @@ stretch   of fibres, 5th and 95th percentile over all poses; beside it that of t
 """
 
 import argparse
-import json
 
 import numpy as np
-from evidence import data_folder
+from evidence import data_folder, write_evidence
 
 from rbfmuscle.fibres.published import published_band
 from rbfmuscle.run import simulate
@@ -95,19 +94,21 @@ def table(data, model, settings):
     return found
 
 
+SHARES = ("overlap", "inside", "union", "median inside")
+
+
 def show(title, found):
     """Print a table, and its means."""
     print(f"\n{title}\n")
     print("| muscle | motion | overlap | inside | union | median inside | arms [mm] | stretch |")
     print("|---|---|---|---|---|---|---|---|")
-    shares = ("overlap", "inside", "union", "median inside")
     for (muscle, motion), row in found.items():
-        numbers = " | ".join(f"{row[name]:.2f}" for name in shares)
+        numbers = " | ".join(f"{row[name]:.2f}" for name in SHARES)
         arms = " to ".join(f"{x:.0f}" for x in row["arms"])
         stretch = " to ".join(f"{x:.2f}" for x in row["stretch"])
         straight = " to ".join(f"{x:.2f}" for x in row["straight"])
         print(f"| {muscle} | {motion} | {numbers} | {arms} | {stretch} ({straight}) |")
-    means = {name: np.mean([row[name] for row in found.values()]) for name in shares}
+    means = {name: np.mean([row[name] for row in found.values()]) for name in SHARES}
     print(f"| mean | | {' | '.join(f'{x:.2f}' for x in means.values())} | | |")
 
 
@@ -116,16 +117,17 @@ def main():
     parser.add_argument("--data", default="hip,leg")
     parser.add_argument("--model", default="rbf")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--json", help="file for the figures")
+    parser.add_argument("-o", "--output", help="file of evidence for the pages: means")
     given = parser.parse_args()
-    kept = {}
+    rows = []
     for data in given.data.split(","):
         found = table(data, given.model, parse_settings(given.set))
         show(f"data/{data}, {given.model} {' '.join(given.set)}", found)
-        kept[data] = {f"{muscle} {motion}": row for (muscle, motion), row in found.items()}
-    if given.json:
-        with open(given.json, "w", encoding="utf-8") as file:
-            json.dump(kept, file, indent=1)
+        values = ([row[name] for name in SHARES] for row in found.values())
+        rows.append([data, len(found), *np.mean(list(values), axis=0).tolist()])
+    if given.output:
+        heads = ["data", "muscles and motions", *SHARES]
+        write_evidence(given.output, ["benchmarks/hip_moment_arms.py", *given.set], rows, heads)
 
 
 if __name__ == "__main__":

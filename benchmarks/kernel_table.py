@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from evidence import write_evidence
 
 from rbfmuscle.experiments.kernel_study import VOLUME_BOUND, ReferenceSurface, measure_row
 from rbfmuscle.experiments.sweep_run import threads_limited
@@ -73,15 +74,26 @@ def best_of_scan(judge, found, own):
     return best
 
 
+COLUMNS = [
+    "kernel",
+    "placement",
+    "muscles",
+    "error, median [mm]",
+    "error over the best of the scan, greatest",
+    "within 5 %",
+]
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--kernels", default=",".join(KERNELS))
     parser.add_argument("--centres", default="150,300")
     parser.add_argument("--placements", default="greedy,fitted")
+    parser.add_argument("-o", "--output", help="file of evidence for the pages, by kernel")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    ratios, unfit = [], []
+    ratios, unfit, errors = [], [], {}
     for name, mesh in surfaces(options.data):
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
         judge = ReferenceSurface(vertices, faces)
@@ -95,6 +107,7 @@ def main():
                     own = np.inf if row["unfit"] else row["rms"]
                     best = best_of_scan(judge, found, own) if kernel.has_epsilon else own
                     (unfit if row["unfit"] else ratios).append(best if row["unfit"] else own / best)
+                    errors.setdefault((kernel.name, placement), []).append((own, own / best))
                     said = (
                         f"unfit, the scan has {best:.3g}"
                         if row["unfit"]
@@ -111,6 +124,16 @@ def main():
         f"{len(unfit)} unfit "
         f"{np.isfinite(unfit).sum()} where the scan has a fit one"
     )
+    if options.output:
+        rows = []
+        for (kernel, placement), found in errors.items():
+            error, ratio = np.array(found).T
+            median = float(np.median(error)) if np.isfinite(error).all() else None
+            met = int((ratio <= LIMIT).sum())
+            rows.append([kernel, placement, len(found), median, float(np.nanmax(ratio)), met])
+        command = ["benchmarks/kernel_table.py", "DATA", "--kernels", options.kernels]
+        command += ["--centres", options.centres]
+        write_evidence(options.output, command, rows, COLUMNS)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Errors of the models against answers in closed form, and runs refined until they no longer move.
 
     python benchmarks/known_answers.py [PART ...]
+    python benchmarks/known_answers.py -o docs/evidence/known_answers.json    the RBF model alone
 
 Parts are ``stretched``, ``bent``, ``wrapped`` (against closed forms), ``solid`` (what held ends do;
 needs the extra ``fem``), ``centres``, ``meshes``, ``iterations``, ``substeps`` (converged runs on
@@ -13,8 +14,10 @@ import argparse
 import math
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from evidence import write_evidence
 from peers.known_answers import (
     bent_bar_errors,
     centreline,
@@ -331,6 +334,31 @@ def substep_tables():
         converged(f"{name} over the sub-step", runs, same_mesh=True)
 
 
+NODES = (150, 300, 600)
+COLUMNS = [
+    "nodes of the solid",
+    "bar stretched by 1.2, radius",
+    "bar bent by 60°, length",
+    "strip over a cylinder, length",
+    "strip over a sphere, length",
+    "strip over a cylinder, radius",
+]
+
+
+def rbf_errors(nodes):
+    """Errors of the RBF model with 600 centres [per cent], one for each of `COLUMNS`."""
+    model = {**RBF, "centres": 600, "nodes": nodes}
+    over = {name: wrapped(name, model, 1.5) for name in TURNS}
+    found = [
+        stretched(1.2, model, 1.5)["radius"],
+        bent({**model, "slack": 1.0}, 2.0)["path"],
+        over["cylinder"]["path"],
+        over["sphere"]["path"],
+        over["cylinder"]["radius"],
+    ]
+    return [nodes, *(100.0 * float(error) for error in found)]
+
+
 PARTS = {
     "stretched": stretched_tables,
     "solid": solid_table,
@@ -348,7 +376,13 @@ def main():
     parser.add_argument(
         "parts", nargs="*", metavar="PART", choices=[*PARTS, []], help=", ".join(PARTS)
     )
-    for part in parser.parse_args().parts or PARTS:
+    parser.add_argument("-o", "--output", type=Path)
+    given = parser.parse_args()
+    if given.output:
+        rows = [rbf_errors(nodes) for nodes in NODES]
+        write_evidence(given.output, ["benchmarks/known_answers.py"], rows, COLUMNS)
+        return
+    for part in given.parts or PARTS:
         PARTS[part]()
 
 

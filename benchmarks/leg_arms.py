@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from evidence import data_folder
+from evidence import data_folder, write_evidence
 from leg_tendons import convert
 
 from rbfmuscle.run import simulate
@@ -129,6 +129,7 @@ def main():
     )
     parser.add_argument("--models", default="rbf")
     parser.add_argument("--joints", default="hip,knee,ankle")
+    parser.add_argument("-o", "--output", help="file of evidence for the pages")
     arguments = parser.parse_args()
     leg, models = data_folder("leg"), arguments.models.split(",")
     reference = leg.parent.parent / "reference" / "anatomy" / "gait2392_moment_arms.json"
@@ -145,7 +146,7 @@ def main():
     ]
     print(f"| joint | muscle | {' | '.join(heads)} |")
     print("|" + "---|" * (2 + len(heads)))
-    differences = []
+    differences, rows = [], []
     with tempfile.TemporaryDirectory() as folder:
         file = convert(leg / "squat.toml", Path(folder))
         for joint in arguments.joints.split(","):
@@ -174,11 +175,15 @@ def main():
                 else:
                     row += ["", published, "", ""]
                 print(f"| {' | '.join(row)} |", flush=True)
+                rows.append(row)
     if differences:
         print(
             f"mean difference of the {len(differences)} whose geodesic agrees: "
             f"{np.mean(differences):.1f} mm"
         )
+    if arguments.output:
+        columns = ["joint", "muscle", *heads[:-1], "result"]
+        write_evidence(arguments.output, ["benchmarks/leg_arms.py"], rows, columns)
 
 
 if __name__ == "__main__":

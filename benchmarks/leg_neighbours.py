@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from evidence import data_folder
+from evidence import data_folder, write_evidence
 from leg_tendons import convert
 from scipy.spatial import cKDTree
 
@@ -180,6 +180,17 @@ def _surfaces(frame):
     }
 
 
+COLUMNS = [
+    "sliding",
+    "pairs that meet",
+    "overlap, 95 %",
+    "gap opened, 95 %",
+    "overlap, worst",
+    "gap opened, worst",
+    "processor time [s]",
+]
+
+
 def pairs(bench, arguments):
     wanted = {0, *chosen(arguments.frames, len(bench.path))}
     worst = {}
@@ -209,6 +220,14 @@ def pairs(bench, arguments):
         for values, into in zip(found[:2], every):
             into += [values.get(pair, 0.0) for pair in met]
         _tell_frame(k, frame, found[:2])
+    rows = list(worst.values())
+    row = [
+        "without" if arguments.without else "with",
+        len(worst),
+        *(float(np.percentile(values, 95)) for values in every),
+        *(max(found[k][0] for found in rows) for k in range(2)),
+        spent,
+    ]
     print(f"processor time {spent:.1f} s, a frame {spent / (max(wanted) + 1):.2f} s")
     deep, wide = (np.percentile(values, 95) for values in every)
     print(f"95th percentile over pairs and frames: overlap {deep:.3f}, opened {wide:.3f}")
@@ -224,8 +243,9 @@ def pairs(bench, arguments):
         "mm RMS, "
         f"worst {wide.max():.3f}"
     )
-    for pair, row in sorted(worst.items(), key=lambda item: -item[1][4][0])[:TOLD]:
-        print(f"    {' and '.join(pair):60} {row[4][0]:7.3f} {row[4][1]:2d}", flush=True)
+    for pair, found in sorted(worst.items(), key=lambda item: -item[1][4][0])[:TOLD]:
+        print(f"    {' and '.join(pair):60} {found[4][0]:7.3f} {found[4][1]:2d}", flush=True)
+    return row
 
 
 def _tell_pairs(name, worst):
@@ -268,8 +288,16 @@ def main():
         "--set", action="append", default=[], metavar="KEY=VALUE", help="of the scene"
     )
     parser.add_argument("--without", action="store_true", help="measure a run without sliding")
+    parser.add_argument("-o", "--output", help="file of evidence for the pages: with and without")
     arguments = parser.parse_args()
-    pairs(Bench(arguments), arguments)
+    if arguments.output:
+        bench, rows = Bench(arguments), []
+        for arguments.without in (True, False):
+            rows.append(pairs(bench, arguments))
+        command = ["benchmarks/leg_neighbours.py", "--frames", arguments.frames]
+        write_evidence(arguments.output, command, rows, COLUMNS)
+    else:
+        pairs(Bench(arguments), arguments)
 
 
 if __name__ == "__main__":

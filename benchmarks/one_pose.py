@@ -1,6 +1,6 @@
 """One pose reached over six ways: how far the muscle's material lies apart.
 
-    python benchmarks/one_pose.py SCENE --muscle NAME [--pose hip.flexion=60 hip.adduction=-25]
+    python benchmarks/one_pose.py SCENE --muscles A,B [--pose hip.flexion=60 hip.adduction=-25]
                                   [--set nodes=300 ...]
 
 The ways to a pose of two coordinates, by default in sub-steps of 2 degrees: both at once, either
@@ -12,8 +12,10 @@ carried surface, RMS and greatest over all pairs [mm].
 import argparse
 import itertools
 import time
+from pathlib import Path
 
 import numpy as np
+from evidence import write_evidence
 
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
@@ -98,24 +100,33 @@ def spread(found):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", help="a scene file, or 'phantom'")
-    parser.add_argument("--muscle", required=True)
+    parser.add_argument("--muscles", required=True, help="separated by commas")
     parser.add_argument("--pose", nargs="+", default=["hip.flexion=60", "hip.adduction=-25"])
     parser.add_argument("--others", nargs="*", default=["hip.internal_rotation"])
     parser.add_argument("--set", nargs="*", default=[], dest="settings")
+    parser.add_argument("-o", "--output", type=Path, help="file of evidence for the pages")
     given = parser.parse_args()
+    rows = [row_of(name, given) for name in given.muscles.split(",")]
+    if given.output:
+        command = ["benchmarks/one_pose.py", given.scene, "--muscles", given.muscles]
+        write_evidence(given.output, command, rows, ["muscle", "RMS", "greatest", "paths"])
+
+
+def row_of(muscle, given):
+    """Spread of the paths of one muscle [mm], which is printed with all distances."""
     scene = phantom_scene() if given.scene == "phantom" else Scene.load(given.scene)
-    scene.muscles = [scene.muscle(given.muscle)]
+    scene.muscles = [scene.muscle(muscle)]
     settings = parse_settings(given.settings)
     found, seconds = ends(scene, parse_settings(given.pose), given.others, settings)
     rms, greatest, pair = spread(found)
     print(
-        f"{given.muscle} {settings}: {rms:.3f} mm RMS ({pair}), {greatest:.2f} greatest, "
-        f"{seconds:.1f} s"
+        f"{muscle} {settings}: {rms:.3f} mm RMS ({pair}), {greatest:.2f} greatest, {seconds:.1f} s"
     )
     names = list(found)
     for a in names:
         row = [float(np.sqrt(((found[a] - found[b]) ** 2).sum(axis=1).mean())) for b in names]
         print(f"  {a:22}" + " ".join(f"{value:6.3f}" for value in row), flush=True)
+    return [muscle, rms, greatest, pair]
 
 
 if __name__ == "__main__":

@@ -41,6 +41,7 @@ CASES = {
     "rectus_femoris": ("leg/quadriceps.toml", "rectus_femoris", (11.0, 8.5)),
 }
 FRAMES = (15, 30)
+ANGLES = (30, 60)  # of these frames [degree]
 ENVELOPE = 0.7  # how far the tetrahedra's surface may leave the mesh [mm]
 STEP, SMALLEST_STEP = 1.0, 0.02  # frames of 2 degrees
 SETTLED, ON_THE_WAY = 2e-6, 1e-3  # share of the energy that a step must save
@@ -285,9 +286,18 @@ def main():
                 given.coarser,
             )
         return
-    rows = compare(given.names, given.models.split(","))
+    found = compare(given.names, given.models.split(","))
     if given.output:
-        write_evidence(given.output, ["benchmarks/real_solids.py", "compare", *given.names], rows)
+        heads = [f"{name.replace('_', ' ')}, {angle}°" for name in given.names for angle in ANGLES]
+        rows = [
+            [
+                title,
+                *(f"{rms:.2f} ({worst:.1f})" for name in given.names for rms, worst in own[name]),
+            ]
+            for title, own in found.items()
+        ]
+        command = ["benchmarks/real_solids.py", "compare", *given.names]
+        write_evidence(given.output, command, rows, ["model", *heads])
 
 
 if __name__ == "__main__":

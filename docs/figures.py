@@ -3,9 +3,10 @@
     python docs/figures.py                   # write them anew into README.md and docs/*.md
     python docs/figures.py --measure [NAME]  # measure first: minutes to an hour, on a quiet machine
 
-In a page a table stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``, a figure within a
-line between ``<!-- value: NAME.KEY -->`` and ``<!-- end -->``. ``tests/contract/test_docs.py``
-fails where a page says something else than its file.
+In a page a table of figures stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``, a
+figure within a line between ``<!-- value: NAME.KEY -->`` and ``<!-- end -->``, a table of the
+library's own facts between ``<!-- table: NAME -->`` and ``<!-- end -->``. A test fails
+where a page says something else.
 """
 
 import argparse
@@ -17,21 +18,32 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from rbfmuscle.metrics.quantities import QUANTITIES  # noqa: E402
+from rbfmuscle.metrics.summary import LIMITS, LOWER_BOUNDS  # noqa: E402
+
 EVIDENCE = ROOT / "docs" / "evidence"
 _TABLE = re.compile(r"<!-- evidence: ([\w]+) -->\n.*?<!-- end -->", re.S)
+_FACTS = re.compile(r"<!-- table: ([\w]+) -->\n.*?<!-- end -->", re.S)
 _VALUE = re.compile(r"<!-- value: ([\w]+)\.([\w]+) -->.*?<!-- end -->", re.S)
 
-# Name: what measures it. DATA stands for the folder of the real hip.
+# Name: what measures it, in minutes. DATA stands for the folder of the real hip and leg.
+_FLEXION = "DATA/hip/flexion.toml"
 COMMANDS = {
-    "headline": ["benchmarks/headline.py", "DATA/hip/flexion.toml", "-o", "OUT"],
-    "real_solids": [
-        "benchmarks/real_solids.py",
-        "compare",
-        "gluteus_maximus",
-        "rectus_femoris",
-        "-o",
-        "OUT",
-    ],
+    "headline": f"headline.py {_FLEXION}",
+    "known_answers": "known_answers.py",
+    "phantom_solid": "fe_reference.py compare",
+    "real_solids": "real_solids.py compare gluteus_maximus rectus_femoris",
+    "mesh_models": "mesh_models.py",
+    "one_pose": f"one_pose.py {_FLEXION} --muscles gluteus_maximus,iliacus",
+    "combined_motions": f"combined_motions.py {_FLEXION} --seeds 7 8",
+    "neighbours": "leg_neighbours.py --frames 0:37:12",
+    "bone_fields": "bench_sdf.py --data DATA --bones femur",
+    "kernels": "kernel_table.py DATA --kernels cubic,quintic,gaussian,wendland_c4 --centres 300",
+    "interpolation": "interpolation.py",
+    "hip_fibres": "hip_moment_arms.py",
+    "leg_arms": "leg_arms.py",
 }
 
 
@@ -52,7 +64,7 @@ def volume(value):
     return "< 1e-12" if value < 1e-12 else f"{value:.0e}"
 
 
-LABELS = {"rbf": "RBF", "pbd": "PBD, 3 sweeps", "pbd-converged": "PBD, converged"}
+LABELS = {"rbf": "RBF", "embedded": "the same solid, no field", "pbd": "PBD, 3 sweeps"}
 
 
 def headline_table(facts):
@@ -95,23 +107,40 @@ def headline_table(facts):
     return lines
 
 
-def real_solids_table(facts):
-    """Distance of the models to finite elements on real muscles: a column a muscle and pose."""
-    rows = facts["rows"]
-    muscles = list(next(iter(rows.values())))
-    head = [f"{name.replace('_', ' ')}, {angle}°" for name in muscles for angle in (30, 60)]
-    lines = [f"| model | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|"]
-    for title, found in rows.items():
-        cells = [f"{rms:.2f} ({worst:.1f})" for name in muscles for rms, worst in found[name]]
-        lines.append(f"| {title} | {' | '.join(cells)} |")
+def plain_table(facts):
+    """Columns and rows as a file has them; numbers with three digits."""
+
+    def cell(value):
+        if isinstance(value, float):
+            return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+        return "–" if value is None else str(value)
+
+    lines = [f"| {' | '.join(facts['columns'])} |", "|---" * len(facts["columns"]) + "|"]
+    return lines + [f"| {' | '.join(map(cell, row))} |" for row in facts["rows"]]
+
+
+def quantities_table():
+    """What `metrics.csv` holds, and the limits: a row for each quantity."""
+
+    def limit(name):
+        found = LIMITS.get(name)
+        if found is None:
+            return ""
+        unit = " mm" if QUANTITIES[name][0] == "length" else ""
+        least = "at least " if name in LOWER_BOUNDS else ""
+        return f"{least}{found.value:g}{unit}"
+
+    lines = ["| quantity | what | limit |", "|---|---|---|"]
+    for name, (_, what) in QUANTITIES.items():
+        if name.endswith("_p05"):
+            what = f"{what.partition(':')[0]}: percentiles of the fibres"
+            lines.append(f"| `{name}`, `_p50`, `_p95` | {what} | |")
+        elif not name.endswith(("_p50", "_p95")):
+            lines.append(f"| `{name}` | {what} | {limit(name)} |".replace("|  |", "| |"))
     return lines
 
 
-TABLES = {
-    "headline": headline_table,
-    "real_solids": real_solids_table,
-}
-
+FACTS = {"quantities": quantities_table}
 
 VALUES = {
     ("headline", "steps_apart"): lambda facts: bound(facts["rows"]["rbf"]["steps_apart"], 2),
@@ -140,7 +169,8 @@ def written(text):
 
     def table(match):
         facts = facts_of(match[1])
-        body = "\n".join([*TABLES[match[1]](facts), "", provenance(facts)])
+        draw = plain_table if "columns" in facts else headline_table
+        body = "\n".join([*draw(facts), "", provenance(facts)])
         return f"<!-- evidence: {match[1]} -->\n{body}\n<!-- end -->"
 
     def value(match):
@@ -149,7 +179,11 @@ def written(text):
             f"-->{VALUES[match[1], match[2]](facts_of(match[1]))}<!-- end -->"
         )
 
-    return _VALUE.sub(value, _TABLE.sub(table, text))
+    def own(match):
+        body = "\n".join(FACTS[match[1]]())
+        return f"<!-- table: {match[1]} -->\n{body}\n<!-- end -->"
+
+    return _VALUE.sub(value, _FACTS.sub(own, _TABLE.sub(table, text)))
 
 
 def page_files():
@@ -167,8 +201,8 @@ def measure(names):
                 f"{name}: the real hip is not here (set RBFMUSCLE_DATA to the folder that "
                 "holds hip/)"
             )
-        command = [part.replace("DATA", data) for part in COMMANDS[name]]
-        command[command.index("OUT")] = str(EVIDENCE / f"{name}.json")
+        script, *words = COMMANDS[name].replace("DATA", data).split()
+        command = [f"benchmarks/{script}", *words, "-o", str(EVIDENCE / f"{name}.json")]
         subprocess.run([sys.executable, *command], cwd=ROOT, check=True)
 
 

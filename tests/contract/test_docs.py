@@ -1,23 +1,136 @@
-"""Links in the pages lead somewhere, tables say what their files of evidence hold, and listed tests
-are there.
+"""Links in the pages lead somewhere, files and commands that they name are there, tables say what
+their files of evidence hold, and listed tests are there.
 """
 
+import argparse
+import importlib.util
 import json
 import re
+import shlex
 import sys
 
 import pytest
 from conftest import ROOT
 
+import rbfmuscle as rm
+from rbfmuscle.cli.app import app
+
 sys.path.insert(0, str(ROOT / "docs"))
 import figures
 
+PAGES = [*figures.page_files(), ROOT / "CONTRIBUTING.md"]
+GENERATED = {"gallery/index", "gallery/reference", "gallery/scene_reference"}
+of_page = pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
 
-@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda path: path.stem)
-def test_links_and_pictures_lead_to_files(page):
+
+def anchors(page):
+    """The names of a page's headings, as links have them."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
+    titles = re.findall(r"^#+ (.+)$", text, flags=re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def commands(text):
+    """Commands of a page, in blocks of shell and in lines, without comments and placeholders."""
+    blocks = re.findall(r"```(?:sh|text)?\n(.*?)```", text, flags=re.S)
+    listed = [line for block in blocks for line in block.splitlines()]
+    prose = re.sub(r"```.*?```", "", text, flags=re.S)
+    listed += re.findall(r"`([^`\n]+)`", prose)
+    for line in listed:
+        words = shlex.split(line.partition("  #")[0].replace("[", "").replace("]", ""), posix=True)
+        words = [word for word in words if word != "..."]
+        if words and words[0] in ("rbfmuscle", ".venv/bin/rbfmuscle", "python", "make"):
+            yield words
+
+
+def is_read(words):
+    """Whether a command of the library, of a script of this folder, or a target of make is read."""
+    if words[0] == "make":
+        targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.M))
+        return all(word in targets or "=" in word for word in words[1:])
+    if words[0] != "python":
+        if len(words) == 2 and words[1] in app:
+            return True
+        app.parse_args(words[1:], exit_on_error=False, print_error=False)
+        return True
+    return words[1] == "-m" or arguments_are_read(ROOT / words[1], words[2:])
+
+
+def arguments_are_read(path, words):
+    """Whether a script's parser takes these words; it does nothing else with them."""
+
+    class Read(Exception):
+        pass
+
+    def parse(parser, *_):
+        read(parser, words)
+        raise Read
+
+    read = argparse.ArgumentParser.parse_args
+    spec = importlib.util.spec_from_file_location("__main__", path)
+    module = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(argparse.ArgumentParser, "parse_args", parse)
+        patch.setattr(sys, "argv", [str(path), *words])
+        patch.setattr(sys, "path", [str(path.parent), *sys.path])
+        with pytest.raises(Read):
+            spec.loader.exec_module(module)
+    return True
+
+
+@of_page
+def test_links_and_pictures_lead_to_files_and_headings(page):
     text = page.read_text(encoding="utf-8")
-    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
-        assert target.startswith("https://") or (page.parent / target).exists(), target
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)]*))?\)", text):
+        if target.startswith("https://"):
+            continue
+        file = page.parent / target if target else page
+        assert file.exists(), target
+        assert not anchor or anchor in anchors(file), f"{target}#{anchor}"
+
+
+@of_page
+def test_files_that_a_page_names_are_there(page):
+    text = page.read_text(encoding="utf-8")
+    named = re.findall(r"[\w./]*\w\.py\b", text)
+    tops = "rbfmuscle|pbd_baseline|benchmarks|tests|docs|examples"
+    named += re.findall(rf"(?<![\w./])(?:{tops})/[\w./]*\w", text)
+    lost = [name for name in named if not any(ROOT.glob(f"**/{name}"))]
+    assert lost == []
+
+
+@of_page
+def test_commands_of_a_page_are_read(page):
+    for words in commands(page.read_text(encoding="utf-8")):
+        assert is_read(words), words
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "`rbfmuscle plan phantom`",
+        "```sh\nrbfmuscle run phantom -o out --muscle a  # no\n```",
+        "`make nothing`",
+        "`python docs/figures.py --remeasure`",
+        "`python benchmarks/gone.py`",
+    ],
+)
+def test_planted_wrong_command_is_found(text):
+    (words,) = commands(text)
+    with pytest.raises((Exception, SystemExit)):
+        assert is_read(words)
+
+
+@of_page
+def test_python_names_of_a_page_are_public(page):
+    text = page.read_text(encoding="utf-8")
+    assert {name for name in re.findall(r"\brm\.(\w+)", text) if name not in rm.__all__} == set()
+
+
+def test_every_page_is_in_the_index():
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    listed = {line for line in index.splitlines() if re.fullmatch(r"[\w/]+", line)} - GENERATED
+    assert listed == {path.stem for path in (ROOT / "docs").glob("*.md")} - {"index"}
 
 
 @pytest.mark.parametrize("name", ["fast.txt", "nojit.txt"])
