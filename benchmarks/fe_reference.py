@@ -262,7 +262,7 @@ def rows_of(path):
         *((f"rbf, {n} nodes", "rbf", {"model.nodes": n}) for n in (300, 600)),
         *((name, name, {}) for name in COMPARED if name != "rbf"),
     ):
-        found = distances(model, kept, settings)
+        found = distances(model, kept, settings=settings)
         rows.append([title, *(x for _, rms, worst, _ in found for x in (rms, worst))])
         print(*rows[-1], flush=True)
     heads = [f"{angle:g}°, {what}" for angle in kept["angles"] for what in ("RMS", "greatest")]
