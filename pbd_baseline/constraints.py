@@ -130,6 +130,8 @@ def _cubic_step(coefficients, wanted, least):
         return 0.0
     limit = 4.0 * abs(error / c1)
     s = 0.0
+    # The slope keeps its sign, so a few steps reach the last digit; what would be left is in the
+    # volume error of the frame.
     for _ in range(50):
         slope = c1 + s * (2.0 * c2 + 3.0 * s * c3)
         if slope * c1 <= 0.0 or abs(s) > limit:

@@ -50,13 +50,14 @@ def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Bool
     return np.maximum(room, 0.0)
 
 
-def _inner_balls(vertices, normals, rounds=12):
+def _inner_balls(vertices, normals):
     """Radius of the largest inner ball that touches the surface at each vertex (shrinking balls, Ma
-    2012).
+    2012): no vertex is in it but at a right angle or more.
     """
     tree = cKDTree(vertices)
     radius = np.full(len(vertices), 0.5 * float(np.ptp(vertices, axis=0).max()))
-    for _ in range(rounds):
+    # A ball becomes smaller each time, through another vertex: this ends.
+    while True:
         distance, index = tree.query(vertices - radius[:, None] * normals)
         offset = vertices - vertices[index]
         height = np.einsum("ij,ij->i", offset, normals)
@@ -64,9 +65,8 @@ def _inner_balls(vertices, normals, rounds=12):
         # a neighbour at a right angle says nothing: the ball would shrink to the sampling
         inside = (distance < radius * (1 - 1e-6)) & (height > 0.3 * np.sqrt(square))
         if not inside.any():
-            break
+            return radius
         radius[inside] = np.minimum(radius[inside], square[inside] / (2.0 * height[inside]))
-    return radius
 
 
 def _normalised(vectors):

@@ -125,8 +125,9 @@ class PBDMuscle:
             if moved < self.still:
                 break
         capped = self.still > 0.0 and not moved < self.still
-        self.log.add(caps=int(capped), solver_residual=moved / self.size)
         self._finish(contacts)
+        capped = int(capped) + int(self.penetration > self.depth)
+        self.log.add(caps=capped, solver_residual=moved / self.size)
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
@@ -205,7 +206,7 @@ class PBDMuscle:
 
     def _finish(self, contacts):
         """Contact and volume in turn, half-spaces found again, until both hold where the bones are
-        now known to be.
+        now known to be, or `FINISHING_ROUNDS` are over.
         """
         for _ in range(FINISHING_ROUNDS):
             self.penetration = self.contact.find(contacts, self.points, reach=self.finishing_reach)

@@ -13,6 +13,8 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import graph_laplacian, harmonic_weights
 
 POWER = 4.0
+# A choice and not an end at convergence: after these the weights are within 0.001 of their limit,
+# and they only predict; what is solved does not depend on them.
 ROUNDS = 8
 # Faces whose gradient is below this share of the largest count as having this much.
 LEAST_GRADIENT = 1e-3

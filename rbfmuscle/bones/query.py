@@ -34,7 +34,8 @@ COUNT, SIDE = 15, 4
 ROUNDING = 1e-3
 # Marks a far point beside the number of its fine cell.
 CELL_FAR = 128
-# Steps of a walk over the surface, at most, and what counts as nearer there.
+# Steps of a walk over the surface, at most, and what counts as nearer there. What a walk that ends
+# early misses is part of the field's error, which is measured when it is built.
 WALK, NEARER = 8, 1 - 1e-6
 # Points of one stage: their reads of memory overlap instead of waiting for each other.
 STAGE = 64

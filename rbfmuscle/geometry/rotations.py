@@ -88,6 +88,8 @@ def rotation_loop(m, q):
     the angle. Where that is not positive definite, as far from the solution, steps are those of
     Müller et al. (2016).
     """
+    # From the last iteration's rotation one to three steps do; what is left when there are no more
+    # is motion of the solve that asked, whose residual shows it.
     for _ in range(20):
         w = q[0]
         x = q[1]

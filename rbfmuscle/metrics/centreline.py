@@ -80,6 +80,8 @@ class Centreline:
         even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
         self.operator = slice_operator(vertices, faces, field, even)
         self.clearance = self._half_thickness(vertices, faces)
+        #: Shortest paths that did not come to rest, since they were last asked for.
+        self.unsettled = 0
         self._pulled: Floats | None = (
             None  # from the points along the line to the last shortest path
         )
@@ -111,7 +113,10 @@ class Centreline:
         the last frame.
         """
         line = self.points(vertices, poses)
-        path = shortest_path(line, probes, poses, clearance=self.clearance, offset=self._pulled)
+        path, settled = shortest_path(
+            line, probes, poses, clearance=self.clearance, offset=self._pulled
+        )
+        self.unsettled += not settled
         self._pulled = path - resampled(line, NODES - 1) if len(path) == NODES else None
         length, shortest = float(distance_along(line)[-1]), float(distance_along(path)[-1])
         return length, length / shortest if shortest > 0.0 else np.nan
@@ -302,20 +307,21 @@ def shortest_path(
     *,
     clearance: Floats,
     offset: Floats | None = None,
-) -> Floats:
+) -> tuple[Floats, bool]:
     """Nodes (`NODES`, 3) of the shortest path over the bones between the ends of a line, beside
     which it begins.
 
     ``line`` (n, 3) says which side of the bones the path takes; the bones have poses (4, 4) by
     name. Each node keeps its ``clearance`` (`NODES`,) [scene unit] from them. ``offset`` (`NODES`,
     3) leads from the points at even distances along the line to where the string begins: what it
-    did in the frame before. Two nodes only where no bone is near.
+    did in the frame before. Two nodes only where no bone is near. Also whether the path came to
+    rest within `ROUNDS`.
     """
     size = float(distance_along(line)[-1])
     widest = clearance.max()
     near = bones_about(np.vstack([line - widest, line + widest]), probes, poses)
     if not near:
-        return line[[0, -1]]
+        return line[[0, -1]], True
     string = resampled(line, NODES - 1) + (0.0 if offset is None else offset)
     earlier = [string]
     gap, normal = _planes(string, near, poses, TOUCHING * size)
@@ -326,14 +332,14 @@ def shortest_path(
         _tighten_loop(string, normal, offsets, SWEEPS, OVER_RELAXATION)
         # A node between two planes can go to and fro.
         if min(np.abs(string - other).max() for other in earlier) < STILL * size:
-            break
+            return string, True
         earlier = [earlier[-1], string]
         renewed = np.abs(string - taken).max(axis=1) > RENEWED * np.abs(gap)
         gap[renewed], normal[renewed] = _planes(string[renewed], near, poses, TOUCHING * size)
         taken[renewed] = string[renewed]
         touching = np.einsum("ij,ij->i", normal, string) - gap
         offsets[renewed] = (touching + clearance)[renewed]
-    return string
+    return string, False
 
 
 def _planes(

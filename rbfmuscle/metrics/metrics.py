@@ -19,7 +19,7 @@ from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.frame import Frame, Mesh, ModelSurface
+from rbfmuscle.simulation.frame import Event, Frame, Mesh, ModelSurface
 
 Values = dict[str, float]
 
@@ -124,6 +124,9 @@ class MuscleMeasurer:
         found["edge_strain_rms"] = math.sqrt(np.mean((stretch - 1.0) ** 2))
         if self.line is not None:
             belly, found["bowing"] = self.line.measure(carried, frame.poses, probes)
+            if self.line.unsettled:
+                count, self.line.unsettled = self.line.unsettled, 0
+                frame.events.append(Event(frame.index, self.name, "", count, "iteration_cap"))
             found["length"] = belly + self.line.tendon_length(frame.tendons)
         if self.name in frame.fibres:
             found.update(percentiles("fibre_stretch", frame.fibres[self.name].stretch))

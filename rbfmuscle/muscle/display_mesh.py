@@ -29,7 +29,8 @@ def display_mesh(muscle: Muscle, resolution: int) -> tuple[Floats, Integers]:
     """Vertices (n, 3) and faces (m, 3) that show a muscle: its input mesh, or a coarser one on it.
 
     With a ``resolution`` above 0, with so many edges along the longest side. Triangles of a scan
-    that cross others are smoothed until they do not.
+    that cross others are smoothed until they do not, `UNTANGLED` times at most: what then crosses
+    counts as ``self_crossings`` of every frame.
     """
     points, faces = _covering(muscle, resolution)
     tree, points = FaceTree(points, faces), points.copy()

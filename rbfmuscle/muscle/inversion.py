@@ -13,7 +13,8 @@ from rbfmuscle.jit import compiled, inner
 LEAST = 0.5  # det F that a point keeps
 STIFFNESS = 100.0  # over 2 μ
 SMALLEST = 0.1  # stretch that the search for the nearest deformation starts with at least
-ROUNDS = 10  # of that search
+# Of that search, a choice: the goal is only pulled at, and asked for anew in every iteration.
+ROUNDS = 10
 
 
 @inner(error_model="numpy")

@@ -236,7 +236,7 @@ def solid_mesh(
     vertices, faces, _, _ = marching_cubes(distance(grid), 0.0, spacing=(spacing,) * 3)
     vertices = vertices.astype(float) + low
     h = 1e-4 * spacing
-    for _ in range(2):
+    for _ in range(2):  # Newton's method from within a cell, a choice: the shapes are defined so
         value = distance(vertices)
         slope = np.stack(
             [

@@ -48,11 +48,12 @@ def tendon_name(muscle: str) -> str:
 
 class TendonLine(NamedTuple):
     """A tendon as it is drawn: points (n, 3) from the belly's end to the insertion, and its radii
-    at both.
+    at both; ``settled`` says whether it has its length.
     """
 
     points: Floats
     radii: tuple[float, float]
+    settled: bool = True
 
 
 class AtRest(dict[str, Floats]):
@@ -161,17 +162,20 @@ class TendonEnd:
         middle = now.point + turn @ (self.middle - before.point)
         middle = middle + self._lift(turn, middle, now.direction, poses)
         passed = max(0, now.legs - len(self.other) + 1)
+        settled = False
         for _ in range(STEPS):
             tendon = self._tendon(middle, passed, poses)
             excess = line_length(tendon) - length
-            if abs(excess) <= TOLERANCE * length:
+            settled = abs(excess) <= TOLERANCE * length
+            if settled:
                 break
             # A taut line becomes shorter by as much as its end goes along it.
             ahead = tendon[1] - tendon[0]
             middle = middle + excess / max(float(np.linalg.norm(ahead)), 1e-300) * ahead
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turn, middle - turn @ self.middle
-        return TendonLine(self._lifted(_with_nodes(tendon), poses), self.radii), pose
+        line = self._lifted(_with_nodes(tendon), poses)
+        return TendonLine(line, self.radii, settled), pose
 
     def _lifted(self, line: Floats, poses: Mapping[str, Floats]) -> Floats:
         """A line (n, 3) whose inner points that graze a bone, no deeper than the tendon's radius,

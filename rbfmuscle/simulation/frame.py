@@ -22,9 +22,9 @@ class Event:
     ``"carried_sheets"`` (no level set could be shown, so the surface is where the material is: it
     is stretched too far, an end is held inside the bone named, or sheets have met),
     ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame),
-    ``"iteration_cap"`` (``count`` times a solve ended at a greatest number of steps, without a
-    bone), or, with no muscle, ``"bones_overlap"`` (the motion drives two bones into each other) or
-    ``"joint_opens"`` (those of a joint apart).
+    ``"iteration_cap"`` (``count`` times a solve, a tendon's line or the shortest path of `bowing`
+    ended at a greatest number of steps, without a bone), or, with no muscle, ``"bones_overlap"``
+    (the motion drives two bones into each other) or ``"joint_opens"`` (those of a joint apart).
     """
 
     frame: int

@@ -216,11 +216,10 @@ class FrameLoop:
         found = [stepper.collect() for stepper in self.steppers]
         times = dict(zip(carried, (times for times, _, _ in found)))
         poses = self._poses(self.here)
-        for end in (end for name in carried for end in self.scene.muscle(name).tendons):
-            poses[end.name]  # the pose of an end is computed, and kept, when it is first asked for
         index = self._next_index - 1
         surfaces = dict(zip(carried, drawn))
         events = [event for _, events, _ in found for event in events]
+        events += self._find_tendons(poses)
         events += [
             Event(index, name, *note) for name, shown in surfaces.items() for note in shown.notes
         ]
@@ -238,6 +237,18 @@ class FrameLoop:
             neighbours={} if self._sliding is None else dict(self._sliding.pairs),
             tendons=dict(poses.tendons),
         )
+
+    def _find_tendons(self, poses: Poses) -> list[Event]:
+        """Ask for the ends of all tendons, whose poses are found, and kept, when they are first
+        asked for; the events of those that did not settle.
+        """
+        events = []
+        for stepper in self.steppers:
+            for end in self.scene.muscle(stepper.name).tendons:
+                poses[end.name]
+                if not poses.tendons[end.name].settled:
+                    events.append(Event(self._next_index - 1, stepper.name, "", 1, "iteration_cap"))
+        return events
 
 
 def simulate_frames(

@@ -234,6 +234,10 @@ def _trace(field, start, end, tolerance):
         under_way = under_way[t < 1.0]
         if len(under_way) == 0:
             break
+    # What is too long to be followed counts as inside, and is judged by its ends.
+    lowest[under_way] = -np.inf
+    entry[under_way] = 0.0
+    leave[under_way] = 1.0
     return lowest, entry, leave
 
 

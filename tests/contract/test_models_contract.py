@@ -195,6 +195,14 @@ def test_a_solve_at_its_cap_is_an_event_and_beyond_its_limit():
     assert settled.values("strap0", "solid_volume_error").max() < LIMITS["solid_volume_error"].value
 
 
+def test_contact_and_volume_that_do_not_both_hold_are_an_event(monkeypatch):
+    frames, _ = _run("pbd", _scene([0, 20]))
+    assert not [event for frame in frames for event in frame.events]
+    monkeypatch.setattr("pbd_baseline.muscle.DEPTH", -1.0)  # no depth is small enough
+    frames, _ = _run("pbd", _scene([0, 20]))
+    assert "iteration_cap" in {event.action for event in frames[1].events}
+
+
 def test_an_overlap_that_does_not_settle_is_an_event(monkeypatch):
     monkeypatch.setattr("rbfmuscle.simulation.overlap.SETTLED", 0.0)
     monkeypatch.setattr("rbfmuscle.simulation.overlap.MOST_SOLVES", 2)

@@ -6,6 +6,7 @@ import trimesh
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.implicit.field import off_surface_points
+from rbfmuscle.implicit.placement import clustering
 from rbfmuscle.implicit.placement.clustering import contract_clusters
 from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
 from rbfmuscle.validation import MeshError
@@ -111,3 +112,19 @@ def test_off_surface_points_stay_nearest_to_their_own_point():
     distance, owner = trimesh.proximity.cKDTree(points).query(where)
     np.testing.assert_allclose(distance, np.abs(values), atol=1e-12)
     np.testing.assert_array_equal(owner, np.tile(np.arange(50), 3))
+
+
+def test_cells_are_those_from_which_no_vertex_wants_to_go(monkeypatch):
+    """Once more over the edges moves nothing, as the loop only ends there."""
+    loop, seen = clustering._equalise_loop, []
+
+    def twice(*given):
+        loop(*given)
+        labels = given[3].copy()
+        loop(*given)
+        seen.append(np.array_equal(labels, given[3]))
+
+    monkeypatch.setattr(clustering, "_equalise_loop", twice)
+    mesh = SHAPES["ellipsoid"]()
+    sample_surface(mesh.vertices, mesh.faces, 40, placement="even")
+    assert seen == [True]

@@ -124,13 +124,16 @@ def test_thin_walls_do_not_go_through_themselves(monkeypatch):
     x, y, z = np.moveaxis(grid, -1, 0)
     wall = (np.abs(z - 6.0 * np.sin(x / 5.0) * np.cos(y / 6.0)) < 1.105) & (np.hypot(x, y) < 22.0)
     volume = LabelVolume(wall.astype(np.int32), np.eye(4), {}, "wall.nii")
-    mesh = label_surface(volume, 1).mesh
+    surface = label_surface(volume, 1)
+    mesh = surface.mesh
     assert mesh.is_watertight and mesh.euler_number == 2
+    assert not any("triangles" in note for note in surface.notes)
     assert not crossing_faces(mesh.vertices, mesh.faces).any()
     assert mesh.volume == pytest.approx(wall.sum(), rel=5e-3)
     monkeypatch.setattr(surfaces, "UNTANGLE", 1)
     mesh = label_surface(volume, 1).mesh
     assert crossing_faces(mesh.vertices, mesh.faces).sum() > 0
+    assert any("triangles go through others" in note for note in label_surface(volume, 1).notes)
 
 
 def test_islands_and_holes_are_left_out_and_told():

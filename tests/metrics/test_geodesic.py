@@ -37,7 +37,8 @@ def test_string_over_a_ball_is_two_tangents_and_an_arc(height, clearance):
     motion[:3, 3] = 3.0, -7.0, 11.0
     line = trimesh.transform_points(over_the_ball(height), motion)
     kept_off = np.full(NODES, clearance)
-    path = shortest_path(line, [ball()], {"ball": motion}, clearance=kept_off)
+    path, settled = shortest_path(line, [ball()], {"ball": motion}, clearance=kept_off)
+    assert settled
     path = trimesh.transform_points(path, np.linalg.inv(motion))
     radius = RADIUS + clearance
     tangent = np.sqrt(FAR**2 - radius**2)
@@ -49,7 +50,7 @@ def test_string_over_a_ball_is_two_tangents_and_an_arc(height, clearance):
     away = np.eye(4)  # with nothing between it is straight
     away[:3, 3] = 0.0, 40.0, 0.0
     for probes, poses in (([], {}), ([ball()], {"ball": away})):
-        path = shortest_path(over_the_ball(height), probes, poses, clearance=kept_off)
+        path, _ = shortest_path(over_the_ball(height), probes, poses, clearance=kept_off)
         assert line_length(path) == pytest.approx(2 * FAR, rel=1e-6)
 
 
@@ -131,3 +132,16 @@ def test_straight_strip_whose_ends_approach_bows_by_arc_over_chord():
     end = wrapped(np.array([[0.5 * LENGTH, 0.0, 0.0]]), radius)[0]
     assert bowing(None, radius) == pytest.approx(LENGTH / (2 * end[0]), abs=2e-3)  # of the slices
     assert bowing(None, 1e6) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_path_that_does_not_come_to_rest_is_counted(monkeypatch):
+    line, mesh = strip()
+    radius = RADIUS + HALF
+    poses = {"trunk": end_pose(line, 0, radius), "limb": end_pose(line, 1, radius)}
+    given = wrapped(np.array(mesh.vertices), radius), {**poses, "ball": np.eye(4)}, [pulley()]
+    line.measure(*given)
+    assert line.unsettled == 0
+    monkeypatch.setattr("rbfmuscle.metrics.centreline.ROUNDS", 1)
+    line, _ = strip()
+    line.measure(*given)
+    assert line.unsettled == 1

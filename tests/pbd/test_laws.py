@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from pbd_baseline.arap import ARAP, ARAPConstraint
 from pbd_baseline.constraints import _cubic_step
+from pbd_baseline.fibres import _inner_balls
 from pbd_baseline.topology import Topology
 
 
@@ -105,3 +106,25 @@ def test_step_to_a_volume_meets_it_or_is_none(error, slope, sign, bend, turn):
     if abs(error) < 0.05 * slope**2:  # so near that the first turn of the cubic lies far behind
         assert cubic[0] == 1.0 or s != 0.0
         assert s * sign * error <= 0.0
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-7])
+def test_no_vertex_is_in_an_inner_ball(size):
+    """Beside a fine cone a ball shrinks many times: there are vertices at all distances."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    rings = np.geomspace(1e-4, 1.0, 60)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    vertices = np.vstack([np.column_stack([0.3 * r * circle, np.full(12, r)]) for r in rings])
+    vertices = size * vertices
+    outward = np.column_stack([circle, np.full(12, -0.3)])
+    normals = np.tile(outward / np.linalg.norm(outward, axis=1)[:, None], (60, 1))
+    radius = _inner_balls(vertices, normals)
+    middle = vertices - radius[:, None] * normals
+    offset = vertices[:, None] - vertices[None]
+    away = np.linalg.norm(middle[:, None] - vertices[None], axis=2)
+    height = np.einsum("ijk,ik->ij", offset, normals)
+    counts = height > 0.3 * np.linalg.norm(offset, axis=2)
+    nearest = np.argmin(away, axis=1)
+    rows = np.arange(len(vertices))
+    within = away[rows, nearest] < radius * (1.0 - 1e-6)
+    assert not (within & counts[rows, nearest]).any()

@@ -212,3 +212,14 @@ def test_via_points_of_another_bone_hold_the_line():
     for wrong in ({"via": [{"bone": "trunc", "point": [0.0, 0.0, 0.0]}]}, {"to": [0.0, 0.0]}):
         with pytest.raises(rm.SceneError, match="tendon"):
             arm(**wrong)
+
+
+def test_a_tendon_that_does_not_come_to_its_length_is_an_event(monkeypatch):
+    def actions():
+        scene = arm().set_motion(waypoints=[{"elbow.bend": 0}, {"elbow.bend": 20}], step=10)
+        return [(e.frame, e.action) for e in rm.simulate(scene, "pbd").events]
+
+    assert all(action != "iteration_cap" for _, action in actions())
+    # No difference is small enough.
+    monkeypatch.setattr("rbfmuscle.scene.tendons.TOLERANCE", -1.0)
+    assert (2, "iteration_cap") in actions()

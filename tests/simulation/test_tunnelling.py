@@ -240,3 +240,14 @@ def test_only_a_path_that_the_triangles_call_shallow_has_grazed(thickness, touch
     assert only_grazed(crossing, mesh, paths, np.eye(4), turn, 0.1) is touched
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)
     assert not only_grazed(crossing, mesh, paths, np.eye(4), turn, 0.1)
+
+
+def test_a_path_too_long_to_be_followed_counts_as_inside_and_is_judged_by_its_ends(monkeypatch):
+    """Through a plate, over it, and into it and out on the same side."""
+    start = np.array([[-2.0, 0.0, -3.0], [0.0, 0.0, 3.0], [-2.0, 0.0, 3.0]])
+    end = np.array([[2.0, 0.0, 3.0], [4.0, 0.0, 3.0], [2.0, 0.0, 0.6]])
+    for most in (10_000, 3):
+        monkeypatch.setattr("rbfmuscle.simulation.tunnelling.MAX_ROUNDS", most)
+        sweep = sweep_paths(box((90.0, 90.0, 0.5)), start, end, tolerance=1e-4)
+        assert sweep.index[sweep.through].tolist() == [0]
+        assert sweep.lowest[sweep.index.tolist().index(0)] < -0.4

@@ -21,8 +21,6 @@ from rbfmuscle.validation import MeshError
 
 # Least ratio of cell size to edge length: about ten mesh vertices a cell, or cells get ragged.
 FINENESS = 2.5
-# Sweeps over the edges in which vertices change their cell, at most.
-ROUNDS = 200
 
 
 class FineMesh(NamedTuple):
@@ -157,7 +155,9 @@ def _equalise_loop(vertices, weight, edges, labels, count):
             members[k] += 1
             for c in range(3):
                 moment[k, c] += weight[v] * vertices[v, c]
-    for _ in range(ROUNDS):
+    # Each move lowers the sum by more than it is rounded, so that no state comes back: this ends.
+    moved = -1
+    while moved != 0:
         moved = 0
         for e in range(len(edges)):
             for side in range(2):
@@ -182,8 +182,6 @@ def _equalise_loop(vertices, weight, edges, labels, count):
                     for c in range(3):
                         moment[old, c] -= w * x[c]
                         moment[k, c] += w * x[c]
-        if moved == 0:
-            break
 
 
 def _mark_loose(

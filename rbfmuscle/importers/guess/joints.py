@@ -211,5 +211,7 @@ def fit_hinge(face: Face) -> Fit | None:
     size = float(np.sqrt(np.average(((points - middle) ** 2).sum(axis=1), weights=areas)))
     start = flat @ np.array(plane) + middle @ axis * axis
     fit = fit_coaxial([(points, areas)], start, axis, np.array([radius]), 0.02 * size)
+    if fit.wrong:
+        return None
     fit.centre = fit.centre + (points.mean(axis=0) - fit.centre) @ fit.axis * fit.axis
     return fit

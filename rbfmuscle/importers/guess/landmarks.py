@@ -49,6 +49,12 @@ class Frame:
         return np.cross(self.anterior, self.superior)
 
 
+# Rounds of the condyles' axis and of the dome, and evaluations of a coaxial fit, at most; real
+# bones take 7, 7 and 67. What does not settle in these is refused.
+AXIS_ROUNDS, DOME_ROUNDS, EVALUATIONS = 12, 40, 200
+UNSETTLED = "the fit does not settle"
+
+
 @dataclass
 class Fit:
     """A sphere, or spheres or cylinders on an axis: centre (3,), radii, misfit (RMS) [scene unit],
@@ -147,7 +153,7 @@ def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> Fit | None:
     along = points @ frame.superior
     near = along < along.min() + CONDYLES * np.ptp(along)
     points, normals, areas = (values[near] for values in femur.faces)
-    for _ in range(12):
+    for _ in range(AXIS_ROUNDS):
         anterior = unit(np.cross(frame.superior, right))
         angle = np.degrees(np.arctan2(-normals @ np.cross(right, anterior), -normals @ anterior))
         chosen = (
@@ -162,19 +168,19 @@ def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> Fit | None:
             return None
         fits = [_fit_condyle(points[g], normals[g], areas[g], millimetre) for g in groups]
         before, right = right, unit(fits[1][0] - fits[0][0])
-        if right @ before > 1.0 - 1e-9:
+        settled = right @ before > 1.0 - 1e-9
+        if settled:
             break
     centres, radii, misfits = (np.array(values) for values in zip(*fits))
-    misfit, wrong = (
-        float(np.sqrt(np.mean(misfits**2))),
-        _refused("condyle", radii, CONDYLE, millimetre),
-    )
+    misfit = float(np.sqrt(np.mean(misfits**2)))
+    wrong = _refused("condyle", radii, CONDYLE, millimetre) if settled else UNSETTLED
     return Fit(centres.mean(axis=0), radii, misfit, right, wrong=wrong)
 
 
 def _fit_condyle(points, normals, areas, millimetre):
     """Centre, radius and misfit of a sphere; what does not lie on it loses its weight."""
     weights = areas
+    # A choice: after these the sphere goes on moving by less than 1e-6 of its radius.
     for _ in range(15):
         centre, radius = fit_sphere(points, weights)
         away = np.linalg.norm(points - centre, axis=1)
@@ -210,7 +216,7 @@ def fit_dome(
         return None
     radii, before = np.array([20.0, 23.0]) * millimetre, np.empty(0)
     centre = np.average(points[top], axis=0, weights=areas[top]) - radii[0] * up
-    for _ in range(40):
+    for _ in range(DOME_ROUNDS):
         chosen = [
             _on_cylinder(*patch[:2], centre, right, up, r) for patch, r in zip(patches, radii)
         ]
@@ -220,7 +226,8 @@ def fit_dome(
             chosen = chosen[:1]
         if chosen[0].sum() < 8:
             return None
-        if np.array_equal(before, before := np.concatenate(chosen)):
+        settled = np.array_equal(before, before := np.concatenate(chosen))
+        if settled:
             break
         used = [(patch[0][c], patch[2][c]) for patch, c in zip(patches, chosen)]
         fit = fit_coaxial(used, centre, right, radii, 0.5 * millimetre)
@@ -228,7 +235,9 @@ def fit_dome(
         right = fit.axis
         radii = fit.radii
     fit.centre = centre + ((used[0][0] - centre) @ right).mean() * right
-    fit.wrong = _refused("talar dome", radii[:1], DOME, millimetre)
+    fit.wrong = fit.wrong or _refused("talar dome", radii[:1], DOME, millimetre)
+    if not settled:
+        fit.wrong = UNSETTLED
     space = np.ptp(radii) / millimetre
     if space > SPACE:
         fit.wrong = f"dome and plafond are {space:.2g} mm apart, at most {SPACE:g} are believed"
@@ -271,7 +280,11 @@ def fit_coaxial(
         )
 
     start = np.r_[np.zeros(4), radii / size]
-    x = least_squares(residual, start, loss="soft_l1", f_scale=soft / size, max_nfev=200).x
+    found = least_squares(
+        residual, start, loss="soft_l1", f_scale=soft / size, max_nfev=EVALUATIONS
+    )
+    x = found.x
     parts = np.split(residual(x) * size, np.cumsum([len(root) for root in roots])[:-1])
     misfit = float(np.sqrt(sum(np.mean(part**2) for part in parts)))
-    return Fit(line(x)[1], x[4:] * size, misfit, line(x)[0])
+    wrong = "" if found.success else UNSETTLED
+    return Fit(line(x)[1], x[4:] * size, misfit, line(x)[0], wrong=wrong)

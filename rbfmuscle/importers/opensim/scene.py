@@ -24,6 +24,7 @@ from rbfmuscle.validation import MeshError, SceneError, check_mesh
 
 WIDEST = 3.0  # a mesh wider than this [m] is a floor or a wall, not a bone
 NARROWEST = 0.002
+LEAST_MISSED = 1e-3  # share of a muscle's volume that its tube may miss without a word
 SCENE = "scene.toml"
 
 
@@ -97,6 +98,10 @@ def _add_muscles(found, walk):
             ]
             mesh = tube.vertices, tube.faces
             scene.add_muscle(muscle.name, mesh, attach=attach, model=dict(TUBE_MODEL))
+            if tube.volume_error > LEAST_MISSED:
+                scene.doubts.append(
+                    f"{muscle.title}: its tube misses the volume by {100 * tube.volume_error:.2g} %"
+                )
         except (SceneError, MeshError) as error:
             scene.doubts.append(f"{muscle.title} is not taken: {error}")
 

@@ -34,6 +34,7 @@ def test_straight_tube_is_closed_has_its_volume_and_is_held_at_its_ends():
     mesh = trimesh.Trimesh(tube.vertices, tube.faces, process=False)
     assert mesh.is_watertight and mesh.volume > 0
     assert mesh.volume == pytest.approx(1e-4, rel=1e-9)
+    assert tube.volume_error == pytest.approx(mesh.volume / 1e-4 - 1.0, abs=1e-12)
     assert (
         tube.vertices[tube.held["a"], 2].max() < 0.03
         and tube.vertices[tube.held["b"], 2].min() > 0.27
