@@ -3,10 +3,9 @@
     python docs/figures.py                   # write them anew into README.md and docs/*.md
     python docs/figures.py --measure [NAME]  # measure first: minutes to an hour, on a quiet machine
 
-In a page a table of figures stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``, a
-figure within a line between ``<!-- value: NAME.KEY -->`` and ``<!-- end -->``, a table of the
-library's own facts between ``<!-- table: NAME -->`` and ``<!-- end -->``. A test fails
-where a page says something else.
+In a page a table of figures stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``, one of
+the library's own facts between ``<!-- table: NAME -->`` and ``<!-- end -->``. A test fails where a
+page says something else.
 """
 
 import argparse
@@ -26,7 +25,6 @@ from rbfmuscle.metrics.summary import LIMITS, LOWER_BOUNDS  # noqa: E402
 EVIDENCE = ROOT / "docs" / "evidence"
 _TABLE = re.compile(r"<!-- evidence: ([\w]+) -->\n.*?<!-- end -->", re.S)
 _FACTS = re.compile(r"<!-- table: ([\w]+) -->\n.*?<!-- end -->", re.S)
-_VALUE = re.compile(r"<!-- value: ([\w]+)\.([\w]+) -->.*?<!-- end -->", re.S)
 
 # Name: what measures it, in minutes. DATA stands for the folder of the real hip and leg.
 _FLEXION = "DATA/hip/flexion.toml"
@@ -142,15 +140,6 @@ def quantities_table():
 
 FACTS = {"quantities": quantities_table}
 
-VALUES = {
-    ("headline", "steps_apart"): lambda facts: bound(facts["rows"]["rbf"]["steps_apart"], 2),
-    ("headline", "there_and_back"): lambda facts: bound(facts["rows"]["rbf"]["there_and_back"], 2),
-    ("headline", "solver_penetration"): lambda facts: bound(
-        facts["rows"]["rbf"]["solver_penetration_max"], 2
-    ),
-    ("headline", "rest_max"): lambda facts: f"{facts['rows']['rbf']['rest_error_max']:.1f}",
-}
-
 
 def facts_of(name):
     """What a file of evidence holds."""
@@ -165,7 +154,7 @@ def provenance(facts):
 
 
 def written(text):
-    """A page with its tables and figures as the files of evidence have them."""
+    """A page with its tables as the files of evidence and the library have them."""
 
     def table(match):
         facts = facts_of(match[1])
@@ -173,17 +162,11 @@ def written(text):
         body = "\n".join([*draw(facts), "", provenance(facts)])
         return f"<!-- evidence: {match[1]} -->\n{body}\n<!-- end -->"
 
-    def value(match):
-        return (
-            f"<!-- value: {match[1]}.{match[2]} "
-            f"-->{VALUES[match[1], match[2]](facts_of(match[1]))}<!-- end -->"
-        )
-
     def own(match):
         body = "\n".join(FACTS[match[1]]())
         return f"<!-- table: {match[1]} -->\n{body}\n<!-- end -->"
 
-    return _VALUE.sub(value, _FACTS.sub(own, _TABLE.sub(table, text)))
+    return _FACTS.sub(own, _TABLE.sub(table, text))
 
 
 def page_files():

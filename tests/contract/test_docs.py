@@ -134,6 +134,11 @@ def test_python_names_of_a_page_are_public(page):
     assert {name for name in re.findall(r"\brm\.(\w+)", text) if name not in rm.__all__} == set()
 
 
+def test_figures_stand_in_one_page_and_the_readme():
+    holding = {page.stem for page in PAGES if "<!-- evidence:" in page.read_text(encoding="utf-8")}
+    assert holding == {"README", "validation"}
+
+
 def test_every_page_is_in_the_index():
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     listed = {line for line in index.splitlines() if re.fullmatch(r"[\w/]+", line)} - GENERATED
