@@ -18,6 +18,7 @@ def check(
     sdf: Flag = False,
     plan: Flag = False,
     time: Flag = False,
+    upgrade: Flag = False,
     printing: Printing = USUAL,
 ) -> int:
     """Check a scene file and its meshes; nothing is solved.
@@ -33,10 +34,12 @@ def check(
     time
         With --plan: also build the muscles, solve two frames after the first, and extrapolate to
         the whole motion.
+    upgrade
+        First rewrite a scene file of format 1 in the form of today; comments stay.
     """
     if time and not plan:
         raise UsageError("--time measures what --plan lists; give check SCENE --plan --time")
-    facts: dict[str, Any] = {}
+    facts: dict[str, Any] = {"upgraded": _upgrade(scene)} if upgrade else {}
     with Progress(f"check {scene.name}"):
         if picture:
             from rbfmuscle.report.render import check_picture
@@ -57,6 +60,16 @@ def check(
         last = f"usable; next: rbfmuscle run {scene} -o results" if usable else "not usable"
         print(last, file=sys.stderr)
     return 0 if usable else SceneError.exit_code
+
+
+def _upgrade(path):
+    """Rewrite an old scene file; whether it was one."""
+    from rbfmuscle.scene.upgrade import upgrade_file
+
+    changed = upgrade_file(path)
+    said = "rewritten in the form of today" if changed else "is in the form of today already"
+    print(f"{path} {said}", file=sys.stderr)
+    return changed
 
 
 def _measure_fields(scene):

@@ -4,56 +4,23 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import BeforeValidator, ValidationInfo
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import Joint, bones_between
 from rbfmuscle.scene.meshes.repair import ReadMesh
+from rbfmuscle.scene.meshes.transform import MeshTransform
 from rbfmuscle.scene.objects import Attachment, LineTable, Muscle, ViaTable, find_named
-from rbfmuscle.scene.options import FileName, NotNegative, Positive, Table, Vector, in_folder
-from rbfmuscle.scene.picked import painted_vertices, picked_vertices, read_points
+from rbfmuscle.scene.patches import AttachTable, select_vertices
 from rbfmuscle.scene.tendons import BonePoint, TendonEnd
-from rbfmuscle.validation import SceneError, read_text, shown, shown_path
+from rbfmuscle.validation import SceneError
 
 THIN = 0.05  # section of a tendon as it is drawn, over the mean section of its muscle
-_WAYS = ("vertices", "near", "sphere", "points", "colour")  # to say what a bone holds
 PATCH = 16  # points of a belly's end that are kept out of bones, at most
-
-
-class SphereTable(Table):
-    """All vertices of the muscle within a ball."""
-
-    centre: Vector
-    radius: Positive
-
-
-def _check_vertices(value: object, info: ValidationInfo) -> object:
-    value = value.tolist() if isinstance(value, np.ndarray) else value
-    if isinstance(value, (list, tuple)) and all(type(number) is int for number in value):
-        return list(value)
-    if value is None or isinstance(value, (str, Path)):
-        return value if value is None else in_folder(value, info)
-    raise ValueError("must be a file or a list of vertex numbers")
-
-
-class AttachTable(Table):
-    """A bone, and one of: a file or list of vertex numbers, a distance to the bone, a ball, a file
-    of picked points, a painted colour; maybe a tendon.
-    """
-
-    bone: str
-    vertices: Annotated[Path | list[int] | None, BeforeValidator(_check_vertices)] = None
-    near: NotNegative | None = None
-    sphere: SphereTable | None = None
-    points: FileName | None = None
-    colour: str | None = None
-    tendon: LineTable | None = None
 
 
 def resolve_attachments(
@@ -62,8 +29,10 @@ def resolve_attachments(
     bones: list[Bone],
     *,
     muscle: str,
+    transform: MeshTransform,
 ) -> list[Attachment]:
-    """Return the attachments of the muscle of that name and mesh.
+    """Return the attachments of the muscle of that name and mesh, which lies in the scene by
+    ``transform``.
 
     SceneError on an unknown bone, an empty selection, an index out of range, or a vertex held by
     two bones.
@@ -82,7 +51,7 @@ def resolve_attachments(
         )
         held = Attachment(
             bone.name,
-            np.unique(_select(entry, read, bone, context)),
+            np.unique(select_vertices(entry, read, bone, transform, context=context)),
             entry.tendon,
             attachment_frame,
         )
@@ -150,59 +119,3 @@ def _patch(points: Floats, areas: Floats, towards: Floats) -> tuple[Floats, floa
     direction = (towards - middle) / max(float(np.linalg.norm(towards - middle)), 1e-300)
     away = np.linalg.norm(np.cross(points - middle, direction), axis=1)
     return middle, float(np.sqrt(2.0 * np.average(away**2, weights=areas)))
-
-
-def _select(table, read, bone, context):
-    given = [key for key in _WAYS if getattr(table, key) is not None]
-    if len(given) != 1:
-        raise SceneError(
-            f"{context}give one of {', '.join(_WAYS[:-1])} and {_WAYS[-1]}, got "
-            f"{' and '.join(given) or 'none'}"
-        )
-    if table.vertices is not None:
-        kept = read.vertex_map[_listed(table.vertices, len(read.vertex_map), context)]
-        if not (kept >= 0).any():
-            raise SceneError(f"{context}none of its vertices is part of the mended surface")
-        return kept[kept >= 0]
-    points = np.asarray(read.mesh.vertices)
-    if table.points is not None:
-        return picked_vertices(read_points(table.points, context=context), points, context=context)
-    if table.colour is not None:
-        return painted_vertices(table.colour, read, context=context)
-    if table.sphere is not None:
-        distance = np.linalg.norm(points - table.sphere.centre, axis=1)
-        limit, what = table.sphere.radius, "sphere.radius"
-    else:
-        distance = bone.distances(points)
-        limit, what = table.near, "near"
-    chosen = np.flatnonzero(distance <= limit)
-    if len(chosen) == 0:
-        raise SceneError(
-            f"{context}{what} = {limit:g} reaches no vertex of the muscle, "
-            f"the nearest is {distance.min():.4g} away; raise it"
-        )
-    return chosen
-
-
-def _listed(listed: Path | list[int], count: int, context: str) -> Integers:
-    """Vertex numbers of a list or of a text file, below ``count``; ``context`` begins each
-    message.
-    """
-    numbers = listed if isinstance(listed, list) else []
-    if isinstance(listed, Path):
-        words, context = (
-            read_text(listed, context=context).split(),
-            f"{context}{shown_path(listed)}: ",
-        )
-        for word in words:
-            try:
-                numbers.append(int(word))
-            except ValueError:
-                raise SceneError(f"{context}{shown(repr(word))} is not a vertex number") from None
-    if not numbers:
-        raise SceneError(f"{context}no vertex numbers")
-    for number in numbers:
-        if not 0 <= number < count:
-            words = f"out of range, the mesh has vertices 0 to {count - 1}"
-            raise SceneError(f"{context}vertex {shown(number)} is {words}")
-    return np.array(numbers, dtype=np.int64)

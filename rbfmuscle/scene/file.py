@@ -1,15 +1,13 @@
 """The scene file: its tables, and the scene that they describe."""
 
-import os
-import tomllib
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from rbfmuscle.scene.activation.keys import ContractionTable
-from rbfmuscle.scene.attachments import AttachTable
+from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.scene.joints.tables import CouplingTable, JointTable
 from rbfmuscle.scene.meshes.transform import MeshTransform
 from rbfmuscle.scene.options import (
@@ -21,18 +19,23 @@ from rbfmuscle.scene.options import (
     OutputOptions,
     SlidingOptions,
     Table,
-    check_plain,
 )
-from rbfmuscle.validation import SceneError, shown, shown_path
+from rbfmuscle.scene.patches import AttachTable
+from rbfmuscle.scene.toml_file import read_tables
+from rbfmuscle.scene.upgrade import FORMAT, MAIN
+from rbfmuscle.validation import SceneError, did_you_mean
 
-# A scene file is a page or two; long lists of vertices belong into files of their own.
-LARGEST_FILE = 4_000_000
+
+def _check_format(number):
+    if number != FORMAT:
+        raise ValueError(f"must be {FORMAT}; update the library for files of a later form")
+    return number
 
 
 class SceneTable(Table):
     """``[scene]``."""
 
-    format: Literal[1]
+    format: Annotated[int, AfterValidator(_check_format)]
     name: str | None = None
     units: Literal["m", "cm", "mm"]
     missing_bones: list[str] = Field(default=[])
@@ -58,26 +61,29 @@ class BoneTable(MeshTransform):
     mesh: FileName | None = None
 
 
-class DefaultsTable(ContractionTable, MeshTransform):
-    """``[defaults]``: any key of a muscle, for all that do not give it themselves."""
+class ClassTable(ContractionTable, MeshTransform):
+    """``[classes.NAME]``: keys of a muscle, for those of the class that do not give them
+    themselves.
+    """
 
     model: Any = "rbf"
     attach: list[AttachTable] = Field(default_factory=list)
     fibres: FileName | None = None
 
 
-class MuscleTable(DefaultsTable):
+class MuscleTable(ClassTable):
     """``[[muscle]]``."""
 
     name: str
     mesh: FileName
+    class_: str = Field(alias="class", default=MAIN)
 
 
 class SceneFile(Table):
     """A whole scene file."""
 
     scene: SceneTable
-    defaults: DefaultsTable = DefaultsTable()
+    classes: dict[str, ClassTable] = Field(default_factory=dict)
     bone: list[BoneTable] = Field(default_factory=list)
     joint: list[JointTable] = Field(default_factory=list)
     coupling: list[CouplingTable] = Field(default_factory=list)
@@ -89,55 +95,38 @@ class SceneFile(Table):
     output: OutputOptions = OutputOptions()
 
 
-def read_scene_file(path: Path) -> SceneFile:
-    """Return the checked SceneFile of a TOML file; relative names of files become relative to its
-    folder.
+def read_scene_file(path: Path) -> tuple[SceneFile, list[Guess]]:
+    """Return the checked SceneFile of a TOML file, and its guesses; relative names of files become
+    relative to its folder.
 
     SceneError names the file, the table, the key, the value and what is right.
     """
-    data = _read_toml(path)
-    check_plain(data, context=f"{path}: ")
+    data, guesses = read_tables(path)
     context, folder = f"{path}: ", path.parent
-    return SceneFile.build(
+    tables = SceneFile.build(
         data, context=context, folder=folder, name_row=lambda at: _place(at, data)
     )
+    return tables, guesses
 
 
-def _read_toml(path):
-    if path.is_dir():
-        raise SceneError(f"{path}: is a folder, give a scene file (.toml)")
-    if not os.path.isfile(path):
-        raise SceneError(f"{shown_path(path)}: no such scene file")
-    size = os.path.getsize(path)
-    if size > LARGEST_FILE:
-        raise SceneError(
-            f"{path}: has {size} bytes, a scene file at most {LARGEST_FILE}; put long lists of "
-            "vertices into "
-            "files of their own"
-        )
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise SceneError(f"{path}: not a text file in UTF-8, give a scene file (.toml)") from None
-    except RecursionError:
-        raise SceneError(f"{path}: not valid TOML: tables or lists are nested too deep") from None
-    except ValueError as error:  # TOML, and integers of thousands of digits
-        quotes = "; text stands in quotes" if str(error).startswith("Invalid value") else ""
-        raise SceneError(f"{path}: not valid TOML: {shown(str(error))}{quotes}") from None
-
-
-def given_muscle(muscle: MuscleTable, defaults: DefaultsTable) -> dict[str, Any]:
-    """What the file gives of a muscle, by key, with the defaults that it does not give itself."""
-    given = {
-        key: getattr(table, key) for table in (defaults, muscle) for key in table.model_fields_set
-    }
-    model = given.get("model", "rbf")
-    if isinstance(model, dict) and "name" not in model:  # some options of the default's change
-        default = defaults.model
-        model = {**(default if isinstance(default, dict) else {"name": default}), **model}
-    return given | {"model": model}
+def given_muscle(muscle: MuscleTable, classes: dict[str, ClassTable]) -> dict[str, Any]:
+    """What the file gives of a muscle, by key: its own, then that of its class, then that of the
+    class ``main``, which all muscles belong to.
+    """
+    name = muscle.class_
+    if name != MAIN and name not in classes:
+        hint = did_you_mean(name, classes)
+        raise SceneError(f"muscle {muscle.name!r}: unknown class {name!r}, {hint}")
+    named = [classes[key] for key in dict.fromkeys((MAIN, name)) if key in classes]
+    given: dict[str, Any] = {"model": "rbf"}
+    for table in (*named, muscle):
+        found = {key: getattr(table, key) for key in table.model_fields_set if key != "class_"}
+        model = found.get("model")
+        if isinstance(model, dict) and "name" not in model:  # some settings of the model change
+            before = given["model"]
+            found["model"] = {**(before if isinstance(before, dict) else {"name": before}), **model}
+        given |= found
+    return given
 
 
 def _place(location, data):
@@ -161,6 +150,8 @@ def _place(location, data):
             words.append(repr(name) if name else str(part + 1))
         elif depth == 0:
             words.append(f"[[{part}]]" if isinstance(here, list) else f"[{part}]")
+        elif depth == 1 and location[0] == "classes":
+            words = [f"[classes.{part}]"]
         else:
             words.append(part)
     return " ".join(words)

@@ -1,14 +1,24 @@
-"""Patches that were picked or painted in another program: points in a text file, vertex colours."""
+"""Patches that were picked or painted in another program: points in a text file, vertex colours,
+regions of another mesh.
+"""
+
+from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.scene.meshes.formats import read_part
 from rbfmuscle.scene.meshes.repair import ReadMesh
-from rbfmuscle.validation import SceneError, read_text, shown, shown_path
+from rbfmuscle.scene.meshes.transform import MeshTransform
+from rbfmuscle.validation import MeshError, SceneError, read_text, shown, shown_path
+
+if TYPE_CHECKING:
+    import trimesh
 
 FEWEST = 3  # picked points of a patch
 # A patch reaches so many times the greatest distance of a picked point from its nearest neighbour;
@@ -46,9 +56,16 @@ def read_points(path: Path, *, context: str) -> Floats:
         points = np.array([[float(row[k]) for k in columns] for row in rows])
     except (ValueError, IndexError):
         raise SceneError(f"{context}every line must hold three coordinates") from None
-    if len(points) < FEWEST or not np.isfinite(points).all():
+    if not len(points) or not np.isfinite(points).all():
+        raise SceneError(f"{context}{len(points)} points, all must be finite")
+    return points
+
+
+def check_patch(points: Floats, *, context: str) -> Floats:
+    """Points that make a patch without a radius; SceneError where they are too few."""
+    if len(points) < FEWEST:
         raise SceneError(
-            f"{context}{len(points)} points, at least {FEWEST} finite ones make a patch"
+            f"{context}{len(points)} points, at least {FEWEST} make a patch; give a radius"
         )
     return points
 
@@ -78,23 +95,64 @@ def picked_vertices(points: Floats, vertices: Floats, *, context: str) -> Intege
 
 def painted_vertices(colour: str, read: ReadMesh, *, context: str) -> Integers:
     """The vertices that have a colour (``"#rrggbb"``) in the muscle's file."""
+    if not read.source:
+        raise SceneError(f"{context}a colour needs a mesh that was read from a file")
+    painted = _painted(colour, Path(read.source), len(read.vertex_map), context)
+    kept = read.vertex_map[painted]
+    if not (kept >= 0).any():
+        raise SceneError(f"{context}no vertex has the colour {colour}, or one near to it")
+    return np.unique(kept[kept >= 0])
+
+
+def _painted(colour: str, path: Path, count: int, context: str) -> Booleans:
+    """Whether each of the ``count`` vertices of a file has a colour."""
     import trimesh
 
     if re.fullmatch(r"#[0-9a-fA-F]{6}", colour) is None:
         raise SceneError(f"{context}colour must be like '#ff0000', got {shown(repr(colour))}")
-    if not read.source:
-        raise SceneError(f"{context}a colour needs a mesh that was read from a file")
-    visual = trimesh.load(read.source, process=False).visual
-    if getattr(visual, "kind", None) != "vertex" or len(visual.vertex_colors) != len(
-        read.vertex_map
-    ):
+    visual = trimesh.load(path, process=False).visual
+    if getattr(visual, "kind", None) != "vertex" or len(visual.vertex_colors) != count:
         raise SceneError(
-            f"{context}{shown_path(Path(read.source))} holds no vertex colours; save the mesh as "
-            "PLY with them"
+            f"{context}{shown_path(path)} holds no vertex colours; save the mesh as PLY with them"
         )
     wanted = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], dtype=float)
     away = np.abs(np.asarray(visual.vertex_colors, dtype=float)[:, :3] - wanted).max(axis=1)
-    kept = read.vertex_map[away <= SHADE]
-    if not (kept >= 0).any():
-        raise SceneError(f"{context}no vertex has the colour {colour}, or one near to it")
-    return np.unique(kept[kept >= 0])
+    return away <= SHADE
+
+
+def region_vertices(
+    path: Path, transform: MeshTransform, colour: str | None, mesh: trimesh.Trimesh, *, context: str
+) -> Integers:
+    """The vertices of a muscle's mesh on another mesh, or on what is painted there.
+
+    Nearer to it than half an edge, of the mesh whose edges are longer; ``transform`` takes the
+    other mesh to the scene.
+    """
+    import igl
+    from trimesh.triangles import points_to_barycentric
+
+    try:
+        part = read_part(path)
+    except MeshError as error:
+        raise SceneError(f"{context}{error}") from None
+    painted = np.ones(len(part.vertices), dtype=bool)
+    if colour is not None:
+        painted = _painted(colour, path, len(part.vertices), context)
+    other = transform.points(part.vertices)
+    square, faces, places = igl.point_mesh_squared_distance(
+        np.asarray(mesh.vertices), other, np.ascontiguousarray(part.faces)
+    )[:3]
+    corners = part.faces[faces]
+    share = (points_to_barycentric(other[corners], places) * painted[corners]).sum(axis=1)
+    edge = max(_edge(np.asarray(mesh.vertices), np.asarray(mesh.faces)), _edge(other, part.faces))
+    away = np.sqrt(square)
+    chosen = np.flatnonzero((share >= 0.5) & (away <= 0.5 * edge))
+    if not len(chosen):
+        words = f"the nearest is {away.min():.4g} away" if painted.any() else "nothing is painted"
+        raise SceneError(f"{context}no vertex of the muscle lies on {shown_path(path)}, {words}")
+    return chosen
+
+
+def _edge(vertices: Floats, faces: Integers) -> float:
+    """Median length of the edges."""
+    return float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))

@@ -17,12 +17,12 @@ from rbfmuscle.geometry.arrays import Floats, MeshLike
 from rbfmuscle.scene import settings as changes
 from rbfmuscle.scene.activation.contraction import resolve_contraction
 from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
-from rbfmuscle.scene.attachments import AttachTable, resolve_attachments, tendon_ends
+from rbfmuscle.scene.attachments import resolve_attachments, tendon_ends
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.extents import check_centre, check_place, check_size
 from rbfmuscle.scene.file import SceneFile, given_muscle, read_scene_file
 from rbfmuscle.scene.frames import make_motion, slice_motion
-from rbfmuscle.scene.guesses import Guess, find_guesses
+from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.scene.joints.joint import Coupling, Joint, all_coordinates, check_tree, ordered
 from rbfmuscle.scene.joints.tables import (
     CouplingTable,
@@ -52,8 +52,10 @@ from rbfmuscle.scene.options import (
     OutputOptions,
     SlidingOptions,
 )
+from rbfmuscle.scene.patches import AttachTable
 from rbfmuscle.scene.record import record_mesh, record_muscle
 from rbfmuscle.scene.save import SceneFiles
+from rbfmuscle.scene.upgrade import FORMAT
 from rbfmuscle.validation import MeshError, SceneError, UsageError, did_you_mean
 
 MeshInput: TypeAlias = str | Path | ReadMesh | MeshLike
@@ -139,10 +141,10 @@ class Scene:
             If a mesh cannot be used.
         """
         path = Path(path)
-        tables = read_scene_file(path)
+        tables, guesses = read_scene_file(path)
         scene = cls(tables.scene.name or path.stem, units=tables.scene.units, path=path)
         try:
-            scene.guesses = find_guesses(path.read_text(encoding="utf-8"))
+            scene.guesses = guesses
             scene._fill(tables)
             return scene if skeleton and not scene.muscles else scene.validate()
         except (SceneError, MeshError) as error:
@@ -165,7 +167,7 @@ class Scene:
         for coupling in tables.coupling:
             self.add_coupling(make_coupling(coupling, self.joints))
         for muscle in tables.muscle:
-            given = given_muscle(muscle, tables.defaults)
+            given = given_muscle(muscle, tables.classes)
             lies = MeshTransform(**{k: given[k] for k in MeshTransform.model_fields if k in given})
             read = read_mesh(muscle.mesh, name=muscle.name, transform=lies)
             check_size("muscle", muscle.name, read, self.units)
@@ -197,7 +199,7 @@ class Scene:
                 "set_motion before the scene is saved"
             )
         files = SceneFiles(Path(path))
-        about: dict[str, Any] = {"format": 1, "name": self.name, "units": self.units}
+        about: dict[str, Any] = {"format": FORMAT, "name": self.name, "units": self.units}
         for key in ("missing_bones", "doubts", "notes", "superior", "anterior"):
             about |= {key: getattr(self, key)} if getattr(self, key) else {}
         tables = [("[scene]", about)]
@@ -329,7 +331,7 @@ class Scene:
             Closed; mended where that is safe.
         attach : list of Attachment or dict
             A dict holds ``bone`` and one of ``vertices`` (indices or a file), ``near`` (distance)
-            and ``sphere`` (``centre``, ``radius``); a ``tendon`` (``to``, ``via``) where the mesh
+            and the other keys of the scene file; a ``tendon`` (``to``, ``via``) where the mesh
             ends short of the bone.
         model : str or dict
             A model's name, or a table with ``name`` and the model's own options.
@@ -343,7 +345,7 @@ class Scene:
         lies = mesh_transform(scale, mirror, transform, context=f"muscle {name!r}: ")
         read = as_mesh(mesh, name, lies, may_be_open=False)
         model_name, options = split_model(model, context=f"muscle {name!r}")
-        attachments = resolve_attachments(attach, read, self.bones, muscle=name)
+        attachments = resolve_attachments(attach, read, self.bones, muscle=name, transform=lies)
         lines = None if fibres is None else read_fibres(fibres, transform=lies, muscle=name)
         keys = contraction_keys(contraction, muscle=name)
         muscle = Muscle(

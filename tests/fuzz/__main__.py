@@ -53,7 +53,7 @@ class Cases:
             muscle = scene["muscle"][0]
             muscle["mesh"] = str(mesh.relative_to(self.folder))
             muscle["attach"] = [
-                {"bone": bone, "sphere": {"centre": [34.0, 0.0, z], "radius": 22.0}}
+                {"bone": bone, "points": [[34.0, 0.0, z]], "radius": 22.0}
                 for bone, z in (("upper", 45.0), ("lower", -65.0))
             ]
             text = to_toml(scene)

@@ -126,8 +126,8 @@ def base_scene() -> dict:
     attach = [{"bone": bone, "vertices": f"{bone}.txt"} for bone in ("upper", "lower")]
     bones = (("upper", {}), ("lower", {"scale": 1.0}))
     return {
-        "scene": {"format": 1, "name": "small", "units": "mm"},
-        "defaults": {"model": "rbf"},
+        "scene": {"format": 2, "name": "small", "units": "mm"},
+        "classes": {"main": {"model": "rbf"}},
         "bone": [{"name": name, "mesh": f"{name}.ply"} | scale for name, scale in bones],
         "joint": [
             {"name": "hip", "parent": "upper", "child": "lower", "centre": [0.0] * 3, "axes": axes}

@@ -196,7 +196,7 @@ def _attach(scene, rng):
             )
         },
         {"near": _number(rng)},
-        {"sphere": {"centre": [34.0, 0.0, _number(rng)], "radius": abs(_number(rng))}},
+        {"points": [[34.0, 0.0, _number(rng)]], "radius": abs(_number(rng))},
         {"vertices": []},
         {},
     )

@@ -62,8 +62,8 @@ class TestNumbers:
             (put("muscle", 0, "attach", 0, "vertices", [2**52]), "out of range"),
             (put("joint", 0, "centre", nested(1000)), "nested"),
             (
-                put("defaults", "model", float("inf")),
-                "defaults.model: must be a finite number, got inf",
+                put("classes", "main", "model", float("inf")),
+                "classes.main.model: must be a finite number, got inf",
             ),
             (put("contact", "substep_angle", float("nan")), "finite"),
             (put("muscle", 0, "mesh", "/dev/zero"), "not a mesh|no such"),

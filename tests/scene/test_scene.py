@@ -70,7 +70,7 @@ class TestLoading:
         assert np.array_equal(*held)
 
 
-BALL = "sphere = { centre = [0, 0, 0], radius = 3 }"
+BALL = "points = [[0, 0, 0]], radius = 3"
 
 
 class TestMistakes:
@@ -86,7 +86,7 @@ class TestMistakes:
             ('{ bone = "upper"', '{ bone = "uper"', r"attach 1: .*'uper', did you mean 'upper'"),
             ("elbow.flexion", "elbo.flexion", r"'elbo.flexion', did you mean 'elbow"),
             ("[0, -2, 0]", "[0, 0, 0]", r"'elbow' axes flexion: must not be the zero vector"),
-            ("near = 4", f"near = 4, {BALL}", r"one of vertices, near, .*, got near and"),
+            ("near = 4", f"near = 4, {BALL}", r"one of vertices, array, near, .*, got near and"),
             ("near = 4", "near = 0.001", r"reaches no vertex .*, the nearest is .* away"),
             ('"lower.txt"', '"nowhere.txt"', r"nowhere.txt: cannot read it"),
             (
@@ -99,15 +99,11 @@ class TestMistakes:
             ("[scene]", "[scene", r"not valid TOML.*line 1"),
             ('"report"', '"reprot"', r"\[detect\] tunnelling action: .*'reprot'"),
             (
-                "[defaults]",
-                '[defaults]\nattach = [ { bone = "arm", x = 1 } ]',
-                r"\[defaults\] attach 1: unknown",
+                "[classes.main]",
+                '[classes.main]\nattach = [ { bone = "arm", x = 1 } ]',
+                r"\[classes.main\] attach 1: unknown",
             ),
-            (
-                "near = 4",
-                BALL.replace(" }", ", x = 1 }"),
-                r"\[\[muscle\]\] 'biceps' attach 1 sphere: unknown",
-            ),
+            ("near = 4", "near = 4, radius = 3", r"'biceps' attach 1: radius belongs to points"),
         ],
     )
     def test_one_line_names_file_place_and_remedy(self, folder, old, new, message):

@@ -23,6 +23,7 @@ from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.guesses import DOUBTFUL
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.toml_text import attachment_file, table_text
+from rbfmuscle.scene.upgrade import FORMAT, MAIN
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
 _TAIL = """[contact]
@@ -247,7 +248,7 @@ def _head(guess):
         *(f"# NOT USED: {file}: {reason}" for file, reason in parts.unusable.items()),
     ]
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
-    row = {"format": 1, "name": name, "units": parts.units}
+    row = {"format": FORMAT, "name": name, "units": parts.units}
     comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
     if parts.missing_bones:
         row["missing_bones"] = parts.missing_bones
@@ -262,7 +263,7 @@ def _head(guess):
         comments[word] = f"by {guess.orientation.source}"
     scene = table_text("[scene]", row, comments)
     models = {"model": 'or a table: { name = "rbf", centres = 300 }'}
-    return "\n".join([*lines, scene, table_text("[defaults]", {"model": "rbf"}, models)])
+    return "\n".join([*lines, scene, table_text(f"[classes.{MAIN}]", {"model": "rbf"}, models)])
 
 
 def _joint(joint: JointGuess) -> str:

@@ -20,6 +20,7 @@ from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.toml_text import attachment_file, table_text
+from rbfmuscle.scene.upgrade import FORMAT
 from rbfmuscle.validation import MeshError, SceneError, check_mesh
 
 WIDEST = 3.0  # a mesh wider than this [m] is a floor or a wall, not a bone
@@ -205,7 +206,7 @@ def write_scene(found: Imported, directory: Path, *, force: bool = False) -> Pat
     The folder is that of `scene_folder`; files take their places when all are written.
     """
     directory, scene = Path(directory), found.scene
-    facts = {"format": 1, "name": scene.name, "units": scene.units}
+    facts = {"format": FORMAT, "name": scene.name, "units": scene.units}
     facts |= {"missing_bones": scene.missing_bones} if scene.missing_bones else {}
     facts |= {"doubts": scene.doubts} if scene.doubts else {}
     facts |= {"superior": scene.superior, "anterior": scene.anterior}

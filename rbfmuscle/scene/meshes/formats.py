@@ -236,6 +236,24 @@ def _read_ply(path, content):
 def _read_polydata(path):
     found = read_polydata(path)
     faces, notes = cut_polygons(found.points, found.ends, found.numbers)
-    if found.other:
-        notes.append(f"{found.other} lines and points left out")
+    other = max(len(found.line_ends) - 1, 0) + found.single
+    if other:
+        notes.append(f"{other} lines and points left out")
     return FilePart("", found.points, faces, notes)
+
+
+def read_vertex_array(path: Path, name: str) -> Floats:
+    """The array (n,) of that name at the vertices of a PLY, VTK or VTP file, or MeshError."""
+    suffix = path.suffix.lower()
+    if suffix in (".vtk", ".vtp"):
+        return read_polydata(path, array=name).values
+    if suffix != ".ply":
+        raise MeshError(f"{path}: has no vertex arrays; save the mesh as PLY or VTP with them")
+    import trimesh
+
+    raw = trimesh.load(path, process=False, force="mesh").metadata.get("_ply_raw", {})
+    data = raw.get("vertex", {}).get("data")
+    names = list(data.dtype.names if isinstance(data, np.ndarray) else data or ())
+    if name not in names:
+        raise MeshError(f"{path}: no vertex array {name!r}, {did_you_mean(name, names)}")
+    return np.asarray(data[name], dtype=np.float64).ravel()

@@ -27,17 +27,24 @@ _SIZE = 8  # bytes of the size that stands before an answer
 class PolyData(NamedTuple):
     """Points (n, 3), and polygons: of polygon k the points ``numbers[ends[k] : ends[k + 1]]``.
 
-    ``other`` is the number of lines and single points in the file.
+    Lines stand in the same way; ``single`` is the number of single points in the file, ``values``
+    (n,) are of the vertex array that was asked for, (0,) where none was.
     """
 
     points: Floats
     ends: Integers
     numbers: Integers
-    other: int
+    line_ends: Integers
+    line_numbers: Integers
+    single: int
+    values: Floats
 
 
-def read_polydata(path: str | Path) -> PolyData:
-    """Return what a ``.vtk``, ``.vtp`` or ``.ply`` file holds; strips are split into triangles."""
+def read_polydata(path: str | Path, *, array: str = "") -> PolyData:
+    """Return what a ``.vtk``, ``.vtp`` or ``.ply`` file holds; strips are split into triangles.
+
+    ``array`` is the name of an array of one number at each point.
+    """
     with _LOCK:
         child = _child(os.getpid())
         assert child.stdin is not None  # start_child asks for pipes
@@ -46,7 +53,7 @@ def read_polydata(path: str | Path) -> PolyData:
         late.daemon = True
         late.start()
         try:
-            send(child.stdin, str(Path(path).absolute()))
+            send(child.stdin, (str(Path(path).absolute()), array))
             found = _receive(child.stdout)
         except (OSError, EOFError, ValueError, MemoryError):
             _end(child)
@@ -80,17 +87,19 @@ def _receive(pipe: IO[bytes]) -> PolyData | str:
     points = np.load(content, allow_pickle=False)
     if points.dtype.kind == "U":
         return str(points)
-    ends, numbers, other = (np.load(content, allow_pickle=False) for _ in range(3))
+    *cells, single, values = (np.load(content, allow_pickle=False) for _ in range(6))
     for array, kind, shape in (
         (points, "f8", (*points.shape[:1], 3)),
-        (ends, "i8", (ends.size,)),
-        (numbers, "i8", (numbers.size,)),
-        (other, "i8", (1,)),
+        *((array, "i8", (array.size,)) for array in cells),
+        (single, "i8", (1,)),
+        (values, "f8", (len(points) if values.size else 0,)),
     ):
         if array.dtype != kind or array.shape != shape:
             raise ValueError("the answer is no mesh")
-    _check_cells(ends, numbers, len(points))
-    return PolyData(points, ends, numbers, int(other[0]))
+    for ends, numbers in (cells[:2], cells[2:]):
+        _check_cells(ends, numbers, len(points))
+    ends, numbers, line_ends, line_numbers = cells
+    return PolyData(points, ends, numbers, line_ends, line_numbers, int(single[0]), values)
 
 
 def _read_whole(pipe: IO[bytes], size: int) -> bytes:
@@ -130,16 +139,16 @@ def _answer() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     outbox, asked = Outbox(), listen()
     while True:
-        path = asked.get()
+        path, array = asked.get()
         try:
-            arrays = _read(str(path))
+            arrays = _read(str(path), str(array))
         except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
             text = " ".join(str(error).split())[:200] or type(error).__name__
             arrays = (np.array(text),)
         _reply(outbox.file, *arrays)
 
 
-def _read(path: str) -> tuple[Array, ...]:
+def _read(path: str, array: str) -> tuple[Array, ...]:
     import pyvista
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
@@ -160,8 +169,24 @@ def _read(path: str) -> tuple[Array, ...]:
             split = _cells(strips.triangulate().GetPolys(), data.n_points)
             ends = np.concatenate([ends, split[0][1:] + len(numbers)])
             numbers = np.concatenate([numbers, split[1]])
-        other = data.n_lines + (data.n_verts if len(numbers) else 0)
-    return np.array(data.points, dtype=np.float64), ends, numbers, np.array([other])
+        lines = _cells(data.GetLines(), data.n_points)
+        single = np.array([data.n_verts if len(numbers) else 0])
+        values = _values(data, array)
+    return np.array(data.points, dtype=np.float64), ends, numbers, *lines, single, values
+
+
+def _values(data, array):
+    """The array (n,) of that name at the points; (0,) for no name."""
+    if not array:
+        return np.empty(0)
+    if array not in data.point_data:
+        raise ValueError(
+            f"no vertex array {array!r}, it has {', '.join(data.point_data) or 'none'}"
+        )
+    values = np.array(data.point_data[array], dtype=np.float64)
+    if values.ndim != 1:
+        raise ValueError(f"the vertex array {array!r} has {values.shape[1]} numbers at a vertex")
+    return values
 
 
 def _cells(cells, points):

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.scene.meshes.formats import read_part
+from rbfmuscle.scene.meshes.polydata import read_polydata
 from rbfmuscle.scene.meshes.repair import ReadMesh, repair
 from rbfmuscle.scene.meshes.transform import MeshTransform
 from rbfmuscle.validation import (
@@ -122,7 +123,8 @@ def read_fibres(
     """Return fibres as a list of (k, 3) arrays in the scene, ``transform`` saying where those of
     a file, or given arrays, lie.
 
-    A JSON file holds ``{"polylines": [[[x, y, z], ...], ...]}`` or that list alone.
+    A JSON file holds ``{"polylines": [[[x, y, z], ...], ...]}`` or that list alone, a VTK or VTP
+    file polylines.
     """
     context = f"muscle {muscle!r} fibres"
     if isinstance(fibres, (str, Path)):
@@ -145,6 +147,8 @@ def read_fibres(
 
 
 def _read_lines(path, context):
+    if path.suffix.lower() in (".vtk", ".vtp"):
+        return _read_polylines(path, context)
     text = read_text(path, context=context)
     try:
         found = json.loads(text)
@@ -154,3 +158,15 @@ def _read_lines(path, context):
     if not isinstance(lines, list):
         raise SceneError(f"{context}{path}: needs a list 'polylines'")
     return lines
+
+
+def _read_polylines(path, context):
+    """The lines of a VTK or VTP file."""
+    if not path.is_file():
+        raise SceneError(f"{context}{path}: cannot read it: no such file")
+    try:
+        found = read_polydata(path)
+    except MeshError as error:
+        raise SceneError(f"{context}{error}") from None
+    pieces = np.split(found.line_numbers, found.line_ends[1:-1]) if len(found.line_ends) else []
+    return [found.points[piece] for piece in pieces if len(piece)]

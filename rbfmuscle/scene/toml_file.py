@@ -1,0 +1,118 @@
+"""The tables of a scene file as they stand, with those of the files that it includes."""
+
+import logging
+import os
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from rbfmuscle.scene.guesses import Guess, find_guesses
+from rbfmuscle.scene.options import check_plain
+from rbfmuscle.scene.upgrade import FORMAT, is_old, upgraded
+from rbfmuscle.validation import SceneError, shown, shown_path
+
+log = logging.getLogger(__name__)
+
+# A scene file is a page or two; long lists of vertices belong into files of their own.
+LARGEST_FILE = 4_000_000
+DEEPEST_INCLUDE = 8
+LISTS = ("bone", "joint", "coupling", "muscle")
+# Keys that name files, wherever they stand.
+FILES = ("mesh", "fibres", "vertices", "points", "region", "file")
+
+Tables = dict[str, Any]
+
+
+def read_tables(path: Path) -> tuple[Tables, list[Guess]]:
+    """The tables of a scene file in the form of today, and its guesses; names of files are relative
+    to its folder.
+
+    A file of format 1 is taken as one of today, with a line in the log.
+    """
+    return _read(path, (path,))
+
+
+def _read(path: Path, chain: tuple[Path, ...]) -> tuple[Tables, list[Guess]]:
+    text = _read_text(path)
+    data = _parse(path, text)
+    check_plain(data, context=f"{path}: ")
+    if is_old(data):
+        log.warning(
+            "%s is in format 1; rbfmuscle check %s --upgrade writes it in format %d",
+            path,
+            path,
+            FORMAT,
+        )
+        data = upgraded(data)
+    guesses = find_guesses(text)
+    names = data.pop("include", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise SceneError(f"{path}: include must be a list of names of files")
+    for name in reversed(names):
+        file = path.parent / name
+        if file.resolve() in [one.resolve() for one in chain] or len(chain) > DEEPEST_INCLUDE:
+            raise SceneError(f"{path}: include {name!r}: a file would include itself")
+        inner, more = _read(file, (*chain, file))
+        data = _merged(_moved(inner, Path(name).parent), data, f"{path}: include {name!r}: ")
+        guesses = more + guesses
+    return data, guesses
+
+
+def _merged(inner: Tables, own: Tables, context: str) -> Tables:
+    """Tables of an included file, then those of the file itself: lists follow each other, other
+    tables take the place of included ones; classes do so one by one, and ``[scene]`` by keys.
+    """
+    found = inner | own
+    for key in LISTS:
+        rows = [data[key] for data in (inner, own) if key in data]
+        if rows and all(isinstance(part, list) for part in rows):
+            found[key] = [row for part in rows for row in part]
+    for key in ("scene", "classes"):
+        tables = [data[key] for data in (inner, own) if isinstance(data.get(key), dict)]
+        if len(tables) == 2:
+            found[key] = tables[0] | tables[1]
+    first, second = (
+        data["scene"].get("units") if isinstance(data.get("scene"), dict) else None
+        for data in (inner, own)
+    )
+    if None not in (first, second) and first != second:
+        raise SceneError(f"{context}its lengths are in {shown(first)}, not in {shown(second)}")
+    return found
+
+
+def _moved(value: Any, folder: Path, key: str = "") -> Any:
+    """Tables whose names of files are relative to the folder of the file that includes them."""
+    if isinstance(value, dict):
+        return {name: _moved(inner, folder, name) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_moved(inner, folder) for inner in value]
+    return (folder / value).as_posix() if isinstance(value, str) and key in FILES else value
+
+
+def _read_text(path: Path) -> str:
+    if path.is_dir():
+        raise SceneError(f"{path}: is a folder, give a scene file (.toml)")
+    if not os.path.isfile(path):
+        raise SceneError(f"{shown_path(path)}: no such scene file")
+    size = os.path.getsize(path)
+    if size > LARGEST_FILE:
+        raise SceneError(
+            f"{path}: has {size} bytes, a scene file at most {LARGEST_FILE}; put long lists of "
+            "vertices into files of their own"
+        )
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SceneError(f"{path}: not a text file in UTF-8, give a scene file (.toml)") from None
+
+
+def _parse(path: Path, text: str) -> Tables:
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise SceneError(f"{path}: not valid TOML: tables or lists are nested too deep") from None
+    except ValueError as error:  # TOML, and integers of thousands of digits
+        quotes = "; text stands in quotes" if str(error).startswith("Invalid value") else ""
+        raise SceneError(f"{path}: not valid TOML: {shown(str(error))}{quotes}") from None
