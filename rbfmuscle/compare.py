@@ -14,7 +14,7 @@ from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import run_folder
 from rbfmuscle.progress import stage
 from rbfmuscle.run import stream_run
-from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.frames import pick_frames
 from rbfmuscle.scene.options import OutputOptions
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.settings import chooses_model
@@ -154,8 +154,8 @@ def _surfaces(scene, chosen):
     """Time to build the models, and the surfaces of all muscles in frames of these numbers, in this
     order.
     """
-    changed, motion = scene.copy(), scene.motion
-    changed.motion = Motion([motion.frames[k] for k in chosen], progress=motion.progress[chosen])
+    changed = scene.copy()
+    changed.motion = pick_frames(scene.motion, chosen)
     start = time.perf_counter()
     models = build_models(changed)
     build = time.perf_counter() - start

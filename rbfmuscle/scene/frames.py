@@ -2,6 +2,8 @@
 
 import itertools
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -43,15 +45,18 @@ def make_motion(
 
 def slice_motion(motion: Motion, frames: slice) -> Motion:
     """Return the motion of the frames in a slice, as ``frames[A:B:S]`` does."""
-    chosen = motion.frames[frames]
+    chosen = range(len(motion))[frames]
     if not chosen:
         text = f"{frames.start}:{frames.stop}:{frames.step}".replace("None", "")
         raise SceneError(f"frames {text} selects none of the {len(motion)} frames of the motion")
-    times = None if motion.times is None else motion.times[frames]
-    progress = motion.progress[frames]
-    return Motion(
-        chosen, options=motion.options, times=times, progress=progress, notes=motion.notes
-    )
+    return pick_frames(motion, chosen)
+
+
+def pick_frames(motion: Motion, chosen: Sequence[int]) -> Motion:
+    """Return the motion of some frames, in the order in which their places are given."""
+    times = None if motion.times is None else [motion.times[k] for k in chosen]
+    frames = [motion.frames[k] for k in chosen]
+    return replace(motion, frames=frames, times=times, numbers=motion.numbers[list(chosen)])
 
 
 def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> dict[str, float]:

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.names import plain_name
 from rbfmuscle.scene.options import MAX_FRAMES
-from rbfmuscle.validation import SceneError, read_text, shown
+from rbfmuscle.scene.storage import read_storage
+from rbfmuscle.validation import SceneError, shown
 
 TURN = 2.0 * math.pi
 MOST_LISTED = 8  # columns that a note lists
@@ -29,7 +29,7 @@ def read_motion_file(
     are the scene's coordinates by full name; columns of ``followers``, which follow others, are not
     used.
     """
-    header, labels, values = _read_storage(path)
+    header, labels, values = read_storage(path)
     if len(values) > MAX_FRAMES:
         raise SceneError(f"[motion]: {path} has {len(values)} rows, more than {MAX_FRAMES}")
     columns, unknown = _match_columns(path, labels, list(known))
@@ -113,35 +113,6 @@ def _match_columns(path, labels, known):
         if name is not None:
             columns[name] = column
     return columns, unknown
-
-
-def _read_storage(path: Path) -> tuple[dict[str, str], list[str], Floats]:
-    """Header (lower case), labels of the columns, and values (rows, columns) of an OpenSim storage
-    file.
-    """
-    lines = read_text(path, context="[motion]: ").splitlines()
-    end = next(
-        (row for row, line in enumerate(lines) if line.strip().lower() == "endheader"), len(lines)
-    )
-    if len(lines) < end + 3:
-        words = "no 'endheader' line with columns and rows after it"
-        raise SceneError(f"[motion]: {path} is no OpenSim motion: {words}")
-    pairs = [line.lower().split("=", 1) for line in lines[:end] if "=" in line]
-    labels, rows = (
-        lines[end + 1].split(),
-        [line.split() for line in lines[end + 2 :] if line.strip()],
-    )
-    for number, row in enumerate(rows, 1):
-        if len(row) != len(labels):
-            words = f"row {number} has {len(row)} values, the header names {len(labels)}"
-            raise SceneError(f"[motion]: {path} {words}")
-    if not rows:
-        raise SceneError(f"[motion]: {path} has no rows under its labels")
-    try:
-        values = np.array(rows, dtype=float)
-    except ValueError as error:
-        raise SceneError(f"[motion]: {path}: {error}") from None
-    return {key.strip(): value.strip() for key, value in pairs}, labels, values
 
 
 def match_label(label: str, known: list[str]) -> str | None:

@@ -93,15 +93,22 @@ class Motion:
     _: KW_ONLY
     options: MotionOptions = field(default_factory=MotionOptions)  # what the frames were made from
     times: Sequence[float] | None = None  # of each frame [s], where a motion file gives it
-    # Where each frame lies in the whole motion (n,), 0 to 1; even where not given.
-    progress: Floats = field(default_factory=lambda: np.empty(0))
+    # Of each frame its number (n,) in the whole motion, and how many frames that has.
+    numbers: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    whole: int = 0
     notes: list[str] = field(
         default_factory=list
     )  # coordinates that leave their range, columns not used
 
     def __post_init__(self) -> None:
-        if not len(self.progress):
-            self.progress = np.linspace(0.0, 1.0, len(self.frames))
+        if not len(self.numbers):
+            self.numbers = np.arange(len(self.frames))
+            self.whole = len(self.frames)
+
+    @property
+    def progress(self) -> Floats:
+        """Where each frame lies in the whole motion (n,), 0 to 1."""
+        return self.numbers / max(self.whole - 1, 1)
 
     @property
     def coordinates(self) -> list[str]:

@@ -141,7 +141,7 @@ def _describe_error(error, name_row):
     """The first problem of a pydantic error as "where: what, given value"."""
     first = error.errors(include_url=False)[0]
     # Of a value of several types, pydantic's place names the class that it tried.
-    parts = [str(part) for part in first["loc"] if not str(part).endswith("Options")]
+    parts = [str(part) for part in first["loc"] if not str(part).endswith(("Options", "]"))]
     where = name_row(first["loc"]) if name_row else ".".join(parts)
     message = first["msg"].removeprefix("Value error, ")
     message = re.sub(

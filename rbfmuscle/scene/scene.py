@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from rbfmuscle import showing
 from rbfmuscle.geometry.arrays import Floats, MeshLike
 from rbfmuscle.scene import settings as changes
-from rbfmuscle.scene.activation.contraction import resolve_contraction
+from rbfmuscle.scene.activation.contraction import check_activation, resolve_contraction
 from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
 from rbfmuscle.scene.attachments import resolve_attachments, tendon_ends
 from rbfmuscle.scene.bone import Bone
@@ -395,6 +395,7 @@ class Scene:
                 raise SceneError(f"{place} {words}")
             if muscle.contraction is not None:
                 resolve_contraction(muscle)
+                check_activation(muscle, self.motion)
         return self
 
     def with_options(

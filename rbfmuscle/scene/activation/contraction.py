@@ -13,6 +13,7 @@ from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.scene.activation.keys import (
     TENDON_STRAIN,
+    ActivationTable,
     Contraction,
     ContractionTable,
     TendonTable,
@@ -92,10 +93,28 @@ def _along_surface(mesh, start):
     return dijkstra(graph, directed=False, indices=start, min_only=True)
 
 
+def check_activation(muscle: Muscle, motion: Motion) -> None:
+    """Raise SceneError where an activation goes by time and the motion has no times."""
+    given = None if muscle.contraction is None else muscle.contraction.activation
+    if isinstance(given, ActivationTable) and given.times is not None and motion.times is None:
+        words = "goes by time, and the motion has none; give frames, or a motion file with time"
+        raise SceneError(f"muscle {muscle.name!r} activation: {words}")
+
+
 def activation_curve(muscle: Muscle, motion: Motion) -> Floats:
-    """Activation (n,) of one muscle in each frame, 0 to 1."""
-    values = np.atleast_1d(0.0 if muscle.contraction is None else muscle.contraction.activation)
-    return np.interp(motion.progress, np.linspace(0.0, 1.0, len(values)), values)
+    """Activation (n,) of one muscle in each frame, 0 to 1; of one that goes by time the first value
+    where the motion has no times, as that of a single pose.
+    """
+    given = 0.0 if muscle.contraction is None else muscle.contraction.activation
+    if not isinstance(given, ActivationTable):
+        values = np.atleast_1d(given)
+        return np.interp(motion.progress, np.linspace(0.0, 1.0, len(values)), values)
+    values = np.array(given.values)
+    if given.frames is not None:
+        return np.interp(motion.numbers, given.frames, values)
+    if motion.times is None or given.times is None:
+        return np.full(len(motion), values[0])
+    return np.interp(motion.times, given.times, values)
 
 
 class Activations:

@@ -139,9 +139,10 @@ def _answer() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     outbox, asked = Outbox(), listen()
     while True:
-        path, array = asked.get()
+        question = asked.get()
+        assert isinstance(question, tuple)  # a path and the name of an array
         try:
-            arrays = _read(str(path), str(array))
+            arrays = _read(*question)
         except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
             text = " ".join(str(error).split())[:200] or type(error).__name__
             arrays = (np.array(text),)
