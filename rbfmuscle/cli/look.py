@@ -231,13 +231,15 @@ def render(
 
 
 def report(
-    directory: Annotated[Path, Parameter(help="Folder of the run, or of a comparison.")],
+    directory: Annotated[
+        Path, Parameter(help="Folder of a run, a comparison, a study of kernels or a sweep.")
+    ],
     *,
     fail_on: FailOn = None,
     pictures: bool = True,
     printing: Printing = USUAL,
 ) -> int:
-    """Write the page of a run or a comparison again, for instance after a change of limits.
+    """Write the page of a run or a study again, for instance after a change of limits.
 
     Parameters
     ----------
@@ -245,25 +247,25 @@ def report(
         Draw pictures and the animation.
     """
     with Progress(f"report {directory}"), stage("drawing pictures" if pictures else "writing"):
-        from rbfmuscle.report.redraw import redraw_comparison, redraw_run
+        from rbfmuscle.report.redraw import redraw_run, redraw_study
 
-        failed = None
-        if (directory / "comparison.json").exists():
+        failed, page = None, directory / "report.html"
+        study = redraw_study(directory, pictures=pictures)
+        if study is not None:
             if fail_on is not None:
-                raise UsageError(
-                    "--fail-on is for a run; give the folder of a model of the comparison"
-                )
-            facts = redraw_comparison(directory, pictures=pictures)
+                raise UsageError(f"--fail-on is for the folder of a run, {directory} holds several")
+            page, facts = study
         else:
             try:
                 facts = redraw_run(directory, fail_on=fail_on, pictures=pictures).to_dict()
             except LimitExceededError as error:
                 facts, failed = error.info.to_dict(), error
-    return print_result(printing, facts, _report_lines(directory, facts), error=failed)
+    return print_result(printing, facts, _report_lines(directory, facts, page), error=failed)
 
 
-def _report_lines(directory, facts):
+def _report_lines(directory, facts, page):
     from rbfmuscle.cli.verdict import verdict_lines
 
-    yield from [facts["answer"]] if "answer" in facts else verdict_lines(directory)
-    yield f"open {directory / 'report.html'}"
+    if page.name == "report.html":
+        yield from [facts["answer"]] if "answer" in facts else verdict_lines(directory)
+    yield f"open {page}"

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from rbfmuscle.cli.options import Force, Output, OwnFolder
+from rbfmuscle.cli.printing import USUAL, Printing, print_result
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.validation import MeshError, UsageError
 
@@ -20,7 +21,8 @@ def new(
     labels: Path | None = None,
     output: OwnFolder = None,
     force: Force = False,
-) -> None:
+    printing: Printing = USUAL,
+) -> int:
     """Write a commented scene file for a folder of meshes or a volume of labels.
 
     Parameters
@@ -67,16 +69,23 @@ def new(
             guess = guess_scene(folder, "mm", base, header=header, capped=capped)
             guess.parts.notes[:0] = notes
         scene = write_scene(guess, output, stage)
-    print(f"{output} written; check the lines marked GUESS")
-    for doubt in guess.doubts():
-        print(f"doubtful: {doubt}")
-    for finding in check_scene(scene):
-        print(finding)
+    findings = check_scene(scene)
+    facts = {
+        "file": str(output),
+        "doubts": guess.doubts(),
+        "guesses": [one._asdict() for one in scene.guesses],
+        "findings": [vars(finding) for finding in findings],
+    }
+    return print_result(printing, facts, _new_lines(output, facts["doubts"], findings, scene))
+
+
+def _new_lines(output, doubts, findings, scene):
+    yield f"{output} written; check the lines marked GUESS"
+    yield from (f"doubtful: {doubt}" for doubt in doubts)
+    yield from map(str, findings)
     if scene.guesses:
-        print(
-            "how to correct guesses: docs/new.md; removing the word GUESS from a line confirms it"
-        )
-    print(f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out")
+        yield "how to correct guesses: docs/new.md; removing the word GUESS from a line confirms it"
+    yield f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out"
 
 
 def import_(
@@ -86,7 +95,8 @@ def import_(
     geometry: Annotated[list[Path] | None, Parameter(negative="")] = None,
     muscles: Annotated[bool, Parameter(negative="--no-muscles")] = True,
     force: Force = False,
-) -> None:
+    printing: Printing = USUAL,
+) -> int:
     """Write a scene file and its meshes from an OpenSim model (.osim), in metres.
 
     Parameters
@@ -106,20 +116,23 @@ def import_(
             raise UsageError(f"--geometry {folder}: no such folder")
     found = import_osim(model, geometry=geometry, muscles=muscles)
     written = write_scene(found, output, force=force)
-    for note in found.notes:
-        print(f"note: {note}")
     scene = found.scene
-    for doubt in scene.doubts:
-        print(f"doubtful: {doubt}")
+    facts = {"file": str(written), "notes": found.notes, "scene": scene.resolved()}
+    return print_result(printing, facts, _import_lines(written, found.notes, scene))
+
+
+def _import_lines(written, notes, scene):
+    yield from (f"note: {note}" for note in notes)
+    yield from (f"doubtful: {doubt}" for doubt in scene.doubts)
     counts = (
         f"{len(scene.bones)} bones, {len(scene.meshless_bones)} without a mesh, "
         f"{len(scene.joints)} joints"
     )
-    print(
+    yield (
         f"{written}: {counts}, {len(scene.couplings)} couplings, {len(scene.muscles)} muscles "
         "as tubes"
     )
-    print(f"next: rbfmuscle check {written}, then rbfmuscle run {written} -o out")
+    yield f"next: rbfmuscle check {written}, then rbfmuscle run {written} -o out"
 
 
 def _new_folder(file, force):

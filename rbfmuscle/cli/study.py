@@ -25,7 +25,7 @@ from rbfmuscle.cli.options import (
 )
 from rbfmuscle.cli.printing import USUAL, Printing, one_line, print_result
 from rbfmuscle.progress import Progress
-from rbfmuscle.validation import LimitExceededError, SolveError, UsageError
+from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError, UsageError
 
 
 def compare(
@@ -256,6 +256,7 @@ def sweep(
     jobs: int | None = None,
     cluster: str | None = None,
     error: str = "error_rms",
+    fail_on: FailOn = None,
     printing: Printing = USUAL,
 ) -> int:
     """Run scenes under a grid of settings: errors, time per frame, Pareto front.
@@ -295,6 +296,7 @@ def sweep(
         )
     opened = {name: open_scene(path) for name, path in _names(scenes).items()}
     loaded = {name: configure_scene(each, changes, model=model) for name, each in opened.items()}
+    limits = {name: _sweep_limits(fail_on, each) for name, each in loaded.items()}
     options: dict[str, Any] = {
         "frames": frames,
         "reference": parse_settings(reference),
@@ -305,7 +307,30 @@ def sweep(
     progress = Progress("sweep", what="point")
     with progress, interruption.keeping(lambda: f"finished points are kept in {output}"):
         table = run_scenes(loaded, axes, output, progress=progress, **options)
-    return _finish(table, output, printing)
+    return _finish(table, output, limits, printing)
+
+
+def _sweep_limits(fail_on, scene):
+    """Limits by quantity in the scene's unit, of what a sweep keeps of its points."""
+    from rbfmuscle.experiments.sweep_run import WORST
+    from rbfmuscle.metrics.summary import parse_limits
+
+    limits = parse_limits(fail_on, scene)
+    every = "all" in split_list(fail_on)
+    other = [name for name in limits.fail_on if name not in WORST]
+    if other and not every:
+        raise UsageError(f"--fail-on {other[0]}: a sweep keeps {', '.join(WORST)}")
+    return {name: limits.values[name] for name in limits.fail_on if name in WORST}
+
+
+def _beyond(rows, limits):
+    """What the points hold beyond the limits of their scenes, in words."""
+    from rbfmuscle.metrics.summary import meets_limit
+
+    for row in rows:
+        for name, limit in limits[row["scene"]].items():
+            if not meets_limit(name, row[name], limit):
+                yield f"{row['scene']} {row['label']}: {name} = {row[name]:.4g} > {limit:g}"
 
 
 def _names(scenes):
@@ -317,16 +342,20 @@ def _names(scenes):
     raise UsageError("scenes of a sweep need different names, or folders of different names")
 
 
-def _finish(table, output, printing):
+def _finish(table, output, limits, printing):
     bad = [row for row in table["rows"] if row["status"] != "done"]
     for row in bad[:5]:
         reason = one_line(row["error"] or row["status"])
         print(f"rbfmuscle: {row['scene']} {row['label']}: {reason}", file=sys.stderr)
     remedy = "the others are kept, the same command runs these again"
-    failed = SolveError(f"{len(bad)} of {len(table['rows'])} points failed; {remedy}")
+    failed: RBFMuscleError | None = None
+    if bad:
+        failed = SolveError(f"{len(bad)} of {len(table['rows'])} points failed; {remedy}")
+    elif beyond := list(_beyond(table["rows"], limits)):
+        failed = LimitExceededError("; ".join(beyond[:5]))
     lines = [
         *(verdict["text"] for verdict in table["verdicts"]),
         f"{table['done']} points done, {table['failed']} failed, in {output}, open "
         f"{output}/sweep.html",
     ]
-    return print_result(printing, table, lines, error=failed if bad else None)
+    return print_result(printing, table, lines, error=failed)

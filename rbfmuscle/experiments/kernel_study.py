@@ -16,7 +16,7 @@ import numpy as np
 from rbfmuscle.experiments.sweep_run import OnProgress, pareto_front, threads_limited
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import face_normals, mesh_volume, vertex_areas
+from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, vertex_areas
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
@@ -220,12 +220,14 @@ class KernelStudy:
     ones (``unfit`` says why) last. Lengths are in the mesh's unit, times in seconds of one thread.
     ``surfaces`` (vertices, faces) are those of the rows, None where there is none. ``recommended``
     is the quickest row that errs at most 5 % more than the best, None where every one is unfit.
+    ``sha256`` is that of the mesh.
     """
 
     rows: list[dict] = field(repr=False)
     surfaces: list[tuple[Floats, Integers] | None] = field(default_factory=list, repr=False)
     units: str = ""
     recommended: dict | None = None
+    sha256: str = ""
 
 
 def row_toml(row: dict) -> str:
@@ -336,7 +338,8 @@ def study_kernels(
     front = pareto_front([row["rms"] for row in good], [cost(row) for row in good])
     for row in rows:  # no other row beats those of the front both in error and in time
         row["front"] = any(row is good[index] for index in front)
-    return KernelStudy(rows, [one.surface for one in found], units, recommend(rows))
+    surfaces = [one.surface for one in found]
+    return KernelStudy(rows, surfaces, units, recommend(rows), mesh_hash(vertices, faces))
 
 
 def _measure_all(

@@ -1,5 +1,7 @@
 """Normals, edges and enclosed volumes of triangle meshes."""
 
+import hashlib
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -239,3 +241,10 @@ def touching_balls(points, normals, steps, nearest):
             if along != 0.0:
                 steps[side, i] = min(steps[side, i], square / (2 * abs(along)))
         nearest[i] = np.sqrt(least)
+
+
+def mesh_hash(vertices: Floats, faces: Integers) -> str:
+    """SHA-256 of vertices (n, 3) and triangles (m, 3)."""
+    points = np.ascontiguousarray(vertices, dtype=np.float64)
+    corners = np.ascontiguousarray(faces, dtype=np.int64)
+    return hashlib.sha256(points.tobytes() + corners.tobytes()).hexdigest()

@@ -1,21 +1,24 @@
 """The kernel study of one or several surfaces as files: tables and a page."""
 
 import csv
+import datetime
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from rbfmuscle.experiments.kernel_study import (
     ALIKE,
     KernelStudy,
     cost,
     describe,
+    recommend,
     row_name,
     row_toml,
 )
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import shown_number
-from rbfmuscle.output.writer import json_text
+from rbfmuscle.output.writer import json_text, versions
 from rbfmuscle.report.page import (
     BAD,
     GOOD,
@@ -63,15 +66,30 @@ def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> 
     surfaces.
     """
     rows = [{"surface": name, **row} for name, study in studies.items() for row in study.rows]
-    units = next(iter(studies.values())).units
+    facts = {
+        "units": next(iter(studies.values())).units,
+        "version": versions()["rbfmuscle"],
+        "date": datetime.date.today().isoformat(),
+        "meshes": {name: study.sha256 for name, study in studies.items()},
+        "rows": rows,
+    }
     with kernels_folder(directory).staged() as stage:
         with (stage / "kernels.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, fieldnames=list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)
-        text = json_text({"units": units, "rows": rows})
-        (stage / "kernels.json").write_text(text, encoding="utf-8")
-        _page(studies).write(stage / "kernels.html")
+        (stage / "kernels.json").write_text(json_text(facts), encoding="utf-8")
+        write_page(stage, facts)
+
+
+def write_page(directory: Path, facts: Mapping[str, Any]) -> None:
+    """Write ``kernels.html`` of what ``kernels.json`` holds."""
+    studies = {}
+    for name, digest in facts["meshes"].items():
+        rows = [row for row in facts["rows"] if row["surface"] == name]
+        studies[name] = KernelStudy(rows, [], facts["units"], recommend(rows), digest)
+    made = f"rbfmuscle {facts['version']}, {facts['date']}"
+    _page(studies, made).write(directory / "kernels.html")
 
 
 def answer(studies: Mapping[str, KernelStudy]) -> str:
@@ -94,7 +112,7 @@ def answer(studies: Mapping[str, KernelStudy]) -> str:
     )
 
 
-def _page(studies: Mapping[str, KernelStudy]) -> ReportPage:
+def _page(studies: Mapping[str, KernelStudy], made: str) -> ReportPage:
     several, rows = len(studies) > 1, [row for study in studies.values() for row in study.rows]
     units = next(iter(studies.values())).units
     surfaces = f"all {len(studies)} muscles" if several else next(iter(studies)).replace("_", " ")
@@ -109,6 +127,7 @@ def _page(studies: Mapping[str, KernelStudy]) -> ReportPage:
             f"{kernels} kernels",
             f"{counts} centres",
             *["every muscle; --muscles for some"][:several],
+            made,
         ],
         answer(studies),
         GOOD if found else BAD,
@@ -116,7 +135,10 @@ def _page(studies: Mapping[str, KernelStudy]) -> ReportPage:
         lights=_lights(studies, units),
         heads=["RMS error", "fit and 20,000 values"],
         sections=[
-            *(Section(f"Every row of {name}", hint, table=_rows(s)) for name, s in studies.items()),
+            *(
+                Section(f"Every row of {name}", f"{hint}; mesh {s.sha256[:12]}", table=_rows(s))
+                for name, s in studies.items()
+            ),
             Section("To paste at the end of a [[muscle]]", code=code),
             Section("How to read this", text=_READING),
         ],

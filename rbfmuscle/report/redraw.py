@@ -1,4 +1,4 @@
-"""Write the report of a saved run or comparison again, after a change of limits or texts."""
+"""Write the page of a saved run or study again, after a change of limits or texts."""
 
 import json
 from pathlib import Path
@@ -16,11 +16,17 @@ from rbfmuscle.metrics.summary import (
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import PAGES, run_folder, write_json
-from rbfmuscle.report.comparison_page import write_page
+from rbfmuscle.report import comparison_page, kernel_page, sweep_page
 from rbfmuscle.report.report import write_report
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import LimitExceededError, UsageError
 
+# What a study keeps, and its page.
+STUDIES = {
+    "comparison.json": "report.html",
+    "kernels.json": "kernels.html",
+    "sweep.json": "sweep.html",
+}
 DOUBTFUL = ". Doubtful: "  # what a verdict says after its limits
 
 
@@ -71,17 +77,30 @@ def redraw_run(
     return info
 
 
-def redraw_comparison(directory: Path, *, pictures: bool = True) -> dict[str, object]:
-    """Write the page of a comparison again; what ``comparison.json`` holds."""
-    OutputFolder(directory, "compare", ["report.html"])
-    path = directory / "comparison.json"
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        write_page(directory, found, pictures=pictures)
-    except (ValueError, KeyError, TypeError) as error:
-        message = f"{path} is not that of a comparison ({error!r}); compare the models again"
-        raise UsageError(message) from None
-    return found
+def redraw_study(
+    directory: Path, *, pictures: bool = True
+) -> tuple[Path, dict[str, object]] | None:
+    """Write the page of a comparison, a study of kernels or a sweep again; the page, and what the
+    JSON file beside it holds, or None where the folder holds none of these.
+    """
+    for file, page in STUDIES.items():
+        path = directory / file
+        if not path.exists():
+            continue
+        OutputFolder(directory, Path(file).stem.replace("comparison", "compare"), [page])
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            if file == "comparison.json":
+                comparison_page.write_page(directory, found, pictures=pictures)
+            elif file == "kernels.json":
+                kernel_page.write_page(directory, found)
+            else:
+                sweep_page.write_page(found, directory)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            message = f"{path} is not as it was written ({error!r}); run the command again"
+            raise UsageError(message) from None
+        return directory / page, found
+    return None
 
 
 def _limits(saved: RunData, fail_on: str | None) -> Limits:

@@ -1,9 +1,8 @@
 """What ``run.json`` says of the parts of a scene."""
 
-import hashlib
-
 import numpy as np
 
+from rbfmuscle.geometry.surfaces import mesh_hash
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.objects import Muscle
 
@@ -27,13 +26,13 @@ def record_muscle(muscle: Muscle) -> dict[str, object]:
 
 def record_mesh(item: Bone | Muscle) -> dict[str, object]:
     """Source, size and hash of a mesh."""
-    vertices = np.ascontiguousarray(item.mesh.vertices, dtype=np.float64)
-    faces = np.ascontiguousarray(item.mesh.faces, dtype=np.int64)
+    vertices = np.asarray(item.mesh.vertices)
+    faces = np.asarray(item.mesh.faces)
     return {
         "mesh": item.source,
         "vertices": len(vertices),
         "triangles": len(faces),
         "volume": float(item.mesh.volume),
-        "sha256": hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest(),
+        "sha256": mesh_hash(vertices, faces),
         "mended": list(item.notes),
     }

@@ -15,6 +15,7 @@ from rbfmuscle.experiments import kernel_study, wanted_error
 from rbfmuscle.experiments.kernel_study import ReferenceSurface, recommend, row_toml
 from rbfmuscle.experiments.wanted_error import STEP, reach_error
 from rbfmuscle.geometry.mesh_distance import MeshDistance
+from rbfmuscle.geometry.surfaces import mesh_hash
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.validation import MeshError, UsageError
@@ -153,7 +154,18 @@ def test_command_ranks_and_prints(tmp_path, capsys):
     assert code == 0 and "use " in out.lower() and "[muscle.model]" in out
     rows = json.loads((tmp_path / "new/k/kernels.json").read_text(encoding="utf-8"))["rows"]
     assert {row["kernel"] for row in rows} == {"cubic", "quintic"}
-    assert (tmp_path / "new/k/kernels.html").exists()
+    page = tmp_path / "new/k/kernels.html"
+    first = page.read_text(encoding="utf-8")
+    digest = mesh_hash(*_muscle("adductor_posterior"))
+    assert f"mesh {digest[:12]}" in first and f"rbfmuscle {rm.__version__}, 20" in first
+    page.unlink()
+    assert call(capsys, "report", page.parent)[0] == 0
+    assert page.read_text(encoding="utf-8") == first
+
+
+def _muscle(name):
+    mesh = rm.phantom_scene().muscle(name).mesh
+    return mesh.vertices, mesh.faces
 
 
 def test_rows_that_err_more_than_the_coarsest_kernel_are_unfit():

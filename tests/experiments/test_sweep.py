@@ -257,6 +257,15 @@ class TestCommand:
         table = json.loads((tmp_path / "out" / "sweep.json").read_text(encoding="utf-8"))
         assert {r["scene"] for r in table["rows"]} == {"arm", "other"}
         assert table["done"] == len(table["rows"])
+        page = tmp_path / "out" / "sweep.html"
+        first = page.read_bytes()
+        page.unlink()
+        assert command(["report", str(tmp_path / "out")]) == 0 and page.read_bytes() == first
+        capsys.readouterr()
+        assert command([*base, "--fail-on", "volume_error=1"]) == 0
+        assert command([*base, "--fail-on", "volume_error=0"]) == 6
+        assert "volume_error = " in capsys.readouterr().err
+        assert command([*base, "--fail-on", "length=1"]) == 2
 
     @pytest.mark.parametrize(
         "words", ["", "--error rms", "--jobs 0", "--grid contact.substep_angel=1,2", "--frames a:b"]

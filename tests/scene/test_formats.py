@@ -1,5 +1,6 @@
 """Mesh files as other programs write them, each against a second reader of the same file."""
 
+import json
 import struct
 
 import numpy as np
@@ -236,7 +237,10 @@ def test_new_takes_each_solid_of_a_file_and_writes_what_was_mended(tmp_path, cap
     )
     muscle = trimesh.creation.icosphere(3).apply_scale([15, 15, 60])
     muscle.apply_translation([26, 0, 190]).export(tmp_path / "gluteus_maximus.ply")
-    assert call(capsys, "new", tmp_path, "--units", "mm")[0] == 0
+    code, out, _ = call(capsys, "new", tmp_path, "--units", "mm", "--json", "--quiet")
+    found = json.loads(out)
+    assert code == 0 and found["file"] == str(tmp_path / "scene.toml")
+    assert {guess["table"] for guess in found["guesses"]} == {"joint", "muscle"}
     scene = (tmp_path / "scene.toml").read_text()
     assert 'mesh = "bones.stl#pelvis"' in scene and 'mesh = "bones.stl#femur"' in scene
     assert "bones.stl: 2 meshes in one file (pelvis, femur)" in scene
