@@ -93,7 +93,8 @@ def _show(shown: Scene, *, model: str | None = None) -> ViewerPage:
 
 def _picture(shown: Scene) -> str:
     from rbfmuscle.importers.guess.orientation import orient_scene
-    from rbfmuscle.report.render import draw_scene, figure_html
+    from rbfmuscle.report.render import figure_html
+    from rbfmuscle.report.scene_picture import draw_scene
 
     oriented = orient_scene(shown.copy())
     return figure_html(lambda file: draw_scene(oriented, file), repr(shown))

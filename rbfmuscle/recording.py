@@ -20,16 +20,15 @@ from rbfmuscle.metrics.summary import (
     Limits,
     Summary,
     Table,
-    describe_verdict,
     exceeded,
     parse_limits,
-    require_limits,
     unmeasured,
 )
 from rbfmuscle.models import build_models, configure_scene, kernel_names
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.writer import Neighbours, RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
+from rbfmuscle.report.verdict import describe_verdict, require_limits
 from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
 from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.scene import Scene

@@ -84,7 +84,7 @@ def _measure_fields(scene):
 
 
 def _draw(scene, path):
-    from rbfmuscle.report.render import draw_scene
+    from rbfmuscle.report.scene_picture import draw_scene
 
     with stage("drawing the picture"):
         draw_scene(scene, path)

@@ -92,8 +92,9 @@ def _failure(table, output):
 
 def _excess(table, output, limits):
     """The error that a run is beyond a limit of ``--fail-on``; None where none is."""
-    from rbfmuscle.metrics.summary import Summary, require_limits
+    from rbfmuscle.metrics.summary import Summary
     from rbfmuscle.output.run_data import RunData
+    from rbfmuscle.report.verdict import require_limits
 
     texts = []
     for name in table["models"] if limits.fail_on else ():
@@ -198,7 +199,7 @@ def _study(meshes, output, options, printing):
 
 
 def _study_lines(studies, output):
-    from rbfmuscle.experiments.kernel_study import describe, row_toml
+    from rbfmuscle.experiments.kernel_rows import describe, row_toml
     from rbfmuscle.report.kernel_page import answer
 
     for name, study in studies.items():
@@ -212,7 +213,7 @@ def _study_lines(studies, output):
 
 def _find_wanted(meshes, output, error, options, units, printing):
     """Find, print and write what reaches an error; where it is not reached, that is said."""
-    from rbfmuscle.experiments.kernel_study import row_toml
+    from rbfmuscle.experiments.kernel_rows import row_toml
     from rbfmuscle.experiments.wanted_error import reach_error
     from rbfmuscle.output.writer import json_text
     from rbfmuscle.report.kernel_page import kernels_folder
@@ -312,7 +313,7 @@ def sweep(
 
 def _sweep_limits(fail_on, scene):
     """Limits by quantity in the scene's unit, of what a sweep keeps of its points."""
-    from rbfmuscle.experiments.sweep_run import WORST
+    from rbfmuscle.experiments.front import WORST
     from rbfmuscle.metrics.summary import parse_limits
 
     limits = parse_limits(fail_on, scene)

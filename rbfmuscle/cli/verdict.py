@@ -4,14 +4,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from textwrap import fill, shorten
 
-from rbfmuscle.metrics.summary import (
-    LIMITS,
-    Summary,
-    describe_excess,
-    describe_unmeasured,
-    find_remedy,
-)
+from rbfmuscle.metrics.summary import LIMITS, Summary
 from rbfmuscle.output.run_data import RunData
+from rbfmuscle.report.verdict import describe_excess, describe_unmeasured, find_remedy
 from rbfmuscle.scene.phantom import PHANTOM
 
 MOST = 3  # values beyond limits, and remedies, that are named

@@ -13,7 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.experiments.sweep_run import OnProgress, pareto_front, threads_limited
+from rbfmuscle.experiments.front import pareto_front
+from rbfmuscle.experiments.kernel_rows import cost, recommend
+from rbfmuscle.experiments.sweep_run import OnProgress, threads_limited
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, vertex_areas
@@ -26,10 +28,6 @@ from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface,
 from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
 
-# Errors this much apart are alike: points of another seed move them as far.
-ALIKE = 1.05
-# Rows beyond this condition are taken only where none that is as accurate is below it.
-SOUND = 1e10
 # Points of the mesh at which errors are measured, and others that choose epsilon.
 JUDGES, HELD_OUT = 20_000, 2000
 # Cells along the longest side (so many a mean radius, between two bounds). With too few thin rims
@@ -230,52 +228,6 @@ class KernelStudy:
     sha256: str = ""
 
 
-def row_toml(row: dict) -> str:
-    """The lines of a scene file's model table that give a row of a study."""
-    lines = [
-        "[muscle.model]",
-        'name = "rbf"',
-        f'kernel = "{row["kernel"]}"',
-        f"centres = {row['centres']}",
-    ]
-    if row["epsilon"]:
-        lines.append(f"epsilon = {row['epsilon']:.6g}")
-    if row["bound"]:
-        lines.append(f"condition = {row['bound']:g}")
-    return "\n".join([*lines, f'placement = "{row["placement"]}"'])
-
-
-def describe(rows: list[dict]) -> str:
-    """What to use of the rows of a study, and why, in one sentence."""
-    best = recommend(rows)
-    if best is None:
-        return "Every field is unfit; take more centres."
-    good = [row for row in rows if not row["unfit"] and row["centres"] == best["centres"]]
-    least = min(row["rms"] for row in good)
-    tied = [row for row in good if row["rms"] <= ALIKE * least]
-    use = f"Use {best['kernel']} with {best['centres']} centres"
-    if len(tied) == 1:
-        less = 100 * (
-            1 - best["rms"] / min((row["rms"] for row in good if row is not best), default=np.inf)
-        )
-        behind = (
-            f": its error is {less:.0f} % less than that of the next kernel"
-            if len(good) > 1
-            else ""
-        )
-        return f"{use}{behind}."
-    near = (
-        f"the errors of {len(tied)} kernels are within {100 * (ALIKE - 1):.0f} % of the least one"
-    )
-    shape = "" if best["epsilon"] else " and needs no shape parameter"
-    return f"{use}: {near}, and of these {best['kernel']} is among the quickest{shape}."
-
-
-def row_name(row: dict) -> str:
-    """A row in words."""
-    return f"{row['kernel']}, {row['centres']} centres"
-
-
 def study_kernels(
     mesh: MeshLike,
     *,
@@ -377,28 +329,3 @@ def _refuse_coarse(rows: list[dict]) -> None:
         bound = bounds.get(row["centres"])
         if not row["unfit"] and bound is not None and row["rms"] > bound:
             row["unfit"] = f"an error of {row['rms']:.3g}, beyond that of linear, {bound:.3g}"
-
-
-def cost(row: dict) -> float:
-    """What a frame pays for a row's field: a fit and the values at 20,000 points [s of processor
-    time].
-    """
-    return float(row["fit_time"] + row["evaluation_time"])
-
-
-def recommend(rows: list[dict]) -> dict | None:
-    """The quickest of the rows that err at most 5 % more than the best, None where every one is
-    unfit.
-
-    Sound conditions come first; of rows alike in time, within 15 %, those without a parameter to
-    choose.
-    """
-    good = [row for row in rows if not row["unfit"]]
-    if not good:
-        return None
-    least = min(row["rms"] for row in good)
-    alike = [row for row in good if row["rms"] <= ALIKE * least]
-    sound = [row for row in alike if row["condition"] <= SOUND] or alike
-    quick = min(cost(row) for row in sound)
-    alike = [row for row in sound if cost(row) <= 1.15 * quick]
-    return min(alike, key=lambda row: (bool(row["epsilon"]), row["condition"]))

@@ -13,6 +13,7 @@ from functools import cache, partial
 import numpy as np
 
 from rbfmuscle.experiments import kernel_study
+from rbfmuscle.experiments.kernel_rows import row_name
 from rbfmuscle.experiments.sweep_run import OnProgress
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.implicit.kernels.table import Kernel
@@ -46,7 +47,7 @@ class CentreSearchResult:
         """One line on the surface of this name: what reaches the wanted error, or what the best
         reached.
         """
-        unit, said = f" {units}" if units else "", kernel_study.row_name(self.row)
+        unit, said = f" {units}" if units else "", row_name(self.row)
         if self.row["unfit"]:
             return f"{name}: no field is fit; take more centres or another kernel"
         if self.reached:

@@ -7,15 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rbfmuscle.experiments.kernel_study import (
-    ALIKE,
-    KernelStudy,
-    cost,
-    describe,
-    recommend,
-    row_name,
-    row_toml,
-)
+from rbfmuscle.experiments.kernel_rows import ALIKE, cost, describe, recommend, row_name, row_toml
+from rbfmuscle.experiments.kernel_study import KernelStudy
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.writer import json_text, versions

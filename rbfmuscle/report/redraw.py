@@ -4,20 +4,13 @@ import json
 from pathlib import Path
 
 from rbfmuscle.folders import OutputFolder
-from rbfmuscle.metrics.summary import (
-    Limits,
-    Summary,
-    describe_verdict,
-    exceeded,
-    parse_limits,
-    require_limits,
-    unmeasured,
-)
+from rbfmuscle.metrics.summary import Limits, Summary, exceeded, parse_limits, unmeasured
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import PAGES, run_folder, write_json
 from rbfmuscle.report import comparison_page, kernel_page, sweep_page
 from rbfmuscle.report.report import write_report
+from rbfmuscle.report.verdict import describe_verdict, require_limits
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import LimitExceededError, UsageError
 

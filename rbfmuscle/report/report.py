@@ -17,7 +17,6 @@ from rbfmuscle.metrics.summary import (
     LOWER_BOUNDS,
     Limits,
     QuantityFacts,
-    describe_unmeasured,
     exceeded,
     limit_ratio,
     meets_limit,
@@ -40,6 +39,7 @@ from rbfmuscle.report.page import (
 )
 from rbfmuscle.report.plots import Band, Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, render_run
+from rbfmuscle.report.verdict import describe_unmeasured
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.simulation.frame import Event
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rbfmuscle.experiments.sweep_run import LENGTHS
+from rbfmuscle.experiments.front import LENGTHS
 from rbfmuscle.report.page import (
     GOOD,
     NEAR,

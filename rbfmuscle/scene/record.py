@@ -1,10 +1,49 @@
-"""What ``run.json`` says of the parts of a scene."""
+"""What ``run.json`` says of a scene."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rbfmuscle.geometry.surfaces import mesh_hash
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.objects import Muscle
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.scene import Scene
+
+
+def record_scene(scene: Scene) -> dict[str, Any]:
+    """A scene as plain data: names, counts, options, sources and hashes."""
+    known = all_coordinates(scene.joints)
+    units = {name: coordinate.unit_sign(scene.units) for name, coordinate in known.items()}
+    motion = scene.motion.options.model_dump(mode="json", by_alias=True, exclude_none=True)
+    times = {} if scene.motion.times is None else {"times": scene.motion.times}
+    return {
+        "name": scene.name,
+        "units": scene.units,
+        "file": str(scene.path) if scene.path else None,
+        "superior": scene.superior,
+        "anterior": scene.anterior,
+        "bones": [{"name": bone.name, **record_mesh(bone)} for bone in scene.bones],
+        "meshless_bones": list(scene.meshless_bones),
+        "missing_bones": list(scene.missing_bones),
+        "doubts": list(scene.doubts),
+        "guesses": [guess._asdict() for guess in scene.guesses],
+        "notes": list(scene.notes),
+        "joints": [joint_row(joint) for joint in scene.joints],
+        "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
+        "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},
+        "motion": {**motion, "frames": len(scene.motion), **times},
+        "muscles": [record_muscle(muscle) for muscle in scene.muscles],
+        "contact": scene.contact.model_dump(),
+        "sliding": scene.sliding.model_dump() if scene.sliding else None,
+        "detect": scene.detect.model_dump() if scene.detect else None,
+        "output": scene.output.model_dump(),
+    }
 
 
 def record_muscle(muscle: Muscle) -> dict[str, object]:

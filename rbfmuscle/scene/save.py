@@ -1,5 +1,7 @@
 """A scene as a TOML file, its meshes, lists of vertices and fibres in a folder beside it."""
 
+from __future__ import annotations
+
 import json
 import shutil
 from collections.abc import Mapping, Sequence
@@ -9,14 +11,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.build import made_motion
 from rbfmuscle.scene.guesses import Guess
+from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.options import Table
+from rbfmuscle.scene.settings import TABLES
 from rbfmuscle.scene.toml_text import attachment_file, table_text
-from rbfmuscle.validation import UsageError
+from rbfmuscle.scene.upgrade import FORMAT
+from rbfmuscle.validation import SceneError, UsageError
 
 if TYPE_CHECKING:
     import trimesh
+
+    from rbfmuscle.scene.scene import Scene
 
 
 class SceneFiles:
@@ -92,7 +100,7 @@ class SceneFiles:
     def _relative(self, file: Path) -> str:
         return file.relative_to(self.path.parent).as_posix()
 
-    def _mesh(self, folder: str, name: str, mesh: "trimesh.Trimesh") -> str:
+    def _mesh(self, folder: str, name: str, mesh: trimesh.Trimesh) -> str:
         """Write a PLY file in double precision, which trimesh does not, and return its name."""
         file = self._new(f"{folder}/{name}.ply")
         faces = np.zeros(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
@@ -110,3 +118,27 @@ class SceneFiles:
         vertices = np.asarray(mesh.vertices, dtype="<f8")
         file.write_bytes("\n".join(head).encode() + vertices.tobytes() + faces.tobytes())
         return self._relative(file)
+
+
+def save_scene(scene: Scene, path: Path) -> Path:
+    """Write a scene and the files that it names; the path of its file."""
+    if list(made_motion(scene, scene.motion.options).frames) != list(scene.motion.frames):
+        raise SceneError(
+            "the frames of the motion are not those of its table [motion]; give it by "
+            "set_motion before the scene is saved"
+        )
+    files = SceneFiles(path)
+    about: dict[str, Any] = {"format": FORMAT, "name": scene.name, "units": scene.units}
+    for key in ("missing_bones", "doubts", "notes", "superior", "anterior"):
+        about |= {key: getattr(scene, key)} if getattr(scene, key) else {}
+    tables = [("[scene]", about)]
+    tables += [("[[bone]]", files.bone(bone)) for bone in scene.bones]
+    tables += [("[[bone]]", {"name": name}) for name in scene.meshless_bones]
+    tables += [("[[joint]]", joint_row(joint)) for joint in scene.joints]
+    tables += [("[[coupling]]", coupling_row(one, scene.joints)) for one in scene.couplings]
+    tables += [("[[muscle]]", files.muscle(muscle)) for muscle in scene.muscles]
+    for key in TABLES:
+        table = getattr(scene, key) if key != "motion" else scene.motion.options
+        tables += [] if table is None else [(f"[{key}]", files.table(table))]
+    files.write(tables, scene.guesses)
+    return files.path

@@ -9,38 +9,32 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle import showing
 from rbfmuscle.geometry.arrays import Floats, MeshLike
 from rbfmuscle.scene import settings as changes
-from rbfmuscle.scene.activation.contraction import check_activation, resolve_contraction
-from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
+from rbfmuscle.scene.activation.keys import contraction_keys
 from rbfmuscle.scene.attachments import resolve_attachments, tendon_ends
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.extents import check_centre, check_place, check_size
-from rbfmuscle.scene.file import SceneFile, given_muscle, read_scene_file
-from rbfmuscle.scene.frames import make_motion, slice_motion
+from rbfmuscle.scene.build import check_runnable, fill_scene, made_motion
+from rbfmuscle.scene.file import read_scene_file
 from rbfmuscle.scene.guesses import Guess
-from rbfmuscle.scene.joints.joint import Coupling, Joint, all_coordinates, check_tree, ordered
+from rbfmuscle.scene.joints.joint import Coupling, Joint, check_tree, ordered
 from rbfmuscle.scene.joints.tables import (
     CouplingTable,
     JointTable,
-    coupling_row,
-    joint_row,
     make_coupling,
 )
-from rbfmuscle.scene.meshes.read import as_mesh, read_fibres, read_mesh
+from rbfmuscle.scene.meshes.read import as_mesh, read_fibres
 from rbfmuscle.scene.meshes.repair import ReadMesh
-from rbfmuscle.scene.meshes.transform import MeshTransform, TransformInput, mesh_transform
+from rbfmuscle.scene.meshes.transform import TransformInput, mesh_transform
 from rbfmuscle.scene.objects import (
     MM_PER_UNIT,
     Attachment,
     Motion,
     Muscle,
     body_axes,
-    check_file_names,
     check_new_name,
     find_named,
     split_model,
@@ -53,10 +47,9 @@ from rbfmuscle.scene.options import (
     SlidingOptions,
 )
 from rbfmuscle.scene.patches import AttachTable
-from rbfmuscle.scene.record import record_mesh, record_muscle
-from rbfmuscle.scene.save import SceneFiles
-from rbfmuscle.scene.upgrade import FORMAT
-from rbfmuscle.validation import MeshError, SceneError, UsageError, did_you_mean
+from rbfmuscle.scene.record import record_scene
+from rbfmuscle.scene.save import save_scene
+from rbfmuscle.validation import MeshError, SceneError
 
 MeshInput: TypeAlias = str | Path | ReadMesh | MeshLike
 
@@ -145,39 +138,10 @@ class Scene:
         scene = cls(tables.scene.name or path.stem, units=tables.scene.units, path=path)
         try:
             scene.guesses = guesses
-            scene._fill(tables)
+            fill_scene(scene, tables)
             return scene if skeleton and not scene.muscles else scene.validate()
         except (SceneError, MeshError) as error:
             raise type(error)(f"{path}: {error}") from None
-
-    def _fill(self, tables: SceneFile) -> None:
-        about = tables.scene
-        self.missing_bones = about.missing_bones
-        self.doubts = about.doubts
-        self.notes = about.notes
-        self.superior = about.superior
-        self.anterior = about.anterior
-        for bone in tables.bone:
-            self.add_bone(**{key: getattr(bone, key) for key in bone.model_fields_set})
-            if bone.mesh is not None:
-                check_size("bone", bone.name, self.bones[-1], self.units)
-        for joint in tables.joint:
-            self.add_joint(joint.joint())
-            check_centre(joint.name, self.joints[-1].centre, self.bones, self.units)
-        for coupling in tables.coupling:
-            self.add_coupling(make_coupling(coupling, self.joints))
-        for muscle in tables.muscle:
-            given = given_muscle(muscle, tables.classes)
-            lies = MeshTransform(**{k: given[k] for k in MeshTransform.model_fields if k in given})
-            read = read_mesh(muscle.mesh, name=muscle.name, transform=lies)
-            check_size("muscle", muscle.name, read, self.units)
-            check_place(muscle.name, read, self.bones, self.units)
-            self.add_muscle(**given | {"mesh": read})
-        self._move(tables.motion)
-        self.contact = tables.contact
-        self.sliding = tables.sliding
-        self.detect = tables.detect
-        self.output = tables.output
 
     def save(self, path: str | Path) -> Path:
         """Write the scene as a TOML file that loads as the same scene, and return its path.
@@ -192,27 +156,7 @@ class Scene:
         SceneError
             If the frames of the motion were not made from the keys of ``[motion]``.
         """
-        motion = self.copy()._move(self.motion.options).motion
-        if list(motion.frames) != list(self.motion.frames):
-            raise SceneError(
-                "the frames of the motion are not those of its table [motion]; give it by "
-                "set_motion before the scene is saved"
-            )
-        files = SceneFiles(Path(path))
-        about: dict[str, Any] = {"format": FORMAT, "name": self.name, "units": self.units}
-        for key in ("missing_bones", "doubts", "notes", "superior", "anterior"):
-            about |= {key: getattr(self, key)} if getattr(self, key) else {}
-        tables = [("[scene]", about)]
-        tables += [("[[bone]]", files.bone(bone)) for bone in self.bones]
-        tables += [("[[bone]]", {"name": name}) for name in self.meshless_bones]
-        tables += [("[[joint]]", joint_row(joint)) for joint in self.joints]
-        tables += [("[[coupling]]", coupling_row(one, self.joints)) for one in self.couplings]
-        tables += [("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles]
-        for key in changes.TABLES:
-            table = getattr(self, key) if key != "motion" else self.motion.options
-            tables += [] if table is None else [(f"[{key}]", files.table(table))]
-        files.write(tables, self.guesses)
-        return files.path
+        return save_scene(self, Path(path))
 
     def add_bone(
         self,
@@ -365,37 +309,15 @@ class Scene:
         **options
             ``ramp``, ``waypoints`` with ``step``, or ``file``.
         """
-        return self._move(MotionOptions.build(options, context="[motion] ", folder=folder))
-
-    def _move(self, options: MotionOptions) -> Self:
-        metre = self.length(1000.0)
-        self.motion = make_motion(options, self.joints, self.couplings, metre=metre)
+        table = MotionOptions.build(options, context="[motion] ", folder=folder)
+        self.motion = made_motion(self, table)
         return self
 
     def validate(self) -> Self:
         """Return the scene, or raise SceneError if it cannot be simulated: no bones, no muscles,
         loose muscles.
         """
-        for what in ("bones", "muscles"):
-            if not getattr(self, what):
-                raise SceneError(f"scene {self.name!r} has no {what}, add a [[{what[:-1]}]]")
-        check_file_names(self.bones, self.muscles)
-        known = all_coordinates(self.joints)
-        for name in (name for frame in self.motion.frames for name in frame):
-            if name not in known:
-                hint = did_you_mean(name, sorted(known))
-                raise SceneError(f"[motion]: unknown coordinate {name!r}, {hint}")
-        for muscle in self.muscles:
-            place = f"muscle {muscle.name!r}"
-            bones = sorted({a.bone for a in muscle.attachments})
-            if not bones:
-                raise SceneError(f"{place} has no attachment, give attach a place on two bones")
-            if len(bones) == 1:
-                words = f"is attached to {bones[0]!r} only, give attach a second bone"
-                raise SceneError(f"{place} {words}")
-            if muscle.contraction is not None:
-                resolve_contraction(muscle)
-                check_activation(muscle, self.motion)
+        check_runnable(self)
         return self
 
     def with_options(
@@ -410,12 +332,9 @@ class Scene:
         Parameters
         ----------
         settings : mapping, optional
-            Dotted keys with their values: ``{"model.centres": 200, "contact.substep_angle": 1}``.
-            ``model`` and ``model.KEY`` change every muscle, ``muscle.NAME.model.KEY`` one; so do
-            the keys of contraction. ``contact.KEY``, ``sliding.KEY``, ``detect.KEY`` and
-            ``output.KEY`` change a table, one that the scene lacks is switched on. ``motion.step``
-            changes the step of every ramp, ``motion.ramp.NAME.COORDINATE.KEY`` one key of one.
-            Whole models come first, as another model drops the settings of the one before.
+            Dotted keys with their values: ``{"model.centres": 200, "contact.substep_angle": 1}``,
+            as in the page of the scene file. Whole models come first, as another model drops the
+            settings of the one before.
         model : str or dict, optional
             For every muscle. Options of another model are dropped.
         frames : slice or str, optional
@@ -427,70 +346,14 @@ class Scene:
             If a key is unknown, with the nearest right one, or a value is not allowed.
         """
         changed = self.copy()
-        settings = settings or {}
-        try:
-            if model is not None:
-                changes.set_models(changed.muscles, model)
-            for key in sorted(settings, key=lambda key: not changes.chooses_model(key)):
-                value = settings[key]
-                changed._set(key, value.item() if isinstance(value, np.generic) else value)
-            if frames is not None:
-                chosen = changes.parse_slice(frames) if isinstance(frames, str) else frames
-                changed.motion = slice_motion(changed.motion, chosen)
-        except SceneError as error:
-            raise UsageError(str(error)) from None
+        changes.change_scene(changed, settings or {}, model, frames)
         return changed
-
-    def _set(self, key: str, value: object) -> None:
-        """Set one dotted key, in place."""
-        head, _, rest = key.partition(".")
-        muscles = self.muscles
-        if head == "muscle":
-            name, head, rest = changes.split_muscle_key(key)
-            muscles = [self.muscle(name)]
-        if head == "model" or head in KEYS:
-            changes.set_on_muscles(muscles, head, rest, value, key)
-        elif head not in changes.TABLES:
-            raise SceneError(f"{key}: unknown setting, {did_you_mean(head, changes.HEADS)}")
-        elif not rest:
-            raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
-        elif head == "motion":
-            folder = self.path.parent if self.path else None
-            self._move(changes.changed_motion(self.motion.options, rest, value, key, folder))
-        else:
-            table = changes.changed_table(head, getattr(self, head), rest, value, key)
-            setattr(self, head, table)
 
     def resolved(self) -> dict[str, Any]:
         """Return the scene as plain data for ``run.json``: names, counts, options, sources and
         hashes.
         """
-        known = all_coordinates(self.joints)
-        units = {name: coordinate.unit_sign(self.units) for name, coordinate in known.items()}
-        motion = self.motion.options.model_dump(mode="json", by_alias=True, exclude_none=True)
-        times = {} if self.motion.times is None else {"times": self.motion.times}
-        return {
-            "name": self.name,
-            "units": self.units,
-            "file": str(self.path) if self.path else None,
-            "superior": self.superior,
-            "anterior": self.anterior,
-            "bones": [{"name": bone.name, **record_mesh(bone)} for bone in self.bones],
-            "meshless_bones": list(self.meshless_bones),
-            "missing_bones": list(self.missing_bones),
-            "doubts": list(self.doubts),
-            "guesses": [guess._asdict() for guess in self.guesses],
-            "notes": list(self.notes),
-            "joints": [joint_row(joint) for joint in self.joints],
-            "couplings": [coupling_row(coupling, self.joints) for coupling in self.couplings],
-            "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},
-            "motion": {**motion, "frames": len(self.motion), **times},
-            "muscles": [record_muscle(muscle) for muscle in self.muscles],
-            "contact": self.contact.model_dump(),
-            "sliding": self.sliding.model_dump() if self.sliding else None,
-            "detect": self.detect.model_dump() if self.detect else None,
-            "output": self.output.model_dump(),
-        }
+        return record_scene(self)
 
     def length(self, millimetres: float) -> float:
         """Return a length given in millimetres in the scene's unit."""

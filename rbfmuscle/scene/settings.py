@@ -2,12 +2,18 @@
 ``Scene.with_options``.
 """
 
+from __future__ import annotations
+
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
+from rbfmuscle.scene.build import made_motion
+from rbfmuscle.scene.frames import slice_motion
 from rbfmuscle.scene.objects import Muscle, split_model
 from rbfmuscle.scene.options import (
     DetectOptions,
@@ -19,6 +25,9 @@ from rbfmuscle.scene.options import (
 )
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
+if TYPE_CHECKING:
+    from rbfmuscle.scene.scene import Scene
+
 TABLES = ("contact", "sliding", "detect", "output", "motion")
 HEADS = ("model", "muscle", *KEYS, *TABLES)
 
@@ -26,6 +35,50 @@ HEADS = ("model", "muscle", *KEYS, *TABLES)
 def chooses_model(key: str) -> bool:
     """Whether a dotted key gives muscles another model as a whole."""
     return key == "model" or (key.startswith("muscle.") and key.endswith(".model"))
+
+
+def change_scene(
+    scene: Scene,
+    settings: Mapping[str, Any],
+    model: str | dict[str, Any] | None,
+    frames: slice | str | None,
+) -> None:
+    """Give a scene other settings, another model or other frames, in place; `Scene.with_options`
+    says what they are.
+    """
+    try:
+        if model is not None:
+            set_models(scene.muscles, model)
+        for key in sorted(settings, key=lambda key: not chooses_model(key)):
+            value = settings[key]
+            set_key(scene, key, value.item() if isinstance(value, np.generic) else value)
+        if frames is not None:
+            chosen = parse_slice(frames) if isinstance(frames, str) else frames
+            scene.motion = slice_motion(scene.motion, chosen)
+    except SceneError as error:
+        raise UsageError(str(error)) from None
+
+
+def set_key(scene: Scene, key: str, value: object) -> None:
+    """Set one dotted key of a scene, in place."""
+    head, _, rest = key.partition(".")
+    muscles = scene.muscles
+    if head == "muscle":
+        name, head, rest = split_muscle_key(key)
+        muscles = [scene.muscle(name)]
+    if head == "model" or head in KEYS:
+        set_on_muscles(muscles, head, rest, value, key)
+    elif head not in TABLES:
+        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, HEADS)}")
+    elif not rest:
+        raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
+    elif head == "motion":
+        folder = scene.path.parent if scene.path else None
+        options = changed_motion(scene.motion.options, rest, value, key, folder)
+        scene.motion = made_motion(scene, options)
+    else:
+        table = changed_table(head, getattr(scene, head), rest, value, key)
+        setattr(scene, head, table)
 
 
 def split_muscle_key(key: str) -> tuple[str, str, str]:

@@ -12,7 +12,8 @@ from command_line import call
 
 import rbfmuscle as rm
 from rbfmuscle.experiments import kernel_study, wanted_error
-from rbfmuscle.experiments.kernel_study import ReferenceSurface, recommend, row_toml
+from rbfmuscle.experiments.kernel_rows import recommend, row_toml
+from rbfmuscle.experiments.kernel_study import ReferenceSurface
 from rbfmuscle.experiments.wanted_error import STEP, reach_error
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import mesh_hash

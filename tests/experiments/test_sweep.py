@@ -17,15 +17,9 @@ from blend_model import arm_files, arm_scene, use_blend_model
 import rbfmuscle as rm
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.study import _names
+from rbfmuscle.experiments.front import mark_front, pareto_front
 from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep, scene_content
-from rbfmuscle.experiments.sweep_run import (
-    SweepFolder,
-    mark_front,
-    pareto_front,
-    run_sweep,
-    sweep_rows,
-    write_table,
-)
+from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep, sweep_rows, write_table
 from rbfmuscle.report.sweep_page import write_page
 from rbfmuscle.sweeping import run_point
 from rbfmuscle.validation import UsageError

@@ -15,11 +15,11 @@ from rbfmuscle.metrics.summary import (
     OF_SCENE,
     Limits,
     Summary,
-    describe_verdict,
     exceeded,
     parse_limits,
     unmeasured,
 )
+from rbfmuscle.report.verdict import describe_verdict
 from rbfmuscle.run import Run, simulate, stream_run
 from rbfmuscle.validation import LimitExceededError, UsageError
 

@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 
 from rbfmuscle.cli.paths import parse_ranges, parse_targets
-from rbfmuscle.paths import (
-    SHIFT,
-    FittedPath,
-    Samples,
-    exponents,
-    fit_path,
-    report_fits,
-    sample_muscles,
-    write_paths,
-)
+from rbfmuscle.output.path_files import FittedPath, fit_path, write_paths
+from rbfmuscle.paths import SHIFT, Samples, report_fits, sample_muscles
+from rbfmuscle.scene.joints.functions import exponents
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import SolveError, UsageError
 

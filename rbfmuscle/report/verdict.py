@@ -1,0 +1,112 @@
+"""The verdict of a run in sentences."""
+
+from collections.abc import Sequence
+
+from rbfmuscle.metrics.quantities import ALL
+from rbfmuscle.metrics.summary import (
+    LIMITS,
+    LOWER_BOUNDS,
+    Exceedance,
+    Limits,
+    Table,
+    exceeded,
+    shown_number,
+    unmeasured,
+)
+from rbfmuscle.validation import LimitExceededError
+
+MOST_NAMED = 6  # exceeded limits that a verdict names
+
+
+def describe_verdict(table: Table, limits: Limits, missing_bones: Sequence[str] = ()) -> str:
+    """Which muscles are within all limits, the worst of the others, what to do, and what was not
+    measured; bones ``missing_bones``.
+    """
+    muscles, found = [name for name in table if name != ALL], exceeded(table, limits)
+    missing = unmeasured(table, limits)
+    wrong = [name for name in dict.fromkeys(row[0] for row in found) if name != ALL]
+    unknown = [name for name in dict.fromkeys(row[0] for row in missing) if name != ALL]
+    if not muscles:
+        text = "nothing was measured"
+    elif not wrong:
+        held = "all limits that were measured" if missing else "all limits"
+        text = f"every muscle is within {held} in every frame"
+    elif len(muscles) == 1:
+        text = f"{muscles[0]} is not within all limits"
+    else:
+        right = len(set(muscles).difference(wrong, unknown))
+        count = (
+            f"{right} of {len(muscles)} muscles {'is' if right == 1 else 'are'} within all limits"
+        )
+        text = f"{count}; {_listed(wrong)} {'is' if len(wrong) == 1 else 'are'} not"
+    text += "; the bones are not" if any(row[0] == ALL for row in found) and not wrong else ""
+    if found:
+        text += _worst_and_remedies(found, table, missing_bones)
+    return f"{text}. Not measured: {describe_unmeasured(missing)}" if missing and muscles else text
+
+
+def describe_unmeasured(missing: Sequence[tuple[str, str]]) -> str:
+    """Each limit that was not measured, with the muscles of which it was not."""
+    by_quantity: dict[str, list[str]] = {}
+    for muscle, quantity in missing:
+        by_quantity.setdefault(quantity, []).extend([] if muscle == ALL else [muscle])
+    texts = [f"{q}{f' of {_listed(n)}' if n else ''}" for q, n in by_quantity.items()]
+    more = f" and {len(texts) - MOST_NAMED} more" if len(texts) > MOST_NAMED else ""
+    return "; ".join(texts[:MOST_NAMED]) + more
+
+
+def _worst_and_remedies(found, table, missing_bones):
+    # The worst of each muscle first, then whatever else is beyond a limit.
+    first = {row[0]: row for row in reversed(found)}.values()
+    named = sorted(found, key=lambda row: row not in first)[:MOST_NAMED]
+    remedies: dict[str, str] = {}
+    for row in named:
+        if row[1].partition(":")[0] in LIMITS:
+            remedy = find_remedy(row, table)
+            remedies.setdefault(remedy, remedy.replace("FRAME", str(row[4])))
+    values = "; ".join(describe_excess(row, table, missing_bones) for row in named)
+    more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
+    to_do = f". What to do: {'; '.join(remedies.values())}" if remedies else ""
+    return f". Worst: {values}{more}{to_do}"
+
+
+def find_remedy(row: Exceedance, table: Table) -> str:
+    """What to do about one excess; smaller steps do not mend an overlap of the meshes at rest."""
+    muscle, quantity, _, limit, _ = row
+    overlap = table[muscle].get("initial_overlap", {}).get("worst")
+    depth = quantity in ("penetration_max", "bone_penetration_max")
+    at_rest = depth and overlap is not None and overlap > limit
+    return LIMITS["initial_overlap" if at_rest else quantity.partition(":")[0]].remedy
+
+
+def _listed(names):
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return f"{', '.join(names[:MOST_NAMED])}{more}"
+
+
+def describe_excess(row: Exceedance, table: Table, missing_bones: Sequence[str] = ()) -> str:
+    """One value beyond its limit, in words; bones ``missing_bones``."""
+    muscle, quantity, worst, limit, frame = row
+    unit = table[muscle][quantity]["unit"]
+    value = shown_number(worst, unit)
+    place = "the bones" if muscle == ALL else muscle
+    quantity, _, coordinate = quantity.partition(":")
+    title = LIMITS[quantity].title if quantity in LIMITS else quantity
+    title += f" ({coordinate})" if coordinate else ""
+    title += f" ({_listed(missing_bones)})" if quantity == "missing_bones" else ""
+    return f"{place}, {title} {value} at frame {frame} (limit {limit:.3g})"
+
+
+def require_limits(table: Table, limits: Limits) -> None:
+    """Raise LimitExceededError naming everything beyond the limits of ``fail_on``, and those of
+    them that were not measured.
+    """
+    failing = limits.failing()
+    texts = [
+        f"{m}: {q} = {v:.4g} {'<' if q in LOWER_BOUNDS else '>'} {limit:g} at frame {f}"
+        for m, q, v, limit, f in exceeded(table, failing)
+    ]
+    missing = unmeasured(table, failing)
+    texts += [f"not measured: {describe_unmeasured(missing)}"] if missing else []
+    if texts:
+        raise LimitExceededError("; ".join(texts))
