@@ -12,6 +12,7 @@ import numpy as np
 
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.build import made_motion
+from rbfmuscle.scene.contents import SceneContents
 from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.objects import Muscle
@@ -23,8 +24,6 @@ from rbfmuscle.validation import SceneError, UsageError
 
 if TYPE_CHECKING:
     import trimesh
-
-    from rbfmuscle.scene.scene import Scene
 
 
 class SceneFiles:
@@ -120,7 +119,7 @@ class SceneFiles:
         return self._relative(file)
 
 
-def save_scene(scene: Scene, path: Path) -> Path:
+def save_scene(scene: SceneContents, path: Path) -> Path:
     """Write a scene and the files that it names; the path of its file."""
     if list(made_motion(scene, scene.motion.options).frames) != list(scene.motion.frames):
         raise SceneError(

@@ -2,49 +2,41 @@
 
 from __future__ import annotations
 
-import copy
 import html
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
 from numpy.typing import ArrayLike
 
 from rbfmuscle import showing
-from rbfmuscle.geometry.arrays import Floats, MeshLike
+from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.scene import settings as changes
 from rbfmuscle.scene.activation.keys import contraction_keys
 from rbfmuscle.scene.attachments import resolve_attachments, tendon_ends
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.build import check_runnable, fill_scene, made_motion
-from rbfmuscle.scene.file import read_scene_file
-from rbfmuscle.scene.guesses import Guess
+from rbfmuscle.scene.build import check_runnable, made_motion
+from rbfmuscle.scene.contents import SceneContents
+from rbfmuscle.scene.extents import check_centre, check_place, check_size
+from rbfmuscle.scene.file import SceneFile, given_muscle, read_scene_file
 from rbfmuscle.scene.joints.joint import Coupling, Joint, check_tree, ordered
 from rbfmuscle.scene.joints.tables import (
     CouplingTable,
     JointTable,
     make_coupling,
 )
-from rbfmuscle.scene.meshes.read import as_mesh, read_fibres
+from rbfmuscle.scene.meshes.read import as_mesh, read_fibres, read_mesh
 from rbfmuscle.scene.meshes.repair import ReadMesh
-from rbfmuscle.scene.meshes.transform import TransformInput, mesh_transform
+from rbfmuscle.scene.meshes.transform import MeshTransform, TransformInput, mesh_transform
 from rbfmuscle.scene.objects import (
-    MM_PER_UNIT,
     Attachment,
-    Motion,
     Muscle,
-    body_axes,
     check_new_name,
     find_named,
     split_model,
 )
 from rbfmuscle.scene.options import (
-    ContactOptions,
-    DetectOptions,
     MotionOptions,
-    OutputOptions,
-    SlidingOptions,
 )
 from rbfmuscle.scene.patches import AttachTable
 from rbfmuscle.scene.record import record_scene
@@ -54,33 +46,9 @@ from rbfmuscle.validation import MeshError, SceneError
 MeshInput: TypeAlias = str | Path | ReadMesh | MeshLike
 
 
-@dataclass(eq=False, repr=False)
-class Scene:
-    """Bones, joints, muscles, a motion and the settings of a simulation.
-
-    Attributes
-    ----------
-    name : str
-    units : {"mm", "cm", "m"}
-        Unit of every length in the scene.
-    couplings : list of Coupling
-        Coordinates that follow others.
-    meshless_bones : list of str
-        Bones without a mesh, which carry joints only.
-    path : pathlib.Path or None
-        The file it was loaded from.
-    missing_bones : list of str
-        Bones of which no mesh could be used; they count in the verdict of a run.
-    doubts : list of str
-        What makes the scene another one than its source, in sentences; warnings of a check, and in
-        the verdict of a run.
-    guesses : list of Guess
-        Lines of the file that are marked GUESS; the doubtful ones count in the verdict of a run.
-    notes : list of str
-        What was assumed about the data or left out, for a check to repeat.
-    superior, anterior : list of float or None
-        Anatomical directions (3,) at rest: those of the file, or found from the bones before a run
-        or a picture.
+class Scene(SceneContents):
+    """Bones, joints, muscles, a motion and the settings of a simulation; what it holds is that of
+    `SceneContents`.
 
     Examples
     --------
@@ -90,31 +58,6 @@ class Scene:
     >>> [bone.name for bone in scene.bones]
     ['upper']
     """
-
-    name: str = "scene"
-    _: KW_ONLY
-    units: str = "mm"
-    bones: list[Bone] = field(default_factory=list)
-    joints: list[Joint] = field(default_factory=list)
-    couplings: list[Coupling] = field(default_factory=list)
-    meshless_bones: list[str] = field(default_factory=list)
-    muscles: list[Muscle] = field(default_factory=list)
-    motion: Motion = field(default_factory=Motion)
-    contact: ContactOptions = field(default_factory=ContactOptions)
-    sliding: SlidingOptions | None = None
-    detect: DetectOptions | None = None
-    output: OutputOptions = field(default_factory=OutputOptions)
-    path: Path | None = None
-    missing_bones: list[str] = field(default_factory=list)
-    doubts: list[str] = field(default_factory=list)
-    guesses: list[Guess] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    superior: list[float] | None = None
-    anterior: list[float] | None = None
-
-    def __post_init__(self) -> None:
-        if self.units not in MM_PER_UNIT:
-            raise SceneError(f"units must be m, cm or mm, got {self.units!r}")
 
     @classmethod
     def load(cls, path: str | Path, *, skeleton: bool = False) -> Self:
@@ -138,10 +81,39 @@ class Scene:
         scene = cls(tables.scene.name or path.stem, units=tables.scene.units, path=path)
         try:
             scene.guesses = guesses
-            fill_scene(scene, tables)
+            scene._fill(tables)
             return scene if skeleton and not scene.muscles else scene.validate()
         except (SceneError, MeshError) as error:
             raise type(error)(f"{path}: {error}") from None
+
+    def _fill(self, tables: SceneFile) -> None:
+        about = tables.scene
+        self.missing_bones = about.missing_bones
+        self.doubts = about.doubts
+        self.notes = about.notes
+        self.superior = about.superior
+        self.anterior = about.anterior
+        for bone in tables.bone:
+            self.add_bone(**{key: getattr(bone, key) for key in bone.model_fields_set})
+            if bone.mesh is not None:
+                check_size("bone", bone.name, self.bones[-1], self.units)
+        for joint in tables.joint:
+            self.add_joint(joint.joint())
+            check_centre(joint.name, self.joints[-1].centre, self.bones, self.units)
+        for coupling in tables.coupling:
+            self.add_coupling(make_coupling(coupling, self.joints))
+        for muscle in tables.muscle:
+            given = given_muscle(muscle, tables.classes)
+            lies = MeshTransform(**{k: given[k] for k in MeshTransform.model_fields if k in given})
+            read = read_mesh(muscle.mesh, name=muscle.name, transform=lies)
+            check_size("muscle", muscle.name, read, self.units)
+            check_place(muscle.name, read, self.bones, self.units)
+            self.add_muscle(**given | {"mesh": read})
+        self.motion = made_motion(self, tables.motion)
+        self.contact = tables.contact
+        self.sliding = tables.sliding
+        self.detect = tables.detect
+        self.output = tables.output
 
     def save(self, path: str | Path) -> Path:
         """Write the scene as a TOML file that loads as the same scene, and return its path.
@@ -355,53 +327,9 @@ class Scene:
         """
         return record_scene(self)
 
-    def length(self, millimetres: float) -> float:
-        """Return a length given in millimetres in the scene's unit."""
-        return millimetres / MM_PER_UNIT[self.units]
-
-    @property
-    def body(self) -> Floats:
-        """Left, posterior and superior (3, 3); x, y and z where the directions are not known."""
-        return body_axes(self.superior, self.anterior)
-
-    def bone(self, name: str) -> Bone:
-        """Return the bone of that name, or raise SceneError naming the nearest."""
-        return find_named(self.bones, name, "bone")
-
-    def muscle(self, name: str) -> Muscle:
-        """Return the muscle of that name, or raise SceneError naming the nearest."""
-        return find_named(self.muscles, name, "muscle")
-
-    def attachment_frames(self, muscle: Muscle) -> list[str]:
-        """Names of the bones, then of the ends that tendons of a muscle hold."""
-        return [*(bone.name for bone in self.bones), *(end.name for end in muscle.tendons)]
-
-    def copy(self) -> Self:
-        """Return a copy whose lists and tables are its own; meshes are shared."""
-        other = copy.copy(self)
-        lists = (
-            "bones",
-            "joints",
-            "couplings",
-            "meshless_bones",
-            "missing_bones",
-            "doubts",
-            "guesses",
-            "notes",
-        )
-        for name in lists:
-            setattr(other, name, list(getattr(self, name)))
-        other.muscles = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
-        return other
-
     def show(self, *, model: str | None = None) -> showing.ShownPage:
         """Show the scene in a browser or a notebook, to be moved by hand; see `rbfmuscle.show`."""
         return showing.registered[0].show(self, model=model)
-
-    def __repr__(self) -> str:
-        muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles)
-        counts = f"{len(self.bones)} bones, {muscles or 'no muscles'}, {len(self.motion)} frames"
-        return f"<Scene {self.name!r}, {self.units}: {counts}>"
 
     def _repr_html_(self) -> str:
         return showing.registered[0].picture(self) if self.bones else html.escape(repr(self))

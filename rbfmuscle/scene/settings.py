@@ -7,12 +7,13 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
 from rbfmuscle.scene.build import made_motion
+from rbfmuscle.scene.contents import SceneContents
 from rbfmuscle.scene.frames import slice_motion
 from rbfmuscle.scene.objects import Muscle, split_model
 from rbfmuscle.scene.options import (
@@ -25,9 +26,6 @@ from rbfmuscle.scene.options import (
 )
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-
 TABLES = ("contact", "sliding", "detect", "output", "motion")
 HEADS = ("model", "muscle", *KEYS, *TABLES)
 
@@ -38,7 +36,7 @@ def chooses_model(key: str) -> bool:
 
 
 def change_scene(
-    scene: Scene,
+    scene: SceneContents,
     settings: Mapping[str, Any],
     model: str | dict[str, Any] | None,
     frames: slice | str | None,
@@ -59,7 +57,7 @@ def change_scene(
         raise UsageError(str(error)) from None
 
 
-def set_key(scene: Scene, key: str, value: object) -> None:
+def set_key(scene: SceneContents, key: str, value: object) -> None:
     """Set one dotted key of a scene, in place."""
     head, _, rest = key.partition(".")
     muscles = scene.muscles
