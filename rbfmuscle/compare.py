@@ -7,9 +7,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from rbfmuscle.experiments.comparison import add_distances, measure_run, write_tables
+from rbfmuscle.experiments.sweep_run import threads_limited
 from rbfmuscle.folders import OutputFolder
-from rbfmuscle.models import COMPARED, build_models, configure_scene, model_kind, model_title
+from rbfmuscle.models import (
+    COMPARED,
+    build_models,
+    configure_scene,
+    model_kind,
+    model_title,
+    solved_points,
+)
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import run_folder
 from rbfmuscle.progress import stage
@@ -25,8 +35,15 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
 
-FILES = ("comparison.json", "comparison.csv", "report.html")
+FILES = (
+    "comparison.json",
+    "comparison.csv",
+    "statistics.csv",
+    "comparison.tex",
+    "report.html",
+)
 COARSER = 5  # the motion is repeated with steps this many times as long
+ONE_THREAD = 5  # frames that are timed on one thread, the first of which does not count
 
 
 def compare_models(
@@ -45,7 +62,7 @@ def compare_models(
     ----------
     scene : Scene, path or "phantom"
     directory : path
-        Takes ``comparison.json``, ``comparison.csv``, ``report.html`` and the run of each model.
+        Takes ``comparison.json``, tables, ``report.html`` and the run of each model.
     models : list of str
         Distances are to the first. One that cannot be solved is left out, and named in the tables.
     frames : slice or str, optional
@@ -98,7 +115,13 @@ def compare_models(
     with stage("distances between models"):
         add_distances(results, folder, poses)
     labels = {name: model_title(variant.muscles[0]) for name, variant in variants.items()}
-    table = write_tables(folder, first, results, failed, labels=labels, poses=poses)
+    unknowns = {
+        name: {muscle.name: solved_points(muscle, variant) for muscle in variant.muscles}
+        for name, variant in variants.items()
+    }
+    table = write_tables(
+        folder, first, results, failed, labels=labels, unknowns=unknowns, poses=poses
+    )
 
     from rbfmuscle.report.comparison_page import write_page
 
@@ -144,22 +167,26 @@ def _measure(name, scene, folder, progress):
     stream_run(scene, folder, pictures=False, progress=report)
     with stage(f"{name}: there and back by coarser steps"):
         coarse = [*range(0, last, COARSER)]
-        build, shown = _surfaces(scene, [*coarse, last, *coarse[::-1]])
-    again = {"build": build} | ({"turn": shown[len(coarse)], "end": shown[-1]} if coarse else {})
+        build, shown, _ = _surfaces(scene, [*coarse, last, *coarse[::-1]])
+    with stage(f"{name}: on one thread"), threads_limited(1):
+        walls = _surfaces(scene, [*range(min(last + 1, ONE_THREAD))])[2]
+    again = {"build": build, "one_thread": float(np.median(walls[1:] or walls))}
+    again |= {"turn": shown[len(coarse)], "end": shown[-1]} if coarse else {}
     with stage(f"{name}: measuring"):
         return measure_run(RunData.load(folder), again)
 
 
 def _surfaces(scene, chosen):
-    """Time to build the models, and the surfaces of all muscles in frames of these numbers, in this
-    order.
+    """Time to build the models, the surfaces of all muscles in frames of these numbers, in this
+    order, and the wall time of each frame.
     """
     changed = scene.copy()
     changed.motion = pick_frames(scene.motion, chosen)
     start = time.perf_counter()
     models = build_models(changed)
     build = time.perf_counter() - start
-    shown = [frame.surfaces for frame in simulate_frames(changed, models)]
-    return build, [
-        {name: (s.vertices, s.faces) for name, s in surfaces.items()} for surfaces in shown
+    frames = list(simulate_frames(changed, models))
+    surfaces = [
+        {name: (s.vertices, s.faces) for name, s in frame.surfaces.items()} for frame in frames
     ]
+    return build, surfaces, [frame.wall for frame in frames]

@@ -1,117 +1,42 @@
 """Models on one scene, measured alike: what each keeps, how far apart they are, what each costs."""
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from rbfmuscle.experiments.measures import DEEPER, FIRST, FROM_METRICS, MEASURES
+from rbfmuscle.folders import write_whole
 from rbfmuscle.metrics.metrics import surface_distance
-from rbfmuscle.metrics.quantities import ALL, unit_text
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
+from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import machine, versions, write_csv, write_json
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 
-FORMAT = 3
-LAW = "law"
-MESH = "input mesh"
-FIRST = "first model"
-COST = "cost"
+FORMAT = 4
 # A model keeps out of bones that is no deeper in one [mm].
 KEPT_OUT = 0.3
 
 
-class Measure(NamedTuple):
-    """A row of the table.
-
-    ``against`` says what a value is an error of or against; a value is better the smaller its
-    magnitude, and differences of less than ``floor`` (millimetres for lengths) do not count.
-    ``ideal`` is the perfect value.
-    """
-
-    title: str
-    kind: str
-    against: str
-    floor: float
-    meaning: str
-    ideal: float = 0.0
-
-
-MEASURES = {
-    "volume_error": Measure("volume error", "1", LAW, 1e-5, "relative to the input mesh"),
-    "penetration_max": Measure(
-        "surface in a bone", "length", LAW, 0.02, "deepest surface vertex in a bone"
-    ),
-    "bone_penetration_max": Measure(
-        "bone in the muscle", "length", LAW, 0.02, "deepest bone vertex in it"
-    ),
-    "solver_penetration_max": Measure(
-        "before the cut", "length", LAW, 0.02, "model in a bone by then"
-    ),
-    "initial_overlap": Measure(
-        "overlap left at rest", "length", LAW, 0.02, "of muscle and bones at first"
-    ),
-    "bowing": Measure("bowing", "1", LAW, 0.005, "centreline over shortest path", 1.0),
-    "components": Measure(
-        "pieces", "1", LAW, 0.0, "connected pieces of the surface, most in any frame"
-    ),
-    "euler_characteristic": Measure(
-        "Euler characteristic", "1", LAW, 0.0, "2 for a sphere, two less for a handle", 2.0
-    ),
-    "self_crossings": Measure(
-        "self-crossings", "1", LAW, 0.0, "triangles that cross others of the surface"
-    ),
-    "flicker": Measure(
-        "flicker", "length", LAW, 0.05, "surface against material mesh, frame to frame"
-    ),
-    "tunnelled": Measure("tunnelled points", "1", LAW, 0.0, "points beyond a bone"),
-    "return_rms": Measure(
-        "return error (RMS)", "length", LAW, 0.02, "first pose before and after motion"
-    ),
-    "return_max": Measure(
-        "return error (greatest)", "length", LAW, 0.1, "the same, greatest distance"
-    ),
-    "step_rms": Measure("step dependence (RMS)", "length", LAW, 0.02, "last pose by coarser steps"),
-    "step_max": Measure(
-        "step dependence (greatest)", "length", LAW, 0.1, "the same, greatest distance"
-    ),
-    "rest_error_rms": Measure(
-        "rest error (RMS)", "length", MESH, 0.02, "surface to input mesh at rest"
-    ),
-    "rest_error_max": Measure(
-        "rest error (greatest)", "length", MESH, 0.1, "the same, greatest distance"
-    ),
-    "distance_rms": Measure(
-        "distance (RMS)", "length", FIRST, 0.0, "to the first model's, worst pose"
-    ),
-    "distance_max": Measure(
-        "distance (greatest)", "length", FIRST, 0.0, "the same, greatest distance"
-    ),
-    "time_frame": Measure(
-        "time per frame", "s", COST, 0.0, "median of all muscles together, with surfaces"
-    ),
-    "time_frame_p95": Measure(
-        "time per frame (95 %)", "s", COST, 0.0, "exceeded by one frame in 20"
-    ),
-    "time_build": Measure(
-        "build", "s", COST, 0.0, "models of all muscles, once, with filled caches"
-    ),
-}
-_FROM_METRICS = [name for name, m in MEASURES.items() if m.against in (LAW, MESH)]
 _TIE = 1.05
 
 
 def measure_run(saved: RunData, extra: dict[str, Any]) -> dict[str, Any]:
     """Values of every measure but the distances for one model: muscle -> quantity -> value.
 
-    Under ``"all"`` the worst over muscles, or the wall time. ``extra`` holds ``build`` [s], and
-    where the motion has more than one frame ``turn`` and ``end``: surfaces by muscle (vertices,
-    faces) at the last pose and back at the first, by coarser steps.
+    Under ``"all"`` the worst over muscles, or the wall time. ``extra`` holds ``build`` and
+    ``one_thread`` [s], and where the motion has more than one frame ``turn`` and ``end``: surfaces
+    by muscle (vertices, faces) at the last pose and back at the first, by coarser steps.
     """
     found = {}
     for muscle in saved.muscles:
         facts = saved.info.muscles.get(muscle, {})
-        values = {q: facts[q]["worst"] for q in _FROM_METRICS if "worst" in facts.get(q, {})}
+        values = {q: facts[q]["worst"] for q in FROM_METRICS if "worst" in facts.get(q, {})}
+        values[DEEPER] = _deepened(values)
         times = saved.series(muscle, "time_frame")[1][1:]  # the first loads and compiles
         if len(times):
             values["time_frame"] = float(np.median(times))
@@ -133,21 +58,59 @@ def measure_run(saved: RunData, extra: dict[str, Any]) -> dict[str, Any]:
             time_frame=float(np.median(wall)), time_frame_p95=float(np.percentile(wall, 95))
         )
     together["time_build"] = extra["build"]
+    together["time_one_thread"] = extra["one_thread"]
     found[ALL] = {name: value for name, value in together.items() if value is not None}
+    return found
+
+
+def statistics(saved: RunData) -> dict[str, dict[str, dict[str, float]]]:
+    """Mean and standard deviation over the frames: muscle -> quantity -> ``mean``, ``sd``; of
+    moment arms the quantity is ``"moment_arm:COORDINATE"``.
+    """
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for muscle in saved.muscles:
+        whole = (*FROM_METRICS, "length", "time_frame")
+        series = {name: saved.series(muscle, name)[1] for name in whole}
+        for about in saved.moment_arm_coordinates(muscle):
+            series[f"moment_arm:{about}"] = saved.series(muscle, "moment_arm", about)[1]
+        series["time_frame"] = series["time_frame"][1:]  # the first loads and compiles
+        found[muscle] = {
+            name: {"mean": float(values.mean()), "sd": float(values.std())}
+            for name, values in series.items()
+            if len(values) and np.isfinite(values).all()
+        }
     return found
 
 
 def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> None:
     """Add the distances of each model's surfaces to those of the first, the worst of some poses of
-    a folder's runs.
+    a folder's runs, and the differences of lengths and moment arms.
     """
     first, *others = (RunData.load(folder / name) for name in results)
     for found, run in zip(list(results.values())[1:], others):
         for muscle in first.muscles:
             pairs = [surface_distance(*first.mesh(muscle, k), *run.mesh(muscle, k)) for k in poses]
-            for name, values in zip(("distance_rms", "distance_max"), zip(*pairs)):
-                found[muscle][name] = max(values)
-                found[ALL][name] = max(found[ALL].get(name, 0.0), max(values))
+            apart = dict(zip(("distance_rms", "distance_max"), map(max, zip(*pairs))))
+            apart["length_rms"] = _apart(first, run, muscle, "length", None)
+            arms = [
+                _apart(first, run, muscle, "moment_arm", about)
+                for about in first.moment_arm_coordinates(muscle)
+            ]
+            apart |= {"moment_arm_rms": max(arms)} if arms else {}
+            for name, value in apart.items():
+                if np.isfinite(value):
+                    found[muscle][name] = value
+                    found[ALL][name] = max(found[ALL].get(name, 0.0), value)
+
+
+def _apart(first: RunData, other: RunData, muscle: str, quantity: str, about: str | None) -> float:
+    """Root mean square over the frames of the difference of a quantity; NaN where frames differ."""
+    (frames, mine), (others, values) = (
+        run.series(muscle, quantity, about) for run in (first, other)
+    )
+    if not len(frames) or not np.array_equal(frames, others):
+        return float("nan")
+    return float(np.sqrt(np.mean((mine - values) ** 2)))
 
 
 def write_tables(
@@ -157,10 +120,14 @@ def write_tables(
     failed: dict[str, str],
     *,
     labels: dict[str, str],
+    unknowns: dict[str, dict[str, str]],
     poses: list[int],
 ) -> dict[str, Any]:
-    """Write ``comparison.json``, which is returned, and ``comparison.csv``: values by model, muscle
-    and quantity.
+    """Write ``comparison.json``, which is returned, ``comparison.csv``: values by model, muscle and
+    quantity, ``statistics.csv``: their means and standard deviations over the frames, and
+    ``comparison.tex``.
+
+    ``unknowns`` are the points that each model solves for, in words, by model and muscle.
     """
     units = {name: unit_text(m.kind, scene.units) for name, m in MEASURES.items()}
     facts = ("title", "against", "meaning")
@@ -178,8 +145,10 @@ def write_tables(
         "labels": {name: labels[name] for name in results},
         "failed": failed,
         "answer": describe(results, labels, scene.units),
+        "unknowns": {name: unknowns[name] for name in results},
         "measures": measures,
         "results": results,
+        "statistics": {name: statistics(RunData.load(folder / name)) for name in results},
         "machine": machine(),
         "versions": versions(),
     }
@@ -192,7 +161,41 @@ def write_tables(
                 (model, muscle, name, values[name], units[name], against) for name, against in known
             ]
     write_csv(folder / "comparison.csv", rows)
+    write_csv(folder / "statistics.csv", _statistics_rows(table["statistics"], scene.units))
+    write_whole(folder / "comparison.tex", latex(table))
     return table
+
+
+def _statistics_rows(found, units):
+    rows: list[tuple[Any, ...]] = [("model", "muscle", "quantity", "mean", "sd", "unit")]
+    for model, muscles in found.items():
+        for muscle, quantities in muscles.items():
+            for name, row in quantities.items():
+                unit = unit_text(QUANTITIES[name.partition(":")[0]][0], units)
+                rows.append((model, muscle, name, row["mean"], row["sd"], unit))
+    return rows
+
+
+def latex(table: dict[str, Any]) -> str:
+    """The table of every measure over all muscles, as LaTeX."""
+    models = table["models"]
+    lines = [
+        f"% rbfmuscle {table['versions']['rbfmuscle']}: worst of muscles and frames",
+        rf"\begin{{tabular}}{{ll{'r' * len(models)}}}",
+        _cells(["", "against", *(table["labels"][name] for name in models)]),
+        r"\hline",
+    ]
+    for quantity, measure in table["measures"].items():
+        values = [table["results"][name][ALL].get(quantity) for name in models]
+        if any(value is not None for value in values):
+            texts = [shown_number(value, measure["unit"]) for value in values]
+            lines.append(_cells([measure["title"], measure["against"], *texts]))
+    return "\n".join([*lines, r"\end{tabular}", ""])
+
+
+def _cells(texts):
+    escaped = (re.sub(r"([%_&#$])", r"\\\1", text).replace("–", "--") for text in texts)
+    return " & ".join(escaped) + r" \\"
 
 
 def best_models(results: dict[str, Any], quantity: str, units: str) -> list[str]:
@@ -211,10 +214,10 @@ def best_models(results: dict[str, Any], quantity: str, units: str) -> list[str]
     return [name for name, value in values.items() if value <= limit]
 
 
-def _deepened(values: dict[str, float]) -> float:
-    """How deep a muscle is in a bone, or a bone in it, beyond what the surface has at rest."""
-    surface = values.get("penetration_max", 0.0) - values.get("initial_overlap", 0.0)
-    return max(surface, values.get("bone_penetration_max", 0.0))
+def _deepened(values: Mapping[str, float | None]) -> float:
+    """How deep a muscle is in a bone, or a bone in it, beyond what is left at rest."""
+    deepest = max(values.get(name) or 0.0 for name in ("penetration_max", "bone_penetration_max"))
+    return max(0.0, deepest - (values.get("initial_overlap") or 0.0))
 
 
 def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str:
@@ -225,12 +228,17 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
     """
     first, *others = results
     whole = {name: found[ALL] for name, found in results.items()}
-    depth = {name: max(map(_deepened, found.values())) for name, found in results.items()}
+    depth = {name: values.get(DEEPER, 0.0) for name, values in whole.items()}
     verb = "keeps out of" if depth[first] <= KEPT_OUT / MM_PER_UNIT[units] else "enters"
     texts = [
-        f"{labels[first]} {verb} bones: {depth[first]:.2g} {units} deep at most, without the "
-        "overlap at rest"
+        f"{labels[first]} {verb} bones: {depth[first]:.2g} {units} deep at most beyond the overlap "
+        "at rest"
     ]
+    before = whole[first].get("solver_penetration_max", 0.0)
+    if before > whole[first].get("penetration_max", 0.0) + 0.02 / MM_PER_UNIT[units]:
+        texts.append(
+            f"Before it is clipped along the bones its points are {before:.2g} {units} deep"
+        )
     timed = [
         name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]
     ]
@@ -239,7 +247,8 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
         ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
         name = f"{labels[quick]}{', the quickest of the others' if len(others) > 1 else ''}"
         texts.append(
-            f"It takes {ratio:.2g} times the time of {name} ({depth[quick]:.2g} {units} deep)"
+            f"It takes {ratio:.2g} times the time of {name} ({depth[quick]:.2g} {units} deep "
+            "beyond rest)"
         )
     apart = {name: whole[name]["distance_rms"] for name in others if "distance_rms" in whole[name]}
     if apart:

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.experiments.comparison import MEASURES, best_models
-from rbfmuscle.metrics.quantities import ALL
+from rbfmuscle.experiments.comparison import best_models
+from rbfmuscle.experiments.measures import DEEPER, MEASURES
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.run_data import RunData
@@ -28,7 +29,8 @@ from rbfmuscle.report.page import (
 from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.report import packed_scene
 
-LIGHTS = ("penetration_max", "bone_penetration_max", "bowing", "return_rms", "time_frame")
+LIGHTS = (DEEPER, "volume_error", "bowing", "return_rms", "time_frame")
+_DRAWN = ("penetration_max", "bone_penetration_max", "bowing")
 _READING = """All models ran through the same frames and sub-steps, with the same bone fields and
 number of threads. The time per frame leaves out the first, which loads and compiles. The
 distance to the first model is no error. A mesh model keeps the overlap with bones that its mesh
@@ -54,7 +56,7 @@ def _page(found: dict[str, Any], runs: Mapping[str, RunData]) -> ReportPage:
     counts = {"muscles": len(first.muscles), "frames": found["frames"], **found["machine"]}
     # Of the bowing each muscle has a limit of its own.
     limits, terms = (
-        first.info.limits | {"bowing": None},
+        first.info.limits | {"bowing": None, DEEPER: first.info.limits.get("penetration_max")},
         [(m.title, m.meaning) for m in MEASURES.values()],
     )
     return ReportPage(
@@ -70,6 +72,8 @@ def _page(found: dict[str, Any], runs: Mapping[str, RunData]) -> ReportPage:
                 "worst of muscles and frames, best in green",
                 table=_measures(found),
             ),
+            Section("Mean and standard deviation over the frames", table=_statistics(found)),
+            Section("What each model solves for", table=_unknowns(found)),
             Section("Over the motion", plots=_plots(runs)),
             Section("How to read this", text=_READING, terms=terms),
         ],
@@ -112,6 +116,34 @@ def _measures(found: dict[str, Any]) -> Table:
     return Table(["", "against", *(found["labels"][name] for name in found["models"])], rows)
 
 
+def _statistics(found: dict[str, Any]) -> Table:
+    """Length, moment arms, volume and time of each muscle, mean ± standard deviation."""
+    models, rows = found["models"], []
+    first = found["statistics"][models[0]]
+    for muscle, quantities in first.items():
+        names = ["length", *(name for name in quantities if name.startswith("moment_arm:"))]
+        for name in [*names, "volume_error", "time_frame"]:
+            quantity, _, about = name.partition(":")
+            unit = unit_text(QUANTITIES[quantity][0], found["units"])
+            texts = []
+            for model in models:
+                row = found["statistics"][model].get(muscle, {}).get(name)
+                pair = [shown_number(row[key], unit) for key in ("mean", "sd")] if row else []
+                texts.append(" ± ".join(pair) or "–")
+            title = f"{quantity.replace('_', ' ')} {about}".strip()
+            rows.append([Cell(muscle), Cell(title), *map(Cell, texts)])
+    return Table(["", "", *(found["labels"][name] for name in models)], rows)
+
+
+def _unknowns(found: dict[str, Any]) -> Table:
+    models = found["models"]
+    rows = [
+        [Cell(muscle), *(Cell(found["unknowns"][name][muscle]) for name in models)]
+        for muscle in found["unknowns"][models[0]]
+    ]
+    return Table(["", *(found["labels"][name] for name in models)], rows)
+
+
 def _plots(runs: Mapping[str, RunData]) -> list[str]:
     """Moment arms, length and depths of each muscle, then the time; a line for each model, no plot
     of constants.
@@ -125,7 +157,7 @@ def _plots(runs: Mapping[str, RunData]) -> list[str]:
     ]
     shapes = {"length": ("Length", first.units)} | {
         name: (MEASURES[name].title.capitalize(), "" if MEASURES[name].kind == "1" else first.units)
-        for name in LIGHTS[:3]
+        for name in _DRAWN
     }
     for quantity, (title, unit) in shapes.items():
         panels += [(f"{title}: {muscle}", unit, muscle, quantity, None) for muscle in first.muscles]

@@ -9,7 +9,8 @@ import pytest
 from blend_model import BlendMuscle, arm_scene
 
 from rbfmuscle.compare import compare_models
-from rbfmuscle.experiments.comparison import MEASURES, best_models, describe
+from rbfmuscle.experiments.comparison import best_models, describe
+from rbfmuscle.experiments.measures import DEEPER, MEASURES
 from rbfmuscle.models import build_model
 from rbfmuscle.report.comparison_page import _values, shown
 from rbfmuscle.run import Run
@@ -43,9 +44,7 @@ def test_what_does_not_count_is_a_tie():
     )
     assert [shown(table, *value) for value in values] == ["0 mm", "0.011 mm", "0.4 mm", "0.4 mm"]
     for depth, verb in ((2e-4, "keeps out of"), (4e-4, "enters")):
-        assert f"A {verb} bones" in describe(
-            {"a": {"all": {"penetration_max": depth}}}, {"a": "A"}, "m"
-        )
+        assert f"A {verb} bones" in describe({"a": {"all": {DEEPER: depth}}}, {"a": "A"}, "m")
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +73,14 @@ class TestComparison:
             }
             assert all(found[name]["time_frame"] == np.median(wall) for name, wall in walls.items())
             assert found["all"]["time_frame_p95"] == np.percentile(walls["all"], 95)
-            assert set(MEASURES) - set(found["all"]) <= {"distance_rms", "distance_max", "flicker"}
+            assert set(MEASURES) - set(found["all"]) <= {
+                "distance_rms",
+                "distance_max",
+                "length_rms",
+                "moment_arm_rms",
+                "flicker",
+                "unfitted_fraction",
+            }
             assert 0 <= found["all"]["return_rms"] < 1.5
         assert Run.load(folder / "rbf").info.scene.muscles[0].model.centres == 100
 
@@ -88,10 +94,52 @@ class TestComparison:
                 float(row["value"])
                 == table["results"][row["model"]][row["muscle"]][row["quantity"]]
             )
+        text = (folder / "comparison.tex").read_text(encoding="utf-8")
+        assert text.count(r" \\") == 1 + len(
+            table["results"]["rbf"]["all"] | table["results"]["pbd"]["all"]
+        )
         text = (folder / "report.html").read_text(encoding="utf-8")
         assert table["answer"].startswith("RBF keeps out of bones") and table["answer"] in text
         assert text.index(table["answer"]) < text.index("<table")
         assert all(MEASURES[quantity].title in text for quantity in table["results"]["pbd"]["all"])
+
+    def test_depth_at_rest_is_not_held_against_a_model(self, compared):
+        """PBD keeps what overlaps at rest; only what is deeper than that counts."""
+        folder, table = compared
+        for model in table["models"]:
+            for muscle in Run.load(folder / model).muscles:
+                found = table["results"][model][muscle]
+                deepest = max(found["penetration_max"], found["bone_penetration_max"])
+                beyond = max(0.0, deepest - found["initial_overlap"])
+                assert found[DEEPER] == pytest.approx(beyond)
+        pbd = table["results"]["pbd"]["all"]
+        assert pbd[DEEPER] < pbd["bone_penetration_max"]
+        assert f"{pbd[DEEPER]:.2g} mm deep beyond rest" in table["answer"]
+
+    def test_statistics_are_those_of_the_frames(self, compared):
+        folder, _ = compared
+        lines = (folder / "statistics.csv").read_text(encoding="utf-8").splitlines()
+        rows = list(csv.DictReader(lines))
+        assert {row["model"] for row in rows} == {"rbf", "pbd"}
+        for row in rows:
+            quantity, _, about = row["quantity"].partition(":")
+            run = Run.load(folder / row["model"])
+            values = run.series(row["muscle"], quantity, about or None)[1]
+            values = values[1:] if quantity == "time_frame" else values
+            assert float(row["mean"]) == pytest.approx(values.mean())
+            assert float(row["sd"]) == pytest.approx(values.std(), abs=1e-12)
+        arms = [row for row in rows if row["quantity"] == "moment_arm:hip.flexion"]
+        assert len(arms) == 8 and {row["unit"] for row in arms} == {"mm"}
+
+    def test_differences_of_length_and_arm_are_over_the_frames(self, compared):
+        folder, table = compared
+        rbf, pbd = (Run.load(folder / name) for name in ("rbf", "pbd"))
+        for muscle in rbf.muscles:
+            apart = rbf.series(muscle, "length")[1] - pbd.series(muscle, "length")[1]
+            found = table["results"]["pbd"][muscle]
+            assert found["length_rms"] == pytest.approx(np.sqrt((apart**2).mean()))
+            assert found["moment_arm_rms"] > 0 and table["unknowns"]["pbd"][muscle]
+        assert 0 < table["results"]["rbf"]["all"]["time_one_thread"] < 60
 
 
 class TestFailure:
