@@ -194,7 +194,9 @@ def latex(table: dict[str, Any]) -> str:
 
 
 def _cells(texts):
-    escaped = (re.sub(r"([%_&#$])", r"\\\1", text).replace("–", "--") for text in texts)
+    escaped = (
+        re.sub(r"([%_&#$])", r"\\\1", text).replace("–", "--").replace("<", "$<$") for text in texts
+    )
     return " & ".join(escaped) + r" \\"
 
 
@@ -231,13 +233,13 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
     depth = {name: values.get(DEEPER, 0.0) for name, values in whole.items()}
     verb = "keeps out of" if depth[first] <= KEPT_OUT / MM_PER_UNIT[units] else "enters"
     texts = [
-        f"{labels[first]} {verb} bones: {depth[first]:.2g} {units} deep at most beyond the overlap "
-        "at rest"
+        f"{labels[first]} {verb} bones: {shown_number(depth[first], units)} deep at most beyond the "
+        "overlap at rest"
     ]
     before = whole[first].get("solver_penetration_max", 0.0)
     if before > whole[first].get("penetration_max", 0.0) + 0.02 / MM_PER_UNIT[units]:
         texts.append(
-            f"Before it is clipped along the bones its points are {before:.2g} {units} deep"
+            f"Before it is clipped along the bones its points are {shown_number(before, units)} deep"
         )
     timed = [
         name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]
@@ -247,8 +249,8 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
         ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
         name = f"{labels[quick]}{', the quickest of the others' if len(others) > 1 else ''}"
         texts.append(
-            f"It takes {ratio:.2g} times the time of {name} ({depth[quick]:.2g} {units} deep "
-            "beyond rest)"
+            f"It takes {ratio:.2g} times the time of {name} "
+            f"({shown_number(depth[quick], units)} deep beyond rest)"
         )
     apart = {name: whole[name]["distance_rms"] for name in others if "distance_rms" in whole[name]}
     if apart:

@@ -11,6 +11,7 @@ from blend_model import BlendMuscle, arm_scene
 from rbfmuscle.compare import compare_models
 from rbfmuscle.experiments.comparison import best_models, describe
 from rbfmuscle.experiments.measures import DEEPER, MEASURES
+from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.models import build_model
 from rbfmuscle.report.comparison_page import _values, shown
 from rbfmuscle.run import Run
@@ -114,7 +115,7 @@ class TestComparison:
                 assert found[DEEPER] == pytest.approx(beyond)
         pbd = table["results"]["pbd"]["all"]
         assert pbd[DEEPER] < pbd["bone_penetration_max"]
-        assert f"{pbd[DEEPER]:.2g} mm deep beyond rest" in table["answer"]
+        assert f"({shown_number(pbd[DEEPER], 'mm')} deep beyond rest)" in table["answer"]
 
     def test_statistics_are_those_of_the_frames(self, compared):
         folder, _ = compared
