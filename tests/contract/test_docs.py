@@ -8,12 +8,16 @@ import json
 import re
 import shlex
 import sys
+import tomllib
 
 import pytest
 from conftest import ROOT
 
 import rbfmuscle as rm
+from pbd_baseline.options import PBDOptions
 from rbfmuscle.cli.app import app
+from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.scene.file import SceneFile
 
 sys.path.insert(0, str(ROOT / "docs"))
 import figures
@@ -132,6 +136,16 @@ def test_planted_wrong_command_is_found(text):
 def test_python_names_of_a_page_are_public(page):
     text = page.read_text(encoding="utf-8")
     assert {name for name in re.findall(r"\brm\.(\w+)", text) if name not in rm.__all__} == set()
+
+
+def test_scene_page_names_every_key_and_its_example_is_read():
+    text = "".join((ROOT / f"docs/{name}.md").read_text() for name in ("scene_file", "contraction"))
+    schemas = [table.model_json_schema() for table in (SceneFile, RBFOptions, PBDOptions)]
+    tables = [table for schema in schemas for table in (schema, *schema.get("$defs", {}).values())]
+    keys = {key for table in tables for key in table.get("properties", {})}
+    assert {key for key in keys if not re.search(rf"\b{key}\b", text)} == set()
+    example = re.search(r"```toml\n(.*?)```", text, flags=re.S).group(1)
+    assert SceneFile.model_validate(tomllib.loads(example)).muscle[0].name == "gluteus_maximus"
 
 
 def test_figures_stand_in_one_page_and_the_readme():
