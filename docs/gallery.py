@@ -156,14 +156,14 @@ def write_reference(root, package):
     ]
     for topic, names in topics.items():
         if names:
-            lines += [f"# {topic}", ""]
+            lines += [f"## {topic}", ""]
         for name in names:
             value = getattr(package, name)
             kind, options = (
                 ("autoclass", "   :members:\n") if isinstance(value, type) else ("autofunction", "")
             )
             directive = f".. {kind}:: {value.__module__}.{name}\n{options}"
-            lines += [f"## {name}", "", f"```{{eval-rst}}\n{directive}```", ""]
+            lines += [f"### {name}", "", f"```{{eval-rst}}\n{directive}```", ""]
     (folder / "reference.md").write_text("\n".join(lines), encoding="utf-8")
 
 
