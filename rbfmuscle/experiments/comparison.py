@@ -233,13 +233,13 @@ def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str
     depth = {name: values.get(DEEPER, 0.0) for name, values in whole.items()}
     verb = "keeps out of" if depth[first] <= KEPT_OUT / MM_PER_UNIT[units] else "enters"
     texts = [
-        f"{labels[first]} {verb} bones: {shown_number(depth[first], units)} deep at most beyond the "
-        "overlap at rest"
+        f"{labels[first]} {verb} bones: {shown_number(depth[first], units)} deep at most beyond "
+        "the overlap at rest"
     ]
     before = whole[first].get("solver_penetration_max", 0.0)
     if before > whole[first].get("penetration_max", 0.0) + 0.02 / MM_PER_UNIT[units]:
         texts.append(
-            f"Before it is clipped along the bones its points are {shown_number(before, units)} deep"
+            f"Before it is clipped along bones its points are {shown_number(before, units)} deep"
         )
     timed = [
         name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]
