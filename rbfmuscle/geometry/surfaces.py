@@ -248,3 +248,11 @@ def mesh_hash(vertices: Floats, faces: Integers) -> str:
     points = np.ascontiguousarray(vertices, dtype=np.float64)
     corners = np.ascontiguousarray(faces, dtype=np.int64)
     return hashlib.sha256(points.tobytes() + corners.tobytes()).hexdigest()
+
+
+def edge_stretch(now: Floats, rest: Floats, faces: Integers) -> Floats:
+    """Mean change of length (n,) of the edges about each vertex, relative to rest."""
+    edges = unique_edges(faces)
+    change = edge_lengths(now, edges) / edge_lengths(rest, edges) - 1.0
+    total, count = (np.bincount(edges.T.ravel(), x, len(now)) for x in (np.tile(change, 2), None))
+    return total / np.maximum(count, 1)

@@ -1,7 +1,7 @@
 """A run in other formats and units: files for each frame, or an animation in one file."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,8 +9,10 @@ import numpy as np
 
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.solids import SolidDistance
+from rbfmuscle.geometry.surfaces import edge_stretch
 from rbfmuscle.output.animation.gltf import animated_glb
-from rbfmuscle.output.animation.parts import Animation, read_animation
+from rbfmuscle.output.animation.parts import AnimatedMesh, Animation, read_animation
 from rbfmuscle.output.animation.usd import check_usd, write_usd
 from rbfmuscle.output.fibre_files import write_fibres
 from rbfmuscle.output.run_data import RunData, open_run
@@ -148,6 +150,7 @@ def _file_name(name: str) -> str:
 
 def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -> list[Path]:
     written, suffix = [], "vtp" if name == "pvd" else name
+    measure = SurfaceArrays(run) if suffix == "vtp" else None
     taken = {part.name.lower() for part in run.muscles}
     for group, parts in (("surfaces", run.muscles), ("bones", run.bones)):
         # No name of a part holds a full stop.
@@ -160,7 +163,8 @@ def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -
             moved = [p for p in parts if k == 0 or p.poses is None or p.moves]
             files |= {p.name: f"{stems[p.name]}_{frame:04d}.{suffix}" for p in moved}
             for part in moved:
-                write_mesh(folder / files[part.name], *part.mesh(k))
+                arrays = measure.of(part, k) if measure and group == "surfaces" else None
+                write_mesh(folder / files[part.name], *part.mesh(k), arrays)
             written += [folder / files[part.name] for part in moved]
             if collection is not None:
                 collection.add(run.times[k] if run.timed else frame, list(files.items()))
@@ -179,12 +183,42 @@ def _export_fibres(run: Animation, folder: Path, frames: list[int]) -> list[Path
     return written
 
 
-def write_mesh(path: Path, vertices: Floats, faces: Integers) -> None:
-    """Write a triangle mesh as ``.vtp``, ``.ply``, ``.stl`` or ``.obj``, by suffix; PLY and STL in
-    single precision.
+class SurfaceArrays:
+    """Arrays at the vertices of muscles' surfaces: distance to the nearest bone, negative inside,
+    mean stretch of the edges against the first frame, number of the muscle's group.
+    """
+
+    def __init__(self, run: Animation) -> None:
+        self._bones = [(SolidDistance(bone.vertices[0], bone.faces[0]), bone) for bone in run.bones]
+        self._groups = sorted({part.group for part in run.muscles})
+
+    def of(self, part: AnimatedMesh, k: int) -> dict[str, Floats]:
+        """Arrays (n,) of a muscle in frame ``k``; no stretch where triangles change."""
+        vertices, faces = part.mesh(k)
+        found = {"group": np.full(len(vertices), self._groups.index(part.group))}
+        distances = [field.signed(_at_rest(vertices, bone, k)) for field, bone in self._bones]
+        if distances:
+            found["bone_distance"] = np.min(distances, axis=0)
+        first, same = part.mesh(0)
+        if np.array_equal(faces, same):
+            found["stretch"] = edge_stretch(vertices, first, faces)
+        return found
+
+
+def _at_rest(points: Floats, bone: AnimatedMesh, k: int) -> Floats:
+    """Points (n, 3) in the frame of a bone at rest."""
+    pose = np.eye(4) if bone.poses is None else bone.poses[k]
+    return (points - pose[:3, 3]) @ pose[:3, :3]
+
+
+def write_mesh(
+    path: Path, vertices: Floats, faces: Integers, arrays: Mapping[str, Floats] | None = None
+) -> None:
+    """Write a triangle mesh as ``.vtp`` (with arrays at its vertices), ``.ply``, ``.stl`` or
+    ``.obj``, by suffix; PLY and STL in single precision.
     """
     if path.suffix == ".vtp":
-        write_vtp(path, vertices, faces)
+        write_vtp(path, vertices, faces, arrays)
         return
     import trimesh
 

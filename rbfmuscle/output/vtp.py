@@ -4,6 +4,7 @@ loading VTK.
 
 import re
 import zlib
+from collections.abc import Mapping
 from functools import lru_cache
 from html import escape
 from pathlib import Path
@@ -25,6 +26,8 @@ _HEAD = """<?xml version="1.0"?>
 <PolyData>
 <Piece NumberOfPoints="{}" NumberOfVerts="0" NumberOfLines="0"
  NumberOfStrips="0" NumberOfPolys="{}">
+<PointData>
+{}</PointData>
 <Points>
 {}</Points>
 <Polys>
@@ -35,24 +38,33 @@ _HEAD = """<?xml version="1.0"?>
 BEFORE_DATA, AFTER_DATA = b'<AppendedData encoding="raw">\n_', b"\n</AppendedData>\n</VTKFile>\n"
 
 
-def write_vtp(path: str | Path, vertices: ArrayLike, faces: ArrayLike) -> None:
-    """Write vertices (n, 3), single precision as it is, double rounded to 1e-11 of each number, and
-    faces (m, 3).
+def write_vtp(
+    path: str | Path,
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    arrays: Mapping[str, ArrayLike] | None = None,
+) -> None:
+    """Write vertices (n, 3), single precision as it is, double rounded to 1e-11 of each number,
+    faces (m, 3), and ``arrays`` (n,) by name in single precision.
     """
     points = np.ascontiguousarray(vertices)
     points = _rounded(points) if points.dtype != np.float32 else points
     corners = np.ascontiguousarray(faces, dtype="<i4")
-    blocks = packed(points.tobytes()), *_packed_faces(corners.tobytes())
+    values = {name: np.asarray(value, dtype="<f4") for name, value in (arrays or {}).items()}
+    names = [*values, "Points", "connectivity", "offsets"]
+    kinds = ["f4"] * len(values) + [points.dtype.str[1:], "i4", "i4"]
+    widths = [1] * len(values) + [3, 1, 1]
+    blocks = [packed(value.tobytes()) for value in values.values()]
+    blocks += [packed(points.tobytes()), *_packed_faces(corners.tobytes())]
     elements, offset = [], 0
-    for name, kind, components, block in zip(
-        ("Points", "connectivity", "offsets"), (points.dtype.str[1:], "i4", "i4"), (3, 1, 1), blocks
-    ):
+    for name, kind, components, block in zip(names, kinds, widths, blocks):
         elements.append(
-            f'<DataArray type="{_TYPES[kind]}" Name="{name}" NumberOfComponents="{components}" '
-            f'format="appended" offset="{offset}"/>\n'
+            f'<DataArray type="{_TYPES[kind]}" Name="{escape(name)}" '
+            f'NumberOfComponents="{components}" format="appended" offset="{offset}"/>\n'
         )
         offset += len(block)
-    head = _HEAD.format(len(points), len(corners), *elements).encode("ascii")
+    data = "".join(elements[: len(values)])
+    head = _HEAD.format(len(points), len(corners), data, *elements[len(values) :]).encode("ascii")
     Path(path).write_bytes(b"".join([head, BEFORE_DATA, *blocks, AFTER_DATA]))
 
 

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import edge_lengths, mesh_volume, unique_edges
+from rbfmuscle.geometry.surfaces import edge_stretch, mesh_volume
 from rbfmuscle.metrics.depths import BoneDistance, surface_depth
 from rbfmuscle.output.appearance import (
     BONE_COLOUR,
@@ -74,20 +74,12 @@ def vertex_values(
     if colouring == "activation":
         return np.full(len(vertices), picture.activation.get(name, np.nan))
     if colouring == "stretch" and np.array_equal(faces, rest.surfaces[name][1]):
-        return _stretch(vertices, *rest.surfaces[name])
+        return edge_stretch(vertices, *rest.surfaces[name])
     if colouring == "penetration":
         return surface_depth(vertices, probes, picture.poses)
     if colouring == "distance" and other is not None:
         return MeshDistance(*other.surfaces[name]).unsigned(vertices)
     return np.full(len(vertices), np.nan)
-
-
-def _stretch(now: Floats, rest: Floats, faces: Integers) -> Floats:
-    """Mean change of length of the edges about each vertex, relative to rest."""
-    edges = unique_edges(faces)
-    change = edge_lengths(now, edges) / edge_lengths(rest, edges) - 1.0
-    total, count = (np.bincount(edges.T.ravel(), x, len(now)) for x in (np.tile(change, 2), None))
-    return total / np.maximum(count, 1)
 
 
 def shades(colouring: Colouring, values: Floats, millimetre: float) -> Floats:

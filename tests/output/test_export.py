@@ -97,6 +97,26 @@ class TestSaved:
         assert "\n" not in str(told.value)
 
 
+def test_vtk_files_carry_distance_to_bones_stretch_and_group(arm_run, tmp_path):
+    export_run(arm_run[1], ["pvd"], output=tmp_path)
+    first, last = (pyvista.read(tmp_path / f"pvd/biceps_{k:04d}.vtp") for k in (0, 6))
+    assert set(first.point_data) == {"bone_distance", "stretch", "group"}
+    assert (first["stretch"] == 0).all() and (first["group"] == 0).all()
+    poses, expected = arm_run[0].frames[6].poses, []
+    for bone in arm_run[0].scene.bones:
+        moved = bone.mesh.copy().apply_transform(poses[bone.name])
+        expected.append(-trimesh.proximity.signed_distance(moved, last.points))
+    np.testing.assert_allclose(last["bone_distance"], np.min(expected, axis=0), atol=1e-5)
+    edges = trimesh.Trimesh(last.points, last.regular_faces, process=False).edges_unique
+    vertex = int(np.abs(last["stretch"]).argmax())
+    own = edges[(edges == vertex).any(axis=1)]
+    lengths = [
+        np.linalg.norm(np.diff(d.points[own], axis=1), axis=-1).ravel() for d in (first, last)
+    ]
+    assert abs(last["stretch"][vertex]) > 0.01
+    assert last["stretch"][vertex] == pytest.approx((lengths[1] / lengths[0] - 1).mean(), abs=1e-6)
+
+
 class TestHostileRuns:
     @pytest.mark.parametrize(
         ("change", "word"),
