@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import rbfmuscle
+from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.folders import OutputFolder, write_whole
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import simplified
@@ -169,7 +170,7 @@ class RunWriter:
                 self._write_bone(name, np.eye(4), "", mesh.vertices, mesh.faces)
             if not np.array_equal(self._bones[name][0], pose):
                 if name not in self._light:
-                    self._light[name] = simplified(mesh.vertices, mesh.faces, LIGHT)
+                    self._light[name] = _light_mesh(mesh.vertices, mesh.faces)
                 vertices, faces = self._light[name]
                 moved = vertices @ pose[:3, :3].T + pose[:3, 3]
                 end = _frame_end(frame.index)
@@ -187,6 +188,17 @@ class RunWriter:
         for name in self.folder.listed:
             if name.endswith(f"{_frame_end(frame)}.vtp"):
                 (self.directory / name).unlink(missing_ok=True)
+
+
+def _light_mesh(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
+    """A bone of `LIGHT` triangles, from the cache where it is there."""
+    key = content_key(vertices, faces, ("light", LIGHT))
+    found = load_arrays(key)
+    if found is None:
+        light = simplified(vertices, faces, LIGHT)
+        found = {"vertices": light[0], "faces": light[1]}
+        store_arrays(key, found)
+    return np.asarray(found["vertices"], float), np.asarray(found["faces"], np.int64)
 
 
 def _frame_end(frame: int) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.fibres.published import published_band
+from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import (
     COUNTS,
@@ -87,16 +88,27 @@ def write_report(directory: str | Path, *, pictures: bool = True) -> None:
     """
     directory = Path(directory)
     saved = RunData.load(directory)
-    page = _page(saved)
     if not pictures or not saved.has_surfaces:
+        page = _page(saved)
         why = "they were switched off." if saved.has_surfaces else "this run kept no surfaces."
         page.missing = f"No pictures: {why}"
     else:
+        pages: list[ReportPage] = []
+        # Plots take the interpreter's lock, and pictures leave it.
+        each(
+            lambda draw: draw(),
+            [lambda: pages.append(_page(saved)), lambda: _draw_preview(saved, directory)],
+        )
+        page = pages[0]
         page.scene = packed_scene({"": saved})
-        if len(saved.frames) > 1:
-            preview = directory / "preview.webp"
-            render_run(saved, preview, views=["motion"], area=110_000, most=12, seconds=4.0)
     page.write(directory / "report.html")
+
+
+def _draw_preview(saved: RunData, directory: Path) -> None:
+    """Draw ``preview.webp`` of a run of several frames."""
+    if len(saved.frames) > 1:
+        preview = directory / "preview.webp"
+        render_run(saved, preview, views=["motion"], area=110_000, most=12, seconds=4.0)
 
 
 def packed_scene(runs: Mapping[str, RunData]) -> str:

@@ -2,11 +2,13 @@
 leaves.
 """
 
+import numpy as np
 import pytest
 import trimesh
 from blend_model import arm_scene, files_in, use_blend_model
 from run_folders import timeless
 
+from rbfmuscle.output import writer
 from rbfmuscle.run import Run, simulate, stream_run
 from rbfmuscle.validation import LimitExceededError, SceneWarning, SolveError
 
@@ -118,3 +120,13 @@ class TestStream:
         with pytest.raises(SolveError, match="frame 2: No space left"):
             stream_run(arm_scene(), tmp_path)
         assert Run.load(tmp_path).frame_numbers == [0, 1]
+
+
+def test_light_bones_come_from_the_cache_the_second_time(monkeypatch, tmp_path):
+    monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path))
+    ball = trimesh.creation.icosphere(5)
+    first = writer._light_mesh(ball.vertices, ball.faces)
+    assert len(first[1]) <= writer.LIGHT < len(ball.faces)
+    monkeypatch.delattr(writer, "simplified")
+    for one, other in zip(first, writer._light_mesh(ball.vertices, ball.faces)):
+        np.testing.assert_array_equal(one, other)

@@ -57,17 +57,25 @@ class Lattice:
     def _choose_spacing(self, triangles: Floats, wanted: float) -> None:
         """The coarsest cells that give the wanted nodes, by bisection; ``triangles`` (m, 3, 3)."""
         small, large = 0.01 * self.extent.max(), self.extent.max()
-        for _ in range(25):
+        nodes: dict[tuple[int, ...], int] = {}  # by the number of cells along each axis
+        for _ in range(25):  # a choice: sides to a millionth, which are whole numbers of cells
             side = np.sqrt(small * large)
-            self._lay_cells(triangles, side)
-            self._number_nodes()
-            small, large = (small, side) if len(self.rest) < wanted else (side, large)
-        self._lay_cells(triangles, large)
+            count = self._count_cells(side)
+            if tuple(count) not in nodes:
+                self._lay_cells(triangles, count)
+                self._number_nodes()
+                nodes[tuple(count)] = len(self.rest)
+            small, large = (small, side) if nodes[tuple(count)] < wanted else (side, large)
+        self._lay_cells(triangles, self._count_cells(large))
 
-    def _lay_cells(self, triangles: Floats, side: float) -> None:
-        self.count = np.maximum(1, np.ceil(self.extent / side - 1e-9).astype(int))
+    def _count_cells(self, side: float) -> Integers:
+        """How many cells (3,) of at most this side lie along each axis."""
+        return np.maximum(1, np.ceil(self.extent / side - 1e-9).astype(int))
+
+    def _lay_cells(self, triangles: Floats, count: Integers) -> None:
+        self.count = count
         self.spacing = self.extent / self.count
-        every = np.indices(self.count).reshape(3, -1).T
+        every = np.indices(tuple(count)).reshape(3, -1).T
         middle = self.low + (every + 0.5) * self.spacing
         depth = self.distance(middle @ self.axes)
         half = 0.5 * float(np.linalg.norm(self.spacing))

@@ -9,7 +9,6 @@ et al. 1992; Siegler et al. 2014).
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull
 
 from rbfmuscle.importers.guess.parts import Part
@@ -280,6 +279,8 @@ def fit_coaxial(
         )
 
     start = np.r_[np.zeros(4), radii / size]
+    from scipy.optimize import least_squares
+
     found = least_squares(
         residual, start, loss="soft_l1", f_scale=soft / size, max_nfev=EVALUATIONS
     )
