@@ -367,6 +367,17 @@ def test_tendons_with_meshes_are_tendons_and_those_of_no_use_are_named(leg, tmp_
     assert any("hamstring_origin.ply is not used" in note for note in guess.parts.notes)
 
 
+def test_the_heads_of_the_calf_are_held_above_the_knees_axis(leg_guess):
+    """What is held below it turns with the femur against the rest of the belly, which folds."""
+    guess, _, _ = leg_guess
+    knee = next(joint for joint in guess.joints if joint.name == "knee")
+    for name in ("gastrocnemius_medial", "gastrocnemius_lateral", "plantaris"):
+        muscle = next(muscle for muscle in guess.muscles if muscle.muscle.name == name)
+        held = next(hold for hold in muscle.holds if hold.bone.name == "femur")
+        above = muscle.muscle.points[held.vertices, 2] - knee.centre[2]
+        assert above.min() > 5.0 and len(held.vertices) >= 8 and held.confidence == 1.0
+
+
 def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_path):
     _phantom_meshes(tmp_path)
     two = [
