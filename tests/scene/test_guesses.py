@@ -7,6 +7,7 @@ import trimesh
 from rbfmuscle.scene.articular import articular_points
 from rbfmuscle.scene.guesses import doubtful, find_guesses
 from rbfmuscle.scene.picked import picked_vertices, read_points
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
 
 TEXT = """# Check every line marked GUESS 0.1: this line is a comment
@@ -64,3 +65,58 @@ def test_a_head_is_articular_and_a_far_end_is_not():
     )
     away = np.linalg.norm(found["femur"], axis=1)
     assert len(found["femur"]) > 1000 and away.max() < 1.08 * 20.0 and len(found["pelvis"])
+
+
+def painted_scene(folder, colour, *, doubled=False):
+    """A scene of two bones and a muscle whose ends were painted red and blue; with ``doubled``
+    vertices as a program writes them that splits a mesh by its colours.
+    """
+    muscle = trimesh.creation.icosphere(3).apply_scale([8.0, 8.0, 30.0])
+    if doubled:
+        muscle = trimesh.Trimesh(muscle.triangles.reshape(-1, 3), process=False)
+        muscle.faces = np.arange(len(muscle.vertices)).reshape(-1, 3)
+    height = muscle.vertices[:, 2]
+    paint = np.full((len(height), 4), 255, dtype=np.uint8)
+    paint[height > 24.0] = [250, 5, 3, 255]  # red, a little off as after colour management
+    paint[height < -24.0] = [0, 0, 255, 255]
+    muscle.visual.vertex_colors = paint
+    muscle.export(folder / "muscle.ply")
+    for name, z in (("upper", 45.0), ("lower", -45.0)):
+        ball = trimesh.creation.icosphere(3, 12.0).apply_translation([0.0, 0.0, z])
+        ball.export(folder / f"{name}.ply")
+    file = folder / "scene.toml"
+    bones = "".join(f'[[bone]]\nname = "{n}"\nmesh = "{n}.ply"\n' for n in ("upper", "lower"))
+    file.write_text(
+        f'[scene]\nformat = 1\nunits = "mm"\n{bones}[[muscle]]\nname = "m"\nmesh = "muscle.ply"\n'
+        f'attach = [{{ bone = "upper", colour = "{colour}" }}, '
+        '{ bone = "lower", colour = "#0000ff" }]\n',
+        encoding="utf-8",
+    )
+    return file
+
+
+@pytest.mark.parametrize("doubled", [False, True])
+def test_painted_vertices_are_attached(tmp_path, doubled):
+    (muscle,) = Scene.load(painted_scene(tmp_path, "#ff0000", doubled=doubled)).muscles
+    height = np.asarray(muscle.mesh.vertices)[:, 2]
+    upper, lower = (set(attachment.vertices) for attachment in muscle.attachments)
+    # A vertex that several triangles doubled is painted in all of them.
+    assert upper == set(np.flatnonzero(height > 24.0)) and len(upper) > 20
+    assert lower == set(np.flatnonzero(height < -24.0))
+
+
+@pytest.mark.parametrize(
+    ("colour", "words"),
+    [("#00ff00", "no vertex has the colour #00ff00"), ("red", "must be like '#ff0000'")],
+)
+def test_a_colour_that_is_not_there_is_refused(tmp_path, colour, words):
+    with pytest.raises(SceneError, match=words):
+        Scene.load(painted_scene(tmp_path, colour))
+
+
+def test_a_mesh_without_colours_is_refused_where_one_is_asked_for(tmp_path):
+    file = painted_scene(tmp_path, "#ff0000")
+    mesh = trimesh.load(tmp_path / "muscle.ply", process=False)
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "muscle.ply")
+    with pytest.raises(SceneError, match="holds no vertex colours"):
+        Scene.load(file)
