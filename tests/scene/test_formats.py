@@ -98,6 +98,23 @@ class TestPolygons:
         file.write_text(obj_text(points, faces))
         assert read_mesh(file).mesh.volume == pytest.approx(7.0 * area, rel=1e-9)
 
+    def test_corners_given_twice_count_once(self, tmp_path):
+        points, faces = prism(L_SHAPE)
+        faces[0] = [*faces[0], faces[0][0]]
+        faces[1] = [faces[1][0], *faces[1]]
+        (tmp_path / "prism.obj").write_text(obj_text(points, faces))
+        part = read_part(tmp_path / "prism.obj")
+        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        assert not part.notes and len(part.faces) == 20
+        assert mesh.volume == pytest.approx(20000) and mesh.area == pytest.approx(5800)
+
+    def test_a_file_that_ends_within_its_faces_is_refused(self, tmp_path):
+        whole = ply_bytes(*prism(L_SHAPE), "ascii").decode()
+        file = tmp_path / "cut.ply"
+        file.write_text("\n".join(whole.split("\n")[:-3]) + "\n")
+        with pytest.raises(MeshError, match="declares 8 faces and holds 6"):
+            read_part(file)
+
 
 class TestObj:
     @pytest.mark.parametrize(
@@ -203,6 +220,27 @@ class TestStl:
         file.write_text(stl_text(capsule(), "femur")[: -max(cut, 16)])  # into the last lines
         with pytest.raises(MeshError, match=r"cut off: solid 'femur' has no end|corners of"):
             read_mesh(file)
+
+    @pytest.mark.parametrize(
+        ("old", "new"), [(b"\n", b"\r"), (b"\n", b"\r\n"), (b"", b"\xef\xbb\xbf")]
+    )
+    def test_line_ends_and_marks_of_text_do_not_count(self, tmp_path, old, new):
+        text = stl_text(capsule(), "femur").encode()
+        file = tmp_path / "bone.stl"
+        file.write_bytes(text.replace(old, new) if old else new + text)
+        part = read_part(file)
+        assert part.name == "femur" and len(part.faces) == len(capsule().faces)
+
+    def test_decimal_commas_and_a_count_of_zero_are_named(self, tmp_path):
+        file = tmp_path / "bone.stl"
+        file.write_text(stl_text(capsule(), "femur").replace(".", ","))
+        with pytest.raises(MeshError, match="decimal comma"):
+            read_part(file)
+        content = bytearray(stl_bytes(capsule(), b"exported"))
+        content[80:84] = bytes(4)
+        file.write_bytes(content)
+        with pytest.raises(MeshError, match="declares 0 triangles, and has"):
+            read_part(file)
 
     def test_solids_have_names_that_differ(self, tmp_path):
         two = stl_text(capsule(), "ascii") + stl_text(capsule(60), "ascii")

@@ -238,7 +238,7 @@ def _hold(place, distance, ends, muscle, skeleton):
     points = muscle.points
     sites = place.sites or (whole_bone(bone, skeleton.articular[bone]),)
     near = cKDTree(np.concatenate([site.points for site in sites])).query(points)[0] / millimetre
-    # The nearest place of the bone belongs to a site where the site's points are hardly aside of it.
+    # The nearest place of the bone belongs to a site whose points are hardly aside of it.
     coarse = np.sqrt(bone.mesh.area / len(bone.faces[0])) / millimetre
     on_site = near <= np.hypot(np.maximum(distance, 0.0), TOUCH + coarse)
     chosen, gap = _touching(np.where(on_site, distance, np.inf), ends.along(place.end))

@@ -155,6 +155,8 @@ def _read_stl(content):
         parts.append(_soup("", rows["corners"].astype(np.float64)))
         start = whole
         if count == 0:
+            if len(parts) == 1 and len(content) > start:
+                raise ValueError(f"it declares 0 triangles, and has {len(content):,} bytes")
             break
     if start < len(content):
         more = len(content) - start
@@ -173,6 +175,9 @@ def _is_binary(content):
 
 def _read_stl_text(content):
     parts, name, start = [], b"", None
+    content = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r", b"\n")
+    if re.search(rb"vertex\s+\S*\d,\d", content, re.IGNORECASE):
+        raise ValueError("its numbers have a decimal comma; write them with a point")
     for match in [*_SOLID.finditer(content), None]:
         if start is not None and (match is None or match[1] is None):
             raise ValueError(f"it is cut off: solid {name.decode('utf-8', 'replace')!r} has no end")
@@ -229,12 +234,15 @@ def _read_ply(path, content):
     faces = np.asarray(getattr(mesh, "faces", ()), np.int64).reshape(-1, 3)
     declared = re.search(rb"element\s+face\s+(\d+)", content[:10000])
     if declared and int(declared[1]) != len(faces):
-        return _read_polydata(path)
+        return _read_polydata(path, declared=int(declared[1]))
     return FilePart("", np.asarray(mesh.vertices, np.float64), faces, [])
 
 
-def _read_polydata(path):
+def _read_polydata(path, declared=0):
     found = read_polydata(path)
+    whole = int((np.diff(found.ends) > 0).sum())
+    if whole < declared:
+        raise ValueError(f"it is cut off: it declares {declared} faces and holds {whole}")
     faces, notes = cut_polygons(found.points, found.ends, found.numbers)
     other = max(len(found.line_ends) - 1, 0) + found.single
     if other:

@@ -15,6 +15,7 @@ def cut_polygons(vertices: Floats, ends: Integers, numbers: Integers) -> tuple[I
     ``numbers[ends[k] : ends[k + 1]]``. Every corner is kept, on straight sides too, so that
     neighbours still fit.
     """
+    ends, numbers = _without_repeats(ends, numbers)
     sizes = np.diff(ends)
     notes = []
     if (sizes < 3).any():
@@ -37,6 +38,19 @@ def cut_polygons(vertices: Floats, ends: Integers, numbers: Integers) -> tuple[I
     if crossed:
         notes.append(f"{crossed} polygons cross themselves: their triangles are a guess")
     return triangles, notes
+
+
+def _without_repeats(ends: Integers, numbers: Integers) -> tuple[Integers, Integers]:
+    """Polygons of more than three corners without those that repeat the one before."""
+    sizes = np.diff(ends)
+    before = np.arange(len(numbers)) - 1
+    full = sizes > 0
+    before[ends[:-1][full]] = ends[1:][full] - 1
+    again = (numbers == numbers[before]) & np.repeat(sizes > 3, sizes)
+    if not again.any():
+        return ends, numbers
+    dropped = np.concatenate([[0], np.cumsum(again)])
+    return ends - dropped[ends], numbers[~again]
 
 
 def _normals(points):
