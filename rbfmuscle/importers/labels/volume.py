@@ -72,4 +72,4 @@ class LabelVolume:
         small = min(sizes, key=lambda label: sizes[label])
         share = 100 * count / sizes[small]
         pair = f"{self.name(one)} and {self.name(other)}"
-        return f"{pair} overlap in {count} voxels ({share:.2g} % of {self.name(small)}), both kept"
+        return f"{pair} overlap in {count} voxels ({share:.3g} % of {self.name(small)}), both kept"

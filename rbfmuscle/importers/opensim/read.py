@@ -41,9 +41,10 @@ def _read_model(root, path):
             f"version {root.get('Version', '')[:20]!r} is no number; correct it"
         ) from None
     _take_defaults(node)
-    _name_joints(node)
+    notes = _name_joints(node)
     frames = Frames(node)
     model = OsimModel(plain_name(node.name or path.stem), version, path)
+    model.notes += notes
     model.bodies = list(frames.bodies.values())
     _note_names(model, frames)
     units = node.word("length_units", "meters")
@@ -75,15 +76,24 @@ def _take_defaults(node):
 
 
 def _name_joints(node):
-    """Give joints without names those that OpenSim gives them: the class, numbered from 0."""
+    """Give joints without names those that OpenSim gives them, the class numbered from 0, and of
+    joints of one name all but the first another; notes of these.
+    """
     joints = [one for one in node.iter() if one.tag.endswith("Joint") and one.tag != "Joint"]
-    taken = {one.name for one in joints}
+    names = {one.name for one in joints}
+    taken: set[str] = set()
+    notes = []
     for joint in joints:
-        if not joint.name:
-            names = itertools.chain([""], (f"_{k}" for k in itertools.count()))
-            found = next(f for k in names if (f := joint.tag.lower() + k) not in taken)
-            taken.add(found)
+        found = joint.name
+        if not found or found in taken:
+            stem = found or joint.tag.lower()
+            ends = itertools.chain([""], (f"_{k}" for k in itertools.count()))
+            found = next(f for k in ends if (f := stem + k) not in names | taken)
+            if joint.name:
+                notes.append(f"another joint is named {joint.name!r} too: it is {found!r} here")
             joint.set("name", found)
+        taken.add(found)
+    return notes
 
 
 def _note_names(model, frames):

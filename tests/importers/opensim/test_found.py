@@ -487,3 +487,14 @@ class TestMuscles:
         (one,) = scene.muscles
         assert sorted(held.bone for held in one.attachments) == ["a", "b"]
         assert not scene.doubts
+
+
+def test_joints_of_one_name_keep_their_own_frames(read):
+    """Their frames have equal paths in the file: the second joint would take the first's place."""
+    joints = [pin("one", "ground", "a", 0.0, "0.1 0.2 0.3"), pin("one", "a", "b", 0.5, "0 -0.4 0")]
+    found = read(model("ab", joints))
+    place = found.transforms()["b"]
+    np.testing.assert_allclose(place[:3, 3], [0.1, -0.2, 0.3], atol=1e-12)
+    np.testing.assert_allclose(place[:3, :3], turned(0.5), atol=1e-12)
+    assert found.notes == ["another joint is named 'one' too: it is 'one_0' here"]
+    assert not found.doubts
