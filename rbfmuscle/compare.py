@@ -103,7 +103,7 @@ def compare_models(
     output.add(*FILES)
     first = next(iter(variants.values()))
     last = len(first.motion) - 1
-    poses = sorted({0, last // 2, last})
+    poses = [int(first.motion.numbers[k]) for k in sorted({0, last // 2, last})]
     results, failed = {}, {}
     for name, variant in variants.items():
         try:

@@ -262,25 +262,27 @@ def _check_skeleton(scene: Scene) -> dict[int, Found]:
     """Events and values of the bones for some frames of the motion, and a warning for each pair
     that meets.
     """
-    collisions = bone_collisions(scene)
+    numbers, sampled = scene.motion.numbers.tolist(), sampled_frames(scene)
+    collisions = [(numbers[place], *rest) for place, *rest in bone_collisions(scene, sampled)]
     for finding in bone_findings(collisions, scene.units):
         warnings.warn(f"{finding.place}: {finding.message}", SceneWarning, stacklevel=5)
     for note in scene.motion.notes:
         warnings.warn(f"motion: {note}", SceneWarning, stacklevel=5)
     found: dict[int, Found] = {
-        frame: ([], {"bone_overlap": 0.0, "joint_gap": 0.0}) for frame in sampled_frames(scene)
+        numbers[place]: ([], {"bone_overlap": 0.0, "joint_gap": 0.0}) for place in sampled
     }
     for frame, first, second, depth in collisions:
         events, values = found.setdefault(frame, ([], {}))
         events.append(Event(frame, "", f"{first} and {second}", 1, "bones_overlap"))
         values["bone_overlap"] = max(values.get("bone_overlap", 0.0), depth)
-    events, values = found.setdefault(0, ([], {}))
-    events.extend(Event(0, "", name, 1, "missing_bone") for name in scene.missing_bones)
+    events, values = found.setdefault(numbers[0], ([], {}))
+    events.extend(Event(numbers[0], "", name, 1, "missing_bone") for name in scene.missing_bones)
     values["missing_bones"] = float(len(scene.missing_bones))
     if doubts := doubtful(scene.guesses, "joint"):
         values["doubtful_guesses"] = float(len(doubts))
     opened = scene.length(LIMITS["joint_gap"].value)
-    for frame, parent, child, opening in joint_gaps(scene, sampled_frames(scene)):
+    for place, parent, child, opening in joint_gaps(scene, sampled):
+        frame = numbers[place]
         events, values = found.setdefault(frame, ([], {}))
         values["joint_gap"] = max(values.get("joint_gap", 0.0), opening)
         if opening > opened:

@@ -44,8 +44,9 @@ def frame_rows(
     """
     name, angle = _leading_coordinate(scene, frame, before)
     together = dict(measured.get(ALL, {}))
-    if scene.motion.times is not None:
-        together["time"] = scene.motion.times[frame.index]
+    time = scene.motion.time(frame.index)
+    if time is not None:
+        together["time"] = time
     together["time_frame"] = frame.wall
     unit = {quantity: unit_text(kind, scene.units) for quantity, (kind, _) in QUANTITIES.items()}
     return [

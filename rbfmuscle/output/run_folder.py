@@ -134,10 +134,10 @@ def _whole_frames(info: RunInfo, directory: Path, poses: Poses) -> list[FrameInf
     return [
         FrameInfo(
             frame=frame,
-            coordinates=planned[frame] if frame < len(planned) else {},
+            coordinates=planned[place] if place < len(planned) else {},
             wall=None,
         )
-        for frame, placed in poses.items()
+        for place, (frame, placed) in enumerate(poses.items())
         if set(placed) >= bones
         and all(surface_file(directory, name, frame).is_file() for name in meshes)
     ]

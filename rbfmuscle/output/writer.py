@@ -123,8 +123,8 @@ class RunWriter:
 
     def _write(self, frame, rows):
         if self.meshes:
-            times = self.scene.motion.times
-            step = frame.index if times is None else times[frame.index]
+            time = self.scene.motion.time(frame.index)
+            step = frame.index if time is None else time
             surfaces = self._write_surfaces(frame)
             self._collections["bones"].add(step, self._write_bones(frame))
             self._collections["surfaces"].add(step, surfaces)
@@ -270,10 +270,10 @@ def frame_facts(scene: Scene, frame: Frame) -> dict:
     """What ``run.json`` says of a written frame; coordinates in degrees, those of shifts in scene
     units.
     """
-    times = scene.motion.times
+    time = scene.motion.time(frame.index)
     return {
         "frame": frame.index,
-        **({} if times is None else {"time": times[frame.index]}),
+        **({} if time is None else {"time": time}),
         "coordinates": {
             name: shown_value(scene, name, value) for name, value in frame.coordinates.items()
         },

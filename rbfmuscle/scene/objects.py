@@ -117,6 +117,12 @@ class Motion:
         spans = {name: np.ptp([frame.get(name, 0.0) for frame in self.frames]) for name in names}
         return sorted((name for name in names if spans[name] > 0), key=lambda name: -spans[name])
 
+    def time(self, number: int) -> float | None:
+        """Time of the frame of a number [s], None where the motion has none."""
+        if self.times is None:
+            return None
+        return self.times[int(np.flatnonzero(self.numbers == number)[0])]
+
     def __len__(self) -> int:
         return len(self.frames)
 

@@ -182,6 +182,11 @@ class FrameLoop:
                 library.set_num_threads(threads)
             self._wall += time.perf_counter() - start
 
+    def _number(self, place: int) -> int:
+        """Number in the whole motion of the frame at a place; the place where there is none."""
+        numbers = self.scene.motion.numbers
+        return int(numbers[place]) if place < len(numbers) else place
+
     def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, Path]:
         """For each muscle the coordinates and the activations of its sub-steps to the next
         frame.
@@ -191,7 +196,7 @@ class FrameLoop:
         self.here = completed(self.scene, coordinates)
         paths: dict[str, Path] = {}
         for stepper in self.steppers:
-            stepper.frame = self._next_index
+            stepper.frame = self._number(self._next_index)
             paths[stepper.name] = [here, *stepper.split(here, self.here)], []
         if any(stepper.rigid_transport is None for stepper in self.steppers):
             # Muscles that slide or contract share the sub-steps of the one that has the most.
@@ -216,7 +221,7 @@ class FrameLoop:
         found = [stepper.collect() for stepper in self.steppers]
         times = dict(zip(carried, (times for times, _, _ in found)))
         poses = self._poses(self.here)
-        index = self._next_index - 1
+        index = self._number(self._next_index - 1)
         surfaces = dict(zip(carried, drawn))
         events = [event for _, events, _ in found for event in events]
         events += self._find_tendons(poses)
@@ -242,12 +247,12 @@ class FrameLoop:
         """Ask for the ends of all tendons, whose poses are found, and kept, when they are first
         asked for; the events of those that did not settle.
         """
-        events = []
+        events, number = [], self._number(self._next_index - 1)
         for stepper in self.steppers:
             for end in self.scene.muscle(stepper.name).tendons:
                 poses[end.name]
                 if not poses.tendons[end.name].settled:
-                    events.append(Event(self._next_index - 1, stepper.name, "", 1, "iteration_cap"))
+                    events.append(Event(number, stepper.name, "", 1, "iteration_cap"))
         return events
 
 

@@ -2,6 +2,8 @@
 leaves.
 """
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,8 +11,9 @@ from blend_model import arm_scene, files_in, use_blend_model
 from run_folders import timeless
 
 from rbfmuscle.output import writer
+from rbfmuscle.output.export import export_run
 from rbfmuscle.run import Run, simulate, stream_run
-from rbfmuscle.validation import LimitExceededError, SceneWarning, SolveError
+from rbfmuscle.validation import LimitExceededError, SceneWarning, SolveError, UsageError
 
 
 @pytest.fixture(autouse=True)
@@ -130,3 +133,30 @@ def test_light_bones_come_from_the_cache_the_second_time(monkeypatch, tmp_path):
     monkeypatch.delattr(writer, "simplified")
     for one, other in zip(first, writer._light_mesh(ball.vertices, ball.faces)):
         np.testing.assert_array_equal(one, other)
+
+
+def test_frames_keep_the_numbers_of_the_motion(tmp_path):
+    """In memory, in every table and file, and where a run was killed before it ended."""
+    scene = arm_scene(end=60, step=10)
+    scene.motion.times = [0.5 * k for k in range(7)]
+    run = simulate(scene, frames="1::2")
+    run.save(tmp_path / "run")
+    saved = Run.load(tmp_path / "run")
+    for each in (run, saved):
+        assert [frame.index for frame in each.frames] == [1, 3, 5]
+        assert each.series("biceps", "volume")[0].tolist() == [1, 3, 5]
+        assert each.series("all", "time")[1].tolist() == [0.5, 1.5, 2.5]
+        assert each.frame(3).coordinates["elbow.flexion"] == pytest.approx(np.radians(30))
+        assert each.caption(5) == "frame 5, 2.5 s, elbow.flexion 50°"
+        with pytest.raises(UsageError, match="frame 2 was not written"):
+            each.frame(2)
+    names = sorted(path.name for path in (tmp_path / "run/surfaces").iterdir())
+    assert names == [f"biceps_{k:04d}.vtp" for k in (1, 3, 5)]
+    exported = export_run(saved, "ply", output=tmp_path / "out", frames=slice(1, None))
+    assert {"biceps_0003.ply", "biceps_0005.ply"} < {path.name for path in exported}
+    path = tmp_path / "run/run.json"
+    info = json.loads(path.read_text(encoding="utf-8"))
+    planned = [entry["coordinates"] for entry in info["frames"]]
+    path.write_text(json.dumps(info | {"status": "running", "planned": planned, "frames": []}))
+    killed = Run.load(tmp_path / "run")
+    assert killed.frame(3).coordinates["elbow.flexion"] == pytest.approx(np.radians(30))

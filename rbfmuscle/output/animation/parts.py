@@ -105,7 +105,8 @@ def read_animation(run: RunData, frames: list[int], *, unit: str) -> Animation:
         poses = np.array([run.frame(frame).poses[name] for frame in frames])
         poses[:, :3, 3] *= factor
         bones.append(AnimatedMesh(name, look.BONE_COLOUR, [vertices * factor], [faces], poses))
-    times = run.info.scene.motion.times
+    given = run.info.scene.motion.times
+    times = None if given is None else dict(zip(run.frame_numbers, given))
     name = str(run.info.scene.name or (run.directory.name if run.directory else "run"))
     if times is not None and np.any(np.diff([times[k] for k in frames]) <= 0.0):
         times = None  # no animation: they stand still, or go backwards
