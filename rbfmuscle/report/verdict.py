@@ -89,6 +89,8 @@ def describe_excess(row: Exceedance, table: Table, missing_bones: Sequence[str] 
     muscle, quantity, worst, limit, frame = row
     unit = table[muscle][quantity]["unit"]
     value = shown_number(worst, unit)
+    if value.startswith("<"):  # less than is shown elsewhere, and beyond a limit all the same
+        value = f"{worst:.3g} {unit}".removesuffix(" 1")
     place = "the bones" if muscle == ALL else muscle
     quantity, _, coordinate = quantity.partition(":")
     title = LIMITS[quantity].title if quantity in LIMITS else quantity

@@ -160,6 +160,13 @@ def test_the_worst_by_its_limit_is_named_first_and_bones_are_named_too():
     assert [said.count(LIMITS[name].remedy) for name in ("flicker", "joint_gap")] == [1, 1]
 
 
+def test_a_value_beyond_its_limit_is_shown_however_small():
+    said = describe_verdict(
+        facts({"rest_error_rms": [0.0097]}), parse_limits("rest_error_rms=0.001", arm_scene())
+    )
+    assert "rest error 0.0097 mm at frame 0 (limit 0.001)" in said
+
+
 def test_limits_of_the_command_line_follow_the_unit():
     limits = parse_limits("all,flicker=2", arm_scene(units="m"))
     assert limits.values["penetration_max"] == pytest.approx(0.0001)
