@@ -95,7 +95,8 @@ def measure(scene: rm.Scene, model: str | None) -> tuple[list[tuple], float]:
         worst = {
             q: abs(run.values(name, q)).max(initial=0.0) for q in WORST if q in run.summary[name]
         }
-        flicker = run.values(name, "flicker")
+        measured = "flicker" in run.summary[name]
+        flicker = run.values(name, "flicker") if measured else np.zeros(1)
         rows.append(
             (
                 name,

@@ -22,7 +22,7 @@ from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.frame_loop import simulate_frames
 
 MODELS = ("rbf", "pbd", "pbd-converged", "xpbd", "arap-pbd", "arap-volume")
-MUSCLES = ("extensor", "anterior_adductor")
+MUSCLES = ("extensor", "adductor_anterior")
 COLUMNS = ["model", "sweeps", "time / pbd", "distance from RBF", "return"]
 
 

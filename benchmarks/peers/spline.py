@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from peers.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.geometry.arrays import MeshLike
-from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
+from rbfmuscle.geometry.bsplines import bspline_weights
 from rbfmuscle.validation import check_points
 
 
@@ -72,8 +72,23 @@ def _spline_loop(points, origin, spacing, coefficients, distance, gradient):
             u = min(max(u, 1.0), coefficients.shape[k] - 2.000001)
             base[k] = int(u) - 1
             bspline_weights(u - int(u), weight[k], slope[k])
-        value, gx, gy, gz = bspline_sum(coefficients, base, weight, slope)
-        distance[n] = value
-        gradient[n, 0] = gx / spacing
-        gradient[n, 1] = gy / spacing
-        gradient[n, 2] = gz / spacing
+        distance[n] = 0.0
+        gradient[n] = 0.0
+        for a in range(4):
+            line = 0.0
+            side = 0.0
+            lean = 0.0
+            for b in range(4):
+                here = 0.0
+                along = 0.0
+                for c in range(4):
+                    node = coefficients[base[0] + a, base[1] + b, base[2] + c]
+                    here += weight[2, c] * node
+                    along += slope[2, c] * node
+                line += weight[1, b] * here
+                side += slope[1, b] * here
+                lean += weight[1, b] * along
+            distance[n] += weight[0, a] * line
+            gradient[n, 0] += slope[0, a] * line / spacing
+            gradient[n, 1] += weight[0, a] * side / spacing
+            gradient[n, 2] += weight[0, a] * lean / spacing
