@@ -1,6 +1,6 @@
 """What the confidence of guessed attachments is worth: leg and hip, changed, against their scenes.
 
-    python benchmarks/guess_confidence.py [--write] [CASE ...]
+    python benchmarks/guess_confidence.py [CASE ...] [-o FILE.json]
 
 Each case writes the meshes of data/leg or data/hip changed (renamed, mirrored, turned, scaled, in
 another unit, stretched, decimated, roughened, with muscles or bones missing), guesses a scene and
@@ -12,7 +12,6 @@ these two skeletons, so this measures how the guess bears change, not how it doe
 
 import argparse
 import json
-import sys
 import tempfile
 import tomllib
 from pathlib import Path
@@ -20,13 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from evidence import ROOT, data_folder, write_evidence
+from evidence import data_folder, write_evidence
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.importers.guess.guess import guess_scene
 
-FILE = ROOT / "docs" / "evidence" / "guess_confidence.json"
+COLUMNS = ["confidence", "guesses", "wrong", "%"]
 FAR = 15.0  # [mm] at scale 1
 PREFIXES = {
     "plain": "{}",
@@ -179,34 +178,32 @@ def is_wrong(muscle, hold, true, case):
 
 
 def main():
-    """Measure, print, and write the evidence with --write."""
+    """Measure, print, and write the evidence with -o."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("cases", nargs="*", help="names of cases, or parts of them")
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
-    table = {}
+    parser.add_argument("-o", "--output", type=Path)
+    given = parser.parse_args()
     counts = {}
     for case in CASES:
-        if options.cases and not any(word in case.name for word in options.cases):
+        if given.cases and not any(word in case.name for word in given.cases):
             continue
         rows = guessed(case)
         for _, _, sure, wrong in rows:
-            counts.setdefault(f"{sure:.1f}", [0, 0])
-            counts[f"{sure:.1f}"][0] += 1
-            counts[f"{sure:.1f}"][1] += wrong
+            found = counts.setdefault(f"{sure:.1f}", [0, 0])
+            found[0] += 1
+            found[1] += wrong
         sure = [row for row in rows if row[2] >= 1.0]
         bad = [row[:2] for row in sure if row[3]]
-        table[case.name] = {"guesses": len(rows), "sure": len(sure), "sure_and_wrong": len(bad)}
-        print(f"{case.name}: {len(rows)} guesses, {len(sure)} called 1.0, wrong of these {bad}")
-        sys.stdout.flush()
-    for sure, (count, wrong) in sorted(counts.items(), reverse=True):
-        print(f"confidence {sure}: {count} guesses, {wrong} wrong ({100 * wrong / count:.1f} %)")
-    if options.write:
-        by_confidence = {
-            sure: {"guesses": count, "wrong": wrong} for sure, (count, wrong) in counts.items()
-        }
-        command = ["benchmarks/guess_confidence.py"]
-        write_evidence(FILE, command, table, by_confidence=by_confidence, far_mm=FAR)
+        words = f"{len(rows)} guesses, {len(sure)} called 1.0, wrong of these {bad}"
+        print(f"{case.name}: {words}", flush=True)
+    table = [
+        [sure, count, wrong, 100 * wrong / count]
+        for sure, (count, wrong) in sorted(counts.items(), reverse=True)
+    ]
+    for row in table:
+        print("confidence {}: {} guesses, {} wrong ({:.1f} %)".format(*row))
+    if given.output:
+        write_evidence(given.output, ["benchmarks/guess_confidence.py"], table, COLUMNS)
 
 
 if __name__ == "__main__":

@@ -42,6 +42,7 @@ COMMANDS = {
     "interpolation": "interpolation.py",
     "hip_fibres": "hip_moment_arms.py",
     "leg_arms": "leg_arms.py",
+    "guess_confidence": "guess_confidence.py",
 }
 
 
