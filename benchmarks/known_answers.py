@@ -123,7 +123,7 @@ def settled(sweeps, spacing):
     """
     return lambda h: {
         "fibre_exponent": 0.0,
-        "slack": 1.0,
+        "slack_ratio": 1.0,
         "iterations": round(sweeps * (spacing / h) ** 2),
     }
 
@@ -201,7 +201,7 @@ def bent_tables():
     table("bent, pbd settled", mesh_levels("pbd", meshes, settled(2000, 4.0)), bent, keys)
     table("bent, xpbd by default", mesh_levels("xpbd", meshes), bent, keys)
     table("bent, arap-volume by default", mesh_levels("arap-volume", meshes), bent, keys)
-    stiff = {"slack": 1.0, "iterations": 100}
+    stiff = {"slack_ratio": 1.0, "iterations": 100}
     table(
         "bent, arap-volume settled",
         mesh_levels("arap-volume", (*meshes, 1.5), lambda h: stiff),
@@ -351,7 +351,7 @@ def rbf_errors(nodes):
     over = {name: wrapped(name, model, 1.5) for name in TURNS}
     found = [
         stretched(1.2, model, 1.5)["radius"],
-        bent({**model, "slack": 1.0}, 2.0)["path"],
+        bent({**model, "slack_ratio": 1.0}, 2.0)["path"],
         over["cylinder"]["path"],
         over["sphere"]["path"],
         over["cylinder"]["radius"],

@@ -65,7 +65,7 @@ class PBDMuscle:
         self.name = muscle.name
         self.options = options or PBDOptions()
         self.rest = RestState.from_muscle(muscle, scene, self.options)
-        slack = self.options.slack
+        slack = self.options.slack_ratio
         contracts = muscle.contraction is not None
         self.fibres = (
             MeshFibres(muscle, self.rest, slack=slack) if contracts or slack > 1.0 else None

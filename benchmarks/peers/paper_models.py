@@ -50,7 +50,7 @@ class PaperMuscle(PBDMuscle):
     """Plain PBD as printed: vertices keep their velocity, fibres have no slack."""
 
     def __init__(self, muscle, scene, options):
-        options = options.model_copy(update={"slack": 1.0})
+        options = options.model_copy(update={"slack_ratio": 1.0})
         super().__init__(muscle, scene, options, method=Method(PaperShape, 3))
         self.contact = DeepestContact(reach=self.contact.reach)
         self.before = self.points.copy()

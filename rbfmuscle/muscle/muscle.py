@@ -251,7 +251,7 @@ def _build_solid(
     fibres = model.fibres._replace(
         direction=np.ascontiguousarray(along),
         passive=np.full(count, 1.5 * (options.fibre_ratio - 1.0)),
-        lower=np.full(count, 1.0 / options.slack),
+        lower=np.full(count, 1.0 / options.slack_ratio),
     )
     model = model._replace(fibres=fibres)
     if muscle.contraction is None:

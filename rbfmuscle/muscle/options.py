@@ -33,14 +33,13 @@ class RBFOptions(Table):
     rest. A ridge keeps the ``condition`` of every fit below a bound, 0 for 1e10 where the kernel
     has a shape parameter and none where not. ``samples`` of the surface meet the bones. ``nodes``
     of the elastic solid that carries the centres, and the greatest number of ``iterations`` of a
-    solve. Fibres shorten without resistance from their length in the scan to 1 / ``slack`` of it
-    (1: no slack); beyond, the solid is stiffer along them than across by ``fibre_ratio``, a ratio
-    of Young's moduli. ``surface`` is shown by
-    a mesh of the ``material`` that is brought onto the level set, by the same mesh ``embedded`` in
-    the solid without a field, or by ``marching`` cubes; ``resolution`` is the number of edges or
-    cells along the longest side, 0 for the input mesh. ``placement`` of the centres:
-    ``greedy`` where a fit misses the surface, or ``fitted`` beside it so that all of it is met, for
-    slower fits.
+    solve. Fibres shorten without resistance from their length in the scan to 1 / ``slack_ratio`` of
+    it (1: no slack); beyond, the solid is stiffer along them than across by ``fibre_ratio``, a
+    ratio of Young's moduli. ``surface`` is shown by a mesh of the ``material`` that is
+    brought onto the level set, by the same mesh ``embedded`` in the solid without a field, or by
+    ``marching`` cubes; ``resolution`` is the number of edges or cells along the longest side, 0 for
+    the input mesh. ``placement`` of the centres: ``greedy`` where a fit misses the surface, or
+    ``fitted`` beside it so that all of it is met, for slower fits.
     """
 
     centres: Annotated[int, Field(ge=0, le=20_000)] = 0
@@ -48,7 +47,7 @@ class RBFOptions(Table):
     samples: Annotated[int, Field(ge=50, le=200_000)] = 4000
     nodes: Annotated[int, Field(ge=30, le=3000)] = 150
     iterations: Annotated[int, Field(ge=1, le=1000)] = 24
-    slack: Annotated[float, Field(ge=1.0, le=5.0)] = 1.6
+    slack_ratio: Annotated[float, Field(ge=1.0, le=5.0)] = 1.6
     surface: Literal["material", "embedded", "marching"] = "material"
     resolution: Annotated[int, Field(ge=0, le=1000)] = 0
     kernel: Annotated[str, AfterValidator(_known_kernel)] = "cubic"

@@ -255,7 +255,7 @@ class Scene(SceneContents):
         scale, mirror, transform
             Where the mesh and the fibres lie, as for a bone.
         **contraction
-            ``activation``, ``fibre_stretch_at_rest``, ``tendon``.
+            ``activation``, ``fibre_stretch_at_rest``, ``tendon_region``.
         """
         check_new_name(self.muscles, name, "muscle")
         lies = mesh_transform(scale, mirror, transform, context=f"muscle {name!r}: ")

@@ -13,6 +13,8 @@ FORMAT = 2
 MAIN = "main"  # the class of all muscles, once [defaults]
 TYPES = {"fixed": "weld", "slider": "slide"}
 RENAMED = {"left_out": "missing_bones"}
+MUSCLE_KEYS = {"tendon": "tendon_region"}
+MODEL_KEYS = {"slack": "slack_ratio"}
 
 Tables = dict[str, Any]
 
@@ -54,9 +56,14 @@ def _joint(row: object) -> object:
 
 def _muscle(row: object) -> object:
     """A muscle, or defaults, whose balls are points with a radius."""
-    if not isinstance(row, dict) or not isinstance(row.get("attach"), list):
+    if not isinstance(row, dict):
         return row
-    return row | {"attach": [_attachment(entry) for entry in row["attach"]]}
+    new = {MUSCLE_KEYS.get(key, key): value for key, value in row.items()}
+    if isinstance(model := row.get("model"), dict):
+        new["model"] = {MODEL_KEYS.get(key, key): value for key, value in model.items()}
+    if isinstance(row.get("attach"), list):
+        new["attach"] = [_attachment(entry) for entry in row["attach"]]
+    return new
 
 
 def _attachment(entry: object) -> object:
@@ -79,6 +86,9 @@ _EDITS: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ...]
         re.compile(r"^(\s*)(" + "|".join(RENAMED) + r")(\s*=)", re.M),
         lambda found: found[1] + RENAMED[found[2]] + found[3],
     ),
+    (re.compile(r"^(\s*)tendon(\s*=)", re.M), r"\g<1>tendon_region\g<2>"),
+    (re.compile(r"^(\s*\[muscle\.)tendon(\])", re.M), r"\g<1>tendon_region\g<2>"),
+    (re.compile(r"\bslack(\s*=)"), r"slack_ratio\g<1>"),
     (_BALL, r"points = [\1], radius = \2"),
 )
 _JOINT = re.compile(r"^\s*\[\[joint\]\]", re.M)

@@ -35,7 +35,7 @@ MODELS = {
             "resolution": 16,
             "kernel": "quintic",
             "epsilon": 0.02,
-            "slack": 1.3,
+            "slack_ratio": 1.3,
             "placement": "fitted",
             "surface": "marching",
             "fibre_ratio": 2.0,
@@ -51,7 +51,7 @@ MODELS = {
             "bending": 0.8,
             "edge_compliance": 0.1,
             "bending_compliance": 0.1,
-            "slack": 1.2,
+            "slack_ratio": 1.2,
         },
     ),
 }

@@ -53,11 +53,11 @@ def test_activation_zero_changes_nothing_to_the_last_digit(model):
 def test_shapes_do_not_depend_on_how_activation_gets_there(model):
     settings = {"output.surfaces": False}
     if model != "rbf":  # slack fibres of a mesh have no tension that would bring them back
-        settings["model.slack"] = 1.0
+        settings["model.slack_ratio"] = 1.0
     reached = []
     for count in (2, 10):
         scene = spindle_scene(
-            model=model, frames=2 * count, spacing=5.0, activation=[0, 1, 0], tendon=TENDON
+            model=model, frames=2 * count, spacing=5.0, activation=[0, 1, 0], tendon_region=TENDON
         )
         run = rm.simulate(scene, settings=settings)
         reached.append(carried(run, count))
@@ -89,7 +89,7 @@ def test_snapshot_holds_the_activation():
 
 @pytest.mark.parametrize("model", MODELS)
 def test_spindle_between_fixed_ends_thickens_and_keeps_its_volume(model):
-    run = rm.simulate(spindle_scene(model=model, frames=2, spacing=4.0, tendon=TENDON))
+    run = rm.simulate(spindle_scene(model=model, frames=2, spacing=4.0, tendon_region=TENDON))
     # Interleaved ARAP leaves a volume step undone by its last global step, as without activation.
     assert np.abs(run.values(MUSCLE, "volume_error")).max() < (1e-10)
     x = carried(run, 0)[:, 0]
@@ -124,7 +124,7 @@ def test_free_bar_is_as_thick_as_its_volume_says(model, stretch):
 )
 def test_spindle_lies_near_finite_elements(model, rms, csa, length):
     kept = np.load(DATA)
-    run = rm.simulate(spindle_scene(model=model, frames=2, tendon=TENDON))
+    run = rm.simulate(spindle_scene(model=model, frames=2, tendon_region=TENDON))
     surface = run.frames[-1].surfaces[MUSCLE]
     found = compare_spindle(surface.vertices, surface.faces, 1.0, kept)
     assert found["rms"] < rms  # mm

@@ -209,7 +209,7 @@ OPTIONS = (
     "samples",
     "iterations",
     "nodes",
-    "slack",
+    "slack_ratio",
     "fibre_ratio",
     "epsilon",
     "placement",

@@ -11,8 +11,10 @@ from rbfmuscle.metrics.centreline import belly_measures
 
 
 def test_run_reports_what_contracts():
-    tendon = {"length": 100.0, "strain": 0.08}
-    run = rm.simulate(spindle_scene(spacing=5.0, frames=2, model="arap-volume", tendon=tendon))
+    region = {"length": 100.0, "strain": 0.08}
+    run = rm.simulate(
+        spindle_scene(spacing=5.0, frames=2, model="arap-volume", tendon_region=region)
+    )
     assert run.values(MUSCLE, "activation") == pytest.approx([0.0, 0.5, 1.0])
     for quantity in ("csa_max", "belly_thickness"):
         assert np.diff(run.values(MUSCLE, quantity))[-1] > 0.0, quantity

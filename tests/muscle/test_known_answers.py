@@ -18,10 +18,10 @@ class TestStretchedBar:
     @pytest.mark.parametrize(
         ("model", "stretch", "spacing", "radius", "path"),
         [
-            ({**FINE_RBF, "slack": 1.0}, 0.8, 1.5, 0.01, 0.003),
+            ({**FINE_RBF, "slack_ratio": 1.0}, 0.8, 1.5, 0.01, 0.003),
             # A slack bar that is pushed shortens more where its held ends do not keep it from
             # thickening.
-            ({**FINE_RBF, "slack": 1.6}, 1.2, 1.5, 0.01, 0.003),
+            ({**FINE_RBF, "slack_ratio": 1.6}, 1.2, 1.5, 0.01, 0.003),
             ({"name": "arap-volume"}, 1.2, 2.0, np.inf, 0.001),
         ],
     )
@@ -42,7 +42,7 @@ class TestStretchedBar:
 class TestBentBar:
     def test_path_arc_and_radius(self):
         # Slack fibres on the inside of the bend would let the middle line become shorter.
-        found = study.bent({**FINE_RBF, "slack": 1.0}, 2.0)
+        found = study.bent({**FINE_RBF, "slack_ratio": 1.0}, 2.0)
         assert max(abs(found["path"]), abs(found["arc"])) < 0.006 and abs(found["radius"]) < 0.01
         # Mesh models need to settle.
         settled = {"name": "pbd", "fibre_exponent": 0.0, "iterations": 1000}

@@ -253,7 +253,11 @@ def test_solve_that_is_cut_short_says_so_and_its_residual_shrinks_with_iteration
 def test_extensor_lies_near_finite_elements_of_the_same_passive_law(file, asked, limits):
     with np.load(DATA / file) as kept:
         kept = dict(kept)
-    asked = {"model.slack": 1.0, "model.fibre_ratio": float(kept.get("fibre_ratio", 1.0)), **asked}
+    asked = {
+        "model.slack_ratio": 1.0,
+        "model.fibre_ratio": float(kept.get("fibre_ratio", 1.0)),
+        **asked,
+    }
     rows = import_module("fe_reference").distances("rbf", kept, settings=asked)
     assert [rms < limit for (_, rms, _, _), limit in zip(rows, limits, strict=True)] == [True] * 3
     # The surface is extracted at the rest volume.

@@ -25,7 +25,9 @@ def scene(**keys):
 
 
 def test_fibres_of_a_mesh_are_slack_pull_or_yield_by_the_law():
-    made = scene(fibre_stretch_at_rest=1.25, tendon={"length": 100.0, "strain": 0.05}, model="pbd")
+    made = scene(
+        fibre_stretch_at_rest=1.25, tendon_region={"length": 100.0, "strain": 0.05}, model="pbd"
+    )
     fibres = build_model(made.muscle(MUSCLE), made).fibres
     belly = ~fibres.at_tendon
     assert belly.any() and fibres.at_tendon.any()
@@ -54,7 +56,7 @@ def test_sub_steps_follow_activation_and_settle_where_bones_stand_still():
 
 
 def test_tendon_is_measured_from_the_attachments_or_from_one():
-    made = scene(tendon={"length": 60.0})
+    made = scene(tendon_region={"length": 60.0})
     muscle = made.muscle(MUSCLE)
     x = np.asarray(muscle.mesh.vertices)[:, 0]
     held = np.zeros(len(x), bool)
@@ -62,7 +64,9 @@ def test_tendon_is_measured_from_the_attachments_or_from_one():
     tendon = resolve_contraction(muscle).tendon
     assert tendon[held].all()
     assert np.abs(x[tendon & ~held]).min() == pytest.approx(100.0, abs=6.0)  # an edge of the mesh
-    one = resolve_contraction(scene(tendon={"length": 60.0, "at": "origin"}).muscle(MUSCLE)).tendon
+    one = resolve_contraction(
+        scene(tendon_region={"length": 60.0, "at": "origin"}).muscle(MUSCLE)
+    ).tendon
     assert np.array_equal(one, tendon & (x < 0))
 
 
@@ -73,9 +77,9 @@ def test_tendon_is_measured_from_the_attachments_or_from_one():
         ({"activation": float("nan")}, "from 0 to 1"),
         ({"activation": "full"}, "got 'full'"),
         ({"activation": {"at": 1}}, "unknown key 'at'"),
-        ({"tendon": {"length": 400.0}}, "covers all"),
-        ({"tendon": {"length": 0.01}}, "make it longer"),
-        ({"tendon": {"length": 5.0, "at": "insertoin"}}, "did you mean 'insertion'"),
+        ({"tendon_region": {"length": 400.0}}, "covers all"),
+        ({"tendon_region": {"length": 0.01}}, "make it longer"),
+        ({"tendon_region": {"length": 5.0, "at": "insertoin"}}, "did you mean 'insertion'"),
         ({"fibre_strech_at_rest": 0.5}, "did you mean 'fibre_stretch_at_rest'"),
     ],
 )

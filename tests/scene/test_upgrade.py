@@ -48,10 +48,11 @@ axes = { out = [1, 0, 0] }
 ramp = { "elbow.flexion" = { from = 0, to = 10, step = 5 } }
 
 [defaults]
-model = "pbd"
+model = { name = "pbd", slack = 1.3 }
 [[muscle]]
 name = "biceps"
 mesh = "biceps.ply"
+tendon = { length = 4 }
 attach = [
   { bone = "upper", sphere = { centre = [-26, 0, 9.5], radius = 8.5 } },   # a ball
   { bone = "fore", vertices = "fore.txt" },
@@ -103,6 +104,8 @@ def test_upgrade_keeps_comments_and_meaning(old, caplog):
         ('type = "ball"   # of one turn', 'type = "hinge"   # of one turn'),
         ("type = 'slider'", "type = 'slide'"),
         ("[defaults]", "[classes.main]"),
+        ('model = { name = "pbd", slack = 1.3 }', 'model = { name = "pbd", slack_ratio = 1.3 }'),
+        ("tendon = { length = 4 }", "tendon_region = { length = 4 }"),
         (
             '  { bone = "upper", sphere = { centre = [-26, 0, 9.5], radius = 8.5 } },   # a ball',
             '  { bone = "upper", points = [[-26, 0, 9.5]], radius = 8.5 },   # a ball',

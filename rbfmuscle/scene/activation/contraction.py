@@ -16,7 +16,7 @@ from rbfmuscle.scene.activation.keys import (
     ActivationTable,
     Contraction,
     ContractionTable,
-    TendonTable,
+    TendonRegionTable,
 )
 from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.objects import Motion, Muscle
@@ -38,7 +38,7 @@ def resolve_contraction(muscle: Muscle) -> Contraction:
     """
     keys = muscle.contraction or ContractionTable()
     _check_fibres(muscle)
-    stretch, tendon = keys.fibre_stretch_at_rest, keys.tendon
+    stretch, tendon = keys.fibre_stretch_at_rest, keys.tendon_region
     strain = TENDON_STRAIN if tendon is None else tendon.strain
     return Contraction(stretch or 1.0, _tendon(muscle, tendon), strain, stretch is not None)
 
@@ -58,12 +58,12 @@ def _check_fibres(muscle):
             )
 
 
-def _tendon(muscle: Muscle, given: TendonTable | None) -> Booleans:
+def _tendon(muscle: Muscle, given: TendonRegionTable | None) -> Booleans:
     """Vertices (n,) that are tendon: up to a length from the attachments."""
     free = np.ones(len(muscle.mesh.vertices), dtype=bool)
     if given is None:
         return ~free
-    context = f"muscle {muscle.name!r} tendon"
+    context = f"muscle {muscle.name!r} tendon_region"
     bones = [attachment.bone for attachment in muscle.attachments]
     if given.at is not None and given.at not in bones:
         raise SceneError(

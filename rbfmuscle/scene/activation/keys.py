@@ -11,12 +11,12 @@ from rbfmuscle.scene.options import FileName, Finite, Positive, Table
 from rbfmuscle.scene.storage import read_storage
 from rbfmuscle.validation import SceneError, did_you_mean
 
-KEYS = ("activation", "fibre_stretch_at_rest", "tendon")
+KEYS = ("activation", "fibre_stretch_at_rest", "tendon_region")
 TENDON_STRAIN = 0.033
 
 
-class TendonTable(Table):
-    """``tendon``: where the tendon is, and its strain at full activation.
+class TendonRegionTable(Table):
+    """``tendon_region``: where the tendon is, and its strain at full activation.
 
     ``length`` from every attachment, or from the bone ``at`` alone. The strain of 0.033 at the
     greatest isometric force is Zajac's (Critical Reviews in Biomedical Engineering 17, 1989).
@@ -105,7 +105,7 @@ class ContractionTable(Table):
     ] = 0.0
     # Stretch of the fibres in the scan pose against their slack length.
     fibre_stretch_at_rest: Annotated[float, Field(gt=0.2, lt=5)] | None = None
-    tendon: TendonTable | None = None
+    tendon_region: TendonRegionTable | None = None
 
 
 def contraction_keys(given: Mapping[str, Any], *, muscle: str) -> ContractionTable | None:
