@@ -115,8 +115,8 @@ class LiveSession:
 
 
 def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
-    """Range [radian] of each free coordinate: its own, or the motion's and 30 degrees (30 mm) both
-    ways.
+    """Range [radian] of each free coordinate: its own with the rest value, or where it has none the
+    motion's and 30 degrees (30 mm) both ways.
 
     Coordinates that are coupled or locked are left out.
     """
@@ -133,8 +133,8 @@ def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
         values = [frame.get(name, coordinate.rest) for frame in scene.motion.frames]
         low, high = min([coordinate.rest - free, *values]), max([coordinate.rest + free, *values])
         if coordinate.range is not None and coordinate.range[0] < coordinate.range[1]:
-            low = max(low, min(coordinate.range[0], coordinate.rest))
-            high = min(high, max(coordinate.range[1], coordinate.rest))
+            low = min(coordinate.range[0], coordinate.rest)
+            high = max(coordinate.range[1], coordinate.rest)
         limits[name] = (low, high)
     return limits
 

@@ -72,8 +72,12 @@ class Panel:
 
     def _add_choices(self, colour: str) -> None:
         gui, choices = self.gui, self.source.choices
-        places = {"Model": choices, "Beside it": ("none", *choices)}
-        self.models = [self._watch(gui.add_dropdown(*place)) for place in places.items()]
+        several = isinstance(self.source, SavedSource) and len(choices) > 1  # of a comparison
+        model = gui.add_dropdown("Model", choices)
+        beside = gui.add_dropdown(
+            "Beside it", ("none", *choices), initial_value=choices[1] if several else "none"
+        )
+        self.models = [self._watch(model), self._watch(beside)]
         self.colour = self._watch(
             gui.add_dropdown("Colour", tuple(COLOURINGS), initial_value=colour)
         )

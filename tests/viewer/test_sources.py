@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 import toy_scene
 import trimesh
+from blend_model import arm_scene
 
 import rbfmuscle as rm
 from rbfmuscle.metrics.depths import BoneDistance
+from rbfmuscle.output.run_data import RunData
+from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.simulation.frame_loop import simulate_frames
-from rbfmuscle.simulation.live import LiveSession
+from rbfmuscle.simulation.live import LiveSession, coordinate_limits
 from rbfmuscle.viewer.panel import Panel
+from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.side import vertex_values
-from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture
+from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource
 
 
 @pytest.fixture
@@ -91,6 +95,31 @@ def test_controls_of_the_phantom_have_joint_unit_and_limits():
     assert source.controls["hip.flexion"] == ("hip", "flexion [°]", -30.0, 60.0, 0.0)
     assert source.choices[0] == "pbd" and len(set(source.choices)) == len(source.choices)
     assert source.motion[-1]["hip.flexion"] == pytest.approx(60.0)
+
+
+def test_a_slider_spans_the_range_of_its_coordinate():
+    """All of it, however far the motion goes; with the rest value where that lies outside."""
+    scene = arm_scene(end=20)
+    for ends, rest, expected in (
+        ((-5, 140), 0, (-5, 140)),
+        ((10, 30), 0, (0, 30)),
+        (None, 0, (-30, 30)),
+    ):
+        given = None if ends is None else tuple(np.radians(ends))
+        scene.joints[0].coordinates["flexion"] = Coordinate(rest=rest, range=given)
+        limits = coordinate_limits(scene)["elbow.flexion"]
+        assert np.degrees(limits) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("runs", "beside"), [(("rbf",), "none"), (("rbf", "pbd", "x"), "pbd")])
+def test_a_comparison_opens_with_its_first_two_models(arm_run, runs, beside):
+    source = SavedSource(dict.fromkeys(runs, RunData.load(arm_run[1])))
+    server, _ = open_server(0)
+    try:
+        panel = Panel(server, source, {}, "group", lambda: None)
+        assert [model.value for model in panel.models] == ["rbf", beside]
+    finally:
+        server.stop()
 
 
 def test_no_text_of_a_run_is_read_as_html():
