@@ -177,5 +177,5 @@ def test_a_moved_turned_or_scaled_bone_has_the_same_field(name, turn, scale):
 
 def test_fields_of_a_run_name_each_bone():
     scene = phantom_scene(model="pbd", end=20.0, step=20.0, spacing=6.0)
-    with pytest.raises(UsageError, match="fields must name each bone"):
+    with pytest.raises(UsageError, match="bone_sdfs must name each bone"):
         simulate(scene, bone_sdfs={"pelvis": BoneSDF.from_mesh(scene.bone("pelvis").mesh)})
