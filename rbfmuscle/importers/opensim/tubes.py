@@ -162,6 +162,9 @@ def _beside_bones(vertices, faces, free, bones):
         points = vertices + shift
         for bone in bones:
             points[free] = _pushed(bone, points[free])
+        if number >= FLATTENINGS // 2:  # coarse faces cut across what is between their corners
+            pressed = _pressed_in(points, faces, bones)
+            points[free] += pressed[free]
         shift = points - vertices
     return vertices + shift
 
@@ -172,6 +175,26 @@ def _pushed(bone, points):
     inside = (distance < MARGIN) & (distance > -FLATTENED)
     away = (points - closest) / np.where(distance == 0.0, 1.0, distance)[:, None]
     return np.where(inside[:, None], closest + MARGIN * away, points)
+
+
+def _pressed_in(vertices, faces, bones):
+    """Shifts (n, 3) of a tube's vertices that take its faces off vertices of bones inside it, no
+    deeper than `FLATTENED`.
+    """
+    surface = ExactDistance(vertices, faces)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    shift = np.zeros_like(vertices)
+    size = np.zeros(len(vertices))
+    for bone in bones:
+        inside = bone.vertices[((bone.vertices > low) & (bone.vertices < high)).all(axis=1)]
+        distance, closest, face, _ = surface.nearest(inside, reach=FLATTENED)
+        deep = np.flatnonzero((distance < 0.0) & (face >= 0))
+        for k in deep[np.argsort(-distance[deep])]:  # the deepest decides
+            corners = faces[face[k]]
+            way = inside[k] - closest[k]
+            further = corners[-distance[k] > size[corners]]
+            shift[further], size[further] = way, -distance[k]
+    return shift
 
 
 def _held(bodies, fixed, bones):

@@ -66,6 +66,18 @@ def test_tube_lies_flat_on_a_bone_in_its_way_and_keeps_its_volume():
     assert mesh.is_watertight and mesh.volume == pytest.approx(1e-4, rel=1e-7)
 
 
+def test_no_edge_of_a_bone_cuts_through_the_faces_of_a_tube():
+    """A sharp edge between the tube's rings, 8 mm into a straight one of 9 mm."""
+    plate = trimesh.creation.box([0.04, 0.04, 0.002]).subdivide().subdivide()
+    plate.apply_translation([0.0215, 0.0, 0.1535])
+    bones = _bones("a", "b", "c") | {"plate": ExactDistance(plate.vertices, plate.faces)}
+    points = [("a", np.zeros(3)), ("b", np.array([0.0, 0.0, 0.3]))]
+    tube = make_tube(ModelMuscle("m", points, volume=5e-5), PLACES, bones, HELD_BY)
+    inside = ExactDistance(tube.vertices, tube.faces).signed_distance(plate.vertices)
+    assert inside.min() > -1e-4
+    assert bones["plate"].signed_distance(tube.vertices).min() > 0.0
+
+
 def test_muscle_without_a_bone_to_hold_it_is_named():
     muscle = ModelMuscle("m", [("a", np.zeros(3)), ("b", np.ones(3))], volume=1e-4)
     with pytest.raises(SceneError, match="body 'b' has no mesh"):
