@@ -34,6 +34,8 @@ from rbfmuscle.jit import compiled
 BLOCK = 256
 # Fits of less weight than this at a vertex are left out there.
 LEAST_WEIGHT = 2e-3
+# Numbers in a cache line.
+LINE = 8
 # Length of a polynomial's part that is new, below which it depends on those before it.
 DEPENDENT = 1e-9
 
@@ -141,8 +143,9 @@ def refit_loop(centres, normals, parts, terms, form, epsilon):
     """
     fits, count = parts.shape
     size = 4 * count
-    a = np.empty((1, size, size))
-    polynomials = np.empty((1, len(terms.powers), size))
+    width = (size + LINE - 1) // LINE * LINE
+    a = np.zeros((1, size, width))
+    polynomials = np.zeros((1, len(terms.powers), width))
     right, worst = np.empty(size), 1.0
     for fit in range(fits):
         _place_part(centres, parts[fit], terms, fit)
@@ -155,7 +158,7 @@ def refit_loop(centres, normals, parts, terms, form, epsilon):
             _cubic_matrices_loop(points, shape, 0, a)
         else:
             _matrices_loop(points, shape, form, True, 0, a)
-        _polynomials_loop(points, terms.powers, polynomials)
+        _polynomials_loop(points, terms.powers, polynomials[:, :, :size])
         for i in range(count):
             right[i] = 0.0
             for c in range(3):
@@ -198,70 +201,94 @@ def _place_part(centres, part, terms, fit):
 def _solve_part(a, polynomials, right, coefficients):
     """Weights (size,) in place of the right side, and the polynomial's coefficients (q,).
 
-    ``a`` (size, size) and ``polynomials`` (q, size) are overwritten. With Q an orthonormal basis of
-    the polynomials, M = (I - Q Q^T) A (I - Q Q^T) + gamma Q Q^T is factored. Returns an estimate of
-    its condition, infinite where it is not definite.
+    ``a`` (size, w), whose rows end with zeros up to a whole cache line, and ``polynomials`` (q, w)
+    are overwritten. With Q an orthonormal basis of the polynomials, M = (I - Q Q^T) A (I - Q Q^T) +
+    gamma Q Q^T is factored. Returns an estimate of its condition, infinite where it is not
+    definite.
     """
-    q, size = polynomials.shape
-    triangle = np.zeros((q, q))
-    _orthonormalise(polynomials, triangle)
-    product, inner, trace = np.zeros((q, size)), np.zeros((q, q)), 0.0
-    norm = 0.0
-    for k in range(q):
-        square = 0.0
-        for i in range(size):
-            total = 0.0
-            for j in range(size):
-                total += a[i, j] * polynomials[k, j]
-            product[k, i] = total
-            square += total * total
-        norm = max(norm, np.sqrt(square))
-    for k in range(q):
-        for m in range(q):
-            inner[k, m] = _dot(polynomials[k], product[m])
-    for i in range(size):
-        trace += a[i, i]
-    for k in range(q):
-        trace -= inner[k, k]
-    gamma = trace / max(size - q, 1)
-    if not gamma > 0.0:
-        gamma = norm if norm > 0.0 else 1.0
-    half = product.copy()
-    for k in range(q):
-        for m in range(q):
-            share = 0.5 * (inner[m, k] + (gamma if k == m else 0.0))
-            for i in range(size):
-                half[k, i] -= share * polynomials[m, i]
-    for i in range(size):
-        row = a[i]
-        for k in range(q):
-            one, other = half[k, i], polynomials[k, i]
-            for j in range(i + 1):
-                row[j] -= one * polynomials[k, j] + other * half[k, j]
-    if not _cholesky(a):
+    q, size = len(polynomials), len(a)
+    triangle, short = np.zeros((q, q)), np.empty(q)
+    _orthonormalise(polynomials, size, triangle)
+    product, norm = _project_matrix(a, polynomials)
+    if not _factor(a):
         return np.inf
-    short = np.empty(q)
-    for k in range(q):
-        short[k] = _dot(polynomials[k], right)
-    for k in range(q):
-        for i in range(size):
-            right[i] -= short[k] * polynomials[k, i]
     most, least = 0.0, np.inf
     for i in range(size):
         most, least = max(most, a[i, i]), min(least, a[i, i])
+    for k in range(q):
+        short[k] = _leave_out(right, polynomials[k])
     _substitute(a, right)
     for k in range(q):
-        share = _dot(polynomials[k], right)
-        for i in range(size):
-            right[i] -= share * polynomials[k, i]
-    for k in range(q):
-        short[k] -= _dot(product[k], right)
+        _leave_out(right, polynomials[k])
     for k in range(q - 1, -1, -1):
         coefficients[k] = short[k]
+        for i in range(size):
+            coefficients[k] -= product[k, i] * right[i]
         for m in range(k + 1, q):
             coefficients[k] -= triangle[k, m] * coefficients[m]
         coefficients[k] = coefficients[k] / triangle[k, k] if triangle[k, k] > 0.0 else 0.0
     return (max(most, np.sqrt(norm)) / least) ** 2
+
+
+@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+def _project_matrix(a, polynomials):
+    """Put M in place of A (size, w); its upper triangle counts.
+
+    With P = A Q: M = A - Q H^T - H Q^T, H = P - Q (Q^T P - gamma I) / 2 , and gamma the mean of the
+    rest of the diagonal. Returns P^T (q, w), and the greatest length of its rows.
+    """
+    q, size, width = len(polynomials), len(a), a.shape[1]
+    product, inner = np.zeros((q, width)), np.zeros((q, q))
+    trace, norm = 0.0, 0.0
+    for i in range(size):
+        trace += a[i, i]
+    for k in range(q):
+        _subtract_rows(product[k], 0, a, polynomials[k], size)
+        for i in range(width):
+            product[k, i] = -product[k, i]
+    for k in range(q):
+        norm = max(norm, np.sqrt(_dot(product[k], product[k])))
+        for m in range(q):
+            inner[k, m] = _dot(polynomials[k], product[m])
+        trace -= inner[k, k]
+    gamma = trace / max(size - q, 1)
+    if not gamma > 0.0:
+        gamma = norm if norm > 0.0 else 1.0
+    both, shares = np.empty((2 * q, width)), np.empty(2 * q)
+    for k in range(q):
+        both[k], both[q + k] = polynomials[k], product[k]
+        for m in range(q):
+            inner[m, k] = 0.5 * (inner[m, k] + (gamma if k == m else 0.0))
+    for k in range(q):
+        _subtract_rows(both[q + k], 0, polynomials, inner[:, k], q)
+    for i in range(size):
+        for k in range(q):
+            shares[k], shares[q + k] = both[q + k, i], both[k, i]
+        _subtract_rows(a[i], i, both, shares, 2 * q)
+    return product, norm
+
+
+@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+def _subtract_rows(row, start, rows, shares, count):
+    """row -= sum of shares[k] * rows[k] over k < count, from the cache line of ``start`` on.
+
+    Four rows at a time. Indices are unsigned, so that none is tested for counting from the end.
+    """
+    first, end = np.uint64(start - start % LINE), np.uint64(len(row))
+    one, k = np.uint64(1), np.uint64(0)
+    while k + np.uint64(3) < np.uint64(count):
+        k1 = k + one
+        k2 = k1 + one
+        k3 = k2 + one
+        p, q, r, s = shares[k], shares[k1], shares[k2], shares[k3]
+        for j in range(first, end):
+            row[j] -= p * rows[k, j] + q * rows[k1, j] + r * rows[k2, j] + s * rows[k3, j]
+        k = k3 + one
+    while k < np.uint64(count):
+        p = shares[k]
+        for j in range(first, end):
+            row[j] -= p * rows[k, j]
+        k += one
 
 
 @compiled(error_model="numpy", fastmath={"contract", "reassoc"})
@@ -272,54 +299,77 @@ def _dot(one, other):
     return total
 
 
-@compiled(error_model="numpy")
-def _orthonormalise(rows, triangle):
-    """Gram-Schmidt, twice: P^T = Q R with the columns of Q in the rows (q, size) and R (q, q); rows
-    that depend on others become zero.
+@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+def _leave_out(x, direction):
+    """Take the part of x along a unit vector, which may be longer, out of x; how long it was."""
+    share = 0.0
+    for i in range(len(x)):
+        share += x[i] * direction[i]
+    for i in range(len(x)):
+        x[i] -= share * direction[i]
+    return share
+
+
+@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+def _orthonormalise(rows, size, triangle):
+    """Gram-Schmidt, twice: P^T = Q R with the columns of Q in the rows (q, size and zeros) and R
+    (q, q); rows that depend on others become zero.
     """
     for k in range(len(rows)):
         for _ in range(2):
             for m in range(k):
-                share = _dot(rows[m], rows[k])
-                triangle[m, k] += share
-                for i in range(rows.shape[1]):
-                    rows[k, i] -= share * rows[m, i]
+                triangle[m, k] += _leave_out(rows[k], rows[m])
         length = np.sqrt(_dot(rows[k], rows[k]))
-        kept = length >= DEPENDENT * np.sqrt(rows.shape[1])
+        kept = length >= DEPENDENT * np.sqrt(size)
         triangle[k, k] = length if kept else 0.0
         for i in range(rows.shape[1]):
             rows[k, i] = rows[k, i] / length if kept else 0.0
 
 
 @compiled(error_model="numpy", fastmath={"contract", "reassoc"})
-def _cholesky(a):
-    """Lower factor in place of a symmetric matrix's lower triangle; whether it is definite."""
-    for i in range(len(a)):
-        row = a[i]
-        for j in range(i):
-            other, total = a[j], 0.0
-            for k in range(j):
-                total += row[k] * other[k]
-            row[j] = (row[j] - total) / other[j]
-        square = row[i]
-        for k in range(i):
-            square -= row[k] * row[k]
-        if not square > 0.0:
+def _factor(a):
+    """Upper factor U, U^T U = A, in place of a symmetric matrix's upper triangle (size, w); whether
+    it is definite. What stands left of the diagonal means nothing then.
+
+    Rows are subtracted as in `_subtract_rows`, which costs half as much again when called from
+    here.
+    """
+    one, end = np.uint64(1), np.uint64(a.shape[1])
+    for i in range(np.uint64(len(a))):
+        first, k = i - i % np.uint64(LINE), np.uint64(0)
+        while k + np.uint64(3) < i:
+            k1 = k + one
+            k2 = k1 + one
+            k3 = k2 + one
+            p, q, r, s = a[k, i], a[k1, i], a[k2, i], a[k3, i]
+            for j in range(first, end):
+                a[i, j] -= p * a[k, j] + q * a[k1, j] + r * a[k2, j] + s * a[k3, j]
+            k = k3 + one
+        while k < i:
+            p = a[k, i]
+            for j in range(first, end):
+                a[i, j] -= p * a[k, j]
+            k += one
+        if not a[i, i] > 0.0:
             return False
-        row[i] = np.sqrt(square)
+        p = 1.0 / np.sqrt(a[i, i])
+        for j in range(first, end):
+            a[i, j] *= p
     return True
 
 
 @compiled(error_model="numpy", fastmath={"contract", "reassoc"})
-def _substitute(lower, x):
-    """Solve L L^T x = b in place."""
-    for j in range(len(x)):
-        row, total = lower[j], 0.0
-        for i in range(j):
-            total += row[i] * x[i]
-        x[j] = (x[j] - total) / row[j]
-    for j in range(len(x) - 1, -1, -1):
-        row = lower[j]
-        x[j] /= row[j]
-        for i in range(j):
-            x[i] -= row[i] * x[j]
+def _substitute(upper, x):
+    """Solve U^T U x = b in place."""
+    one, size = np.uint64(1), np.uint64(len(x))
+    for j in range(size):
+        x[j] /= upper[j, j]
+        share = x[j]
+        for i in range(j + one, size):
+            x[i] -= share * upper[j, i]
+    for n in range(size):
+        j = size - n - one
+        total = 0.0
+        for i in range(j + one, size):
+            total += upper[j, i] * x[i]
+        x[j] = (x[j] - total) / upper[j, j]
