@@ -79,8 +79,7 @@ def crossing_loop(vertices, tree, among, folds, found):
     faces, count = tree.corners, len(tree.corners)
     plain = np.full(len(vertices), tree.closed and folds)
     if tree.closed and folds:
-        normals, turns = np.zeros_like(vertices), np.zeros(len(vertices), np.int64)
-        _plain_loop(vertices, faces, normals, turns, plain)
+        _plain_loop(vertices, faces, plain)
     asked, any_asked = np.empty(count, np.bool_), False
     for f in range(count):
         folded = not (plain[faces[f, 0]] and plain[faces[f, 1]] and plain[faces[f, 2]])
@@ -169,49 +168,54 @@ def _apart(one, i, other, j):
     )
 
 
-@compiled
-def _plain_loop(vertices, faces, normals, turns, plain):
+@compiled(error_model="numpy")
+def _plain_loop(vertices, faces, plain):
     """Unmark the vertices whose triangles do not lie side by side when seen along the mean normal
     there.
 
     Of a closed surface these triangles are a ring around the vertex. Where all of them are seen
     from outside and the ring goes round once, none covers another, so no two of them cross.
     """
-    for f in range(len(faces)):
-        normal = triangle_normal(vertices, faces, f)
-        for k in range(3):
-            for a in range(3):
-                normals[faces[f, k], a] += normal[a]
+    areas, normals = np.empty((len(faces), 3)), np.zeros_like(vertices)
     for f in range(len(faces)):
         x, y, z = triangle_normal(vertices, faces, f)
+        areas[f, 0], areas[f, 1], areas[f, 2] = x, y, z
         for k in range(3):
             v = faces[f, k]
-            p = faces[f, (k + 1) % 3]
-            q = faces[f, (k + 2) % 3]
-            u = normals[v]
-            along = x * u[0] + y * u[1] + z * u[2]
-            least = 1e-12 * (x * x + y * y + z * z) * (u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-            if along <= 0.0 or along * along <= least:
-                plain[v] = False
+            normals[v, 0] += x
+            normals[v, 1] += y
+            normals[v, 2] += z
+    across, square, turns = _across_loop(normals), np.empty(len(vertices)), np.zeros(len(vertices))
+    for v in range(len(vertices)):
+        square[v] = normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2
+    for f in range(len(faces)):
+        x, y, z = areas[f, 0], areas[f, 1], areas[f, 2]
+        least = 1e-12 * (x * x + y * y + z * z)
+        for k in range(3):
+            v, p, q = faces[f, k], faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            along = x * normals[v, 0] + y * normals[v, 1] + z * normals[v, 2]
+            plain[v] &= (along > 0.0) & (along * along > least * square[v])
             # The side of a plane through the normal that a neighbour lies on: once round, once from
             # below to above.
-            a = (
-                0
-                if abs(u[0]) <= abs(u[1]) and abs(u[0]) <= abs(u[2])
-                else (1 if abs(u[1]) <= abs(u[2]) else 2)
-            )
-            b, c = (a + 1) % 3, (a + 2) % 3
-            below = (
-                u[c] * (vertices[p, b] - vertices[v, b]) - u[b] * (vertices[p, c] - vertices[v, c])
-                < 0.0
-            )
-            above = (
-                u[c] * (vertices[q, b] - vertices[v, b]) - u[b] * (vertices[q, c] - vertices[v, c])
-                >= 0.0
-            )
-            turns[v] += below and above
+            below, above = 0.0, 0.0
+            for a in range(3):
+                below += across[v, a] * (vertices[p, a] - vertices[v, a])
+                above += across[v, a] * (vertices[q, a] - vertices[v, a])
+            turns[v] += np.float64((below < 0.0) & (above >= 0.0))
     for v in range(len(plain)):
-        plain[v] &= turns[v] == 1
+        plain[v] &= turns[v] == 1.0
+
+
+@compiled(error_model="numpy")
+def _across_loop(normals):
+    """A vector (n, 3) at a right angle to each normal."""
+    across = np.zeros_like(normals)
+    for v in range(len(normals)):
+        x, y, z = abs(normals[v, 0]), abs(normals[v, 1]), abs(normals[v, 2])
+        a = 0 if x <= y and x <= z else (1 if y <= z else 2)
+        b, c = (a + 1) % 3, (a + 2) % 3
+        across[v, b], across[v, c] = normals[v, c], -normals[v, b]
+    return across
 
 
 @compiled

@@ -193,31 +193,58 @@ def volume_loop(vertices, faces):
 
 
 @compiled(error_model="numpy")
+def volume_rate(vertices, faces, direction):
+    """The volume of a closed mesh, and how fast it grows along directions d (n, 3)."""
+    volume, rate = 0.0, 0.0
+    origin = corner_from(vertices, faces[0, 0], (0.0, 0.0, 0.0))
+    for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        p = corner_from(vertices, i, origin)
+        q = corner_from(vertices, j, origin)
+        r = corner_from(vertices, k, origin)
+        x, y, z = p[0] - r[0], p[1] - r[1], p[2] - r[2]
+        u, v, w = q[0] - r[0], q[1] - r[1], q[2] - r[2]
+        a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
+        volume += a * r[0] + b * r[1] + c * r[2]
+        rate += a * (direction[i, 0] + direction[j, 0] + direction[k, 0])
+        rate += b * (direction[i, 1] + direction[j, 1] + direction[k, 1])
+        rate += c * (direction[i, 2] + direction[j, 2] + direction[k, 2])
+    return volume / 6.0, rate / 6.0
+
+
+@compiled(error_model="numpy")
 def volume_cubic(vertices, faces, direction):
-    """Coefficients c of the volume V(x + s d) = c0 + c1 s + c2 s^2 + c3 s^3 along directions d (n,
-    3).
+    """Coefficients c of the volume V(x + s d) = c0 + c1 s + c2 s^2 + c3 s^3 of a closed mesh along
+    directions d (n, 3).
+
+    With N(s) twice a triangle's area vector, dV/ds is the sum of N(s) . (d_i + d_j + d_k) / 6.
     """
     c0 = 0.0
     c1 = 0.0
     c2 = 0.0
     c3 = 0.0
-    still = (0.0, 0.0, 0.0)
-    origin = corner_from(vertices, faces[0, 0], still)
+    origin = corner_from(vertices, faces[0, 0], (0.0, 0.0, 0.0))
     for f in range(len(faces)):
         i = faces[f, 0]
         j = faces[f, 1]
         k = faces[f, 2]
-        p = corner_from(vertices, i, origin)
-        q = corner_from(vertices, j, origin)
-        r = corner_from(vertices, k, origin)
-        u = corner_from(direction, i, still)
-        v = corner_from(direction, j, still)
-        w = corner_from(direction, k, still)
+        at = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        p = at[0] - origin[0], at[1] - origin[1], at[2] - origin[2]
+        u = direction[i, 0], direction[i, 1], direction[i, 2]
+        total = (
+            u[0] + direction[j, 0] + direction[k, 0],
+            u[1] + direction[j, 1] + direction[k, 1],
+            u[2] + direction[j, 2] + direction[k, 2],
+        )
+        q = corner_from(vertices, j, at)
+        r = corner_from(vertices, k, at)
+        v = corner_from(direction, j, u)
+        w = corner_from(direction, k, u)
         c0 += six_volumes(q, r, p)
-        c1 += six_volumes(q, r, u) + six_volumes(v, r, p) + six_volumes(q, w, p)
-        c2 += six_volumes(v, r, u) + six_volumes(q, w, u) + six_volumes(v, w, p)
-        c3 += six_volumes(v, w, u)
-    return c0 / 6.0, c1 / 6.0, c2 / 6.0, c3 / 6.0
+        c1 += six_volumes(q, r, total)
+        c2 += six_volumes(q, w, total) + six_volumes(v, r, total)
+        c3 += six_volumes(v, w, total)
+    return c0 / 6.0, c1 / 6.0, c2 / 12.0, c3 / 18.0
 
 
 @compiled

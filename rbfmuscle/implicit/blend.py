@@ -33,7 +33,7 @@ from rbfmuscle.jit import compiled
 # Points of a block, which stays in the first-level cache.
 BLOCK = 256
 # Fits of less weight than this at a vertex are left out there.
-LEAST_WEIGHT = 2e-3
+LEAST_WEIGHT = 2e-2
 # Numbers in a cache line.
 LINE = 8
 # Length of a polynomial's part that is new, below which it depends on those before it.

@@ -299,17 +299,22 @@ def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
 
 @compiled(error_model="numpy")
 def _cubic_block_loop(terms, fit, wanted, p, acc, g):
-    """The cubic kernel with epsilon 1."""
+    """The cubic kernel with epsilon 1, whose polynomial is linear."""
     centres = terms.centres[fit]
     a = terms.a[fit]
     b = terms.b[fit]
-    for j in range(centres.shape[1]):
-        at, slope = (centres[0, j], centres[1, j], centres[2, j]), (b[0, j], b[1, j], b[2, j])
-        if wanted:
-            _cubic_gradient_loop(p, at, a[j], slope, acc, g)
-        else:
+    if wanted:
+        _cubic_gradient_loop(p, centres, a, b, acc, g)
+    else:
+        for j in range(centres.shape[1]):
+            at, slope = (centres[0, j], centres[1, j], centres[2, j]), (b[0, j], b[1, j], b[2, j])
             _cubic_value_loop(p, at, a[j], slope, acc)
-    _polynomial_loop(terms.coefficients[fit], terms.powers, wanted, p, acc, g)
+    c = terms.coefficients[fit]
+    for i in range(acc.size):
+        acc[i] += c[0] + c[1] * p[0, i] + c[2] * p[1, i] + c[3] * p[2, i]
+        if wanted:
+            for k in range(3):
+                g[k, i] += c[1 + k]
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
@@ -325,22 +330,24 @@ def _cubic_value_loop(p, at, a, b, acc):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _cubic_gradient_loop(p, at, a, b, acc, g):
-    """Adds 3 a r d - 3 r B - 3/r (B . d) d to g, the value to acc."""
-    bx, by, bz = b
-    for i in range(acc.size):
-        dx = p[0, i] - at[0]
-        dy = p[1, i] - at[1]
-        dz = p[2, i] - at[2]
-        u = dx * dx + dy * dy + dz * dz + 1e-300
-        r = np.sqrt(u)
-        bd = 3.0 * (bx * dx + by * dy + bz * dz)
-        acc[i] += r * (a * u - bd)
-        radial = 3.0 * a * r - bd / r
-        r3 = 3.0 * r
-        g[0, i] += radial * dx - r3 * bx
-        g[1, i] += radial * dy - r3 * by
-        g[2, i] += radial * dz - r3 * bz
+def _cubic_gradient_loop(p, centres, weight, slope, acc, g):
+    """Adds 3 a r d - 3 r B - 3/r (B . d) d of each centre to g, the value to acc."""
+    for j in range(centres.shape[1]):
+        x, y, z = centres[0, j], centres[1, j], centres[2, j]
+        a, bx, by, bz = weight[j], slope[0, j], slope[1, j], slope[2, j]
+        for i in range(acc.size):
+            dx = p[0, i] - x
+            dy = p[1, i] - y
+            dz = p[2, i] - z
+            u = dx * dx + dy * dy + dz * dz + 1e-300
+            r = np.sqrt(u)
+            bd = 3.0 * (bx * dx + by * dy + bz * dz)
+            acc[i] += r * (a * u - bd)
+            radial = 3.0 * a * r - bd / r
+            r3 = 3.0 * r
+            g[0, i] += radial * dx - r3 * bx
+            g[1, i] += radial * dy - r3 * by
+            g[2, i] += radial * dz - r3 * bz
 
 
 @compiled(error_model="numpy", fastmath={"contract"})

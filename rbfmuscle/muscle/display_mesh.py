@@ -8,17 +8,21 @@ rest the mesh itself.
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.surfaces import face_normals, opposite_half_edges
 from rbfmuscle.muscle.placement import cached_sample
-from rbfmuscle.muscle.surface import smooth_loop
+from rbfmuscle.muscle.surface_limits import smooth_loop
 from rbfmuscle.scene.objects import Muscle
 
 # The input mesh itself is shown up to so many vertices; what has more is covered with so many.
 MOST_SHOWN = 6000
 # Sweeps of smoothing for triangles that cross others at rest.
 UNTANGLED = 24
+# Cosine between the normals of two neighbours that lie on each other, which cross when they move;
+# and in how many sweeps they are smoothed, as some sharp rims fold back on themselves too.
+FOLDED, UNFOLDED = -np.sqrt(0.75), 4
 # Bounds on the vertices that are asked for by a resolution.
 WANTED = (200, 12_000)
 # Vertices of a triangulation on an area of one edge squared.
@@ -29,14 +33,17 @@ def display_mesh(muscle: Muscle, resolution: int) -> tuple[Floats, Integers]:
     """Vertices (n, 3) and faces (m, 3) that show a muscle: its input mesh, or a coarser one on it.
 
     With a ``resolution`` above 0, with so many edges along the longest side. Triangles of a scan
-    that cross others are smoothed until they do not, `UNTANGLED` times at most: what then crosses
-    counts as ``self_crossings`` of every frame.
+    that cross others, or lie on a neighbour, are smoothed until they do not, `UNTANGLED` times at
+    most: what then crosses counts as ``self_crossings`` of every frame.
     """
     points, faces = _covering(muscle, resolution)
     tree, points = FaceTree(points, faces), points.copy()
     start, other = neighbour_lists(faces, len(points))
+    beside = opposite_half_edges(faces).reshape(-1, 3) // 3
     for turn in range(UNTANGLED):
         crossing = tree.crossing(points)
+        if turn < UNFOLDED:
+            crossing |= _folded(points, faces, beside)
         if not crossing.any():
             break
         marked = np.unique(faces[crossing])
@@ -46,6 +53,17 @@ def display_mesh(muscle: Muscle, resolution: int) -> tuple[Floats, Integers]:
             )
         smooth_loop(points, marked, start, other)
     return points, faces
+
+
+def _folded(points: Floats, faces: Integers, beside: Integers) -> Booleans:
+    """Which triangles (m,) are folded onto a neighbour, of those ``beside`` (m, 3) each, -1 for
+    none.
+    """
+    normals = face_normals(points, faces)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
+    cosine = np.einsum("mka,ma->mk", normals[beside], normals)
+    folded: Booleans = ((cosine < FOLDED) & (beside >= 0)).any(axis=1)
+    return folded
 
 
 def _covering(muscle: Muscle, resolution: int) -> tuple[Floats, Integers]:

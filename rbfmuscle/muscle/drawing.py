@@ -23,13 +23,11 @@ from rbfmuscle.muscle.surface import (
     FITTED,
     NO_VOLUME,
     UNSURE,
-    Obstacles,
-    SurfaceModel,
-    SurfaceState,
     clear_rest,
     finish_surface,
     start_surface,
 )
+from rbfmuscle.muscle.surface_limits import Obstacles, SurfaceModel, SurfaceState
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
@@ -127,7 +125,11 @@ class SurfaceBuilder:
         self.embedded = options.surface == "embedded"
         self.marching = options.surface == "marching"
         self.state = SurfaceState(
-            np.zeros(1), np.zeros(len(vertices)), np.zeros((0, 0, 3)), np.zeros((0, 0))
+            np.zeros(1),
+            np.zeros(len(vertices)),
+            np.zeros((0, 0, 3)),
+            np.zeros((0, 0)),
+            np.zeros((0, 0, 3)),
         )
         self._met: tuple[list[int], Obstacles] | None = None
         self._take(vertices)
@@ -154,6 +156,7 @@ class SurfaceBuilder:
             offset,
             slope,
             self.rest.mesh_volume,
+            float(_lengths(vertices, faces).mean()),
         )
 
     def _clear_rest(self, obstacles: Obstacles) -> None:
@@ -229,6 +232,7 @@ class SurfaceBuilder:
             self.state = self.state._replace(
                 places=np.zeros((len(grids), count, 3)),
                 bounds=np.full((len(grids), count), -np.inf),
+                outward=np.zeros((len(grids), count, 3)),
             )
             self._clear_rest(met)
         return self._met[1]._replace(poses=contacts.placed)

@@ -28,7 +28,7 @@ from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
 from rbfmuscle.muscle.rounded_bones import RoundedBones, grown, round_bones
 from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, Report, settle
 from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform
-from rbfmuscle.muscle.surface import SurfaceState
+from rbfmuscle.muscle.surface_limits import SurfaceState
 from rbfmuscle.scene.ends import ordered_muscle
 from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.objects import Muscle

@@ -15,26 +15,26 @@ The search starts from where the solid carries the vertex, moved along the norma
 height above it that the vertex had in the last frame.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
-from rbfmuscle.bones.obstacles import Bones, query_bone
-from rbfmuscle.geometry.crossing import TreeArrays, crossing_loop
-from rbfmuscle.geometry.surfaces import _vertex_normal_loop, volume_cubic
-from rbfmuscle.implicit.blend import Blend, blend_loop
-from rbfmuscle.implicit.extraction.obstacles import PointGrids, grid_of, push_off_loop
+from rbfmuscle.geometry.crossing import crossing_loop
+from rbfmuscle.geometry.surfaces import _vertex_normal_loop, volume_cubic, volume_rate
+from rbfmuscle.implicit.blend import blend_loop
 from rbfmuscle.jit import compiled
-from rbfmuscle.muscle.model import Embedding, carry
+from rbfmuscle.muscle.model import carry
+from rbfmuscle.muscle.surface_limits import (
+    Work,
+    ask_bones,
+    lift,
+    mark_near,
+    push_off,
+    untangle,
+)
 
-# Lengths below are in mean edges of the mesh.
+# Lengths below are in mean edges of the mesh at rest.
 NEAR_BONE = 1.5  # what is within this of a bone may come to lie on it
-# No point of a triangle is farther from a corner than its longest side over root 3, and a bone's
-# vertex behind it, which pushes it, no deeper than a third of that side; in longest sides.
-NEAR_FACE = 0.8
+SAME = 0.02  # what moved less than this by a bone need not be asked for anew
 SUNK = 1.0  # deeper in a bone the material is sunk
-OUT = 1e-5  # what is no deeper in a bone counts as out of it
-PUSHED = 0.01  # a bone's vertex may lie within the surface by so much
 LAMELLA = 0.02  # where both sides of a muscle sink into a bone, the far one stays above it by this
 # No vertex goes farther than this from where the material carries it; and where the field's slope
 # has sunk to these shares of its slope at rest, not at all, or as far as it likes within that.
@@ -43,60 +43,12 @@ UNSURE, SURE = 0.3, 0.7
 KEPT_HEIGHT = 0.5  # the search starts at the last height above the material, up to this
 SETTLED = 0.01  # a step of less is one whose error, of second order, does not count
 BLOWN = 1e-3  # the same of the material blown up to its volume, whose last digit follows
-NEWTON, LEVELS, LIFTS, MEET = 6, 20, 2, 4  # rounds, at most
-# What crosses is taken back towards the material by a share of the way as long as that helps, then
-# smoothed by some sweeps; rounds, at most, and in how many of them the region grows by a ring.
-BACK, TRIED, SWEEPS, ROUNDS, GROWTH = 0.2, 10, 1, 60, 6
-# All of that is done up to so many times, as the way back to the volume can make triangles cross.
+NEWTON, LEVELS, CUBIC, MEET = 6, 20, 4, 4  # rounds, at most
+# Bones, crossings and volume are met up to so many times, as the way back to the volume can make
+# triangles cross.
 AGAIN = 4
 # Outcomes.
 FITTED, NO_FIT, NOT_FINITE, NO_LEVEL, CROSSED, NO_VOLUME = range(6)
-
-
-class SurfaceModel(NamedTuple):
-    """What never changes of a shown mesh: n vertices, m outward triangles."""
-
-    faces: np.ndarray  # (m, 3)
-    start: np.ndarray  # (n + 1,) neighbours of vertex v are other[start[v] : start[v + 1]]
-    other: np.ndarray
-    tree: TreeArrays
-    embedding: Embedding  # of the vertices in the solid
-    blend: Blend  # local fits of each vertex
-    offset: np.ndarray  # (n,) level offset, the field's value at rest
-    slope: np.ndarray  # (n,) |grad F| at rest; 0 where there is no field
-    volume: float  # at rest
-
-
-class SurfaceState(NamedTuple):
-    """What goes from frame to frame; r bones."""
-
-    level: np.ndarray  # (1,)
-    height: np.ndarray  # (n,) above the carried material, along its normal
-    places: np.ndarray  # (r, n, 3) of the last questions, in bone coordinates
-    bounds: np.ndarray  # (r, n) lower bounds of the distances there
-
-
-class Obstacles(NamedTuple):
-    """The bones in reach, their poses (r, 4, 4), and grids of their vertices."""
-
-    bones: Bones
-    poses: np.ndarray
-    grids: PointGrids
-
-
-class Work(NamedTuple):
-    """A surface on its way; all arrays by vertex."""
-
-    carried: np.ndarray
-    vertices: np.ndarray
-    direction: np.ndarray  # motion for a unit of level; 0 where held
-    near: np.ndarray  # may come to a bone
-    least: np.ndarray  # lower bound of the distance from all bones, where carried
-    clearance: np.ndarray  # above a bone
-    on_field: np.ndarray  # and not on a bone
-    odd: np.ndarray  # what may cross others without a fold at a corner
-    left: np.ndarray  # kept from a level set that is too far away
-    edge: np.ndarray  # (1,) mean length of an edge
 
 
 @compiled(error_model="numpy")
@@ -150,118 +102,57 @@ def clear_rest(model, state, obstacles, vertices, held):
     work.near[:] = work.near & held
     if not lift(obstacles, state, work, np.flatnonzero(work.near)):
         return vertices
-    _untangle(model, state, obstacles, work, True, np.zeros(len(vertices), np.bool_))
+    untangle(model, state, obstacles, work, True, np.zeros(len(vertices), np.bool_))
     return work.vertices
 
 
 @compiled(error_model="numpy")
 def _begin(model, state, obstacles, carried):
     """The vertices where the solid carries them, moved by the last heights, and the bones there."""
-    n = len(model.offset)
-    normals = np.zeros((n, 3))
+    n, edge = len(model.offset), model.edge
+    normals, flags = np.zeros((n, 3)), np.zeros((4, n), np.bool_)
     _vertex_normal_loop(carried, model.faces, normals)
-    edge = _mean_edge(carried, model.faces)
-    flags = np.zeros((4, n), np.bool_)
     work = Work(
         carried,
+        normals,
         carried.copy(),
         np.zeros((n, 3)),
         flags[0],
-        np.full(n, np.inf),
+        np.empty(n),
         np.zeros(n),
         np.ones(n, np.bool_),
         flags[1],
         flags[2],
-        np.full(1, edge),
+        edge,
     )
-    rows, limit = np.arange(n), np.full(n, NEAR_BONE * edge)
-    distance, outward = np.empty(n), np.empty((n, 3))
-    ask_bones(obstacles, state, carried, rows, limit, distance, outward)
+    rows, limit, outward = np.arange(n), np.full(n, NEAR_BONE * edge), np.empty((n, 3))
+    ask_bones(obstacles, state, carried, rows, limit, SAME * edge, work.least, outward)
     for v in range(n):
-        work.least[v] = distance[v]
         along = 0.0
         for a in range(3):
             along += normals[v, a] * outward[v, a]
             if abs(state.height[v]) <= KEPT_HEIGHT * edge:
                 work.vertices[v, a] += state.height[v] * normals[v, a]
-        if distance[v] < limit[v]:
+        if work.least[v] < limit[v]:
             work.near[v] = True
-            work.odd[v] = distance[v] < -SUNK * edge
+            work.odd[v] = work.least[v] < -SUNK * edge
             # Of what sinks into a bone, what looks away from it keeps off the rest.
             work.clearance[v] = LAMELLA * edge if along > 0.0 else 0.0
     return work
 
 
 @compiled(error_model="numpy")
-def _mean_edge(vertices, faces):
-    total = 0.0
-    for f in range(len(faces)):
-        for k in range(3):
-            square = 0.0
-            for d in range(3):
-                square += (vertices[faces[f, k], d] - vertices[faces[f, (k + 1) % 3], d]) ** 2
-            total += np.sqrt(square)
-    return total / (3.0 * len(faces))
-
-
-@compiled(error_model="numpy")
-def ask_bones(obstacles, state, x, rows, limit, distance, outward):
-    """Distances (k,) of vertices x[rows] to the nearest bone and the directions (k, 3) in which
-    they grow; beyond a limit (k,) a lower bound without a direction.
-
-    A bone is asked only where what is known of it does not say that it is farther.
-    """
-    count = len(rows)
-    asked, here = np.empty(count, np.int64), np.empty((count, 3))
-    points, reach, one, way = here.copy(), np.empty(count), np.empty(count), here.copy()
-    distance[:count] = np.inf
-    outward[:count] = 0.0
-    for b in range(len(obstacles.poses)):
-        pose, places, bounds = obstacles.poses[b], state.places[b], state.bounds[b]
-        m = 0
-        for i in range(count):
-            v = rows[i]
-            dx, dy, dz = x[v, 0] - pose[0, 3], x[v, 1] - pose[1, 3], x[v, 2] - pose[2, 3]
-            px = dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]
-            py = dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]
-            pz = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
-            here[m, 0], here[m, 1], here[m, 2] = px, py, pz
-            square = (px - places[v, 0]) ** 2 + (py - places[v, 1]) ** 2 + (pz - places[v, 2]) ** 2
-            least = bounds[v] - np.sqrt(square)
-            most = min(distance[i], limit[i])
-            if least > most:
-                distance[i] = min(distance[i], least)
-                continue
-            asked[m], reach[m] = i, most
-            for a in range(3):
-                points[m, a] = x[v, a]
-            m += 1
-        if m == 0:
-            continue
-        query_bone(obstacles.bones, b, pose, points[:m], reach[:m], one[:m], way[:m])
-        for j in range(m):
-            i = asked[j]
-            v = rows[i]
-            bounds[v] = one[j]
-            for a in range(3):
-                places[v, a] = here[j, a]
-            if one[j] < distance[i]:
-                distance[i] = one[j]
-                for a in range(3):
-                    outward[i, a] = way[j, a] if one[j] <= reach[j] else 0.0
-
-
-@compiled(error_model="numpy")
 def _reach(model, state, obstacles, fit, work):
     """Bring the vertices onto the level set that has the volume; how that ended."""
-    edge, level = work.edge[0], state.level[0]
+    edge, level = work.edge, state.level[0]
     allowed = np.full(len(model.offset), -1.0)
     for _ in range(LEVELS):
         if not _project(model, state, obstacles, fit, work, level, allowed):
             return NOT_FINITE
-        step, largest = _level_step(model, work, 1), _fastest(work)
-        if np.isnan(step):
+        volume, rate = volume_rate(work.vertices, model.faces, work.direction)
+        if not rate > 0.0:
             return NO_LEVEL
+        step, largest = (model.volume - volume) / rate, _fastest(work)
         step = min(max(step, -edge / largest), edge / largest)
         level += step
         _shift(work, step)
@@ -276,7 +167,7 @@ def _project(model, state, obstacles, fit, work, level, allowed):
     """Newton steps of all vertices onto the level, no farther from the material than the field is
     to be trusted; False where the field is not finite.
     """
-    n, edge = len(model.offset), work.edge[0]
+    n, edge = len(model.offset), work.edge
     value, gradient, todo = np.empty(n), np.empty((n, 3)), np.ones(n, np.bool_)
     rows, limit, miss = np.empty(n, np.int64), np.empty(n), np.empty(n)
     for _ in range(NEWTON):
@@ -339,7 +230,7 @@ def _move(vertices, v, direction, share, most):
 def _turn_to_bones(obstacles, state, work, rows, limit, miss):
     """Where a bone is the surface, the step onto it replaces that onto the field."""
     distance, outward = np.empty(len(rows)), np.empty((len(rows), 3))
-    ask_bones(obstacles, state, work.vertices, rows, limit, distance, outward)
+    ask_bones(obstacles, state, work.vertices, rows, limit, 0.0, distance, outward)
     for i in range(len(rows)):
         v = rows[i]
         gap = distance[i] - work.clearance[v]
@@ -353,7 +244,7 @@ def _turn_to_bones(obstacles, state, work, rows, limit, miss):
 @compiled(error_model="numpy")
 def _bound(work, allowed):
     """Bring back what went beyond where the field is to be trusted, which stays, and mark it."""
-    edge = work.edge[0]
+    edge = work.edge
     for v in range(len(allowed)):
         # A way to a bone from outside it, which the field asked for, is bounded too.
         bounded = work.on_field[v] or (work.least[v] >= 0.0 and allowed[v] < FARTHEST * edge)
@@ -370,34 +261,6 @@ def _bound(work, allowed):
 
 
 @compiled(error_model="numpy")
-def lift(obstacles, state, work, rows):
-    """Move vertices that lie in a bone onto it, where they stay; whether any did."""
-    moved = False
-    count, limit = len(rows), np.empty(len(rows))
-    distance, outward = np.empty(len(rows)), np.empty((len(rows), 3))
-    rows = rows.copy()
-    for _ in range(LIFTS):
-        for i in range(count):
-            limit[i] = work.clearance[rows[i]]
-        ask_bones(obstacles, state, work.vertices, rows[:count], limit[:count], distance, outward)
-        left = 0
-        for i in range(count):
-            v = rows[i]
-            gap = distance[i] - work.clearance[v]
-            if gap < -OUT * work.edge[0]:
-                for a in range(3):
-                    work.vertices[v, a] -= gap * outward[i, a]
-                    work.direction[v, a] = 0.0
-                rows[left] = v
-                left += 1
-        count = left
-        moved |= left > 0
-        if left == 0:
-            break
-    return moved
-
-
-@compiled(error_model="numpy")
 def _fastest(work):
     """Greatest motion of a vertex for a unit of level."""
     most = 2.3e-308
@@ -410,13 +273,13 @@ def _fastest(work):
 
 
 @compiled(error_model="numpy")
-def _level_step(model, work, steps):
+def _level_step(model, work):
     """Change of the level that brings the mesh to its volume, by Newton steps; NaN where no level
     does.
     """
     c0, c1, c2, c3 = volume_cubic(work.vertices, model.faces, work.direction)
     change = 0.0
-    for _ in range(steps):
+    for _ in range(CUBIC):
         lack = model.volume - (c0 + change * (c1 + change * (c2 + change * c3)))
         if lack == 0.0:
             break
@@ -442,17 +305,17 @@ def _embed(model, state, obstacles, work):
     """
     work.vertices[:] = work.carried
     work.left[:] = True
-    near, most = np.flatnonzero(work.near), 0.5 * work.edge[0]
+    near, most = np.flatnonzero(work.near), 0.5 * work.edge
     lift(obstacles, state, work, near)
     for _ in range(LEVELS):
         _take_normals(model, work)
-        step = _level_step(model, work, 1)
-        if np.isnan(step):
+        volume, rate = volume_rate(work.vertices, model.faces, work.direction)
+        if not rate > 0.0:
             return False
-        step = min(max(step, -most), most)
+        step = min(max((model.volume - volume) / rate, -most), most)
         _shift(work, step)
         lift(obstacles, state, work, near)
-        if abs(step) < BLOWN * work.edge[0]:
+        if abs(step) < BLOWN * work.edge:
             break
     return True
 
@@ -484,16 +347,16 @@ def _finish(model, state, obstacles, work, excess, embedded):
     if len(excess) > 0:
         _give_room(model, state, obstacles, work, excess)
     moved = np.ones(len(work.vertices), np.bool_)
-    _push_off(model, state, obstacles, work, moved)
+    push_off(model, state, obstacles, work, moved)
     for _ in range(AGAIN):
         if not _fill(model, state, obstacles, work, embedded):
             return -1
-        if not _untangle(model, state, obstacles, work, embedded, moved):
+        if not untangle(model, state, obstacles, work, embedded, moved):
             if not embedded:
-                _keep_heights(model, state, work)
+                _keep_heights(state, work)
             return 0
         # What was smoothed may lie over a bone's vertex again.
-        _push_off(model, state, obstacles, work, moved)
+        push_off(model, state, obstacles, work, moved)
     if not _fill(model, state, obstacles, work, embedded):
         return -1
     found = np.zeros(len(model.faces), np.bool_)
@@ -501,62 +364,18 @@ def _finish(model, state, obstacles, work, excess, embedded):
 
 
 @compiled(error_model="numpy")
-def _push_off(model, state, obstacles, work, among):
-    """Move the corners of triangles, of those with a marked corner, that a bone's vertices came
-    through, and out of the bones again what that drove into another.
-    """
-    if len(obstacles.poses) == 0:
-        return
-    edge, m = work.edge[0], len(model.faces)
-    faces, count = np.empty_like(model.faces), 0
-    for f in range(m):
-        if not (among[model.faces[f, 0]] or among[model.faces[f, 1]] or among[model.faces[f, 2]]):
-            continue
-        least, side = np.inf, 0.0
-        for k in range(3):
-            v, w = model.faces[f, k], model.faces[f, (k + 1) % 3]
-            away, length = 0.0, 0.0
-            for a in range(3):
-                away += (work.vertices[v, a] - work.carried[v, a]) ** 2
-                length += (work.vertices[v, a] - work.vertices[w, a]) ** 2
-            least = min(least, work.least[v] - np.sqrt(away))
-            side = max(side, length)
-        if least < NEAR_FACE * np.sqrt(side):
-            faces[count] = model.faces[f]
-            count += 1
-    if count == 0:
-        return
-    moved = np.zeros(len(work.vertices), np.bool_)
-    for _ in range(2):
-        for b in range(len(obstacles.poses)):
-            push_off_loop(
-                work.vertices,
-                faces[:count],
-                grid_of(obstacles.grids, b),
-                obstacles.poses[b],
-                PUSHED * edge,
-                moved,
-            )
-        rows = np.flatnonzero(moved)
-        for v in rows:
-            work.odd[v] = True
-            work.direction[v] = 0.0
-        if len(rows) == 0 or not lift(obstacles, state, work, rows):
-            break
-
-
-@compiled(error_model="numpy")
 def _fill(model, state, obstacles, work, embedded):
     """The volume to the last digit; what its last step drove into a bone is brought out and stays
     there. False where no level has the volume.
     """
+    mark_near(work)
     near = np.flatnonzero(work.near)
     if embedded:
         # What was smoothed stays put otherwise, and that may be all of it.
         _take_normals(model, work)
         lift(obstacles, state, work, near)
     for turn in range(MEET + 1):
-        step = _level_step(model, work, 4)
+        step = _level_step(model, work)
         if np.isnan(step):
             return False
         if not embedded:
@@ -568,86 +387,10 @@ def _fill(model, state, obstacles, work, embedded):
 
 
 @compiled(error_model="numpy")
-def _untangle(model, state, obstacles, work, embedded, moved):
-    """Take what crosses itself back towards the material, then smooth it; whether anything was
-    moved for it, and marked.
-    """
-    m, n = len(model.faces), len(work.vertices)
-    found, among = np.zeros(m, np.bool_), np.ones(m, np.bool_)
-    if not embedded:
-        _touching(model.faces, work.odd | work.left, among)
-    moved[:] = False
-    last, back = m + 1, not embedded
-    for turn in range(ROUNDS):
-        # What was not moved does not begin to cross.
-        count = crossing_loop(work.vertices, model.tree, among, turn == 0, found)
-        if count == 0:
-            return turn > 0
-        # Where the material crosses itself the way back to it does not help.
-        back &= turn < TRIED or count < last
-        last = count
-        marked = np.zeros(n, np.bool_)
-        for f in range(m):
-            if found[f]:
-                for k in range(3):
-                    marked[model.faces[f, k]] = True
-        for _ in range(1 + turn // GROWTH):
-            marked = _grown(model, marked)
-        _touching(model.faces, marked, among)
-        rows = np.flatnonzero(marked)
-        for v in rows:
-            work.odd[v], moved[v] = True, True
-        if back:
-            # What the material takes into a bone cannot go back there.
-            for v in rows:
-                if work.least[v] >= 0.0:
-                    for a in range(3):
-                        away = work.vertices[v, a] - work.carried[v, a]
-                        work.vertices[v, a] -= BACK * away
-            rows = np.flatnonzero(marked & (work.least < 0.0))
-        for _ in range(SWEEPS):
-            smooth_loop(work.vertices, rows, model.start, model.other)
-        lift(obstacles, state, work, np.flatnonzero(marked & work.near))
-    return True
-
-
-@compiled(error_model="numpy")
-def _touching(faces, marked, out):
-    """Mark the triangles with a marked corner."""
-    for f in range(len(faces)):
-        out[f] = marked[faces[f, 0]] or marked[faces[f, 1]] or marked[faces[f, 2]]
-
-
-@compiled(error_model="numpy")
-def _grown(model, marked):
-    """The marked vertices and their neighbours."""
-    out = marked.copy()
-    for v in range(len(marked)):
-        if marked[v]:
-            for k in range(model.start[v], model.start[v + 1]):
-                out[model.other[k]] = True
-    return out
-
-
-@compiled(error_model="numpy")
-def smooth_loop(vertices, rows, start, other):
-    """Half the way to the mean of the neighbours, one vertex after the other."""
-    for v in rows:
-        count = start[v + 1] - start[v]
-        for a in range(3):
-            total = 0.0
-            for n in range(start[v], start[v + 1]):
-                total += vertices[other[n], a]
-            vertices[v, a] = 0.5 * (vertices[v, a] + total / count)
-
-
-@compiled(error_model="numpy")
-def _keep_heights(model, state, work):
+def _keep_heights(state, work):
     """Heights of the vertices above the carried material, for the next frame."""
-    normals = np.zeros_like(work.carried)
-    _vertex_normal_loop(work.carried, model.faces, normals)
-    for v in range(len(normals)):
+    for v in range(len(work.normals)):
         height = 0.0
         for a in range(3):
-            height += normals[v, a] * (work.vertices[v, a] - work.carried[v, a])
+            height += work.normals[v, a] * (work.vertices[v, a] - work.carried[v, a])
         state.height[v] = height

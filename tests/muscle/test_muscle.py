@@ -305,6 +305,23 @@ def test_shown_mesh_is_the_input_mesh_unless_it_is_large_or_another_resolution_i
     assert len(long.mesh.vertices) > MOST_SHOWN == len(display_mesh(long, 0)[0])
 
 
+def test_triangles_that_lie_folded_on_a_neighbour_are_smoothed():
+    ball = trimesh.creation.icosphere(4, 10.0)
+    vertices, faces = np.array(ball.vertices), np.array(ball.faces)
+    # A vertex goes over the far side of its ring, where one triangle then lies on its neighbour.
+    corner, far = faces[100, 0], faces[100, 1]
+    way = vertices[far] - vertices[corner]
+    vertices[corner] += 1.2 * way
+    vertices[corner] *= 10.0 / np.linalg.norm(vertices[corner])
+    folded = trimesh.Trimesh(vertices, faces, process=False)
+    assert np.degrees(folded.face_adjacency_angles).max() > 150.0
+    shown = display_mesh(SimpleNamespace(mesh=folded), 0)[0]
+    angles = trimesh.Trimesh(shown, faces, process=False).face_adjacency_angles
+    assert np.degrees(angles).max() < 90.0
+    still = np.linalg.norm(shown - vertices, axis=1) < 1e-9
+    assert still.mean() > 0.98
+
+
 def test_surface_at_rest_is_the_input_mesh_but_for_what_overlaps_bones():
     scene = phantom_scene()
     scene.muscles = [scene.muscle("extensor")]

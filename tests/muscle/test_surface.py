@@ -24,13 +24,11 @@ from rbfmuscle.muscle.model import Embedding
 from rbfmuscle.muscle.surface import (
     FITTED,
     NO_FIT,
-    Obstacles,
-    SurfaceModel,
-    SurfaceState,
     clear_rest,
     finish_surface,
     start_surface,
 )
+from rbfmuscle.muscle.surface_limits import Obstacles, SurfaceModel, SurfaceState, ask_bones
 
 BALL = trimesh.creation.icosphere(3)
 X = np.array(BALL.vertices)
@@ -75,12 +73,13 @@ class Drawn:
             value,
             np.linalg.norm(gradient, axis=1),
             volume,
+            EDGE,
         )
         self.forget()
 
     def forget(self):
         n, r = len(X), len(self.fields)
-        known = np.zeros((r, n, 3)), np.full((r, n), -np.inf)
+        known = np.zeros((r, n, 3)), np.full((r, n), -np.inf), np.zeros((r, n, 3))
         self.state = SurfaceState(np.zeros(1), np.zeros(n), *known)
 
     def __call__(self, carried, *, fitted=True, excess=None):
@@ -203,6 +202,25 @@ def test_what_is_known_of_the_bones_changes_nothing(shift):
     fresh = drawn(start)[0]
     drawn.state = known
     np.testing.assert_allclose(drawn(start)[0], fresh, rtol=0, atol=1e-12)
+
+
+def test_a_question_about_the_same_place_takes_the_answer_that_is_known():
+    drawn = Drawn([bone(0.9, 0.0, 0.0, 1.9)])
+    rows, limit, asked = np.arange(len(X)), np.full(len(X), 0.3), np.empty(len(X))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.4, 0.2, 0.1]).as_matrix(), [0.1, 0.0, 0.2]
+    ask_bones(drawn.obstacles, drawn.state, X, rows, limit, 0.0, asked, np.empty_like(X))
+    there = drawn.obstacles._replace(poses=pose[None])
+    points, known, way = (X + 1e-4) @ pose[:3, :3].T + pose[:3, 3], np.empty(len(X)), X.copy()
+    ask_bones(there, drawn.state, points, rows, limit, 1e-3, known, way)
+    exact = drawn.fields[0].distance(X + 1e-4)
+    near = asked < limit
+    assert 10 < near.sum() < len(X)
+    assert (known <= exact + 1e-9).all(), "a lower bound"
+    np.testing.assert_allclose(known[near], exact[near], atol=4e-4)
+    outward = (X[near] - [0.0, 0.0, 1.9]) @ pose[:3, :3].T
+    outward /= np.linalg.norm(outward, axis=1)[:, None]
+    assert (np.einsum("ij,ij->i", way[near], outward) > 0.98).all(), "turned with the bone"
 
 
 def test_what_a_bone_holds_is_brought_out_of_it_at_rest():

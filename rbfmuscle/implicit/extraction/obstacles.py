@@ -14,8 +14,8 @@ from rbfmuscle.jit import compiled
 # are pushed off, points are looked for so far above and below triangles, and so far beside them in
 # barycentric coordinates.
 CHORD = 0.35
-MARGIN = 0.5
-BESIDE = 0.3
+MARGIN = 0.4
+BESIDE = 0.15
 # Points deeper than the tolerance by less than this share are there but for rounding.
 ASKED = 1.0 + 1e-6
 # Room for pairs of a point and a triangle near it, at first, for each triangle.
@@ -129,6 +129,8 @@ def push_off_loop(vertices, faces, grid, pose, tolerance, moved):
     if met > room:
         pairs = np.empty((2, met), np.int64)
         met = _near_loop(local, faces, grid, pairs)
+    if met == 0:
+        return
     point, first, near = _sort_loop(pairs, met, len(grid.points))
     places = np.empty((len(point), 3))
     for p in range(len(point)):

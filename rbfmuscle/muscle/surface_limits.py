@@ -1,0 +1,336 @@
+"""What bounds the surface of an RBF muscle: bones, neighbours, and triangles of its own that it
+crosses.
+
+Arrays of one surface, and compiled functions that move its vertices out of what they may not be in.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.bones.obstacles import Bones, query_bone
+from rbfmuscle.geometry.crossing import TreeArrays, crossing_loop
+from rbfmuscle.implicit.blend import Blend
+from rbfmuscle.implicit.extraction.obstacles import PointGrids, grid_of, push_off_loop
+from rbfmuscle.jit import compiled
+from rbfmuscle.muscle.model import Embedding
+
+# Lengths below are in mean edges of the mesh at rest.
+# No point of a triangle is farther from a corner than its longest side over root 3, and a bone's
+# vertex behind it, which pushes it, no deeper than a third of that side; in longest sides.
+NEAR_FACE = 0.8
+OUT = 1e-5  # what is no deeper in a bone counts as out of it
+PUSHED = 0.01  # a bone's vertex may lie within the surface by so much
+LIFTS = 2  # rounds of moving what lies in a bone onto it, at most
+# What crosses is taken back towards the material by a share of the way as long as that helps, then
+# smoothed by some sweeps; rounds, at most, and in how many of them the region grows by a ring.
+BACK, TRIED, SWEEPS, ROUNDS, GROWTH = 0.2, 10, 1, 60, 6
+
+
+class SurfaceModel(NamedTuple):
+    """What never changes of a shown mesh: n vertices, m outward triangles."""
+
+    faces: np.ndarray  # (m, 3)
+    start: np.ndarray  # (n + 1,) neighbours of vertex v are other[start[v] : start[v + 1]]
+    other: np.ndarray
+    tree: TreeArrays
+    embedding: Embedding  # of the vertices in the solid
+    blend: Blend  # local fits of each vertex
+    offset: np.ndarray  # (n,) level offset, the field's value at rest
+    slope: np.ndarray  # (n,) |grad F| at rest; 0 where there is no field
+    volume: float  # at rest [scene unit cubed]
+    edge: float  # mean length of an edge at rest [scene unit]
+
+
+class SurfaceState(NamedTuple):
+    """What goes from frame to frame; r bones, in whose coordinates the last questions are."""
+
+    level: np.ndarray  # (1,)
+    height: np.ndarray  # (n,) above the carried material, along its normal
+    places: np.ndarray  # (r, n, 3) of the last questions
+    bounds: np.ndarray  # (r, n) lower bounds of the distances there
+    outward: np.ndarray  # (r, n, 3) directions in which these grow, 0 where none was found
+
+
+class Obstacles(NamedTuple):
+    """The bones in reach, their poses (r, 4, 4), and grids of their vertices."""
+
+    bones: Bones
+    poses: np.ndarray
+    grids: PointGrids
+
+
+class Work(NamedTuple):
+    """A surface on its way; all arrays by vertex."""
+
+    carried: np.ndarray
+    normals: np.ndarray  # unit, of the carried mesh
+    vertices: np.ndarray
+    direction: np.ndarray  # motion for a unit of level; 0 where held
+    near: np.ndarray  # may come to a bone
+    least: np.ndarray  # lower bound of the distance from all bones, where carried
+    clearance: np.ndarray  # above a bone
+    on_field: np.ndarray  # and not on a bone
+    odd: np.ndarray  # what may cross others without a fold at a corner
+    left: np.ndarray  # kept from a level set that is too far away
+    edge: float  # of the model
+
+
+class Question(NamedTuple):
+    """Room for asking one bone about some of k points."""
+
+    row: np.ndarray  # (k,) number of the point
+    here: np.ndarray  # (k, 3) in bone coordinates
+    points: np.ndarray  # (k, 3)
+    reach: np.ndarray  # (k,)
+    distance: np.ndarray  # (k,)
+    outward: np.ndarray  # (k, 3)
+
+
+@compiled(error_model="numpy")
+def ask_bones(obstacles, state, x, rows, limit, same, distance, outward):
+    """Distances (k,) of vertices x[rows] to the nearest bone and the directions (k, 3) in which
+    they grow; beyond a limit (k,) a lower bound without a direction.
+
+    A bone is asked only where what is known of it does not say that it is farther. What a vertex
+    found no farther than ``same`` away [scene unit] counts for it too, the distance less by that
+    way.
+    """
+    count = len(rows)
+    ask = Question(
+        np.empty(count, np.int64),
+        np.empty((count, 3)),
+        np.empty((count, 3)),
+        np.empty(count),
+        np.empty(count),
+        np.empty((count, 3)),
+    )
+    distance[:count] = np.inf
+    outward[:count] = 0.0
+    for b in range(len(obstacles.poses)):
+        m = _recall(obstacles.poses[b], state, b, x, rows, limit, same, distance, outward, ask)
+        if m > 0:
+            _ask_bone(obstacles, state, b, rows, ask, m, distance, outward)
+
+
+@compiled(error_model="numpy")
+def _recall(pose, state, b, x, rows, limit, same, distance, outward, ask):
+    """What is known of bone b; puts the points that have to be asked into ``ask`` and counts
+    them.
+    """
+    places, bounds, ways, m = state.places[b], state.bounds[b], state.outward[b], 0
+    for i in range(len(rows)):
+        v = rows[i]
+        dx, dy, dz = x[v, 0] - pose[0, 3], x[v, 1] - pose[1, 3], x[v, 2] - pose[2, 3]
+        px = dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]
+        py = dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]
+        pz = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
+        square = (px - places[v, 0]) ** 2 + (py - places[v, 1]) ** 2 + (pz - places[v, 2]) ** 2
+        least, most = bounds[v] - np.sqrt(square), min(distance[i], limit[i])
+        if least > most:
+            distance[i] = min(distance[i], least)
+        elif square <= same * same and (
+            ways[v, 0] != 0.0 or ways[v, 1] != 0.0 or ways[v, 2] != 0.0
+        ):
+            distance[i] = least
+            for a in range(3):
+                outward[i, a] = (
+                    pose[a, 0] * ways[v, 0] + pose[a, 1] * ways[v, 1] + pose[a, 2] * ways[v, 2]
+                )
+        else:
+            ask.row[m], ask.reach[m] = i, most
+            ask.here[m, 0], ask.here[m, 1], ask.here[m, 2] = px, py, pz
+            for a in range(3):
+                ask.points[m, a] = x[v, a]
+            m += 1
+    return m
+
+
+@compiled(error_model="numpy")
+def _ask_bone(obstacles, state, b, rows, ask, m, distance, outward):
+    """Ask bone b about the first m points, and keep what it says."""
+    pose, one, way = obstacles.poses[b], ask.distance, ask.outward
+    query_bone(obstacles.bones, b, pose, ask.points[:m], ask.reach[:m], one[:m], way[:m])
+    for j in range(m):
+        i = ask.row[j]
+        v, reached = rows[i], one[j] <= ask.reach[j]
+        state.bounds[b, v] = one[j]
+        for a in range(3):
+            state.places[b, v, a] = ask.here[j, a]
+            state.outward[b, v, a] = 0.0
+            if reached:
+                for k in range(3):
+                    state.outward[b, v, a] += pose[k, a] * way[j, k]
+        if one[j] < distance[i]:
+            distance[i] = one[j]
+            for a in range(3):
+                outward[i, a] = way[j, a] if reached else 0.0
+
+
+@compiled(error_model="numpy")
+def lift(obstacles, state, work, rows):
+    """Move vertices that lie in a bone onto it, where they stay; whether any did."""
+    moved = False
+    count, limit = len(rows), np.empty(len(rows))
+    distance, outward = np.empty(len(rows)), np.empty((len(rows), 3))
+    rows = rows.copy()
+    for _ in range(LIFTS):
+        for i in range(count):
+            limit[i] = work.clearance[rows[i]]
+        some = rows[:count], limit[:count]
+        ask_bones(obstacles, state, work.vertices, some[0], some[1], 0.0, distance, outward)
+        left = 0
+        for i in range(count):
+            v = rows[i]
+            gap = distance[i] - work.clearance[v]
+            if gap < -OUT * work.edge:
+                for a in range(3):
+                    work.vertices[v, a] -= gap * outward[i, a]
+                    work.direction[v, a] = 0.0
+                rows[left] = v
+                left += 1
+        count = left
+        moved |= left > 0
+        if left == 0:
+            break
+    return moved
+
+
+@compiled(error_model="numpy")
+def mark_near(work):
+    """Mark what has gone so far from where the material carries it that it may lie in a bone."""
+    for v in range(len(work.near)):
+        square, least = 0.0, max(work.least[v], 0.0)
+        for a in range(3):
+            square += (work.vertices[v, a] - work.carried[v, a]) ** 2
+        work.near[v] |= square >= least * least
+
+
+@compiled(error_model="numpy")
+def push_off(model, state, obstacles, work, among):
+    """Move the corners of triangles, of those with a marked corner, that a bone's vertices came
+    through, and out of the bones again what that drove into another.
+    """
+    if len(obstacles.poses) == 0:
+        return
+    moved = np.zeros(len(work.vertices), np.bool_)
+    for turn in range(2):
+        faces = _near_faces(model, work, among if turn == 0 else _grown(model, moved))
+        if len(faces) == 0:
+            return
+        for b in range(len(obstacles.poses)):
+            grid, pose = grid_of(obstacles.grids, b), obstacles.poses[b]
+            push_off_loop(work.vertices, faces, grid, pose, PUSHED * work.edge, moved)
+        rows = np.flatnonzero(moved)
+        for v in rows:
+            work.odd[v] = True
+            work.direction[v] = 0.0
+        if len(rows) == 0 or not lift(obstacles, state, work, rows):
+            return
+
+
+@compiled(error_model="numpy")
+def _near_faces(model, work, among):
+    """The triangles with a marked corner that a bone's vertex may have come through."""
+    x, faces, count = work.vertices, np.empty_like(model.faces), 0
+    least = np.empty(len(x))
+    for v in range(len(x)):
+        away = 0.0
+        for a in range(3):
+            away += (x[v, a] - work.carried[v, a]) ** 2
+        least[v] = work.least[v] - np.sqrt(away)
+    for f in range(len(model.faces)):
+        p, q, r = model.faces[f, 0], model.faces[f, 1], model.faces[f, 2]
+        one, two, three = 0.0, 0.0, 0.0
+        for a in range(3):
+            one += (x[q, a] - x[p, a]) ** 2
+            two += (x[r, a] - x[q, a]) ** 2
+            three += (x[p, a] - x[r, a]) ** 2
+        near, side = min(least[p], least[q], least[r]), max(one, two, three)
+        if (near <= 0.0 or near * near < NEAR_FACE * NEAR_FACE * side) and (
+            among[p] or among[q] or among[r]
+        ):
+            faces[count, 0], faces[count, 1], faces[count, 2] = p, q, r
+            count += 1
+    return faces[:count]
+
+
+@compiled(error_model="numpy")
+def untangle(model, state, obstacles, work, embedded, moved):
+    """Take what crosses itself back towards the material, then smooth it; whether anything was
+    moved for it, and marked.
+    """
+    m, n = len(model.faces), len(work.vertices)
+    found, among = np.zeros(m, np.bool_), np.ones(m, np.bool_)
+    if not embedded:
+        _touching(model.faces, work.odd | work.left, among)
+    moved[:] = False
+    last, back = m + 1, not embedded
+    for turn in range(ROUNDS):
+        # What was not moved does not begin to cross.
+        count = crossing_loop(work.vertices, model.tree, among, turn == 0, found)
+        if count == 0:
+            return turn > 0
+        # Where the material crosses itself the way back to it does not help.
+        back &= turn < TRIED or count < last
+        last = count
+        marked = np.zeros(n, np.bool_)
+        for f in range(m):
+            if found[f]:
+                for k in range(3):
+                    marked[model.faces[f, k]] = True
+        for _ in range(1 + turn // GROWTH):
+            marked = _grown(model, marked)
+        _touching(model.faces, marked, among)
+        work.odd[:] |= marked
+        moved[:] |= marked
+        _calm(model, work, marked, back)
+        mark_near(work)
+        lift(obstacles, state, work, np.flatnonzero(marked & work.near))
+    return True
+
+
+@compiled(error_model="numpy")
+def _calm(model, work, marked, back):
+    """Move the marked vertices ``back`` towards the material, or smooth them."""
+    rows = np.flatnonzero(marked)
+    if back:
+        # What the material takes into a bone cannot go back there.
+        for v in rows:
+            if work.least[v] >= 0.0:
+                for a in range(3):
+                    away = work.vertices[v, a] - work.carried[v, a]
+                    work.vertices[v, a] -= BACK * away
+        rows = np.flatnonzero(marked & (work.least < 0.0))
+    for _ in range(SWEEPS):
+        smooth_loop(work.vertices, rows, model.start, model.other)
+
+
+@compiled(error_model="numpy")
+def _touching(faces, marked, out):
+    """Mark the triangles with a marked corner."""
+    for f in range(len(faces)):
+        out[f] = marked[faces[f, 0]] or marked[faces[f, 1]] or marked[faces[f, 2]]
+
+
+@compiled(error_model="numpy")
+def _grown(model, marked):
+    """The marked vertices and their neighbours."""
+    out = marked.copy()
+    for v in range(len(marked)):
+        if marked[v]:
+            for k in range(model.start[v], model.start[v + 1]):
+                out[model.other[k]] = True
+    return out
+
+
+@compiled(error_model="numpy")
+def smooth_loop(vertices, rows, start, other):
+    """Half the way to the mean of the neighbours, one vertex after the other."""
+    for v in rows:
+        count = start[v + 1] - start[v]
+        for a in range(3):
+            total = 0.0
+            for n in range(start[v], start[v + 1]):
+                total += vertices[other[n], a]
+            vertices[v, a] = 0.5 * (vertices[v, a] + total / count)
