@@ -11,7 +11,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.geometry.surfaces import face_normals, opposite_half_edges
+from rbfmuscle.geometry.surfaces import face_normals, opposite_half_edges, vertex_normals
 from rbfmuscle.muscle.placement import cached_sample
 from rbfmuscle.muscle.surface_limits import smooth_loop
 from rbfmuscle.scene.objects import Muscle
@@ -21,8 +21,9 @@ MOST_SHOWN = 6000
 # Sweeps of smoothing for triangles that cross others at rest.
 UNTANGLED = 24
 # Cosine between the normals of two neighbours that lie on each other, which cross when they move;
-# and in how many sweeps they are smoothed, as some sharp rims fold back on themselves too.
-FOLDED, UNFOLDED = -np.sqrt(0.75), 4
+# sweeps in which they are smoothed; and how far vertices may go for that, in mean edges: a scan's
+# overlaps are small, and what is larger is the shape.
+FOLDED, UNFOLDED, UNFOLD_WAY = -np.sqrt(0.75), 4, 0.25
 # Bounds on the vertices that are asked for by a resolution.
 WANTED = (200, 12_000)
 # Vertices of a triangulation on an area of one edge squared.
@@ -33,17 +34,16 @@ def display_mesh(muscle: Muscle, resolution: int) -> tuple[Floats, Integers]:
     """Vertices (n, 3) and faces (m, 3) that show a muscle: its input mesh, or a coarser one on it.
 
     With a ``resolution`` above 0, with so many edges along the longest side. Triangles of a scan
-    that cross others, or lie on a neighbour, are smoothed until they do not, `UNTANGLED` times at
-    most: what then crosses counts as ``self_crossings`` of every frame.
+    that lie on a neighbour are smoothed where that is a small change, and those that cross others
+    until they do not, `UNTANGLED` times at most: what then crosses counts as ``self_crossings`` of
+    every frame.
     """
     points, faces = _covering(muscle, resolution)
     tree, points = FaceTree(points, faces), points.copy()
     start, other = neighbour_lists(faces, len(points))
-    beside = opposite_half_edges(faces).reshape(-1, 3) // 3
+    _unfold(points, faces, start, other)
     for turn in range(UNTANGLED):
         crossing = tree.crossing(points)
-        if turn < UNFOLDED:
-            crossing |= _folded(points, faces, beside)
         if not crossing.any():
             break
         marked = np.unique(faces[crossing])
@@ -55,6 +55,19 @@ def display_mesh(muscle: Muscle, resolution: int) -> tuple[Floats, Integers]:
     return points, faces
 
 
+def _unfold(points: Floats, faces: Integers, start: Integers, other: Integers) -> None:
+    """Smooth, in place, triangles that lie folded on a neighbour, where that is a small change."""
+    beside, smooth = opposite_half_edges(faces).reshape(-1, 3) // 3, points.copy()
+    for _ in range(UNFOLDED):
+        folded = _folded(smooth, faces, beside)
+        if not folded.any():
+            break
+        smooth_loop(smooth, np.unique(faces[folded]), start, other)
+    way = np.linalg.norm(smooth - points, axis=1).max()
+    if way < UNFOLD_WAY * np.linalg.norm(points[faces[:, 0]] - points[faces[:, 1]], axis=1).mean():
+        points[:] = smooth
+
+
 def _folded(points: Floats, faces: Integers, beside: Integers) -> Booleans:
     """Which triangles (m,) are folded onto a neighbour, of those ``beside`` (m, 3) each, -1 for
     none.
@@ -63,6 +76,9 @@ def _folded(points: Floats, faces: Integers, beside: Integers) -> Booleans:
     normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
     cosine = np.einsum("mka,ma->mk", normals[beside], normals)
     folded: Booleans = ((cosine < FOLDED) & (beside >= 0)).any(axis=1)
+    # Of a sharp rim both sides are seen from outside.
+    along = np.einsum("mka,ma->mk", vertex_normals(points, faces)[faces], normals)
+    folded &= (along < 0.0).any(axis=1)
     return folded
 
 

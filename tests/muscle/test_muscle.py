@@ -15,7 +15,7 @@ import rbfmuscle as rm
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.models import build_model, build_models
 from rbfmuscle.muscle import placement
-from rbfmuscle.muscle.display_mesh import MOST_SHOWN, display_mesh
+from rbfmuscle.muscle.display_mesh import MOST_SHOWN, _unfold, display_mesh, neighbour_lists
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import LEAST_ATTACHED
@@ -305,21 +305,28 @@ def test_shown_mesh_is_the_input_mesh_unless_it_is_large_or_another_resolution_i
     assert len(long.mesh.vertices) > MOST_SHOWN == len(display_mesh(long, 0)[0])
 
 
-def test_triangles_that_lie_folded_on_a_neighbour_are_smoothed():
-    ball = trimesh.creation.icosphere(4, 10.0)
-    vertices, faces = np.array(ball.vertices), np.array(ball.faces)
-    # A vertex goes over the far side of its ring, where one triangle then lies on its neighbour.
-    corner, far = faces[100, 0], faces[100, 1]
-    way = vertices[far] - vertices[corner]
-    vertices[corner] += 1.2 * way
-    vertices[corner] *= 10.0 / np.linalg.norm(vertices[corner])
-    folded = trimesh.Trimesh(vertices, faces, process=False)
-    assert np.degrees(folded.face_adjacency_angles).max() > 150.0
-    shown = display_mesh(SimpleNamespace(mesh=folded), 0)[0]
-    angles = trimesh.Trimesh(shown, faces, process=False).face_adjacency_angles
-    assert np.degrees(angles).max() < 90.0
-    still = np.linalg.norm(shown - vertices, axis=1) < 1e-9
-    assert still.mean() > 0.98
+@pytest.mark.parametrize(("most", "smoothed"), [(1.0, True), (0.01, False)])
+def test_triangles_folded_on_a_neighbour_are_smoothed_where_that_is_little(
+    most, smoothed, monkeypatch
+):
+    monkeypatch.setattr("rbfmuscle.muscle.display_mesh.UNFOLD_WAY", most)
+    box = trimesh.creation.box([20.0, 20.0, 20.0]).subdivide_to_size(3.0)
+    vertices, faces = np.array(box.vertices), np.array(box.faces)
+    # In the middle of a side a vertex goes a little beyond its ring, in the plane.
+    corner = np.linalg.norm(vertices - [0.0, 0.0, 10.0], axis=1).argmin()
+    ring = np.setdiff1d(faces[(faces == corner).any(axis=1)], corner)
+    vertices[corner] += 1.02 * (vertices[ring[0]] - vertices[corner])
+    assert _largest_angle(vertices, faces) > 150.0
+    points = vertices.copy()
+    _unfold(points, faces, *neighbour_lists(faces, len(points)))
+    assert (_largest_angle(points, faces) < 91.0) == smoothed
+    assert (points != vertices).any() == smoothed
+
+
+def _largest_angle(vertices, faces):
+    """Between the normals of two neighbours [degree]."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    return np.degrees(mesh.face_adjacency_angles).max()
 
 
 def test_surface_at_rest_is_the_input_mesh_but_for_what_overlaps_bones():
