@@ -263,9 +263,9 @@ def rows_of(path):
         *((name, name, {}) for name in COMPARED if name != "rbf"),
     ):
         found = distances(model, kept, settings=settings)
-        rows.append([title, *(x for _, rms, worst, _ in found for x in (rms, worst))])
+        rows.append([title, *(x for angle, rms, worst, _ in found if angle for x in (rms, worst))])
         print(*rows[-1], flush=True)
-    heads = [f"{angle:g}°, {what}" for angle in kept["angles"] for what in ("RMS", "greatest")]
+    heads = [f"{a:g}°, {what}" for a in kept["angles"] if a for what in ("RMS", "greatest")]
     return rows, ["model", *heads]
 
 
