@@ -102,7 +102,7 @@ def wrapped(over, model, spacing):
     )
     angle = math.radians(TURNS[over])
     added, lifted = wrapped_path(angle, bar=STRIPS[over])
-    places = played.material_meshes[0]
+    places = played.carried[0]
     return wrapped_strip_errors(angle, over, added, lifted, DRUM_RADIUS, *played.lines(), places)
 
 
