@@ -2,10 +2,22 @@
 
 import numpy as np
 
+from rbfmuscle.implicit.selection import SCAN, SPAN
+
 # Errors this much apart are alike: points of another seed move them as far.
 ALIKE = 1.05
 # Rows beyond this condition are taken only where none that is as accurate is below it.
 SOUND = 1e10
+
+
+ENDS = "epsilon lies at an end of its search"
+
+
+def at_end(shape: float) -> bool:
+    """Whether epsilon times the spacing lies at an end of its search, within a scan's step."""
+    low, high = SPAN
+    step = (high / low) ** (1.0 / (SCAN - 1))
+    return shape <= low * step or shape >= high / step
 
 
 def row_toml(row: dict) -> str:

@@ -122,6 +122,7 @@ def measure_row(
         "volume_error": None,
         "fit_time": None,
         "evaluation_time": None,
+        "trials": [],
         "unfit": "",
         "note": "" if kernel.hermite else "values on and off the surface, the kernel is not C2",
     }
@@ -142,6 +143,7 @@ def measure_row(
                     *places, fit, held_out=unseen, distance=judge.distance.unsigned
                 )
                 fit = replace(fit, epsilon=choice.epsilon)
+                row["trials"] = choice.trials.tolist()
                 row["epsilon"], row["shape"] = (
                     fit.epsilon,
                     fit.epsilon * float(spacing(sample.points).mean()),

@@ -58,11 +58,13 @@ class EpsilonChoice(NamedTuple):
     [length].
 
     ``broken`` says why no zero set that was extracted is that of the surface, empty where one is.
+    ``trials`` (n, 2) are each epsilon times the mean spacing, growing, and its error.
     """
 
     epsilon: float
     error: float
     broken: str
+    trials: Floats
 
 
 def spacing(points: ArrayLike) -> Floats:
@@ -127,7 +129,9 @@ def choose_epsilon(
     found, broken = (
         (order[0], "") if distance is None else _first_sound(order, points, reach, distance)
     )
-    return EpsilonChoice((found or order[0]).epsilon, (found or order[0]).error, broken)
+    chosen = found or order[0]
+    trials = np.array(sorted((trial.epsilon * reach, trial.error) for trial in order))
+    return EpsilonChoice(chosen.epsilon, chosen.error, broken, trials)
 
 
 def _search(

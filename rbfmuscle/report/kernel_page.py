@@ -4,13 +4,26 @@ import csv
 import datetime
 from collections import Counter
 from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-from rbfmuscle.experiments.kernel_rows import ALIKE, cost, describe, recommend, row_name, row_toml
+import numpy as np
+
+from rbfmuscle.experiments.kernel_rows import (
+    ALIKE,
+    ENDS,
+    at_end,
+    cost,
+    describe,
+    recommend,
+    row_name,
+    row_toml,
+)
 from rbfmuscle.experiments.kernel_study import KernelStudy
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import shown_number
+from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.writer import json_text, versions
 from rbfmuscle.report.page import (
     BAD,
@@ -23,7 +36,7 @@ from rbfmuscle.report.page import (
     Table,
     number_cell,
 )
-from rbfmuscle.report.plots import Point, front_plot
+from rbfmuscle.report.plots import Point, Track, front_plot, line_plot
 
 # Quantity: heading, factor.
 COLUMNS = {
@@ -68,7 +81,8 @@ def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> 
     }
     with kernels_folder(directory).staged() as stage:
         with (stage / "kernels.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+            names = [name for name in rows[0] if name != "trials"]
+            writer = csv.DictWriter(file, fieldnames=names, extrasaction="ignore")
             writer.writeheader()
             writer.writerows(rows)
         (stage / "kernels.json").write_text(json_text(facts), encoding="utf-8")
@@ -129,8 +143,18 @@ def _page(studies: Mapping[str, KernelStudy], made: str) -> ReportPage:
         heads=["RMS error", "fit and 20,000 values"],
         sections=[
             *(
-                Section(f"Every row of {name}", f"{hint}; mesh {s.sha256[:12]}", table=_rows(s))
+                Section(f"Fitted rows of {name}", f"{hint}; mesh {s.sha256[:12]}", table=_rows(s))
                 for name, s in studies.items()
+            ),
+            *(
+                Section(f"Unfit rows of {name}", hint, table=_rows(s, unfit=True))
+                for name, s in studies.items()
+                if any(row["unfit"] for row in s.rows)
+            ),
+            *(
+                Section(f"Error against epsilon: {name}", plots=_curves(s))
+                for name, s in studies.items()
+                if any(row["trials"] for row in s.rows)
             ),
             Section("To paste at the end of a [[muscle]]", code=code),
             Section("How to read this", text=_READING),
@@ -175,12 +199,31 @@ def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
     return front_plot(points, labels)
 
 
-def _rows(study: KernelStudy) -> Table:
+def _curves(study: KernelStudy) -> list[str]:
+    """For each number of centres the error at the held-out points against epsilon, by kernel."""
+    pictures = []
+    unit = study.units or "mesh units"
+    for count in dict.fromkeys(row["centres"] for row in study.rows):
+        rows = [row for row in study.rows if row["centres"] == count and row["trials"]]
+        tracks = []
+        for row, colour in zip(rows, cycle(MUSCLE_COLOURS)):
+            shapes, errors = np.array(row["trials"]).T
+            tracks.append(Track(row["kernel"], colour, np.log10(shapes), np.log10(errors)))
+        labels = "log10 of epsilon times spacing", f"log10 of the RMS error [{unit}]"
+        if tracks:
+            pictures.append(line_plot(f"{count} centres", tracks, labels, legend=True))
+    return pictures
+
+
+def _rows(study: KernelStudy, *, unfit: bool = False) -> Table:
     rows = []
-    for row in study.rows:
+    for row in (row for row in study.rows if bool(row["unfit"]) == unfit):
         state = GOOD if row is study.recommended else BAD if row["unfit"] else PLAIN
         front = "on the front" if row["front"] else ""
         verdict = row["unfit"] or ("recommended" if row is study.recommended else front)
+        verdict = "; ".join(
+            filter(None, [verdict, ENDS if row["shape"] and at_end(row["shape"]) else ""])
+        )
         values = [(row[name], factor) for name, (_, factor) in COLUMNS.items()]
         texts = [
             shown_number(x * factor) if isinstance(x, float) else str(x or "")

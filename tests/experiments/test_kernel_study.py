@@ -12,13 +12,15 @@ from command_line import call
 
 import rbfmuscle as rm
 from rbfmuscle.experiments import kernel_study, wanted_error
-from rbfmuscle.experiments.kernel_rows import recommend, row_toml
+from rbfmuscle.experiments.kernel_rows import ENDS, at_end, recommend, row_toml
 from rbfmuscle.experiments.kernel_study import ReferenceSurface
 from rbfmuscle.experiments.wanted_error import STEP, reach_error
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import mesh_hash
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.implicit.selection import SPAN
+from rbfmuscle.report.kernel_page import write_page
 from rbfmuscle.validation import MeshError, UsageError
 
 
@@ -228,3 +230,24 @@ def test_command_with_an_error_says_what_to_paste(tmp_path, ellipsoid, capsys, m
     monkeypatch.setattr(wanted_error, "MOST", 24)
     code, said, _ = call(capsys, "kernels", *words, "--error", "1e-5")
     assert code == 0 and "is not reached; the best, cubic, 24 centres" in said
+
+
+def test_page_has_curves_of_epsilon_flags_its_ends_and_folds_unfit_rows(tmp_path, ellipsoid):
+    study = rm.study_kernels(
+        ellipsoid, kernels=["gaussian", "cubic"], centres=[30], placement="greedy", resolution=24
+    )
+    (gaussian,) = (row for row in study.rows if row["kernel"] == "gaussian")
+    shapes, errors = np.array(gaussian["trials"]).T
+    assert (np.diff(shapes) > 0).all() and len(shapes) > 20 and (errors > 0).all()
+    best = shapes[errors.argmin()]
+    assert errors[np.abs(shapes - gaussian["shape"]).argmin()] <= 1.5 * errors.min()
+    assert SPAN[0] <= best <= SPAN[1]
+    assert at_end(SPAN[0]) and at_end(SPAN[1]) and not at_end(1.0)
+    facts = {"units": "mm", "version": "1", "date": "2", "meshes": {"m": "0" * 64}}
+    rows = [row | {"surface": "m"} for row in study.rows]
+    rows[0] |= {"shape": SPAN[1]}
+    rows += [gaussian | {"surface": "m", "unfit": "open", "kernel": "planted"}]
+    write_page(tmp_path, facts | {"rows": rows})
+    page = (tmp_path / "kernels.html").read_text(encoding="utf-8")
+    assert ENDS in page and "Error against epsilon: m" in page
+    assert page.index("Fitted rows of m") < page.index("Unfit rows of m") < page.rindex("planted")
