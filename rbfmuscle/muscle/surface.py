@@ -22,14 +22,7 @@ from rbfmuscle.geometry.surfaces import _vertex_normal_loop, volume_cubic, volum
 from rbfmuscle.implicit.blend import blend_loop
 from rbfmuscle.jit import compiled
 from rbfmuscle.muscle.model import carry
-from rbfmuscle.muscle.surface_limits import (
-    Work,
-    ask_bones,
-    lift,
-    mark_near,
-    push_off,
-    untangle,
-)
+from rbfmuscle.muscle.surface_limits import Work, ask_bones, lift, mark_near, push_off, untangle
 
 # Lengths below are in mean edges of the mesh at rest.
 NEAR_BONE = 1.5  # what is within this of a bone may come to lie on it
