@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -51,11 +51,11 @@ def compare_models(
     directory: str | Path,
     models: Sequence[str] = COMPARED,
     *,
-    frames: Any = None,
-    settings: dict[str, Any] | None = None,
+    frames: object = None,
+    settings: dict[str, object] | None = None,
     pictures: bool = True,
-    progress: Callable[..., Any] | None = None,
-) -> dict[str, Any]:
+    progress: Callable[..., object] | None = None,
+) -> dict[str, object]:
     """Run every model on a scene, measure all alike, and write tables, a report and pictures.
 
     Parameters

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rbfmuscle.folders import LIST, read_list
 from rbfmuscle.geometry.fields import BoneField
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 def simulate(
     scene: Scene | str | Path,
-    model: str | dict[str, Any] | None = None,
+    model: str | dict[str, object] | None = None,
     *,
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, object] | None = None,
     frames: slice | str | None = None,
     progress: Callable[[int, int], None] | bool | None = None,
     bone_sdfs: Mapping[str, BoneField] | None = None,
@@ -104,8 +104,8 @@ def stream_run(
     scene: Scene,
     directory: str | Path,
     *,
-    model: str | dict[str, Any] | None = None,
-    settings: Mapping[str, Any] | None = None,
+    model: str | dict[str, object] | None = None,
+    settings: Mapping[str, object] | None = None,
     frames: slice | str | None = None,
     fail_on: str | Sequence[str] | None = None,
     pictures: bool = True,

@@ -3,7 +3,6 @@
 import logging
 import sys
 from time import perf_counter
-from typing import Any
 
 from rbfmuscle.cli.options import Flag, SceneName
 from rbfmuscle.cli.printing import USUAL, Printing, print_result
@@ -39,7 +38,7 @@ def check(
     """
     if time and not plan:
         raise UsageError("--time measures what --plan lists; give check SCENE --plan --time")
-    facts: dict[str, Any] = {"upgraded": _upgrade(scene)} if upgrade else {}
+    facts: dict[str, object] = {"upgraded": _upgrade(scene)} if upgrade else {}
     with Progress(f"check {scene.name}"):
         if picture:
             from rbfmuscle.report.render import check_picture

@@ -2,7 +2,7 @@
 read.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt
 
@@ -126,7 +126,7 @@ class RunInfo(Part):
     status: str = "complete"
     message: str | None = None
     scene: SceneInfo
-    options: dict[str, Any] = {}  # settings have values of any type
+    options: dict[str, object] = {}  # settings have values of any type
     versions: dict[str, str] = {}
     machine: dict[str, str | int | None] = {}
     kernels: dict[str, str] = {}
@@ -141,7 +141,7 @@ class RunInfo(Part):
     frames: list[FrameInfo]
     planned: list[dict[str, float]] = []
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """What ``run.json`` holds."""
         return self.model_dump(exclude_unset=True)
 

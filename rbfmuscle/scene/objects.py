@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -139,7 +139,18 @@ def body_axes(superior: Sequence[float] | None, anterior: Sequence[float] | None
     return np.stack([left, np.cross(up, left), up])
 
 
-def find_named(items: list[Any], name: str, what: str, *, context: str = "") -> Any:
+class Named(Protocol):
+    """Anything with a name."""
+
+    @property
+    def name(self) -> str:
+        """As the scene file has it."""
+
+
+NamedItem = TypeVar("NamedItem", bound=Named)
+
+
+def find_named(items: Sequence[NamedItem], name: str, what: str, *, context: str = "") -> NamedItem:
     """Return the item of that name, or raise SceneError naming the nearest."""
     for item in items:
         if item.name == name:

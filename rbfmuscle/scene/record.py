@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from rbfmuscle.geometry.surfaces import mesh_hash
@@ -14,7 +12,7 @@ from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.objects import Muscle
 
 
-def record_scene(scene: SceneContents) -> dict[str, Any]:
+def record_scene(scene: SceneContents) -> dict[str, object]:
     """A scene as plain data: names, counts, options, sources and hashes."""
     known = all_coordinates(scene.joints)
     units = {name: coordinate.unit_sign(scene.units) for name, coordinate in known.items()}

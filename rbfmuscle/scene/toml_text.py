@@ -2,10 +2,9 @@
 
 import json
 from collections.abc import Mapping
-from typing import Any
 
 
-def value_text(value: Any) -> str:
+def value_text(value: object) -> str:
     """A value as TOML on one line; numbers to 13 digits."""
     if isinstance(value, float):
         return f"{value + 0.0:.13g}"  # no -0
@@ -24,7 +23,7 @@ def _key(key):
 
 
 def table_text(
-    head: str, row: Mapping[str, Any], comments: Mapping[str, str | list[str]] | None = None
+    head: str, row: Mapping[str, object], comments: Mapping[str, str | list[str]] | None = None
 ) -> str:
     """A table as TOML, lists of tables with one a line, after its first line ``head``, as
     ``[[bone]]``.

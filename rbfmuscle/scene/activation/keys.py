@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -79,7 +79,7 @@ class ActivationTable(Table):
         return ActivationTable.build(values, context=f"{context}{self.file} column {name!r}: ")
 
 
-def _check_activation(value: Any) -> Any:
+def _check_activation(value: object) -> object:
     """One message in place of one for each of the forms that it may take."""
     if isinstance(value, (dict, ActivationTable)):
         return value
@@ -108,7 +108,7 @@ class ContractionTable(Table):
     tendon_region: TendonRegionTable | None = None
 
 
-def contraction_keys(given: Mapping[str, Any], *, muscle: str) -> ContractionTable | None:
+def contraction_keys(given: Mapping[str, object], *, muscle: str) -> ContractionTable | None:
     """The checked keys of one muscle, or None where it has none; a value None counts as not
     given.
     """
