@@ -381,13 +381,9 @@ def _fill(model, state, obstacles, work, embedded):
 
 @compiled(error_model="numpy")
 def _keep_heights(state, work):
-    """Heights of the vertices above the carried material, for the next frame.
-
-    Where the field's slope is less than at rest, how far a vertex may go depends on where it is
-    looked for first: there the search starts at the material in every frame.
-    """
+    """Heights of the vertices above the carried material, for the next frame."""
     for v in range(len(work.normals)):
         height = 0.0
         for a in range(3):
             height += work.normals[v, a] * (work.vertices[v, a] - work.carried[v, a])
-        state.height[v] = 0.0 if work.odd[v] or work.left[v] else height
+        state.height[v] = height

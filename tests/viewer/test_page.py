@@ -107,7 +107,7 @@ def test_dragging_a_slider_moves_number_muscles_and_picture_and_a_reload_keeps_t
     assert 21 < value < 27
     wait_for(lambda: abs(degrees(page) - value) < 1e-6, SLOW)
     assert changed(before, canvas(tab)) > 0.01
-    tab.call("ViewerPage.reload")
+    tab.call("Page.reload")
     wait_for(lambda: (tab.slider(FLEXION) or [None])[0] == value and "extensor" in tab.text(), SLOW)
 
 
