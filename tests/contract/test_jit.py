@@ -64,7 +64,9 @@ def place(tmp_path):
 
 def start(place, cache="cache", **settings):
     paths = os.pathsep.join([str(place), str(ROOT)])
-    env = {**os.environ, "PYTHONPATH": paths, "RBFMUSCLE_LOOPS": str(place / cache), **settings}
+    # Python takes sources of one size that change within a second for the same.
+    own = {"PYTHONPATH": paths, "RBFMUSCLE_LOOPS": str(place / cache)}
+    env = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **own, **settings}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([sys.executable, "-c", MAIN], env=env, cwd=place, **pipes)
 

@@ -55,7 +55,7 @@ def test_masks_that_overlap_are_kept_whole_and_their_overlap_is_said(tmp_path):
     for name, mask in masks.items():
         np.testing.assert_array_equal(found[name], mask)
     count, least = int((MUSCLE & PELVIS).sum()), int(min(MUSCLE.sum(), PELVIS.sum()))
-    share = f"{100 * count / least:.2g} %"
+    share = f"{100 * count / least:.3g} %"
     said = [note for note in volume.notes if "gluteus_maximus" in note and "pelvis" in note]
     assert len(said) == 1 and f"in {count} voxels ({share}" in said[0] and "both kept" in said[0]
     for label in volume.values().tolist():
