@@ -89,14 +89,17 @@ def describe_excess(row: Exceedance, table: Table, missing_bones: Sequence[str] 
     muscle, quantity, worst, limit, frame = row
     unit = table[muscle][quantity]["unit"]
     value = shown_number(worst, unit)
-    if value.startswith("<"):  # less than is shown elsewhere, and beyond a limit all the same
-        value = f"{worst:.3g} {unit}".removesuffix(" 1")
+    shown_limit = f"{limit:.3g}"
+    # Less than is shown elsewhere, or so near to the limit that it would look the same.
+    if value.startswith("<") or value.split()[0] == shown_limit:
+        value = f"{worst:.5g} {unit}".removesuffix(" 1")
+        shown_limit = f"{limit:.5g}"
     place = "the bones" if muscle == ALL else muscle
     quantity, _, coordinate = quantity.partition(":")
     title = LIMITS[quantity].title if quantity in LIMITS else quantity
     title += f" ({coordinate})" if coordinate else ""
     title += f" ({_listed(missing_bones)})" if quantity == "missing_bones" else ""
-    return f"{place}, {title} {value} at frame {frame} (limit {limit:.3g})"
+    return f"{place}, {title} {value} at frame {frame} (limit {shown_limit})"
 
 
 def require_limits(table: Table, limits: Limits) -> None:

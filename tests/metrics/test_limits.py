@@ -167,6 +167,13 @@ def test_a_value_beyond_its_limit_is_shown_however_small():
     assert "rest error 0.0097 mm at frame 0 (limit 0.001)" in said
 
 
+def test_a_value_just_beyond_its_limit_does_not_look_like_it():
+    said = describe_verdict(
+        facts({"rest_error_rms": [0.5004]}), parse_limits("rest_error_rms=0.5", arm_scene())
+    )
+    assert "rest error 0.5004 mm at frame 0 (limit 0.5)" in said
+
+
 def test_limits_of_the_command_line_follow_the_unit():
     limits = parse_limits("all,flicker=2", arm_scene(units="m"))
     assert limits.values["penetration_max"] == pytest.approx(0.0001)
