@@ -5,6 +5,7 @@ their files of evidence hold, and listed tests are there.
 import argparse
 import importlib.util
 import json
+import os
 import re
 import shlex
 import sys
@@ -84,8 +85,14 @@ def arguments_are_read(path, words):
         patch.setattr(argparse.ArgumentParser, "parse_args", parse)
         patch.setattr(sys, "argv", [str(path), *words])
         patch.setattr(sys, "path", [str(path.parent), *sys.path])
-        with pytest.raises(Read):
-            spec.loader.exec_module(module)
+        # Some scripts choose their threads in the environment, for themselves alone.
+        before = dict(os.environ)
+        try:
+            with pytest.raises(Read):
+                spec.loader.exec_module(module)
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
     return True
 
 
