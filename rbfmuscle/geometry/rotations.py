@@ -1,25 +1,9 @@
-"""Rigid motions that fit moved points; rotations as unit quaternions (w, x, y, z), for compiled
-loops.
-"""
+"""Rotations as unit quaternions (w, x, y, z), for compiled loops."""
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.jit import compiled
-
-
-def rigid_fit(points: Floats, targets: Floats) -> Floats:
-    """Rigid (4, 4) transform that takes points (n, 3) nearest to targets (n, 3) by least squares
-    (Kabsch 1976).
-    """
-    middle, aim = points.mean(axis=0), targets.mean(axis=0)
-    u, _, vt = np.linalg.svd((points - middle).T @ (targets - aim))
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    transform = np.eye(4)
-    if len(points) > 2:
-        transform[:3, :3] = vt.T @ mirror @ u.T
-    transform[:3, 3] = aim - transform[:3, :3] @ middle
-    return transform
 
 
 def turned_quaternions(quaternions: Floats, rotation: Floats) -> Floats:
