@@ -277,26 +277,6 @@ def simulate_frames(
             loop.skip(coordinates)
 
 
-def solve_pose(
-    scene: Scene,
-    models: Collection[MuscleModel],
-    coordinates: Mapping[str, float],
-    *,
-    bone_sdfs: Mapping[str, BoneField] | None = None,
-) -> Frame:
-    """Solve one pose [radian] straight from rest, so that the shapes depend on the pose alone.
-
-    The models are in their rest state, to which they return. Raises SolveError if a muscle cannot
-    be solved.
-    """
-    rest = [model.snapshot() for model in models]
-    try:
-        return FrameLoop(scene, models, bone_sdfs=bone_sdfs).advance(coordinates)
-    finally:
-        for model, state in zip(models, rest):
-            model.restore(state)
-
-
 def _obstacles(scene, models, bone_sdfs):
     """One BoneContacts for each model, with fields of the bones that it can reach.
 

@@ -10,7 +10,7 @@ import rbfmuscle as rm
 from rbfmuscle.models import build_model, build_models
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.options import SlidingOptions
-from rbfmuscle.simulation.frame_loop import simulate_frames, solve_pose
+from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 from rbfmuscle.simulation.plan import plan_scene
 from rbfmuscle.simulation.substeps import SubSteps
 
@@ -134,6 +134,15 @@ def test_plan_counts_what_a_run_then_does():
 
 POSE = {"hip.flexion": np.radians(24.0), "hip.adduction": np.radians(-10.0)}
 OTHER = {"hip.flexion": np.radians(30.0)}
+
+
+def solve_pose(scene, models, coordinates):
+    """The frame of one pose, solved straight from rest, to which the models return."""
+    rest = [model.snapshot() for model in models]
+    frame = FrameLoop(scene, models).advance(coordinates)
+    for model, state in zip(models, rest):
+        model.restore(state)
+    return frame
 
 
 @pytest.mark.parametrize(
