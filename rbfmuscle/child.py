@@ -62,7 +62,7 @@ class Outbox:
                 send(self.file, what)
         except BrokenPipeError:
             os._exit(0)
-        except Exception:  # noqa: BLE001 - whatever it is, the message is cut, and none can follow it
+        except Exception:  # noqa: BLE001 - whatever it is, the message is cut: none can follow
             traceback.print_exc()
             os._exit(1)
 
