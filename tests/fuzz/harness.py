@@ -51,6 +51,9 @@ def run_case(action: Callable[[], int], folder: Path) -> tuple[str, str, float]:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     said = folder / "said.txt"
+    # What waits in a buffer would be written by both processes.
+    sys.stdout.flush()
+    sys.stderr.flush()
     pid = os.fork()
     if pid == 0:
         _limit(said, folder.parent)
