@@ -8,7 +8,6 @@ import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from rbfmuscle.output.writer import versions
 from rbfmuscle.scene.scene import Scene
@@ -16,7 +15,8 @@ from rbfmuscle.scene.settings import parse_value
 from rbfmuscle.validation import UsageError
 
 # Values of each setting that is varied.
-Grid = dict[str, list[Any]]
+Grid = Mapping[str, Sequence[object]]
+_FILES = ("file", "mesh", "output")  # keys of what says where a scene lies and what it writes
 
 # Of these keys the reference takes the greatest value of the grid, or the least; of all others the
 # scene's own.
@@ -36,7 +36,7 @@ class SweepPoint:
 
     key: str
     scene: str
-    settings: dict[str, Any]
+    settings: dict[str, object]
     role: str
     reference: str
 
@@ -50,7 +50,7 @@ def parse_grid(texts: Sequence[str]) -> Grid:
     """Return the grid of ``["KEY=a,b,c", ...]``; UsageError on other text, or a key given twice or
     without values.
     """
-    grid: Grid = {}
+    grid: dict[str, list[object]] = {}
     for text in texts:
         name, found, values = text.partition("=")
         key = name.strip()
@@ -77,7 +77,7 @@ def plan_sweep(
     grid: Grid,
     *,
     frames: str | None = None,
-    reference: Mapping[str, Any] | None = None,
+    reference: Mapping[str, object] | None = None,
 ) -> list[SweepPoint]:
     """Lay out a sweep scene by scene: reference, the scene's own settings, the grid; nothing is
     run.
@@ -118,12 +118,7 @@ def _model_first(settings):
 
 def scene_content(scene: Scene, frames: str | None = None) -> str:
     """Hash of what a scene would simulate, wherever its files lie, and of the library's version."""
-    facts = scene.resolved()
-    for part in ("file", "output"):
-        facts.pop(part)
-    for item in [*facts["bones"], *facts["muscles"]]:
-        item.pop("mesh")
-    facts["motion"].pop("file", None)
+    facts = _without_files(scene.resolved())
     ends = [muscle.attachments for muscle in scene.muscles]
     held = [
         [(a.bone, a.vertices.tolist(), a.tendon and a.tendon.model_dump()) for a in end]
@@ -135,7 +130,15 @@ def scene_content(scene: Scene, frames: str | None = None) -> str:
     return _hash([facts, held, fibres, track, str(frames or ""), version])
 
 
-def point_key(content: str, settings: Mapping[str, Any]) -> str:
+def _without_files(facts: object) -> object:
+    """Facts of a scene without names of files, and without what it writes."""
+    if isinstance(facts, dict):
+        left = {key: value for key, value in facts.items() if key not in _FILES}
+        return {key: _without_files(value) for key, value in left.items()}
+    return [_without_files(value) for value in facts] if isinstance(facts, list) else facts
+
+
+def point_key(content: str, settings: Mapping[str, object]) -> str:
     """Key of a point: 16 hexadecimal digits."""
     return _hash([content, sorted(settings.items())])[:16]
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -24,7 +23,7 @@ PATCH = 16  # points of a belly's end that are kept out of bones, at most
 
 
 def resolve_attachments(
-    attach: Sequence[Attachment | AttachTable | dict[str, Any]],
+    attach: Sequence[Attachment | AttachTable | Mapping[str, object]],
     read: ReadMesh,
     bones: list[Bone],
     *,

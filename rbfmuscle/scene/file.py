@@ -1,12 +1,12 @@
 """The scene file: its tables, and the scene that they describe."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from rbfmuscle.scene.activation.keys import ContractionTable
+from rbfmuscle.scene.activation.keys import KEYS, ContractionTable
 from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.scene.joints.tables import CouplingTable, JointTable
 from rbfmuscle.scene.meshes.transform import MeshTransform
@@ -61,12 +61,18 @@ class BoneTable(MeshTransform):
     mesh: FileName | None = None
 
 
+def _check_model(model):
+    if not isinstance(model, str | dict):
+        raise ValueError("must be a name or a table with a name")
+    return model
+
+
 class ClassTable(ContractionTable, MeshTransform):
     """``[classes.NAME]``: keys of a muscle, for those of the class that do not give them
     themselves.
     """
 
-    model: Any = "rbf"
+    model: Annotated[str | dict[str, object], BeforeValidator(_check_model)] = "rbf"
     attach: list[AttachTable] = Field(default_factory=list)
     fibres: FileName | None = None
 
@@ -77,6 +83,11 @@ class MuscleTable(ClassTable):
     name: str
     mesh: FileName
     class_: str = Field(alias="class", default=MAIN)
+
+    @property
+    def contraction(self) -> dict[str, object]:
+        """The keys of a muscle that contracts, those that are given."""
+        return {key: getattr(self, key) for key in KEYS if key in self.model_fields_set}
 
 
 class SceneFile(Table):
@@ -109,8 +120,8 @@ def read_scene_file(path: Path) -> tuple[SceneFile, list[Guess]]:
     return tables, guesses
 
 
-def given_muscle(muscle: MuscleTable, classes: dict[str, ClassTable]) -> dict[str, Any]:
-    """What the file gives of a muscle, by key: its own, then that of its class, then that of the
+def given_muscle(muscle: MuscleTable, classes: dict[str, ClassTable]) -> MuscleTable:
+    """What the file gives of a muscle: its own keys, then those of its class, then those of the
     class ``main``, which all muscles belong to.
     """
     name = muscle.class_
@@ -118,7 +129,7 @@ def given_muscle(muscle: MuscleTable, classes: dict[str, ClassTable]) -> dict[st
         hint = did_you_mean(name, classes)
         raise SceneError(f"muscle {muscle.name!r}: unknown class {name!r}, {hint}")
     named = [classes[key] for key in dict.fromkeys((MAIN, name)) if key in classes]
-    given: dict[str, Any] = {"model": "rbf"}
+    given: dict[str, object] = {"model": "rbf"}
     for table in (*named, muscle):
         found = {key: getattr(table, key) for key in table.model_fields_set if key != "class_"}
         model = found.get("model")
@@ -126,7 +137,7 @@ def given_muscle(muscle: MuscleTable, classes: dict[str, ClassTable]) -> dict[st
             before = given["model"]
             found["model"] = {**(before if isinstance(before, dict) else {"name": before}), **model}
         given |= found
-    return given
+    return muscle.model_copy(update=given)
 
 
 def _place(location, data):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -74,7 +74,7 @@ class Muscle:
     name: str
     mesh: trimesh.Trimesh = field(repr=False)
     model: str = "rbf"
-    options: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, object] = field(default_factory=dict)
     attachments: list[Attachment] = field(default_factory=list)
     fibres: list[Floats] | None = field(default=None, repr=False)
     source: str = ""
@@ -177,11 +177,13 @@ def check_file_names(bones: list[Bone], muscles: list[Muscle]) -> None:
             )
 
 
-def split_model(model: dict[str, Any] | str, *, context: str) -> tuple[str, dict[str, Any]]:
-    """Return (name, options) of a model given as a name or as a table with ``name``."""
+def split_model(model: object, *, context: str) -> tuple[str, dict[str, object]]:
+    """Return (name, options) of a model given as a name or as a table with ``name``, or raise
+    SceneError.
+    """
     if isinstance(model, str):
         return model, {}
-    if isinstance(model, dict):
+    if isinstance(model, Mapping):
         options = dict(model)
         name = options.pop("name", "rbf")
         if isinstance(name, str):

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -34,7 +34,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-def _listed(vector: Any) -> Any:
+def _listed(vector: object) -> object:
     """An array or a tuple as a list; anything else as it is."""
     return np.asarray(vector).tolist() if isinstance(vector, (np.ndarray, tuple)) else vector
 
@@ -106,7 +106,7 @@ class Table(BaseModel):
     @classmethod
     def build(
         cls,
-        values: Mapping[str, Any],
+        values: Mapping[str, object],
         *,
         context: str,
         folder: Path | None = None,
@@ -123,7 +123,7 @@ class Table(BaseModel):
             raise SceneError(f"{context}{_describe_error(error, name_row)}") from None
 
 
-def set_dotted(table: dict[str, Any], key: str, value: object, *, context: str) -> None:
+def set_dotted(table: dict[str, object], key: str, value: object, *, context: str) -> None:
     """Set the dotted ``key`` of nested tables, in place; ``context`` begins the message where a
     value is no table.
     """
@@ -132,8 +132,9 @@ def set_dotted(table: dict[str, Any], key: str, value: object, *, context: str) 
         inner = table.get(parent, {})
         if not isinstance(inner, dict):
             raise SceneError(f"{context}: {parent!r} is not a table")
-        table[parent] = dict(inner)
-        table = table[parent]
+        copied: dict[str, object] = dict(inner)
+        table[parent] = copied
+        table = copied
     table[last] = value
 
 

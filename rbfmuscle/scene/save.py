@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -39,25 +39,26 @@ class SceneFiles:
                 raise UsageError(f"{taken} is there already; choose another name")
         self.folder.mkdir(parents=True)
 
-    def bone(self, bone: Bone) -> dict[str, Any]:
+    def bone(self, bone: Bone) -> dict[str, object]:
         """``[[bone]]``, its mesh written."""
         return {"name": bone.name, "mesh": self._mesh("bones", bone.name, bone.mesh)}
 
-    def muscle(self, muscle: Muscle) -> dict[str, Any]:
+    def muscle(self, muscle: Muscle) -> dict[str, object]:
         """``[[muscle]]``, its mesh, attached vertices and fibres written."""
-        row: dict[str, Any] = {
+        attach: list[dict[str, object]] = []
+        row: dict[str, object] = {
             "name": muscle.name,
             "mesh": self._mesh("muscles", muscle.name, muscle.mesh),
             "model": {"name": muscle.model, **muscle.options},
-            "attach": [],
+            "attach": attach,
         }
         for number, held in enumerate(muscle.attachments, 1):
             file = self._new(attachment_file(f"{muscle.name}.{number}", held.bone))
             np.savetxt(file, held.vertices, fmt="%d")
-            entry: dict[str, Any] = {"bone": held.bone, "vertices": self._relative(file)}
+            entry: dict[str, object] = {"bone": held.bone, "vertices": self._relative(file)}
             if held.tendon is not None:
                 entry["tendon"] = held.tendon.model_dump(exclude_unset=True)
-            row["attach"].append(entry)
+            attach.append(entry)
         if muscle.fibres:
             file = self._new(f"fibres/{muscle.name}.json")
             lines = [np.asarray(line).tolist() for line in muscle.fibres]
@@ -67,7 +68,7 @@ class SceneFiles:
             row |= muscle.contraction.model_dump(exclude_unset=True)
         return row
 
-    def table(self, table: Table) -> dict[str, Any]:
+    def table(self, table: Table) -> dict[str, object]:
         """A table of settings; the file of a motion is copied."""
         row = table.model_dump(by_alias=True, exclude_unset=True, exclude_none=True)
         if "file" in row:
@@ -77,7 +78,7 @@ class SceneFiles:
         return row
 
     def write(
-        self, tables: Sequence[tuple[str, Mapping[str, Any]]], guesses: Sequence[Guess]
+        self, tables: Sequence[tuple[str, Mapping[str, object]]], guesses: Sequence[Guess]
     ) -> None:
         """Write the file itself from the heads and rows of its tables; lines that are guesses are
         marked.
@@ -127,7 +128,7 @@ def save_scene(scene: SceneContents, path: Path) -> Path:
             "set_motion before the scene is saved"
         )
     files = SceneFiles(path)
-    about: dict[str, Any] = {"format": FORMAT, "name": scene.name, "units": scene.units}
+    about: dict[str, object] = {"format": FORMAT, "name": scene.name, "units": scene.units}
     for key in ("missing_bones", "doubts", "notes", "superior", "anterior"):
         about |= {key: getattr(scene, key)} if getattr(scene, key) else {}
     tables = [("[scene]", about)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import Self, TypeAlias
 
 from numpy.typing import ArrayLike
 
@@ -27,7 +27,7 @@ from rbfmuscle.scene.joints.tables import (
 )
 from rbfmuscle.scene.meshes.read import as_mesh, read_fibres, read_mesh
 from rbfmuscle.scene.meshes.repair import ReadMesh
-from rbfmuscle.scene.meshes.transform import MeshTransform, TransformInput, mesh_transform
+from rbfmuscle.scene.meshes.transform import TransformInput, mesh_transform
 from rbfmuscle.scene.objects import (
     Attachment,
     Muscle,
@@ -104,11 +104,20 @@ class Scene(SceneContents):
             self.add_coupling(make_coupling(coupling, self.joints))
         for muscle in tables.muscle:
             given = given_muscle(muscle, tables.classes)
-            lies = MeshTransform(**{k: given[k] for k in MeshTransform.model_fields if k in given})
-            read = read_mesh(muscle.mesh, name=muscle.name, transform=lies)
-            check_size("muscle", muscle.name, read, self.units)
-            check_place(muscle.name, read, self.bones, self.units)
-            self.add_muscle(**given | {"mesh": read})
+            read = read_mesh(given.mesh, name=given.name, transform=given)
+            check_size("muscle", given.name, read, self.units)
+            check_place(given.name, read, self.bones, self.units)
+            self.add_muscle(
+                given.name,
+                read,
+                attach=given.attach,
+                model=given.model,
+                fibres=given.fibres,
+                scale=given.scale,
+                mirror=given.mirror,
+                transform=given.transform,
+                **given.contraction,
+            )
         self.motion = made_motion(self, tables.motion)
         self.contact = tables.contact
         self.sliding = tables.sliding
@@ -172,7 +181,7 @@ class Scene(SceneContents):
         child: str = "",
         centre: ArrayLike | None = None,
         axes: Mapping[str, ArrayLike] | None = None,
-        **keys: Any,
+        **keys: object,
     ) -> Self:
         """Add a joint, a ball where no ``type`` is given, and return the scene.
 
@@ -190,8 +199,8 @@ class Scene(SceneContents):
             ``rotations``, ...
         """
         if isinstance(joint, str):
-            row = {"name": joint, "parent": parent, "child": child, "centre": centre}
-            row |= {"axes": axes and dict(axes)} | keys
+            row = {"name": joint, "parent": parent, "child": child, "centre": centre, **keys}
+            row["axes"] = axes and dict(axes)
             joint = JointTable.build(row, context=f"joint {joint!r}: ").joint()
         check_new_name(self.joints, joint.name, "joint")
         for bone in (joint.parent, joint.child):
@@ -204,7 +213,7 @@ class Scene(SceneContents):
         return self
 
     def add_coupling(
-        self, coordinate: str | Coupling, of: Sequence[str] = (), **function: Any
+        self, coordinate: str | Coupling, of: Sequence[str] = (), **function: object
     ) -> Self:
         """Let a coordinate follow others by a function, as in ``[[coupling]]``, and return the
         scene.
@@ -230,13 +239,13 @@ class Scene(SceneContents):
         name: str,
         mesh: MeshInput,
         *,
-        attach: Sequence[Attachment | AttachTable | dict[str, Any]] = (),
-        model: dict[str, Any] | str = "rbf",
+        attach: Sequence[Attachment | AttachTable | Mapping[str, object]] = (),
+        model: Mapping[str, object] | str = "rbf",
         fibres: str | Path | Sequence[ArrayLike] | None = None,
         scale: float = 1.0,
         mirror: str | None = None,
         transform: TransformInput = None,
-        **contraction: Any,
+        **contraction: object,
     ) -> Self:
         """Add a muscle and return the scene.
 
@@ -271,7 +280,7 @@ class Scene(SceneContents):
         self.muscles.append(muscle)
         return self
 
-    def set_motion(self, *, folder: Path | None = None, **options: Any) -> Self:
+    def set_motion(self, *, folder: Path | None = None, **options: object) -> Self:
         """Set the motion from the keys of ``[motion]`` (angles in degrees) and return the scene.
 
         Parameters
@@ -294,9 +303,9 @@ class Scene(SceneContents):
 
     def with_options(
         self,
-        settings: Mapping[str, Any] | None = None,
+        settings: Mapping[str, object] | None = None,
         *,
-        model: str | dict[str, Any] | None = None,
+        model: str | Mapping[str, object] | None = None,
         frames: slice | str | None = None,
     ) -> Self:
         """Return a copy with other settings, another model or other frames; meshes are shared.
@@ -321,7 +330,7 @@ class Scene(SceneContents):
         changes.change_scene(changed, settings or {}, model, frames)
         return changed
 
-    def resolved(self) -> dict[str, Any]:
+    def resolved(self) -> dict[str, object]:
         """Return the scene as plain data for ``run.json``: names, counts, options, sources and
         hashes.
         """

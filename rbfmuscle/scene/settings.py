@@ -7,7 +7,6 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -37,8 +36,8 @@ def chooses_model(key: str) -> bool:
 
 def change_scene(
     scene: SceneContents,
-    settings: Mapping[str, Any],
-    model: str | dict[str, Any] | None,
+    settings: Mapping[str, object],
+    model: str | Mapping[str, object] | None,
     frames: slice | str | None,
 ) -> None:
     """Give a scene other settings, another model or other frames, in place; `Scene.with_options`
@@ -91,7 +90,7 @@ def split_muscle_key(key: str) -> tuple[str, str, str]:
 
 
 def set_on_muscles(
-    muscles: Sequence[Muscle], head: str, rest: str, value: Any, context: str
+    muscles: Sequence[Muscle], head: str, rest: str, value: object, context: str
 ) -> None:
     """Set a model, an option of it, or a key of contraction of muscles, in place."""
     if head == "model" and not rest:
@@ -104,7 +103,7 @@ def set_on_muscles(
             _set_contraction(muscle, head, rest, value)
 
 
-def set_models(muscles: Sequence[Muscle], model: str | dict[str, Any]) -> None:
+def set_models(muscles: Sequence[Muscle], model: object) -> None:
     """Give muscles another model; options of a different model are dropped."""
     name, options = split_model(model, context="model")
     for muscle in muscles:
@@ -130,7 +129,7 @@ def changed_table(head: str, table: Table | None, rest: str, value: object, cont
 
 
 def changed_motion(
-    options: MotionOptions, rest: str, value: Any, key: str, folder: Path | None
+    options: MotionOptions, rest: str, value: object, key: str, folder: Path | None
 ) -> MotionOptions:
     """The table of a motion with one key changed; names of coordinates hold full stops."""
     values = options.model_dump(by_alias=True, exclude_unset=True)
@@ -148,11 +147,11 @@ def changed_motion(
     return MotionOptions.build(values, context=f"{key}: motion ", folder=folder)
 
 
-def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:
+def parse_settings(texts: Sequence[str] | None) -> dict[str, object]:
     """Return the settings of several "KEY=VALUE", of which the last of a key counts; values are as
     in TOML, or text.
     """
-    found = {}
+    found: dict[str, object] = {}
     for text in texts or ():
         key, equals, value = (part.strip() for part in text.partition("="))
         if not equals or not key:
@@ -161,7 +160,7 @@ def parse_settings(texts: Sequence[str] | None) -> dict[str, Any]:
     return found
 
 
-def parse_value(text: str, *, context: str) -> dict[str, Any] | int | str:
+def parse_value(text: str, *, context: str) -> dict[str, object] | int | str:
     """Return the value of a TOML literal (number, true, list, table), or the text itself.
 
     NaN, infinity, numbers beyond 2^53 and deep nesting raise a UsageError that begins with

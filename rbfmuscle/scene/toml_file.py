@@ -4,11 +4,10 @@ import logging
 import os
 import tomllib
 from pathlib import Path
-from typing import Any
 
 from rbfmuscle.scene.guesses import Guess, find_guesses
 from rbfmuscle.scene.options import check_plain
-from rbfmuscle.scene.upgrade import FORMAT, is_old, upgraded
+from rbfmuscle.scene.upgrade import FORMAT, Tables, is_old, upgraded
 from rbfmuscle.validation import SceneError, shown, shown_path
 
 log = logging.getLogger(__name__)
@@ -19,8 +18,6 @@ DEEPEST_INCLUDE = 8
 LISTS = ("bone", "joint", "coupling", "muscle")
 # Keys that name files, wherever they stand.
 FILES = ("mesh", "fibres", "vertices", "points", "region", "file")
-
-Tables = dict[str, Any]
 
 
 def read_tables(path: Path) -> tuple[Tables, list[Guess]]:
@@ -53,7 +50,8 @@ def _read(path: Path, chain: tuple[Path, ...]) -> tuple[Tables, list[Guess]]:
         if file.resolve() in [one.resolve() for one in chain] or len(chain) > DEEPEST_INCLUDE:
             raise SceneError(f"{path}: include {name!r}: a file would include itself")
         inner, more = _read(file, (*chain, file))
-        data = _merged(_moved(inner, Path(name).parent), data, f"{path}: include {name!r}: ")
+        moved = {key: _moved(value, Path(name).parent) for key, value in inner.items()}
+        data = _merged(moved, data, f"{path}: include {name!r}: ")
         guesses = more + guesses
     return data, guesses
 
@@ -64,23 +62,26 @@ def _merged(inner: Tables, own: Tables, context: str) -> Tables:
     """
     found = inner | own
     for key in LISTS:
-        rows = [data[key] for data in (inner, own) if key in data]
-        if rows and all(isinstance(part, list) for part in rows):
-            found[key] = [row for part in rows for row in part]
+        given = [data[key] for data in (inner, own) if key in data]
+        lists = [part for part in given if isinstance(part, list)]
+        if lists and len(lists) == len(given):
+            found[key] = [row for part in lists for row in part]
     for key in ("scene", "classes"):
-        tables = [data[key] for data in (inner, own) if isinstance(data.get(key), dict)]
-        if len(tables) == 2:
-            found[key] = tables[0] | tables[1]
-    first, second = (
-        data["scene"].get("units") if isinstance(data.get("scene"), dict) else None
-        for data in (inner, own)
-    )
+        first, second = inner.get(key), own.get(key)
+        if isinstance(first, dict) and isinstance(second, dict):
+            found[key] = first | second
+    first, second = (_units(data) for data in (inner, own))
     if None not in (first, second) and first != second:
         raise SceneError(f"{context}its lengths are in {shown(first)}, not in {shown(second)}")
     return found
 
 
-def _moved(value: Any, folder: Path, key: str = "") -> Any:
+def _units(data: Tables) -> object:
+    about = data.get("scene")
+    return about.get("units") if isinstance(about, dict) else None
+
+
+def _moved(value: object, folder: Path, key: str = "") -> object:
     """Tables whose names of files are relative to the folder of the file that includes them."""
     if isinstance(value, dict):
         return {name: _moved(inner, folder, name) for name, inner in value.items()}

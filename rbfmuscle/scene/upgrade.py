@@ -4,7 +4,6 @@ import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from rbfmuscle.scene.joints.joint import BY_TURNS
 from rbfmuscle.validation import SceneError, shown
@@ -16,7 +15,7 @@ RENAMED = {"left_out": "missing_bones"}
 MUSCLE_KEYS = {"tendon": "tendon_region"}
 MODEL_KEYS = {"slack": "slack_ratio"}
 
-Tables = dict[str, Any]
+Tables = dict[str, object]  # of a TOML file, unchecked
 
 
 def upgraded(data: Tables) -> Tables:
@@ -25,10 +24,9 @@ def upgraded(data: Tables) -> Tables:
     if isinstance(about := data.get("scene"), dict):
         renamed = {RENAMED.get(key, key): value for key, value in about.items()}
         found["scene"] = renamed | {"format": FORMAT}
-    if isinstance(data.get("joint"), list):
-        found["joint"] = [_joint(row) for row in data["joint"]]
-    if isinstance(data.get("muscle"), list):
-        found["muscle"] = [_muscle(row) for row in data["muscle"]]
+    for key, changed in (("joint", _joint), ("muscle", _muscle)):
+        if isinstance(rows := data.get(key), list):
+            found[key] = [changed(row) for row in rows]
     if "defaults" in data:
         found["classes"] = {MAIN: _muscle(data["defaults"])}
     return found
@@ -106,11 +104,12 @@ def upgraded_text(text: str) -> str:
     new = text
     for pattern, replacement in _EDITS:
         new = pattern.sub(replacement, new)
-    joints = data.get("joint", [])
+    joints = wanted.get("joint")
+    rows = joints if isinstance(joints, list) else []
     starts = [match.start() for match in _JOINT.finditer(new)]
-    if len(starts) == len(joints):
+    if len(starts) == len(rows):
         parts = [new[: starts[0]]] if starts else [new]
-        for start, end, row in zip(starts, [*starts[1:], len(new)], wanted.get("joint", [])):
+        for start, end, row in zip(starts, [*starts[1:], len(new)], rows):
             kind = row.get("type", "")
             parts.append(_TYPE.sub(rf"\g<1>\g<2>{kind}\g<2>", new[start:end], count=1))
         new = "".join(parts)

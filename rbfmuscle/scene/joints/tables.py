@@ -5,7 +5,7 @@ Files and calls speak in degrees and scene units; inside are radians and scene u
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -26,6 +26,7 @@ from rbfmuscle.scene.joints.joint import (
     Coordinate,
     Coupling,
     Joint,
+    MotionKind,
     TransformAxis,
     all_coordinates,
     motion_of,
@@ -63,7 +64,7 @@ class FunctionTable(Table):
     piecewise: PointsTable | None = None
     spline: PointsTable | None = None
 
-    def function(self, inputs: list[str], output: str, *, context: str) -> Function:
+    def function(self, inputs: Sequence[str], output: str, *, context: str) -> Function:
         """Return the function in inner units; ``inputs`` and ``output`` are kinds of motion, keys
         of `FACTORS`.
         """
@@ -114,7 +115,7 @@ class AxisTable(FunctionTable):
 class CoordinateTable(Table):
     """``joint.coordinates.NAME`` [degree or scene unit]."""
 
-    motion: Literal["rotation", "translation", "coupled"] | None = None
+    motion: MotionKind | None = None
     rest: Finite = 0.0
     range: list[Finite] | None = Field(default=None, min_length=2, max_length=2)
     clamped: bool = False
@@ -128,9 +129,9 @@ class CoordinateTable(Table):
             raise ValueError("clamped needs a range")
         return self
 
-    def coordinate(self, motion: str) -> Coordinate:
+    def coordinate(self, motion: MotionKind) -> Coordinate:
         """Return it in inner units."""
-        kind: Any = self.motion or motion
+        kind = self.motion or motion
         factor = FACTORS[kind]
         ends = None if self.range is None else (self.range[0] * factor, self.range[1] * factor)
         return Coordinate(kind, self.rest * factor, ends, self.clamped, self.locked)
@@ -263,15 +264,14 @@ def make_coupling(table: CouplingTable, joints: list[Joint]) -> Coupling:
     target = full_name(table.coordinate, known, context="coupling")
     context = f"coupling of {target!r}"
     of = tuple(full_name(name, known, context=context) for name in table.of)
-    motions: list[Any] = [coordinates[name].motion for name in of]
-    return Coupling(
-        target, of, table.function(motions, coordinates[target].motion, context=context)
-    )
+    motions = [coordinates[name].motion for name in of]
+    function = table.function(motions, coordinates[target].motion, context=context)
+    return Coupling(target, of, function)
 
 
-def joint_row(joint: Joint) -> dict:
+def joint_row(joint: Joint) -> dict[str, object]:
     """Return a joint as the plain table that makes it again [degree, scene unit]."""
-    row: dict[str, Any] = {"name": joint.name, "parent": joint.parent, "child": joint.child}
+    row: dict[str, object] = {"name": joint.name, "parent": joint.parent, "child": joint.child}
     row["type"] = joint.kind
     if joint.kind != "weld":
         row["centre"] = joint.centre.tolist()
@@ -297,7 +297,7 @@ def joint_row(joint: Joint) -> dict:
     return row
 
 
-def coupling_row(coupling: Coupling, joints: list[Joint]) -> dict:
+def coupling_row(coupling: Coupling, joints: list[Joint]) -> dict[str, object]:
     """Return a coupling as the plain table that makes it again."""
     known = all_coordinates(joints)
     inputs = [known[name].motion for name in coupling.of]
@@ -307,7 +307,7 @@ def coupling_row(coupling: Coupling, joints: list[Joint]) -> dict:
 
 def _coordinate_row(coordinate, kind):
     factor = FACTORS[coordinate.motion]
-    row: dict[str, Any] = {"motion": coordinate.motion} if kind == "custom" else {}
+    row: dict[str, object] = {"motion": coordinate.motion} if kind == "custom" else {}
     if coordinate.rest:
         row["rest"] = coordinate.rest / factor
     if coordinate.range is not None:
@@ -324,7 +324,7 @@ def _axis_row(axis, coordinates, output):
     return {"axis": list(axis.direction), **names, **function}
 
 
-def _function_row(function: Function, inputs: Sequence[str], output: str) -> dict[str, Any]:
+def _function_row(function: Function, inputs: Sequence[str], output: str) -> dict[str, object]:
     if function == IDENTITY and inputs == [output]:
         return {}
     function = function.rescaled(
