@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.experiments.comparison import add_distances, measure_run, write_tables
+from rbfmuscle.experiments.comparison import Repeated, add_distances, measure_run, write_tables
+from rbfmuscle.experiments.comparison_table import Comparison
 from rbfmuscle.experiments.sweep_run import threads_limited
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.models import (
@@ -51,11 +52,11 @@ def compare_models(
     directory: str | Path,
     models: Sequence[str] = COMPARED,
     *,
-    frames: object = None,
-    settings: dict[str, object] | None = None,
+    frames: slice | str | None = None,
+    settings: Mapping[str, object] | None = None,
     pictures: bool = True,
-    progress: Callable[..., object] | None = None,
-) -> dict[str, object]:
+    progress: Callable[[str, int, int], object] | None = None,
+) -> Comparison:
     """Run every model on a scene, measure all alike, and write tables, a report and pictures.
 
     Parameters
@@ -75,7 +76,7 @@ def compare_models(
 
     Returns
     -------
-    dict
+    Comparison
         What ``comparison.json`` holds.
 
     Raises
@@ -91,7 +92,7 @@ def compare_models(
     >>> from rbfmuscle import phantom_scene
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     table = compare_models(phantom_scene(end=2.0), folder, ["pbd", "xpbd"], pictures=False)
-    >>> sorted(table["models"])
+    >>> sorted(table.models)
     ['pbd', 'xpbd']
     """
     variants = _variants(open_scene(scene), list(models), settings or {}, frames)
@@ -170,8 +171,9 @@ def _measure(name, scene, folder, progress):
         build, shown, _ = _surfaces(scene, [*coarse, last, *coarse[::-1]])
     with stage(f"{name}: on one thread"), threads_limited(1):
         walls = _surfaces(scene, [*range(min(last + 1, ONE_THREAD))])[2]
-    again = {"build": build, "one_thread": float(np.median(walls[1:] or walls))}
-    again |= {"turn": shown[len(coarse)], "end": shown[-1]} if coarse else {}
+    again = Repeated(build, float(np.median(walls[1:] or walls)))
+    if coarse:
+        again = again._replace(turn=shown[len(coarse)], end=shown[-1])
     with stage(f"{name}: measuring"):
         return measure_run(RunData.load(folder), again)
 

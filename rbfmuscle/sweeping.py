@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from rbfmuscle.experiments.sweep import plan_sweep
 from rbfmuscle.experiments.sweep_run import VALUES, OnProgress, run_sweep, write_table
+from rbfmuscle.experiments.sweep_table import SweepTable
 from rbfmuscle.models import configure_scene
 from rbfmuscle.report.sweep_page import write_page
 from rbfmuscle.run import Run, simulate
@@ -17,16 +17,16 @@ from rbfmuscle.validation import UsageError, did_you_mean
 
 def sweep(
     scenes: Mapping[str, Scene],
-    grid: Mapping[str, Sequence[Any]],
+    grid: Mapping[str, Sequence[object]],
     directory: str | Path,
     *,
     frames: str | None = None,
-    reference: Mapping[str, Any] | None = None,
+    reference: Mapping[str, object] | None = None,
     jobs: int | None = None,
     cluster: str | None = None,
     error: str = "error_rms",
     progress: OnProgress | None = None,
-) -> dict[str, Any]:
+) -> SweepTable:
     """Run scenes under every combination of some settings, and write tables and a page.
 
     Points that the folder holds done are not run again.
@@ -55,8 +55,8 @@ def sweep(
 
     Returns
     -------
-    dict
-        What ``sweep.json`` holds: ``done``, ``failed``, ``verdicts`` and ``rows``, one per point.
+    SweepTable
+        ``done``, ``failed``, ``verdicts`` and ``rows``, one per point, as in ``sweep.json``.
 
     Examples
     --------
@@ -65,7 +65,7 @@ def sweep(
     >>> scene = phantom_scene(end=0.0, spacing=6.0).with_options(model="pbd")
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     table = sweep({"hip": scene}, {}, folder, jobs=1)
-    >>> table["done"], len(table["rows"])
+    >>> table.done, len(table.rows)
     (1, 1)
     """
     if error not in VALUES:
@@ -76,14 +76,22 @@ def sweep(
     points = plan_sweep(scenes, values, frames=frames, reference=reference)
     for point in points:  # a mistyped key is reported now, not after the first point
         configure_scene(scenes[point.scene], point.settings, frames=frames)
-    options: dict[str, Any] = {"frames": frames, "jobs": jobs, "cluster": cluster}
-    run_sweep(run_point, scenes, points, directory, progress=progress, **options)
+    run_sweep(
+        run_point,
+        scenes,
+        points,
+        directory,
+        frames=frames,
+        jobs=jobs,
+        cluster=cluster,
+        progress=progress,
+    )
     units = {name: scene.units for name, scene in scenes.items()}
     table = write_table(points, directory, units, quantity=error)
     write_page(table, Path(directory))
     return table
 
 
-def run_point(scene: Scene, settings: dict[str, Any], frames: str | None) -> Run:
+def run_point(scene: Scene, settings: dict[str, object], frames: str | None) -> Run:
     """One run of a sweep, in memory; module-level, so that it can be sent to other processes."""
     return simulate(scene, settings=settings, frames=frames)

@@ -76,17 +76,24 @@ def compare(
             progress(done, total)
             interruption.check()
 
-        options: dict[str, Any] = {"frames": frames, "settings": changes, "pictures": pictures}
-        table = compare_models(loaded, output, names, progress=advance, **options)
+        table = compare_models(
+            loaded,
+            output,
+            names,
+            frames=frames,
+            settings=changes,
+            pictures=pictures,
+            progress=advance,
+        )
     error = _failure(table, output) or _excess(table, output, limits)
-    return print_result(printing, table, _table_lines(table, output), error=error)
+    return print_result(printing, table.model_dump(), _table_lines(table, output), error=error)
 
 
 def _failure(table, output):
     """The error that some models could not be solved; None where all were."""
-    if not table["failed"]:
+    if not table.failed:
         return None
-    reasons = "; ".join(f"{name}: {reason}" for name, reason in table["failed"].items())
+    reasons = "; ".join(f"{name}: {reason}" for name, reason in table.failed.items())
     return SolveError(f"{reasons}; the other models are in {output}")
 
 
@@ -97,7 +104,7 @@ def _excess(table, output, limits):
     from rbfmuscle.report.verdict import require_limits
 
     texts = []
-    for name in table["models"] if limits.fail_on else ():
+    for name in table.models if limits.fail_on else ():
         summary = Summary()
         summary.add(RunData.load(output / name).metrics)
         try:
@@ -111,15 +118,15 @@ def _table_lines(table, output):
     from rbfmuscle.report.comparison_page import LIGHTS, shown
 
     # As many columns as a terminal holds stand beside each other.
-    for k in range(0, len(table["models"]), 3):
-        names = table["models"][k : k + 3]
+    for k in range(0, len(table.models), 3):
+        names = table.models[k : k + 3]
         yield " " * 24 + "".join(f"{name:>18}" for name in names)
         for quantity in LIGHTS:
-            values = [table["results"][name]["all"].get(quantity) for name in names]
+            values = [table.results[name]["all"].get(quantity) for name in names]
             cells = [f"{shown(table, quantity, value):>18}" for value in values]
             yield f"{quantity:24}" + "".join(cells)
-    yield table["answer"]
-    yield f"{table['frames']} frames, in {output}, open {output / 'report.html'}"
+    yield table.answer
+    yield f"{table.frames} frames, in {output}, open {output / 'report.html'}"
 
 
 def kernels(
@@ -298,16 +305,20 @@ def sweep(
     opened = {name: open_scene(path) for name, path in _names(scenes).items()}
     loaded = {name: configure_scene(each, changes, model=model) for name, each in opened.items()}
     limits = {name: _sweep_limits(fail_on, each) for name, each in loaded.items()}
-    options: dict[str, Any] = {
-        "frames": frames,
-        "reference": parse_settings(reference),
-        "jobs": jobs,
-        "cluster": cluster,
-        "error": error,
-    }
+    finest = parse_settings(reference)
     progress = Progress("sweep", what="point")
     with progress, interruption.keeping(lambda: f"finished points are kept in {output}"):
-        table = run_scenes(loaded, axes, output, progress=progress, **options)
+        table = run_scenes(
+            loaded,
+            axes,
+            output,
+            frames=frames,
+            reference=finest,
+            jobs=jobs,
+            cluster=cluster,
+            error=error,
+            progress=progress,
+        )
     return _finish(table, output, limits, printing)
 
 
@@ -329,9 +340,9 @@ def _beyond(rows, limits):
     from rbfmuscle.metrics.summary import meets_limit
 
     for row in rows:
-        for name, limit in limits[row["scene"]].items():
-            if not meets_limit(name, row[name], limit):
-                yield f"{row['scene']} {row['label']}: {name} = {row[name]:.4g} > {limit:g}"
+        for name, limit in limits[row.scene].items():
+            if not meets_limit(name, row.value(name), limit):
+                yield f"{row.scene} {row.label}: {name} = {row.value(name):.4g} > {limit:g}"
 
 
 def _names(scenes):
@@ -344,19 +355,18 @@ def _names(scenes):
 
 
 def _finish(table, output, limits, printing):
-    bad = [row for row in table["rows"] if row["status"] != "done"]
+    bad = [row for row in table.rows if row.status != "done"]
     for row in bad[:5]:
-        reason = one_line(row["error"] or row["status"])
-        print(f"rbfmuscle: {row['scene']} {row['label']}: {reason}", file=sys.stderr)
+        reason = one_line(row.error or row.status)
+        print(f"rbfmuscle: {row.scene} {row.label}: {reason}", file=sys.stderr)
     remedy = "the others are kept, the same command runs these again"
     failed: RBFMuscleError | None = None
     if bad:
-        failed = SolveError(f"{len(bad)} of {len(table['rows'])} points failed; {remedy}")
-    elif beyond := list(_beyond(table["rows"], limits)):
+        failed = SolveError(f"{len(bad)} of {len(table.rows)} points failed; {remedy}")
+    elif beyond := list(_beyond(table.rows, limits)):
         failed = LimitExceededError("; ".join(beyond[:5]))
     lines = [
-        *(verdict["text"] for verdict in table["verdicts"]),
-        f"{table['done']} points done, {table['failed']} failed, in {output}, open "
-        f"{output}/sweep.html",
+        *(verdict.text for verdict in table.verdicts),
+        f"{table.done} points done, {table.failed} failed, in {output}, open {output}/sweep.html",
     ]
-    return print_result(printing, table, lines, error=failed)
+    return print_result(printing, table.model_dump(), lines, error=failed)

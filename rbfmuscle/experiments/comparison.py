@@ -1,21 +1,23 @@
 """Models on one scene, measured alike: what each keeps, how far apart they are, what each costs."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.experiments.comparison_table import Comparison, MeasureFacts, Spread, Values
 from rbfmuscle.experiments.measures import DEEPER, FIRST, FROM_METRICS, MEASURES
 from rbfmuscle.folders import write_whole
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
-from rbfmuscle.metrics.summary import shown_number
+from rbfmuscle.metrics.summary import QuantityFacts, shown_number
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import machine, versions, write_csv, write_json
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Mesh
 
 FORMAT = 4
 # A model keeps out of bones that is no deeper in one [mm].
@@ -25,49 +27,58 @@ KEPT_OUT = 0.3
 _TIE = 1.05
 
 
-def measure_run(saved: RunData, extra: dict[str, Any]) -> dict[str, Any]:
+class Repeated(NamedTuple):
+    """What a model gives beside its run: the time to build it and that of a frame on one thread
+    [s]; where the motion has more than one frame, surfaces by muscle at the last pose (``turn``)
+    and back at the first (``end``), by coarser steps.
+    """
+
+    build: float
+    one_thread: float
+    turn: dict[str, Mesh] | None = None
+    end: dict[str, Mesh] | None = None
+
+
+def measure_run(saved: RunData, again: Repeated) -> Values:
     """Values of every measure but the distances for one model: muscle -> quantity -> value.
 
-    Under ``"all"`` the worst over muscles, or the wall time. ``extra`` holds ``build`` and
-    ``one_thread`` [s], and where the motion has more than one frame ``turn`` and ``end``: surfaces
-    by muscle (vertices, faces) at the last pose and back at the first, by coarser steps.
+    Under ``"all"`` the worst over muscles, or the wall time.
     """
-    found = {}
+    found: Values = {}
     for muscle in saved.muscles:
         facts = saved.info.muscles.get(muscle, {})
-        values = {q: facts[q]["worst"] for q in FROM_METRICS if "worst" in facts.get(q, {})}
+        worst = {q: facts.get(q, QuantityFacts()).get("worst") for q in FROM_METRICS}
+        values = {q: value for q, value in worst.items() if value is not None}
         values[DEEPER] = _deepened(values)
         times = saved.series(muscle, "time_frame")[1][1:]  # the first loads and compiles
         if len(times):
             values["time_frame"] = float(np.median(times))
-        for name, frame, part in (("return", 0, "end"), ("step", -1, "turn")):
-            if part in extra:
-                pair = surface_distance(
-                    *saved.mesh(muscle, saved.frame_numbers[frame]), *extra[part][muscle]
-                )
+        for name, frame, meshes in (("return", 0, again.end), ("step", -1, again.turn)):
+            if meshes is not None:
+                mine = saved.mesh(muscle, saved.frame_numbers[frame])
+                pair = surface_distance(*mine, *meshes[muscle])
                 values[f"{name}_rms"], values[f"{name}_max"] = pair
         found[muscle] = values
-    together = {}
+    together: dict[str, float] = {}
     for name, measure in MEASURES.items():
-        known = [values.get(name) for values in found.values()]
-        worst = [value for value in known if value is not None]
-        together[name] = max(worst, key=lambda v: abs(v - measure.ideal), default=None)
+        known = [values[name] for values in found.values() if name in values]
+        if known:
+            together[name] = max(known, key=lambda value: abs(value - measure.ideal))
     wall = saved.series(ALL, "time_frame")[1][1:]
     if len(wall):
-        together.update(
-            time_frame=float(np.median(wall)), time_frame_p95=float(np.percentile(wall, 95))
-        )
-    together["time_build"] = extra["build"]
-    together["time_one_thread"] = extra["one_thread"]
-    found[ALL] = {name: value for name, value in together.items() if value is not None}
+        together["time_frame"] = float(np.median(wall))
+        together["time_frame_p95"] = float(np.percentile(wall, 95))
+    together["time_build"] = again.build
+    together["time_one_thread"] = again.one_thread
+    found[ALL] = together
     return found
 
 
-def statistics(saved: RunData) -> dict[str, dict[str, dict[str, float]]]:
-    """Mean and standard deviation over the frames: muscle -> quantity -> ``mean``, ``sd``; of
-    moment arms the quantity is ``"moment_arm:COORDINATE"``.
+def statistics(saved: RunData) -> dict[str, dict[str, Spread]]:
+    """Mean and standard deviation over the frames, by muscle and quantity; of moment arms the
+    quantity is ``"moment_arm:COORDINATE"``.
     """
-    found: dict[str, dict[str, dict[str, float]]] = {}
+    found = {}
     for muscle in saved.muscles:
         whole = (*FROM_METRICS, "length", "time_frame")
         series = {name: saved.series(muscle, name)[1] for name in whole}
@@ -75,14 +86,14 @@ def statistics(saved: RunData) -> dict[str, dict[str, dict[str, float]]]:
             series[f"moment_arm:{about}"] = saved.series(muscle, "moment_arm", about)[1]
         series["time_frame"] = series["time_frame"][1:]  # the first loads and compiles
         found[muscle] = {
-            name: {"mean": float(values.mean()), "sd": float(values.std())}
+            name: Spread(mean=float(values.mean()), sd=float(values.std()))
             for name, values in series.items()
             if len(values) and np.isfinite(values).all()
         }
     return found
 
 
-def add_distances(results: dict[str, Any], folder: Path, poses: list[int]) -> None:
+def add_distances(results: dict[str, Values], folder: Path, poses: list[int]) -> None:
     """Add the distances of each model's surfaces to those of the first, the worst of some poses of
     a folder's runs, and the differences of lengths and moment arms.
     """
@@ -116,13 +127,13 @@ def _apart(first: RunData, other: RunData, muscle: str, quantity: str, about: st
 def write_tables(
     folder: Path,
     scene: Scene,
-    results: dict[str, Any],
+    results: dict[str, Values],
     failed: dict[str, str],
     *,
     labels: dict[str, str],
     unknowns: dict[str, dict[str, str]],
     poses: list[int],
-) -> dict[str, Any]:
+) -> Comparison:
     """Write ``comparison.json``, which is returned, ``comparison.csv``: values by model, muscle and
     quantity, ``statistics.csv``: their means and standard deviations over the frames, and
     ``comparison.tex``.
@@ -130,66 +141,66 @@ def write_tables(
     ``unknowns`` are the points that each model solves for, in words, by model and muscle.
     """
     units = {name: unit_text(m.kind, scene.units) for name, m in MEASURES.items()}
-    facts = ("title", "against", "meaning")
     measures = {
-        n: {"unit": units[n], **{key: getattr(m, key) for key in facts}}
+        n: MeasureFacts(unit=units[n], title=m.title, against=m.against, meaning=m.meaning)
         for n, m in MEASURES.items()
     }
-    table = {
-        "format": FORMAT,
-        "scene": scene.name,
-        "units": scene.units,
-        "frames": len(scene.motion),
-        "poses": poses,
-        "models": list(results),
-        "labels": {name: labels[name] for name in results},
-        "failed": failed,
-        "answer": describe(results, labels, scene.units),
-        "unknowns": {name: unknowns[name] for name in results},
-        "measures": measures,
-        "results": results,
-        "statistics": {name: statistics(RunData.load(folder / name)) for name in results},
-        "machine": machine(),
-        "versions": versions(),
-    }
-    write_json(folder / "comparison.json", table)
-    rows: list[tuple[Any, ...]] = [("model", "muscle", "quantity", "value", "unit", "against")]
-    for model, muscles in results.items():
-        for muscle, values in muscles.items():
-            known = [(name, m.against) for name, m in MEASURES.items() if name in values]
-            rows += [
-                (model, muscle, name, values[name], units[name], against) for name, against in known
-            ]
-    write_csv(folder / "comparison.csv", rows)
-    write_csv(folder / "statistics.csv", _statistics_rows(table["statistics"], scene.units))
+    table = Comparison(
+        format=FORMAT,
+        scene=scene.name,
+        units=scene.units,
+        frames=len(scene.motion),
+        poses=poses,
+        models=list(results),
+        labels={name: labels[name] for name in results},
+        failed=failed,
+        answer=describe(results, labels, scene.units),
+        unknowns={name: unknowns[name] for name in results},
+        measures=measures,
+        results=results,
+        statistics={name: statistics(RunData.load(folder / name)) for name in results},
+        machine=machine(),
+        versions=versions(),
+    )
+    write_json(folder / "comparison.json", table.model_dump())
+    write_csv(folder / "comparison.csv", _value_rows(table))
+    write_csv(folder / "statistics.csv", _statistics_rows(table))
     write_whole(folder / "comparison.tex", latex(table))
     return table
 
 
-def _statistics_rows(found, units):
-    rows: list[tuple[Any, ...]] = [("model", "muscle", "quantity", "mean", "sd", "unit")]
-    for model, muscles in found.items():
+def _value_rows(table: Comparison) -> Iterator[tuple[object, ...]]:
+    yield "model", "muscle", "quantity", "value", "unit", "against"
+    for model, muscles in table.results.items():
+        for muscle, values in muscles.items():
+            for name, measure in table.measures.items():
+                if name in values:
+                    yield model, muscle, name, values[name], measure.unit, measure.against
+
+
+def _statistics_rows(table: Comparison) -> Iterator[tuple[object, ...]]:
+    yield "model", "muscle", "quantity", "mean", "sd", "unit"
+    for model, muscles in table.statistics.items():
         for muscle, quantities in muscles.items():
-            for name, row in quantities.items():
-                unit = unit_text(QUANTITIES[name.partition(":")[0]][0], units)
-                rows.append((model, muscle, name, row["mean"], row["sd"], unit))
-    return rows
+            for name, spread in quantities.items():
+                unit = unit_text(QUANTITIES[name.partition(":")[0]][0], table.units)
+                yield model, muscle, name, spread.mean, spread.sd, unit
 
 
-def latex(table: dict[str, Any]) -> str:
+def latex(table: Comparison) -> str:
     """The table of every measure over all muscles, as LaTeX."""
-    models = table["models"]
+    models = table.models
     lines = [
-        f"% rbfmuscle {table['versions']['rbfmuscle']}: worst of muscles and frames",
+        f"% rbfmuscle {table.versions['rbfmuscle']}: worst of muscles and frames",
         rf"\begin{{tabular}}{{ll{'r' * len(models)}}}",
-        _cells(["", "against", *(table["labels"][name] for name in models)]),
+        _cells(["", "against", *(table.labels[name] for name in models)]),
         r"\hline",
     ]
-    for quantity, measure in table["measures"].items():
-        values = [table["results"][name][ALL].get(quantity) for name in models]
+    for quantity, measure in table.measures.items():
+        values = [table.results[name][ALL].get(quantity) for name in models]
         if any(value is not None for value in values):
-            texts = [shown_number(value, measure["unit"]) for value in values]
-            lines.append(_cells([measure["title"], measure["against"], *texts]))
+            texts = [shown_number(value, measure.unit) for value in values]
+            lines.append(_cells([measure.title, measure.against, *texts]))
     return "\n".join([*lines, r"\end{tabular}", ""])
 
 
@@ -200,7 +211,7 @@ def _cells(texts):
     return " & ".join(escaped) + r" \\"
 
 
-def best_models(results: dict[str, Any], quantity: str, units: str) -> list[str]:
+def best_models(results: dict[str, Values], quantity: str, units: str) -> list[str]:
     """Models that are as good as the best in a measure: within 5 %, or within what does not
     count.
     """
@@ -216,13 +227,13 @@ def best_models(results: dict[str, Any], quantity: str, units: str) -> list[str]
     return [name for name, value in values.items() if value <= limit]
 
 
-def _deepened(values: Mapping[str, float | None]) -> float:
+def _deepened(values: Mapping[str, float]) -> float:
     """How deep a muscle is in a bone, or a bone in it, beyond what is left at rest."""
-    deepest = max(values.get(name) or 0.0 for name in ("penetration_max", "bone_penetration_max"))
-    return max(0.0, deepest - (values.get("initial_overlap") or 0.0))
+    deepest = max(values.get(name, 0.0) for name in ("penetration_max", "bone_penetration_max"))
+    return max(0.0, deepest - values.get("initial_overlap", 0.0))
 
 
-def describe(results: dict[str, Any], labels: dict[str, str], units: str) -> str:
+def describe(results: dict[str, Values], labels: dict[str, str], units: str) -> str:
     """Whether the first model keeps out of bones, its time against the quickest other one, which is
     nearest in shape.
 

@@ -10,24 +10,28 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
 from rbfmuscle.experiments.front import WORST, mark_front
 from rbfmuscle.experiments.sweep import SweepPoint
+from rbfmuscle.experiments.sweep_table import SweepRow, SweepTable
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL
+from rbfmuscle.metrics.summary import QuantityFacts
+from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import write_csv, write_json
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.frame import Mesh
 from rbfmuscle.validation import MissingDependencyError, RBFMuscleError, SolveError, UsageError
 
 if TYPE_CHECKING:
     from distributed import Client
 
 CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
-Runner = Callable[[Scene, dict[str, Any], str | None], Any]
+Runner = Callable[[Scene, dict[str, object], str | None], RunData]
 OnProgress = Callable[[int, int], None]  # of what is done and the total
 # What a point may fail with and leave the others standing.
 POINT_ERRORS = (
@@ -44,6 +48,21 @@ TIMES = ("time_frame", "time_frame_p95", "time_extract")
 VALUES = ("error_rms", "error_max", *WORST, *TIMES)
 
 
+class PointResult(TypedDict, total=False):
+    """What is kept of a point; ``values`` are null where they were not finite."""
+
+    key: str
+    reference: str
+    settings: dict[str, object]
+    status: str
+    error: str
+    values: dict[str, float | None]
+    threads: int
+    machine: str
+    process: int
+    seconds: float
+
+
 class SweepFolder:
     """``points/KEY.json``, a result each, and ``references/KEY.npz``, surfaces that errors are
     measured against.
@@ -55,14 +74,14 @@ class SweepFolder:
         self.output = OutputFolder(self.directory, "sweep", ("points", "references", *TABLES))
         self.output.add(*TABLES)
 
-    def read(self, key: str) -> dict[str, Any]:
+    def read(self, key: str) -> PointResult:
         """A point's result, empty where there is none."""
         try:
             return json.loads((self.points / f"{key}.json").read_text(encoding="utf-8"))
         except (FileNotFoundError, ValueError):
             return {}
 
-    def write(self, result: dict[str, Any]) -> None:
+    def write(self, result: PointResult) -> None:
         """Keep a point's result: whole or not at all."""
         write_json(self.points / f"{result['key']}.json", result)
 
@@ -188,12 +207,16 @@ def measure_point(
     point.
     """
     start = time.perf_counter()
-    result: dict[str, Any] = {
+    result: PointResult = {
         "key": point.key,
         "reference": point.reference,
         "settings": point.settings,
+        "status": "done",
+        "error": "",
+        "threads": threads,
+        "machine": platform.node(),
+        "process": os.getpid(),
     }
-    result |= {"status": "done", "error": ""}
     try:
         with threads_limited(threads):
             run = runner(scene, point.settings, frames)
@@ -203,27 +226,25 @@ def measure_point(
             if point.role == "reference":
                 arrays = {f"{place}|{k}": mesh[k] for place, mesh in shown.items() for k in (0, 1)}
                 fresh = folder.references / f".{point.key}.{os.getpid()}.npz"
-                np.savez_compressed(fresh, **arrays)
+                np.savez_compressed(fresh, allow_pickle=False, **arrays)
                 os.replace(fresh, folder.surfaces(point.key))
             elif point.reference:
                 values |= _errors(shown, folder.surfaces(point.reference))
             result["values"] = values
     except POINT_ERRORS as error:
-        result |= {
-            "status": "failed",
-            "error": f"{type(error).__name__}: {' '.join(str(error).split())}",
-        }
-    result |= {"threads": threads, "machine": platform.node(), "process": os.getpid()}
-    folder.write({**result, "seconds": time.perf_counter() - start})
+        result["status"] = "failed"
+        result["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    result["seconds"] = time.perf_counter() - start
+    folder.write(result)
 
 
-def _values(run):
-    values: dict[str, float] = {}
+def _values(run: RunData) -> dict[str, float | None]:
+    worst: dict[str, float] = {}
     for muscle, quantities in run.summary.items():
         for name in WORST:
-            worst = abs(quantities.get(name, {}).get("worst", math.nan))
-            if muscle != ALL and not math.isnan(worst):
-                values[name] = max(values.get(name, 0.0), worst)
+            value = quantities.get(name, QuantityFacts()).get("worst")
+            if muscle != ALL and value is not None and not math.isnan(value):
+                worst[name] = max(worst.get(name, 0.0), abs(value))
     # The first frame loads and compiles, and settles what overlaps at rest.
     shown = run.frames[1:] or run.frames
     walls = np.array([frame.wall for frame in shown])
@@ -231,7 +252,7 @@ def _values(run):
         sum(s.quantities.get("time_extract", 0.0) for s in f.surfaces.values()) for f in shown
     ]
     times = np.median(walls), np.percentile(walls, 95), np.median(extract)
-    return values | {name: float(value) for name, value in zip(TIMES, times)}
+    return {**worst, **{name: float(value) for name, value in zip(TIMES, times)}}
 
 
 def _pose(frame):
@@ -239,7 +260,7 @@ def _pose(frame):
     return " ".join(f"{name}={round(value, 9) + 0.0:.9f}" for name, value in values) or "rest"
 
 
-def _errors(shown, path):
+def _errors(shown: Mapping[str, Mesh], path: Path) -> dict[str, float | None]:
     """Surface distance to the reference, root mean square over frames and muscles, and greatest."""
     if not path.exists():
         raise UsageError("its reference is missing: that point failed, or the folder is not shared")
@@ -274,27 +295,27 @@ def threads_limited(count: int) -> Iterator[None]:
 
 def sweep_rows(
     points: Sequence[SweepPoint], folder: SweepFolder, units: Mapping[str, str]
-) -> list[dict[str, Any]]:
-    """One dict a point: scene, its units, role, status, settings, values, threads, error; NaN where
-    unknown.
-    """
+) -> list[SweepRow]:
+    """The rows of points; ``units`` are those of the scenes by name."""
     rows = []
     for point in points:
         result = folder.read(point.key)
         values = result.get("values", {})
-        row = {
-            "scene": point.scene,
-            "units": units[point.scene],
-            "role": point.role,
-            "status": result.get("status", "missing"),
-            "front": False,
-            "settings": point.settings,
-            **{name: math.nan if values.get(name) is None else values[name] for name in VALUES},
-            **{name: result.get(name, "") for name in ("seconds", "threads", "machine", "error")},
-            "label": point.label,
-            "reference": point.reference,
-            "key": point.key,
-        }
+        row = SweepRow(
+            scene=point.scene,
+            units=units[point.scene],
+            role=point.role,
+            status=result.get("status", "missing"),
+            settings=point.settings,
+            values={name: value for name, value in values.items() if value is not None},
+            seconds=result.get("seconds"),
+            threads=result.get("threads"),
+            machine=result.get("machine", ""),
+            error=result.get("error", ""),
+            label=point.label,
+            reference=point.reference,
+            key=point.key,
+        )
         rows.append(row)
     return rows
 
@@ -305,24 +326,35 @@ def write_table(
     units: dict[str, str],
     *,
     quantity: str = "error_rms",
-) -> dict[str, Any]:
-    """Write ``sweep.csv``, a line a point, and ``sweep.json``; what the latter holds: counts,
-    verdicts, rows.
-    """
+) -> SweepTable:
+    """Write ``sweep.csv``, a line a point, and ``sweep.json``; what the latter holds."""
     folder = SweepFolder(directory)
     rows = sweep_rows(points, folder, units)
     verdicts = mark_front(rows, quantity)
-    keys = list(dict.fromkeys(key for row in rows for key in row["settings"]))
-    columns = [name for name in rows[0] if name not in ("settings", "label")]
-    lines: list[list[Any]] = [[*keys, *columns]]
-    for row in rows:
-        values = [row["settings"].get(key, "") for key in keys] + [row[name] for name in columns]
-        # Digits beyond nine places are rounding.
-        lines.append([f"{round(v, 9):.6g}" if isinstance(v, float) else v for v in values])
-    write_csv(folder.directory / "sweep.csv", lines)
-    counts = {
-        status: sum(r["status"] == status for r in rows) for status in ("done", "failed", "missing")
-    }
-    table = {"quantity": quantity, **counts, "verdicts": verdicts, "rows": rows}
-    write_json(folder.directory / "sweep.json", table)
+    write_csv(folder.directory / "sweep.csv", _lines(rows))
+    statuses = [row.status for row in rows]
+    table = SweepTable(
+        quantity=quantity,
+        done=statuses.count("done"),
+        failed=statuses.count("failed"),
+        missing=statuses.count("missing"),
+        verdicts=verdicts,
+        rows=rows,
+    )
+    write_json(folder.directory / "sweep.json", table.model_dump())
     return table
+
+
+def _lines(rows: Sequence[SweepRow]) -> Iterator[list[object]]:
+    """Lines of ``sweep.csv``: settings, then facts and values of each point."""
+    keys = list(dict.fromkeys(key for row in rows for key in row.settings))
+    first = ("scene", "units", "role", "status", "front")
+    last = ("seconds", "threads", "machine", "error", "reference", "key")
+    yield [*keys, *first, *VALUES, *last]
+    for row in rows:
+        cells = [row.settings.get(key, "") for key in keys]
+        cells += [getattr(row, name) for name in first]
+        cells += [row.value(name) for name in VALUES]
+        cells += ["" if getattr(row, name) is None else getattr(row, name) for name in last]
+        # Digits beyond nine places are rounding.
+        yield [f"{round(v, 9):.6g}" if isinstance(v, float) else v for v in cells]

@@ -7,7 +7,7 @@ import hashlib
 import importlib.metadata
 import os
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -212,7 +212,7 @@ def write_csv(path: Path, rows: Iterable[Sequence[object]], *, mode: str = "w") 
         csv.writer(file, lineterminator="\n").writerows(rows)
 
 
-def write_json(path: Path, data: dict[str, object]) -> None:
+def write_json(path: Path, data: Mapping[str, object]) -> None:
     """Write JSON in one move, so that whoever reads it finds the old or the new; NaN and infinity
     become null.
     """

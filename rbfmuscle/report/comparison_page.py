@@ -5,11 +5,11 @@ else folded.
 from collections.abc import Mapping
 from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rbfmuscle.experiments.comparison import best_models
+from rbfmuscle.experiments.comparison_table import Comparison
 from rbfmuscle.experiments.measures import DEEPER, MEASURES
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
 from rbfmuscle.metrics.summary import shown_number
@@ -37,11 +37,11 @@ distance to the first model is no error. A mesh model keeps the overlap with bon
 has at rest; the first sentence leaves that out."""
 
 
-def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) -> None:
+def write_page(folder: Path, found: Comparison, *, pictures: bool = True) -> None:
     """Write ``report.html`` of what `write_tables` found to the folder of its runs; raises
     SolveError.
     """
-    runs = {found["labels"][name]: RunData.load(folder / name) for name in found["models"]}
+    runs = {found.labels[name]: RunData.load(folder / name) for name in found.models}
     page = _page(found, runs)
     if pictures:
         page.scene = packed_scene(runs)
@@ -50,19 +50,19 @@ def write_page(folder: Path, found: dict[str, Any], *, pictures: bool = True) ->
     page.write(folder / "report.html")
 
 
-def _page(found: dict[str, Any], runs: Mapping[str, RunData]) -> ReportPage:
+def _page(found: Comparison, runs: Mapping[str, RunData]) -> ReportPage:
     first = next(iter(runs.values()))
-    failed = [f"{name} did not finish: {reason}" for name, reason in found["failed"].items()]
-    counts = {"muscles": len(first.muscles), "frames": found["frames"], **found["machine"]}
+    failed = [f"{name} did not finish: {reason}" for name, reason in found.failed.items()]
+    counts = {"muscles": len(first.muscles), "frames": found.frames, **found.machine}
     # Of the bowing each muscle has a limit of its own.
     limits, terms = (
         first.info.limits | {"bowing": None, DEEPER: first.info.limits.get("penetration_max")},
         [(m.title, m.meaning) for m in MEASURES.values()],
     )
     return ReportPage(
-        f"{found['scene']}: models compared",
+        f"{found.scene}: models compared",
         [f"{counts[what]} {what}" for what in ("muscles", "frames", "threads")],
-        " ".join([found["answer"], *failed]),
+        " ".join([found.answer, *failed]),
         BAD if failed else PLAIN,
         lights=[_light(found, name, limits.get(name)) for name in LIGHTS if _values(found, name)],
         heads=list(runs),
@@ -77,17 +77,17 @@ def _page(found: dict[str, Any], runs: Mapping[str, RunData]) -> ReportPage:
             Section("Over the motion", plots=_plots(runs)),
             Section("How to read this", text=_READING, terms=terms),
         ],
-        footer=", ".join(f"{name} {value}" for name, value in found["versions"].items()),
+        footer=", ".join(f"{name} {value}" for name, value in found.versions.items()),
     )
 
 
-def _values(found: dict[str, Any], quantity: str) -> list[float | None]:
+def _values(found: Comparison, quantity: str) -> list[float | None]:
     """A measure of each model over all muscles; empty where none has it."""
-    values = [found["results"][name][ALL].get(quantity) for name in found["models"]]
+    values = [found.results[name][ALL].get(quantity) for name in found.models]
     return values if any(value is not None for value in values) else []
 
 
-def _light(found: dict[str, Any], quantity: str, limit: float | None) -> CheckRow:
+def _light(found: Comparison, quantity: str, limit: float | None) -> CheckRow:
     values = _values(found, quantity)
     cells = [Cell(shown(found, quantity, x), limit_state(quantity, x, limit)) for x in values]
     # A column of limits would be off a phone's screen.
@@ -95,53 +95,53 @@ def _light(found: dict[str, Any], quantity: str, limit: float | None) -> CheckRo
     return CheckRow(MEASURES[quantity].title, cells, note=note)
 
 
-def shown(found: dict[str, Any], quantity: str, value: float | None) -> str:
+def shown(found: Comparison, quantity: str, value: float | None) -> str:
     """A value of a measure with its unit; lengths that do not count as zero."""
-    measure, unit = MEASURES[quantity], found["measures"][quantity]["unit"]
+    measure, unit = MEASURES[quantity], found.measures[quantity].unit
     if value is not None and unit == "mm" and abs(value) < 0.5 * measure.floor:
         value = 0.0
     return shown_number(value, unit)
 
 
-def _measures(found: dict[str, Any]) -> Table:
+def _measures(found: Comparison) -> Table:
     rows = []
     for quantity, measure in MEASURES.items():
         if values := _values(found, quantity):
-            best, models = best_models(found["results"], quantity, found["units"]), found["models"]
+            best, models = best_models(found.results, quantity, found.units), found.models
             states = [
                 GOOD if name in best and len(best) < len(models) else PLAIN for name in models
             ]
             texts = [shown(found, quantity, value) for value in values]
             rows.append([Cell(measure.title), Cell(measure.against), *map(Cell, texts, states)])
-    return Table(["", "against", *(found["labels"][name] for name in found["models"])], rows)
+    return Table(["", "against", *(found.labels[name] for name in found.models)], rows)
 
 
-def _statistics(found: dict[str, Any]) -> Table:
+def _statistics(found: Comparison) -> Table:
     """Length, moment arms, volume and time of each muscle, mean ± standard deviation."""
-    models, rows = found["models"], []
-    first = found["statistics"][models[0]]
+    models, rows = found.models, []
+    first = found.statistics[models[0]]
     for muscle, quantities in first.items():
         names = ["length", *(name for name in quantities if name.startswith("moment_arm:"))]
         for name in [*names, "volume_error", "time_frame"]:
             quantity, _, about = name.partition(":")
-            unit = unit_text(QUANTITIES[quantity][0], found["units"])
+            unit = unit_text(QUANTITIES[quantity][0], found.units)
             texts = []
             for model in models:
-                row = found["statistics"][model].get(muscle, {}).get(name)
-                pair = [shown_number(row[key], unit) for key in ("mean", "sd")] if row else []
+                spread = found.statistics[model].get(muscle, {}).get(name)
+                pair = [shown_number(x, unit) for x in (spread.mean, spread.sd)] if spread else []
                 texts.append(" ± ".join(pair) or "–")
             title = f"{quantity.replace('_', ' ')} {about}".strip()
             rows.append([Cell(muscle), Cell(title), *map(Cell, texts)])
-    return Table(["", "", *(found["labels"][name] for name in models)], rows)
+    return Table(["", "", *(found.labels[name] for name in models)], rows)
 
 
-def _unknowns(found: dict[str, Any]) -> Table:
-    models = found["models"]
+def _unknowns(found: Comparison) -> Table:
+    models = found.models
     rows = [
-        [Cell(muscle), *(Cell(found["unknowns"][name][muscle]) for name in models)]
-        for muscle in found["unknowns"][models[0]]
+        [Cell(muscle), *(Cell(found.unknowns[name][muscle]) for name in models)]
+        for muscle in found.unknowns[models[0]]
     ]
-    return Table(["", *(found["labels"][name] for name in models)], rows)
+    return Table(["", *(found.labels[name] for name in models)], rows)
 
 
 def _plots(runs: Mapping[str, RunData]) -> list[str]:

@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+from rbfmuscle.experiments.comparison_table import Comparison
+from rbfmuscle.experiments.sweep_table import SweepTable
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import Limits, Summary, exceeded, parse_limits, unmeasured
 from rbfmuscle.output.info import RunInfo
@@ -84,11 +86,12 @@ def redraw_study(
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
             if file == "comparison.json":
-                comparison_page.write_page(directory, found, pictures=pictures)
+                table = Comparison.model_validate(found)
+                comparison_page.write_page(directory, table, pictures=pictures)
             elif file == "kernels.json":
                 kernel_page.write_page(directory, found)
             else:
-                sweep_page.write_page(found, directory)
+                sweep_page.write_page(SweepTable.model_validate(found), directory)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             message = f"{path} is not as it was written ({error!r}); run the command again"
             raise UsageError(message) from None

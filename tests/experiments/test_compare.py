@@ -4,6 +4,7 @@ import csv
 import html
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from blend_model import BlendMuscle, arm_scene
 
 from rbfmuscle.compare import compare_models
 from rbfmuscle.experiments.comparison import best_models, describe
+from rbfmuscle.experiments.comparison_table import Comparison
 from rbfmuscle.experiments.measures import DEEPER, MEASURES
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.models import build_model
@@ -35,9 +37,9 @@ def test_what_does_not_count_is_a_tie():
         == []
     )
     assert best_models(found, "bowing", "mm") == ["a"]  # which is perfect at 1
-    known = {"models": ["a"], "results": found}
+    known = SimpleNamespace(models=["a"], results=found)
     assert (_values(known, "bowing"), _values(known, "flicker")) == ([1.0], [])
-    table = {"measures": {name: {"unit": "mm"} for name in MEASURES}}
+    table = SimpleNamespace(measures={name: SimpleNamespace(unit="mm") for name in MEASURES})
     values = (
         ("return_rms", 0.009),
         ("return_rms", 0.011),
@@ -63,9 +65,9 @@ def compared(tmp_path_factory):
 class TestComparison:
     def test_values_are_those_of_the_runs(self, compared):
         folder, table = compared
-        assert (table["models"], table["frames"], table["poses"]) == (["rbf", "pbd"], 4, [0, 1, 3])
-        for model in table["models"]:
-            saved, found = Run.load(folder / model), table["results"][model]
+        assert (table.models, table.frames, table.poses) == (["rbf", "pbd"], 4, [0, 1, 3])
+        for model in table.models:
+            saved, found = Run.load(folder / model), table.results[model]
             assert len(saved.frames) == 4
             for quantity in ("volume_error", "bone_penetration_max", "rest_error_rms"):
                 each = [saved.series(muscle, quantity)[1] for muscle in saved.muscles]
@@ -89,35 +91,34 @@ class TestComparison:
     def test_files_hold_the_table_and_the_page_begins_with_the_answer(self, compared):
         folder, table = compared
         kept = json.loads((folder / "comparison.json").read_text(encoding="utf-8"))
-        assert kept == json.loads(json.dumps(table))
+        assert Comparison.model_validate(kept) == table
         lines = (folder / "comparison.csv").read_text(encoding="utf-8").splitlines()
         for row in csv.DictReader(lines):
             assert (
-                float(row["value"])
-                == table["results"][row["model"]][row["muscle"]][row["quantity"]]
+                float(row["value"]) == table.results[row["model"]][row["muscle"]][row["quantity"]]
             )
         text = (folder / "comparison.tex").read_text(encoding="utf-8")
         assert text.count(r" \\") == 1 + len(
-            table["results"]["rbf"]["all"] | table["results"]["pbd"]["all"]
+            table.results["rbf"]["all"] | table.results["pbd"]["all"]
         )
         text = (folder / "report.html").read_text(encoding="utf-8")
-        answer = html.escape(table["answer"], quote=False)
+        answer = html.escape(table.answer, quote=False)
         assert answer.startswith("RBF keeps out of bones") and answer in text
         assert text.index(answer) < text.index("<table")
-        assert all(MEASURES[quantity].title in text for quantity in table["results"]["pbd"]["all"])
+        assert all(MEASURES[quantity].title in text for quantity in table.results["pbd"]["all"])
 
     def test_depth_at_rest_is_not_held_against_a_model(self, compared):
         """PBD keeps what overlaps at rest; only what is deeper than that counts."""
         folder, table = compared
-        for model in table["models"]:
+        for model in table.models:
             for muscle in Run.load(folder / model).muscles:
-                found = table["results"][model][muscle]
+                found = table.results[model][muscle]
                 deepest = max(found["penetration_max"], found["bone_penetration_max"])
                 beyond = max(0.0, deepest - found["initial_overlap"])
                 assert found[DEEPER] == pytest.approx(beyond)
-        pbd = table["results"]["pbd"]["all"]
+        pbd = table.results["pbd"]["all"]
         assert pbd[DEEPER] < pbd["bone_penetration_max"]
-        assert f"({shown_number(pbd[DEEPER], 'mm')} deep beyond rest)" in table["answer"]
+        assert f"({shown_number(pbd[DEEPER], 'mm')} deep beyond rest)" in table.answer
 
     def test_statistics_are_those_of_the_frames(self, compared):
         folder, _ = compared
@@ -139,10 +140,10 @@ class TestComparison:
         rbf, pbd = (Run.load(folder / name) for name in ("rbf", "pbd"))
         for muscle in rbf.muscles:
             apart = rbf.series(muscle, "length")[1] - pbd.series(muscle, "length")[1]
-            found = table["results"]["pbd"][muscle]
+            found = table.results["pbd"][muscle]
             assert found["length_rms"] == pytest.approx(np.sqrt((apart**2).mean()))
-            assert found["moment_arm_rms"] > 0 and table["unknowns"]["pbd"][muscle]
-        assert 0 < table["results"]["rbf"]["all"]["time_one_thread"] < 60
+            assert found["moment_arm_rms"] > 0 and table.unknowns["pbd"][muscle]
+        assert 0 < table.results["rbf"]["all"]["time_one_thread"] < 60
 
 
 class TestFailure:
@@ -166,6 +167,6 @@ class TestFailure:
         monkeypatch.setattr(BlendMuscle, "fail_at", 1)
         monkeypatch.setattr("rbfmuscle.models.build_model", build)
         table = compare_models(arm_scene(), tmp_path, ["pbd", "arap-pbd", "xpbd"], pictures=False)
-        assert table["models"] == ["pbd", "arap-pbd"] and "planted" in table["failed"]["xpbd"]
+        assert table.models == ["pbd", "arap-pbd"] and "planted" in table.failed["xpbd"]
         assert "xpbd did not finish" in (tmp_path / "report.html").read_text(encoding="utf-8")
-        assert not math.isnan(table["results"]["pbd"]["all"]["volume_error"])
+        assert not math.isnan(table.results["pbd"]["all"]["volume_error"])

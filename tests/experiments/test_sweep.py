@@ -20,6 +20,7 @@ from rbfmuscle.cli.study import _names
 from rbfmuscle.experiments.front import mark_front, pareto_front
 from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep, scene_content
 from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep, sweep_rows, write_table
+from rbfmuscle.experiments.sweep_table import SweepRow
 from rbfmuscle.report.sweep_page import write_page
 from rbfmuscle.sweeping import run_point
 from rbfmuscle.validation import UsageError
@@ -106,19 +107,9 @@ class TestGrid:
 
 def row(error, time, role=""):
     label = role or f"{error:g} {time:g}"
-    return {
-        "scene": "s",
-        "status": "done",
-        "role": role,
-        "reference": "r",
-        "units": "mm",
-        "label": label,
-        "key": label,
-        "settings": {},
-        "error_rms": error,
-        "time_frame": time,
-        "front": False,
-    }
+    values = {"error_rms": error, "time_frame": time}
+    names = {"scene": "s", "units": "mm", "label": label, "reference": "r", "key": label}
+    return SweepRow(role=role, settings={}, values=values, **names)
 
 
 class TestFront:
@@ -137,11 +128,11 @@ class TestFront:
             row(np.nan, 0.1, "reference"),
         ]
         exact = mark_front([row(0.0, 1.0, "default"), row(0.0, 0.5)])[0]
-        assert (exact["factor"], exact["faster"], exact["better"]) == (1.0, "0 0.5", None)
+        assert (exact.factor, exact.faster, exact.better) == (1.0, "0 0.5", None)
         (verdict,) = mark_front(rows)
-        assert verdict["factor"] == pytest.approx(factor)
-        assert verdict["near"] is near
-        assert ("lies on the Pareto front" in verdict["text"]) is rows[2]["front"]
+        assert verdict.factor == pytest.approx(factor)
+        assert verdict.near is near
+        assert ("lies on the Pareto front" in verdict.text) is rows[2].front
 
 
 class TestRun:
@@ -151,12 +142,12 @@ class TestRun:
         write_page(table, folder)
         page = (folder / "sweep.html").read_text(encoding="utf-8")
         assert "<svg" in page and "http" not in page and "the default lies" in page
-        rows = {r["label"]: r for r in table["rows"]}
-        assert all(r["status"] == "done" for r in rows.values())
+        rows = {r.label: r for r in table.rows}
+        assert all(r.status == "done" for r in rows.values())
         coarse, fine = (rows[f"model.centres=40 model.resolution={n}"] for n in (16, 24))
-        assert 0 < fine["error_rms"] < coarse["error_rms"] < 1
-        (reference,) = [r for r in rows.values() if r["role"] == "reference"]
-        assert np.isnan(reference["error_rms"]) and not reference["front"]
+        assert 0 < fine.value("error_rms") < coarse.value("error_rms") < 1
+        (reference,) = [r for r in rows.values() if r.role == "reference"]
+        assert np.isnan(reference.value("error_rms")) and not reference.front
 
     def test_what_is_done_is_not_done_twice(self, finished):
         before = {path: path.stat().st_mtime_ns for path in (finished[1] / "points").iterdir()}
@@ -172,10 +163,10 @@ class TestRun:
 
     def test_failed_points_leave_the_others_and_are_tried_again(self, tmp_path):
         points, _ = sweep(tmp_path, ["model.centres=40,-3", "model.resolution=16,24"])
-        rows = write_table(points, tmp_path, {"arm": "mm"})["rows"]
-        failed = [r for r in rows if r["status"] == "failed"]
-        assert {r["settings"]["model.centres"] for r in failed} == {-3} and all(
-            r["error"] for r in failed
+        rows = write_table(points, tmp_path, {"arm": "mm"}).rows
+        failed = [r for r in rows if r.status == "failed"]
+        assert {r.settings["model.centres"] for r in failed} == {-3} and all(
+            r.error for r in failed
         )
         assert sweep(tmp_path, ["model.centres=40,-3", "model.resolution=16,24"])[1] == len(failed)
 
@@ -190,9 +181,9 @@ def crash_or_run(scene, settings, frames):
 @pytest.mark.filterwarnings("ignore:A worker stopped:UserWarning")
 def test_a_process_that_dies_takes_only_its_own_point(tmp_path):
     points, _ = sweep(tmp_path, ["model.centres=40,60,80"], crash_or_run, jobs=2)
-    rows = {r["label"]: r for r in write_table(points, tmp_path, {"arm": "mm"})["rows"]}
-    assert {label for label, r in rows.items() if r["status"] != "done"} == {"model.centres=60"}
-    assert "process ended" in rows["model.centres=60"]["error"]
+    rows = {r.label: r for r in write_table(points, tmp_path, {"arm": "mm"}).rows}
+    assert {label for label, r in rows.items() if r.status != "done"} == {"model.centres=60"}
+    assert "process ended" in rows["model.centres=60"].error
 
 
 @pytest.fixture
@@ -282,7 +273,7 @@ def test_rows_are_those_of_their_points_in_order():
     )
     folder = SimpleNamespace(read=lambda key: {"k0": done, "k1": failed}.get(key, {}))
     rows = sweep_rows(points, folder, {"s": "cm"})
-    assert [r["status"] for r in rows] == ["done", "failed", "missing"]
-    assert [r["label"] for r in rows] == ["default", "a=1", "a=2"]
-    assert [r["error"] for r in rows] == ["", "no", ""] and rows[0]["units"] == "cm"
-    np.testing.assert_array_equal([r["error_rms"] for r in rows], [0.25, np.nan, np.nan])
+    assert [r.status for r in rows] == ["done", "failed", "missing"]
+    assert [r.label for r in rows] == ["default", "a=1", "a=2"]
+    assert [r.error for r in rows] == ["", "no", ""] and rows[0].units == "cm"
+    np.testing.assert_array_equal([r.value("error_rms") for r in rows], [0.25, np.nan, np.nan])

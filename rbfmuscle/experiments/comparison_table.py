@@ -1,0 +1,49 @@
+"""What a comparison of models found."""
+
+from pydantic import BaseModel
+
+# Values by muscle, "all" included, and quantity.
+Values = dict[str, dict[str, float]]
+
+
+class MeasureFacts(BaseModel):
+    """A measure: its unit, and the words of its row of `MEASURES`."""
+
+    unit: str
+    title: str
+    against: str
+    meaning: str
+
+
+class Spread(BaseModel):
+    """Mean and standard deviation over the frames."""
+
+    mean: float
+    sd: float
+
+
+class Comparison(BaseModel):
+    """What ``comparison.json`` holds.
+
+    ``poses`` are the numbers of the frames at which distances were measured, ``labels`` models as
+    tables name them, ``failed`` why models were not solved, ``answer`` all of it in sentences,
+    ``unknowns`` the points that each model solves for, in words, by model and muscle. ``results``
+    are by model; ``statistics`` by model, muscle and quantity, of moment arms
+    ``"moment_arm:COORDINATE"``.
+    """
+
+    format: int
+    scene: str
+    units: str
+    frames: int
+    poses: list[int]
+    models: list[str]
+    labels: dict[str, str]
+    failed: dict[str, str]
+    answer: str
+    unknowns: dict[str, dict[str, str]]
+    measures: dict[str, MeasureFacts]
+    results: dict[str, Values]
+    statistics: dict[str, dict[str, dict[str, Spread]]]
+    machine: dict[str, str | int | None]
+    versions: dict[str, str]
