@@ -32,7 +32,9 @@ def play(model, step):
     scene.muscles = [scene.muscle(name) for name in MUSCLES]
     stops = [{"hip.flexion": angle} for angle in (0.0, 90.0, 0.0)]
     scene.set_motion(waypoints=stops, step=step)
-    kept, sweeps, last = [], [], len(scene.motion) - 1
+    kept = []
+    sweeps = []
+    last = len(scene.motion) - 1
     stamps = []
     for k, frame in enumerate(simulate_frames(scene, build_models(scene))):
         stamps.append(time.process_time())

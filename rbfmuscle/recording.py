@@ -36,7 +36,6 @@ from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.simulation.substeps import check_substeps
 from rbfmuscle.validation import (
-    LimitExceededError,
     RBFMuscleError,
     SceneWarning,
     SolveError,
@@ -166,11 +165,7 @@ class Recording:
         self._end += time.perf_counter() - start
         info = self.info()
         writer.write_info(info)
-        try:
-            require_limits(self.summary.table(), self.limits)
-        except LimitExceededError as error:
-            error.info = info
-            raise
+        require_limits(self.summary.table(), self.limits)
         return info
 
     def _frames(self) -> Iterator[tuple[Frame, dict[str, Values]]]:

@@ -4,7 +4,6 @@ import difflib
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,21 +40,20 @@ class MeshError(RBFMuscleError, ValueError):
 
 
 class SolveError(RBFMuscleError, RuntimeError):
-    """A frame could not be solved; frames so far are kept (exit code 5), in memory as ``run``."""
+    """A frame could not be solved; frames so far are kept (exit code 5), in memory as ``run``, a
+    `Run`.
+    """
 
     exit_code = 5
-    run: Any = None  # a Run, of a package above this one
+    run: object = None
 
 
 class LimitExceededError(RBFMuscleError, RuntimeError):
     """A limit given with ``--fail-on`` was exceeded, or not measured (exit code 6); everything is
     written.
-
-    ``info`` is the `RunInfo`.
     """
 
     exit_code = 6
-    info: Any = None  # a RunInfo, of a package above this one
 
 
 class MissingDependencyError(RBFMuscleError, ImportError):

@@ -247,6 +247,7 @@ def report(
         Draw pictures and the animation.
     """
     with Progress(f"report {directory}"), stage("drawing pictures" if pictures else "writing"):
+        from rbfmuscle.output.run_data import RunData
         from rbfmuscle.report.redraw import redraw_run, redraw_study
 
         failed, page = None, directory / "report.html"
@@ -259,7 +260,7 @@ def report(
             try:
                 facts = redraw_run(directory, fail_on=fail_on, pictures=pictures).to_dict()
             except LimitExceededError as error:
-                facts, failed = error.info.to_dict(), error
+                facts, failed = RunData.load(directory).info.to_dict(), error
     return print_result(printing, facts, _report_lines(directory, facts, page), error=failed)
 
 

@@ -171,7 +171,9 @@ def _write_surfaces(volume, stage):
 
     meshes = stage / "meshes"
     meshes.mkdir()
-    values, files, capped = volume.values(), set(), {}
+    values = volume.values()
+    files = set()
+    capped = {}
     frame = "right, forward, up (RAS), mm"
     notes = [f"surfaces of {Path(volume.source).name}, in its frame: {frame}", *volume.notes]
     with Progress("surfaces", "label") as progress:

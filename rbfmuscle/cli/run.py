@@ -1,8 +1,8 @@
 """``rbfmuscle run`` and ``rbfmuscle demo``: a scene through its motion, into a folder."""
 
 import time
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rbfmuscle.cli.options import (
     FailOn,
@@ -31,8 +31,15 @@ def demo(
     printing: Printing = USUAL,
 ) -> int:
     """Run the embedded hip: no data, no network. The same as `run phantom`."""
-    options: dict[str, Any] = {"model": model, "frames": frames, "fail_on": fail_on}
-    return run(Path("phantom"), output=output, jobs=jobs, printing=printing, **options)
+    return run(
+        Path("phantom"),
+        output=output,
+        model=model,
+        frames=frames,
+        fail_on=fail_on,
+        jobs=jobs,
+        printing=printing,
+    )
 
 
 def run(
@@ -78,16 +85,16 @@ def run(
         changes, loaded = parse_settings(settings), open_scene(scene)
         if muscles is not None:
             loaded.muscles, loaded.sliding = chosen_muscles(loaded, muscles), None
-        options: dict[str, Any] = {"model": model, "frames": frames, "fail_on": fail_on}
+        limited = partial(stream_run, frames=frames, fail_on=fail_on, progress=advance)
         try:
-            info = stream_run(loaded, output, settings=changes, progress=advance, **options)
+            limited(loaded, output, model=model, settings=changes)
         except SolveError as error:
             failed = SolveError("; ".join(filter(None, [str(error), kept()])))
             if not done:
                 raise failed from None
-            info = RunData.load(output).info
         except LimitExceededError as error:
-            info, failed = error.info, error
+            failed = error
+        info = RunData.load(output).info
     facts = {"directory": str(output), **info.to_dict()}
     seconds = time.perf_counter() - start
     return print_result(printing, facts, _lines(output, len(info.frames), seconds), error=failed)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -164,6 +165,8 @@ def kernels(
         Find the fewest centres, and the kernel, that reach this RMS distance (in the mesh's unit),
         in place of a table.
     """
+    from rbfmuscle.experiments.kernel_study import study_kernels
+    from rbfmuscle.experiments.wanted_error import reach_error
     from rbfmuscle.report.kernel_page import kernels_folder
 
     counts = split_list(centres)
@@ -171,12 +174,20 @@ def kernels(
         raise UsageError(f"--centres must be whole numbers of 8 and more, got {centres!r}")
     meshes, units = _meshes(source, muscles, units)
     kernels_folder(output)
-    options: dict[str, Any] = {"kernels": split_list(names) or None, "placement": placement}
+    chosen = split_list(names) or None
     with threads(jobs):
         if error is not None:
-            return _find_wanted(meshes, output, error, options, units, printing)
-        options |= {"centres": [int(c) for c in counts], "units": units, "resolution": resolution}
-        return _study(meshes, output, options, printing)
+            find = partial(reach_error, error=error, kernels=chosen, placement=placement)
+            return _find_wanted(meshes, output, find, units, printing)
+        study = partial(
+            study_kernels,
+            kernels=chosen,
+            centres=[int(count) for count in counts],
+            placement=placement,
+            resolution=resolution,
+            units=units,
+        )
+        return _study(meshes, output, study, printing)
 
 
 def _meshes(source, muscles, units):
@@ -192,14 +203,13 @@ def _meshes(source, muscles, units):
     return {each.name: each.mesh for each in chosen_muscles(scene, muscles)}, scene.units
 
 
-def _study(meshes, output, options, printing):
-    from rbfmuscle.experiments.kernel_study import study_kernels
+def _study(meshes, output, study, printing):
     from rbfmuscle.report.kernel_page import write_studies
 
     studies = {}
     for name, mesh in meshes.items():
         with Progress(f"kernels of {name}", what="fit") as bar:
-            studies[name] = study_kernels(mesh, **options, progress=bar)
+            studies[name] = study(mesh, progress=bar)
     write_studies(studies, output)
     facts = json.loads((output / "kernels.json").read_text(encoding="utf-8"))
     return print_result(printing, facts, _study_lines(studies, output))
@@ -218,21 +228,20 @@ def _study_lines(studies, output):
     yield f"all rows: open {output / 'kernels.html'}"
 
 
-def _find_wanted(meshes, output, error, options, units, printing):
+def _find_wanted(meshes, output, find, units, printing):
     """Find, print and write what reaches an error; where it is not reached, that is said."""
     from rbfmuscle.experiments.kernel_rows import row_toml
-    from rbfmuscle.experiments.wanted_error import reach_error
     from rbfmuscle.output.writer import json_text
     from rbfmuscle.report.kernel_page import kernels_folder
 
     facts = {}
     for name, mesh in meshes.items():
         with Progress(f"kernels of {name}", what="fit") as bar:
-            found = reach_error(mesh, error, **options, progress=bar)
+            found = find(mesh, progress=bar)
         facts[name] = {
             "reached": found.reached,
             "error": found.error,
-            "wanted": error,
+            "wanted": found.wanted,
             "units": units,
             "row": found.row,
             "toml": row_toml(found.row),

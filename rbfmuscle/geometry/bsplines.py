@@ -26,11 +26,22 @@ def bspline_sum(nodes, start, width, weight, slope):
     """Value and gradient, in units of a cell, of the 4 x 4 x 4 nodes from ``start`` on of a block
     of ``width`` nodes along each axis, flattened; weights and slopes are (3, 4).
     """
-    value, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
-    w0, w1, w2, w3 = weight[2, 0], weight[2, 1], weight[2, 2], weight[2, 3]
-    s0, s1, s2, s3 = slope[2, 0], slope[2, 1], slope[2, 2], slope[2, 3]
+    value = 0.0
+    gx = 0.0
+    gy = 0.0
+    gz = 0.0
+    w0 = weight[2, 0]
+    w1 = weight[2, 1]
+    w2 = weight[2, 2]
+    w3 = weight[2, 3]
+    s0 = slope[2, 0]
+    s1 = slope[2, 1]
+    s2 = slope[2, 2]
+    s3 = slope[2, 3]
     for a in range(4):
-        line, lean, side = 0.0, 0.0, 0.0
+        line = 0.0
+        lean = 0.0
+        side = 0.0
         for b in range(4):
             # Unsigned, as compiled code looks for negative ones otherwise.
             k = np.uint64(start + (a * width + b) * width)

@@ -179,20 +179,28 @@ def _plain_loop(vertices, faces, plain):
     areas, normals = np.empty((len(faces), 3)), np.zeros_like(vertices)
     for f in range(len(faces)):
         x, y, z = triangle_normal(vertices, faces, f)
-        areas[f, 0], areas[f, 1], areas[f, 2] = x, y, z
+        areas[f, 0] = x
+        areas[f, 1] = y
+        areas[f, 2] = z
         for k in range(3):
             v = faces[f, k]
             normals[v, 0] += x
             normals[v, 1] += y
             normals[v, 2] += z
-    across, square, turns = _across_loop(normals), np.empty(len(vertices)), np.zeros(len(vertices))
+    across = _across_loop(normals)
+    square = np.empty(len(vertices))
+    turns = np.zeros(len(vertices))
     for v in range(len(vertices)):
         square[v] = normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2
     for f in range(len(faces)):
-        x, y, z = areas[f, 0], areas[f, 1], areas[f, 2]
+        x = areas[f, 0]
+        y = areas[f, 1]
+        z = areas[f, 2]
         least = 1e-12 * (x * x + y * y + z * z)
         for k in range(3):
-            v, p, q = faces[f, k], faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            v = faces[f, k]
+            p = faces[f, (k + 1) % 3]
+            q = faces[f, (k + 2) % 3]
             along = x * normals[v, 0] + y * normals[v, 1] + z * normals[v, 2]
             plain[v] &= (along > 0.0) & (along * along > least * square[v])
             # The side of a plane through the normal that a neighbour lies on: once round, once from
@@ -211,7 +219,9 @@ def _across_loop(normals):
     """A vector (n, 3) at a right angle to each normal."""
     across = np.zeros_like(normals)
     for v in range(len(normals)):
-        x, y, z = abs(normals[v, 0]), abs(normals[v, 1]), abs(normals[v, 2])
+        x = abs(normals[v, 0])
+        y = abs(normals[v, 1])
+        z = abs(normals[v, 2])
         a = 0 if x <= y and x <= z else (1 if y <= z else 2)
         b, c = (a + 1) % 3, (a + 2) % 3
         across[v, b], across[v, c] = normals[v, c], -normals[v, b]

@@ -187,13 +187,9 @@ def _above(at, vertices, faces, f, axes):
     if found < 2:
         return 0
     if east < west:
-        west, west_height, west_falls, east, east_height = (
-            east,
-            east_height,
-            east_falls,
-            west,
-            west_height,
-        )
+        west, east = east, west
+        west_height, east_height = east_height, west_height
+        west_falls = east_falls
     if not (west <= x < east):
         return 0
     if west_height + (x - west) / (east - west) * (east_height - west_height) <= z:

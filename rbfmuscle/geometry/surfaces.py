@@ -198,13 +198,21 @@ def volume_rate(vertices, faces, direction):
     volume, rate = 0.0, 0.0
     origin = corner_from(vertices, faces[0, 0], (0.0, 0.0, 0.0))
     for f in range(len(faces)):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        i = faces[f, 0]
+        j = faces[f, 1]
+        k = faces[f, 2]
         p = corner_from(vertices, i, origin)
         q = corner_from(vertices, j, origin)
         r = corner_from(vertices, k, origin)
-        x, y, z = p[0] - r[0], p[1] - r[1], p[2] - r[2]
-        u, v, w = q[0] - r[0], q[1] - r[1], q[2] - r[2]
-        a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
+        x = p[0] - r[0]
+        y = p[1] - r[1]
+        z = p[2] - r[2]
+        u = q[0] - r[0]
+        v = q[1] - r[1]
+        w = q[2] - r[2]
+        a = y * w - z * v
+        b = z * u - x * w
+        c = x * v - y * u
         volume += a * r[0] + b * r[1] + c * r[2]
         rate += a * (direction[i, 0] + direction[j, 0] + direction[k, 0])
         rate += b * (direction[i, 1] + direction[j, 1] + direction[k, 1])

@@ -115,7 +115,9 @@ def blend_loop(x, terms, form, blend, todo, value, gradient):
             if count == 0:
                 break
             size = (count + 7) // 8 * 8
-            p, acc, g = np.empty((3, size)), np.zeros(size), np.zeros((3, size))
+            p = np.empty((3, size))
+            acc = np.zeros(size)
+            g = np.zeros((3, size))
             scale = terms.scale[fit]
             for n in range(size):
                 i = rows[min(n, count - 1)]
@@ -237,7 +239,9 @@ def _project_matrix(a, polynomials):
     With P = A Q: M = A - Q H^T - H Q^T, H = P - Q (Q^T P - gamma I) / 2 , and gamma the mean of the
     rest of the diagonal. Returns P^T (q, w), and the greatest length of its rows.
     """
-    q, size, width = len(polynomials), len(a), a.shape[1]
+    q = len(polynomials)
+    size = len(a)
+    width = a.shape[1]
     product, inner = np.zeros((q, width)), np.zeros((q, q))
     trace, norm = 0.0, 0.0
     for i in range(size):
@@ -280,7 +284,10 @@ def _subtract_rows(row, start, rows, shares, count):
         k1 = k + one
         k2 = k1 + one
         k3 = k2 + one
-        p, q, r, s = shares[k], shares[k1], shares[k2], shares[k3]
+        p = shares[k]
+        q = shares[k1]
+        r = shares[k2]
+        s = shares[k3]
         for j in range(first, end):
             row[j] -= p * rows[k, j] + q * rows[k1, j] + r * rows[k2, j] + s * rows[k3, j]
         k = k3 + one
@@ -341,7 +348,10 @@ def _factor(a):
             k1 = k + one
             k2 = k1 + one
             k3 = k2 + one
-            p, q, r, s = a[k, i], a[k1, i], a[k2, i], a[k3, i]
+            p = a[k, i]
+            q = a[k1, i]
+            r = a[k2, i]
+            s = a[k3, i]
             for j in range(first, end):
                 a[i, j] -= p * a[k, j] + q * a[k1, j] + r * a[k2, j] + s * a[k3, j]
             k = k3 + one

@@ -1,7 +1,6 @@
 """Values and gradients of an RBF field at many points.
 
-Points are handled in blocks that stay in the first-level cache; the inner loops run over the points
-of a block.
+Points are handled in blocks that stay in the first-level cache; inner loops run over a block.
 """
 
 from typing import NamedTuple
@@ -16,12 +15,10 @@ from rbfmuscle.jit import compiled
 
 # Points of a block, and pairs of points and centres below which a thread does not pay.
 _BLOCK, _SERIAL = 256, 200_000
-# Points that are sorted into fits at a time.
-_CHUNK = 4096
+_CHUNK = 4096  # points that are sorted into fits at a time
 # Beyond this share of the radius of every ball, all grow until the point lies there in the nearest.
 RIM = 0.95
-# How close to a centre its closeness levels off, in radii of the fit's ball.
-NEAR = 0.15
+NEAR = 0.15  # how close to a centre its closeness levels off, in radii of the fit's ball
 
 
 class Terms(NamedTuple):
@@ -333,8 +330,13 @@ def _cubic_value_loop(p, at, a, b, acc):
 def _cubic_gradient_loop(p, centres, weight, slope, acc, g):
     """Adds 3 a r d - 3 r B - 3/r (B . d) d of each centre to g, the value to acc."""
     for j in range(centres.shape[1]):
-        x, y, z = centres[0, j], centres[1, j], centres[2, j]
-        a, bx, by, bz = weight[j], slope[0, j], slope[1, j], slope[2, j]
+        x = centres[0, j]
+        y = centres[1, j]
+        z = centres[2, j]
+        a = weight[j]
+        bx = slope[0, j]
+        by = slope[1, j]
+        bz = slope[2, j]
         for i in range(acc.size):
             dx = p[0, i] - x
             dy = p[1, i] - y

@@ -181,7 +181,9 @@ def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
 def _find_residual(touch, rhs, near, push, residual):
     """Motion that each contact still needs after a push of the nodes."""
     for c in range(len(rhs)):
-        i, value, normal = touch.point[c], rhs[c], touch.normal[c]
+        i = touch.point[c]
+        value = rhs[c]
+        normal = touch.normal[c]
         for k in range(near.columns.shape[1]):
             j = near.columns[i, k]
             value -= near.shares[i, k] * (
@@ -199,7 +201,9 @@ def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
     until none is left; forces solve the complementarity problem on it.
     """
     count = len(touch.point)
-    rhs, force, residual = np.empty(count), np.empty(count), np.empty(count)
+    rhs = np.empty(count)
+    force = np.empty(count)
+    residual = np.empty(count)
     is_chosen, total = np.zeros(count, np.bool_), 0
     for c in range(count):
         i = touch.point[c]
@@ -212,12 +216,18 @@ def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
         total += is_chosen[c]
     forces[:] = 0.0
     push, taken = np.zeros((len(metric.inverse), 3)), np.zeros(len(metric.factor))
-    room, done, capped = min(count, total + ROUNDS * BATCH), 0, False
+    room = min(count, total + ROUNDS * BATCH)
+    done = 0
+    capped = False
     # The working set: its contacts, their numbers among the answers, and rows of the problem.
     chosen, numbers = np.empty(room, np.int64), np.empty(room, np.int64)
     chosen[:total] = np.flatnonzero(is_chosen)
-    normal, wants, strength = np.empty((room, 3)), np.empty(room), np.empty(room)
-    rows, delassus, own = np.empty((room, len(taken))), np.empty((room, room)), np.empty(room)
+    normal = np.empty((room, 3))
+    wants = np.empty(room)
+    strength = np.empty(room)
+    rows = np.empty((room, len(taken)))
+    delassus = np.empty((room, room))
+    own = np.empty(room)
     most = np.empty(room)
     for turn in range(ROUNDS):
         added = deepest(residual, is_chosen, tolerance, BATCH)

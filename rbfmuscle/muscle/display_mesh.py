@@ -23,7 +23,9 @@ UNTANGLED = 24
 # Cosine between the normals of two neighbours that lie on each other, which cross when they move;
 # sweeps in which they are smoothed; and how far vertices may go for that, in mean edges: a scan's
 # overlaps are small, and what is larger is the shape.
-FOLDED, UNFOLDED, UNFOLD_WAY = -np.sqrt(0.75), 4, 0.25
+FOLDED = -np.sqrt(0.75)
+UNFOLDED = 4
+UNFOLD_WAY = 0.25
 # Bounds on the vertices that are asked for by a resolution.
 WANTED = (200, 12_000)
 # Vertices of a triangulation on an area of one edge squared.

@@ -64,7 +64,9 @@ class MuscleFit:
         self._epsilon = rest.fit.epsilon if kernel.has_epsilon else 0.0
         self._quick = kernel.hermite and not np.isfinite(rest.fit.condition)
         self.terms = _no_terms(len(kernel.form.table))
-        self.sound, self.flat, self.condition = False, False, np.inf
+        self.sound = False
+        self.flat = False
+        self.condition = np.inf
         self.move(rest.centres, rest.normals, first=True)
 
     def move(self, centres: Floats, normals: Floats, *, first: bool = False) -> None:
@@ -80,7 +82,9 @@ class MuscleFit:
         except (ValueError, np.linalg.LinAlgError):
             self.sound, self.condition = False, np.inf
             return
-        self.terms, self.sound, self.condition = field.terms, True, field.condition
+        self.terms = field.terms
+        self.sound = True
+        self.condition = field.condition
 
 
 def _no_terms(count: int) -> Terms:
@@ -116,7 +120,9 @@ class SurfaceBuilder:
         embed: Callable[[Floats], Embedding],
     ) -> None:
         self.name = f"muscle {muscle.name!r}" + (f" ({muscle.source})" if muscle.source else "")
-        self.rest, self.options, self._embed = rest, options, embed
+        self.rest = rest
+        self.options = options
+        self._embed = embed
         self.mesh = vertices, _ = display_mesh(muscle, options.resolution)
         self._grids = {
             bone.name: PointGrid.of(np.asarray(bone.mesh.vertices, dtype=float))

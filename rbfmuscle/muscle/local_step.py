@@ -97,7 +97,10 @@ def target_loop(y, cells, fibres, tension, local):
     """
     columns, slopes = cells.columns, cells.slopes
     fibre, least = fibres.direction, fibres.lower
-    q, t, f, target = local.rotations, local.stretches, local.f, local.target
+    q = local.rotations
+    t = local.stretches
+    f = local.f
+    target = local.target
     fd = np.empty((3, 3))
     for i in range(len(columns)):
         first, second, third = gradient_rows(y, columns[i], slopes[i])
@@ -147,9 +150,16 @@ def stress_loop(cells, fibres, activation, local):
     """Right side Σ w T ∇N of the fibres and the rest, volumes of the regions and their
     gradients.
     """
-    columns, slopes, region, slot = cells.columns, cells.slopes, cells.region, cells.slot
-    weights, f, target = cells.weights, local.f, local.target
-    out, gradient, volume = local.right, local.gradient, local.volumes
+    columns = cells.columns
+    slopes = cells.slopes
+    region = cells.region
+    slot = cells.slot
+    weights = cells.weights
+    f = local.f
+    target = local.target
+    out = local.right
+    gradient = local.gradient
+    volume = local.volumes
     out[:] = 0.0
     gradient[:] = 0.0
     volume[:] = 0.0

@@ -253,7 +253,9 @@ def stiffness(model: SolidModel, activation: float) -> Stiffness:
     What a bone that is driven into an attachment would need to lift the points beside it bends the
     whole muscle: a point that moves less than the median for a unit force bears less.
     """
-    matrix, cells, fibres = _hung(model), model.cells, model.fibres
+    matrix = _hung(model)
+    cells = model.cells
+    fibres = model.fibres
     stiff = fibres.passive + activation * fibres.active
     if stiff.any():
         along = np.zeros((len(cells.weights), len(model.rest)))
@@ -305,12 +307,10 @@ def mobility(columns, shares, inverse):
 @compiled(error_model="numpy", fastmath={"contract"})
 def carry(embedding, y):
     """Places (n, 3) of embedded points, Σ_k share_k y_k, for nodes y (N, 3); cell by cell."""
-    nodes, start, order, shares = (
-        embedding.nodes,
-        embedding.start,
-        embedding.order,
-        embedding.by_cell,
-    )
+    nodes = embedding.nodes
+    start = embedding.start
+    order = embedding.order
+    shares = embedding.by_cell
     most = 0
     for c in range(len(nodes)):
         most = max(most, start[c + 1] - start[c])

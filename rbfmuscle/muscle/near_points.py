@@ -43,7 +43,9 @@ class Touch(NamedTuple):
 @inner(error_model="numpy")
 def find_near(points, obstacles, reach):
     """Mask (n,) of the contact points nearer than ``reach`` to an obstacle."""
-    bones, free, known = obstacles.bones, obstacles.free, obstacles.known
+    bones = obstacles.bones
+    free = obstacles.free
+    known = obstacles.known
     found, box = np.zeros(len(points), np.bool_), np.empty((2, 3))
     box_loop(points, free, box)
     some = np.empty(len(points), np.int64)
@@ -87,8 +89,12 @@ def take_near(found, model, most, obstacles, edges, forces, y):
 
     ``edges`` (b,) are those of the cells that bones are rounded over.
     """
-    which, columns, shares = np.flatnonzero(found), model.embedding.columns, model.embedding.shares
-    count, bones, width = len(which), len(edges), columns.shape[1]
+    which = np.flatnonzero(found)
+    columns = model.embedding.columns
+    shares = model.embedding.shares
+    count = len(which)
+    bones = len(edges)
+    width = columns.shape[1]
     near = Near(
         which,
         np.empty((count, width), np.int64),
@@ -128,7 +134,9 @@ def find_touch(near, here, reach, obstacles, rounded):
     """
     bones, planes = obstacles.bones, obstacles.planes
     touch = _no_touch(len(obstacles.poses) * len(here) + len(planes.point))
-    normal, box, scratch = np.empty(3), np.empty((2, 3)), no_scratch()
+    normal = np.empty(3)
+    box = np.empty((2, 3))
+    scratch = no_scratch()
     local = scratch.local
     farthest = _farthest(here, near.free, reach, box)
     count, room = 0, True
@@ -183,7 +191,9 @@ def find_exact_touch(near, here, reach, obstacles, softest):
             if near.free[i] and may_reach(here, i, pose, bounds, anchor, bound, reach):
                 some[asked] = i
                 asked += 1
-        at, distance, normal = np.empty((asked, 3)), np.empty(asked), np.empty((asked, 3))
+        at = np.empty((asked, 3))
+        distance = np.empty(asked)
+        normal = np.empty((asked, 3))
         for k in range(asked):
             at[k] = here[some[k]]
         query_bone(bones, b, pose, at, limits[:asked], distance, normal)
@@ -218,7 +228,9 @@ def _greatest(reach):
 @inner(error_model="numpy")
 def _exact_distance(bones, b, pose, point, normal):
     """Distance of one point to a bone as it is, and its gradient."""
-    at, distance, gradient = point.reshape((1, 3)), np.empty(1), np.empty((1, 3))
+    at = point.reshape((1, 3))
+    distance = np.empty(1)
+    gradient = np.empty((1, 3))
     query_bone(bones, b, pose, at, np.full(1, np.inf), distance, gradient)
     normal[:] = gradient[0]
     return distance[0]

@@ -124,7 +124,9 @@ def find_slot(keys, b, key):
 @inner(error_model="numpy")
 def _fill_block(rounded, bones, b, key, slot):
     """Find the distances at the nodes of a block of bone b."""
-    edge, place, first = rounded.edges[b], np.empty(3), np.empty(3)
+    edge = rounded.edges[b]
+    place = np.empty(3)
+    first = np.empty(3)
     for a in range(3):
         block = (key >> (BITS * (2 - a)) & (2 * MOST - 1)) - MOST
         first[a] = block * SIDE - 1

@@ -51,7 +51,9 @@ YIELDING = 1e-4  # how far a contact yields under a pressure of 2 μ
 SHOWN_YIELDING = 0.1
 LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
 
-DONE, NO_ROOM, DIVERGED = 0, 1, 2
+DONE = 0
+NO_ROOM = 1
+DIVERGED = 2
 
 
 class Report(NamedTuple):
@@ -131,7 +133,9 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     springs = np.dot(model.springs, state.anchors)
     pull = tension(model.end, model.end_distance, state.anchors)
     given = Problem(model, stiffness, obstacles, rounded, springs, state.activation[0], pull)
-    y, pressure, local = state.nodes.copy(), state.pressures.copy(), start_local(model, state)
+    y = state.nodes.copy()
+    pressure = state.pressures.copy()
+    local = start_local(model, state)
     joined = local_step(model, y, given.activation, pull, local)[0]
     metric, sound = _new_metric(given, local, joined)
     forces = _start_forces(state.forces, obstacles)
@@ -139,7 +143,11 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     answers, push = no_answers(near, metric), np.zeros_like(y)
     memory = no_memory(MEMORY, y.size + len(pressure), y.size)
     limit, most = _limits(given, state)
-    least, status, done, caps, residual = np.inf, DONE, 0, 0, 0.0
+    least = np.inf
+    status = DONE
+    done = 0
+    caps = 0
+    residual = 0.0
     lifted_nodes = y
     if room:
         lifted_nodes = y + _push_out(given, near, metric, answers, y, np.inf)
@@ -211,7 +219,9 @@ def _inverse_with(matrix, cells, stiffened):
     """Inverse of the matrix with `STIFFNESS` w |F|² of the squeezed points."""
     total = matrix.copy()
     for q in np.flatnonzero(stiffened):
-        columns, slopes, weight = cells.columns[q], cells.slopes[q], STIFFNESS * cells.weights[q]
+        columns = cells.columns[q]
+        slopes = cells.slopes[q]
+        weight = STIFFNESS * cells.weights[q]
         for k in range(len(columns)):
             for m in range(len(columns)):
                 total[columns[k], columns[m]] += weight * (
@@ -252,7 +262,9 @@ def _note_forces(near, forces):
 @inner(error_model="numpy", inline="always")
 def _iterate(given, y, pressure, push, local, metric, near, answers):
     """One global step with volumes and contacts; ``push`` is that of the step before."""
-    model, size, part = given.model, given.model.size, calm_share(pressure)
+    model = given.model
+    size = given.model.size
+    part = calm_share(pressure)
     force = local.right + given.springs
     new, change = global_step(model.cells, y, pressure, force, local, metric, part)
     # Contacts that push now push in the next iteration too: where the points will then go decides
@@ -287,7 +299,9 @@ def _ways(near, y, new, push, margin):
             displacements[n, a] = y[n, a]
             displacements[n, 3 + a] = new[n, a] - y[n, a]
             displacements[n, 6 + a] = push[n, a]
-    here, motion, reach = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    here = np.empty((count, 3))
+    motion = np.empty((count, 3))
+    reach = np.empty(count)
     total = np.empty(9)
     for s in range(count):
         total[:] = 0.0

@@ -143,7 +143,9 @@ def _predicted(model, state, before, after):
         at = model.fixed[i]
         _along(model.points[at], after[model.fixed_bone[i]], points[at])
     step = anchors - state.anchors
-    along, square, farthest = 0.0, 0.0, 0.0
+    along = 0.0
+    square = 0.0
+    farthest = 0.0
     for i in range(len(step)):
         for a in range(3):
             last = state.step[i, a]

@@ -36,7 +36,11 @@ UNSURE, SURE = 0.3, 0.7
 KEPT_HEIGHT = 0.5  # the search starts at the last height above the material, up to this
 SETTLED = 0.01  # a step of less is one whose error, of second order, does not count
 BLOWN = 1e-3  # the same of the material blown up to its volume, whose last digit follows
-NEWTON, LEVELS, CUBIC, MEET = 6, 20, 4, 4  # rounds, at most
+# Rounds, at most.
+NEWTON = 6
+LEVELS = 20
+CUBIC = 4
+MEET = 4
 # Bones, crossings and volume are met up to so many times, as the way back to the volume can make
 # triangles cross.
 AGAIN = 4
@@ -118,7 +122,9 @@ def _begin(model, state, obstacles, carried):
         flags[2],
         edge,
     )
-    rows, limit, outward = np.arange(n), np.full(n, NEAR_BONE * edge), np.empty((n, 3))
+    rows = np.arange(n)
+    limit = np.full(n, NEAR_BONE * edge)
+    outward = np.empty((n, 3))
     ask_bones(obstacles, state, carried, rows, limit, SAME * edge, work.least, outward)
     for v in range(n):
         along = 0.0
@@ -161,8 +167,12 @@ def _project(model, state, obstacles, fit, work, level, allowed):
     to be trusted; False where the field is not finite.
     """
     n, edge = len(model.offset), work.edge
-    value, gradient, todo = np.empty(n), np.empty((n, 3)), np.ones(n, np.bool_)
-    rows, limit, miss = np.empty(n, np.int64), np.empty(n), np.empty(n)
+    value = np.empty(n)
+    gradient = np.empty((n, 3))
+    todo = np.ones(n, np.bool_)
+    rows = np.empty(n, np.int64)
+    limit = np.empty(n)
+    miss = np.empty(n)
     for _ in range(NEWTON):
         blend_loop(work.vertices, fit[0], fit[1], model.blend, todo, value, gradient)
         count, settled = 0, True

@@ -24,7 +24,11 @@ PUSHED = 0.01  # a bone's vertex may lie within the surface by so much
 LIFTS = 2  # rounds of moving what lies in a bone onto it, at most
 # What crosses is taken back towards the material by a share of the way as long as that helps, then
 # smoothed by some sweeps; rounds, at most, and in how many of them the region grows by a ring.
-BACK, TRIED, SWEEPS, ROUNDS, GROWTH = 0.2, 10, 1, 60, 6
+BACK = 0.2
+TRIED = 10
+SWEEPS = 1
+ROUNDS = 60
+GROWTH = 6
 
 
 class SurfaceModel(NamedTuple):
@@ -118,10 +122,15 @@ def _recall(pose, state, b, x, rows, limit, same, distance, outward, ask):
     """What is known of bone b; puts the points that have to be asked into ``ask`` and counts
     them.
     """
-    places, bounds, ways, m = state.places[b], state.bounds[b], state.outward[b], 0
+    places = state.places[b]
+    bounds = state.bounds[b]
+    ways = state.outward[b]
+    m = 0
     for i in range(len(rows)):
         v = rows[i]
-        dx, dy, dz = x[v, 0] - pose[0, 3], x[v, 1] - pose[1, 3], x[v, 2] - pose[2, 3]
+        dx = x[v, 0] - pose[0, 3]
+        dy = x[v, 1] - pose[1, 3]
+        dz = x[v, 2] - pose[2, 3]
         px = dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]
         py = dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]
         pz = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
@@ -139,7 +148,9 @@ def _recall(pose, state, b, x, rows, limit, same, distance, outward, ask):
                 )
         else:
             ask.row[m], ask.reach[m] = i, most
-            ask.here[m, 0], ask.here[m, 1], ask.here[m, 2] = px, py, pz
+            ask.here[m, 0] = px
+            ask.here[m, 1] = py
+            ask.here[m, 2] = pz
             for a in range(3):
                 ask.points[m, a] = x[v, a]
             m += 1
@@ -149,7 +160,9 @@ def _recall(pose, state, b, x, rows, limit, same, distance, outward, ask):
 @compiled(error_model="numpy")
 def _ask_bone(obstacles, state, b, rows, ask, m, distance, outward):
     """Ask bone b about the first m points, and keep what it says."""
-    pose, one, way = obstacles.poses[b], ask.distance, ask.outward
+    pose = obstacles.poses[b]
+    one = ask.distance
+    way = ask.outward
     query_bone(obstacles.bones, b, pose, ask.points[:m], ask.reach[:m], one[:m], way[:m])
     for j in range(m):
         i = ask.row[j]
@@ -232,7 +245,9 @@ def push_off(model, state, obstacles, work, among):
 @compiled(error_model="numpy")
 def _near_faces(model, work, among):
     """The triangles with a marked corner that a bone's vertex may have come through."""
-    x, faces, count = work.vertices, np.empty_like(model.faces), 0
+    x = work.vertices
+    faces = np.empty_like(model.faces)
+    count = 0
     least = np.empty(len(x))
     for v in range(len(x)):
         away = 0.0
@@ -240,8 +255,12 @@ def _near_faces(model, work, among):
             away += (x[v, a] - work.carried[v, a]) ** 2
         least[v] = work.least[v] - np.sqrt(away)
     for f in range(len(model.faces)):
-        p, q, r = model.faces[f, 0], model.faces[f, 1], model.faces[f, 2]
-        one, two, three = 0.0, 0.0, 0.0
+        p = model.faces[f, 0]
+        q = model.faces[f, 1]
+        r = model.faces[f, 2]
+        one = 0.0
+        two = 0.0
+        three = 0.0
         for a in range(3):
             one += (x[q, a] - x[p, a]) ** 2
             two += (x[r, a] - x[q, a]) ** 2
@@ -250,7 +269,9 @@ def _near_faces(model, work, among):
         if (near <= 0.0 or near * near < NEAR_FACE * NEAR_FACE * side) and (
             among[p] or among[q] or among[r]
         ):
-            faces[count, 0], faces[count, 1], faces[count, 2] = p, q, r
+            faces[count, 0] = p
+            faces[count, 1] = q
+            faces[count, 2] = r
             count += 1
     return faces[:count]
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
@@ -62,6 +62,18 @@ front. A kernel that is not C2 cannot be fitted to normals: it is fitted to valu
 surface."""
 
 
+class KernelFacts(TypedDict):
+    """What ``kernels.json`` holds: the unit, the library's version, the date, the hash of each mesh
+    by its name, and rows as in `KernelStudy`, each with its ``surface``.
+    """
+
+    units: str
+    version: str
+    date: str
+    meshes: dict[str, str]
+    rows: list[dict]
+
+
 def kernels_folder(directory: str | Path) -> OutputFolder:
     """The folder of a kernel study; UsageError if something in it is in the way."""
     return OutputFolder(directory, "kernels", (*FILES, "error.json"))
@@ -72,7 +84,7 @@ def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> 
     surfaces.
     """
     rows = [{"surface": name, **row} for name, study in studies.items() for row in study.rows]
-    facts = {
+    facts: KernelFacts = {
         "units": next(iter(studies.values())).units,
         "version": versions()["rbfmuscle"],
         "date": datetime.date.today().isoformat(),
@@ -89,7 +101,7 @@ def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> 
         write_page(stage, facts)
 
 
-def write_page(directory: Path, facts: Mapping[str, Any]) -> None:
+def write_page(directory: Path, facts: KernelFacts) -> None:
     """Write ``kernels.html`` of what ``kernels.json`` holds."""
     studies = {}
     for name, digest in facts["meshes"].items():

@@ -14,7 +14,7 @@ from rbfmuscle.report import comparison_page, kernel_page, sweep_page
 from rbfmuscle.report.report import write_report
 from rbfmuscle.report.verdict import describe_verdict, require_limits
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import LimitExceededError, UsageError
+from rbfmuscle.validation import UsageError
 
 # What a study keeps, and its page.
 STUDIES = {
@@ -38,8 +38,7 @@ def redraw_run(
     UsageError
         If the folder holds no run that has ended, or a file that is not the run's is in the way.
     LimitExceededError
-        If a limit of ``fail_on`` is exceeded, or was not measured; everything is written, and its
-        ``info`` is what ``run.json`` holds.
+        If a limit of ``fail_on`` is exceeded, or was not measured; everything is written.
     """
     directory = Path(directory)
     saved = RunData.load(directory)
@@ -64,11 +63,7 @@ def redraw_run(
     folder.add(*(PAGES if drawn else PAGES[:1]))
     write_json(directory / "run.json", info.to_dict())
     write_report(directory, pictures=pictures)
-    try:
-        require_limits(table, limits)
-    except LimitExceededError as error:
-        error.info = info
-        raise
+    require_limits(table, limits)
     return info
 
 

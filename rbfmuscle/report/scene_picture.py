@@ -19,7 +19,9 @@ _SCENE_SIDES = ("front", "right", "back", "left")
 _PALE = 0.72
 # Width that is kept free at both sides of a view for names, their heights [pixel], their colours.
 _NAMES, _STEP = 130, 14
-_MUSCLE_NAME, _BONE_NAME, _DOUBTED = "#26282b", "#7a756c", "#a3281f"
+_MUSCLE_NAME = "#26282b"
+_BONE_NAME = "#7a756c"
+_DOUBTED = "#a3281f"
 _MUSCLE = "#9a8f8f"
 _OPACITY = 0.12
 _AXIS = "#0057d9"

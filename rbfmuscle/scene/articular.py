@@ -18,7 +18,9 @@ BAND, FARTHEST = 6.0, 15.0
 # Least cosine between a face's normal and the direction to the other bone.
 LOOK = 0.5
 # Radii of a head [mm]; what belongs to it and to its socket, in radii from the centre.
-HEAD, SHELL, SOCKET = (12.0, 35.0), 1.08, 1.4
+HEAD = (12.0, 35.0)
+SHELL = 1.08
+SOCKET = 1.4
 # The nearest points of a bone to the centre, of which the radius is the median.
 NEAREST = 50
 # What is attached lies on an articular surface where that is farther by no more than this than the

@@ -11,7 +11,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +28,7 @@ from rbfmuscle.bones.broad_phase import (
 from rbfmuscle.bones.obstacles import Bones, Known, Obstacles, PlaneStack, stack_bones
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.scene.tendons import AtRest
 from rbfmuscle.validation import check_points
 
@@ -70,25 +71,37 @@ class Planes:
         self.anchor = anchor
 
 
+class Neighbour(Protocol):
+    """A sliding neighbour, for the muscle's surface."""
+
+    def excess(self, points: Floats) -> Floats:
+        """How far (n,) points (n, 3) are to move inwards for it [scene unit]."""
+
+
 class BoneContacts:
     """The obstacles of one muscle, in one pose.
 
-    ``fields`` has one entry for each bone of the scene, None where the muscle cannot reach it;
-    muscles may share fields. ``attached_bone`` (n,) holds the bone that each contact point is
-    attached to, -1 where it is free; attached points take no contact. ``reached`` lists the bones
-    that have a field, ``boxes`` (r, 2, 3) has theirs at rest and ``placed`` (r, 4, 4) their poses.
+    ``fields`` is given one entry for each bone of the scene, None where the muscle cannot reach it,
+    and holds those in reach by number; muscles may share fields. ``attached_bone`` (n,) holds the
+    bone that each contact point is attached to, -1 where it is free; attached points take no
+    contact. ``reached`` lists the bones that have a field, ``boxes`` (r, 2, 3) has theirs at rest
+    and ``placed`` (r, 4, 4) their poses.
     """
 
     def __init__(
-        self, names: list[str], fields: list[Any], *, attached_bone: ArrayLike | None = None
+        self,
+        names: Sequence[str],
+        fields: Sequence[BoneField | None],
+        *,
+        attached_bone: ArrayLike | None = None,
     ) -> None:
         if len(names) != len(fields):
             raise ValueError(
                 f"one field per bone is needed, got {len(fields)} for {len(names)} bones"
             )
         self.names = list(names)
-        self.fields = list(fields)
-        self.reached = [b for b, field in enumerate(self.fields) if field is not None]
+        self.fields = {b: field for b, field in enumerate(fields) if field is not None}
+        self.reached = list(self.fields)
         self._row = {b: row for row, b in enumerate(self.reached)}
         boxes = [self.fields[b].bounds for b in self.reached]
         self.boxes = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3)
@@ -99,7 +112,7 @@ class BoneContacts:
         self.allowed: dict[int, Floats] = {}
         #: Planes of sliding neighbours, and those that hold points on their side of a bone.
         self.neighbours: list[Planes] = []
-        self.beside: list[Any] = []  # sliding pairs, for the muscle's surface
+        self.beside: list[Neighbour] = []
         self._allowed: Floats | None = None
         self._known = Known(np.zeros((len(self.reached), 0, 3)), np.zeros((len(self.reached), 0)))
 
@@ -119,8 +132,8 @@ class BoneContacts:
     @cached_property
     def bones(self) -> Bones | None:
         """The fields of the bones in reach, for compiled loops; None where one is no `BoneSDF`."""
-        fields = [self.fields[b] for b in self.reached]
-        return stack_bones(fields) if all(isinstance(f, BoneSDF) for f in fields) else None
+        fields = [field for field in self.fields.values() if isinstance(field, BoneSDF)]
+        return stack_bones(fields) if len(fields) == len(self.reached) else None
 
     def obstacles(self, count: int) -> Obstacles:
         """What ``count`` contact points meet in the present poses."""

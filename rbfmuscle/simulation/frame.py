@@ -166,10 +166,10 @@ class MuscleModel(Protocol):
     def transform(self, motion: np.ndarray) -> None:
         """Move the whole muscle rigidly by (4, 4)."""
 
-    def snapshot(self) -> Any:  # each model's own state
+    def snapshot(self) -> object:
         """The state, for :meth:`restore`."""
 
-    def restore(self, state: Any) -> None:
+    def restore(self, state: Any) -> None:  # each model has a type of its own for its state
         """Return to a snapshot, which stays valid."""
 
     def activate(self, activation: float) -> None:

@@ -15,7 +15,7 @@ from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.motion import shown_value, step_angle, unit_sign
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
-from rbfmuscle.simulation.contact import BoneContacts, Planes
+from rbfmuscle.simulation.contact import BoneContacts, Neighbour, Planes
 from rbfmuscle.simulation.frame import Event, ModelSurface, MuscleModel
 from rbfmuscle.simulation.rigid_transport import MuscleStatus, RigidState, RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
@@ -50,7 +50,7 @@ class StepperState(NamedTuple):
     model: object
     poses: dict[str, Floats]
     neighbours: tuple[Planes, ...]
-    beside: tuple[object, ...]  # sliding pairs, as the contacts have them
+    beside: tuple[Neighbour, ...]  # sliding pairs, as the contacts have them
     rigid_transport: RigidState | None
     shown: ModelSurface | None
     events: dict[tuple[int, str, str], int]

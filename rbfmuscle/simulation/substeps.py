@@ -247,7 +247,9 @@ def step_excess(old, new, root, owner, corners, travel, limit, is_end, seen):
     (a, 8, 3) on the bones ``owner`` (a,) move by ``travel`` (a,) as seen from any of the
     first ``seen`` bones. ``is_end`` (b,) are ends among the bones.
     """
-    most, first, second = np.zeros(2), np.empty((3, 4)), np.empty((3, 4))
+    most = np.zeros(2)
+    first = np.empty((3, 4))
+    second = np.empty((3, 4))
     for b in range(len(old)):
         if root < 0:
             first[:], second[:] = old[b, :3], new[b, :3]

@@ -11,18 +11,21 @@ cannot miss what is thicker than its tolerance.
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, may_reach, path_loop
 from rbfmuscle.bones.obstacles import query_bone
-from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.jit import compiled, inner
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, Planes
+
+if TYPE_CHECKING:
+    import trimesh
 
 # 135 degrees, the bound of the angle test.
 RIGHT_ANGLE_AND_HALF = 0.75 * math.pi
@@ -64,7 +67,7 @@ class Crossing:
 
 
 def sweep_paths(
-    field: BoneSDF,
+    field: BoneField,
     start: Floats,
     end: Floats,
     *,
@@ -170,7 +173,7 @@ def one_sided_planes(
 
 def only_grazed(
     crossing: Crossing,
-    mesh: Any,
+    mesh: "trimesh.Trimesh",
     paths: tuple[Floats, Floats],
     before: Floats,
     after: Floats,
@@ -312,7 +315,10 @@ def unclear_paths(bones, b, start, end, cosine, tolerance):
     query_bone(bones, b, pose, start, length, first, way)
     query_bone(bones, b, pose, end, length + tolerance, last, out)
     # Pieces of the paths: which path, where they begin (fraction), the distances at their ends.
-    path, at, near, far = np.arange(count), np.zeros(count), first, last
+    path = np.arange(count)
+    at = np.zeros(count)
+    near = first
+    far = last
     size, left = 1.0, np.zeros(count, np.bool_)
     for k in range(count):
         left[k] = first[k] < length[k] and first[k] + last[k] <= length[k] + tolerance
@@ -322,7 +328,10 @@ def unclear_paths(bones, b, start, end, cosine, tolerance):
         for k in range(len(path)):
             deepest = near[k] + far[k] - size * length[path[k]] / STEP_SHARE
             left[k] &= deepest < -2.0 * tolerance and not found[path[k]]
-        path, at, near, far = path[left], at[left], near[left], far[left]
+        path = path[left]
+        at = at[left]
+        near = near[left]
+        far = far[left]
         if len(path) == 0:
             break
         if halvings == HALVINGS:

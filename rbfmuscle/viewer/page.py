@@ -5,7 +5,7 @@ import io
 import math
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from rbfmuscle.viewer.side import ModelView, ViewSettings
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 if TYPE_CHECKING:
-    from viser import ViserServer
+    from viser import CameraHandle, InitialCameraConfig, ViserServer
 
 # Where a picture takes longer [s], those on the way to the controls' places are drawn coarse.
 COSTLY = 0.1
@@ -97,7 +97,6 @@ class ViewerPage:
             lambda e: self._aim(VIEWS[e.target.value.lower()], e.client.camera)
         )
         self.server.scene.set_up_direction(source.body[2])
-        self.sides[0].picture = self.sides[0].rest = source.rest
         self._aim(FIRST, self.server.initial_camera)
         self._draw(self.sides[:1], self.panel.look())
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -124,7 +123,9 @@ class ViewerPage:
         self._resting |= rest
         self._wake.set()
 
-    def _aim(self, direction: tuple[float, ...], camera: Any) -> None:
+    def _aim(
+        self, direction: tuple[float, ...], camera: "CameraHandle | InitialCameraConfig"
+    ) -> None:
         """Let a camera look at everything; models then stand side by side across its direction."""
         points = (0.001 / self.source.millimetre) * np.concatenate(self.sides[0].points())
         middle, size = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0)
@@ -179,25 +180,25 @@ class ViewerPage:
         if changed[1]:
             for client in self.server.get_clients().values():
                 self._aim(FIRST, client.camera)
-        sides = [side for side in self.sides if side.figure is not None]
+        figures = {side: side.figure for side in self.sides if side.figure is not None}
         if self._resting:
             self._rest("")
-        self._follow_motion(not any(side.figure.pending for side in sides))
-        for side in sides:
+        self._follow_motion(not any(figure.pending for figure in figures.values()))
+        for figure in figures.values():
             for name, control in panel.controls.items():
-                side.figure.set(name, control.value)
+                figure.set(name, control.value)
         start = time.perf_counter()
-        coarse = self._cost > COSTLY and not all(side.figure.near for side in sides)
-        waiting = [side for side in sides if side.figure.pending]
-        for side in waiting:
-            side.picture = side.figure.advance(coarse=coarse)
+        coarse = self._cost > COSTLY and not all(figure.near for figure in figures.values())
+        waiting = {side: figure for side, figure in figures.items() if figure.pending}
+        for side, figure in waiting.items():
+            side.picture = figure.advance(coarse=coarse)
         if waiting and not coarse:
             self._cost = time.perf_counter() - start
         look = panel.look()
         if waiting or look != self._shown:
             self._shown = look
-            self._draw(sides, look)
-        return panel.play.value or any(side.figure.pending for side in sides)
+            self._draw(list(figures), look)
+        return panel.play.value or any(figure.pending for figure in figures.values())
 
     def _follow_motion(self, arrived: bool) -> None:
         """Set the controls to the frame of the motion where the play bar is."""

@@ -5,7 +5,7 @@ needed.
 import html
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,10 @@ from rbfmuscle.output.appearance import VIEWS
 from rbfmuscle.viewer.side import COLOURINGS, ModelView, ViewSettings, legend
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
+if TYPE_CHECKING:
+    from viser import GuiInputHandle, GuiUplotHandle, ViserServer
+
+Element = TypeVar("Element", bound="GuiInputHandle")
 WIDTH = 350  # [pixel]
 HISTORY, LINES = 200, 8  # Pictures and lines in a plot.
 
@@ -24,7 +28,7 @@ class Panel:
 
     def __init__(
         self,
-        server: Any,
+        server: "ViserServer",
         source: LiveSource | SavedSource,
         at: dict[str, float],
         colour: str,
@@ -45,10 +49,10 @@ class Panel:
             depth = f"depth in bones [{source.units}]"
             quantities = ("none", "volume error [%]", depth, "mean of the colour")
             self.quantity = self._watch(self.gui.add_dropdown("Quantity", quantities))
-            self._plot: Any = None
+            self._plot: GuiUplotHandle | None = None
             self._lines, self._history = [], []
 
-    def _watch(self, element: Any) -> Any:
+    def _watch(self, element: Element) -> Element:
         element.on_update(lambda _: self._touch())
         return element
 
@@ -149,10 +153,10 @@ class Panel:
             self._lines, self._history = lines, []
         self._history = [*self._history[1 - HISTORY :], row]
         data = (np.arange(float(len(self._history))), *np.array(self._history).T)
-        if len(self._history) > 1:
-            self._plot.data = data
-            return
         if self._plot is not None:
+            if len(self._history) > 1:
+                self._plot.data = data
+                return
             self._plot.remove()
         series = [uplot.Series(label="picture")]
         for side, name in shown:

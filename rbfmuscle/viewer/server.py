@@ -8,7 +8,7 @@ import io
 import secrets
 from collections.abc import Callable
 from types import FunctionType, SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rbfmuscle.validation import MissingDependencyError, UsageError
 
@@ -49,7 +49,7 @@ class Gate:
         return self.inner(connection, request)
 
 
-def _with_globals(function: Callable[..., Any], **names: Any) -> Callable[..., Any]:
+def _with_globals(function: FunctionType, **names: object) -> FunctionType:
     """A copy of a function that sees other values of some global names of its module."""
     seen = {**function.__globals__, **names}
     copy = FunctionType(
@@ -69,7 +69,11 @@ def _gated_server(gate: Gate) -> "type[ViserServer]":
     import websockets.asyncio.server
     from viser import infra
 
-    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+    def serve(
+        *arguments: object,
+        process_request: "Callable[..., Response | None] | None" = None,
+        **options: object,
+    ) -> object:
         gate.inner = process_request
         return websockets.asyncio.server.serve(*arguments, process_request=gate, **options)
 

@@ -3,11 +3,11 @@ their colours.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import edge_stretch, mesh_volume
@@ -22,7 +22,17 @@ from rbfmuscle.output.appearance import (
     stretch_colours,
 )
 from rbfmuscle.scene.tendons import tendon_name
-from rbfmuscle.viewer.sources import LiveSource, Mesh, Picture, SavedSource
+from rbfmuscle.viewer.sources import (
+    LiveFigure,
+    LiveSource,
+    Mesh,
+    Picture,
+    SavedFigure,
+    SavedSource,
+)
+
+if TYPE_CHECKING:
+    from viser import GlbHandle, LineSegmentsHandle, MeshHandle, ViserServer
 
 LINE = 2.0  # thickness of a fibre [pixel]
 BONE_TRIANGLES = 6000  # Software drawing pays for each of them in every picture.
@@ -111,7 +121,7 @@ def _limits(colouring: Colouring, millimetre: float) -> Floats:
     return np.array([colouring.low, colouring.high]) * (millimetre if colouring.length else 1.0)
 
 
-def _make_matt(tree: Any) -> None:
+def _make_matt(tree: dict) -> None:
     """Give a glTF its material: one without is a metal, which is dark under plain lights."""
     tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0}}]
     tree["meshes"][0]["primitives"][0]["material"] = 0
@@ -126,32 +136,33 @@ class ModelView:
     volume error [%], depth in bones and mean of the coloured quantity, NaN where not known.
     """
 
-    def __init__(self, server: Any, root: str, source: LiveSource | SavedSource) -> None:
+    def __init__(self, server: "ViserServer", root: str, source: LiveSource | SavedSource) -> None:
         self.server = server
         self.root = root
         self.source = source
         self.choice = "none"
-        self.figure: Any = None
-        self.picture: Any = None
-        self.rest: Any = None
+        self.figure: LiveFigure | SavedFigure | None = None
+        self.picture = source.rest
+        self.rest = source.rest
         self.numbers: dict[str, dict[str, float]] = {}
         self.frame = server.scene.add_frame(root, show_axes=False)
         self._bones = {
             name: clustered(v, f, BONE_TRIANGLES) for name, (v, f) in source.bones.items()
         }
         self._volumes: dict[str, float] = {}
-        self._nodes: dict[str, Any] = {}
-        self._painted: list[Any] = []
-        self._lines: dict[str, Any] = {}
+        self._nodes: dict[str, MeshHandle] = {}
+        self._painted: list[GlbHandle] = []
+        self._lines: dict[str, LineSegmentsHandle] = {}
 
     def choose(self, choice: str) -> bool:
         """Show another model or run, or none; returns whether it is another."""
         if choice == self.choice:
             return False
         figure = None if choice == "none" else self.source.figure(choice)
-        picture = None if figure is None else figure.advance()
-        self.choice, self.figure = choice, figure
-        self.rest = self.picture = picture
+        self.choice = choice
+        self.figure = figure
+        self.picture = self.source.rest if figure is None else figure.advance()
+        self.rest = self.picture
         self._volumes = {name: mesh_volume(*mesh) for name, mesh in self.source.muscles.items()}
         self.frame.visible = figure is not None
         return True
@@ -233,7 +244,7 @@ class ModelView:
         if visible:
             node.vertices, node.faces = mesh
 
-    def _paint(self, painted: list[Any]) -> None:
+    def _paint(self, painted: list[tuple[Floats, Integers, Floats]]) -> None:
         """Show coloured meshes as glTF, which the browser needs a moment to read: the last stays
         until the next.
         """
@@ -256,7 +267,7 @@ class ModelView:
         while len(self._painted) > kept:
             self._painted.pop(0).remove()
 
-    def points(self) -> list[Any]:
+    def points(self) -> list[Floats]:
         """Vertices (n, 3) of bones and muscles, where they are shown."""
         poses = [
             (vertices, self.picture.poses[name]) for name, (vertices, _) in self._bones.items()

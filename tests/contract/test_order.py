@@ -57,7 +57,9 @@ def shuffled(scene):
     """The same scene with everything in it in another order, and the vertices' new numbers by
     muscle.
     """
-    rng, other, places = np.random.default_rng(5), scene.copy(), {}
+    rng = np.random.default_rng(5)
+    other = scene.copy()
+    places = {}
     other.bones = [Bone(b.name, renumbered(b.mesh, rng)[0]) for b in reversed(scene.bones)]
     other.joints, other.muscles = scene.joints[::-1], other.muscles[::-1]
     for muscle in other.muscles:

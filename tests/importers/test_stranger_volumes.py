@@ -22,7 +22,9 @@ def ball(centre, radius):
     return np.linalg.norm(grid - np.array(centre), axis=-1) < radius
 
 
-FEMUR, PELVIS, MUSCLE = ball((14, 12, 8), 6.2), ball((14, 12, 28), 7.2), ball((14, 12, 18), 7.6)
+FEMUR = ball((14, 12, 8), 6.2)
+PELVIS = ball((14, 12, 28), 7.2)
+MUSCLE = ball((14, 12, 18), 7.6)
 
 
 def write_nifti(path, data, *, codes=(0, 2), unit="mm", slope=None):
@@ -69,7 +71,9 @@ def test_masks_that_overlap_are_kept_whole_and_their_overlap_is_said(tmp_path):
 @pytest.mark.parametrize("place", [0, 3])
 def test_layers_of_segments_are_read_with_names_and_empty_ones_are_named(tmp_path, place):
     layers = np.zeros((2, *SHAPE), np.uint8)
-    layers[0][FEMUR], layers[0][PELVIS], layers[1][MUSCLE] = 1, 2, 1
+    layers[0][FEMUR] = 1
+    layers[0][PELVIS] = 2
+    layers[1][MUSCLE] = 1
     rows = [*(SPACING * np.eye(3)).tolist()]
     rows.insert(place, [np.nan] * 3)
     kinds = ["domain"] * 3

@@ -54,7 +54,9 @@ def test_string_over_a_ball_is_two_tangents_and_an_arc(height, clearance):
         assert line_length(path) == pytest.approx(2 * FAR, rel=1e-6)
 
 
-LENGTH, HALF, STRAIGHT = 90.0, 4.0, 25.0  # of a strip, its half thickness, and of its free ends
+LENGTH = 90.0  # of a strip
+HALF = 4.0  # its thickness
+STRAIGHT = 25.0  # of its free ends
 
 
 def strip():

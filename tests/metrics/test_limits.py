@@ -223,12 +223,11 @@ def test_rest_is_measured_whatever_frames_are_asked_for(monkeypatch, tmp_path):
 
 def test_a_limit_that_cannot_be_measured_fails(monkeypatch, tmp_path):
     use_blend_model(monkeypatch)
-    with pytest.raises(LimitExceededError, match="not measured: moment_arm") as caught:
+    with pytest.raises(LimitExceededError, match="not measured: moment_arm"):
         stream_run(arm_scene(end=0), tmp_path, fail_on="moment_arm=50", pictures=False)
     info = Run.load(tmp_path).info
     assert info.fail_on == {"moment_arm": 50.0} and info.limits["moment_arm"] == 50.0
     assert info.not_measured == [(ALL, "moment_arm")]
-    assert info.verdict == caught.value.info.verdict
     assert info.verdict.endswith("Not measured: moment_arm")
 
 

@@ -144,7 +144,9 @@ def test_shape_functions_reproduce_linear_maps():
 
 def elastic(model, y):
     """Matrix of the elastic energy times places y (N, 3), targets frozen."""
-    cells, fibre, stiff = model.cells, model.fibres.direction, model.fibres.passive
+    cells = model.cells
+    fibre = model.fibres.direction
+    stiff = model.fibres.passive
     f = np.einsum("qka,qkb->qab", y[cells.columns], cells.slopes)
     along = np.einsum("qab,qb->qa", f, fibre)
     f = f + (stiff[:, None] * along)[:, :, None] * fibre[:, None, :]
@@ -350,7 +352,9 @@ def test_nearest_deformation_has_the_least_volume_and_none_is_nearer(stretches):
 
 def test_force_of_squeezed_points_is_the_derivative_of_their_energy():
     solid = Bar().with_fibres([1.0, 0.0, 0.0], ratio=1.0, slack=1.0)
-    rng, rest, cells = np.random.default_rng(1), solid.model.rest, solid.model.cells
+    rng = np.random.default_rng(1)
+    rest = solid.model.rest
+    cells = solid.model.cells
     base = rest * [0.5, 0.8, 0.8] + rng.normal(0, 0.05, rest.shape)
     way = rng.normal(size=base.shape)
     h = 1e-4

@@ -120,7 +120,9 @@ class Tetrahedra:
             slopes[q] = np.linalg.inv(np.column_stack([self.rest[nodes], np.ones(4)]))[:3].T
         self.fibre = rng.normal(size=(2, 3))
         self.fibre /= np.linalg.norm(self.fibre, axis=1, keepdims=True)
-        start, node, region = np.array([0, 4, 8]), columns.ravel(), np.array([0, 1])
+        start = np.array([0, 4, 8])
+        node = columns.ravel()
+        region = np.array([0, 1])
         slot = np.arange(8).reshape(2, 4)
         self.cells = Cells(
             columns,

@@ -206,12 +206,16 @@ def test_what_is_known_of_the_bones_changes_nothing(shift):
 
 def test_a_question_about_the_same_place_takes_the_answer_that_is_known():
     drawn = Drawn([bone(0.9, 0.0, 0.0, 1.9)])
-    rows, limit, asked = np.arange(len(X)), np.full(len(X), 0.3), np.empty(len(X))
+    rows = np.arange(len(X))
+    limit = np.full(len(X), 0.3)
+    asked = np.empty(len(X))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.4, 0.2, 0.1]).as_matrix(), [0.1, 0.0, 0.2]
     ask_bones(drawn.obstacles, drawn.state, X, rows, limit, 0.0, asked, np.empty_like(X))
     there = drawn.obstacles._replace(poses=pose[None])
-    points, known, way = (X + 1e-4) @ pose[:3, :3].T + pose[:3, 3], np.empty(len(X)), X.copy()
+    points = (X + 1e-4) @ pose[:3, :3].T + pose[:3, 3]
+    known = np.empty(len(X))
+    way = X.copy()
     ask_bones(there, drawn.state, points, rows, limit, 1e-3, known, way)
     exact = drawn.fields[0].distance(X + 1e-4)
     near = asked < limit

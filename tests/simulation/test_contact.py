@@ -72,7 +72,8 @@ def test_nearest_is_the_smallest_over_bones_and_infinite_without():
     contacts, poses = _pair()
     points = _points()
     expected = np.min(
-        [f.distance(points, poses[n]) for f, n in zip(contacts.fields, contacts.names)], axis=0
+        [f.distance(points, poses[n]) for f, n in zip(contacts.fields.values(), contacts.names)],
+        axis=0,
     )
     assert np.isinf(BoneContacts(["a"], [None]).nearest(points)[0]).all()
     distance, gradient = contacts.nearest(points)

@@ -220,7 +220,9 @@ def test_other_websocket_servers_of_the_process_are_not_gated(page):
     import websockets.asyncio.server as module
     from viser import infra
 
-    seen, plain, start = [], module.serve, infra.WebsockServer.start
+    seen = []
+    plain = module.serve
+    start = infra.WebsockServer.start
 
     def watched(self):
         start(self)

@@ -156,11 +156,9 @@ def _sort_loop(pairs, met, count):
     used = 0
     for p in range(count):
         used += begin[p + 1] > 0
-    point, first, near = (
-        np.empty(used, np.int64),
-        np.zeros(used + 1, np.int64),
-        np.empty(met, np.int64),
-    )
+    point = np.empty(used, np.int64)
+    first = np.zeros(used + 1, np.int64)
+    near = np.empty(met, np.int64)
     used = 0
     for p in range(count):
         if begin[p + 1] > 0:

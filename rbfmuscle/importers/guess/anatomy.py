@@ -3,7 +3,6 @@ as guessed.
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -91,9 +90,9 @@ class JointGuess:
         """Full name of the first coordinate."""
         return f"{self.name}.{next(iter(self.axes))}"
 
-    def row(self) -> dict[str, Any]:
+    def row(self) -> dict[str, object]:
         """The joint's table in the scene file [degree, scene unit]."""
-        row: dict[str, Any] = {
+        row: dict[str, object] = {
             "name": self.name,
             "parent": self.parent.name,
             "child": self.child.name,

@@ -52,8 +52,14 @@ LONG = 100.0  # a tendon longer than this [mm] is less sure
 UPPER = 0.25
 # Confidence where a muscle touches its site, lies beside it, has a tendon, a long one; where its
 # site is not known; where a bone stands for one that is not here; where not even its bones are.
-TOUCHES, BESIDE, TENDON, LONG_TENDON = 1.0, 0.9, 0.8, 0.7
-NO_SITE, STAND_IN, NO_BONE, NO_NAME = 0.5, 0.4, 0.2, 0.4
+TOUCHES = 1.0
+BESIDE = 0.9
+TENDON = 0.8
+LONG_TENDON = 0.7
+NO_SITE = 0.5
+STAND_IN = 0.4
+NO_BONE = 0.2
+NO_NAME = 0.4
 
 
 @dataclass

@@ -50,7 +50,9 @@ class Frame:
 
 # Rounds of the condyles' axis and of the dome, and evaluations of a coaxial fit, at most; real
 # bones take 7, 7 and 67. What does not settle in these is refused.
-AXIS_ROUNDS, DOME_ROUNDS, EVALUATIONS = 12, 40, 200
+AXIS_ROUNDS = 12
+DOME_ROUNDS = 40
+EVALUATIONS = 200
 UNSETTLED = "the fit does not settle"
 
 

@@ -5,7 +5,7 @@ import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,6 +16,9 @@ from rbfmuscle.scene.extents import LARGEST_MM, SMALLEST_MM
 from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES, read_file
 from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.validation import MeshError, UsageError
+
+if TYPE_CHECKING:
+    import trimesh
 
 # Folders below the one that is given, as people sort their meshes.
 FOLDERS = {"bones": "bone", "bone": "bone", "knochen": "bone", "os": "bone"}
@@ -36,17 +39,18 @@ class Part:
 
     name: str  # in the scene
     file: str  # path as the scene file gives it
-    read: Any  # ReadMesh or Bone
+    read: Any  # ReadMesh, of a bone of a scene Bone; muscles need the map of its vertices
     kind: str = ""  # class of bone, empty where the name says none
     side: str = ""  # "l", "r" or empty
     doubt: str = ""  # what speaks for a bone or a muscle where the name does not
     facts: MuscleFacts | None = None
     tendon_of: tuple[str, ...] = ()  # muscles of which it is a tendon by its name
     coarse: bool = False  # whether the mesh was made coarser than its file
-    frame: Any = None  # directions of a femur, a Frame
+    # Directions of a femur, a Frame of `landmarks`, which imports this module.
+    frame: Any = None
 
     @property
-    def mesh(self) -> Any:
+    def mesh(self) -> "trimesh.Trimesh":
         """The mended mesh, trimesh.Trimesh [scene unit]."""
         return self.read.mesh
 
@@ -73,7 +77,7 @@ class Part:
         )
 
     @cached_property
-    def tree(self) -> Any:
+    def tree(self) -> cKDTree:
         """Tree over the middles of the faces."""
         return cKDTree(self.faces[0])
 

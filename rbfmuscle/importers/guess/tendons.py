@@ -23,7 +23,11 @@ REACHES = 15.0
 # Lengths as shares of a tendon's: what is so much farther than the nearest joins too; its end
 # begins here; places at which its middle is taken, each as the mean of what lies so near; middles
 # so close to the line of the others are left out.
-JOINS, LAST, SECTIONS, HALF, STRAIGHT = 0.02, 0.97, np.linspace(0.1, 0.9, 9), 0.04, 0.04
+JOINS = 0.02
+LAST = 0.97
+SECTIONS = np.linspace(0.1, 0.9, 9)
+HALF = 0.04
+STRAIGHT = 0.04
 
 BonePlace = tuple[Part, np.ndarray]
 

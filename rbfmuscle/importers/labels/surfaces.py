@@ -8,7 +8,7 @@ voxel.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import binary_fill_holes, find_objects, gaussian_filter, map_coordinates
@@ -18,6 +18,9 @@ from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normals
 from rbfmuscle.importers.labels.volume import LabelVolume
 from rbfmuscle.validation import MeshError
+
+if TYPE_CHECKING:
+    import trimesh
 
 SMOOTHING, PASSES = (
     1.3,
@@ -39,7 +42,7 @@ class LabelSurface:
     """
 
     name: str
-    mesh: Any
+    mesh: "trimesh.Trimesh"
     volume: float
     notes: list[str]
     capped: np.ndarray

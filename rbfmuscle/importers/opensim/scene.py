@@ -4,7 +4,6 @@ are; its files.
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -94,9 +93,7 @@ def _add_muscles(found, walk):
     for muscle in found.model.muscles:
         try:
             tube = make_tube(muscle, found.places, bones, holders)
-            attach: Any = [
-                {"bone": body, "vertices": held.tolist()} for body, held in tube.held.items()
-            ]
+            attach = [{"bone": body, "vertices": held.tolist()} for body, held in tube.held.items()]
             mesh = tube.vertices, tube.faces
             scene.add_muscle(muscle.name, mesh, attach=attach, model=dict(TUBE_MODEL))
             if tube.volume_error > LEAST_MISSED:

@@ -6,7 +6,6 @@ objects, kept out of the bones.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,9 @@ HELD = 0.06
 ENDS = 3  # sections at either end that may lie in bones
 # Of bones that a tube lies on: the gap left [m], the depth to which its vertices are brought out
 # [m], and how often, as what leaves one bone may enter another.
-MARGIN, FLATTENED, FLATTENINGS = 5e-4, 0.03, 8
+MARGIN = 5e-4
+FLATTENED = 0.03
+FLATTENINGS = 8
 # Rounds in which the radius is fitted to the volume, at most, and the share of it that is left.
 FITTINGS, FITTED = 12, 1e-8
 # A tube is smooth: fewer points of its surface and a coarser mesh show and bound it as well.
@@ -115,7 +116,7 @@ def _clear_line(line, fixed, radius, wraps, bones):
     return line
 
 
-def _out_of_shape(wrap: WrapShape, points: Any) -> Any:
+def _out_of_shape(wrap: WrapShape, points: np.ndarray) -> np.ndarray:
     """Points (n, 3) in a shape's frame [metre], those inside moved to its surface, in its
     quadrant.
     """

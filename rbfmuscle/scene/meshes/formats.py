@@ -174,7 +174,9 @@ def _is_binary(content):
 
 
 def _read_stl_text(content):
-    parts, name, start = [], b"", None
+    parts = []
+    name = b""
+    start = None
     content = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r", b"\n")
     if re.search(rb"vertex\s+\S*\d,\d", content, re.IGNORECASE):
         raise ValueError("its numbers have a decimal comma; write them with a point")
