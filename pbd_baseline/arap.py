@@ -9,7 +9,7 @@ rotations optimal the gradient of E is its partial derivative with R frozen: gra
 
 import numpy as np
 
-from pbd_baseline.topology import Topology, colour
+from pbd_baseline.topology import Topology, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import cotangent_laplacian, graph_laplacian
 from rbfmuscle.geometry.rotations import quaternion_matrix, rotate
@@ -64,32 +64,26 @@ class ARAPConstraint:
     compliance 1 / w_ij: at convergence the gradient of the sum is that of the ARAP energy.
     """
 
-    def __init__(self, arap: ARAP) -> None:
-        self.arap = arap
+    def __init__(self, arap: ARAP, inverse_mass: Floats) -> None:
+        self.arap, self.inverse_mass = arap, inverse_mass
         edges = arap.topology.edges
-        order, self.colours = colour(edges, arap.topology.vertex_count)
+        order, self.colours = colour(edges, inverse_mass)
         self.order = order
-        self.edges = np.ascontiguousarray(edges[order])
+        self.edges = members_in_order(edges, order)
         self.rest = np.ascontiguousarray(arap.rest[order])
         # a mesh whose median cotangent is 0 has weights of 0
         self.compliance = 1.0 / np.maximum(arap.weights[order], LEAST_WEIGHT)
-        self.multiplier = np.zeros((len(order), 3))
 
-    def reset(self) -> None:
-        """Forget the multipliers, as each time step does."""
-        self.multiplier[:] = 0.0
-
-    def project(self, points: Floats, inverse_mass: Floats, *, time: float = 1.0) -> None:
+    def project(self, points: Floats, *, time: float = 1.0) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place, with the arap's rotations."""
         _constraint_loop(
             points,
-            inverse_mass,
+            self.inverse_mass,
             self.edges,
             self.rest,
             self.arap.quaternions,
             self.compliance,
             time,
-            self.multiplier,
         )
 
 
@@ -185,18 +179,15 @@ def _target_loop(edges, rest, weights, quaternions, out):
 
 
 @compiled(error_model="numpy")
-def _constraint_loop(points, inverse_mass, edges, rest, quaternions, compliance, time, multiplier):
+def _constraint_loop(points, inverse_mass, edges, rest, quaternions, compliance, time):
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
         wi, wj = inverse_mass[i], inverse_mass[j]
         soft = compliance[c] / time
         total = wi + wj + soft
-        if wi + wj <= 0.0:
-            continue
         one, two = rotate(quaternions[i], rest[c]), rotate(quaternions[j], rest[c])
         for k in range(3):
             value = points[i, k] - points[j, k] - 0.5 * (one[k] + two[k])
-            change = -(value + soft * multiplier[c, k]) / total
-            multiplier[c, k] += change
+            change = -value / total
             points[i, k] += wi * change
             points[j, k] -= wj * change

@@ -4,7 +4,7 @@ instructions.
 
 import numpy as np
 
-from pbd_baseline.topology import colour, spread
+from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.jit import compiled
 
@@ -15,10 +15,9 @@ TINY = 1e-12
 # compiler see that the loop over a block may use vector instructions (36 ns a constraint without,
 # 17 with).
 BLOCK = 64
-# Rows: 0-8 edge and wings relative to the first vertex, 9-12 inverse masses, 13-14 rest, 15
-# compliance times multiplier, 16 compliance, 17 stiffness; out come 18-29 moves of the vertices, 30
-# the multiplier's change.
-ROWS = 31
+# Rows: 0-8 edge and wings relative to the first vertex, 9-12 inverse masses, 13-14 rest; out come
+# in 0-11 the moves of the vertices.
+ROWS = 15
 
 
 class BendingConstraint:
@@ -30,7 +29,8 @@ class BendingConstraint:
     / 4) grad t, with the gradient of t by Bridson et al. 2003: for edge (0, 1) of length |e|, wings
     2 and 3 and unnormalised face normals n_2 and n_3, grad_2 t = -|e| n_2 / |n_2|^2 and grad_3 t =
     -|e| n_3 / |n_3|^2; the edge's ends take the opposite, split by where the wings' feet fall.
-    Edges and wings (e, 2) are those of a `Topology`; the compliance is per radian squared.
+    Edges and wings (e, 2) are those of a `Topology`, of whose vertices ``inverse_mass`` (n,) says
+    which are held; the compliance is per radian squared.
     """
 
     def __init__(
@@ -38,19 +38,20 @@ class BendingConstraint:
         vertices: Floats,
         edges: Integers,
         wings: Integers,
+        inverse_mass: Floats,
         *,
         stiffness: float = 0.9,
         compliance: float = 0.0,
     ) -> None:
         members = np.column_stack([edges, wings])
-        order, self.colours = colour(members, len(vertices))
-        self.members = np.ascontiguousarray(members[order])
+        order, self.colours = colour(members, inverse_mass)
+        self.members = members_in_order(members, order)
+        self.inverse_mass = inverse_mass
         self.order = order
         self.rest = np.empty((len(order), 2))
         _dihedral_loop(vertices, self.members, self.rest)
-        self.stiffness = spread(stiffness, order)
-        self.compliance = spread(compliance, order)
-        self.multiplier = np.zeros(len(order))
+        self.stiffness = float(stiffness)
+        self.compliance = float(compliance)
 
     def values(self, points: Floats) -> Floats:
         """C of each edge, in the order of ``self.members``."""
@@ -60,21 +61,16 @@ class BendingConstraint:
         cosine = now[:, 0] * self.rest[:, 0] + now[:, 1] * self.rest[:, 1]
         return 2.0 * sine / np.maximum(1.0 + cosine, TINY)
 
-    def reset(self) -> None:
-        """Forget the multipliers, as each time step does."""
-        self.multiplier[:] = 0.0
-
-    def project(self, points: Floats, inverse_mass: Floats) -> None:
+    def project(self, points: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""
         _sweep_loop(
             points,
-            inverse_mass,
+            self.inverse_mass,
             self.colours,
             self.members,
             self.rest,
             self.stiffness,
             self.compliance,
-            self.multiplier,
         )
 
 
@@ -99,50 +95,48 @@ def _dihedral_loop(points, members, out):
         out[c, 1] = -(a * q).sum() * np.sqrt(ee) / size
 
 
-@compiled
-def _sweep_loop(points, inverse_mass, colours, members, rest, stiffness, compliance, multiplier):
+@compiled(error_model="numpy")
+def _sweep_loop(points, inverse_mass, colours, members, rest, stiffness, compliance):
     block = np.empty(ROWS * BLOCK)
+    x = points.reshape(-1)
     for q in range(len(colours) - 1):
         for low in range(colours[q], colours[q + 1], BLOCK):
             count = min(BLOCK, colours[q + 1] - low)
             for t in range(count):
                 c = low + t
-                _gather(points, inverse_mass, members, c, t, block)
+                _gather(x, inverse_mass, members, c, t, block)
                 block[t + 13 * BLOCK], block[t + 14 * BLOCK] = rest[c, 0], rest[c, 1]
-                block[t + 15 * BLOCK] = compliance[c] * multiplier[c]
-                block[t + 16 * BLOCK], block[t + 17 * BLOCK] = compliance[c], stiffness[c]
-            _project_block(block, count)
+            _project_block(block, count, stiffness, compliance)
             for t in range(count):
                 c = low + t
-                multiplier[c] += block[t + 30 * BLOCK]
-                i = members[c, 0]
-                j = members[c, 1]
-                k = members[c, 2]
-                m = members[c, 3]
+                i = THREE * members[c, 0]
+                j = THREE * members[c, 1]
+                k = THREE * members[c, 2]
+                m = THREE * members[c, 3]
                 for d in range(3):
-                    points[i, d] += block[t + (18 + d) * BLOCK]
-                    points[j, d] += block[t + (21 + d) * BLOCK]
-                    points[k, d] += block[t + (24 + d) * BLOCK]
-                    points[m, d] += block[t + (27 + d) * BLOCK]
+                    x[i + np.uint32(d)] += block[t + d * BLOCK]
+                    x[j + np.uint32(d)] += block[t + (3 + d) * BLOCK]
+                    x[k + np.uint32(d)] += block[t + (6 + d) * BLOCK]
+                    x[m + np.uint32(d)] += block[t + (9 + d) * BLOCK]
 
 
 @compiled
-def _gather(points, inverse_mass, members, c, t, block):
-    i = members[c, 0]
-    j = members[c, 1]
-    k = members[c, 2]
-    m = members[c, 3]
-    for d in range(3):
-        x = points[i, d]
-        block[t + d * BLOCK] = points[j, d] - x
-        block[t + (3 + d) * BLOCK] = points[k, d] - x
-        block[t + (6 + d) * BLOCK] = points[m, d] - x
-    block[t + 9 * BLOCK], block[t + 10 * BLOCK] = inverse_mass[i], inverse_mass[j]
-    block[t + 11 * BLOCK], block[t + 12 * BLOCK] = inverse_mass[k], inverse_mass[m]
+def _gather(x, inverse_mass, members, c, t, block):
+    """Fill place t of a block from constraint c; x (3 n,) are coordinates, indices unsigned, so
+    that none is tested for counting from the end.
+    """
+    for k in range(4):
+        block[t + (9 + k) * BLOCK] = inverse_mass[members[c, k]]
+    first = THREE * members[c, 0]
+    for k in range(3):
+        other = THREE * members[c, k + 1]
+        block[t + 3 * k * BLOCK] = x[other] - x[first]
+        block[t + (3 * k + 1) * BLOCK] = x[other + ONE] - x[first + ONE]
+        block[t + (3 * k + 2) * BLOCK] = x[other + TWO] - x[first + TWO]
 
 
 @compiled(error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"})
-def _project_block(g, count):
+def _project_block(g, count, stiffness, compliance):
     """grad_k = -gk p, grad_m = -gm q, grad_j = aj p + bj q, grad_i = ai p + bi q; a collapsed face
     stays.
     """
@@ -181,22 +175,25 @@ def _project_block(g, count):
         wj = g[t + 10 * BLOCK]
         wk = g[t + 11 * BLOCK]
         wm = g[t + 12 * BLOCK]
-        total = g[t + 16 * BLOCK] + wk * gk * gk * pp + wm * gm * gm * qq
+        total = compliance + wk * gk * gk * pp + wm * gm * gm * qq
         total += wi * (ai * ai * pp + 2.0 * ai * bi * pq + bi * bi * qq)
         total += wj * (aj * aj * pp + 2.0 * aj * bj * pq + bj * bj * qq)
-        change = -good * (2.0 * half + g[t + 15 * BLOCK]) / (total + 1e-300)
-        g[t + 30 * BLOCK] = change
-        change *= g[t + 17 * BLOCK]
+        change = -good * stiffness * (2.0 * half) / (total + 1e-300)
         fi = wi * change
         fj = wj * change
         fk = wk * change * gk
         fm = wm * change * gm
-        g[t + 18 * BLOCK], g[t + 21 * BLOCK] = fi * (ai * px + bi * qx), fj * (aj * px + bj * qx)
-        g[t + 19 * BLOCK], g[t + 22 * BLOCK] = fi * (ai * py + bi * qy), fj * (aj * py + bj * qy)
-        g[t + 20 * BLOCK], g[t + 23 * BLOCK] = fi * (ai * pz + bi * qz), fj * (aj * pz + bj * qz)
-        g[t + 24 * BLOCK] = -fk * px
-        g[t + 25 * BLOCK] = -fk * py
-        g[t + 26 * BLOCK] = -fk * pz
-        g[t + 27 * BLOCK] = -fm * qx
-        g[t + 28 * BLOCK] = -fm * qy
-        g[t + 29 * BLOCK] = -fm * qz
+        ai, bi = fi * ai, fi * bi
+        aj, bj = fj * aj, fj * bj
+        g[t] = ai * px + bi * qx
+        g[t + BLOCK] = ai * py + bi * qy
+        g[t + 2 * BLOCK] = ai * pz + bi * qz
+        g[t + 3 * BLOCK] = aj * px + bj * qx
+        g[t + 4 * BLOCK] = aj * py + bj * qy
+        g[t + 5 * BLOCK] = aj * pz + bj * qz
+        g[t + 6 * BLOCK] = -fk * px
+        g[t + 7 * BLOCK] = -fk * py
+        g[t + 8 * BLOCK] = -fk * pz
+        g[t + 9 * BLOCK] = -fm * qx
+        g[t + 10 * BLOCK] = -fm * qy
+        g[t + 11 * BLOCK] = -fm * qz

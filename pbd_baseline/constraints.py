@@ -1,16 +1,16 @@
 """Edge and volume constraints: one class a family, one loop each, for PBD and XPBD alike.
 
-Every projection is ``dlambda = (-C - a lambda) / (sum_i w_i |grad_i C|^2 + a)``, ``dx_i = k w_i
-grad_i C dlambda`` with the compliance a over the time of the step (Macklin 2016); ``a = 0`` is the
-hard constraint of PBD, and k in [0, 1] its stiffness (Müller 2007). w is the inverse mass, 0 where
-a vertex is held.
+Every projection is ``dlambda = -C / (sum_i w_i |grad_i C|^2 + a)``, ``dx_i = k w_i grad_i C
+dlambda`` with the compliance a over the time of the step, which is one projection (Macklin 2019);
+``a = 0`` is the hard constraint of PBD, and k in [0, 1] its stiffness (Müller 2007). w is the
+inverse mass, 0 where a vertex is held; constraints between held vertices alone are left out.
 """
 
 from collections.abc import Callable
 
 import numpy as np
 
-from pbd_baseline.topology import colour, spread
+from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order, spread
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import volume_cubic, volume_loop
 from rbfmuscle.jit import compiled
@@ -23,28 +23,30 @@ TINY = 1e-12
 class EdgeConstraint:
     """Keeps edge lengths: C = |x_i - x_j| - l, grad_i C = (x_i - x_j) / |x_i - x_j| = -grad_j C.
 
-    ``edges`` (e, 2) has each once. One PBD projection removes the share ``stiffness`` of an error;
-    ``compliance`` is that of XPBD times inverse time, 0 is hard. Beyond the ratios ``limits`` of
-    length to rest length an edge is hard whatever its stiffness.
+    ``edges`` (e, 2) has each once; those between two vertices of no ``inverse_mass`` (n,) are left
+    out. One PBD projection removes the share ``stiffness`` of an error; ``compliance`` is that of
+    XPBD times inverse time, 0 is hard. Beyond the ratios ``limits`` of length to rest length an
+    edge is hard whatever its stiffness.
     """
 
     def __init__(
         self,
         vertices: Floats,
         edges: Integers,
+        inverse_mass: Floats,
         *,
         stiffness: Floats | float = 1.0,
         compliance: float = 0.0,
         limits: list[float] | tuple[float, float] = (0.0, np.inf),
     ) -> None:
-        order, self.colours = colour(edges, len(vertices))
-        self.edges = np.ascontiguousarray(edges[order])
+        order, self.colours = colour(edges, inverse_mass)
+        self.edges = members_in_order(edges, order)
+        self.inverse_mass = inverse_mass
         self.order = order
         self.rest = np.linalg.norm(vertices[self.edges[:, 0]] - vertices[self.edges[:, 1]], axis=1)
         self.limits = float(limits[0]), float(limits[1])
         self.stiffness = spread(stiffness, order)
         self.compliance = spread(compliance, order)
-        self.multiplier = np.zeros(len(order))
 
     def values(self, points: Floats) -> Floats:
         """C of each edge, in the order of ``self.edges``."""
@@ -52,21 +54,16 @@ class EdgeConstraint:
             np.linalg.norm(points[self.edges[:, 0]] - points[self.edges[:, 1]], axis=1) - self.rest
         )
 
-    def reset(self) -> None:
-        """Forget the multipliers, as each time step does."""
-        self.multiplier[:] = 0.0
-
-    def project(self, points: Floats, inverse_mass: Floats) -> None:
+    def project(self, points: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""
         _edge_loop(
             points,
-            inverse_mass,
+            self.inverse_mass,
             self.edges,
             self.rest,
             self.limits,
             self.stiffness,
             self.compliance,
-            self.multiplier,
         )
 
 
@@ -144,32 +141,33 @@ def _cubic_step(coefficients, wanted, least):
 
 
 @compiled(error_model="numpy")
-def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance, multiplier):
+def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance):
+    # A flat array and unsigned numbers: no index is tested for counting from the end.
+    x = points.reshape(-1)
     for c in range(len(edges)):
-        i, j = edges[c, 0], edges[c, 1]
-        wi, wj = inverse_mass[i], inverse_mass[j]
-        dx = points[i, 0] - points[j, 0]
-        dy = points[i, 1] - points[j, 1]
-        dz = points[i, 2] - points[j, 2]
+        wi, wj = inverse_mass[edges[c, 0]], inverse_mass[edges[c, 1]]
+        i = THREE * edges[c, 0]
+        j = THREE * edges[c, 1]
+        dx = x[i] - x[j]
+        dy = x[i + ONE] - x[j + ONE]
+        dz = x[i + TWO] - x[j + TWO]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
         total = wi + wj + compliance[c]
-        if length <= TINY * rest[c] or wi + wj <= 0.0:
+        if length <= TINY * rest[c]:
             continue
-        change = -(length - rest[c] + compliance[c] * multiplier[c]) / total
-        multiplier[c] += change
-        change *= stiffness[c]
+        change = stiffness[c] * (rest[c] - length) / total
         if length > limits[1] * rest[c]:
             change = min(change, (limits[1] * rest[c] - length) / (wi + wj))
         elif length < limits[0] * rest[c]:
             change = max(change, (limits[0] * rest[c] - length) / (wi + wj))
         factor = change / length
         fi, fj = wi * factor, wj * factor
-        points[i, 0] += fi * dx
-        points[i, 1] += fi * dy
-        points[i, 2] += fi * dz
-        points[j, 0] -= fj * dx
-        points[j, 1] -= fj * dy
-        points[j, 2] -= fj * dz
+        x[i] += fi * dx
+        x[i + ONE] += fi * dy
+        x[i + TWO] += fi * dz
+        x[j] -= fj * dx
+        x[j + ONE] -= fj * dy
+        x[j + TWO] -= fj * dz
 
 
 @compiled

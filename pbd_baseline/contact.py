@@ -35,10 +35,9 @@ class ContactConstraint:
 
     def project(self, points: Floats) -> None:
         """Push vertices out of the half-spaces, in place."""
-        depth = self.depths(points)
-        if depth.max(initial=0.0) <= TOUCHING * self.reach:
-            return
-        np.add.at(points, self.index, depth[:, None] * self.normal)
+        if len(self.index):
+            planes = self.index, self.gap, self.normal, self.anchor
+            _push_loop(points, *planes, TOUCHING * self.reach)
 
     def clear_way(self, points: Floats, direction: Floats, step: float) -> bool:
         """Take out of ``step * direction``, in place, what would lead into a half-space; say if
@@ -50,8 +49,33 @@ class ContactConstraint:
 
     def depths(self, points: Floats) -> Floats:
         """Depth (c,) of the points (n, 3) in each half-space found last, 0 outside."""
-        way = np.einsum("cd,cd->c", points[self.index] - self.anchor, self.normal)
-        return np.maximum(0.0, -self.gap - way)
+        found = np.empty(len(self.index))
+        _depth_loop(points, self.index, self.gap, self.normal, self.anchor, found)
+        return found
+
+
+@compiled(error_model="numpy")
+def _depth_loop(points, index, gap, normal, anchor, depth):
+    """Depth of each point in its half-space, 0 outside."""
+    for c in range(len(index)):
+        value = gap[c]
+        for a in range(3):
+            value += normal[c, a] * (points[index[c], a] - anchor[c, a])
+        depth[c] = max(0.0, -value)
+
+
+@compiled(error_model="numpy")
+def _push_loop(points, index, gap, normal, anchor, least):
+    """Push points out of their half-spaces, all by where they are now, if one is deeper than
+    ``least``.
+    """
+    depth = np.empty(len(index))
+    _depth_loop(points, index, gap, normal, anchor, depth)
+    if depth.max() <= least:
+        return
+    for c in range(len(index)):
+        for a in range(3):
+            points[index[c], a] += depth[c] * normal[c, a]
 
 
 @compiled

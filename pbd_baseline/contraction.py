@@ -5,7 +5,7 @@ tendon.
 import numpy as np
 
 from pbd_baseline.rest import RestState
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.jit import compiled
 from rbfmuscle.scene.activation.contraction import resolve_contraction
 from rbfmuscle.scene.objects import Muscle
@@ -46,16 +46,20 @@ class MeshFibres:
         one, other = rest.fibres[edges[:, 0]], rest.fibres[edges[:, 1]]
         axis = one + np.where(np.einsum("ij,ij->i", one, other) < 0.0, -1.0, 1.0)[:, None] * other
         size = np.linalg.norm(axis, axis=1, keepdims=True)
-        self.known = size > 1e-12  # else the fibres have no direction there
-        axis = np.divide(axis, size, out=np.zeros_like(axis), where=self.known)
+        self.known = size[:, 0] > 1e-12  # else the fibres have no direction there
+        axis = np.divide(axis, size, out=np.zeros_like(axis), where=size > 1e-12)
         along = np.einsum("ij,ij->i", self.vectors, axis)
         self.along = along[:, None] * axis
         square = np.einsum("ij,ij->i", self.vectors, self.vectors)
-        self.lengths = np.sqrt(square)
         # Weight of an edge in the stretch along the fibre: the fourth power of the cosine between
         # them.
-        self.weights = (along**2 / np.maximum(square, 1e-300)) ** 2
-        self.stretch = np.ones(count)
+        weights = (along**2 / np.maximum(square, 1e-300)) ** 2
+        self.per_length = weights / np.sqrt(square)
+        self.total = 1e-9 + np.bincount(edges.T.ravel(), np.tile(weights, 2), count)
+        self.across_square = np.maximum(square - along**2, 0.0)
+        self.along_square = along**2
+        #: Target stretches (n, 2) of the vertices, along the fibres and across.
+        self.wanted = np.ones((count, 2))
         self.activate(0.0)
 
     def activate(self, activation: float) -> None:
@@ -80,30 +84,57 @@ class MeshFibres:
 
     def targets(self, points: Floats) -> Floats:
         """Wanted vectors of the edges (e, 3) in the rest frame, for the present points (n, 3)."""
-        _stretch_loop(points, self.edges, self.lengths, self.weights, self.stretch)
-        along = np.minimum(np.maximum(self.stretch, self.lower), self.upper)
-        across = (along + self.active * (self.stretch - along)) ** -0.5
-        t = 0.5 * (along[self.edges[:, 0]] + along[self.edges[:, 1]])[:, None]
-        s = 0.5 * (across[self.edges[:, 0]] + across[self.edges[:, 1]])[:, None]
-        t, s = np.where(self.known, t, 1.0), np.where(self.known, s, 1.0)
+        self._find_wanted(points)
+        wanted = 0.5 * (self.wanted[self.edges[:, 0]] + self.wanted[self.edges[:, 1]])
+        t, s = np.where(self.known, wanted.T, 1.0)[:, :, None]
         return s * self.vectors + (t - s) * self.along
+
+    def target_lengths(self, points: Floats, chosen: Integers, lengths: Floats) -> None:
+        """Fill ``lengths`` (l,) with those of the `targets` of the ``chosen`` edges (l,)."""
+        self._find_wanted(points)
+        squares = self.along_square, self.across_square
+        _length_loop(chosen, self.edges, self.known, self.wanted, squares, lengths)
+
+    def _find_wanted(self, points: Floats) -> None:
+        """Find the target stretches for the present points (n, 3)."""
+        measured = self.edges, self.per_length, self.total
+        _wanted_loop(points, measured, (self.lower, self.upper, self.active), self.wanted)
 
 
 @compiled(error_model="numpy")
-def _stretch_loop(points, edges, lengths, weights, stretch):
-    """Stretch along the fibre at each vertex: mean ratio of its edges, by how much they lie along
-    the fibre.
+def _wanted_loop(points, measured, band, wanted):
+    """Target stretches (n, 2) along the fibre and across it at each vertex.
+
+    The present stretch λ is the mean ratio of the vertex's edges, by how much they lie along the
+    fibre.
     """
-    total = np.full(len(stretch), 1e-9)
-    stretch[:] = 1e-9
+    edges, per_length, total = measured
+    lower, upper, active = band
+    stretch = np.full(len(points), 1e-9)
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
         square = 0.0
         for k in range(3):
             square += (points[i, k] - points[j, k]) ** 2
-        ratio = weights[c] * np.sqrt(square) / lengths[c]
+        ratio = per_length[c] * np.sqrt(square)
         stretch[i] += ratio
         stretch[j] += ratio
-        total[i] += weights[c]
-        total[j] += weights[c]
-    stretch /= total
+    for i in range(len(points)):
+        now = stretch[i] / total[i]
+        along = min(max(now, lower[i]), upper[i])
+        wanted[i, 0] = along
+        wanted[i, 1] = 1.0 / np.sqrt(along + active[i] * (now - along))
+
+
+@compiled(error_model="numpy")
+def _length_loop(chosen, edges, known, wanted, squares, lengths):
+    """|T E|, from E² = (E · a)² + rest by (t E · a)² + s² · rest."""
+    along, across = squares
+    for c in range(len(chosen)):
+        e = chosen[c]
+        i, j = edges[e, 0], edges[e, 1]
+        t, s = 1.0, 1.0
+        if known[e]:
+            t = 0.5 * (wanted[i, 0] + wanted[j, 0])
+            s = 0.5 * (wanted[i, 1] + wanted[j, 1])
+        lengths[c] = np.sqrt(t * t * along[e] + s * s * across[e])

@@ -16,6 +16,7 @@ from pbd_baseline.shapes import METHODS, Method
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.interpolation import SurfaceInterpolation
 from rbfmuscle.geometry.rest_frame import diameter
+from rbfmuscle.jit import compiled
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
@@ -86,6 +87,9 @@ class PBDMuscle:
         self.attached_bone = _bone_numbers(self.rest, scene.attachment_frames(muscle))
         self.contact = ContactConstraint(reach=scene.length(REACH))
         self.finishing_reach, self.depth = scene.length(FINISHING_REACH), scene.length(DEPTH)
+        # The mesh's own numbers of the vertices, for `material_mesh`.
+        self._place = np.argsort(self.rest.order)
+        self._faces = self.rest.order[self.rest.topology.faces]
         self.points = self.rest.vertices.copy()
         self.time = 1.0
         self.penetration = 0.0
@@ -99,11 +103,8 @@ class PBDMuscle:
         motions = np.array([_relative(before[bone], after[bone]) for bone in self.rest.bones])
         self.time = max(1.0, _largest_angle(motions) / STEP_ANGLE)
         self._move_free(motions)
-        for b, bone in enumerate(self.rest.bones):
-            held = self.rest.attached_bone == b
-            self.points[held] = (
-                self.rest.vertices[held] @ after[bone][:3, :3].T + after[bone][:3, 3]
-            )
+        poses = np.array([after[bone] for bone in self.rest.bones])
+        _place_loop(self.rest.vertices, self.rest.attached_bone, poses, self.points)
 
     def _move_free(self, motions: np.ndarray) -> None:
         """Predict the free vertices from the motions (b, 4, 4) of the bones."""
@@ -164,9 +165,7 @@ class PBDMuscle:
 
     def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces, numbered as in the muscle's mesh but for the order of the faces."""
-        vertices = np.empty_like(self.points)
-        vertices[self.rest.order] = self.points
-        return vertices, self.rest.order[self.rest.topology.faces]
+        return np.take(self.points, self._place, axis=0), self._faces.copy()
 
     def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
         """What gives the present places (n, 3) of points (n, 3) of the muscle at rest, by
@@ -202,7 +201,7 @@ class PBDMuscle:
         self.contact.project(self.points)
         if self.shape.volume_in_sweeps or self.still > 0.0:
             self.shape.restore_volume(self.points, self.contact)
-        return float(np.sqrt(((self.points - before) ** 2).sum(axis=1).max())) if asked else np.inf
+        return _farthest_loop(before, self.points) if asked else np.inf
 
     def _finish(self, contacts):
         """Contact and volume in turn, half-spaces found again, until both hold where the bones are
@@ -221,6 +220,31 @@ def _bone_numbers(rest, names):
     """Number of the bone, or end of a tendon, that holds each vertex, -1 where it is free."""
     numbers = np.array([names.index(bone) for bone in rest.bones])
     return np.where(rest.attached_bone < 0, -1, numbers[rest.attached_bone])
+
+
+@compiled(error_model="numpy")
+def _place_loop(rest, attached_bone, poses, points):
+    """Put held vertices where their bones' poses (b, 4, 4) take them."""
+    for i in range(len(points)):
+        b = attached_bone[i]
+        if b >= 0:
+            for a in range(3):
+                points[i, a] = poses[b, a, 3]
+                for k in range(3):
+                    points[i, a] += poses[b, a, k] * rest[i, k]
+
+
+@compiled(error_model="numpy")
+def _farthest_loop(before, after):
+    """How far a point moved at most; infinity where one is not finite."""
+    most = 0.0
+    for i in range(len(before)):
+        square = 0.0
+        for a in range(3):
+            square += (after[i, a] - before[i, a]) ** 2
+        if not square <= most:
+            most = square if np.isfinite(square) else np.inf
+    return np.sqrt(most)
 
 
 def _relative(before, after):

@@ -85,25 +85,36 @@ class PBDShape(Shape):
         )
         stiffness = stiffness * np.minimum(1.0, self.soft_length / rest.relative_lengths())
         self.edges = EdgeConstraint(
-            rest.vertices, rest.topology.edges, stiffness=stiffness, limits=self.limits
+            rest.vertices,
+            rest.topology.edges,
+            rest.inverse_mass,
+            stiffness=stiffness,
+            limits=self.limits,
         )
         self.passive = self.edges.stiffness
+        self.activation = np.nan  # that the stiffnesses are for
         self.bending = BendingConstraint(
-            rest.vertices, rest.topology.edges, rest.topology.wings, stiffness=options.bending
+            rest.vertices,
+            rest.topology.edges,
+            rest.topology.wings,
+            rest.inverse_mass,
+            stiffness=options.bending,
         )
 
     def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
         """Take rest lengths and stiffnesses from the fibres: an active fibre is as stiff along as
         across.
         """
-        self.edges.rest = np.linalg.norm(fibres.targets(points), axis=1)[self.edges.order]
-        share = np.where(fibres.tendon, 1.0, fibres.activation)[self.edges.order]
-        self.edges.stiffness = self.passive + share * (1.0 - self.passive)
+        fibres.target_lengths(points, self.edges.order, self.edges.rest)
+        if fibres.activation != self.activation:
+            self.activation = fibres.activation
+            share = np.where(fibres.tendon, 1.0, fibres.activation)[self.edges.order]
+            self.edges.stiffness = self.passive + share * (1.0 - self.passive)
 
     def sweep(self, points: Floats, time: float) -> None:
         """One Gauss-Seidel sweep; PBD knows no time."""
-        self.bending.project(points, self.inverse_mass)
-        self.edges.project(points, self.inverse_mass)
+        self.bending.project(points)
+        self.edges.project(points)
 
 
 class XPBDShape(Shape):
@@ -119,8 +130,11 @@ class XPBDShape(Shape):
         softness = edge_stiffness(
             rest.vertices, rest.topology.edges, rest.fibres, options.fibre_exponent
         )
-        self.edges = EdgeConstraint(rest.vertices, rest.topology.edges, limits=LIMITS)
-        self.bending = BendingConstraint(rest.vertices, rest.topology.edges, rest.topology.wings)
+        topology = rest.topology
+        self.edges = EdgeConstraint(rest.vertices, topology.edges, rest.inverse_mass, limits=LIMITS)
+        self.bending = BendingConstraint(
+            rest.vertices, topology.edges, topology.wings, rest.inverse_mass
+        )
         across = options.edge_compliance * rest.relative_lengths()
         self.edge_compliance = (across / np.maximum(softness, 1e-3))[self.edges.order]
         self.passive, self.stiffest = self.edge_compliance, across[self.edges.order]
@@ -131,7 +145,7 @@ class XPBDShape(Shape):
         """Take rest lengths and compliances from the fibres: an active fibre is as stiff along as
         across.
         """
-        self.edges.rest = np.linalg.norm(fibres.targets(points), axis=1)[self.edges.order]
+        fibres.target_lengths(points, self.edges.order, self.edges.rest)
         share = np.where(fibres.tendon, 1.0, fibres.activation)[self.edges.order]
         mixed = 1.0 / ((1.0 - share) / self.passive + share / self.stiffest)
         self.edge_compliance = np.where(share > 0.0, mixed, self.passive)
@@ -140,11 +154,9 @@ class XPBDShape(Shape):
     def sweep(self, points: Floats, time: float) -> None:
         """One small step of the given time."""
         self.edges.compliance = self.edge_compliance / time
-        self.bending.compliance[:] = self.bending_compliance / time
-        self.edges.reset()
-        self.bending.reset()
-        self.bending.project(points, self.inverse_mass)
-        self.edges.project(points, self.inverse_mass)
+        self.bending.compliance = self.bending_compliance / time
+        self.bending.project(points)
+        self.edges.project(points)
 
 
 class RotatingShape(Shape):
@@ -174,7 +186,7 @@ class ARAPShape(RotatingShape):
 
     def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
-        self.constraint = ARAPConstraint(self.arap)
+        self.constraint = ARAPConstraint(self.arap, rest.inverse_mass)
 
     def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
         """Take rest vectors from the fibres."""
@@ -184,8 +196,7 @@ class ARAPShape(RotatingShape):
     def sweep(self, points: Floats, time: float) -> None:
         """Rotations, then one small step of the constraints."""
         self.arap.fit_rotations(points)
-        self.constraint.reset()
-        self.constraint.project(points, self.inverse_mass, time=time)
+        self.constraint.project(points, time=time)
 
 
 class GlobalARAPShape(RotatingShape):

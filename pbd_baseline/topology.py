@@ -10,9 +10,12 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Array, Floats, Integers
 from rbfmuscle.jit import compiled
 from rbfmuscle.validation import MeshError, check_mesh
+
+# Offsets in a flat array of coordinates, as unsigned as the vertices of `members_in_order`.
+ONE, TWO, THREE = np.uint32(1), np.uint32(2), np.uint32(3)
 
 
 @dataclass(frozen=True)
@@ -81,15 +84,16 @@ def _one_rings(edges, count):
     return start, np.ascontiguousarray(target[order]), np.ascontiguousarray(index[order])
 
 
-def colour(members: Integers, count: int) -> tuple[Integers, Integers]:
+def colour(members: Integers, inverse_mass: Floats) -> tuple[Integers, Integers]:
     """Order constraints, given by their vertices (c, k), so that those of one colour share no
-    vertex.
+    vertex; without those that can move none, by the ``inverse_mass`` (n,) of the vertices.
 
     Greedy: each constraint takes the smallest colour that none of its vertices has yet. Constraints
     of one colour may be projected in any order, or at once, with the same result to the last bit.
-    Returns the order (c,), by colour and then by the first vertex for the sake of the cache, and
+    Returns the order (l,), by colour and then by the first vertex for the sake of the cache, and
     where each colour starts, (colours + 1,).
     """
+    count = len(inverse_mass)
     members = np.ascontiguousarray(members, dtype=np.int64)
     if len(members) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
@@ -98,8 +102,14 @@ def colour(members: Integers, count: int) -> tuple[Integers, Integers]:
     taken = np.zeros((count, words), dtype=np.int64)
     _colour_loop(members, taken, colours)
     order = np.lexsort((members.min(axis=1), colours))
-    start = np.concatenate([[0], np.cumsum(np.bincount(colours))])
+    order = order[(inverse_mass[members[order]] > 0.0).any(axis=1)]
+    start = np.searchsorted(colours[order], np.arange(int(colours.max()) + 2))
     return order, start
+
+
+def members_in_order(members: Integers, order: Integers) -> Array:
+    """Vertices (l, k) of constraints in the order of their colours, for the loops over them."""
+    return np.ascontiguousarray(members[order], dtype=np.uint32)
 
 
 def spread(value: Floats | float, order: Integers) -> Floats:

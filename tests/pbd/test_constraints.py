@@ -36,7 +36,7 @@ def rng():
 def test_constraints_of_one_colour_share_no_vertex(body):
     _, _, topology = body
     members = np.column_stack([topology.edges, topology.wings])
-    order, start = colour(members, topology.vertex_count)
+    order, start = colour(members, np.ones(topology.vertex_count))
     assert sorted(order) == list(range(len(members)))
     for low, high in itertools.pairwise(start):
         used = members[order[low:high]].ravel()
@@ -51,14 +51,30 @@ def test_a_sweep_over_a_mesh_is_one_edge_after_another(rng):
         rng.uniform(0.5, 2.0, len(vertices)),
     )
     for family, extra in ((EdgeConstraint, ()), (BendingConstraint, (topology.wings,))):
-        whole = family(vertices, topology.edges, *extra, stiffness=0.7)
+        whole = family(vertices, topology.edges, *extra, mass, stiffness=0.7)
         swept, stepped = given.copy(), given.copy()
-        whole.project(swept, mass)
+        whole.project(swept)
         for number in whole.order:
             parts = [part[[number]] for part in (topology.edges, *extra)]
-            family(vertices, *parts, stiffness=0.7).project(stepped, mass)
+            family(vertices, *parts, mass, stiffness=0.7).project(stepped)
         np.testing.assert_allclose(swept, stepped, atol=1e-12)
         assert np.abs(swept - given).max() > 1e-2
+
+
+def test_only_constraints_between_held_vertices_are_left_out(body, rng):
+    vertices, _, topology = body
+    given = vertices + 0.1 * rng.normal(size=vertices.shape)
+    mass = (vertices[:, 0] < 1.0).astype(float)
+    for family, extra in ((EdgeConstraint, ()), (BendingConstraint, (topology.wings,))):
+        members = np.column_stack([topology.edges, *extra])
+        constraint = family(vertices, topology.edges, *extra, mass)
+        live = mass[members].any(axis=1)
+        assert sorted(constraint.order) == np.flatnonzero(live).tolist()
+        assert constraint.colours[-1] == live.sum() < len(members)
+        found = given.copy()
+        constraint.project(found)
+        moved = np.abs(found - given).max(axis=1)
+        assert (moved[mass == 0.0] == 0.0).all() and (moved[mass > 0.0] > 0.0).all()
 
 
 @pytest.mark.parametrize("number", [0, 100, 500])
@@ -67,10 +83,11 @@ def test_projection_follows_the_gradient(body, rng, family, number):
     vertices, _, topology = body
     points = vertices + 0.02 * rng.normal(size=vertices.shape)
     edge, wing = topology.edges[[number]], topology.wings[[number]]
+    ones = np.ones(len(points))
     if family == "edge":
-        constraint, members = EdgeConstraint(vertices, edge), edge[0]
+        constraint, members = EdgeConstraint(vertices, edge, ones), edge[0]
     else:
-        constraint = BendingConstraint(vertices, edge, wing, stiffness=1.0)
+        constraint = BendingConstraint(vertices, edge, wing, ones, stiffness=1.0)
         members = np.concatenate([edge[0], wing[0]])
     gradient, step = np.zeros((len(members), 3)), 6e-6 * 3.0
     for a, d in np.ndindex(gradient.shape):
@@ -79,7 +96,7 @@ def test_projection_follows_the_gradient(body, rng, family, number):
         change = constraint.values(points + ahead)[0] - constraint.values(points - ahead)[0]
         gradient[a, d] = change / (2 * step)
     moved = points.copy()
-    constraint.project(moved, np.ones(len(points)))
+    constraint.project(moved)
     expected = -constraint.values(points)[0] * gradient / (gradient**2).sum()
     # central differences of step 2e-5 on values of order one
     np.testing.assert_allclose((moved - points)[members], expected, atol=1e-7)
@@ -89,8 +106,10 @@ def test_an_edge_without_stiffness_is_hard_beyond_its_limits():
     ends = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     for length, kept in ((1.0, 1.6), (1.8, 1.8), (3.0, 2.4)):
         points = ends * 0.5 * length
-        edge = EdgeConstraint(ends, np.array([[0, 1]]), stiffness=0.0, limits=(0.8, 1.2))
-        edge.project(points, np.array([1.0, 3.0]))
+        edge = EdgeConstraint(
+            ends, np.array([[0, 1]]), np.array([1.0, 3.0]), stiffness=0.0, limits=(0.8, 1.2)
+        )
+        edge.project(points)
         assert points[:, 0] == pytest.approx(
             [0.25 * (length - kept), 0.25 * (length - kept) + kept]
         )

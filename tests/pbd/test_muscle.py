@@ -143,3 +143,17 @@ def test_last_motion_is_that_of_the_worst_solve_since_the_last_drawing():
     worst = rig.model.surface(rig.contacts).quantities["solver_residual"]
     rig.go(60.0)
     assert 0.0 < rig.model.surface(rig.contacts).quantities["solver_residual"] < worst
+
+
+def test_target_lengths_are_those_of_the_target_vectors():
+    model = Rig("pbd").model
+    fibres, order = model.fibres, np.arange(len(model.rest.topology.edges))[::-2].copy()
+    fibres.known[::7] = False  # as where fibres have no direction
+    points = model.points * [0.8, 1.2, 0.9]
+    found = np.empty(len(order))
+    for activation in (0.0, 0.6):
+        fibres.activate(activation)
+        fibres.target_lengths(points, order, found)
+        wanted = np.linalg.norm(fibres.targets(points), axis=1)
+        np.testing.assert_allclose(found, wanted[order], rtol=1e-12)
+        assert np.ptp(found / np.linalg.norm(fibres.vectors, axis=1)[order]) > 0.1
