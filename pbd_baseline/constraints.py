@@ -152,15 +152,13 @@ def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance)
         dy = x[i + ONE] - x[j + ONE]
         dz = x[i + TWO] - x[j + TWO]
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
-        total = wi + wj + compliance[c]
         if length <= TINY * rest[c]:
             continue
-        change = stiffness[c] * (rest[c] - length) / total
+        factor = stiffness[c] * (rest[c] - length) / ((wi + wj + compliance[c]) * length)
         if length > limits[1] * rest[c]:
-            change = min(change, (limits[1] * rest[c] - length) / (wi + wj))
+            factor = min(factor, (limits[1] * rest[c] - length) / ((wi + wj) * length))
         elif length < limits[0] * rest[c]:
-            change = max(change, (limits[0] * rest[c] - length) / (wi + wj))
-        factor = change / length
+            factor = max(factor, (limits[0] * rest[c] - length) / ((wi + wj) * length))
         fi, fj = wi * factor, wj * factor
         x[i] += fi * dx
         x[i + ONE] += fi * dy

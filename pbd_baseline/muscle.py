@@ -165,7 +165,7 @@ class PBDMuscle:
 
     def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces, numbered as in the muscle's mesh but for the order of the faces."""
-        return np.take(self.points, self._place, axis=0), self._faces.copy()
+        return np.take(self.points, self._place, axis=0), self._faces
 
     def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
         """What gives the present places (n, 3) of points (n, 3) of the muscle at rest, by

@@ -104,21 +104,25 @@ def may_reach(points, i, pose, bounds, anchor, bound, reach):
         moved += (local - anchor[i, k]) ** 2
         beyond = max(bounds[0, k] - local, local - bounds[1, k], 0.0)
         outside += beyond * beyond
-    if outside > 0.0 and (reach < 0.0 or outside > reach * reach):
-        return False
     spare = bound[i] - reach
-    return spare <= 0.0 or moved >= spare * spare
+    # Without branches, as they are a toss-up.
+    away = (outside > 0.0) & ((reach < 0.0) | (outside > reach * reach))
+    return ((spare <= 0.0) | (moved >= spare * spare)) & (not away)
 
 
 @compiled(error_model="numpy")
 def box_loop(points, chosen, box):
     """Fill ``box`` (2, 3) with the least and greatest coordinates of the chosen points."""
-    box[0], box[1] = np.inf, -np.inf
+    low, high = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
     for i in range(len(points)):
         if chosen[i]:
-            for k in range(3):
-                box[0, k] = min(box[0, k], points[i, k])
-                box[1, k] = max(box[1, k], points[i, k])
+            x = points[i, 0]
+            y = points[i, 1]
+            z = points[i, 2]
+            low = min(low[0], x), min(low[1], y), min(low[2], z)
+            high = max(high[0], x), max(high[1], y), max(high[2], z)
+    box[0, :] = low
+    box[1, :] = high
 
 
 @compiled(error_model="numpy")
@@ -167,9 +171,10 @@ def near_loop(points, free, reach, bones, known, found, counts):
         if boxes_apart(box, poses[b], boxes[b]) > farthest:
             continue
         for i in range(len(points)):
-            if free[i] and may_reach(points, i, poses[b], boxes[b], anchor[b], bound[b], limit[i]):
-                found[b, count] = i
-                count += 1
+            found[b, count] = i
+            count += free[i] & may_reach(
+                points, i, poses[b], boxes[b], anchor[b], bound[b], limit[i]
+            )
         counts[b] = count
 
 

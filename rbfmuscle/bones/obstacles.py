@@ -9,7 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.bones.broad_phase import direction_loop
+from rbfmuscle.bones.broad_phase import (
+    box_loop,
+    boxes_apart,
+    direction_loop,
+    may_reach,
+    note_query,
+)
 from rbfmuscle.bones.query import FieldData, query_loop
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.jit import compiled
@@ -152,3 +158,44 @@ def query_bone(bones, b, pose, points, reach, distance, gradient):
     query_loop(points, placed, reach, bones.sizes[b], distance, gradient, field_of(bones, b))
     if len(gradient) > 0:
         direction_loop(points, gradient, pose, bones.boxes[b])
+
+
+@compiled(error_model="numpy")
+def find_contacts(obstacles, points, reach):
+    """Pairs of free point (n, 3) and bone nearer than ``reach`` (n,), bone by bone.
+
+    Numbers (c,) of the points, of the bones in reach, gaps (c,) [scene unit] and unit normals (c,
+    3).
+    """
+    bones, free, known = obstacles.bones, obstacles.free, obstacles.known
+    box, farthest = np.empty((2, 3)), -np.inf
+    box_loop(points, free, box)
+    for i in range(len(points)):
+        farthest = max(farthest, reach[i] if free[i] else -np.inf)
+    some = np.empty(len(points), np.int64)
+    index, source = np.empty(0, np.int64), np.empty(0, np.int64)
+    gap, normal = np.empty(0), np.empty((0, 3))
+    for b in range(len(obstacles.poses)):
+        pose, bounds = obstacles.poses[b], bones.boxes[b]
+        anchor, bound = known.anchor[b], known.bound[b]
+        if boxes_apart(box, pose, bounds) > farthest:
+            continue
+        asked, count = 0, 0
+        for i in range(len(points)):
+            some[asked] = i
+            asked += free[i] & may_reach(points, i, pose, bounds, anchor, bound, reach[i])
+        near = some[:asked].copy()
+        distance, way = np.empty(asked), np.empty((asked, 3))
+        query_bone(bones, b, pose, points[near], reach[near], distance, way)
+        for k in range(asked):
+            i = near[k]
+            note_query(points, i, pose, distance[k], anchor, bound)
+            near[count] = i
+            distance[count] = distance[k] + obstacles.allowed[b, i]
+            way[count] = way[k]
+            count += distance[count] < reach[i]
+        index = np.concatenate((index, near[:count]))
+        source = np.concatenate((source, np.full(count, b)))
+        gap = np.concatenate((gap, distance[:count]))
+        normal = np.concatenate((normal, way[:count]))
+    return index, source, gap, normal

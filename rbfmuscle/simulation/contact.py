@@ -25,7 +25,14 @@ from rbfmuscle.bones.broad_phase import (
     path_loop,
     take_contacts_loop,
 )
-from rbfmuscle.bones.obstacles import Bones, Known, Obstacles, PlaneStack, stack_bones
+from rbfmuscle.bones.obstacles import (
+    Bones,
+    Known,
+    Obstacles,
+    PlaneStack,
+    find_contacts,
+    stack_bones,
+)
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import BoneField
@@ -102,6 +109,7 @@ class BoneContacts:
         self.names = list(names)
         self.fields = {b: field for b, field in enumerate(fields) if field is not None}
         self.reached = list(self.fields)
+        self._reached = np.array(self.reached, dtype=np.int64)
         self._row = {b: row for row, b in enumerate(self.reached)}
         boxes = [self.fields[b].bounds for b in self.reached]
         self.boxes = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3)
@@ -222,6 +230,15 @@ class BoneContacts:
             if np.ndim(reach) == 0
             else np.asarray(reach, dtype=np.float64)
         )
+        if self.bones is None:
+            spaces = self._asked_one_by_one(points, reach)
+        else:
+            index, row, gap, normal = find_contacts(self.obstacles(len(points)), points, reach)
+            spaces = HalfSpaces(index, gap, normal, self._reached[row])
+        return self.with_planes(spaces, points, reach)
+
+    def _asked_one_by_one(self, points: Floats, reach: Floats) -> HalfSpaces:
+        """Half-spaces of bones whose fields are no arrays that a loop could ask."""
         near = self.near(points, reach[None])
         most = sum(len(some) for _, some in near)
         index, source = np.empty(most, np.int64), np.empty(most, np.int64)
@@ -236,9 +253,7 @@ class BoneContacts:
             end = count + take_contacts_loop(some, distance, direction, limits, found)
             source[count:end] = b
             count = end
-        return self.with_planes(
-            HalfSpaces(index[:count], gap[:count], normal[:count], source[:count]), points, reach
-        )
+        return HalfSpaces(index[:count], gap[:count], normal[:count], source[:count])
 
     def with_planes(self, spaces: HalfSpaces, points: Floats, reach: Floats) -> HalfSpaces:
         """Half-spaces of bones and, behind them, of the neighbours of contact points (n, 3) nearer

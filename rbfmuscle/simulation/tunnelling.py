@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, may_reach, path_loop
+from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, may_reach
 from rbfmuscle.bones.obstacles import query_bone
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
@@ -263,30 +263,68 @@ def suspect_paths(obstacles, start, end, before, cosine, tolerance):
     """
     total = 0
     found = np.zeros((len(before), len(end)), np.bool_)
-    box, known = np.empty((2, 3)), obstacles.known
-    box_loop(end, obstacles.free, box)
-    some, length = np.empty(len(end), np.int64), np.empty((1, len(end)))
+    free, known = obstacles.free, obstacles.known
+    boxes = np.empty((2, 2, 3))
+    box_loop(start, free, boxes[0])
+    box_loop(end, free, boxes[1])
+    moved = _greatest_move(start, end, free)
+    some = np.empty(len(end), np.int64)
     for b in range(len(before)):
         pose, bounds = obstacles.poses[b], obstacles.bones.boxes[b]
-        path_loop(start, end, before[b : b + 1], obstacles.poses[b : b + 1], length)
-        if boxes_apart(box, pose, bounds) > length.max():
+        longest = moved + _bone_move(boxes[0], before[b], pose)
+        if boxes_apart(boxes[1], pose, bounds) > longest:
             continue
-        count = 0
+        many, count = 0, 0
         anchor, bound = known.anchor[b], known.bound[b]
         for i in range(len(end)):
+            some[many] = i
+            many += free[i] & may_reach(end, i, pose, bounds, anchor, bound, longest)
+        first, last = np.empty((many, 3)), np.empty((many, 3))
+        for i in some[:many]:
+            _to_bone(start[i], before[b], first[count])
+            _to_bone(end[i], pose, last[count])
             # A path that is shorter than the distance of its end touches nothing.
-            if obstacles.free[i] and may_reach(end, i, pose, bounds, anchor, bound, length[0, i]):
-                some[count] = i
-                count += 1
-        first, last = np.empty((count, 3)), np.empty((count, 3))
-        for k in range(count):
-            _to_bone(start[some[k]], before[b], first[k])
-            _to_bone(end[some[k]], pose, last[k])
+            length = np.sqrt(((last[count] - first[count]) ** 2).sum())
+            some[count] = i
+            count += may_reach(end, i, pose, bounds, anchor, bound, length)
+        first, last = first[:count], last[:count]
         unclear = unclear_paths(obstacles.bones, b, first, last, cosine, tolerance)
         for k in range(count):
             found[b, some[k]] = unclear[k]
             total += unclear[k]
     return found, total
+
+
+@inner(error_model="numpy")
+def _greatest_move(start, end, free):
+    """How far a free point moves at most."""
+    most = 0.0
+    for i in range(len(start)):
+        square = 0.0
+        for k in range(3):
+            square += (end[i, k] - start[i, k]) ** 2
+        most = max(most, square * free[i])
+    return np.sqrt(most)
+
+
+@inner(error_model="numpy")
+def _bone_move(box, before, after):
+    """How far a bone takes a point of a box (2, 3) at most, from one pose to another; it is a
+    corner.
+    """
+    most, corner, local = 0.0, np.empty(3), np.empty(3)
+    for n in range(8):
+        for k in range(3):
+            corner[k] = box[n >> k & 1, k]
+        _to_bone(corner, before, local)
+        square = 0.0
+        for k in range(3):
+            way = after[k, 3] - corner[k]
+            for j in range(3):
+                way += after[k, j] * local[j]
+            square += way * way
+        most = max(most, square)
+    return np.sqrt(most)
 
 
 @inner(error_model="numpy")

@@ -4,9 +4,11 @@ from itertools import product
 
 import numpy as np
 import pytest
+import trimesh
 from toy_scene import ToyMuscle, attach, box, ellipsoid, muscle, scene, sphere
 
 from rbfmuscle.bones.broad_phase import boxes_apart
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.simulation.contact import BoneContacts, Planes
@@ -19,8 +21,9 @@ def _points(count=400, seed=0):
     return np.random.default_rng(seed).uniform(-6, 6, (count, 3))
 
 
-def _pair(**options):
-    contacts = BoneContacts(["ball", "plate"], [sphere(2.0), box((3, 3, 0.5))], **options)
+def _pair(fields=None, **options):
+    fields = fields or [sphere(2.0), box((3, 3, 0.5))]
+    contacts = BoneContacts(["ball", "plate"], fields, **options)
     poses = {"ball": rotation_about([0, 1, 0], 0.3, np.array([5.0, 0, 0])), "plate": np.eye(4)}
     poses["plate"][:3, 3] = [0, 0, 4.0]
     contacts.move(poses)
@@ -37,10 +40,17 @@ def _literal(contacts, poses, points, reach):
     return pairs
 
 
+def _meshed():
+    """The same two as fields of meshes, which compiled loops ask."""
+    ball, plate = trimesh.creation.icosphere(3, 2.0), trimesh.creation.box((6, 6, 1))
+    return [BoneSDF.from_mesh(mesh.subdivide(), cache=False) for mesh in (ball, plate)]
+
+
 @pytest.mark.parametrize("reach", [0.5, 3.0, 100.0])
-def test_half_spaces_are_all_pairs_nearer_than_reach(reach):
+@pytest.mark.parametrize("kind", ["analytic", "meshed"])
+def test_half_spaces_are_all_pairs_nearer_than_reach(kind, reach):
     attached = np.where(np.arange(400) % 3 == 0, 0, -1)  # which take no contact
-    contacts, poses = _pair(attached_bone=attached)
+    contacts, poses = _pair(_meshed() if kind == "meshed" else None, attached_bone=attached)
     points, rng = _points(), np.random.default_rng(1)
     for _ in range(10):  # later calls rely on distances known from the earlier ones
         every = _literal(contacts, poses, points, reach)

@@ -131,9 +131,9 @@ def test_sliding_around_a_bone_is_no_crossing():
     assert sweep_paths(box((9, 9, 1.0)), start, end, tolerance=TOLERANCE).through.all()
 
 
-def _moving_plate(turn):
+def _moving_plate(turn, plate):
     """A plate that moves through a point at rest, everything seen in a world turned by ``turn``."""
-    contacts = BoneContacts(["plate", "far"], [box((5, 5, 0.2)), box((5, 5, 0.2))])
+    contacts = BoneContacts(["plate", "far"], [plate, plate])
     before, after = np.eye(4), np.eye(4)
     before[2, 3], after[2, 3] = -2.0, 2.0
     far = np.eye(4)
@@ -146,12 +146,16 @@ def _moving_plate(turn):
 
 @pytest.mark.parametrize("angle", [0.0, 1.0])
 @pytest.mark.parametrize("count", [1, 3])
-def test_paths_are_relative_to_the_bone(angle, count):
+@pytest.mark.parametrize("kind", ["analytic", "meshed"])
+def test_paths_are_relative_to_the_bone(kind, angle, count):
     """The last two points stay clear. Where the first ends alone, no box of the bone is near it:
     the bone has moved.
     """
     turn = rotation_about([1, 2, 3], angle, np.array([4.0, 5, 6]))
-    contacts, points, poses = _moving_plate(turn)
+    plate = box((5, 5, 0.2))
+    if kind == "meshed":
+        plate = BoneSDF.from_mesh(trimesh.creation.box((10, 10, 0.4)), cache=False)
+    contacts, points, poses = _moving_plate(turn, plate)
     points = points[:count]
     options = TunnellingOptions()
     (crossing,) = find_crossings(contacts, points, points, *poses, options, tolerance=TOLERANCE)
