@@ -111,6 +111,23 @@ def may_reach(points, i, pose, bounds, anchor, bound, reach):
 
 
 @compiled(error_model="numpy")
+def least_distance(points, i, pose, bounds, anchor, bound):
+    """Lower bound of the distance of point i from a bone, by the bone's box and by what an earlier
+    bound less the motion since says.
+    """
+    moved, outside = 0.0, 0.0
+    for k in range(3):
+        local = 0.0
+        for j in range(3):
+            local += pose[j, k] * (points[i, j] - pose[j, 3])
+        moved += (local - anchor[i, k]) ** 2
+        beyond = max(bounds[0, k] - local, local - bounds[1, k], 0.0)
+        outside += beyond * beyond
+    least = bound[i] - np.sqrt(moved)
+    return max(least, np.sqrt(outside)) if outside > 0.0 else least
+
+
+@compiled(error_model="numpy")
 def box_loop(points, chosen, box):
     """Fill ``box`` (2, 3) with the least and greatest coordinates of the chosen points."""
     low, high = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)

@@ -8,6 +8,7 @@ from rbfmuscle.bones.broad_phase import (
     TRUSTED_SHARE,
     box_loop,
     boxes_apart,
+    least_distance,
     may_reach,
     note_query,
 )
@@ -29,6 +30,9 @@ class Near(NamedTuple):
     exact: Known
     rounded: Known
     y: np.ndarray  # (N, 3)
+    gap: np.ndarray  # (m,) lower bounds of the exact gaps there
+    # (m,) lower bounds of the rounded gaps, plus what the nodes had travelled when they were found
+    spare: np.ndarray
 
 
 class Touch(NamedTuple):
@@ -42,11 +46,12 @@ class Touch(NamedTuple):
 
 @inner(error_model="numpy")
 def find_near(points, obstacles, reach):
-    """Mask (n,) of the contact points nearer than ``reach`` to an obstacle."""
-    bones = obstacles.bones
-    free = obstacles.free
-    known = obstacles.known
+    """Mask (n,) of the contact points nearer than ``reach`` to an obstacle, and lower bounds (n,)
+    of the gaps, at most ``reach``.
+    """
+    bones, free, known = obstacles.bones, obstacles.free, obstacles.known
     found, box = np.zeros(len(points), np.bool_), np.empty((2, 3))
+    gap = np.full(len(points), reach)
     box_loop(points, free, box)
     some = np.empty(len(points), np.int64)
     for b in range(len(obstacles.poses)):
@@ -68,10 +73,22 @@ def find_near(points, obstacles, reach):
             i = some[k]
             note_query(points, i, pose, distance[k], anchor, bound)
             found[i] |= distance[k] + obstacles.allowed[b, i] < reach
+            gap[i] = min(gap[i], trusted(distance[k]) + obstacles.allowed[b, i])
     planes = obstacles.planes
     for p in range(len(planes.point)):
-        found[planes.point[p]] |= plane_gap(planes, p, points[planes.point[p]]) < reach
-    return found
+        i = planes.point[p]
+        there = plane_gap(planes, p, points[i])
+        found[i] |= there < reach
+        gap[i] = min(gap[i], there)
+    return found, gap
+
+
+@inner(error_model="numpy")
+def trusted(distance):
+    """Lower bound of a distance that a field answers: it is exact near its bone, coarser far
+    away.
+    """
+    return TRUSTED_SHARE * distance if distance > 0.0 else distance
 
 
 @inner(error_model="numpy")
@@ -84,8 +101,9 @@ def plane_gap(planes, p, point):
 
 
 @inner(error_model="numpy")
-def take_near(found, model, most, obstacles, edges, forces, y):
-    """The contact points of a mask (n,), with the greatest and the present forces of all on them.
+def take_near(found, gap, model, most, obstacles, edges, forces, y):
+    """The contact points of a mask (n,), with the greatest and the present forces and the gaps of
+    all on them.
 
     ``edges`` (b,) are those of the cells that bones are rounded over.
     """
@@ -106,6 +124,8 @@ def take_near(found, model, most, obstacles, edges, forces, y):
         Known(np.empty((bones, count, 3)), np.empty((bones, count))),
         Known(np.empty((bones, count, 3)), np.empty((bones, count))),
         y.copy(),
+        gap[which],
+        np.full(count, -np.inf),
     )
     for k in range(count):
         i = which[k]
@@ -127,10 +147,11 @@ def take_near(found, model, most, obstacles, edges, forces, y):
 
 
 @inner(error_model="numpy")
-def find_touch(near, here, reach, obstacles, rounded):
+def find_touch(near, here, reach, travelled, obstacles, rounded):
     """Half-spaces that near points ``here`` (m, 3) meet within ``reach`` (m,), bones rounded.
 
-    Also whether there was room for all blocks of the rounded bones.
+    Points with a reach of -∞ are passed over. Also whether there was room for all blocks of the
+    rounded bones. Fills ``near.spare`` for nodes that have ``travelled`` so far.
     """
     bones, planes = obstacles.bones, obstacles.planes
     touch = _no_touch(len(obstacles.poses) * len(here) + len(planes.point))
@@ -138,15 +159,24 @@ def find_touch(near, here, reach, obstacles, rounded):
     box = np.empty((2, 3))
     scratch = no_scratch()
     local = scratch.local
-    farthest = _farthest(here, near.free, reach, box)
+    asked, farthest = near.free & (reach > -np.inf), reach.max() if len(reach) > 0 else -np.inf
+    box_loop(here, asked, box)
+    for i in range(len(here)):
+        if reach[i] > -np.inf:
+            near.spare[i] = np.inf
     count, room = 0, True
     for b in range(len(obstacles.poses)):
         pose, bounds = obstacles.poses[b], bones.boxes[b]
         anchor, bound = near.rounded.anchor[b], near.rounded.bound[b]
-        if boxes_apart(box, pose, bounds) > farthest:
-            continue
+        apart = boxes_apart(box, pose, bounds)
         for i in range(len(here)):
-            if not near.free[i] or not may_reach(here, i, pose, bounds, anchor, bound, reach[i]):
+            if not asked[i]:
+                continue
+            least = apart
+            if apart <= farthest:
+                least = least_distance(here, i, pose, bounds, anchor, bound)
+            if least >= reach[i]:
+                near.spare[i] = min(near.spare[i], travelled + least)
                 continue
             for k in range(3):
                 local[k] = 0.0
@@ -164,22 +194,27 @@ def find_touch(near, here, reach, obstacles, rounded):
                     normal[k] = 0.0
                     for a in range(3):
                         normal[k] += pose[k, a] * scratch.gradient[a]
+            there = trusted(distance) + near.allowed[b, i]
+            near.spare[i] = min(near.spare[i], travelled + there)
             if distance + near.allowed[b, i] < reach[i]:
                 _add_touch(touch, count, i, distance + near.allowed[b, i], normal, b)
                 count += 1
-    count = _add_planes(touch, count, near, here, _greatest(reach), obstacles, np.inf)
+    first = count
+    count = _add_planes(touch, count, near, here, reach, obstacles, np.inf)
+    for c in range(first, count):
+        i = touch.point[c]
+        near.spare[i] = min(near.spare[i], travelled + touch.gap[c])
     return _first(touch, count), room
 
 
 @inner(error_model="numpy")
 def find_exact_touch(near, here, reach, obstacles, softest):
-    """The same with bones as they are, and without planes softer than ``softest``; ``reach`` is a
-    number.
-    """
+    """The same with bones as they are, and without planes softer than ``softest``."""
     bones, planes = obstacles.bones, obstacles.planes
     touch = _no_touch(len(obstacles.poses) * len(here) + len(planes.point))
-    limits, box = np.full(len(here), reach), np.empty((2, 3))
-    farthest = _farthest(here, near.free, limits, box)
+    box, farthest = np.empty((2, 3)), reach.max() if len(reach) > 0 else -np.inf
+    free = near.free & (reach > -np.inf)
+    box_loop(here, free, box)
     some, count = np.empty(len(here), np.int64), 0
     for b in range(len(obstacles.poses)):
         pose, bounds = obstacles.poses[b], bones.boxes[b]
@@ -188,41 +223,22 @@ def find_exact_touch(near, here, reach, obstacles, softest):
             continue
         asked = 0
         for i in range(len(here)):
-            if near.free[i] and may_reach(here, i, pose, bounds, anchor, bound, reach):
+            if free[i] and may_reach(here, i, pose, bounds, anchor, bound, reach[i]):
                 some[asked] = i
                 asked += 1
-        at = np.empty((asked, 3))
-        distance = np.empty(asked)
-        normal = np.empty((asked, 3))
+        at, distance, normal = np.empty((asked, 3)), np.empty(asked), np.empty((asked, 3))
+        limits = np.empty(asked)
         for k in range(asked):
             at[k] = here[some[k]]
-        query_bone(bones, b, pose, at, limits[:asked], distance, normal)
+            limits[k] = reach[some[k]]
+        query_bone(bones, b, pose, at, limits, distance, normal)
         for k in range(asked):
             i = some[k]
             note_query(here, i, pose, distance[k], anchor, bound)
-            if distance[k] + near.allowed[b, i] < reach:
+            if distance[k] + near.allowed[b, i] < reach[i]:
                 _add_touch(touch, count, i, distance[k] + near.allowed[b, i], normal[k], b)
                 count += 1
     return _first(touch, _add_planes(touch, count, near, here, reach, obstacles, softest))
-
-
-@inner(error_model="numpy")
-def _farthest(here, free, reach, box):
-    """Greatest reach of the free points, and the box about these."""
-    box_loop(here, free, box)
-    farthest = -np.inf
-    for i in range(len(here)):
-        if free[i]:
-            farthest = max(farthest, reach[i])
-    return farthest
-
-
-@inner(error_model="numpy")
-def _greatest(reach):
-    greatest = 0.0
-    for i in range(len(reach)):
-        greatest = max(greatest, reach[i])
-    return greatest
 
 
 @inner(error_model="numpy")
@@ -269,8 +285,10 @@ def _add_planes(touch, count, near, here, reach, obstacles, softest):
         i = np.searchsorted(near.which, planes.point[p])
         if i == len(near.which) or near.which[i] != planes.point[p]:
             continue
+        if reach[i] == -np.inf:
+            continue
         gap = plane_gap(planes, p, here[i])
-        if gap < reach:
+        if gap < reach[i]:
             _add_touch(touch, count, i, gap, planes.normal[p], bones + planes.kind[p])
             count += 1
     return count

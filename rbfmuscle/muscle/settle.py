@@ -143,16 +143,13 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     answers, push = no_answers(near, metric), np.zeros_like(y)
     memory = no_memory(MEMORY, y.size + len(pressure), y.size)
     limit, most = _limits(given, state)
-    least = np.inf
-    status = DONE
-    done = 0
-    caps = 0
-    residual = 0.0
+    least, status, done, caps, residual = np.inf, DONE, 0, 0, 0.0
+    travelled, before = 0.0, y.copy()
     lifted_nodes = y
     if room:
         lifted_nodes = y + _push_out(given, near, metric, answers, y, np.inf)
     while not room:
-        step = _iterate(given, y, pressure, push, local, metric, near, answers)
+        step = _iterate(given, y, pressure, push, local, metric, near, answers, travelled)
         moved = step.moved
         done += 1
         push[:] = step.push
@@ -168,7 +165,9 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
             caps = int(not moved < limit) + int(step.capped)
             residual = step.residual / model.size
             break
+        before[:] = y
         _accelerate(y, pressure, step, memory)
+        travelled += farthest_between(y, before)
         joined = local_step(model, y, given.activation, pull, local)[0]
         if joined > 0:
             metric, sound = _new_metric(given, local, joined)
@@ -237,9 +236,9 @@ def _inverse_with(matrix, cells, stiffened):
 def _choose_near(given, forces, y):
     """The contact points near an obstacle, with the forces on them until now."""
     model, obstacles = given.model, given.obstacles
-    found = find_near(carry(model.embedding, y), obstacles, NEAR * model.size)
+    found, gap = find_near(carry(model.embedding, y), obstacles, NEAR * model.size)
     most, edges = given.stiffness.most, given.rounded.edges
-    return take_near(found, model, most, obstacles, edges, forces, y)
+    return take_near(found, gap, model, most, obstacles, edges, forces, y)
 
 
 @inner(error_model="numpy", inline="always")
@@ -260,50 +259,51 @@ def _note_forces(near, forces):
 
 
 @inner(error_model="numpy", inline="always")
-def _iterate(given, y, pressure, push, local, metric, near, answers):
-    """One global step with volumes and contacts; ``push`` is that of the step before."""
-    model = given.model
-    size = given.model.size
-    part = calm_share(pressure)
+def _iterate(given, y, pressure, push, local, metric, near, answers, travelled):
+    """One global step with volumes and contacts.
+
+    ``push`` is that of the step before, ``travelled`` how far nodes have gone at most.
+    """
+    model, size, part = given.model, given.model.size, calm_share(pressure)
     force = local.right + given.springs
     new, change = global_step(model.cells, y, pressure, force, local, metric, part)
     # Contacts that push now push in the next iteration too: where the points will then go decides
     # what they meet.
-    here, motion, reach = _ways(near, y, new, push, MARGIN * size)
-    touch, room = find_touch(near, here, reach, given.obstacles, given.rounded)
+    here, motion, reach = _ways(near, y, new, push, MARGIN * size, travelled)
+    touch, room = find_touch(near, here, reach, travelled, given.obstacles, given.rounded)
     law = _law(given, touch, near, YIELDING / part, part)
     found = contact_push(touch, motion, near, metric, answers, law, near.forces, TOLERANCE * size)
     pressures = corrected_pressures(pressure, change, found.taken, metric.factor, part)
-    largest = 0.0
-    for n in range(len(y)):
-        square = 0.0
-        for a in range(3):
-            new[n, a] += found.nodes[n, a]
-            square += (new[n, a] - y[n, a]) ** 2
-        # Written so that NaN is not lost.
-        if not square <= largest:
-            largest = square
-    moved = np.sqrt(largest)
+    new += found.nodes
+    moved = farthest_between(new, y)
     return Step(new, pressures, found.nodes, moved, moved / part, found.capped, room)
 
 
 @inner(error_model="numpy", inline="always")
-def _ways(near, y, new, push, margin):
+def _ways(near, y, new, push, margin, travelled):
     """Where near points are (m, 3), their motion in a step of the nodes, and how far to look for
     obstacles: half as far again as they go in the step with the last push on top, and a margin.
+
+    -∞ for points that nothing can be so near to.
     """
-    nodes, count = len(y), len(near.which)
+    nodes, count, farthest = len(y), len(near.which), 0.0
     displacements = np.empty((nodes, 9))
     for n in range(nodes):
+        square = 0.0
         for a in range(3):
             displacements[n, a] = y[n, a]
             displacements[n, 3 + a] = new[n, a] - y[n, a]
             displacements[n, 6 + a] = push[n, a]
-    here = np.empty((count, 3))
-    motion = np.empty((count, 3))
-    reach = np.empty(count)
+            square += (displacements[n, 3 + a] + push[n, a]) ** 2
+        if not square <= farthest:
+            farthest = square
+    farthest = 1.5 * np.sqrt(farthest) + margin
+    here, motion, reach = np.empty((count, 3)), np.empty((count, 3)), np.full(count, -np.inf)
     total = np.empty(9)
     for s in range(count):
+        # Shape functions are not negative and add up to one: no point goes farther than the nodes.
+        if near.spare[s] - travelled > farthest:
+            continue
         total[:] = 0.0
         for k in range(near.columns.shape[1]):
             way, share = displacements[near.columns[s, k]], near.shares[s, k]
@@ -357,14 +357,34 @@ def _accelerate(y, pressure, step, memory):
 
 
 @inner(error_model="numpy")
-def _carry_near(near, y):
-    """Where near points are, (m, 3)."""
-    out = np.zeros((len(near.which), 3))
+def _carry_near(near, y, margin):
+    """Where near points are, (m, 3), and how far to look for obstacles: -∞ for points that nothing
+    can be so near to.
+    """
+    out, reach = np.zeros((len(near.which), 3)), np.full(len(near.which), -np.inf)
+    farthest = farthest_between(y, near.y) + margin
     for s in range(len(out)):
+        if near.gap[s] > farthest:
+            continue
+        reach[s] = margin
         for k in range(near.columns.shape[1]):
             for a in range(3):
                 out[s, a] += near.shares[s, k] * y[near.columns[s, k], a]
-    return out
+    return out, reach
+
+
+@inner(error_model="numpy")
+def farthest_between(first, second):
+    """Greatest distance between corresponding rows (N, 3)."""
+    largest = 0.0
+    for n in range(len(first)):
+        square = 0.0
+        for a in range(3):
+            square += (first[n, a] - second[n, a]) ** 2
+        # Written so that NaN is not lost.
+        if not square <= largest:
+            largest = square
+    return np.sqrt(largest)
 
 
 @inner(error_model="numpy")
@@ -375,7 +395,8 @@ def _push_out(given, near, metric, answers, y, softest):
     little. Zero where nothing is left in one of them.
     """
     size, push = given.model.size, np.zeros_like(y)
-    touch = find_exact_touch(near, _carry_near(near, y), MARGIN * size, given.obstacles, softest)
+    here, reach = _carry_near(near, y, MARGIN * size)
+    touch = find_exact_touch(near, here, reach, given.obstacles, softest)
     hard = softest <= 1.0
     if hard and (len(touch.gap) == 0 or touch.gap.min() > -TOLERANCE * size):
         return push

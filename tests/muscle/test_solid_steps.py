@@ -56,6 +56,8 @@ class System:
             known,
             known,
             np.zeros((CENTRES, 3)),
+            np.zeros(POINTS),
+            np.zeros(POINTS),
         )
 
     def gaps(self, motion):
