@@ -51,7 +51,7 @@ def find_metric(cells, gradient, inverse):
                     value += gradient[s, a] * response[r, a, cells.node[s]]
             factor[r, o] = value
         factor[r, r] += 1e-9 * factor[r, r] + cells.volumes[r] / BULK
-    sound = _factor_small(factor)
+    sound = factor_small(factor)
     for r in range(count):
         for a in range(3):
             for o in range(r):
@@ -63,7 +63,7 @@ def find_metric(cells, gradient, inverse):
 
 
 @inner(error_model="numpy")
-def _factor_small(matrix):
+def factor_small(matrix):
     """Turn the lower triangle of a small matrix into its Cholesky factor; returns whether it is
     positive definite.
     """

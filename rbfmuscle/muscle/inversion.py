@@ -9,6 +9,7 @@ only the points that need it.
 import numpy as np
 
 from rbfmuscle.jit import compiled, inner
+from rbfmuscle.muscle.global_step import factor_small
 
 LEAST = 0.5  # det F that a point keeps
 STIFFNESS = 100.0  # over 2 μ
@@ -93,3 +94,36 @@ def unfold_loop(f, stiffened, weights, columns, slopes, out):
                     + goal[a, 2] * slopes[i, k, 2]
                 )
     return joined, energy
+
+
+@compiled(error_model="numpy")
+def stiffened_inverse(inverse, cells, points):
+    """Inverse (N, N) of the matrix with `STIFFNESS` w |F|² of squeezed points added.
+
+    With B the rows sqrt(STIFFNESS w) ∇N of these points the sum is A + BᵀB, and by Woodbury's
+    identity its inverse is A⁻¹ - (L⁻¹ B A⁻¹)ᵀ (L⁻¹ B A⁻¹), where L Lᵀ = I + B A⁻¹ Bᵀ.
+    """
+    rows, nodes = 3 * len(points), len(inverse)
+    answer, small = np.zeros((rows, nodes)), np.eye(rows)
+    for i in range(rows):
+        q, a = points[i // 3], i % 3
+        root = np.sqrt(STIFFNESS * cells.weights[q])
+        for k in range(cells.columns.shape[1]):
+            j, share = cells.columns[q, k], root * cells.slopes[q, k, a]
+            for n in range(nodes):
+                answer[i, n] += share * inverse[j, n]
+    for i in range(rows):
+        q, a = points[i // 3], i % 3
+        root = np.sqrt(STIFFNESS * cells.weights[q])
+        for k in range(cells.columns.shape[1]):
+            j, share = cells.columns[q, k], root * cells.slopes[q, k, a]
+            for o in range(rows):
+                small[o, i] += share * answer[o, j]
+    factor_small(small)
+    for i in range(rows):
+        for o in range(i):
+            for n in range(nodes):
+                answer[i, n] -= small[i, o] * answer[o, n]
+        for n in range(nodes):
+            answer[i, n] /= small[i, i]
+    return inverse - np.dot(answer.T.copy(), answer)

@@ -57,8 +57,8 @@ def local_step(model, y, activation, tension, local):
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def gradient_rows(y, columns, slopes):
-    """Rows of the deformation gradient Σ_k y_k ∇N_k at one point."""
+def gradient_rows(y, columns, slopes, i):
+    """Rows of the deformation gradient Σ_k y_k ∇N_k at point i."""
     xx = 0.0
     xy = 0.0
     xz = 0.0
@@ -68,11 +68,11 @@ def gradient_rows(y, columns, slopes):
     zx = 0.0
     zy = 0.0
     zz = 0.0
-    for k in range(len(columns)):
-        j = columns[k]
-        u = slopes[k, 0]
-        v = slopes[k, 1]
-        w = slopes[k, 2]
+    for k in range(columns.shape[1]):
+        j = columns[i, k]
+        u = slopes[i, k, 0]
+        v = slopes[i, k, 1]
+        w = slopes[i, k, 2]
         x = y[j, 0]
         xx = xx + x * u
         xy = xy + x * v
@@ -97,39 +97,40 @@ def target_loop(y, cells, fibres, tension, local):
     """
     columns, slopes = cells.columns, cells.slopes
     fibre, least = fibres.direction, fibres.lower
-    q = local.rotations
-    t = local.stretches
-    f = local.f
-    target = local.target
-    fd = np.empty((3, 3))
+    q, t, f, target = local.rotations, local.stretches, local.f, local.target
+    fd, rotation = np.empty((3, 3)), np.empty(4)
     for i in range(len(columns)):
-        first, second, third = gradient_rows(y, columns[i], slopes[i])
+        first, second, third = gradient_rows(y, columns, slopes, i)
+        e0, e1, e2 = fibre[i, 0], fibre[i, 1], fibre[i, 2]
+        u = 1.0 / np.sqrt(t[i])
         for b in range(3):
             f[i, 0, b] = first[b]
             f[i, 1, b] = second[b]
             f[i, 2, b] = third[b]
-        e = fibre[i]
-        u = 1.0 / np.sqrt(t[i])
         for a in range(3):
-            along = f[i, a, 0] * e[0] + f[i, a, 1] * e[1] + f[i, a, 2] * e[2]
-            for b in range(3):
-                fd[a, b] = u * f[i, a, b] + (t[i] - u) * along * e[b]
-        rotation_loop(fd, q[i])
-        r = target[i]
-        first, second, third = quaternion_matrix(q[i])
+            along = (t[i] - u) * (f[i, a, 0] * e0 + f[i, a, 1] * e1 + f[i, a, 2] * e2)
+            fd[a, 0] = u * f[i, a, 0] + along * e0
+            fd[a, 1] = u * f[i, a, 1] + along * e1
+            fd[a, 2] = u * f[i, a, 2] + along * e2
+        for k in range(4):
+            rotation[k] = q[i, k]
+        rotation_loop(fd, rotation)
+        for k in range(4):
+            q[i, k] = rotation[k]
+        first, second, third = quaternion_matrix(rotation)
         for b in range(3):
-            r[0, b] = first[b]
-            r[1, b] = second[b]
-            r[2, b] = third[b]
+            target[i, 0, b] = first[b]
+            target[i, 1, b] = second[b]
+            target[i, 2, b] = third[b]
         if least[i] < 1.0:
             # S = RᵀF: s is its part along the fibre, m the sum of those across.
             s, m = 0.0, 0.0
             for a in range(3):
-                fa = f[i, a, 0] * e[0] + f[i, a, 1] * e[1] + f[i, a, 2] * e[2]
-                ra = r[a, 0] * e[0] + r[a, 1] * e[1] + r[a, 2] * e[2]
+                fa = f[i, a, 0] * e0 + f[i, a, 1] * e1 + f[i, a, 2] * e2
+                ra = target[i, a, 0] * e0 + target[i, a, 1] * e1 + target[i, a, 2] * e2
                 s += ra * fa
                 for b in range(3):
-                    m += r[a, b] * f[i, a, b]
+                    m += target[i, a, b] * f[i, a, b]
             m -= s
             v = t[i]
             for _ in range(4):
@@ -140,9 +141,11 @@ def target_loop(y, cells, fibres, tension, local):
             t[i] = v
             u = 1.0 / np.sqrt(v)
             for a in range(3):
-                ra = r[a, 0] * e[0] + r[a, 1] * e[1] + r[a, 2] * e[2]
-                for b in range(3):
-                    r[a, b] = u * r[a, b] + (v - u) * ra * e[b]
+                ra = target[i, a, 0] * e0 + target[i, a, 1] * e1 + target[i, a, 2] * e2
+                ra *= v - u
+                target[i, a, 0] = u * target[i, a, 0] + ra * e0
+                target[i, a, 1] = u * target[i, a, 1] + ra * e1
+                target[i, a, 2] = u * target[i, a, 2] + ra * e2
 
 
 @compiled(error_model="numpy")

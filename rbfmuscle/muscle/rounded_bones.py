@@ -14,7 +14,7 @@ import numpy as np
 
 from rbfmuscle.bones.obstacles import query_bone
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
+from rbfmuscle.geometry.bsplines import bspline_sum
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.jit import compiled, inner
@@ -156,15 +156,13 @@ class Scratch(NamedTuple):
 
     local: np.ndarray  # (3,) the point in bone coordinates
     gradient: np.ndarray  # (3,) of the distance there
-    place: np.ndarray  # (3,) in cells of the lattice
-    weight: np.ndarray  # (3, 4)
-    lean: np.ndarray  # (3, 4)
+    place: np.ndarray  # (3,) in a cell of the lattice
 
 
 @compiled(error_model="numpy")
 def no_scratch():
     """Room for questions."""
-    return Scratch(np.empty(3), np.empty(3), np.empty(3), np.empty((3, 4)), np.empty((3, 4)))
+    return Scratch(np.empty(3), np.empty(3), np.empty(3))
 
 
 @compiled(error_model="numpy")
@@ -173,7 +171,7 @@ def rounded_distance(rounded, bones, b, scratch):
 
     Infinite where there is no room for the block; NaN where the spline is flat.
     """
-    local, gradient, place, weight, lean = scratch
+    local, gradient, place = scratch.local, scratch.gradient, scratch.place
     edge, axes = rounded.edges[b], rounded.axes
     key, start = np.int64(0), np.int64(0)
     for a in range(3):
@@ -191,9 +189,7 @@ def rounded_distance(rounded, bones, b, scratch):
         if rounded.filled[0] >= FULLEST * len(rounded.keys):
             return np.inf
         _fill_block(rounded, bones, b, key, slot)
-    for a in range(3):
-        bspline_weights(place[a], weight[a], lean[a])
-    value, x, y, z = bspline_sum(rounded.nodes[slot], start, WIDE, weight, lean)
+    value, x, y, z = bspline_sum(rounded.nodes, slot, start, WIDE, place[0], place[1], place[2])
     steep = np.sqrt(x * x + y * y + z * z)
     if not steep > LEAST_SLOPE:
         return np.nan

@@ -26,7 +26,7 @@ from rbfmuscle.muscle.global_step import (
     find_metric,
     global_step,
 )
-from rbfmuscle.muscle.inversion import STIFFNESS
+from rbfmuscle.muscle.inversion import stiffened_inverse
 from rbfmuscle.muscle.local_step import gradient_rows, local_step, start_local
 from rbfmuscle.muscle.model import SolidModel, Stiffness, carry
 from rbfmuscle.muscle.near_points import find_exact_touch, find_near, find_touch, take_near
@@ -209,27 +209,8 @@ def _new_metric(given, local, joined):
     """The metric of corrections, with the stiffness of squeezed points; whether there is one."""
     model, inverse = given.model, given.stiffness.inverse
     if joined > 0:
-        inverse = _inverse_with(given.stiffness.matrix, model.cells, local.stiffened)
+        inverse = stiffened_inverse(inverse, model.cells, np.flatnonzero(local.stiffened))
     return find_metric(model.cells, local.gradient, inverse)
-
-
-@inner(error_model="numpy")
-def _inverse_with(matrix, cells, stiffened):
-    """Inverse of the matrix with `STIFFNESS` w |F|² of the squeezed points."""
-    total = matrix.copy()
-    for q in np.flatnonzero(stiffened):
-        columns = cells.columns[q]
-        slopes = cells.slopes[q]
-        weight = STIFFNESS * cells.weights[q]
-        for k in range(len(columns)):
-            for m in range(len(columns)):
-                total[columns[k], columns[m]] += weight * (
-                    slopes[k, 0] * slopes[m, 0]
-                    + slopes[k, 1] * slopes[m, 1]
-                    + slopes[k, 2] * slopes[m, 2]
-                )
-    inverse = np.linalg.inv(total)
-    return 0.5 * (inverse + inverse.T)
 
 
 @inner(error_model="numpy")
@@ -424,7 +405,7 @@ def _volume_error(cells, y):
     """Greatest relative error of a region's volume for nodes y (N, 3)."""
     volumes = np.zeros(len(cells.volumes))
     for i in range(len(cells.weights)):
-        r0, r1, r2 = gradient_rows(y, cells.columns[i], cells.slopes[i])
+        r0, r1, r2 = gradient_rows(y, cells.columns, cells.slopes, i)
         volumes[cells.region[i]] += cells.weights[i] * (
             r0[0] * (r1[1] * r2[2] - r1[2] * r2[1])
             - r0[1] * (r1[0] * r2[2] - r1[2] * r2[0])
