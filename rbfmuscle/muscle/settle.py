@@ -34,7 +34,7 @@ from rbfmuscle.muscle.rounded_bones import RoundedBones
 from rbfmuscle.muscle.state import SolidState, place_points, tension
 
 # All lengths are relative to the muscle's size.
-SETTLED = 2e-5  # an iteration that moves no node farther was the last one
+SETTLED = 1e-5  # an iteration that moves no node farther was the last one
 SETTLED_BESIDE = 1e-4  # the same beside neighbours, whose planes are not known better
 # The same where the bones stand still and only the activation changes, and how many times the
 # iterations it may take.
