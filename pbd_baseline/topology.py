@@ -15,7 +15,9 @@ from rbfmuscle.jit import compiled
 from rbfmuscle.validation import MeshError, check_mesh
 
 # Offsets in a flat array of coordinates, as unsigned as the vertices of `members_in_order`.
-ONE, TWO, THREE = np.uint32(1), np.uint32(2), np.uint32(3)
+ONE = np.uint32(1)
+TWO = np.uint32(2)
+THREE = np.uint32(3)
 
 
 @dataclass(frozen=True)

@@ -167,7 +167,9 @@ def find_contacts(obstacles, points, reach):
     Numbers (c,) of the points, of the bones in reach, gaps (c,) [scene unit] and unit normals (c,
     3).
     """
-    bones, free, known = obstacles.bones, obstacles.free, obstacles.known
+    bones = obstacles.bones
+    free = obstacles.free
+    known = obstacles.known
     box, farthest = np.empty((2, 3)), -np.inf
     box_loop(points, free, box)
     for i in range(len(points)):

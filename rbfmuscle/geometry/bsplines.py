@@ -32,7 +32,10 @@ def bspline_sum(blocks, block, start, width, x, y, z):
     weight_x, slope_x = bspline_weights(x)
     weight_y, slope_y = bspline_weights(y)
     (w0, w1, w2, w3), (s0, s1, s2, s3) = bspline_weights(z)
-    value, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
+    value = 0.0
+    gx = 0.0
+    gy = 0.0
+    gz = 0.0
     for a in range(4):
         line = 0.0
         lean = 0.0

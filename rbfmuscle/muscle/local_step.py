@@ -97,11 +97,16 @@ def target_loop(y, cells, fibres, tension, local):
     """
     columns, slopes = cells.columns, cells.slopes
     fibre, least = fibres.direction, fibres.lower
-    q, t, f, target = local.rotations, local.stretches, local.f, local.target
+    q = local.rotations
+    t = local.stretches
+    f = local.f
+    target = local.target
     fd, rotation = np.empty((3, 3)), np.empty(4)
     for i in range(len(columns)):
         first, second, third = gradient_rows(y, columns, slopes, i)
-        e0, e1, e2 = fibre[i, 0], fibre[i, 1], fibre[i, 2]
+        e0 = fibre[i, 0]
+        e1 = fibre[i, 1]
+        e2 = fibre[i, 2]
         u = 1.0 / np.sqrt(t[i])
         for b in range(3):
             f[i, 0, b] = first[b]

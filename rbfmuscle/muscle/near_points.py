@@ -49,7 +49,9 @@ def find_near(points, obstacles, reach):
     """Mask (n,) of the contact points nearer than ``reach`` to an obstacle, and lower bounds (n,)
     of the gaps, at most ``reach``.
     """
-    bones, free, known = obstacles.bones, obstacles.free, obstacles.known
+    bones = obstacles.bones
+    free = obstacles.free
+    known = obstacles.known
     found, box = np.zeros(len(points), np.bool_), np.empty((2, 3))
     gap = np.full(len(points), reach)
     box_loop(points, free, box)
@@ -146,6 +148,80 @@ def take_near(found, gap, model, most, obstacles, edges, forces, y):
     return near
 
 
+@inner(error_model="numpy", inline="always")
+def near_ways(near, y, new, push, margin, travelled):
+    """Where near points are (m, 3), their motion in a step of the nodes, and how far to look for
+    obstacles: half as far again as they go in the step with the last push on top, and a margin.
+
+    -∞ for points that nothing can be so near to.
+    """
+    nodes = len(y)
+    count = len(near.which)
+    farthest = 0.0
+    displacements = np.empty((nodes, 9))
+    for n in range(nodes):
+        square = 0.0
+        for a in range(3):
+            displacements[n, a] = y[n, a]
+            displacements[n, 3 + a] = new[n, a] - y[n, a]
+            displacements[n, 6 + a] = push[n, a]
+            square += (displacements[n, 3 + a] + push[n, a]) ** 2
+        if not square <= farthest:
+            farthest = square
+    farthest = 1.5 * np.sqrt(farthest) + margin
+    here = np.empty((count, 3))
+    motion = np.empty((count, 3))
+    reach = np.full(count, -np.inf)
+    total = np.empty(9)
+    for s in range(count):
+        # Shape functions are not negative and add up to one: no point goes farther than the nodes.
+        if near.spare[s] - travelled > farthest:
+            continue
+        total[:] = 0.0
+        for k in range(near.columns.shape[1]):
+            way, share = displacements[near.columns[s, k]], near.shares[s, k]
+            for a in range(9):
+                total[a] += share * way[a]
+        square = 0.0
+        for a in range(3):
+            here[s, a] = total[a]
+            motion[s, a] = total[3 + a]
+            square += (total[3 + a] + total[6 + a]) ** 2
+        reach[s] = 1.5 * np.sqrt(square) + margin
+    return here, motion, reach
+
+
+@inner(error_model="numpy")
+def carry_near(near, y, margin):
+    """Where near points are, (m, 3), and how far to look for obstacles: -∞ for points that nothing
+    can be so near to.
+    """
+    out, reach = np.zeros((len(near.which), 3)), np.full(len(near.which), -np.inf)
+    farthest = farthest_between(y, near.y) + margin
+    for s in range(len(out)):
+        if near.gap[s] > farthest:
+            continue
+        reach[s] = margin
+        for k in range(near.columns.shape[1]):
+            for a in range(3):
+                out[s, a] += near.shares[s, k] * y[near.columns[s, k], a]
+    return out, reach
+
+
+@inner(error_model="numpy")
+def farthest_between(first, second):
+    """Greatest distance between corresponding rows (N, 3)."""
+    largest = 0.0
+    for n in range(len(first)):
+        square = 0.0
+        for a in range(3):
+            square += (first[n, a] - second[n, a]) ** 2
+        # Written so that NaN is not lost.
+        if not square <= largest:
+            largest = square
+    return np.sqrt(largest)
+
+
 @inner(error_model="numpy")
 def find_touch(near, here, reach, travelled, obstacles, rounded):
     """Half-spaces that near points ``here`` (m, 3) meet within ``reach`` (m,), bones rounded.
@@ -226,7 +302,9 @@ def find_exact_touch(near, here, reach, obstacles, softest):
             if free[i] and may_reach(here, i, pose, bounds, anchor, bound, reach[i]):
                 some[asked] = i
                 asked += 1
-        at, distance, normal = np.empty((asked, 3)), np.empty(asked), np.empty((asked, 3))
+        at = np.empty((asked, 3))
+        distance = np.empty(asked)
+        normal = np.empty((asked, 3))
         limits = np.empty(asked)
         for k in range(asked):
             at[k] = here[some[k]]

@@ -171,7 +171,9 @@ def rounded_distance(rounded, bones, b, scratch):
 
     Infinite where there is no room for the block; NaN where the spline is flat.
     """
-    local, gradient, place = scratch.local, scratch.gradient, scratch.place
+    local = scratch.local
+    gradient = scratch.gradient
+    place = scratch.place
     edge, axes = rounded.edges[b], rounded.axes
     key, start = np.int64(0), np.int64(0)
     for a in range(3):

@@ -29,7 +29,15 @@ from rbfmuscle.muscle.global_step import (
 from rbfmuscle.muscle.inversion import stiffened_inverse
 from rbfmuscle.muscle.local_step import gradient_rows, local_step, start_local
 from rbfmuscle.muscle.model import SolidModel, Stiffness, carry
-from rbfmuscle.muscle.near_points import find_exact_touch, find_near, find_touch, take_near
+from rbfmuscle.muscle.near_points import (
+    carry_near,
+    farthest_between,
+    find_exact_touch,
+    find_near,
+    find_touch,
+    near_ways,
+    take_near,
+)
 from rbfmuscle.muscle.rounded_bones import RoundedBones
 from rbfmuscle.muscle.state import SolidState, place_points, tension
 
@@ -143,7 +151,11 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     answers, push = no_answers(near, metric), np.zeros_like(y)
     memory = no_memory(MEMORY, y.size + len(pressure), y.size)
     limit, most = _limits(given, state)
-    least, status, done, caps, residual = np.inf, DONE, 0, 0, 0.0
+    least = np.inf
+    status = DONE
+    done = 0
+    caps = 0
+    residual = 0.0
     travelled, before = 0.0, y.copy()
     lifted_nodes = y
     if room:
@@ -245,12 +257,14 @@ def _iterate(given, y, pressure, push, local, metric, near, answers, travelled):
 
     ``push`` is that of the step before, ``travelled`` how far nodes have gone at most.
     """
-    model, size, part = given.model, given.model.size, calm_share(pressure)
+    model = given.model
+    size = given.model.size
+    part = calm_share(pressure)
     force = local.right + given.springs
     new, change = global_step(model.cells, y, pressure, force, local, metric, part)
     # Contacts that push now push in the next iteration too: where the points will then go decides
     # what they meet.
-    here, motion, reach = _ways(near, y, new, push, MARGIN * size, travelled)
+    here, motion, reach = near_ways(near, y, new, push, MARGIN * size, travelled)
     touch, room = find_touch(near, here, reach, travelled, given.obstacles, given.rounded)
     law = _law(given, touch, near, YIELDING / part, part)
     found = contact_push(touch, motion, near, metric, answers, law, near.forces, TOLERANCE * size)
@@ -258,45 +272,6 @@ def _iterate(given, y, pressure, push, local, metric, near, answers, travelled):
     new += found.nodes
     moved = farthest_between(new, y)
     return Step(new, pressures, found.nodes, moved, moved / part, found.capped, room)
-
-
-@inner(error_model="numpy", inline="always")
-def _ways(near, y, new, push, margin, travelled):
-    """Where near points are (m, 3), their motion in a step of the nodes, and how far to look for
-    obstacles: half as far again as they go in the step with the last push on top, and a margin.
-
-    -∞ for points that nothing can be so near to.
-    """
-    nodes, count, farthest = len(y), len(near.which), 0.0
-    displacements = np.empty((nodes, 9))
-    for n in range(nodes):
-        square = 0.0
-        for a in range(3):
-            displacements[n, a] = y[n, a]
-            displacements[n, 3 + a] = new[n, a] - y[n, a]
-            displacements[n, 6 + a] = push[n, a]
-            square += (displacements[n, 3 + a] + push[n, a]) ** 2
-        if not square <= farthest:
-            farthest = square
-    farthest = 1.5 * np.sqrt(farthest) + margin
-    here, motion, reach = np.empty((count, 3)), np.empty((count, 3)), np.full(count, -np.inf)
-    total = np.empty(9)
-    for s in range(count):
-        # Shape functions are not negative and add up to one: no point goes farther than the nodes.
-        if near.spare[s] - travelled > farthest:
-            continue
-        total[:] = 0.0
-        for k in range(near.columns.shape[1]):
-            way, share = displacements[near.columns[s, k]], near.shares[s, k]
-            for a in range(9):
-                total[a] += share * way[a]
-        square = 0.0
-        for a in range(3):
-            here[s, a] = total[a]
-            motion[s, a] = total[3 + a]
-            square += (total[3 + a] + total[6 + a]) ** 2
-        reach[s] = 1.5 * np.sqrt(square) + margin
-    return here, motion, reach
 
 
 @inner(error_model="numpy")
@@ -338,37 +313,6 @@ def _accelerate(y, pressure, step, memory):
 
 
 @inner(error_model="numpy")
-def _carry_near(near, y, margin):
-    """Where near points are, (m, 3), and how far to look for obstacles: -∞ for points that nothing
-    can be so near to.
-    """
-    out, reach = np.zeros((len(near.which), 3)), np.full(len(near.which), -np.inf)
-    farthest = farthest_between(y, near.y) + margin
-    for s in range(len(out)):
-        if near.gap[s] > farthest:
-            continue
-        reach[s] = margin
-        for k in range(near.columns.shape[1]):
-            for a in range(3):
-                out[s, a] += near.shares[s, k] * y[near.columns[s, k], a]
-    return out, reach
-
-
-@inner(error_model="numpy")
-def farthest_between(first, second):
-    """Greatest distance between corresponding rows (N, 3)."""
-    largest = 0.0
-    for n in range(len(first)):
-        square = 0.0
-        for a in range(3):
-            square += (first[n, a] - second[n, a]) ** 2
-        # Written so that NaN is not lost.
-        if not square <= largest:
-            largest = square
-    return np.sqrt(largest)
-
-
-@inner(error_model="numpy")
 def _push_out(given, near, metric, answers, y, softest):
     """Motion (N, 3) of nodes y that stand still, out of obstacles that are at most so soft.
 
@@ -376,7 +320,7 @@ def _push_out(given, near, metric, answers, y, softest):
     little. Zero where nothing is left in one of them.
     """
     size, push = given.model.size, np.zeros_like(y)
-    here, reach = _carry_near(near, y, MARGIN * size)
+    here, reach = carry_near(near, y, MARGIN * size)
     touch = find_exact_touch(near, here, reach, given.obstacles, softest)
     hard = softest <= 1.0
     if hard and (len(touch.gap) == 0 or touch.gap.min() > -TOLERANCE * size):

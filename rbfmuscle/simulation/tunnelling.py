@@ -312,7 +312,9 @@ def _bone_move(box, before, after):
     """How far a bone takes a point of a box (2, 3) at most, from one pose to another; it is a
     corner.
     """
-    most, corner, local = 0.0, np.empty(3), np.empty(3)
+    most = 0.0
+    corner = np.empty(3)
+    local = np.empty(3)
     for n in range(8):
         for k in range(3):
             corner[k] = box[n >> k & 1, k]
