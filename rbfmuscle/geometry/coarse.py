@@ -11,15 +11,18 @@ def simplified(vertices: Floats, faces: Integers, count: int) -> tuple[Floats, I
     as it is.
 
     Edges collapse in the order of their quadric error (Garland and Heckbert 1997, "Surface
-    simplification using quadric error metrics"). A mesh that is not manifold is `clustered`.
+    simplification using quadric error metrics"). A mesh that is not manifold, or that cannot
+    collapse so far, as one of many parts, is `clustered`.
     """
     vertices, faces = np.array(vertices, dtype=float), np.array(faces, dtype=np.int64)
     if len(faces) <= count:
         return vertices, faces
     if not igl.is_edge_manifold(faces)[0]:
         return clustered(vertices, faces, count)
-    vertices, faces, _, _ = igl.qslim(vertices, faces, count)
-    return np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
+    fewer, kept, _, _ = igl.qslim(vertices, faces, count)
+    if not len(kept):  # so it says that it cannot
+        return clustered(vertices, faces, count)
+    return np.ascontiguousarray(fewer), np.ascontiguousarray(kept)
 
 
 def clustered(vertices: Floats, faces: Integers, count: int) -> tuple[Floats, Integers]:

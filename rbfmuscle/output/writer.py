@@ -192,7 +192,7 @@ class RunWriter:
 
 def _light_mesh(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
     """A bone of `LIGHT` triangles, from the cache where it is there."""
-    key = content_key(vertices, faces, ("light", LIGHT))
+    key = content_key(vertices, faces, ("light mesh", LIGHT))
     found = load_arrays(key)
     if found is None:
         light = simplified(vertices, faces, LIGHT)

@@ -78,6 +78,12 @@ class TestSaved:
         np.testing.assert_array_equal(simplified(box.vertices, box.faces, 1600)[0], box.vertices)
         doubled = np.vstack([ball.faces, ball.faces[:5, ::-1]])  # edges of four faces
         assert 1000 < len(simplified(ball.vertices, doubled, 1600)[1]) < 2500
+        # No edge of a tetrahedron can collapse: what is of many parts is not lost for that.
+        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+        parts = [corners + [3.0 * k, 0, 0] for k in range(600)]
+        four = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+        many = np.concatenate([four + 4 * k for k in range(600)])
+        assert len(simplified(np.concatenate(parts), many, 1600)[1])
 
     def test_no_run_is_said(self, tmp_path):
         with pytest.raises(UsageError, match="holds no run"):
