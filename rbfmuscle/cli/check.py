@@ -165,15 +165,18 @@ def _scene_lines(scene):
             f"{', '.join(joint.coordinates) or joint.kind}"
         )
     for muscle in scene.muscles:
-        held = ", ".join(
-            f"{len(a.vertices)} {'on' if a.tendon is None else 'by a tendon to'} {a.bone}"
-            for a in muscle.attachments
-        )
+        held = ", ".join(f"{len(a.vertices)} {_held_how(a)} {a.bone}" for a in muscle.attachments)
         volume = muscle.mesh.volume / scene.length(10.0) ** 3
         yield (
             f"  muscle {muscle.name}: model {muscle.model}, {len(muscle.mesh.vertices)} vertices, "
             f"{volume:.4g} cm3, attached: {held}"
         )
+
+
+def _held_how(held):
+    if held.via:
+        return "via"
+    return "on" if held.tendon is None else "by a tendon to"
 
 
 def _plan(scene, timed):

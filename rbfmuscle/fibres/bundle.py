@@ -91,7 +91,7 @@ def build_bundles(scene: Scene, models: Sequence[MuscleModel]) -> dict[str, Fibr
 
     def build(model: MuscleModel) -> FibreBundle | None:
         muscle = scene.muscle(model.name)
-        if len(muscle.attachments) < 2:
+        if len([a for a in muscle.attachments if not a.via]) < 2:
             return None
         try:
             return FibreBundle(muscle, scene, model, count)

@@ -108,6 +108,16 @@ def split_pinched_vertices(vertices: Floats, faces: Integers) -> tuple[Floats, I
     return np.vstack([vertices, vertices[at[first][repeated]]]), number[fan].reshape(-1, 3)
 
 
+def connected_vertices(faces: Integers, vertices: Integers) -> list[Integers]:
+    """Some vertices (k,) of a mesh by the pieces that edges between them join."""
+    edges = unique_edges(faces)
+    edges = edges[np.isin(edges, vertices).all(axis=1)]
+    size = int(faces.max()) + 1
+    joined = coo_matrix((np.ones(len(edges)), edges.T), shape=(size, size))
+    label = connected_components(joined, directed=False)[1][vertices]
+    return [vertices[label == piece] for piece in np.unique(label)]
+
+
 def label_sheets(faces: Integers, count: int) -> tuple[int, Integers]:
     """Number of connected sheets of a triangle mesh, and the sheet (count,) of each vertex."""
     ends = np.concatenate([faces[:, :2], faces[:, 1:]])

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import vertex_areas
+from rbfmuscle.geometry.surfaces import connected_vertices, vertex_areas
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.jit import compiled
 from rbfmuscle.metrics.depths import BoneDistance, bones_about
@@ -79,23 +79,16 @@ class Centreline:
         along = distance_along(fine @ vertices)
         even = np.interp(np.linspace(0.0, along[-1], slices), along, levels)
         self.operator = slice_operator(vertices, faces, field, even)
-        self.clearance = self._half_thickness(vertices, faces)
+        first, last = (_rest_middle(end) for end in self.ends)
+        line = np.vstack([first, self.operator @ vertices, last])
+        self.clearance = _half_thickness(line, vertices, faces)
+        #: What the shortest path goes through: patches as those of an end, by its node.
+        self.via = _passed(muscle, areas, resampled(line, NODES - 1))
         #: Shortest paths that did not come to rest, since they were last asked for.
         self.unsettled = 0
         self._pulled: Floats | None = (
             None  # from the points along the line to the last shortest path
         )
-
-    def _half_thickness(self, vertices: Floats, faces: Integers) -> Floats:
-        """Distance (`NODES`,) from the line at rest to the surface, at even distances along it; 0
-        at both attachments.
-        """
-        line = np.vstack([_rest_middle(self.ends[0]), self.operator @ vertices])
-        line = np.vstack([line, _rest_middle(self.ends[1])])
-        distance = MeshDistance(vertices, faces).unsigned(line)
-        distance[[0, -1]] = 0.0
-        along = distance_along(line)
-        return np.interp(np.linspace(0.0, along[-1], NODES), along, distance)
 
     def points(self, vertices: Floats, poses: Mapping[str, Floats]) -> Floats:
         """The line now, (k, 3), from the carried mesh (n, 3) and the poses (4, 4) of the bones."""
@@ -113,9 +106,8 @@ class Centreline:
         the last frame.
         """
         line = self.points(vertices, poses)
-        path, settled = shortest_path(
-            line, probes, poses, clearance=self.clearance, offset=self._pulled
-        )
+        via = {node: _carried_middle(patch, poses) for node, patch in self.via.items()}
+        path, settled = shortest_path(line, probes, poses, self.clearance, self._pulled, via)
         self.unsettled += not settled
         self._pulled = path - resampled(line, NODES - 1) if len(path) == NODES else None
         length, shortest = float(distance_along(line)[-1]), float(distance_along(path)[-1])
@@ -144,6 +136,28 @@ class Centreline:
         return total
 
 
+def _half_thickness(line: Floats, vertices: Floats, faces: Integers) -> Floats:
+    """Distance (`NODES`,) from a line at rest (n, 3) to the surface, at even distances along it; 0
+    at both ends.
+    """
+    distance = MeshDistance(vertices, faces).unsigned(line)
+    distance[[0, -1]] = 0.0
+    along = distance_along(line)
+    return np.interp(np.linspace(0.0, along[-1], NODES), along, distance)
+
+
+def _passed(muscle: Muscle, areas: Floats, path: Floats) -> dict[int, End]:
+    """Connected patches via bones, by the node of a path at rest that is nearest to each."""
+    found, rest = {}, np.asarray(muscle.mesh.vertices, dtype=float)
+    faces = np.asarray(muscle.mesh.faces)
+    for held in muscle.attachments:
+        for patch in connected_vertices(faces, held.vertices) if held.via else ():
+            end = [(held.attachment_frame, rest[patch], areas[patch])]
+            away = np.linalg.norm(path[1:-1] - _rest_middle(end), axis=1)
+            found[1 + int(np.argmin(away))] = end
+    return found
+
+
 def resampled(line: Floats, segments: int) -> Floats:
     """Points (segments + 1, 3) at even distances along a line (n, 3)."""
     return points_along(line, np.linspace(0.0, distance_along(line)[-1], segments + 1))
@@ -156,16 +170,17 @@ def split_ends(
 
     The origin is every attachment on the same rigid body as the first one; the rest is the
     insertion. Bones whose joint does not move are one body with its parent. Where all are on one
-    body, the first attachment is the origin.
+    body, the first attachment is the origin. Those via a bone count to neither.
     """
-    bodies = [rigid_body(a.bone, joints, moving) for a in muscle.attachments]
-    origin = [a for a, owner in zip(muscle.attachments, bodies) if owner == bodies[0]]
-    insertion = [a for a, owner in zip(muscle.attachments, bodies) if owner != bodies[0]]
+    held = [a for a in muscle.attachments if not a.via]
+    bodies = [rigid_body(a.bone, joints, moving) for a in held]
+    origin = [a for a, owner in zip(held, bodies) if owner == bodies[0]]
+    insertion = [a for a, owner in zip(held, bodies) if owner != bodies[0]]
     if insertion:
         return [origin, insertion]
     if moving is not None:
         return split_ends(muscle, joints)
-    return [muscle.attachments[:1], muscle.attachments[1:]]
+    return [held[:1], held[1:]]
 
 
 def moving_joints(scene: Scene) -> set[str]:
@@ -304,9 +319,9 @@ def shortest_path(
     line: Floats,
     probes: list[BoneDistance],
     poses: dict[str, Floats],
-    *,
     clearance: Floats,
     offset: Floats | None = None,
+    via: Mapping[int, Floats] | None = None,
 ) -> tuple[Floats, bool]:
     """Nodes (`NODES`, 3) of the shortest path over the bones between the ends of a line, beside
     which it begins.
@@ -314,22 +329,26 @@ def shortest_path(
     ``line`` (n, 3) says which side of the bones the path takes; the bones have poses (4, 4) by
     name. Each node keeps its ``clearance`` (`NODES`,) [scene unit] from them. ``offset`` (`NODES`,
     3) leads from the points at even distances along the line to where the string begins: what it
-    did in the frame before. Two nodes only where no bone is near. Also whether the path came to
-    rest within `ROUNDS`.
+    did in the frame before. Some nodes are held at places (3,), ``via`` by number. Only these and
+    the ends where no bone is near. Also whether the path came to rest within `ROUNDS`.
     """
+    via = dict(sorted((via or {}).items()))
     size = float(distance_along(line)[-1])
     widest = clearance.max()
     near = bones_about(np.vstack([line - widest, line + widest]), probes, poses)
     if not near:
-        return line[[0, -1]], True
+        return np.array([line[0], *via.values(), line[-1]]), True
     string = resampled(line, NODES - 1) + (0.0 if offset is None else offset)
+    held = np.isin(np.arange(len(string)), [0, len(string) - 1, *via])
+    for node, place in via.items():
+        string[node] = place
     earlier = [string]
     gap, normal = _planes(string, near, poses, TOUCHING * size)
     taken = string.copy()
     offsets = np.einsum("ij,ij->i", normal, string) - gap + clearance
     for _ in range(ROUNDS):
         string = string.copy()
-        _tighten_loop(string, normal, offsets, SWEEPS, OVER_RELAXATION)
+        _tighten_loop(string, held, normal, offsets, SWEEPS, OVER_RELAXATION)
         # A node between two planes can go to and fro.
         if min(np.abs(string - other).max() for other in earlier) < STILL * size:
             return string, True
@@ -361,12 +380,14 @@ def _planes(
 
 
 @compiled(error_model="numpy")
-def _tighten_loop(string, normal, offset, sweeps, relaxation):
-    """Move inner nodes to where the squared segments are least with normal · node >= offset, by
-    projected SOR.
+def _tighten_loop(string, held, normal, offset, sweeps, relaxation):
+    """Move nodes that are not held (n,) to where the squared segments are least with normal · node
+    >= offset, by projected SOR.
     """
     for _ in range(sweeps):
         for n in range(1, len(string) - 1):
+            if held[n]:
+                continue
             along = -offset[n]
             for a in range(3):
                 middle = 0.5 * (string[n - 1, a] + string[n + 1, a])

@@ -95,7 +95,7 @@ class MuscleMeasurer:
         self.contracts = muscle.contraction is not None
         moving = moving_joints(scene)
         self.line = None
-        if len(muscle.attachments) > 1:
+        if len([a for a in muscle.attachments if not a.via]) > 1:
             self.line = Centreline(muscle, scene.joints, vertices, faces, moving=moving)
         self.form = SurfaceForm()
         self.carried = vertices
@@ -190,7 +190,7 @@ class MuscleMeasurer:
                 there[inside] = probe.nearest(there[inside])[1]
         rms, worst = surface_distance(surface.vertices, surface.faces, there, mesh[1])
         bones = {probe.name: probe for probe in probes}
-        held = [a for a in self.attachments if a.tendon is None]
+        held = [a for a in self.attachments if a.tendon is None and not a.via]
         gaps = [bones[a.bone].unsigned(mesh[0][a.vertices]).min() for a in held]
         found = {"rest_error_rms": rms, "rest_error_max": worst, "end_gap": max(gaps, default=0.0)}
         found["initial_shift"] = float(np.linalg.norm(there - mesh[0], axis=1).max())

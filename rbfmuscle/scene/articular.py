@@ -73,7 +73,7 @@ def articular_share(
     ``surfaces`` are as of `scene_surfaces`.
     """
     worst = (0.0, "")
-    for held in muscle.attachments:
+    for held in (a for a in muscle.attachments if not a.via):
         surface = surfaces.get(held.bone, np.empty((0, 3)))
         if held.tendon is None and len(surface):
             points = np.asarray(muscle.mesh.vertices)[held.vertices]

@@ -53,6 +53,7 @@ def resolve_attachments(
             np.unique(select_vertices(entry, read, bone, transform, context=context)),
             entry.tendon,
             attachment_frame,
+            entry.via,
         )
         for name in held.bones:
             find_named(bones, name, "bone", context=f"{context}tendon: ")

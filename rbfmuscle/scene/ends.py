@@ -38,15 +38,15 @@ def attachment_ends(
 
     Attachments on one rigid body belong together; where all are on one body, each stands for
     itself. Of several the two farthest apart are the ends, and the others belong to the nearer of
-    these.
+    these. Those via a bone belong to neither.
     """
+    held = [a for a in muscle.attachments if not a.via]
     areas = vertex_areas(np.asarray(muscle.mesh.vertices), np.asarray(muscle.mesh.faces))
-    bodies = [rigid_body(a.bone, joints) or "" for a in muscle.attachments]
+    bodies = [rigid_body(a.bone, joints) or "" for a in held]
     if len(set(bodies)) == 1:
-        bodies = [str(k) for k in range(len(muscle.attachments))]
+        bodies = [str(k) for k in range(len(held))]
     groups = {
-        body: [a for a, own in zip(muscle.attachments, bodies) if own == body]
-        for body in sorted(set(bodies))
+        body: [a for a, own in zip(held, bodies) if own == body] for body in sorted(set(bodies))
     }
     if len(groups) < 2:
         return None

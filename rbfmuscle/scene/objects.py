@@ -45,13 +45,15 @@ class Attachment:
     """Vertices (n,) of a muscle's mesh that move with a bone.
 
     ``tendon`` joins them to it where they end short of it. ``attachment_frame`` is the name,
-    among the poses, of what they move with: the bone, or the end of the tendon.
+    among the poses, of what they move with: the bone, or the end of the tendon. What is ``via`` a
+    bone passes it and is neither origin nor insertion.
     """
 
     bone: str
     vertices: Integers = field(repr=False)
     tendon: LineTable | None = None
     attachment_frame: str = ""
+    via: bool = False
 
     def __post_init__(self) -> None:
         self.attachment_frame = self.attachment_frame or self.bone

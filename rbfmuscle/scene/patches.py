@@ -48,7 +48,8 @@ def _check_places(value: object, info: ValidationInfo) -> object:
 class AttachTable(Table):
     """A bone, and what it holds: a file or list of vertex numbers, a vertex array of the mesh's
     file, a distance to the bone, points or a file of them (maybe with a radius), a painted colour,
-    or a region of another mesh (maybe of a colour); maybe a tendon.
+    or a region of another mesh (maybe of a colour); maybe a tendon. With
+    ``via`` the muscle passes there on its way.
     """
 
     bone: str
@@ -60,6 +61,7 @@ class AttachTable(Table):
     colour: str | None = None
     region: FileName | None = None
     tendon: LineTable | None = None
+    via: bool = False
 
     @model_validator(mode="after")
     def _check_ways(self):
@@ -69,6 +71,8 @@ class AttachTable(Table):
             raise ValueError(f"give one of {words}, got {' and '.join(given) or 'none'}")
         if self.radius is not None and self.points is None:
             raise ValueError("radius belongs to points")
+        if self.via and self.tendon is not None:
+            raise ValueError("a tendon belongs to an end of the muscle, which via is not")
         return self
 
 

@@ -51,6 +51,7 @@ def record_muscle(muscle: Muscle) -> dict[str, object]:
         "attach": [
             {"bone": held.bone, "vertices": len(held.vertices)}
             | ({} if held.tendon is None else {"tendon": held.tendon.model_dump()})
+            | ({"via": True} if held.via else {})
             for held in muscle.attachments
         ],
         "fibres": len(muscle.fibres) if muscle.fibres else 0,

@@ -58,6 +58,8 @@ class SceneFiles:
             entry: dict[str, object] = {"bone": held.bone, "vertices": self._relative(file)}
             if held.tendon is not None:
                 entry["tendon"] = held.tendon.model_dump(exclude_unset=True)
+            if held.via:
+                entry["via"] = True
             attach.append(entry)
         if muscle.fibres:
             file = self._new(f"fibres/{muscle.name}.json")

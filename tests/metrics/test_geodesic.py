@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.geometry.tubes import line_length
+from rbfmuscle.geometry.tubes import line_length, tube_mesh
 from rbfmuscle.metrics.centreline import NODES, Centreline, shortest_path
 from rbfmuscle.metrics.depths import BoneDistance
 from rbfmuscle.scene.objects import Attachment
@@ -52,6 +52,38 @@ def test_string_over_a_ball_is_two_tangents_and_an_arc(height, clearance):
     for probes, poses in (([], {}), ([ball()], {"ball": away})):
         path, _ = shortest_path(over_the_ball(height), probes, poses, clearance=kept_off)
         assert line_length(path) == pytest.approx(2 * FAR, rel=1e-6)
+
+
+def test_path_goes_through_the_patches_via_bones():
+    """A bent tube that a third bone holds at its bend: as long as the path through the bend."""
+    bend = np.array([0.0, 0.0, 30.0])
+    line = np.concatenate(
+        [np.linspace([-40.0, 0, 0], bend, 20), np.linspace(bend, [40.0, 0, 0], 20)[1:]]
+    )
+    mesh = trimesh.Trimesh(*tube_mesh(line, np.full(len(line), 3.0)), process=False)
+    rings = np.arange(len(mesh.vertices) - 2).reshape(len(line), -1)
+    held = [Attachment("a", rings[0]), Attachment("b", rings[-1])]
+    joints = [SimpleNamespace(name="j", parent="a", child="b", coordinates=("x",))]
+    poses = {name: np.eye(4) for name in "abc"}
+    measured = {}
+    for via in ([], [Attachment("c", rings[19], via=True)]):
+        muscle = SimpleNamespace(mesh=mesh, attachments=held + via)
+        centreline = Centreline(muscle, joints, mesh.vertices, mesh.faces)
+        measured[len(via)] = centreline.measure(mesh.vertices, poses, [])
+    # The centroids of slices cut the corner at the bend, by less than the tube's radius.
+    assert measured[1][0] == measured[0][0] == pytest.approx(100.0, abs=3.0)
+    assert measured[0][1] == pytest.approx(measured[0][0] / 80.0, rel=1e-6)
+    # The outer side of the bend has the larger triangles, which draw the ring's middle there.
+    assert measured[1][1] == pytest.approx(measured[0][0] / 100.0, rel=0.02)
+    path, settled = shortest_path(
+        over_the_ball(20.0),
+        [ball()],
+        {"ball": np.eye(4)},
+        clearance=np.zeros(NODES),
+        via={16: bend},
+    )
+    assert settled and path[16] == pytest.approx(bend)
+    assert line_length(path) == pytest.approx(2 * np.hypot(FAR, 30.0), rel=1e-3)
 
 
 LENGTH = 90.0  # of a strip

@@ -205,7 +205,10 @@ class TestLength:
         ]
         joints = [SimpleNamespace(name=n, parent=p, child=c, coordinates=BEND) for n, p, c in rows]
         soleus = SimpleNamespace(
-            attachments=[SimpleNamespace(bone=b) for b in ("fibula", "tibia", "talus")]
+            attachments=[
+                SimpleNamespace(bone=b, via=b == "heel")
+                for b in ("fibula", "tibia", "heel", "talus")
+            ]
         )
 
         def ends(moving):

@@ -39,6 +39,7 @@ def rich():
     vertices = biceps.mesh.vertices[:, 0]
     attach = [
         {"bone": "upper", "vertices": np.flatnonzero(vertices < -50)},
+        {"bone": "upper", "vertices": np.flatnonzero(np.abs(vertices) < 5), "via": True},
         {
             "bone": "lower",
             "vertices": np.flatnonzero(vertices > 50),
@@ -73,7 +74,7 @@ def test_a_saved_scene_loads_as_the_same_scene(tmp_path):
     assert again.motion.frames == scene.motion.frames
     for ours, theirs in zip(scene.muscles, again.muscles, strict=True):
         for one, other in zip(ours.attachments, theirs.attachments, strict=True):
-            assert np.array_equal(one.vertices, other.vertices)
+            assert np.array_equal(one.vertices, other.vertices) and one.via == other.via
     assert np.array_equal(again.muscles[0].fibres, scene.muscles[0].fibres)
     (end,) = again.muscle("second").tendons
     assert end.length == scene.muscle("second").tendons[0].length
