@@ -4,7 +4,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 
-# Vertices around a tube.
+# Vertices around a tube, where nothing else is asked for.
 SIDES = 12
 
 
@@ -24,18 +24,18 @@ def points_along(line: Floats, places: Floats) -> Floats:
     return np.stack([np.interp(places, along, line[:, axis]) for axis in range(3)], axis=1)
 
 
-def tube_mesh(line: Floats, radii: Floats) -> tuple[Floats, Integers]:
-    """Rings about the points (n, 3) of a line, closed by a vertex at either end; and outward faces
-    (m, 3).
+def tube_mesh(line: Floats, radii: Floats, sides: int = SIDES) -> tuple[Floats, Integers]:
+    """Rings of so many ``sides`` about the points (n, 3) of a line, closed by a vertex at either
+    end; and outward faces (m, 3).
 
     Vertices are ring by ring, then both ends; neighbouring rings are turned as little as they can
     be.
     """
     first, second = _frames(line)
-    angles = np.linspace(0.0, 2.0 * np.pi, SIDES, endpoint=False)
+    angles = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     spokes = np.cos(angles)[:, None] * first[:, None] + np.sin(angles)[:, None] * second[:, None]
     rings = line[:, None] + radii[:, None, None] * spokes
-    return np.concatenate([rings.reshape(-1, 3), line[[0, -1]]]), _tube_faces(len(line))
+    return np.concatenate([rings.reshape(-1, 3), line[[0, -1]]]), _tube_faces(len(line), sides)
 
 
 def _frames(line: Floats) -> tuple[Floats, Floats]:
@@ -52,18 +52,18 @@ def _frames(line: Floats) -> tuple[Floats, Floats]:
     return across, np.cross(ahead, across)
 
 
-def _tube_faces(rings: int) -> Integers:
+def _tube_faces(rings: int, sides: int) -> Integers:
     """Outward faces of so many rings, then of the fans at both ends."""
-    side = np.arange(SIDES)
+    side = np.arange(sides)
     after = np.roll(side, -1)
-    base = SIDES * np.arange(rings - 1)[:, None]
-    a, b, c, d = (base + k for k in (side, after, SIDES + side, SIDES + after))
+    base = sides * np.arange(rings - 1)[:, None]
+    a, b, c, d = (base + k for k in (side, after, sides + side, sides + after))
     wall = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(
         -1, 3
     )
-    last, tips = SIDES * (rings - 1), SIDES * rings
+    last, tips = sides * (rings - 1), sides * rings
     fans = [
-        np.stack([np.full(SIDES, tips), after, side], axis=-1),
-        np.stack([np.full(SIDES, tips + 1), last + side, last + after], axis=-1),
+        np.stack([np.full(sides, tips), after, side], axis=-1),
+        np.stack([np.full(sides, tips + 1), last + side, last + after], axis=-1),
     ]
     return np.concatenate([wall, *fans])

@@ -31,8 +31,9 @@ class RBFOptions(Table):
     at rest would err by more than ``rest_error`` (RMS; 0 for 0.5 mm, or a tenth of the muscle's
     thickness where that is less), and ``epsilon`` (a kernel's shape parameter) from the error at
     rest. A ridge keeps the ``condition`` of every fit below a bound, 0 for 1e10 where the kernel
-    has a shape parameter and none where not. ``samples`` of the surface meet the bones. ``nodes``
-    of the elastic solid that carries the centres, and the greatest number of ``iterations`` of a
+    has a shape parameter and none where not. ``samples`` of the surface meet the bones: the
+    vertices of a mesh that has as many. ``nodes`` of the elastic solid that carries the centres,
+    and the greatest number of ``iterations`` of a
     solve. Fibres shorten without resistance from their length in the scan to 1 / ``slack_ratio`` of
     it (1: no slack); beyond, the solid is stiffer along them than across by ``fibre_ratio``, a
     ratio of Young's moduli. ``surface`` is shown by a mesh of the ``material`` that is

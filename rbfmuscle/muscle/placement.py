@@ -11,7 +11,7 @@ from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.geometry.crossing import morton_order
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.geometry.surfaces import mesh_volume
+from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.implicit.kernels.table import get_kernel
@@ -257,8 +257,11 @@ def cached_sample(
     takes a second.
 
     Points are in an order in which near ones are mostly near each other, except for greedy
-    placement.
+    placement. A mesh of ``count`` vertices is its own even sample.
     """
+    if placement == "even" and len(vertices) == count:
+        normals = vertex_normals(vertices, faces)
+        return SurfaceSample(vertices, normals, np.ascontiguousarray(faces, dtype=np.int64))
     key = content_key(vertices, faces, ("surface sample", SAMPLING, count, SEED, placement))
     arrays = load_arrays(key)
     if arrays is None:

@@ -18,6 +18,7 @@ from rbfmuscle.muscle import placement
 from rbfmuscle.muscle.display_mesh import MOST_SHOWN, _unfold, display_mesh, neighbour_lists
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.muscle.placement import cached_sample
 from rbfmuscle.muscle.rest import LEAST_ATTACHED
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
@@ -303,6 +304,18 @@ def test_shown_mesh_is_the_input_mesh_unless_it_is_large_or_another_resolution_i
     assert len(display_mesh(long, 100)[0]) == pytest.approx(wanted, rel=0.06)
     long.mesh = long.mesh.subdivide_to_size(1.5)
     assert len(long.mesh.vertices) > MOST_SHOWN == len(display_mesh(long, 0)[0])
+
+
+def test_a_mesh_with_as_many_vertices_as_samples_meets_the_bones_with_them():
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=20.0)
+    sample = cached_sample(mesh.vertices, mesh.faces, len(mesh.vertices), "even")
+    np.testing.assert_array_equal(sample.points, mesh.vertices)
+    np.testing.assert_array_equal(sample.control_faces, mesh.faces)
+    np.testing.assert_allclose(
+        sample.normals, mesh.vertices / 20.0, atol=0.02
+    )  # of facets, by area
+    fewer = cached_sample(mesh.vertices, mesh.faces, 300, "even")
+    assert len(fewer.points) == 300
 
 
 @pytest.mark.parametrize(("most", "smoothed"), [(1.0, True), (0.01, False)])

@@ -93,7 +93,11 @@ def _add_muscles(found, walk):
     for muscle in found.model.muscles:
         try:
             tube = make_tube(muscle, found.places, bones, holders)
-            attach = [{"bone": body, "vertices": held.tolist()} for body, held in tube.held.items()]
+            attach = [
+                {"bone": body, "vertices": rows.tolist(), "via": via}
+                for held, via in ((tube.held, False), (tube.via, True))
+                for body, rows in held.items()
+            ]
             mesh = tube.vertices, tube.faces
             scene.add_muscle(muscle.name, mesh, attach=attach, model=dict(TUBE_MODEL))
             if tube.volume_error > LEAST_MISSED:
@@ -155,19 +159,35 @@ def _body_meshes(
             notes.append(f"body {mesh.body!r}: mesh {mesh.file!r} was read from {file.name!r}")
         parts.setdefault(mesh.body, []).append((vertices, faces, file.name))
     for body, found in parts.items():
-        starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in found)])
-        vertices = np.concatenate([part[0] for part in found])
-        faces = np.concatenate([part[1] + start for part, start in zip(found, starts)])
-        source = ", ".join(part[2] for part in found)
         try:
-            meshes[body] = prepare_mesh(
-                vertices, faces, context=source, name=body, may_be_open=True
-            )
-        except MeshError as error:
-            notes.append(f"body {body!r}: its meshes are not taken: {error}")
+            meshes[body] = _joined(found, body)
             continue
-        meshes[body].source = source
+        except MeshError as error:
+            whole = error
+        sound = []
+        for part in found if len(found) > 1 else ():
+            try:
+                _joined([part], body)
+            except MeshError as error:
+                notes.append(f"body {body!r}: mesh {part[2]!r} is not taken: {error}")
+            else:
+                sound.append(part)
+        if sound and len(sound) < len(found):
+            meshes[body] = _joined(sound, body)
+        else:
+            notes.append(f"body {body!r}: its meshes are not taken: {whole}")
     return meshes, notes
+
+
+def _joined(parts, body):
+    """Meshes of a body as one; MeshError where that cannot be used."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts)])
+    vertices = np.concatenate([part[0] for part in parts])
+    faces = np.concatenate([part[1] + start for part, start in zip(parts, starts)])
+    source = ", ".join(part[2] for part in parts)
+    mesh = prepare_mesh(vertices, faces, context=source, name=body, may_be_open=True)
+    mesh.source = source
+    return mesh
 
 
 def _placed(
@@ -245,9 +265,10 @@ def _muscle_text(directory, muscle):
     row |= {"model": {"name": muscle.model, **muscle.options}, "attach": []}
     (directory / "attachments").mkdir(exist_ok=True)
     for held in muscle.attachments:
-        file = attachment_file(muscle.name, held.bone)
+        file = attachment_file(muscle.name, f"{held.bone}_via" if held.via else held.bone)
         np.savetxt(directory / file, held.vertices, fmt="%d")
-        row["attach"].append({"bone": held.bone, "vertices": file})
+        entry = {"bone": held.bone, "vertices": file}
+        row["attach"].append(entry | ({"via": True} if held.via else {}))
     head = (
         "[[muscle]]   # a tube along the model's path, of its fibres' volume; put a mesh of "
         "your own here"

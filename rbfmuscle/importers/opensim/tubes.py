@@ -11,36 +11,39 @@ import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import mesh_volume, unique_edges
-from rbfmuscle.geometry.tubes import SIDES, distance_along, line_length, points_along, tube_mesh
+from rbfmuscle.geometry.tubes import distance_along, line_length, points_along, tube_mesh
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.validation import SceneError
 
-# Sections along a tube; radius at the ends against the middle; share of the length held at an end.
-SECTIONS = 28
+# Sections along a tube and vertices of each; radius at the ends against the middle; share of the
+# length held at an end.
+SECTIONS = 40
+SIDES = 16
 END_RADIUS = 0.3
 HELD = 0.06
-ENDS = 3  # sections at either end that may lie in bones
 # Of bones that a tube lies on: the gap left [m], the depth to which its vertices are brought out
 # [m], and how often, as what leaves one bone may enter another.
 MARGIN = 5e-4
 FLATTENED = 0.03
 FLATTENINGS = 8
-# Rounds in which the radius is fitted to the volume, at most, and the share of it that is left.
-FITTINGS, FITTED = 12, 1e-8
-# A tube is smooth: fewer points of its surface and a coarser mesh show and bound it as well.
-TUBE_MODEL = {"name": "rbf", "samples": 1200, "resolution": 60}
+# Rounds in which the radius is fitted to the volume, at most, and the share of it left open.
+FITTINGS = 12
+FITTED = 1e-5
+# A tube is smooth: fewer centres fit it as well, and its own vertices meet the bones.
+TUBE_MODEL = {"name": "rbf", "centres": 100, "samples": SECTIONS * SIDES + 2}
 ROUNDS = 60  # rounds in which the middle line is drawn straight and put out of what is in its way
 
 
 @dataclass
 class Tube:
-    """A tube: vertices [metre], triangles, the vertices that each bone holds, and by what share its
-    volume misses the muscle's.
+    """A tube: vertices [metre], triangles, the vertices that bones hold at both ends and those that
+    bones hold on its way, and by what share its volume misses the muscle's.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     held: dict[str, np.ndarray]
+    via: dict[str, np.ndarray]
     volume_error: float
 
 
@@ -75,8 +78,7 @@ def make_tube(
     radius = share * np.sqrt(muscle.volume / (np.pi * length * np.mean(share**2)))
     wraps = [(wrap, places[wrap.body] @ wrap.frame) for wrap in muscle.wraps]
     line = _clear_line(line, fixed, radius, wraps, list(bones.values()))
-    held = _held(bodies, fixed, bones)
-    free = np.setdiff1d(np.arange(SECTIONS * SIDES + 2), np.concatenate(list(held.values())))
+    held, via = _held(bodies, fixed, bones)
     reach = FLATTENED + 2.0 * float(radius.max())
     low, high = line.min(axis=0) - reach, line.max(axis=0) + reach
     near = [
@@ -85,15 +87,15 @@ def make_tube(
         if (bone.vertices.min(axis=0) < high).all() and (bone.vertices.max(axis=0) > low).all()
     ]
     for _ in range(FITTINGS):
-        vertices, faces = tube_mesh(line, radius)
-        vertices = _beside_bones(vertices, faces, free, near)
+        vertices, faces = tube_mesh(line, radius, SIDES)
+        vertices = _beside_bones(vertices, faces, near)
         # As its square, but for where sections run into each other or lie flat on a bone.
         volume = mesh_volume(vertices, faces)
         ratio = float(np.sqrt(muscle.volume / volume))
         if abs(ratio - 1.0) < FITTED:
             break
         radius = radius * ratio
-    return Tube(vertices, faces, held, abs(volume / muscle.volume - 1.0))
+    return Tube(vertices, faces, held, via, abs(volume / muscle.volume - 1.0))
 
 
 def _clear_line(line, fixed, radius, wraps, bones):
@@ -101,7 +103,6 @@ def _clear_line(line, fixed, radius, wraps, bones):
     bones.
     """
     line, start = line.copy(), line.copy()
-    middle = np.arange(ENDS, len(line) - ENDS)
     for number in range(ROUNDS):
         line[1:-1] = 0.25 * (line[:-2] + 2.0 * line[1:-1] + line[2:])
         line[fixed] = 0.5 * (line[fixed] + start[fixed])
@@ -111,8 +112,7 @@ def _clear_line(line, fixed, radius, wraps, bones):
             line = _out_of_shape(wrap, local) @ frame[:3, :3].T + frame[:3, 3]
         if number % 10 == 9:
             for bone in bones:
-                line[middle] = _out_of_bone(bone, line[middle], 0.8 * radius[middle])
-    line[[0, -1]] = start[[0, -1]]
+                line = _out_of_bone(bone, line, 0.8 * radius)
     return line
 
 
@@ -145,13 +145,12 @@ def _out_of_bone(bone, points, reach):
     return np.where((distance < reach)[:, None], closest + away * reach[:, None], points)
 
 
-def _beside_bones(vertices, faces, free, bones):
-    """A tube's vertices (n, 3), those ``free`` of them out of all bones by `MARGIN`, where they are
-    no deeper than `FLATTENED`: there the tube lies flat on them, and is smooth beside.
+def _beside_bones(vertices, faces, bones):
+    """A tube's vertices (n, 3), out of all bones by `MARGIN` where they are no deeper than
+    `FLATTENED`: there the tube lies flat on them, and is smooth beside.
     """
     edges = unique_edges(faces)
     count = np.bincount(edges.ravel(), minlength=len(vertices))
-    still = np.setdiff1d(np.arange(len(vertices)), free)
     shift = np.zeros_like(vertices)
     for number in range(FLATTENINGS):
         beside = np.zeros_like(shift)
@@ -159,13 +158,11 @@ def _beside_bones(vertices, faces, free, bones):
         np.add.at(beside, edges[:, 1], shift[edges[:, 0]])
         if number < FLATTENINGS - 1:  # in the last round what is out stays out
             shift = 0.5 * (shift + beside / count[:, None])
-            shift[still] = 0.0
         points = vertices + shift
         for bone in bones:
-            points[free] = _pushed(bone, points[free])
+            points = _pushed(bone, points)
         if number >= FLATTENINGS // 2:  # coarse faces cut across what is between their corners
-            pressed = _pressed_in(points, faces, bones)
-            points[free] += pressed[free]
+            points = points + _pressed_in(points, faces, bones)
         shift = points - vertices
     return vertices + shift
 
@@ -199,23 +196,27 @@ def _pressed_in(vertices, faces, bones):
 
 
 def _held(bodies, fixed, bones):
-    """Vertices by bone: both ends with the points that follow on their body, a section at each
-    point on another.
+    """Vertices by bone: those of the sections at both ends, and those that bones hold on the way.
+
+    On the way are what lies between an end and the points that follow it on its body, and a section
+    at each other point.
     """
     few = max(1, round(HELD * SECTIONS))
+    ends = {bodies[0]: range(few + 1), bodies[-1]: range(SECTIONS - 1 - few, SECTIONS)}
     first = next(k for k, body in enumerate(bodies) if body != bodies[0])
     last = len(bodies) - next(k for k, body in enumerate(reversed(bodies)) if body != bodies[-1])
-    start = min(max(few, fixed[first - 1]), SECTIONS // 3)
-    end = max(min(SECTIONS - 1 - few, fixed[last]), SECTIONS - 1 - SECTIONS // 3)
-    sections = dict.fromkeys(range(start + 1), bodies[0]) | dict.fromkeys(
-        range(end, SECTIONS), bodies[-1]
-    )
-    for place, body in zip(fixed[first:last].tolist(), bodies[first:last]):
-        if body in bones:
-            sections.setdefault(place, body)
-    held = {body: [] for body in sections.values()}
-    for k, body in sections.items():
-        held[body].append(np.arange(k * SIDES, (k + 1) * SIDES))
-    for k in (0, -1):
-        held[bodies[k]].append(np.array([SECTIONS * SIDES - k]))
-    return {body: np.sort(np.concatenate(rows)) for body, rows in held.items()}
+    start = min(fixed[first - 1], SECTIONS // 3)
+    end = max(fixed[last], SECTIONS - 1 - SECTIONS // 3)
+    passed = {bodies[0]: list(range(few + 1, start + 1))}
+    passed.setdefault(bodies[-1], []).extend(range(end, SECTIONS - 1 - few))
+    for body, place in zip(bodies[first:last], fixed[first:last].tolist()):
+        if body in bones and max(few, start) < place < min(SECTIONS - 1 - few, end):
+            passed.setdefault(body, []).append(place)
+    tips = {bodies[0]: [SECTIONS * SIDES], bodies[-1]: [SECTIONS * SIDES + 1]}
+    held = {body: np.append(_rings(sections), tips[body]) for body, sections in ends.items()}
+    return held, {body: np.unique(_rings(some)) for body, some in passed.items() if some}
+
+
+def _rings(sections):
+    """Vertices of sections."""
+    return np.concatenate([np.arange(k * SIDES, (k + 1) * SIDES) for k in sections])

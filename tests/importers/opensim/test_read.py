@@ -138,3 +138,15 @@ def test_a_body_keeps_the_meshes_that_can_be_read_beside_one_that_cannot(small):
     (small.parent / "wedge.obj").write_text(torn)
     scene = import_osim(small).scene
     assert not scene.bones and "thigh" in scene.missing_bones
+
+
+def test_meshes_of_a_body_are_kept_beside_one_that_has_one_side_only(osim_data):
+    """The spine of the torso cannot be oriented; ribs, skull and jaw can."""
+    path = osim_data / "gait2392" / "gait2392_thelen2003muscle.osim"
+    found = import_osim(path, muscles=False)
+    assert {"hat_ribs.vtp", "hat_skull.vtp", "hat_jaw.vtp"} == set(
+        found.scene.bone("torso").source.split(", ")
+    )
+    assert "torso" not in found.scene.missing_bones
+    (line,) = (note for note in found.notes if "hat_spine" in note)
+    assert line.startswith("body 'torso': mesh 'hat_spine.vtp' is not taken: ")
