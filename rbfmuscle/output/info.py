@@ -74,7 +74,7 @@ class OutputInfo(Part):
     """What was written."""
 
     surfaces: bool
-    tendons: bool = False
+    tendons: bool = True  # false of earlier versions alone
 
 
 class MotionInfo(Part):

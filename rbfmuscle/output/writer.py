@@ -146,13 +146,10 @@ class RunWriter:
         meshes = {
             name: (surface.vertices, surface.faces) for name, surface in frame.surfaces.items()
         }
-        if self.scene.output.tendons:
-            tendons = {
-                muscle.name: tendon_mesh(muscle, frame.tendons) for muscle in self.scene.muscles
-            }
-            meshes |= {
-                tendon_name(name): mesh for name, mesh in tendons.items() if mesh is not None
-            }
+        for muscle in self.scene.muscles:
+            tendon = tendon_mesh(muscle, frame.tendons)
+            if tendon is not None:
+                meshes[tendon_name(muscle.name)] = tendon
         entries = [(name, f"surfaces/{name}{_frame_end(frame.index)}.vtp") for name in meshes]
         self.folder.add(*(file for _, file in entries))
         each(lambda entry: write_vtp(self.directory / entry[1], *meshes[entry[0]]), entries)

@@ -175,7 +175,6 @@ class TunnellingOptions(Table):
 
     angle: Annotated[float, Field(gt=0, lt=180)] = 135.0
     action: Literal["report", "substep"] = "substep"
-    swept: bool = True
 
 
 class DetectOptions(Table):
@@ -207,7 +206,6 @@ class OutputOptions(Table):
     """``[output]``: which files a run writes, and how many fibres of each muscle it follows."""
 
     surfaces: Annotated[bool, BeforeValidator(_accept_format)] = True
-    tendons: bool = True
     fibres: Annotated[int, Field(ge=0, le=MOST_FIBRES), BeforeValidator(_accept_true)] = 0
     report: bool = True
 

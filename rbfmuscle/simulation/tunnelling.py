@@ -123,9 +123,9 @@ def find_crossings(
         name = contacts.names[b]
         first, second = _local(start[index], before[name]), _local(end[index], after[name])
         sweep = sweep_paths(contacts.fields[b], first, second, tolerance=tolerance, angle=angle)
-        crossed = sweep.through if options.swept else sweep.flagged
-        if crossed.any() or sweep.flagged.any():
-            crossings.append(Crossing(b, index[sweep.index[crossed]], int(sweep.flagged.sum())))
+        if sweep.through.any() or sweep.flagged.any():
+            crossed = index[sweep.index[sweep.through]]
+            crossings.append(Crossing(b, crossed, int(sweep.flagged.sum())))
     return crossings
 
 

@@ -17,11 +17,11 @@ TABLES = {
     "sliding": (options.SlidingOptions, {"threshold": 1.5, "bones": True, "pairs": PAIRS}),
     "detect.tunnelling": (
         options.TunnellingOptions,
-        {"angle": 120.0, "action": "report", "swept": False},
+        {"angle": 120.0, "action": "report"},
     ),
     "output": (
         options.OutputOptions,
-        {"surfaces": False, "tendons": False, "fibres": 5, "report": False},
+        {"surfaces": False, "fibres": 5, "report": False},
     ),
 }
 MODELS = {

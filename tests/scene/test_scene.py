@@ -181,13 +181,13 @@ class TestOptions:
     def test_copy_shares_meshes_and_leaves_the_original_alone(self):
         scene = built().set_motion(ramp={"elbow.flexion": {"to": 30, "step": 10}})
         other = scene.with_options(
-            {"contact.substep_angle": 1.0, "detect.tunnelling.swept": False, "motion.step": 5.0},
+            {"contact.substep_angle": 1.0, "detect.tunnelling.angle": 120.0, "motion.step": 5.0},
             model={"name": "rbf", "centres": 10},
             frames="1:3",
         )
         assert other.muscles[0].mesh is scene.muscles[0].mesh
         assert (other.contact.substep_angle, scene.contact.substep_angle) == (1.0, 2.0)
-        assert not other.detect.tunnelling.swept and scene.detect is None
+        assert other.detect.tunnelling.angle == 120.0 and scene.detect is None
         assert other.muscles[0].options == {"centres": 10} and scene.muscles[0].options == {}
         assert len(other.motion) == 2 and len(scene.motion) == 4
 

@@ -183,10 +183,10 @@ def test_a_drawn_tendon_tapers_smoothly_from_the_belly_to_its_own_radius(length,
     np.testing.assert_allclose(radii, 4.0 - 3.0 * (3.0 * share**2 - 2.0 * share**3), rtol=1e-9)
 
 
-def test_a_notebook_shows_a_run_with_tendons_that_are_left_out_of_its_files_on_request(tmp_path):
-    run = rm.simulate(arm().with_options({"output.tendons": False}))
+def test_a_notebook_shows_a_run_with_tendons(tmp_path):
+    run = rm.simulate(arm())
     run.save(tmp_path, pictures=False)
-    assert not Run.load(tmp_path).tendons and not list(tmp_path.glob("surfaces/*tendon*"))
+    assert Run.load(tmp_path).tendons and list(tmp_path.glob("surfaces/*tendon*"))
     for shown in (run, rm.Run.load(tmp_path)):
         assert "data:image/webp;base64," in shown._repr_html_()
 

@@ -228,7 +228,7 @@ def _read_ply(path, content):
                 fix_texture=False,
                 skip_materials=True,
             )
-    except Exception as error:  # noqa: BLE001 - lists of different lengths, too
+    except Exception as error:  # noqa: BLE001 - any error of trimesh: VTK may read it
         try:
             return _read_polydata(path)
         except MeshError:
