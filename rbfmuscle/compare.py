@@ -11,8 +11,10 @@ import numpy as np
 
 from rbfmuscle.experiments.comparison import Repeated, add_distances, measure_run, write_tables
 from rbfmuscle.experiments.comparison_table import Comparison
+from rbfmuscle.experiments.scenes_table import ScenesComparison, write_scenes
 from rbfmuscle.experiments.sweep_run import threads_limited
 from rbfmuscle.folders import OutputFolder
+from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.models import (
     COMPARED,
     build_models,
@@ -43,6 +45,7 @@ FILES = (
     "comparison.tex",
     "report.html",
 )
+SCENES_FILES = ("scenes.json", "scenes.csv", "scenes.tex", "report.html")
 COARSER = 5  # the motion is repeated with steps this many times as long
 ONE_THREAD = 5  # frames that are timed on one thread, the first of which does not count
 
@@ -129,6 +132,76 @@ def compare_models(
     with stage("drawing pictures" if pictures else "writing the report"):
         write_page(folder, table, pictures=pictures)
     return table
+
+
+def compare_scenes(
+    scenes: Mapping[str, Scene],
+    directory: str | Path,
+    models: Sequence[str] = COMPARED,
+    *,
+    frames: slice | str | None = None,
+    settings: Mapping[str, object] | None = None,
+    pictures: bool = True,
+    progress: Callable[[str, int, int], object] | None = None,
+) -> ScenesComparison:
+    """Compare models on several scenes, and write means and the worst over the scenes.
+
+    Parameters
+    ----------
+    scenes : mapping of str to Scene
+        By name; the comparison of each is in a folder of this name.
+    directory : path
+        Takes ``scenes.json``, tables, ``report.html`` and the folders of the scenes.
+    models, frames, settings, pictures
+        As for `compare_models`.
+    progress : callable, optional
+        Called as ``progress("SCENE: MODEL", done, total)``.
+
+    Returns
+    -------
+    ScenesComparison
+        What ``scenes.json`` holds.
+
+    Raises
+    ------
+    UsageError, SolveError
+        As for `compare_models`; SolveError if no model could be solved on any scene.
+    """
+    folder = Path(directory)
+    output = OutputFolder(folder, "compare", SCENES_FILES)
+    for scene in scenes.values():
+        _variants(scene, list(models), settings or {}, frames)
+    output.clear()
+    output.add(*SCENES_FILES)
+    found, failed = {}, {}
+    for name, scene in scenes.items():
+
+        def advance(model, done, total, name=name):
+            if progress is not None:
+                progress(f"{name}: {model}", done, total)
+
+        try:
+            table = compare_models(
+                scene,
+                folder / name,
+                models,
+                frames=frames,
+                settings=settings,
+                pictures=pictures,
+                progress=advance,
+            )
+            found[name] = table
+            failed[name] = table.failed
+        except SolveError as error:
+            failed[name] = {ALL: str(error)}
+    if not found:
+        raise SolveError("; ".join(f"{name}: {each[ALL]}" for name, each in failed.items()))
+    whole = write_scenes(folder, found, failed)
+
+    from rbfmuscle.report.scenes_page import write_page
+
+    write_page(folder, whole)
+    return whole
 
 
 def _variants(scene, models, settings, frames):

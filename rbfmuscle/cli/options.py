@@ -1,5 +1,6 @@
 """Options that several commands take."""
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -82,3 +83,14 @@ def threads(jobs: int | None) -> AbstractContextManager[None]:
     from rbfmuscle.experiments.sweep_run import threads_limited
 
     return threads_limited(jobs)
+
+
+def named_scenes(scenes: Sequence[str]) -> dict[str, str]:
+    """Scene files by their names, or by those of their folders where names are the same."""
+    if not scenes:
+        raise UsageError("give a scene file, or the word phantom")
+    folders = [Path(path).resolve().parent.name for path in scenes]
+    for names in ([Path(path).stem for path in scenes], folders):
+        if len(set(names)) == len(names):
+            return dict(zip(names, scenes))
+    raise UsageError("scenes need different names, or folders of different names")

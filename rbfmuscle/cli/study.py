@@ -1,4 +1,4 @@
-"""``rbfmuscle compare``, ``kernels`` and ``sweep``: models, kernels and settings."""
+"""``rbfmuscle kernels`` and ``sweep``: kernels and settings."""
 
 from __future__ import annotations
 
@@ -18,116 +18,15 @@ from rbfmuscle.cli.options import (
     Muscles,
     Output,
     Pairs,
-    SceneName,
     Settings,
     chosen_muscles,
+    named_scenes,
     split_list,
     threads,
 )
 from rbfmuscle.cli.printing import USUAL, Printing, one_line, print_result
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError, UsageError
-
-
-def compare(
-    scene: SceneName,
-    *,
-    output: Output,
-    models: str | None = None,
-    settings: Settings = None,
-    frames: Frames = None,
-    fail_on: FailOn = None,
-    jobs: Jobs = None,
-    pictures: bool = True,
-    printing: Printing = USUAL,
-) -> int:
-    """Run models on one scene: the same motion, contacts and measures; tables, report, pictures.
-
-    Each model's run is in a folder of its own; MODEL:KEY=VALUE is a setting for one model.
-
-    Parameters
-    ----------
-    models
-        Models, separated by commas, for instance rbf,pbd; distances are measured to the first. By
-        default rbf, the mesh models and pbd-converged, which takes long: it sweeps until no vertex
-        moves.
-    pictures
-        Draw pictures and the animation.
-    """
-    from rbfmuscle import interruption
-    from rbfmuscle.compare import compare_models
-    from rbfmuscle.metrics.summary import parse_limits
-    from rbfmuscle.models import COMPARED
-    from rbfmuscle.scene.phantom import open_scene
-    from rbfmuscle.scene.settings import parse_settings
-
-    names = split_list(models) or list(COMPARED)
-    changes, loaded = parse_settings(settings), open_scene(scene)
-    limits = parse_limits(fail_on, loaded)
-    kept = f"finished runs are kept in {output}"
-    with (
-        Progress("compare") as progress,
-        interruption.keeping(lambda: kept if output.exists() else ""),
-        threads(jobs),
-    ):
-
-        def advance(model, done, total):
-            if done == 0:
-                progress.show(model, done, total)
-            progress(done, total)
-            interruption.check()
-
-        table = compare_models(
-            loaded,
-            output,
-            names,
-            frames=frames,
-            settings=changes,
-            pictures=pictures,
-            progress=advance,
-        )
-    error = _failure(table, output) or _excess(table, output, limits)
-    return print_result(printing, table.model_dump(), _table_lines(table, output), error=error)
-
-
-def _failure(table, output):
-    """The error that some models could not be solved; None where all were."""
-    if not table.failed:
-        return None
-    reasons = "; ".join(f"{name}: {reason}" for name, reason in table.failed.items())
-    return SolveError(f"{reasons}; the other models are in {output}")
-
-
-def _excess(table, output, limits):
-    """The error that a run is beyond a limit of ``--fail-on``; None where none is."""
-    from rbfmuscle.metrics.summary import Summary
-    from rbfmuscle.output.run_data import RunData
-    from rbfmuscle.report.verdict import require_limits
-
-    texts = []
-    for name in table.models if limits.fail_on else ():
-        summary = Summary()
-        summary.add(RunData.load(output / name).metrics)
-        try:
-            require_limits(summary.table(), limits)
-        except LimitExceededError as error:
-            texts.append(f"{name}: {error}")
-    return LimitExceededError("; ".join(texts)) if texts else None
-
-
-def _table_lines(table, output):
-    from rbfmuscle.report.comparison_page import LIGHTS, shown
-
-    # As many columns as a terminal holds stand beside each other.
-    for k in range(0, len(table.models), 3):
-        names = table.models[k : k + 3]
-        yield " " * 24 + "".join(f"{name:>18}" for name in names)
-        for quantity in LIGHTS:
-            values = [table.results[name]["all"].get(quantity) for name in names]
-            cells = [f"{shown(table, quantity, value):>18}" for value in values]
-            yield f"{quantity:24}" + "".join(cells)
-    yield table.answer
-    yield f"{table.frames} frames, in {output}, open {output / 'report.html'}"
 
 
 def kernels(
@@ -311,7 +210,7 @@ def sweep(
         raise UsageError(
             "a sweep needs several scenes, or a grid, for instance --grid model.centres=100,200"
         )
-    opened = {name: open_scene(path) for name, path in _names(scenes).items()}
+    opened = {name: open_scene(path) for name, path in named_scenes(scenes).items()}
     loaded = {name: configure_scene(each, changes, model=model) for name, each in opened.items()}
     limits = {name: _sweep_limits(fail_on, each) for name, each in loaded.items()}
     finest = parse_settings(reference)
@@ -352,15 +251,6 @@ def _beyond(rows, limits):
         for name, limit in limits[row.scene].items():
             if not meets_limit(name, row.value(name), limit):
                 yield f"{row.scene} {row.label}: {name} = {row.value(name):.4g} > {limit:g}"
-
-
-def _names(scenes):
-    """Scene files by their names, or by those of their folders where names are the same."""
-    folders = [Path(path).resolve().parent.name for path in scenes]
-    for names in ([Path(path).stem for path in scenes], folders):
-        if len(set(names)) == len(names):
-            return dict(zip(names, scenes))
-    raise UsageError("scenes of a sweep need different names, or folders of different names")
 
 
 def _finish(table, output, limits, printing):

@@ -1,13 +1,19 @@
 """Models on one scene, measured alike: what each keeps, how far apart they are, what each costs."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.experiments.comparison_table import Comparison, MeasureFacts, Spread, Values
+from rbfmuscle.experiments.comparison_table import (
+    VALUE_COLUMNS,
+    Comparison,
+    MeasureFacts,
+    Spread,
+    Values,
+)
 from rbfmuscle.experiments.measures import DEEPER, FIRST, FROM_METRICS, MEASURES
 from rbfmuscle.folders import write_whole
 from rbfmuscle.metrics.metrics import surface_distance
@@ -163,19 +169,10 @@ def write_tables(
         versions=versions(),
     )
     write_json(folder / "comparison.json", table.model_dump())
-    write_csv(folder / "comparison.csv", _value_rows(table))
+    write_csv(folder / "comparison.csv", [VALUE_COLUMNS, *table.value_rows()])
     write_csv(folder / "statistics.csv", _statistics_rows(table))
     write_whole(folder / "comparison.tex", latex(table))
     return table
-
-
-def _value_rows(table: Comparison) -> Iterator[tuple[object, ...]]:
-    yield "model", "muscle", "quantity", "value", "unit", "against"
-    for model, muscles in table.results.items():
-        for muscle, values in muscles.items():
-            for name, measure in table.measures.items():
-                if name in values:
-                    yield model, muscle, name, values[name], measure.unit, measure.against
 
 
 def _statistics_rows(table: Comparison) -> Iterator[tuple[object, ...]]:
@@ -193,18 +190,19 @@ def latex(table: Comparison) -> str:
     lines = [
         f"% rbfmuscle {table.versions['rbfmuscle']}: worst of muscles and frames",
         rf"\begin{{tabular}}{{ll{'r' * len(models)}}}",
-        _cells(["", "against", *(table.labels[name] for name in models)]),
+        latex_cells(["", "against", *(table.labels[name] for name in models)]),
         r"\hline",
     ]
     for quantity, measure in table.measures.items():
         values = [table.results[name][ALL].get(quantity) for name in models]
         if any(value is not None for value in values):
             texts = [shown_number(value, measure.unit) for value in values]
-            lines.append(_cells([measure.title, measure.against, *texts]))
+            lines.append(latex_cells([measure.title, measure.against, *texts]))
     return "\n".join([*lines, r"\end{tabular}", ""])
 
 
-def _cells(texts):
+def latex_cells(texts: Iterable[str]) -> str:
+    """A row of a LaTeX table."""
     escaped = (
         re.sub(r"([%_&#$])", r"\\\1", text).replace("–", "--").replace("<", "$<$") for text in texts
     )

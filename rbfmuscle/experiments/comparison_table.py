@@ -1,6 +1,10 @@
 """What a comparison of models found."""
 
+from collections.abc import Iterator
+
 from pydantic import BaseModel
+
+VALUE_COLUMNS = ("model", "muscle", "quantity", "value", "unit", "against")
 
 # Values by muscle, "all" included, and quantity.
 Values = dict[str, dict[str, float]]
@@ -47,3 +51,11 @@ class Comparison(BaseModel):
     statistics: dict[str, dict[str, dict[str, Spread]]]
     machine: dict[str, str | int | None]
     versions: dict[str, str]
+
+    def value_rows(self) -> Iterator[tuple[str, str, str, float, str, str]]:
+        """Every value, in rows of `VALUE_COLUMNS`."""
+        for model, muscles in self.results.items():
+            for muscle, values in muscles.items():
+                for name, measure in self.measures.items():
+                    if name in values:
+                        yield model, muscle, name, values[name], measure.unit, measure.against

@@ -4,13 +4,14 @@ import json
 from pathlib import Path
 
 from rbfmuscle.experiments.comparison_table import Comparison
+from rbfmuscle.experiments.scenes_table import ScenesComparison
 from rbfmuscle.experiments.sweep_table import SweepTable
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import Limits, Summary, exceeded, parse_limits, unmeasured
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import PAGES, run_folder, write_json
-from rbfmuscle.report import comparison_page, kernel_page, sweep_page
+from rbfmuscle.report import comparison_page, kernel_page, scenes_page, sweep_page
 from rbfmuscle.report.report import write_report
 from rbfmuscle.report.verdict import describe_verdict, require_limits
 from rbfmuscle.scene.scene import Scene
@@ -19,9 +20,11 @@ from rbfmuscle.validation import UsageError
 # What a study keeps, and its page.
 STUDIES = {
     "comparison.json": "report.html",
+    "scenes.json": "report.html",
     "kernels.json": "kernels.html",
     "sweep.json": "sweep.html",
 }
+COMMANDS = {"comparison.json": "compare", "scenes.json": "compare"}
 DOUBTFUL = ". Doubtful: "  # what a verdict says after its limits
 
 
@@ -77,12 +80,14 @@ def redraw_study(
         path = directory / file
         if not path.exists():
             continue
-        OutputFolder(directory, Path(file).stem.replace("comparison", "compare"), [page])
+        OutputFolder(directory, COMMANDS.get(file, Path(file).stem), [page])
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
             if file == "comparison.json":
                 table = Comparison.model_validate(found)
                 comparison_page.write_page(directory, table, pictures=pictures)
+            elif file == "scenes.json":
+                scenes_page.write_page(directory, ScenesComparison.model_validate(found))
             elif file == "kernels.json":
                 kernel_page.write_page(directory, found)
             else:

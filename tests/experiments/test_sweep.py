@@ -16,7 +16,7 @@ from blend_model import arm_files, arm_scene, use_blend_model
 
 import rbfmuscle as rm
 from rbfmuscle.cli.app import run_command as command
-from rbfmuscle.cli.study import _names
+from rbfmuscle.cli.options import named_scenes
 from rbfmuscle.experiments.front import mark_front, pareto_front
 from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep, scene_content
 from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep, sweep_rows, write_table
@@ -224,10 +224,10 @@ def test_a_cluster_that_loses_one_of_two_workers_gives_the_same_table(finished, 
 
 class TestCommand:
     def test_scenes_of_one_name_are_named_by_their_folders(self):
-        assert _names(["x/a.toml", "x/b.toml"]) == {"a": "x/a.toml", "b": "x/b.toml"}
-        assert _names(["x/a.toml", "y/a.toml"]) == {"x": "x/a.toml", "y": "y/a.toml"}
+        assert named_scenes(["x/a.toml", "x/b.toml"]) == {"a": "x/a.toml", "b": "x/b.toml"}
+        assert named_scenes(["x/a.toml", "y/a.toml"]) == {"x": "x/a.toml", "y": "y/a.toml"}
         with pytest.raises(UsageError, match="different names"):
-            _names(2 * ["x/a.toml"])
+            named_scenes(2 * ["x/a.toml"])
 
     def test_failed_points_end_with_five_and_are_run_again(self, tmp_path, monkeypatch, capsys):
         scenes = [str(arm_files(tmp_path, name)) for name in ("arm.toml", "other.toml")]
