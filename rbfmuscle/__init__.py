@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from rbfmuscle import showing
 
 if TYPE_CHECKING:
+    from rbfmuscle.accuracy import discretisation_error as discretisation_error
     from rbfmuscle.bones.sdf import BoneSDF as BoneSDF
     from rbfmuscle.compare import compare_models as compare_models
     from rbfmuscle.experiments.kernel_study import study_kernels as study_kernels
@@ -56,6 +57,7 @@ _HOME = {
     "Scene": "rbfmuscle.scene.scene",
     "check_scene": "rbfmuscle.scene.check",
     "compare_models": "rbfmuscle.compare",
+    "discretisation_error": "rbfmuscle.accuracy",
     "phantom_scene": "rbfmuscle.scene.phantom",
     "reach_error": "rbfmuscle.experiments.wanted_error",
     "show": "rbfmuscle.viewer.page",

@@ -1,4 +1,4 @@
-"""``rbfmuscle check``: a scene file, and what a run of it would build; nothing solved."""
+"""``rbfmuscle check``: a scene file, and what a run of it would build."""
 
 import logging
 import sys
@@ -17,10 +17,11 @@ def check(
     sdf: Flag = False,
     plan: Flag = False,
     time: Flag = False,
+    accuracy: Flag = False,
     upgrade: Flag = False,
     printing: Printing = USUAL,
 ) -> int:
-    """Check a scene file and its meshes; nothing is solved.
+    """Check a scene file and its meshes; nothing is solved but what --time and --accuracy ask for.
 
     Parameters
     ----------
@@ -33,6 +34,9 @@ def check(
     time
         With --plan: also build the muscles, solve two frames after the first, and extrapolate to
         the whole motion.
+    accuracy
+        Run the motion on lattices with the nodes given and twice as many, and tell how far RBF
+        muscles are apart.
     upgrade
         First rewrite a scene file of format 1 in the form of today; comments stay.
     """
@@ -50,6 +54,8 @@ def check(
             facts["sdf"] = _measure_fields(loaded)
         if plan and usable:
             facts["plan"] = _plan(loaded, time)
+        if accuracy and usable:
+            facts["accuracy"] = _accuracy(loaded)
         if picture:
             facts["picture"] = _draw(loaded, scene.with_suffix(".png"))
     lines = [*_scene_lines(loaded), *map(str, findings), *_more_lines(facts, loaded.units)]
@@ -95,6 +101,12 @@ def _more_lines(facts, units):
     for name, found in facts.get("sdf", {}).items():
         yield _describe_field(name, found, units)
     yield from _plan_lines(facts["plan"]) if "plan" in facts else ()
+    for found in facts.get("accuracy", []):
+        rms, greatest = (f"{found[key]:.2g} {units}" for key in ("rms", "greatest"))
+        yield (
+            f"muscle {found['muscle']}: {found['nodes']} nodes are {rms} RMS ({greatest} at most) "
+            f"from twice as many, in frame {found['frame']}"
+        )
     yield from [facts["picture"]] if "picture" in facts else ()
 
 
@@ -177,6 +189,15 @@ def _held_how(held):
     if held.via:
         return "via"
     return "on" if held.tendon is None else "by a tendon to"
+
+
+def _accuracy(scene):
+    from dataclasses import asdict
+
+    from rbfmuscle.accuracy import discretisation_error
+
+    with stage("two lattices"):
+        return [asdict(found) for found in discretisation_error(scene)]
 
 
 def _plan(scene, timed):
