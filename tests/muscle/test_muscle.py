@@ -356,3 +356,32 @@ def test_surface_at_rest_is_the_input_mesh_but_for_what_overlaps_bones():
     assert run.values("extensor", "initial_shift")[0] == pytest.approx(0.22, abs=0.02)
     # The bare field of the centres is farther from the mesh.
     assert np.abs(model.field()(mesh.vertices)).max() > 0.3
+
+
+@pytest.mark.parametrize("bend", [-30.0, 30.0])
+def test_a_curved_sheet_of_four_millimetres_is_shown_by_its_field(bend):
+    """A plate 140 long and 70 wide, bent over a cylinder of radius 80, straightened and bent
+    further: both sides of one sheet are fitted apart.
+    """
+    radius = 80.0
+    flat = trimesh.creation.box((140.0, 70.0, 4.0))
+    along, faces = trimesh.remesh.subdivide_to_size(flat.vertices, flat.faces, 6.0)
+    angle, height = along[:, 0] / radius, radius + along[:, 2]
+    curved = np.c_[height * np.sin(angle), along[:, 1], height * np.cos(angle) - radius]
+    sheet = trimesh.Trimesh(curved, faces)
+    scene = rm.Scene("sheet")
+    scene.units = "mm"
+    attach = []
+    for bone, side in (("a", -1.0), ("b", 1.0)):
+        end = np.flatnonzero(side * sheet.vertices[:, 0] > 58.0)
+        block = trimesh.creation.box((8.0, 76.0, 16.0)).subdivide().subdivide()
+        block.apply_translation(sheet.vertices[end].mean(axis=0) + [side * 11.0, 0.0, -6.0])
+        scene.add_bone(bone, block)
+        attach.append({"bone": bone, "vertices": end.tolist()})
+    scene.add_joint("hinge", "a", "b", centre=[0.0, 0.0, -radius], axes={"bend": [0.0, 1.0, 0.0]})
+    scene.add_muscle("sheet", sheet, attach=attach)
+    scene.set_motion(waypoints=[{}, {"hinge.bend": bend}], step=15.0)
+    run = rm.simulate(scene)
+    assert run.values("sheet", "unfitted_fraction").max() < 0.01
+    assert run.values("sheet", "self_crossings").max() == 0
+    assert run.values("sheet", "rest_error_rms")[0] < 0.1
