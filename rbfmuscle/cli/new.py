@@ -29,8 +29,8 @@ def new(
     ----------
     source
         Folder with STL, OBJ, PLY, VTK or VTP files, one bone or muscle each (or in folders bones
-        and muscles); or a segmentation: .nii, .nii.gz, .nrrd, or a folder with one file for each
-        mask.
+        and muscles); or a segmentation: .nii, .nii.gz, .nrrd, .nhdr, or a folder with one file for
+        each mask.
     units
         Unit of the meshes; by default chosen from the size of the bones. Label volumes are always
         in mm.
@@ -187,9 +187,13 @@ def _write_surfaces(volume, stage):
             except MeshError as error:
                 notes.append(f"{error}; left out")
                 continue
-            file = re.sub(r"[^A-Za-z0-9_-]+", "_", surface.name)
+            file = plain = re.sub(r"[^A-Za-z0-9_-]+", "_", surface.name)
+            count = 1
             while file.lower() in files:  # two labels of one name are two parts
-                file = f"{file}_{int(label)}"
+                count += 1
+                file = f"{plain}_{count}"
+            if count > 1:
+                notes.append(f"{count} labels are named {plain}: one of them is {file} here")
             files.add(file.lower())
             surface.mesh.export(meshes / f"{file}.ply")
             capped[file] = surface.capped

@@ -22,6 +22,11 @@ def ball(centre, radius):
     return np.linalg.norm(grid - np.array(centre), axis=-1) < radius
 
 
+NRRD_HEAD = {
+    "space": "right-anterior-superior",
+    "space directions": np.diag([SPACING] * 3),
+    "space origin": np.zeros(3),
+}
 FEMUR = ball((14, 12, 8), 6.2)
 PELVIS = ball((14, 12, 28), 7.2)
 MUSCLE = ball((14, 12, 18), 7.6)
@@ -155,6 +160,58 @@ def test_empty_masks_are_counted_and_named_and_the_scene_and_check_repeat_it(tmp
     assert words in scene and "surfaces of masks, in its frame: right, forward, up (RAS)" in scene
     _, out, _ = call(capsys, "check", tmp_path / "o" / "scene.toml")
     assert words in out and "no unit of length: mm taken" in out
+
+
+def test_what_lies_in_a_folder_of_masks_and_is_none_is_said_or_refused(tmp_path):
+    folder = write_masks(tmp_path, {"femur": FEMUR, "pelvis": PELVIS})
+    (folder / "._femur.nii.gz").write_bytes(b"what one system leaves for another")
+    write_nifti(folder / "whole.nii.gz", (FEMUR + 2 * PELVIS).astype(np.uint8))
+    volume = read_labels(folder)
+    assert by_name(volume).keys() == {"femur", "pelvis", "whole"}
+    assert "hidden files are not read: ._femur.nii.gz" in volume.notes
+    assert "whole.nii.gz has 2 labels and is taken for one mask of them all" in volume.notes
+    write_nifti(folder / "ct.nii.gz", np.where(FEMUR, 900, -1000).astype(np.int16))
+    with pytest.raises(MeshError, match=r"ct.nii.gz: labels from -1000 to 900, .* take it out"):
+        read_labels(folder)
+
+
+def test_two_labels_of_one_name_have_two_names_and_that_is_said(tmp_path):
+    folder = write_masks(tmp_path / "m", {"femur": FEMUR, "pelvis": PELVIS})
+    nrrd.write(str(folder / "femur.nrrd"), FEMUR.astype(np.uint8), NRRD_HEAD)
+    meshes, _, notes = _write_surfaces(read_labels(folder), tmp_path)
+    assert {file.stem for file in meshes.iterdir()} == {"femur", "femur_2", "pelvis"}
+    assert "2 labels are named femur: one of them is femur_2 here" in notes
+
+
+def test_a_header_beside_its_voxels_is_read_and_lost_voxels_are_said(tmp_path):
+    nrrd.write(str(tmp_path / "labels.nhdr"), (FEMUR + 2 * PELVIS).astype(np.uint8), NRRD_HEAD)
+    volume = read_labels(tmp_path / "labels.nhdr")
+    np.testing.assert_array_equal(volume.mask(1), FEMUR)
+    (tmp_path / "labels.raw.gz").unlink()
+    with pytest.raises(MeshError, match="no readable NRRD volume"):
+        read_labels(tmp_path / "labels.nhdr")
+
+
+def test_a_volume_with_two_places_says_which_counts(tmp_path):
+    path = write_nifti(tmp_path / "labels.nii.gz", (FEMUR + 2 * PELVIS).astype(np.uint8))
+    assert not read_labels(path).notes
+    image = nibabel.load(path)
+    moved = image.affine.copy()
+    moved[:3, 3] += 3.0, 0.0, 4.0
+    image.set_qform(moved, 1)
+    nibabel.save(image, tmp_path / "two.nii.gz")
+    volume = read_labels(tmp_path / "two.nii.gz")
+    np.testing.assert_allclose(volume.affine, np.diag([SPACING, SPACING, SPACING, 1.0]))
+    assert volume.notes == ["its sform counts, from which its qform is up to 5 mm off"]
+
+
+def test_voxels_that_are_no_numbers_are_counted(tmp_path):
+    labels = FEMUR + 2.0 * PELVIS
+    labels[labels == 0.0] = np.nan
+    path = write_nifti(tmp_path / "labels.nii.gz", labels.astype(np.float32))
+    count = f"{int(np.isnan(labels).sum()):,} of {labels.size:,} voxels are not finite"
+    with pytest.raises(MeshError, match=count):
+        read_labels(path)
 
 
 def test_holes_that_hold_other_labels_stay_and_others_are_filled():

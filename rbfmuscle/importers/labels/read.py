@@ -17,7 +17,7 @@ from rbfmuscle.geometry.arrays import Array, Floats
 from rbfmuscle.importers.labels.volume import LAYER, LabelVolume
 from rbfmuscle.validation import MeshError, UsageError
 
-VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd")
+VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
 # Stated limits: bytes of one volume once unpacked, labels, and the edge of a voxel [mm].
 MOST_BYTES = 2_000_000_000
 MOST_LABELS = 512
@@ -31,6 +31,8 @@ NO_DIRECTIONS = (
     "up (RAS), so left and right may be exchanged"
 )
 NO_UNIT = "the header states no unit of length: mm taken"
+# Places of voxels by a NIfTI's two transforms that differ by more than this [mm] are said.
+SAME_PLACE = 0.1
 
 
 @dataclass
@@ -76,7 +78,8 @@ def read_labels(path: Path, *, names: Path | None = None) -> LabelVolume:
 
 def _read_folder(path):
     """One mask a file: the label's name is the file's."""
-    files = sorted(file for file in path.iterdir() if is_volume(file))
+    found = sorted(file for file in path.iterdir() if is_volume(file))
+    files = [file for file in found if not file.name.startswith(".")]
     if not 0 < len(files) <= MOST_LABELS:
         raise MeshError(
             f"{path}: {len(files)} masks ({' '.join(VOLUME_SUFFIXES)}), 1 to {MOST_LABELS}"
@@ -84,6 +87,9 @@ def _read_folder(path):
     first = _read_file(files[0])
     layers: list[Array] = []
     together = LabelVolume(first.labels, first.affine, {}, str(path), first.notes, first.directed)
+    if len(files) < len(found):
+        hidden = ", ".join(file.name for file in found if file not in files)
+        together.notes.append(f"hidden files are not read: {hidden}")
     empty = []
     for number, file in enumerate(files, start=1):
         mask = _read_file(file)
@@ -91,7 +97,11 @@ def _read_folder(path):
             mask.affine, first.affine, atol=1e-3
         ):
             raise MeshError(f"{file}: its grid differs from that of {files[0].name}; resample it")
-        name = re.sub(r"(\.seg)?(\.nii(\.gz)?|\.nrrd)$", "", file.name, flags=re.IGNORECASE)
+        name = re.sub(r"(\.seg)?(\.nii(\.gz)?|\.n(rr|hd)[dr])$", "", file.name, flags=re.IGNORECASE)
+        if len(mask.values()) > 1:
+            together.notes.append(
+                f"{file.name} has {len(mask.values())} labels and is taken for one mask of them all"
+            )
         voxels = np.flatnonzero(mask.labels.max(axis=0))
         together.notes += [note for note in mask.notes if note not in together.notes]
         if len(voxels) == 0:
@@ -121,7 +131,9 @@ def _read_file(path):
     if not path.exists():
         raise UsageError(f"{path} does not exist; give a label volume or a folder")
     kind, read = (
-        ("NRRD", _read_nrrd) if path.name.lower().endswith(".nrrd") else ("NIfTI", _read_nifti)
+        ("NRRD", _read_nrrd)
+        if path.name.lower().endswith((".nrrd", ".nhdr"))
+        else ("NIfTI", _read_nifti)
     )
     try:
         data, header = read(path)
@@ -167,7 +179,23 @@ def _read_nifti(path):
     if not (int(image.header["qform_code"]) or int(image.header["sform_code"])):
         header.directed = False
         header.affine = np.diag([*map(float, image.header.get_zooms()[:3]), 1.0])
+    header.notes += _two_places(image)
     return data.reshape(data.shape[:3]), header
+
+
+def _two_places(image):
+    """A note where both transforms of a NIfTI are set and put its voxels at different places."""
+    first, second = image.get_sform(coded=True), image.get_qform(coded=True)
+    if not (first[1] and second[1]):
+        return []
+    corners = np.stack(np.meshgrid(*([0, size - 1] for size in image.shape[:3])), -1).reshape(-1, 3)
+    way = (first[0] - second[0])[:3] @ np.column_stack([corners, np.ones(8)]).T
+    apart = float(np.linalg.norm(way, axis=0).max())
+    return (
+        [f"its sform counts, from which its qform is up to {apart:.3g} mm off"]
+        if apart > SAME_PLACE
+        else []
+    )
 
 
 def _read_nrrd(path):
@@ -247,7 +275,11 @@ def _check_labels(data, path, notes):
     if not np.issubdtype(data.dtype, np.number) or np.iscomplexobj(data):
         raise MeshError(f"{path}: voxels of type {data.dtype}; labels are whole numbers")
     if not np.isfinite(data).all():
-        raise MeshError(f"{path}: some voxels are not finite; labels are whole numbers")
+        count = int((~np.isfinite(data)).sum())
+        raise MeshError(
+            f"{path}: {count:,} of {data.size:,} voxels are not finite; set to 0 what belongs to "
+            "nothing"
+        )
     whole = np.rint(data)
     off = np.abs(data - whole)
     if off.max(initial=0.0) > ROUNDED:
@@ -260,7 +292,10 @@ def _check_labels(data, path, notes):
         notes.append(f"labels that are no whole numbers rounded, by {off.max():.2g} at most")
     low, high = float(whole.min()), float(whole.max())
     if low < 0 or high >= LAYER:
-        raise MeshError(f"{path}: labels from {low:g} to {high:g}, allowed are 0 to {LAYER - 1}")
+        raise MeshError(
+            f"{path}: labels from {low:g} to {high:g}, allowed are 0 to {LAYER - 1}; is "
+            "it an image? take it out of the folder, or give its segmentation"
+        )
     return np.ascontiguousarray(whole, dtype=np.uint16)
 
 
