@@ -13,6 +13,10 @@ from rbfmuscle.validation import SceneError, shown
 
 TURN = 2.0 * math.pi
 MOST_LISTED = 8  # columns that a note lists
+# A row jumps that is this far [radian] from those beside it, and this many times farther than these
+# are from each other and than the other steps, in the median.
+SPIKE = math.radians(30.0)
+SPIKE_RATIO = 3.0
 IN_DEGREES = dict.fromkeys(("yes", "true", "1"), math.pi / 180) | dict.fromkeys(
     ("no", "false", "0"), 1.0
 )
@@ -44,7 +48,7 @@ def read_motion_file(
             f"[motion]: {path} row {row + 1}: {labels[used[column]]} is not a finite number"
         )
     factor, notes = _angle_factor(path, header)
-    notes += _storage_notes(path, header, unknown, len(values))
+    notes += _storage_notes(path, header, unknown, values.shape)
     if "time" in labels:
         notes += _time_notes(path, values[:, labels.index("time")])
     turns = {name: column for name, column in columns.items() if known[name].motion == "rotation"}
@@ -59,20 +63,45 @@ def read_motion_file(
             notes.append(f"{path}: the column of {name!r} is not used, the coordinate {why}")
         else:
             tracks[name] = (values[:, column] * units[known[name].motion]).tolist()
+    notes += _spike_notes(path, {name: tracks[name] for name in turns if name in tracks})
     frames = [{name: track[row] for name, track in tracks.items()} for row in range(len(values))]
     return frames, values[:, labels.index("time")].tolist() if "time" in labels else None, notes
 
 
-def _storage_notes(path, header, unknown, rows):
-    """Columns of a motion file that are of no coordinate, and rows counted wrongly."""
+def _storage_notes(path, header, unknown, shape):
+    """Columns of a motion file that are of no coordinate, and rows or columns counted wrongly."""
     notes = []
     if unknown:
         more = f" and {len(unknown) - MOST_LISTED} more" if len(unknown) > MOST_LISTED else ""
         listed = ", ".join(map(shown, unknown[:MOST_LISTED]))
         notes.append(f"{path}: columns of no coordinate of the scene are not used: {listed}{more}")
-    said = header.get("nrows", header.get("datarows"))
-    if said is not None and said != str(rows):
-        notes.append(f"{path}: nRows says {shown(said)}, {rows} rows are there: is it whole?")
+    for count, what, old in zip(shape, ("nRows", "nColumns"), ("datarows", "datacolumns")):
+        said = header.get(what.lower(), header.get(old))
+        if said is not None and said != str(count):
+            there = f"{count} {what[1:].lower()} are there"
+            notes.append(f"{path}: {what} says {shown(said)}, {there}: is it whole?")
+    return notes
+
+
+def _spike_notes(path, tracks):
+    """One row of a coordinate that lies far from those before and after, which are near to each
+    other.
+    """
+    notes = []
+    for name, track in tracks.items():
+        steps = np.diff(track)
+        beside = np.abs(steps[:-1] + steps[1:])
+        way = np.minimum(np.abs(steps[:-1]), np.abs(steps[1:]))
+        rows = np.flatnonzero((way > SPIKE) & (way > SPIKE_RATIO * beside))
+        # Of three rows there are no other steps.
+        rows = rows if len(steps) > 2 else rows[:0]
+        usual = [np.median(np.abs(np.delete(steps, [row, row + 1]))) for row in rows]
+        rows = rows[way[rows] > SPIKE_RATIO * np.array(usual)] if len(rows) else rows
+        if len(rows):
+            row = int(rows[np.argmax(way[rows])])
+            jump = f"{math.degrees(way[row]):.4g} degrees from the rows before and after"
+            others = f", and {len(rows) - 1} rows more" if len(rows) > 1 else ""
+            notes.append(f"{path} row {row + 2}: {name} jumps {jump}{others}: is the row right?")
     return notes
 
 

@@ -96,6 +96,18 @@ class TestOpenSimFile:
     def test_rows_that_are_missing_are_counted(self, tmp_path):
         (note,) = self.notes(tmp_path, "0 10 20\n")
         assert "nRows says 2, 1 rows are there" in note
+        (note,) = self.notes(tmp_path, "0 10 20\n0.1 11 21\n", nColumns="datacolumns=7\nwas")
+        assert "nColumns says 7, 3 columns are there" in note
+
+    def test_a_row_that_jumps_there_and_back_is_named(self, tmp_path):
+        rows = "0 1 2\n1 2 2\n2 350 2\n3 4 2\n4 6 2\n"
+        (note,) = self.notes(tmp_path, rows, nRows="row_s")
+        assert "row 3: two.bend jumps 346 degrees from the rows before and after" in note
+        # What only moves fast, or turns back, does not jump.
+        assert not self.notes(tmp_path, "0 1 2\n1 40 2\n2 80 2\n3 40 2\n", nRows="row_s")
+
+    def test_names_in_quotes_are_names(self, tmp_path):
+        assert not self.notes(tmp_path, "0 10 20\n0.1 11 21\n", bend='"bend"')
 
     def test_times_that_do_not_increase_are_named(self, tmp_path):
         (note,) = self.notes(tmp_path, "0 1 2\n0.1 1 2\n0.1 2 3\n0.05 2 3\n", nRows="row_s")
@@ -105,6 +117,18 @@ class TestOpenSimFile:
         (note,) = self.notes(tmp_path, "0 0 20\n0.1 1 60\n", flag="no")
         assert "one.turn reaches 60 radians, 9.55 turns: does the file mean degrees" in note
         assert not self.notes(tmp_path, "0 0 2\n0.1 1 6\n", flag="no")
+
+    @pytest.mark.parametrize(
+        ("rows", "words"),
+        [
+            ("0 1 2\n1 x 2\n", "row 2: bend is 'x'"),
+            ("0,1 1 2\n", "row 1: time is '0,1', .* points"),
+        ],
+    )
+    def test_text_among_numbers_is_named_with_row_and_column(self, tmp_path, rows, words):
+        self.write(tmp_path, rows)
+        with pytest.raises(SceneError, match=words):
+            chain().set_motion(file="walk.mot", folder=tmp_path)
 
     @pytest.mark.parametrize("rows", ["0 1\n", "0 x 1\n", "0 nan 1\n", "", "\n"])
     def test_bad_rows(self, tmp_path, rows):
