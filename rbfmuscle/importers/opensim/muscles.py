@@ -39,6 +39,8 @@ def read_muscles(reading: Reading, model: Node, forces: list[Node]) -> None:
             others[force.tag] += [force.name or force.tag] if path is not None else []
             continue
         title = f"{force.tag} {force.name!r}"
+        if force.truth("isDisabled") or not force.truth("appliesForce", True):
+            reading.model.notes.append(f"{title} is switched off in the model: taken all the same")
         try:
             if path is None:
                 raise SceneError("it has no path; give it one")

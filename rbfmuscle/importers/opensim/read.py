@@ -14,6 +14,7 @@ from rbfmuscle.importers.opensim.xml import Node, read_xml
 from rbfmuscle.scene.names import plain_name
 from rbfmuscle.validation import SceneError
 
+NEWEST = 40699  # what later versions add is not known here
 SOCKETS = 40000  # from this version on joints stand in a set of their own and name their frames
 MOST_RENAMED = 6  # names that a note lists
 
@@ -47,6 +48,9 @@ def _read_model(root, path):
     model.notes += notes
     model.bodies = list(frames.bodies.values())
     _note_names(model, frames)
+    if version > NEWEST or not version:
+        said = f"is of version {version}, newer than 4.6" if version else "states no version"
+        model.notes.append(f"the file {said}: read as one of version 4.6 where nothing else shows")
     units = node.word("length_units", "meters")
     if units not in ("meters", "m", "metres"):
         words = "lengths are read as metres, as OpenSim reads them"

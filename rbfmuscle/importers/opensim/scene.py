@@ -2,6 +2,7 @@
 are; its files.
 """
 
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -124,9 +125,11 @@ def _holders(walk, bodies, bones):
 
 def _find_mesh(name: str, folders: list[Path]) -> Path | None:
     """Return the first file of that name in some folders, or None; exact names before others in
-    case or suffix.
+    case or suffix, and a whole path that is not here by its last part.
     """
     plain = name.replace("\\", "/")
+    if re.match(r"/|[A-Za-z]:", plain) and not Path(plain).is_file():
+        plain = Path(plain).name
     for folder in folders:
         if (folder / plain).is_file():
             return folder / plain
@@ -155,8 +158,8 @@ def _body_meshes(
         except MeshError as error:
             notes.append(f"body {mesh.body!r}: mesh {mesh.file!r} is not taken: {error}")
             continue
-        if file.name != Path(mesh.file).name:
-            notes.append(f"body {mesh.body!r}: mesh {mesh.file!r} was read from {file.name!r}")
+        if file.name != Path(mesh.file).name or Path(mesh.file).is_absolute():
+            notes.append(f"body {mesh.body!r}: mesh {mesh.file!r} was read from {str(file)!r}")
         parts.setdefault(mesh.body, []).append((vertices, faces, file.name))
     for body, found in parts.items():
         try:

@@ -96,7 +96,8 @@ class Node(ElementTree.Element):
         """The finite numbers in the child of that tag; ``count`` says how many there must be."""
         text = self.word(tag, default)
         try:
-            values = [float(word) for word in text.replace(",", " ").split()]
+            # OpenSim also takes commas and brackets.
+            values = [float(word) for word in re.sub(r"[,()\[\]~]", " ", text).split()]
         except ValueError:
             raise self.error(f"{tag}: {text[:60]!r} is no list of numbers; correct it") from None
         if not all(map(math.isfinite, values)):

@@ -4,6 +4,7 @@ Where no hand calculation is named, numbers are those of OpenSim 4.6 for the sam
 """
 
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -498,3 +499,46 @@ def test_joints_of_one_name_keep_their_own_frames(read):
     np.testing.assert_allclose(place[:3, :3], turned(0.5), atol=1e-12)
     assert found.notes == ["another joint is named 'one' too: it is 'one_0' here"]
     assert not found.doubts
+
+
+class TestWhatIsSaid:
+    """Each stands in one line of the import, and so in the scene."""
+
+    def changed(self, tmp_path, *pairs):
+        for name in ("muscles.osim", "wedge.obj"):
+            shutil.copy(ROOT / "tests" / "data" / name, tmp_path)
+        path = tmp_path / "muscles.osim"
+        text = path.read_text(encoding="utf-8")
+        for before, after in pairs:
+            assert before in text
+            text = text.replace(before, after, 1)
+        path.write_text(text, encoding="utf-8")
+        return import_osim(path)
+
+    @pytest.mark.parametrize("version", ["50300", ""])
+    def test_a_version_that_is_not_known(self, tmp_path, version):
+        after = f' Version="{version}"' if version else ""
+        found = self.changed(tmp_path, (' Version="40000"', after))
+        (note,) = (note for note in found.notes if "version" in note)
+        assert ("50300" if version else "no version") in note and len(found.scene.muscles) == 2
+
+    @pytest.mark.parametrize("said", ["<appliesForce>false<", "<isDisabled>true<"])
+    def test_a_muscle_that_is_switched_off_is_taken(self, tmp_path, said):
+        tag = said.split(">")[0][1:]
+        force = "<max_isometric_force>900"
+        found = self.changed(tmp_path, (force, f"{said}/{tag}>{force}"))
+        assert [muscle.name for muscle in found.scene.muscles] == ["hamstring", "vastus"]
+        assert sum("'hamstring' is switched off" in note for note in found.notes) == 1
+        assert not any("switched off" in note for note in self.changed(tmp_path).notes)
+
+    @pytest.mark.parametrize("folder", ["C:\\Models\\Geometry\\", "/home/somebody/Geometry/"])
+    def test_a_mesh_by_a_path_of_another_machine_is_the_one_of_its_name(self, tmp_path, folder):
+        found = self.changed(tmp_path, ("wedge.obj", f"{folder}wedge.obj"))
+        assert len(found.scene.bones) == 2
+        (note,) = (note for note in found.notes if "was read from" in note)
+        assert str(tmp_path / "wedge.obj") in note
+
+    def test_numbers_in_brackets_are_numbers(self, tmp_path):
+        at = "<location>0.04 -0.05 0.01"
+        found = self.changed(tmp_path, (at, "<location>~[0.04,-0.05,0.01]"))
+        assert found.model.muscles[1].points[0][1] == pytest.approx([0.04, -0.05, 0.01])
