@@ -2,6 +2,8 @@
 
     python benchmarks/guess_confidence.py [CASE ...] [-o FILE.json]
 
+Without CASE the evidence of the pages is written (``docs/evidence``), else that of ``-o`` alone.
+
 Each case writes the meshes of data/leg or data/hip changed (renamed, mirrored, turned, scaled, in
 another unit, stretched, decimated, roughened, with muscles or bones missing), guesses a scene and
 compares every attachment with that of the scene in the data. A guess is wrong where the scene does
@@ -19,13 +21,14 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from evidence import data_folder, write_evidence
+from evidence import ROOT, data_folder, write_evidence
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.importers.guess.guess import guess_scene
 
 COLUMNS = ["confidence", "guesses", "wrong", "%"]
+EVIDENCE = ROOT / "docs" / "evidence" / "guess_confidence.json"
 FAR = 15.0  # [mm] at scale 1
 PREFIXES = {
     "plain": "{}",
@@ -178,11 +181,12 @@ def is_wrong(muscle, hold, true, case):
 
 
 def main():
-    """Measure, print, and write the evidence with -o."""
+    """Measure, print, and write the evidence."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("cases", nargs="*", help="names of cases, or parts of them")
     parser.add_argument("-o", "--output", type=Path)
     given = parser.parse_args()
+    output = given.output or (None if given.cases else EVIDENCE)
     counts = {}
     for case in CASES:
         if given.cases and not any(word in case.name for word in given.cases):
@@ -202,8 +206,8 @@ def main():
     ]
     for row in table:
         print("confidence {}: {} guesses, {} wrong ({:.1f} %)".format(*row))
-    if given.output:
-        write_evidence(given.output, ["benchmarks/guess_confidence.py"], table, COLUMNS)
+    if output:
+        write_evidence(output, ["benchmarks/guess_confidence.py"], table, COLUMNS)
 
 
 if __name__ == "__main__":

@@ -108,6 +108,17 @@ class TestPolygons:
         assert not part.notes and len(part.faces) == 20
         assert mesh.volume == pytest.approx(20000) and mesh.area == pytest.approx(5800)
 
+    @pytest.mark.parametrize("strips", [False, True])
+    def test_points_without_faces_are_counted(self, tmp_path, strips):
+        more = "element tristrips 1\nproperty list int int vertex_indices\n" if strips else ""
+        axes = "".join(f"property float {axis}\n" for axis in "xyz")
+        head = f"ply\nformat ascii 1.0\nelement vertex 3\n{axes}{more}end_header\n"
+        rows = "0 0 0\n1 0 0\n0 1 0\n" + ("3 0 1 2\n" if strips else "")
+        (tmp_path / "cloud.ply").write_text(head + rows, encoding="utf-8")
+        words = "3 points and no faces" + (" but strips" if strips else "")
+        with pytest.raises(MeshError, match=words):
+            read_mesh(tmp_path / "cloud.ply", name="cloud")
+
     def test_a_file_that_ends_within_its_faces_is_refused(self, tmp_path):
         whole = ply_bytes(*prism(L_SHAPE), "ascii").decode()
         file = tmp_path / "cut.ply"

@@ -235,6 +235,11 @@ def _read_ply(path, content):
             raise error from None
     faces = np.asarray(getattr(mesh, "faces", ()), np.int64).reshape(-1, 3)
     declared = re.search(rb"element\s+face\s+(\d+)", content[:10000])
+    if not len(faces) and not (declared and int(declared[1])):
+        points = re.search(rb"element\s+vertex\s+(\d+)", content[:10000])
+        strips = " but strips" if b"element tristrips" in content[:10000] else ""
+        count = int(points[1]) if points else 0
+        raise ValueError(f"it has {count} points and no faces{strips}; export its triangles")
     if declared and int(declared[1]) != len(faces):
         return _read_polydata(path, declared=int(declared[1]))
     return FilePart("", np.asarray(mesh.vertices, np.float64), faces, [])
