@@ -14,6 +14,8 @@ from rbfmuscle.jit import compiled
 LEAF, BITS = 4, 10
 # Pairs of nodes that wait at a time: less than four for each level of the tree.
 WAITING = 512
+# Pairs of leaves looked into at a time.
+STAGE = 64
 
 
 def morton_order(points: Floats) -> Integers:
@@ -262,12 +264,30 @@ def _cross_loop(vertices, faces, leaves, asked, found):
     """
     pairs, box = leaves
     among, plain = asked
-    near = np.empty(LEAF, np.bool_)
+    some = np.empty((STAGE * LEAF * LEAF, 2), np.int64)
+    for start in range(0, len(pairs), STAGE):
+        near = _near_loop(pairs[start : start + STAGE], box, some)
+        # Nearly all that touch share a corner: those that do not are put in front.
+        count = 0
+        for k in range(near):
+            f, g = some[k, 0], some[k, 1]
+            some[count, 0] = f
+            some[count, 1] = g
+            count += _meet(faces, f, g, plain) & (among[f] | among[g])
+        for k in range(count):
+            f, g = some[k, 0], some[k, 1]
+            if not (found[f] and found[g]) and _cross(vertices, faces, f, g):
+                found[f], found[g] = True, True
+
+
+@compiled
+def _near_loop(pairs, box, some):
+    """Fill ``some`` with the triangles of pairs of leaves whose boxes touch; how many there are."""
+    # Without branches, as which of them touch is a toss-up.
+    near, count = np.empty(LEAF, np.bool_), 0
     for k in range(len(pairs)):
         i, j = pairs[k, 0], pairs[k, 1]
         for m in range(LEAF):
-            # All six are compared, and all boxes of the leaf: side by side, which is quicker than
-            # to choose.
             for n in range(LEAF):
                 near[n] = (
                     (box[i, 0, m] <= box[j, 3, n])
@@ -277,18 +297,11 @@ def _cross_loop(vertices, faces, leaves, asked, found):
                     & (box[i, 2, m] <= box[j, 5, n])
                     & (box[j, 2, n] <= box[i, 5, m])
                 )
-            for n in range(m + 1 if i == j else 0, LEAF):
-                if not near[n]:
-                    continue
-                f, g = LEAF * i + m, LEAF * j + n
-                if (
-                    not _meet(faces, f, g, plain)
-                    or (found[f] and found[g])
-                    or not (among[f] or among[g])
-                ):
-                    continue
-                if _cross(vertices, faces, f, g):
-                    found[f], found[g] = True, True
+            for n in range(LEAF):
+                some[count, 0] = LEAF * i + m
+                some[count, 1] = LEAF * j + n
+                count += near[n] & ((i != j) | (n > m))
+    return count
 
 
 @compiled
