@@ -18,7 +18,7 @@ import numpy as np
 
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.metrics.depths import BoneDistance, bone_depth, surface_depth
+from rbfmuscle.metrics.depths import bone_depth, surface_depth
 from rbfmuscle.metrics.metrics import SurfaceForm
 from rbfmuscle.models import build_model, configure_scene
 from rbfmuscle.scene.scene import Scene
@@ -100,7 +100,7 @@ def main():
         scene, parse_settings(given.set), model=given.model, frames=given.frames
     )
     faults = {muscle.name: Faults(muscle) for muscle in scene.muscles}
-    probes = [BoneDistance(bone.name, bone.mesh) for bone in scene.bones]
+    probes = [bone.exact for bone in scene.bones]
     models = [build_model(muscle, scene, muscle.model) for muscle in scene.muscles]
     spent = 0.0
     start = time.process_time()

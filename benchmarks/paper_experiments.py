@@ -25,7 +25,7 @@ import numpy as np
 from peers import paper_models
 
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.metrics.depths import BoneDistance, bone_depth, surface_depth
+from rbfmuscle.metrics.depths import bone_depth, surface_depth
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
@@ -96,7 +96,7 @@ class Experiment:
         self.names = [bone.name for bone in scene.bones]
         self.sub_steps = SubSteps(self.scene)
         self.fields = [fields.get(name) for name in self.names]
-        self.probes = [BoneDistance(bone.name, bone.mesh) for bone in scene.bones]
+        self.probes = [bone.exact for bone in scene.bones]
 
     def run(self, method, substeps):
         """Angles of the first penetration and tunnelling, and the worst of everything else."""

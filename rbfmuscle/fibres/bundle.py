@@ -10,7 +10,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import moving_joints, split_ends
-from rbfmuscle.metrics.depths import BoneDistance, bones_about
+from rbfmuscle.metrics.depths import bones_about
 from rbfmuscle.scene.objects import Attachment, Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import NODES, TendonLine
@@ -31,7 +31,7 @@ class FibreBundle:
         mesh = MeshDistance(muscle.mesh.vertices, muscle.mesh.faces)
         groups = split_ends(muscle, scene.joints, moving_joints(scene))
         patches = [_end_points(mesh, group) for group in groups]
-        probes = [BoneDistance(bone.name, bone.mesh) for bone in scene.bones]
+        probes = [bone.exact for bone in scene.bones]
         near = bones_about(mesh.vertices, probes, {probe.name: np.eye(4) for probe in probes})
         ends = (patches[0][0], patches[1][0])
         traced = trace_fibres(mesh, ends, count, polylines=muscle.fibres, bones=near)

@@ -9,7 +9,7 @@ from rbfmuscle.fibres.flux import FluxField
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.tubes import distance_along, points_along
-from rbfmuscle.metrics.depths import BoneDistance
+from rbfmuscle.scene.bone import BoneDistance
 
 POINTS = 25  # of a fibre, at even distances along it
 STEP = 0.5  # of a line that is traced, in cells

@@ -20,7 +20,8 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import connected_vertices, vertex_areas
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.jit import compiled
-from rbfmuscle.metrics.depths import BoneDistance, bones_about
+from rbfmuscle.metrics.depths import bones_about
+from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.joints.joint import Joint, all_coordinates, rigid_body
 from rbfmuscle.scene.objects import Attachment, Muscle
 from rbfmuscle.scene.scene import Scene

@@ -1,25 +1,10 @@
 """Depths of muscles in bones and of bones in muscles, as they are measured."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.solids import SolidDistance
-from rbfmuscle.validation import check_mesh
-
-if TYPE_CHECKING:
-    import trimesh
-
-
-class BoneDistance(SolidDistance):
-    """One bone, prepared once in its own coordinates; it may have holes and several shells."""
-
-    def __init__(self, name: str, mesh: "trimesh.Trimesh") -> None:
-        super().__init__(*check_mesh(mesh.vertices, mesh.faces, name=name))
-        self.name = name
-        self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+from rbfmuscle.scene.bone import BoneDistance
 
 
 def surface_depth(vertices: Floats, probes: list[BoneDistance], poses: dict[str, Floats]) -> Floats:

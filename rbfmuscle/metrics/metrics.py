@@ -13,9 +13,10 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import edge_lengths, label_sheets, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
-from rbfmuscle.metrics.depths import BoneDistance, bone_depth, surface_depth
+from rbfmuscle.metrics.depths import bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
 from rbfmuscle.scene.articular import articular_share, scene_surfaces
+from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
@@ -44,7 +45,7 @@ class MuscleMeasures:
     """
 
     def __init__(self, scene: Scene, carried: Mapping[str, Mesh]) -> None:
-        self.probes = [BoneDistance(bone.name, bone.mesh) for bone in scene.bones]
+        self.probes = [bone.exact for bone in scene.bones]
         surfaces = scene_surfaces(scene)
         mine = [muscle for muscle in scene.muscles if muscle.name in carried]
         self.trackers = {

@@ -10,11 +10,21 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.solids import SolidDistance
+from rbfmuscle.validation import check_mesh
 
 if TYPE_CHECKING:
     import trimesh
 
 SURFACE_POINTS = 2000  # about how many points cover a bone: 4.5 mm apart on a femur
+
+
+class BoneDistance(SolidDistance):
+    """One bone, prepared once in its own coordinates; it may have holes and several shells."""
+
+    def __init__(self, name: str, mesh: trimesh.Trimesh) -> None:
+        super().__init__(*check_mesh(mesh.vertices, mesh.faces, name=name))
+        self.name = name
+        self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
 
 @dataclass
@@ -37,19 +47,20 @@ class Bone:
         return np.array(self.mesh.bounds)
 
     @cached_property
-    def _distance(self) -> SolidDistance:
-        return SolidDistance(self.mesh.vertices, self.mesh.faces)
+    def exact(self) -> BoneDistance:
+        """Exact distances to the bone at rest, for checks and metrics alike."""
+        return BoneDistance(self.name, self.mesh)
 
     def distances(self, points: Floats) -> Floats:
         """Distances (n,) of points (n, 3) to the outer surface, negative inside."""
-        return self._distance.signed(points)
+        return self.exact.signed(points)
 
     def nearest(self, points: Floats) -> tuple[Floats, Floats]:
         """Distances (n,) to the outer surface, negative inside, and the nearest places (n, 3) on
         it, of points (n, 3).
         """
-        distances, places, _ = self._distance.nearest(points)
-        return np.where(self._distance.inside(points), -1.0, 1.0) * np.abs(distances), places
+        distances, places, _ = self.exact.nearest(points)
+        return np.where(self.exact.inside(points), -1.0, 1.0) * np.abs(distances), places
 
     @cached_property
     def surface_points(self) -> Floats:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.metrics.depths import BoneDistance
 from rbfmuscle.output.appearance import VIEWS, view_axes
 from rbfmuscle.output.run_data import RunData
+from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SolveError
 from rbfmuscle.viewer.panel import Panel

@@ -11,7 +11,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import edge_stretch, mesh_volume
-from rbfmuscle.metrics.depths import BoneDistance, surface_depth
+from rbfmuscle.metrics.depths import surface_depth
 from rbfmuscle.output.appearance import (
     BONE_COLOUR,
     LONG,
@@ -21,6 +21,7 @@ from rbfmuscle.output.appearance import (
     linear_rgb,
     stretch_colours,
 )
+from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.viewer.sources import (
     LiveFigure,

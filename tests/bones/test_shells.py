@@ -6,8 +6,7 @@ import trimesh
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.solids import outer_surface
-from rbfmuscle.metrics.depths import BoneDistance
-from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.bone import Bone, BoneDistance
 from rbfmuscle.scene.meshes.read import prepare_mesh
 
 FACETING = 0.05  # a ball of radius 20 with 2562 vertices lies up to 0.024 inside the sphere

@@ -7,7 +7,7 @@ import trimesh
 from rbfmuscle.fibres.flux import FluxField
 from rbfmuscle.fibres.trace import trace_fibres
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.metrics.depths import BoneDistance
+from rbfmuscle.scene.bone import BoneDistance
 
 LENGTH, SIDE = 60.0, 12.0
 

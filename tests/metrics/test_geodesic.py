@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.tubes import line_length, tube_mesh
 from rbfmuscle.metrics.centreline import NODES, Centreline, shortest_path
-from rbfmuscle.metrics.depths import BoneDistance
+from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.objects import Attachment
 
 RADIUS, FAR = 10.0, 25.0

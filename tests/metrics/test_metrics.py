@@ -10,11 +10,12 @@ import trimesh
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.mesh_distance import Columns, MeshDistance
 from rbfmuscle.metrics.centreline import Centreline, split_ends
-from rbfmuscle.metrics.depths import BoneDistance, bone_depth, surface_depth
+from rbfmuscle.metrics.depths import bone_depth, surface_depth
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.metrics.rows import _smoothness, moment_arms
 from rbfmuscle.run import simulate
+from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.objects import Attachment, Motion
 from rbfmuscle.simulation.frame import Frame, ModelSurface

@@ -9,8 +9,8 @@ import trimesh
 from blend_model import arm_scene
 
 import rbfmuscle as rm
-from rbfmuscle.metrics.depths import BoneDistance
 from rbfmuscle.output.run_data import RunData
+from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession, coordinate_limits
