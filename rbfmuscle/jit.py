@@ -43,8 +43,23 @@ def compiled(function: Callable | None = None, **options: object) -> Callable:
     # is left out.
     loop = numba.njit(**{"nogil": True, "no_cfunc_wrapper": True, **options})(function)
     loop._compiler.compile = _no_collection()(loop._compiler.compile)
+    loop.get_call_template = _of_plain_types(loop.get_call_template)
     loop._cache = _LoopCache(function)
     return loop
+
+
+def _of_plain_types(find: Callable) -> Callable:
+    """A loop that is called with constants is compiled once for all of them: numba would compile
+    it for each ``True``, ``False`` and 0 that another loop gives it.
+    """
+
+    def find_plain(args, kws):
+        return find(
+            [numba.types.unliteral(kind) for kind in args],
+            {name: numba.types.unliteral(kind) for name, kind in kws.items()},
+        )
+
+    return find_plain
 
 
 def inner(**options: object) -> Callable:

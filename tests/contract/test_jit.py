@@ -10,6 +10,8 @@ import numba
 import pytest
 from conftest import ROOT
 
+from rbfmuscle.jit import compiled
+
 pytestmark = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
 SOURCES = {
     "__init__": "",
@@ -157,3 +159,16 @@ def test_folders_that_are_unused_are_removed(place):
 def test_nothing_is_compiled_where_numba_is_switched_off(place):
     assert run(place, NUMBA_DISABLE_JIT="1") == ([102.5, 1.0], "")
     assert not (place / "cache").exists()
+
+
+def test_a_loop_is_compiled_once_for_all_constants_that_it_is_called_with():
+    @compiled
+    def chosen(x, flag, factor):
+        return x + 1.0 if flag else factor * x
+
+    @compiled
+    def caller(x, flag):
+        return chosen(x, True, 0) + chosen(x, False, 2) + chosen(x, flag, factor=3)
+
+    assert caller(2.0, False) == 3.0 + 4.0 + 6.0
+    assert len(chosen.signatures) == 1
