@@ -78,9 +78,11 @@ def articular_share(
         if held.tendon is None and len(surface):
             points = np.asarray(muscle.mesh.vertices)[held.vertices]
             near, _ = cKDTree(surface).query(points)
-            away = np.abs(scene.bone(held.bone).distances(points))
-            lies = (near <= away + scene.length(BESIDE)) & (away < scene.length(TOUCHED))
-            share = float(np.mean(lies))
+            touched, beside = scene.length(TOUCHED), scene.length(BESIDE)
+            some = near < touched + beside  # others cannot lie on it
+            away = scene.bone(held.bone).exact.unsigned(points[some])
+            lies = (near[some] <= away + beside) & (away < touched)
+            share = float(lies.sum()) / len(points)
             worst = max(worst, (share, held.bone))
     return worst
 

@@ -117,7 +117,7 @@ def _rest_overlaps(scene):
     """Muscle vertices inside bones at rest."""
     findings = []
     for muscle, bone in itertools.product(scene.muscles, scene.bones):
-        depth = _depths(np.asarray(muscle.mesh.vertices), bone)
+        depth = bone.exact.depth(muscle.mesh.vertices)
         for attachment in muscle.attachments:
             depth[attachment.vertices] = 0.0
         inside = np.count_nonzero(depth)
@@ -144,16 +144,6 @@ def check_initial(scene: Scene) -> None:
         if finding.level == "error":
             remedy = "move it, or set [contact] initial"
             raise SceneError(f"muscle {finding.place!r}: {finding.message}; {remedy}")
-
-
-def _depths(points, bone):
-    """Depth of points inside a bone, zero outside; only points in its box are measured."""
-    depth = np.zeros(len(points))
-    low, high = bone.bounds
-    near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
-    if len(near):
-        depth[near] = -np.minimum(bone.distances(points[near]), 0.0)
-    return depth
 
 
 def bone_collisions(
@@ -189,12 +179,13 @@ def _pair_depths(scene, poses):
         if np.allclose(relative, np.eye(4), atol=1e-12):
             continue
         back = np.linalg.inv(relative)
-        (low, high), other = moved_box(first.mesh.bounds, relative), second.mesh.bounds
+        (low, high), other = moved_box(first.bounds, relative), second.bounds
         if np.any(low > other[1]) or np.any(high < other[0]):
             continue
-        one = np.asarray(first.mesh.vertices) @ relative[:3, :3].T + relative[:3, 3]
-        two = np.asarray(second.mesh.vertices) @ back[:3, :3].T + back[:3, 3]
-        deepest = max(_depths(one, second).max(), _depths(two, first).max())
+        deepest = max(
+            second.exact.depth(first.mesh.vertices, pose=relative).max(),
+            first.exact.depth(second.mesh.vertices, pose=back).max(),
+        )
         if deepest > 0:
             depths[first.name, second.name] = float(deepest)
     return depths
