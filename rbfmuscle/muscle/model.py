@@ -32,7 +32,7 @@ from rbfmuscle.jit import compiled
 
 # Stiffness of the spring at a held point that stands for a 4000th of the surface, relative to that
 # of a cell: springs are spread evenly over an attachment, however many points it has.
-HOLD, HELD_OF = 25.0, 4000
+HOLD, HELD_OF = 10.0, 4000
 # Stiffness of second differences, relative to a cell: for nodes that hold hardly any material.
 GHOST = 1e-3
 NODES_PER_REGION = 8
