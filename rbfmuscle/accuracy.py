@@ -58,7 +58,7 @@ def discretisation_error(scene: Scene) -> list[LatticeError]:
             away = np.linalg.norm(one[name] - other[name], axis=1)
             rms = float(np.sqrt(np.mean(away**2)))
             if name not in worst or rms > worst[name].rms:
-                found = LatticeError(name, nodes[name], numbers[k], rms, float(away.max()))
+                found = LatticeError(name, nodes[name], int(numbers[k]), rms, float(away.max()))
                 worst[name] = found
     return list(worst.values())
 
