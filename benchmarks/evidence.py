@@ -53,12 +53,12 @@ def provenance(command):
     }
 
 
-def write_evidence(path, command, rows, columns=None):
-    """Write the rows of a table with where they come from.
+def write_evidence(path, command, rows, columns=None, **more):
+    """Write the rows of a table with where they come from, and ``more``, such as what plots show.
 
     With ``columns``, the heads of the table, rows are lists of texts and numbers, None for an empty
     cell; without them a function of ``docs/figures.py`` draws the table.
     """
     heads = {"columns": columns} if columns else {}
-    text = json.dumps({**provenance(command), **heads, "rows": rows}, indent=1)
+    text = json.dumps({**provenance(command), **heads, "rows": rows, **more}, indent=1)
     Path(path).write_text(text + "\n", encoding="utf-8")

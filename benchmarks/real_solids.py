@@ -247,7 +247,7 @@ def rows_of(models):
     for model in models:
         rows.append((model, model, {}))
         if model == "rbf":
-            rows += [(f"rbf, {n} nodes", model, {"model.nodes": n}) for n in (300, 600)]
+            rows += [(f"rbf, {n} nodes", model, {"model.nodes": n}) for n in (150, 600)]
     return rows
 
 

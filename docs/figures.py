@@ -41,6 +41,7 @@ COMMANDS = {
     "kernels": "kernel_table.py DATA --kernels cubic,quintic,gaussian,wendland_c4 --centres 300",
     "interpolation": "interpolation.py",
     "hip_fibres": "hip_moment_arms.py",
+    "ischial_cover": "ischial_cover.py",
     "leg_arms": "leg_arms.py",
     "guess_confidence": "guess_confidence.py",
 }
