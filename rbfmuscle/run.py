@@ -126,8 +126,7 @@ def stream_run(
     SolveError
         If a frame cannot be solved or written; frames so far are kept.
     LimitExceededError
-        If a limit of ``fail_on`` is exceeded, or was not measured; everything is written, and its
-        ``info`` is the `RunInfo`.
+        If a limit of ``fail_on`` is exceeded, or was not measured; everything is written.
     """
     run_folder(directory)
     recording = Recording(scene, model=model, settings=settings, frames=frames, fail_on=fail_on)

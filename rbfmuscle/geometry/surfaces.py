@@ -295,9 +295,18 @@ def mesh_hash(vertices: Floats, faces: Integers) -> str:
     return hashlib.sha256(points.tobytes() + corners.tobytes()).hexdigest()
 
 
-def edge_stretch(now: Floats, rest: Floats, faces: Integers) -> Floats:
-    """Mean change of length (n,) of the edges about each vertex, relative to rest."""
-    edges = unique_edges(faces)
-    change = edge_lengths(now, edges) / edge_lengths(rest, edges) - 1.0
-    total, count = (np.bincount(edges.T.ravel(), x, len(now)) for x in (np.tile(change, 2), None))
-    return total / np.maximum(count, 1)
+class EdgeStretch:
+    """Mean change of length (n,) of the edges about each vertex, relative to vertices (n, 3) and
+    faces (m, 3) at rest.
+    """
+
+    def __init__(self, rest: Floats, faces: Integers) -> None:
+        self._edges = unique_edges(faces)
+        self._lengths = edge_lengths(rest, self._edges)
+        self._ends = self._edges.T.ravel()
+        self._count = np.maximum(np.bincount(self._ends, minlength=len(rest)), 1)
+
+    def __call__(self, now: Floats) -> Floats:
+        """The change at vertices (n, 3)."""
+        change = edge_lengths(now, self._edges) / self._lengths - 1.0
+        return np.bincount(self._ends, np.tile(change, 2), len(now)) / self._count

@@ -226,7 +226,8 @@ class SurfaceBuilder:
             if left == 1.0:
                 bone, cause = self._cause(now, work.carried, contacts)
                 notes.append((bone, len(work.left), f"carried_{cause}"))
-        return ModelSurface(work.vertices, self.model.faces, quantities, notes)
+        arrays = {} if fit is None else {"level_offset": self.model.offset}
+        return ModelSurface(work.vertices, self.model.faces, quantities, notes, arrays=arrays)
 
     def _obstacles(self, contacts: BoneContacts) -> Obstacles:
         """The bones in reach, and their poses now."""

@@ -10,12 +10,12 @@ import numpy as np
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.solids import SolidDistance
-from rbfmuscle.geometry.surfaces import edge_stretch
 from rbfmuscle.output.animation.gltf import animated_glb
 from rbfmuscle.output.animation.parts import AnimatedMesh, Animation, read_animation
 from rbfmuscle.output.animation.usd import check_usd, write_usd
 from rbfmuscle.output.fibre_files import write_fibres
 from rbfmuscle.output.run_data import RunData, open_run
+from rbfmuscle.output.surface_arrays import VertexArrays
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingDependencyError, SolveError, UsageError
@@ -184,24 +184,24 @@ def _export_fibres(run: Animation, folder: Path, frames: list[int]) -> list[Path
 
 
 class SurfaceArrays:
-    """Arrays at the vertices of muscles' surfaces: distance to the nearest bone, negative inside,
-    mean stretch of the edges against the first frame, number of the muscle's group.
+    """Arrays at the vertices of muscles: those of `VertexArrays` against the first frame, and the
+    distance to the nearest bone, negative inside.
     """
 
     def __init__(self, run: Animation) -> None:
         self._bones = [(SolidDistance(bone.vertices[0], bone.faces[0]), bone) for bone in run.bones]
         self._groups = sorted({part.group for part in run.muscles})
+        self._first: dict[str, VertexArrays] = {}
 
     def of(self, part: AnimatedMesh, k: int) -> dict[str, Floats]:
         """Arrays (n,) of a muscle in frame ``k``; no stretch where triangles change."""
-        vertices, faces = part.mesh(k)
-        found = {"group": np.full(len(vertices), self._groups.index(part.group))}
-        distances = [field.signed(_at_rest(vertices, bone, k)) for field, bone in self._bones]
+        mesh = part.mesh(k)
+        if part.name not in self._first:
+            self._first[part.name] = VertexArrays(part.mesh(0), self._groups.index(part.group))
+        found = self._first[part.name].of(mesh)
+        distances = [field.signed(_at_rest(mesh[0], bone, k)) for field, bone in self._bones]
         if distances:
             found["bone_distance"] = np.min(distances, axis=0)
-        first, same = part.mesh(0)
-        if np.array_equal(faces, same):
-            found["stretch"] = edge_stretch(vertices, first, faces)
         return found
 
 

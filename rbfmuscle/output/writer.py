@@ -25,6 +25,7 @@ from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.output.appearance import tendon_mesh
 from rbfmuscle.output.fibre_files import FOLDER, TABLE, begin_table, fibre_file, write_frame
 from rbfmuscle.output.info import FORMAT, RunInfo
+from rbfmuscle.output.surface_arrays import RunArrays
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.scene import Scene
@@ -67,6 +68,7 @@ class RunWriter:
         self.scene = scene
         self.meshes = bool(scene.output.surfaces)
         self.count, self._failed = 0, False
+        self._arrays = RunArrays(scene)
         # Pose and file that show a bone now, and its mesh for a series.
         self._bones: dict[str, tuple[Floats, str]] = {}
         self._light: dict[str, tuple[Floats, Integers]] = {}
@@ -152,7 +154,13 @@ class RunWriter:
                 meshes[tendon_name(muscle.name)] = tendon
         entries = [(name, f"surfaces/{name}{_frame_end(frame.index)}.vtp") for name in meshes]
         self.folder.add(*(file for _, file in entries))
-        each(lambda entry: write_vtp(self.directory / entry[1], *meshes[entry[0]]), entries)
+
+        def write(entry):
+            name, file = entry
+            arrays = self._arrays.of(frame, name) if name in frame.surfaces else None
+            write_vtp(self.directory / file, *meshes[name], arrays)
+
+        each(write, entries)
         return entries
 
     def _write_bones(self, frame):

@@ -131,9 +131,10 @@ class BoneContacts:
             raise ValueError(f"poses lack the bone {missing[0]!r}")
         self.poses, self.placed = poses, self.stacked(poses)
 
-    def frozen(self) -> BoneContacts:
-        """A copy in the present poses, for queries from another thread while the bones move."""
+    def at(self, poses: dict[str, Floats]) -> BoneContacts:
+        """A copy with the bones in these poses, for queries while they move on."""
         other = copy.copy(self)
+        other.move(poses)
         other.beside, other._known = list(self.beside), Known(*(p[:, :0] for p in self._known))
         return other
 

@@ -47,6 +47,8 @@ class ModelSurface:
     # An earlier ModelSurface and the rigid motion (4, 4) since, where the muscle moved rigidly;
     # else None.
     origin: "tuple[ModelSurface, np.ndarray] | None" = field(default=None, repr=False)
+    # Values (n,) at the vertices, by name, that the model knows of and a file may show.
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     def moved(self, motion: np.ndarray) -> "ModelSurface":
         """The surface after a rigid motion (4, 4), which took no time."""
@@ -57,7 +59,7 @@ class ModelSurface:
         }
         # What is said of the solves was said with this surface.
         notes = [note for note in self.notes if note[2] != "iteration_cap"]
-        return ModelSurface(vertices, self.faces, quantities, notes, (self, motion))
+        return ModelSurface(vertices, self.faces, quantities, notes, (self, motion), self.arrays)
 
 
 class FibreLines(NamedTuple):
@@ -101,6 +103,8 @@ class Frame:
     neighbours: dict = field(default_factory=dict)
     # TendonLine by the end that each holds; the poses have these too
     tendons: dict = field(default_factory=dict)
+    # The bones about each muscle, by muscle, in the poses of the frame
+    contacts: Mapping[str, BoneContacts] = field(default_factory=dict, repr=False)
     # FibreLines by muscle, where the scene asks for them
     fibres: Mapping[str, FibreLines] = field(default_factory=dict, repr=False)
 

@@ -241,6 +241,7 @@ class FrameLoop:
             work=dict(zip(carried, (status for _, _, status in found))),
             neighbours={} if self._sliding is None else dict(self._sliding.pairs),
             tendons=dict(poses.tendons),
+            contacts={stepper.name: stepper.contacts.at(poses) for stepper in self.steppers},
         )
 
     def _find_tendons(self, poses: Poses) -> list[Event]:

@@ -10,7 +10,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import edge_stretch, mesh_volume
+from rbfmuscle.geometry.surfaces import EdgeStretch, mesh_volume
 from rbfmuscle.metrics.depths import surface_depth
 from rbfmuscle.output.appearance import (
     BONE_COLOUR,
@@ -85,7 +85,7 @@ def vertex_values(
     if colouring == "activation":
         return np.full(len(vertices), picture.activation.get(name, np.nan))
     if colouring == "stretch" and np.array_equal(faces, rest.surfaces[name][1]):
-        return edge_stretch(vertices, *rest.surfaces[name])
+        return EdgeStretch(*rest.surfaces[name])(vertices)
     if colouring == "penetration":
         return surface_depth(vertices, probes, picture.poses)
     if colouring == "distance" and other is not None:

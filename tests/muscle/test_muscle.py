@@ -356,6 +356,10 @@ def test_surface_at_rest_is_the_input_mesh_but_for_what_overlaps_bones():
     assert run.values("extensor", "initial_shift")[0] == pytest.approx(0.22, abs=0.02)
     # The bare field of the centres is farther from the mesh.
     assert np.abs(model.field()(mesh.vertices)).max() > 0.3
+    # What makes it the input mesh are level offsets; there are as many centres as keep them small.
+    offsets = surface.arrays["level_offset"]
+    assert offsets.shape == (len(mesh.vertices),)
+    assert 0.05 < np.sqrt(np.mean(offsets**2)) < 0.6
 
 
 @pytest.mark.parametrize("bend", [-30.0, 30.0])

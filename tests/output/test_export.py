@@ -121,6 +121,14 @@ def test_vtk_files_carry_distance_to_bones_stretch_and_group(arm_run, tmp_path):
     ]
     assert abs(last["stretch"][vertex]) > 0.01
     assert last["stretch"][vertex] == pytest.approx((lengths[1] / lengths[0] - 1).mean(), abs=1e-6)
+    kept = pyvista.read(arm_run[1] / "surfaces" / "biceps_0006.vtp")
+    assert set(kept.point_data) == set(last.point_data)
+    for name in ("stretch", "group"):
+        np.testing.assert_allclose(kept[name], last[name], atol=1e-6)
+    # A run's own files have the distance of the bones' fields, here to the bones in reach.
+    near = np.abs(last["bone_distance"]) < 1.0
+    assert near.sum() > 10
+    np.testing.assert_allclose(kept["bone_distance"][near], last["bone_distance"][near], atol=0.05)
 
 
 class TestHostileRuns:
