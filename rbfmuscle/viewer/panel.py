@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from rbfmuscle.output.appearance import VIEWS
+from rbfmuscle.viewer.marks import KINDS
 from rbfmuscle.viewer.side import COLOURINGS, ModelView, ViewSettings, legend
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
@@ -88,10 +89,21 @@ class Panel:
         self.view = gui.add_button_group("View", [view.capitalize() for view in VIEWS])
         self.cut = self._watch(gui.add_dropdown("Cut along", ("none", "x", "y", "z")))
         self.place = self._watch(gui.add_slider("Cut at", 0.0, 1.0, 0.01, 0.5))
+        self._add_marks()
         self.eyes = {}
         for title, names in (("Muscles", self.source.muscles), ("Bones", self.source.bones)):
             with gui.add_folder(title, expand_by_default=False):
                 self.eyes |= {name: self._watch(gui.add_checkbox(name, True)) for name in names}
+
+    def _add_marks(self) -> None:
+        marks = self.source.marks
+        kinds = KINDS if marks.held else KINDS[-1:]
+        with self.gui.add_folder("Marks", expand_by_default=False):
+            self.marks = {kind: self._watch(self.gui.add_checkbox(kind, False)) for kind in kinds}
+        if marks.doubts:
+            with self.gui.add_folder(f"Doubts ({len(marks.doubts)})", expand_by_default=False):
+                lines = "".join(f"<li>{html.escape(doubt)}</li>" for doubt in marks.doubts)
+                self.gui.add_html(f"<ul style='font-size:12px;padding:0 24px'>{lines}</ul>")
 
     def look(self) -> ViewSettings:
         """All that decides how a picture is shown."""
@@ -104,7 +116,8 @@ class Panel:
             cut = axis, float(points.min() + self.place.value * np.ptp(points))
         hidden = frozenset(name for name, eye in self.eyes.items() if not eye.value)
         others = *(model.value for model in self.models), self.quantity.value
-        return ViewSettings(self.colour.value, hidden, cut, others)
+        marks = frozenset(kind for kind, box in self.marks.items() if box.value)
+        return ViewSettings(self.colour.value, hidden, cut, others, marks)
 
     def move_to(self, values: dict[str, float]) -> None:
         """Set controls."""

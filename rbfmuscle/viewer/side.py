@@ -23,6 +23,7 @@ from rbfmuscle.output.appearance import (
 )
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.tendons import tendon_name
+from rbfmuscle.viewer.marks import MarkView
 from rbfmuscle.viewer.sources import (
     LiveFigure,
     LiveSource,
@@ -61,13 +62,14 @@ COLOURINGS = {
 
 class ViewSettings(NamedTuple):
     """Colouring, hidden muscles and bones, axis and place [scene unit] of a cut, choices that ask
-    for a new picture.
+    for a new picture, and what is marked.
     """
 
     colour: str
     hidden: frozenset[str]
     cut: tuple[int, float] | None
     others: tuple[str, ...]
+    marks: frozenset[str] = frozenset()
 
 
 def vertex_values(
@@ -154,6 +156,7 @@ class ModelView:
         self._nodes: dict[str, MeshHandle] = {}
         self._painted: list[GlbHandle] = []
         self._lines: dict[str, LineSegmentsHandle] = {}
+        self._marks = MarkView(server, f"{root}/.marks", source.marks, 0.001 / source.millimetre)
 
     def choose(self, choice: str) -> bool:
         """Show another model or run, or none; returns whether it is another."""
@@ -203,6 +206,7 @@ class ModelView:
             self._show(tendon_name(name), part, TENDON_COLOUR, visible=name not in look.hidden)
         self._paint(painted)
         self._draw_fibres(look)
+        self._marks.draw(look.marks, look.hidden, self.picture.poses, self.picture.surfaces)
         for node in self._nodes.values():
             # The inside is seen in a cut alone, and software drawing pays for it.
             node.side = "front" if look.cut is None else "double"

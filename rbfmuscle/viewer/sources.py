@@ -24,6 +24,7 @@ from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import FibreLines, MuscleModel
 from rbfmuscle.simulation.live import LiveSession, live_fields
 from rbfmuscle.validation import UsageError
+from rbfmuscle.viewer.marks import Marks, scene_marks
 
 Mesh = tuple[Floats, Integers]
 REST_TRIANGLES = 3000  # of a muscle, until its model is built
@@ -84,6 +85,7 @@ class LiveSource:
         self.colours = muscle_colours(list(self.muscles), groups)
         coarse = {name: clustered(*mesh, REST_TRIANGLES) for name, mesh in self.muscles.items()}
         self.rest = Picture(bone_poses(scene, {}), coarse, {}, {}, {}, "")
+        self.marks = scene_marks(scene)
         session = LiveSession(scene, bone_sdfs={})
         self.controls = {
             name: _coordinate(scene, name, (*limits, session.rest[name]))
@@ -185,6 +187,8 @@ class SavedSource:
         self.muscles = {name: first.mesh(name, first.frame_numbers[0]) for name in first.muscles}
         self.colours, self.rest = first.colours, SavedFigure(first).advance()
         self.motion = [{"frame": float(frame)} for frame in first.frame_numbers]
+        doubts = first.verdict.partition("Doubtful: ")[2]
+        self.marks = Marks({}, [], [doubts] if doubts else [])
         self.controls = {
             "frame": Control("Run", "frame", *(first.frames[k].index for k in (0, -1, 0)))
         }

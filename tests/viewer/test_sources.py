@@ -11,9 +11,11 @@ from blend_model import arm_scene
 import rbfmuscle as rm
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.scene.bone import BoneDistance
+from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession, coordinate_limits
+from rbfmuscle.viewer.marks import KINDS, MarkView, scene_marks
 from rbfmuscle.viewer.panel import Panel
 from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.side import vertex_values
@@ -146,3 +148,40 @@ def test_activation_of_a_muscle_is_set_and_coloured():
     picture, _ = go(figure)
     values = vertex_values("activation", "extensor", picture, picture, [], None)
     np.testing.assert_allclose(values, 0.35)
+
+
+def test_marks_of_a_scene_move_with_their_bones():
+    scene = rm.phantom_scene()
+    marks = scene_marks(scene)
+    (joint,) = scene.joints
+    lines = marks.axes[joint.name].lines
+    assert len(lines) == len(joint.coordinates)
+    np.testing.assert_allclose(lines.mean(axis=1), np.tile(joint.centre, (len(lines), 1)))
+    assert sum(held.muscle == "extensor" for held in marks.held) == 2
+    server, _ = open_server()
+    try:
+        view = MarkView(server, "/.marks", marks, 0.001)
+        pose = np.eye(4)
+        pose[:3, 3] = [10.0, 0.0, 0.0]
+        poses = {bone.name: pose for bone in scene.bones}
+        meshes = {m.name: (np.asarray(m.mesh.vertices), m.mesh.faces) for m in scene.muscles}
+        view.draw(KINDS, {"abductor"}, poses, meshes)
+        nodes = view._nodes
+        shown = nodes[f"/.marks/axes/{joint.name}"].points
+        np.testing.assert_allclose(shown, 0.001 * (lines + pose[:3, 3]), rtol=1e-5)
+        assert {"/.marks/names/extensor", f"/.marks/names/{joint.name}"} <= set(nodes)
+        assert "/.marks/names/abductor" not in nodes
+        view.draw((), (), poses, meshes)
+        assert not any(node.visible for node in nodes.values())
+    finally:
+        server.stop()
+
+
+def test_doubts_of_a_scene_are_listed():
+    scene = rm.phantom_scene(end=0.0)
+    scene.doubts = ["the foot is one bone"]
+    scene.guesses = [Guess("muscle", "extensor", 0.3, "held by the nearest bone")]
+    assert scene_marks(scene).doubts == [
+        "the foot is one bone",
+        "muscle extensor: held by the nearest bone",
+    ]
