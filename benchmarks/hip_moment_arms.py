@@ -39,6 +39,8 @@ DATA = {
         {name: f"hip_{name}" for name in RANGES},
     ),
 }
+# Clinical angle = coordinate + this [degree], where it is known (data/leg/README.md).
+OFFSETS = {"leg": {"flexion": -3.7, "adduction": 3.3, "rotation": -11.5}}
 PICTURED = "leg"  # the other data may not be
 MUSCLES = ("psoas_major", "iliacus", "gluteus_maximus", "gluteus_medius")
 
@@ -52,10 +54,11 @@ def moving(file, coordinate, ends):
     return scene
 
 
-def compared(run, muscle, coordinate):
-    """Measures of one muscle's fibres about one coordinate."""
+def compared(run, muscle, coordinate, offset):
+    """Measures of one muscle's fibres about one coordinate; ``offset`` is as in `OFFSETS`."""
     band = published_band(muscle, coordinate)
-    angles = np.degrees([frame.coordinates[coordinate] for frame in run.frames])
+    turned = np.degrees([frame.coordinates[coordinate] for frame in run.frames])
+    angles = turned + offset
     every = run[muscle].moment_arms(coordinate)
     shared = (angles >= band.angle[0] - 1e-6) & (angles <= band.angle[-1] + 1e-6)
     arms = every[shared]
@@ -67,7 +70,7 @@ def compared(run, muscle, coordinate):
     middle = np.median(arms, axis=1)
     fibres = [frame.fibres[muscle] for frame in run.frames]
     straight = np.array([np.linalg.norm(f.points[:, 0] - f.points[:, -1], axis=1) for f in fibres])
-    at_rest = np.argmin(np.abs(angles))
+    at_rest = np.argmin(np.abs(turned))
     stretch = np.array([f.stretch for f in fibres])
     apart = stretch - straight / straight[at_rest]
     return {
@@ -99,7 +102,8 @@ def table(data, model, settings):
         asked = {"output.fibres": FIBRES, **settings}
         run = simulate(scene, model=model, settings=asked)
         for muscle in run.muscles:
-            found[muscle, motion] = compared(run, muscle, coordinate)
+            offset = OFFSETS.get(data, {}).get(motion, 0.0)
+            found[muscle, motion] = compared(run, muscle, coordinate, offset)
     return found
 
 

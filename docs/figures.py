@@ -19,10 +19,16 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+import numpy as np  # noqa: E402
+
+from rbfmuscle.fibres.published import published_band  # noqa: E402
 from rbfmuscle.metrics.quantities import QUANTITIES  # noqa: E402
 from rbfmuscle.metrics.summary import LIMITS, LOWER_BOUNDS  # noqa: E402
+from rbfmuscle.output.appearance import MUSCLE_COLOURS  # noqa: E402
+from rbfmuscle.report.plots import Band, Track, line_plot  # noqa: E402
 
 EVIDENCE = ROOT / "docs" / "evidence"
+ARMS_IMAGE = ROOT / "docs" / "images" / "hip_fibres.svg"
 _TABLE = re.compile(r"<!-- evidence: ([\w]+) -->\n.*?<!-- end -->", re.S)
 _FACTS = re.compile(r"<!-- table: ([\w]+) -->\n.*?<!-- end -->", re.S)
 
@@ -155,6 +161,46 @@ def provenance(facts):
     return f"`{facts['command']}`, commit {facts['commit']}, {facts['machine']}{date}.{note}"
 
 
+SIZE = ("width", "height")
+
+
+def arms_plot(facts, colour):
+    """Markup of a muscle's moment arms over a motion: band, median, and dashed the published."""
+    name = facts["muscle"]
+    angle, *curves = (np.array(facts[key]) for key in ("angle", "least", "median", "greatest"))
+    bands = [Band(name, colour, angle, curves[0], curves[2])]
+    known = published_band(name, f"hip.{facts['motion']}")
+    shown = (known.angle >= angle[0]) & (known.angle <= angle[-1])
+    edges = (values[shown] for values in (known.angle, known.least, known.greatest))
+    bands.append(Band(name, colour, *edges, dashed=True))
+    title = f"{name.replace('_', ' ').capitalize()}, {facts['motion']}"
+    track = Track(name, colour, angle, curves[1])
+    return line_plot(title, [track], ("degree", "mm"), bands=bands)
+
+
+def arms_image():
+    """Plots of `hip_fibres` as one picture: a row for each muscle, a column for each motion."""
+    plots = facts_of("hip_fibres")["plots"]
+    muscles = list(dict.fromkeys(facts["muscle"] for facts in plots))
+    motions = list(dict.fromkeys(facts["motion"] for facts in plots))
+    colours = dict(zip(muscles, MUSCLE_COLOURS))
+    parts = []
+    for facts in plots:
+        markup = arms_plot(facts, colours[facts["muscle"]])
+        wide, high = (float(re.search(rf' {key}="([\d.]+)pt"', markup)[1]) for key in SIZE)
+        x = wide * motions.index(facts["motion"])
+        y = high * muscles.index(facts["muscle"])
+        # Within a picture a length has no unit.
+        for key, value in zip(SIZE, (wide, high)):
+            markup = re.sub(rf' {key}="[\d.]+pt"', f' {key}="{value:g}"', markup, count=1)
+        markup = re.sub(r"font-family: [^;]*;", "font-family: sans-serif;", markup)
+        markup = re.sub(r"(\.\d)\d+", r"\1", markup)
+        parts.append(markup.replace("<svg", f'<svg x="{x:g}" y="{y:g}"', 1).strip())
+    box = f"0 0 {wide * len(motions):g} {high * len(muscles):g}"
+    space = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
+    return "\n".join([f'<svg {space} viewBox="{box}">', *parts, "</svg>", ""])
+
+
 def written(text):
     """A page with its tables as the files of evidence and the library have them."""
 
@@ -203,6 +249,7 @@ def main():
         if new != text:
             path.write_text(new, encoding="utf-8")
             print(f"written: {path.relative_to(ROOT)}")
+    ARMS_IMAGE.write_text(arms_image(), encoding="utf-8")
 
 
 if __name__ == "__main__":
