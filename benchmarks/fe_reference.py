@@ -259,7 +259,7 @@ def rows_of(path):
     kept, rows = np.load(path), []
     for title, model, settings in (
         ("rbf", "rbf", {}),
-        *((f"rbf, {n} nodes", "rbf", {"model.nodes": n}) for n in (300, 600)),
+        *((f"rbf, {n} nodes", "rbf", {"model.nodes": n}) for n in (150, 600)),
         *((name, name, {}) for name in COMPARED if name != "rbf"),
     ):
         found = distances(model, kept, settings=settings)
