@@ -18,6 +18,7 @@ import numpy as np
 from evidence import write_evidence
 
 import rbfmuscle as rm
+from rbfmuscle.experiments.front import WORST
 from rbfmuscle.models import build_models
 from rbfmuscle.simulation.frame_loop import simulate_frames
 
@@ -26,17 +27,6 @@ ROOT = Path(__file__).resolve().parent.parent
 MODELS = ("rbf", "embedded", "pbd")
 SETTINGS = {"embedded": ("rbf", {"model.surface": "embedded"})}
 STEPS = (2.0, 5.0, 10.0, 30.0)
-WORST = (
-    "volume_error",
-    "penetration_max",
-    "bone_penetration_max",
-    "solver_penetration_max",
-    "rest_error_rms",
-    "rest_error_max",
-    "flicker",
-    "bowing",
-    "self_crossings",
-)
 
 
 def worst(run, quantity):

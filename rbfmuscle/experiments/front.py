@@ -7,15 +7,19 @@ from rbfmuscle.experiments.sweep_table import FrontVerdict, SweepRow
 from rbfmuscle.metrics.quantities import QUANTITIES
 from rbfmuscle.metrics.summary import shown_number
 
-# Worst over muscles and frames, by magnitude.
+# Worst over muscles and frames, by magnitude: of a point of a sweep, and of the README's table.
 WORST = (
     "volume_error",
     "penetration_max",
     "bone_penetration_max",
     "solver_penetration_max",
     "rest_error_rms",
+    "rest_error_max",
     "edge_strain_rms",
     "components",
+    "flicker",
+    "bowing",
+    "self_crossings",
 )
 # In the scene's unit.
 LENGTHS = ("error_rms", "error_max", *(name for name in WORST if QUANTITIES[name][0] == "length"))
