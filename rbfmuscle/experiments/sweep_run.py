@@ -78,7 +78,7 @@ class SweepFolder:
         """A point's result, empty where there is none."""
         try:
             return json.loads((self.points / f"{key}.json").read_text(encoding="utf-8"))
-        except (FileNotFoundError, ValueError):
+        except (FileNotFoundError, ValueError, RecursionError):
             return {}
 
     def write(self, result: PointResult) -> None:

@@ -69,6 +69,11 @@ class Limits(NamedTuple):
         """Whether the caller gave the value of this limit."""
         return self.fail_on.get(quantity) is not None
 
+    def is_named(self, quantity: str) -> bool:
+        """Whether the caller asked for this limit by name; "all" names none."""
+        everything = LIMITS.keys() <= self.fail_on.keys()
+        return self.is_given(quantity) or (quantity in self.fail_on and not everything)
+
     def failing(self) -> "Limits":
         """Those of ``fail_on`` alone."""
         return Limits({name: self.values[name] for name in self.fail_on}, self.fail_on)
@@ -337,7 +342,7 @@ def unmeasured(table: Table, limits: Limits) -> list[Unmeasured]:
             wanted = [name for name in muscles if need is None or need in table[name]]
         else:
             wanted = [] if having else [ALL]
-        if limits.is_given(quantity) and not having:
+        if limits.is_named(quantity) and not having:
             wanted = wanted or [ALL]
         found += [Unmeasured(muscle, quantity) for muscle in wanted if muscle not in having]
     return found

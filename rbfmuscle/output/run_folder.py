@@ -71,7 +71,7 @@ def read_info(directory: Path) -> RunInfo:
     except OSError:
         message = f"{directory} holds no run (no run.json); give the folder of 'run -o'"
         raise UsageError(message) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UsageError(f"{path} is not the run.json of a run ({error})") from None
     version = table.get("format", 0) if isinstance(table, dict) else 0
     if isinstance(version, int) and version > FORMAT:

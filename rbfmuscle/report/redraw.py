@@ -92,7 +92,7 @@ def redraw_study(
                 kernel_page.write_page(directory, found)
             else:
                 sweep_page.write_page(SweepTable.model_validate(found), directory)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             message = f"{path} is not as it was written ({error!r}); run the command again"
             raise UsageError(message) from None
         return directory / page, found

@@ -135,8 +135,10 @@ def test_what_was_not_measured_is_within_no_limit():
     assert found(None, lacking) == [("psoas", "rest_error_rms")]
     assert found("rest_error_rms=9", lacking, lacking)[0] == ("psoas", "rest_error_rms")
     assert found(None, scene_values={}) == [(ALL, name) for name in OF_SCENE]
-    # What is asked for by value has to be measured of some muscle.
-    assert found("flicker=1", mesh) == [] and found("flicker=1", mesh, mesh) == [(ALL, "flicker")]
+    # What is asked for by name has to be measured of some muscle.
+    for asked in ("flicker", "flicker=1", "all,flicker=1"):
+        assert found(asked, mesh) == [] and found(asked, mesh, mesh) == [(ALL, "flicker")]
+    assert found("all", mesh, mesh) == []
     assert found("moment_arm=50") == [(ALL, "moment_arm")]
     said = describe_verdict(table(lacking), parse_limits(None, scene))
     assert said == (

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ROOT
+from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.rest_frame import RestFrame
@@ -275,6 +276,25 @@ def moved(x, along, ratio=1.0, slack=1.0, steps=3):
 
 
 ALONG, ACROSS = [1.0, 0, 0], [0, 1.0, 0]
+
+
+@pytest.mark.parametrize("stretch", [0.5, 0.7, 1.2])
+def test_energy_is_that_of_the_formula_with_fibres_stiffer_than_across(stretch):
+    """Springs along the fibres have no part in the choice of t."""
+    ratio, slack, tension = 4.0, 1.6, 0.1
+    f = np.array([stretch, 1.1 / np.sqrt(stretch), 1.0 / (1.1 * np.sqrt(stretch))])
+
+    def miss(t):
+        across = ((f[1:] - t**-0.5) ** 2).sum()
+        return (f[0] - t) ** 2 + across - 2.0 * tension * (1.0 - t)
+
+    least = minimize_scalar(miss, bounds=(1.0 / slack, 1.0), options={"xatol": 1e-9}).fun
+    beyond = f[0] - np.clip(f[0], 1.0 / slack, 1.0)
+    wanted = 0.5 * (least + 1.5 * (ratio - 1.0) * beyond**2)
+    solid = Bar().with_fibres(ALONG, ratio=ratio, slack=slack)
+    found = solid.energy(solid.model.rest * f, tension) / solid.model.cells.weights.sum()
+    # The bounded search stays off its bounds by its tolerance.
+    assert found == pytest.approx(wanted, rel=1e-6)
 
 
 def test_fibres_make_the_bar_stiffer_along_them():

@@ -154,6 +154,12 @@ class TestHostileRuns:
             Run.load(folder)
         assert word in str(caught.value)
 
+    def test_a_file_that_is_nested_too_deep_is_refused(self, arm_run, tmp_path):
+        folder = shutil.copytree(arm_run[1], tmp_path / "run")
+        (folder / "run.json").write_text('{"a":' * 100_000)
+        with pytest.raises(UsageError, match=r"not the run\.json"):
+            Run.load(folder)
+
     def test_messages_reach_the_terminal_without_control_characters(self):
         assert one_line("a\x1b[2J\nb\x00\u202ec") == "a?[2J b??c"
 
