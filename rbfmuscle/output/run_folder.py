@@ -4,8 +4,9 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from pydantic import ValidationError
@@ -20,6 +21,7 @@ from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
 from rbfmuscle.validation import SceneError, UsageError
 
 Mesh = tuple[Floats, Integers]
+_Row = TypeVar("_Row")
 Poses = dict[int, dict[str, Floats]]  # (4, 4) by frame and bone
 
 
@@ -102,25 +104,45 @@ def read_run(directory: Path) -> tuple[RunInfo, list[Frame], list[Row], FolderMe
     return info, frames, _read_metrics(directory), FolderMeshes(directory)
 
 
-def _read_table(directory: Path, name: str) -> list[list[str]]:
-    """Rows of a table, without its head; none where the file is missing."""
+def _read_table(directory: Path, name: str, read: Callable[[list[str]], _Row]) -> list[_Row]:
+    """Rows of a table, without its head, each as it is read; none where the file is missing.
+
+    UsageError if it is not as a run writes it.
+    """
     path = directory / name
     if not path.is_file():
         return []
-    text = path.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]  # the last line of a run that was killed may be cut
-    return list(csv.reader(io.StringIO(whole, newline="")))[1:]
+    try:
+        text = path.read_text(encoding="utf-8")
+        whole = text[: text.rfind("\n") + 1]  # the last line of a run that was killed may be cut
+        rows = list(csv.reader(io.StringIO(whole, newline="")))[1:]
+        return [read(row) for row in rows]
+    except (ValueError, IndexError, csv.Error) as error:
+        message = f"{path} is not as it was written ({error}); run the scene again"
+        raise UsageError(message) from None
 
 
 def _read_metrics(directory: Path) -> list[Row]:
-    rows = _read_table(directory, "metrics.csv")
-    return [Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6]) for r in rows]
+    def row(r: list[str]) -> Row:
+        return Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6])
+
+    return _read_table(directory, "metrics.csv", row)
+
+
+def _read_events(directory: Path) -> list[Event]:
+    def event(r: list[str]) -> Event:
+        return Event(int(r[0]), r[1], r[2], int(r[3]), r[4])
+
+    return _read_table(directory, "events.csv", event)
 
 
 def _read_poses(directory: Path) -> Poses:
+    def placed(r: list[str]) -> tuple[int, str, Floats]:
+        return int(r[0]), r[1], np.array(r[2:], dtype=float).reshape(4, 4)
+
     found: Poses = {}
-    for row in _read_table(directory, "poses.csv"):
-        found.setdefault(int(row[0]), {})[row[1]] = np.array(row[2:], dtype=float).reshape(4, 4)
+    for frame, bone, pose in _read_table(directory, "poses.csv", placed):
+        found.setdefault(frame, {})[bone] = pose
     return found
 
 
@@ -148,8 +170,7 @@ def _read_frames(info: RunInfo, directory: Path, poses: Poses) -> list[Frame]:
     units = scene.coordinate_units
     muscles = [muscle.name for muscle in scene.muscles]
     events: dict[int, list[Event]] = {}
-    for row in _read_table(directory, "events.csv"):
-        event = Event(int(row[0]), row[1], row[2], int(row[3]), row[4])
+    for event in _read_events(directory):
         events.setdefault(event.frame, []).append(event)
     found = []
     for entry in info.frames:

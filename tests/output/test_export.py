@@ -154,6 +154,15 @@ class TestHostileRuns:
             Run.load(folder)
         assert word in str(caught.value)
 
+    @pytest.mark.parametrize("name", ["metrics.csv", "events.csv", "poses.csv"])
+    @pytest.mark.parametrize("line", [b"0,a,b,c,d,e,f\n", b"0,a\n", b"\xff\n"])
+    def test_a_table_that_no_run_writes_is_refused(self, arm_run, tmp_path, name, line):
+        folder = shutil.copytree(arm_run[1], tmp_path / "run")
+        with (folder / name).open("ab") as file:
+            file.write(line)
+        with pytest.raises(UsageError, match=f"{name} is not as it was written"):
+            Run.load(folder)
+
     def test_a_file_that_is_nested_too_deep_is_refused(self, arm_run, tmp_path):
         folder = shutil.copytree(arm_run[1], tmp_path / "run")
         (folder / "run.json").write_text('{"a":' * 100_000)
