@@ -176,10 +176,15 @@ def _read_frames(info: RunInfo, directory: Path, poses: Poses) -> list[Frame]:
     for entry in info.frames:
         index = entry.frame
         values = entry.coordinates.items()
+        placed = poses.get(index, {})
+        lost = next((bone.name for bone in scene.bones if bone.name not in placed), None)
+        if lost is not None:
+            what = f"lacks frame {index} of bone {lost!r}"
+            raise UsageError(f"{directory / 'poses.csv'} {what}; run the scene again")
         frame = Frame(
             index,
             {name: value if name in units else math.radians(value) for name, value in values},
-            poses.get(index, {}),
+            placed,
             FolderSurfaces(directory, muscles if scene.output.surfaces else [], index),
             {},
             events.get(index, []),

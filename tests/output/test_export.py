@@ -163,6 +163,14 @@ class TestHostileRuns:
         with pytest.raises(UsageError, match=f"{name} is not as it was written"):
             Run.load(folder)
 
+    def test_a_run_without_all_poses_is_refused(self, arm_run, tmp_path):
+        folder = shutil.copytree(arm_run[1], tmp_path / "run")
+        lines = (folder / "poses.csv").read_text().splitlines(keepends=True)
+        for kept in (lines[:-1], []):
+            (folder / "poses.csv").write_text("".join(kept))
+            with pytest.raises(UsageError, match=r"poses\.csv lacks frame"):
+                Run.load(folder)
+
     def test_a_file_that_is_nested_too_deep_is_refused(self, arm_run, tmp_path):
         folder = shutil.copytree(arm_run[1], tmp_path / "run")
         (folder / "run.json").write_text('{"a":' * 100_000)
