@@ -50,6 +50,9 @@ SETTLED_STILL, ROUNDS_STILL = 1e-7, 10
 LONGEST = 0.2  # a longer step is shortened to it
 GROWTH = 2.0  # a motion beyond this multiple of the least so far restarts the acceleration
 MEMORY = 5  # steps that Anderson acceleration combines
+# Iterations in which the motion has not halved, after which steps are plain until it has: where a
+# muscle slips over an edge of a bone, accelerated ones go round in circles.
+STALLED = 12
 TOLERANCE = 2e-5  # violation of a contact that is left
 MARGIN = 0.003  # obstacles are looked for beyond where a point goes by this
 NEAR = 0.03  # contact points nearer to an obstacle take part in a solve
@@ -156,6 +159,8 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     done = 0
     caps = 0
     residual = 0.0
+    halved = np.inf
+    since = 0
     travelled, before = 0.0, y.copy()
     lifted_nodes = y
     if room:
@@ -178,7 +183,15 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
             residual = step.residual / model.size
             break
         before[:] = y
-        _accelerate(y, pressure, step, memory)
+        if moved < 0.5 * halved:
+            halved = moved
+            since = done
+        if done - since < STALLED:
+            _accelerate(y, pressure, step, memory)
+        else:
+            memory.steps[0] = 0
+            y[:] = step.nodes
+            pressure[:] = step.pressures
         travelled += farthest_between(y, before)
         joined = local_step(model, y, given.activation, pull, local)[0]
         if joined > 0:
