@@ -194,8 +194,8 @@ def arms_image():
         for key, value in zip(SIZE, (wide, high)):
             markup = re.sub(rf' {key}="[\d.]+pt"', f' {key}="{value:g}"', markup, count=1)
         markup = re.sub(r"font-family: [^;]*;", "font-family: sans-serif;", markup)
-        markup = re.sub(r"(\.\d)\d+", r"\1", markup)
-        parts.append(markup.replace("<svg", f'<svg x="{x:g}" y="{y:g}"', 1).strip())
+        markup = " ".join(re.sub(r"(\.\d)\d+", r"\1", markup).split())
+        parts.append(markup.replace("<svg", f'<svg x="{x:g}" y="{y:g}"', 1))
     box = f"0 0 {wide * len(motions):g} {high * len(muscles):g}"
     space = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
     return "\n".join([f'<svg {space} viewBox="{box}">', *parts, "</svg>", ""])
