@@ -200,6 +200,7 @@ def sweep(
     """
     from rbfmuscle import interruption
     from rbfmuscle.experiments.sweep import parse_grid
+    from rbfmuscle.metrics.summary import parse_limits
     from rbfmuscle.models import configure_scene
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
@@ -212,7 +213,7 @@ def sweep(
         )
     opened = {name: open_scene(path) for name, path in named_scenes(scenes).items()}
     loaded = {name: configure_scene(each, changes, model=model) for name, each in opened.items()}
-    limits = {name: _sweep_limits(fail_on, each) for name, each in loaded.items()}
+    limits = {name: parse_limits(fail_on, each) for name, each in loaded.items()}
     finest = parse_settings(reference)
     progress = Progress("sweep", what="point")
     with progress, interruption.keeping(lambda: f"finished points are kept in {output}"):
@@ -230,27 +231,24 @@ def sweep(
     return _finish(table, output, limits, printing)
 
 
-def _sweep_limits(fail_on, scene):
-    """Limits by quantity in the scene's unit, of what a sweep keeps of its points."""
-    from rbfmuscle.experiments.front import WORST
-    from rbfmuscle.metrics.summary import parse_limits
+def _beyond(table, output, limits):
+    """What the points hold beyond the limits of their scenes, and what they did not measure, in
+    words.
+    """
+    from rbfmuscle.experiments.sweep_run import SweepFolder
+    from rbfmuscle.metrics.summary import exceeded, shown_number, unmeasured
 
-    limits = parse_limits(fail_on, scene)
-    every = "all" in split_list(fail_on)
-    other = [name for name in limits.fail_on if name not in WORST]
-    if other and not every:
-        raise UsageError(f"--fail-on {other[0]}: a sweep keeps {', '.join(WORST)}")
-    return {name: limits.values[name] for name in limits.fail_on if name in WORST}
-
-
-def _beyond(rows, limits):
-    """What the points hold beyond the limits of their scenes, in words."""
-    from rbfmuscle.metrics.summary import meets_limit
-
-    for row in rows:
-        for name, limit in limits[row.scene].items():
-            if not meets_limit(name, row.value(name), limit):
-                yield f"{row.scene} {row.label}: {name} = {row.value(name):.4g} > {limit:g}"
+    folder = SweepFolder(output)
+    for row in table.rows:
+        facts, held = folder.read(row.key).get("summary", {}), limits[row.scene].failing()
+        for found in exceeded(facts, held):
+            value = shown_number(found.value)
+            yield (
+                f"{row.scene} {row.label}: {found.muscle}, {found.quantity} {value} (limit "
+                f"{shown_number(found.limit)})"
+            )
+        for lacking in unmeasured(facts, held):
+            yield f"{row.scene} {row.label}: {lacking.quantity} was not measured"
 
 
 def _finish(table, output, limits, printing):
@@ -262,7 +260,7 @@ def _finish(table, output, limits, printing):
     failed: RBFMuscleError | None = None
     if bad:
         failed = SolveError(f"{len(bad)} of {len(table.rows)} points failed; {remedy}")
-    elif beyond := list(_beyond(table.rows, limits)):
+    elif beyond := list(_beyond(table, output, limits)):
         failed = LimitExceededError("; ".join(beyond[:5]))
     lines = [
         *(verdict.text for verdict in table.verdicts),

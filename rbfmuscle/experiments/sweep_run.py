@@ -20,7 +20,7 @@ from rbfmuscle.experiments.sweep_table import SweepRow, SweepTable
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL
-from rbfmuscle.metrics.summary import QuantityFacts
+from rbfmuscle.metrics.summary import QuantityFacts, Table
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import write_csv, write_json
 from rbfmuscle.scene.scene import Scene
@@ -57,6 +57,7 @@ class PointResult(TypedDict, total=False):
     status: str
     error: str
     values: dict[str, float | None]
+    summary: Table  # of the run, as limits read it
     threads: int
     machine: str
     process: int
@@ -231,6 +232,7 @@ def measure_point(
             elif point.reference:
                 values |= _errors(shown, folder.surfaces(point.reference))
             result["values"] = values
+            result["summary"] = run.summary
     except POINT_ERRORS as error:
         result["status"] = "failed"
         result["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
