@@ -230,8 +230,8 @@ def test_labels_of_one_name_are_each_a_mesh(tmp_path):
     labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
     labels[np.diff(labels, axis=1, prepend=0) > 0] = 0
     labels[:, :13][labels[:, :13] == 2] = 3
-    # The name that the third label would get is that of the first.
+    # File names that differ in case alone are one on some systems.
     names = {1: "soleus_3", 2: "soleus", 3: "Soleus"}
     _write_surfaces(LabelVolume(labels, np.eye(4), names, "a.nii"), tmp_path)
     found = sorted(path.name for path in (tmp_path / "meshes").iterdir())
-    assert found == ["Soleus_3_3.ply", "soleus.ply", "soleus_3.ply"]
+    assert found == ["Soleus_2.ply", "soleus.ply", "soleus_3.ply"]

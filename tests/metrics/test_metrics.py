@@ -15,7 +15,7 @@ from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_charact
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.metrics.rows import _smoothness, moment_arms
 from rbfmuscle.run import simulate
-from rbfmuscle.scene.bone import BoneDistance
+from rbfmuscle.scene.bone import Bone, BoneDistance
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.objects import Attachment, Motion
 from rbfmuscle.simulation.frame import Frame, ModelSurface
@@ -262,11 +262,8 @@ class TestRows:
         mesh = rod()
         block = trimesh.creation.box((10, 10, 10))
         block.apply_translation([50, 0, -12])
-        bones = [
-            SimpleNamespace(name="trunk", mesh=block),
-            SimpleNamespace(name="limb", mesh=block.copy()),
-        ]
-        bones[1].mesh.apply_translation([500, 0, 0])
+        far = block.copy().apply_translation([500, 0, 0])
+        bones = [Bone("trunk", block), Bone("limb", far)]
         frames = [{"joint.bend": a} for a in (0.0, 0.1, 0.2)]
         parts = {"bones": bones, "couplings": [], "joints": JOINTS, "muscles": [rod_muscle(mesh)]}
         parts |= {"guesses": [], "length": lambda millimetres: millimetres / 10.0}
