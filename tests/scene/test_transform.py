@@ -87,8 +87,8 @@ class TestMirroredScene:
         for mine, image in zip(one.muscles[0].attachments, other.muscles[0].attachments):
             assert np.array_equal(mine.vertices, image.vertices)
 
-    # The RBF model takes centres and samples in the order of coordinates, and these are mirrored: 2 %
-    # of the muscle's thickness is what their choice changes.
+    # The RBF model takes centres and samples in the order of coordinates, and these are mirrored:
+    # 2 % of the muscle's thickness is what their choice changes.
     @pytest.mark.parametrize(("model", "tolerance"), [("arap-volume", 1e-9), ("rbf", 0.2)])
     def test_shapes_are_mirrored(self, pair, model, tolerance):
         one, other = (rm.simulate(scene, model=model)["biceps"] for scene in pair)
