@@ -22,7 +22,7 @@ $(DEV): $(STAMP)
 
 # Both models at once; what the second says is printed when the first is done.
 demo: $(STAMP)
-	@echo "The first run compiles what it needs, for a minute; later ones start at once."
+	@echo "The first run compiles what it needs, for two minutes; later ones start at once."
 	@mkdir -p demo_output
 	@$(BIN)/rbfmuscle demo --model pbd -o demo_output/pbd >demo_output/pbd.log 2>&1 & second=$$!; \
 	$(BIN)/rbfmuscle demo --model rbf -o demo_output/rbf; code=$$?; \
