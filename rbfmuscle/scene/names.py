@@ -4,6 +4,8 @@ import re
 import unicodedata
 from collections.abc import Iterable
 
+LONGEST_NAME = 100  # a file may be named after two of them, and systems allow 255 letters
+
 
 def plain_name(name: str) -> str:
     """A name as a scene may have it, of letters, digits, ``_`` and ``-``.
@@ -21,7 +23,7 @@ def plain_name(name: str) -> str:
 
 def new_name(name: str, taken: Iterable[str], *, file: bool = True) -> str:
     """The plain name, numbered where it is taken; of a ``file`` in letters of another case too."""
-    plain, number = plain_name(name), 2
+    plain, number = plain_name(name)[: LONGEST_NAME - 5], 2
     known = {one.lower() if file else one for one in taken} | {"all"}  # that is the whole scene
     found = plain
     while (found.lower() if file else found) in known:

@@ -13,6 +13,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import Joint
+from rbfmuscle.scene.names import LONGEST_NAME
 from rbfmuscle.scene.options import MotionOptions, Table, Vector
 from rbfmuscle.scene.tendons import TendonEnd, tendon_name
 from rbfmuscle.validation import SceneError, did_you_mean, shown
@@ -198,6 +199,11 @@ def check_name(name: object, what: str) -> None:
     if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
         allowed = "letters, digits, '_' and '-' only (it becomes a file name)"
         raise SceneError(f"{what} name {shown(repr(name))} may hold {allowed}")
+    if len(name) > LONGEST_NAME:
+        raise SceneError(
+            f"{what} name {shown(repr(name))} has {len(name)} letters, at most {LONGEST_NAME} are "
+            "allowed (it becomes a file name)"
+        )
 
 
 def check_new_name(items: Sequence[Bone | Joint | Muscle], name: str, what: str) -> None:

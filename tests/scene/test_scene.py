@@ -96,6 +96,11 @@ class TestMistakes:
             ),
             ('name = "lower"', 'name = "upper"', r"bone 'upper' is given twice"),
             ('name = "biceps"', 'name = "../x"', r"muscle name '../x' may hold letters"),
+            (
+                'name = "biceps"',
+                f'name = "{"b" * 101}"',
+                "has 101 letters, at most 100 are allowed",
+            ),
             ("[scene]", "[scene", r"not valid TOML.*line 1"),
             ('"report"', '"reprot"', r"\[detect\] tunnelling action: .*'reprot'"),
             (
