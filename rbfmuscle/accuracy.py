@@ -47,8 +47,7 @@ def discretisation_error(scene: Scene) -> list[LatticeError]:
     fine = coarse.copy()
     nodes = {}
     for muscle in fine.muscles:
-        given = muscle.options.get("nodes", RBFOptions.model_fields["nodes"].default)
-        nodes[muscle.name] = int(str(given))
+        nodes[muscle.name] = RBFOptions.model_validate(muscle.options).nodes
         muscle.options = {**muscle.options, "nodes": FINER * nodes[muscle.name]}
     fine = configure_scene(fine)
     worst: dict[str, LatticeError] = {}

@@ -91,10 +91,10 @@ def take_contacts_loop(near, distance, direction, limits, found):
     return count
 
 
-@compiled(error_model="numpy")
-def may_reach(points, i, pose, bounds, anchor, bound, reach):
-    """Whether point i may be as near to a bone as ``reach``, by the bone's box and by what an
-    earlier bound less the motion since says.
+@compiled(error_model="numpy", inline="always")
+def _squares(points, i, pose, bounds, anchor):
+    """Squares of how far point i has moved against a bone since it was asked about, and of its
+    distance from the bone's box.
     """
     moved, outside = 0.0, 0.0
     for k in range(3):
@@ -104,6 +104,15 @@ def may_reach(points, i, pose, bounds, anchor, bound, reach):
         moved += (local - anchor[i, k]) ** 2
         beyond = max(bounds[0, k] - local, local - bounds[1, k], 0.0)
         outside += beyond * beyond
+    return moved, outside
+
+
+@compiled(error_model="numpy")
+def may_reach(points, i, pose, bounds, anchor, bound, reach):
+    """Whether point i may be as near to a bone as ``reach``, by the bone's box and by what an
+    earlier bound less the motion since says.
+    """
+    moved, outside = _squares(points, i, pose, bounds, anchor)
     spare = bound[i] - reach
     # Without branches, as they are a toss-up.
     away = (outside > 0.0) & ((reach < 0.0) | (outside > reach * reach))
@@ -115,14 +124,7 @@ def least_distance(points, i, pose, bounds, anchor, bound):
     """Lower bound of the distance of point i from a bone, by the bone's box and by what an earlier
     bound less the motion since says.
     """
-    moved, outside = 0.0, 0.0
-    for k in range(3):
-        local = 0.0
-        for j in range(3):
-            local += pose[j, k] * (points[i, j] - pose[j, 3])
-        moved += (local - anchor[i, k]) ** 2
-        beyond = max(bounds[0, k] - local, local - bounds[1, k], 0.0)
-        outside += beyond * beyond
+    moved, outside = _squares(points, i, pose, bounds, anchor)
     least = bound[i] - np.sqrt(moved)
     return max(least, np.sqrt(outside)) if outside > 0.0 else least
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
-from rbfmuscle.muscle.model import SolidModel
+from rbfmuscle.muscle.model import SolidModel, hung_matrix
 from rbfmuscle.scene.ends import attachment_ends
 from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.objects import Muscle
@@ -31,7 +31,7 @@ def along_fibres(model: SolidModel, insertion: Booleans) -> Floats:
     """Gradient (Q, 3) at the quadrature points of the share that the points held at the
     ``insertion`` (h,) have in what moves a node.
     """
-    matrix = model.matrix + model.springs @ model.springs.T / model.spring
+    matrix = hung_matrix(model)
     share = np.linalg.solve(matrix, model.springs @ np.stack([insertion, ~insertion], axis=1))
     return _gradient(model, share[:, 0] / share.sum(axis=1))
 

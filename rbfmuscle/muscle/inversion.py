@@ -104,21 +104,14 @@ def stiffened_inverse(inverse, cells, points):
     identity its inverse is A⁻¹ - (L⁻¹ B A⁻¹)ᵀ (L⁻¹ B A⁻¹), where L Lᵀ = I + B A⁻¹ Bᵀ.
     """
     rows, nodes = 3 * len(points), len(inverse)
-    answer, small = np.zeros((rows, nodes)), np.eye(rows)
+    added = np.zeros((rows, nodes))
     for i in range(rows):
         q, a = points[i // 3], i % 3
         root = np.sqrt(STIFFNESS * cells.weights[q])
         for k in range(cells.columns.shape[1]):
-            j, share = cells.columns[q, k], root * cells.slopes[q, k, a]
-            for n in range(nodes):
-                answer[i, n] += share * inverse[j, n]
-    for i in range(rows):
-        q, a = points[i // 3], i % 3
-        root = np.sqrt(STIFFNESS * cells.weights[q])
-        for k in range(cells.columns.shape[1]):
-            j, share = cells.columns[q, k], root * cells.slopes[q, k, a]
-            for o in range(rows):
-                small[o, i] += share * answer[o, j]
+            added[i, cells.columns[q, k]] += root * cells.slopes[q, k, a]
+    answer = np.dot(added, inverse)
+    small = np.eye(rows) + np.dot(answer, added.T.copy())
     factor_small(small)
     for i in range(rows):
         for o in range(i):

@@ -116,8 +116,7 @@ class SolidModel(NamedTuple):
 class Stiffness(NamedTuple):
     """What follows from the model and an activation."""
 
-    matrix: np.ndarray  # (N, N) second derivative of E / 2 μ
-    inverse: np.ndarray  # (N, N)
+    inverse: np.ndarray  # (N, N) of the second derivative of E / 2 μ
     most: np.ndarray  # (n,) greatest contact force, over 2 μ
 
 
@@ -230,15 +229,15 @@ def _motion_weights(model: SolidModel) -> Floats:
     """How much (N, b) of each bone's motion a node takes: where springs to that bone alone move
     it.
     """
-    inverse = _inverted(_hung(model))
+    inverse = _inverted(hung_matrix(model))
     bones = range(int(model.held_bone.max()) + 1)
     pulls = [model.springs[:, model.held_bone == b].sum(axis=1) for b in bones]
     weights = inverse @ np.stack(pulls, 1)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
-def _hung(model: SolidModel) -> Floats:
-    """The model's matrix with the springs at its held points."""
+def hung_matrix(model: SolidModel) -> Floats:
+    """The matrix (N, N) of a solid with the springs at its held points."""
     return np.asarray(model.matrix + model.springs @ (model.springs / model.spring).T)
 
 
@@ -248,12 +247,12 @@ def _inverted(matrix: Floats) -> Floats:
 
 
 def stiffness(model: SolidModel, activation: float) -> Stiffness:
-    """The matrix with springs and fibres, its inverse, and the greatest contact forces.
+    """The inverse of the matrix with springs and fibres, and the greatest contact forces.
 
     What a bone that is driven into an attachment would need to lift the points beside it bends the
     whole muscle: a point that moves less than the median for a unit force bears less.
     """
-    matrix = _hung(model)
+    matrix = hung_matrix(model)
     cells = model.cells
     fibres = model.fibres
     stiff = fibres.passive + activation * fibres.active
@@ -265,7 +264,7 @@ def stiffness(model: SolidModel, activation: float) -> Stiffness:
     inverse = _inverted(matrix)
     move = mobility(model.embedding.columns, model.embedding.shares, inverse)
     share = np.minimum(1.0, move / np.median(move[model.owner < 0]))
-    return Stiffness(matrix, inverse, MOST_CONTACT_PRESSURE * model.area * share)
+    return Stiffness(inverse, MOST_CONTACT_PRESSURE * model.area * share)
 
 
 def attached_owner(model: SolidModel) -> Integers:

@@ -149,7 +149,7 @@ def take_near(found, gap, model, most, obstacles, edges, forces, y):
 
 
 @inner(error_model="numpy", inline="always")
-def near_ways(near, y, new, push, margin, travelled):
+def near_motion(near, y, new, push, margin, travelled):
     """Where near points are (m, 3), their motion in a step of the nodes, and how far to look for
     obstacles: half as far again as they go in the step with the last push on top, and a margin.
 

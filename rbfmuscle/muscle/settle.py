@@ -35,7 +35,7 @@ from rbfmuscle.muscle.near_points import (
     find_exact_touch,
     find_near,
     find_touch,
-    near_ways,
+    near_motion,
     take_near,
 )
 from rbfmuscle.muscle.rounded_bones import RoundedBones
@@ -161,7 +161,7 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     residual = 0.0
     halved = np.inf
     since = 0
-    travelled, before = 0.0, y.copy()
+    travelled = 0.0
     lifted_nodes = y
     if room:
         lifted_nodes = y + _push_out(given, near, metric, answers, y, np.inf)
@@ -182,17 +182,10 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
             caps = int(not moved < limit) + int(step.capped)
             residual = step.residual / model.size
             break
-        before[:] = y
         if moved < 0.5 * halved:
             halved = moved
             since = done
-        if done - since < STALLED:
-            _accelerate(y, pressure, step, memory)
-        else:
-            memory.steps[0] = 0
-            y[:] = step.nodes
-            pressure[:] = step.pressures
-        travelled += farthest_between(y, before)
+        travelled += _advance(y, pressure, step, memory, done - since < STALLED)
         joined = local_step(model, y, given.activation, pull, local)[0]
         if joined > 0:
             metric, sound = _new_metric(given, local, joined)
@@ -277,7 +270,7 @@ def _iterate(given, y, pressure, push, local, metric, near, answers, travelled):
     new, change = global_step(model.cells, y, pressure, force, local, metric, part)
     # Contacts that push now push in the next iteration too: where the points will then go decides
     # what they meet.
-    here, motion, reach = near_ways(near, y, new, push, MARGIN * size, travelled)
+    here, motion, reach = near_motion(near, y, new, push, MARGIN * size, travelled)
     touch, room = find_touch(near, here, reach, travelled, given.obstacles, given.rounded)
     law = _law(given, touch, near, YIELDING / part, part)
     found = contact_push(touch, motion, near, metric, answers, law, near.forces, TOLERANCE * size)
@@ -312,8 +305,23 @@ def _shorten(y, pressure, step, longest):
 
 
 @inner(error_model="numpy", inline="always")
+def _advance(y, pressure, step, memory, accelerated):
+    """Turn nodes and pressures, in place, into those that the next iteration starts from; returns
+    how far the nodes go at most.
+    """
+    before = y.copy()
+    if accelerated:
+        _accelerate(y, pressure, step, memory)
+    else:
+        memory.steps[0] = 0
+        y[:] = step.nodes
+        pressure[:] = step.pressures
+    return farthest_between(y, before)
+
+
+@inner(error_model="numpy", inline="always")
 def _accelerate(y, pressure, step, memory):
-    """Turn nodes and pressures, in place, into those that the next iteration starts from."""
+    """Turn nodes and pressures, in place, into the mixture of the last steps."""
     count = y.size
     here, there = np.empty(count + len(pressure)), np.empty(count + len(pressure))
     here[:count] = y.ravel()
