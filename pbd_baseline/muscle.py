@@ -16,6 +16,7 @@ from pbd_baseline.shapes import METHODS, Method
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.interpolation import SurfaceInterpolation
 from rbfmuscle.geometry.rest_frame import diameter
+from rbfmuscle.geometry.surfaces import farthest_move
 from rbfmuscle.jit import compiled
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
@@ -201,7 +202,7 @@ class PBDMuscle:
         self.contact.project(self.points)
         if self.shape.volume_in_sweeps or self.still > 0.0:
             self.shape.restore_volume(self.points, self.contact)
-        return _farthest_loop(before, self.points) if asked else np.inf
+        return farthest_move(before, self.points) if asked else np.inf
 
     def _finish(self, contacts):
         """Contact and volume in turn, half-spaces found again, until both hold where the bones are
@@ -232,19 +233,6 @@ def _place_loop(rest, attached_bone, poses, points):
                 points[i, a] = poses[b, a, 3]
                 for k in range(3):
                     points[i, a] += poses[b, a, k] * rest[i, k]
-
-
-@compiled(error_model="numpy")
-def _farthest_loop(before, after):
-    """How far a point moved at most; infinity where one is not finite."""
-    most = 0.0
-    for i in range(len(before)):
-        square = 0.0
-        for a in range(3):
-            square += (after[i, a] - before[i, a]) ** 2
-        if not square <= most:
-            most = square if np.isfinite(square) else np.inf
-    return np.sqrt(most)
 
 
 def _relative(before, after):

@@ -1,4 +1,4 @@
-"""Normals, edges and enclosed volumes of triangle meshes."""
+"""Normals, edges, enclosed volumes and motions of triangle meshes."""
 
 import hashlib
 
@@ -310,3 +310,16 @@ class EdgeStretch:
         """The change at vertices (n, 3)."""
         change = edge_lengths(now, self._edges) / self._lengths - 1.0
         return np.bincount(self._ends, np.tile(change, 2), len(now)) / self._count
+
+
+@compiled(error_model="numpy")
+def farthest_move(before, after):
+    """How far a point (n, 3) moved at most; infinity where one is not finite."""
+    most = 0.0
+    for i in range(len(before)):
+        square = 0.0
+        for a in range(3):
+            square += (after[i, a] - before[i, a]) ** 2
+        if not square <= most:
+            most = square if np.isfinite(square) else np.inf
+    return np.sqrt(most)

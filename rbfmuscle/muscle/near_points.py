@@ -13,6 +13,7 @@ from rbfmuscle.bones.broad_phase import (
     note_query,
 )
 from rbfmuscle.bones.obstacles import Known, query_bone
+from rbfmuscle.geometry.surfaces import farthest_move
 from rbfmuscle.jit import inner
 from rbfmuscle.muscle.rounded_bones import SPREAD, no_scratch, rounded_distance
 
@@ -166,8 +167,7 @@ def near_motion(near, y, new, push, margin, travelled):
             displacements[n, 3 + a] = new[n, a] - y[n, a]
             displacements[n, 6 + a] = push[n, a]
             square += (displacements[n, 3 + a] + push[n, a]) ** 2
-        if not square <= farthest:
-            farthest = square
+        farthest = max(farthest, square)
     farthest = 1.5 * np.sqrt(farthest) + margin
     here = np.empty((count, 3))
     motion = np.empty((count, 3))
@@ -197,7 +197,7 @@ def carry_near(near, y, margin):
     can be so near to.
     """
     out, reach = np.zeros((len(near.which), 3)), np.full(len(near.which), -np.inf)
-    farthest = farthest_between(y, near.y) + margin
+    farthest = farthest_move(y, near.y) + margin
     for s in range(len(out)):
         if near.gap[s] > farthest:
             continue
@@ -206,20 +206,6 @@ def carry_near(near, y, margin):
             for a in range(3):
                 out[s, a] += near.shares[s, k] * y[near.columns[s, k], a]
     return out, reach
-
-
-@inner(error_model="numpy")
-def farthest_between(first, second):
-    """Greatest distance between corresponding rows (N, 3)."""
-    largest = 0.0
-    for n in range(len(first)):
-        square = 0.0
-        for a in range(3):
-            square += (first[n, a] - second[n, a]) ** 2
-        # Written so that NaN is not lost.
-        if not square <= largest:
-            largest = square
-    return np.sqrt(largest)
 
 
 @inner(error_model="numpy")

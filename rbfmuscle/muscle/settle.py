@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.bones.obstacles import Obstacles
+from rbfmuscle.geometry.surfaces import farthest_move
 from rbfmuscle.jit import compiled, inner
 from rbfmuscle.muscle.anderson import mix, no_memory
 from rbfmuscle.muscle.contact_forces import Law, contact_push, no_answers
@@ -31,7 +32,6 @@ from rbfmuscle.muscle.local_step import gradient_rows, local_step, start_local
 from rbfmuscle.muscle.model import SolidModel, Stiffness, carry
 from rbfmuscle.muscle.near_points import (
     carry_near,
-    farthest_between,
     find_exact_touch,
     find_near,
     find_touch,
@@ -276,7 +276,7 @@ def _iterate(given, y, pressure, push, local, metric, near, answers, travelled):
     found = contact_push(touch, motion, near, metric, answers, law, near.forces, TOLERANCE * size)
     pressures = corrected_pressures(pressure, change, found.taken, metric.factor, part)
     new += found.nodes
-    moved = farthest_between(new, y)
+    moved = farthest_move(new, y)
     return Step(new, pressures, found.nodes, moved, moved / part, found.capped, room)
 
 
@@ -316,7 +316,7 @@ def _advance(y, pressure, step, memory, accelerated):
         memory.steps[0] = 0
         y[:] = step.nodes
         pressure[:] = step.pressures
-    return farthest_between(y, before)
+    return farthest_move(y, before)
 
 
 @inner(error_model="numpy", inline="always")

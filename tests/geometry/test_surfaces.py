@@ -13,6 +13,7 @@ from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.geometry.surfaces import (
     edge_lengths,
     face_normals,
+    farthest_move,
     mesh_volume,
     unique_edges,
     vertex_areas,
@@ -101,3 +102,11 @@ def test_crossings_turn_with_the_surface(seed):
     assert found.sum() > 10
     turned = Rotation.random(random_state=seed).apply(vertices)
     np.testing.assert_array_equal(FaceTree(turned, faces).crossing(turned), found)
+
+
+def test_farthest_move_is_the_greatest_and_what_is_not_finite_is_not_lost():
+    before = np.zeros((3, 3))
+    after = np.array([[0.0, 0.0, 1.0], [3.0, 4.0, 0.0], [0.0, 2.0, 0.0]])
+    assert farthest_move(before, after) == 5.0
+    after[0, 1] = np.nan
+    assert farthest_move(before, after) == np.inf
