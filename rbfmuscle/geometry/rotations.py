@@ -63,73 +63,62 @@ def rotate(q, v):
     )
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
-def rotation_loop(m, q):
-    """Turn the unit quaternion q in place to the rotational part of the 3x3 matrix m, by Newton's
-    method.
+@compiled(error_model="numpy", inline="always")
+def dot(u, v):
+    """Product of two vectors of three numbers."""
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@compiled(error_model="numpy", inline="always")
+def turn_towards(m, q):
+    """The unit quaternion q a step nearer to the rotational part of a matrix m, given as rows.
 
     The torque that aligns R with m is the skew part of P = m Rᵀ, and tr(P) I - P its change with
-    the angle. Where that is not positive definite, as far from the solution, steps are those of
-    Müller et al. (2016).
+    the angle, so a step is one of Newton's method. Where that is not positive definite, as far from
+    the solution, it is that of Müller et al. (2016). No step turns by more than a radian.
     """
-    # From the last iteration's rotation one to three steps do; what is left when there are no more
-    # is motion of the solve that asked, whose residual shows it.
-    for _ in range(20):
-        w = q[0]
-        x = q[1]
-        y = q[2]
-        z = q[3]
-        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = quaternion_matrix(q)
-        p00 = m[0, 0] * r00 + m[0, 1] * r01 + m[0, 2] * r02
-        p01 = m[0, 0] * r10 + m[0, 1] * r11 + m[0, 2] * r12
-        p02 = m[0, 0] * r20 + m[0, 1] * r21 + m[0, 2] * r22
-        p10 = m[1, 0] * r00 + m[1, 1] * r01 + m[1, 2] * r02
-        p11 = m[1, 0] * r10 + m[1, 1] * r11 + m[1, 2] * r12
-        p12 = m[1, 0] * r20 + m[1, 1] * r21 + m[1, 2] * r22
-        p20 = m[2, 0] * r00 + m[2, 1] * r01 + m[2, 2] * r02
-        p21 = m[2, 0] * r10 + m[2, 1] * r11 + m[2, 2] * r12
-        p22 = m[2, 0] * r20 + m[2, 1] * r21 + m[2, 2] * r22
-        ox = p21 - p12
-        oy = p02 - p20
-        oz = p10 - p01
-        a = p11 + p22
-        b = p00 + p22
-        c = p00 + p11
-        d = -0.5 * (p01 + p10)
-        e = -0.5 * (p02 + p20)
-        f = -0.5 * (p12 + p21)
-        ab = e * f - d * c
-        ac = d * f - b * e
-        bc = d * e - a * f
-        det = a * (b * c - f * f) + d * ab + e * ac
-        newton = a > 0.0 and a * b > d * d and det > 1e-9 * (a + b + c) ** 3
-        if newton:
-            t = 1.0 / det
-            vx = t * ((b * c - f * f) * ox + ab * oy + ac * oz)
-            vy = t * (ab * ox + (a * c - e * e) * oy + bc * oz)
-            vz = t * (ac * ox + bc * oy + (a * b - d * d) * oz)
-        else:
-            t = 1.0 / (abs(p00 + p11 + p22) + 1e-12)
-            vx = t * ox
-            vy = t * oy
-            vz = t * oz
-        square = vx * vx + vy * vy + vz * vz
-        if square < 1e-16:
-            break
-        if square > 1.0:
-            t = 1.0 / np.sqrt(square)
-            vx = t * vx
-            vy = t * vy
-            vz = t * vz
-        vx = 0.5 * vx
-        vy = 0.5 * vy
-        vz = 0.5 * vz
-        q0, q1 = w - vx * x - vy * y - vz * z, x + vx * w + vy * z - vz * y
-        q2, q3 = y - vx * z + vy * w + vz * x, z + vx * y - vy * x + vz * w
-        t = 1.0 / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
-        q[0] = q0 * t
-        q[1] = q1 * t
-        q[2] = q2 * t
-        q[3] = q3 * t
-        if newton and square < 1e-8:
-            break  # the next step would be of the order of its square
+    r = quaternion_matrix(q)
+    p00 = dot(m[0], r[0])
+    p11 = dot(m[1], r[1])
+    p22 = dot(m[2], r[2])
+    p01 = dot(m[0], r[1])
+    p10 = dot(m[1], r[0])
+    p02 = dot(m[0], r[2])
+    p20 = dot(m[2], r[0])
+    p12 = dot(m[1], r[2])
+    p21 = dot(m[2], r[1])
+    x = p21 - p12
+    y = p02 - p20
+    z = p10 - p01
+    a = p11 + p22
+    b = p00 + p22
+    c = p00 + p11
+    d = -0.5 * (p01 + p10)
+    e = -0.5 * (p02 + p20)
+    f = -0.5 * (p12 + p21)
+    # The adjugate of the symmetric matrix with a, b, c on its diagonal and d, e, f beside it.
+    aa = b * c - f * f
+    bb = a * c - e * e
+    cc = a * b - d * d
+    ab = e * f - d * c
+    ac = d * f - b * e
+    bc = d * e - a * f
+    det = a * aa + d * ab + e * ac
+    newton = (a > 0.0) & (cc > 0.0) & (det > 1e-9 * (a + b + c) ** 3)
+    share = 1.0 / (det if newton else abs(p00 + p11 + p22) + 1e-12)
+    u = share * (aa * x + ab * y + ac * z if newton else x)
+    v = share * (ab * x + bb * y + bc * z if newton else y)
+    w = share * (ac * x + bc * y + cc * z if newton else z)
+    half = 0.5 / np.sqrt(max(u * u + v * v + w * w, 1.0))
+    return _turned(q, half * u, half * v, half * w)
+
+
+@compiled(error_model="numpy", inline="always")
+def _turned(q, u, v, w):
+    """Unit quaternion q followed by a small rotation, by twice the vector (u, v, w)."""
+    a = q[0] - u * q[1] - v * q[2] - w * q[3]
+    b = q[1] + u * q[0] + v * q[3] - w * q[2]
+    c = q[2] - u * q[3] + v * q[0] + w * q[1]
+    d = q[3] + u * q[2] - v * q[1] + w * q[0]
+    share = 1.0 / np.sqrt(a * a + b * b + c * c + d * d)
+    return share * a, share * b, share * c, share * d

@@ -63,37 +63,23 @@ def nearest_volume(f, out):
     return away
 
 
-@compiled(error_model="numpy")
-def unfold_loop(f, stiffened, weights, columns, slopes, out):
-    """Add what pulls squeezed points apart to the right side ``out`` (N, 3).
-
-    Points that are squeezed join those ``stiffened`` (Q,); returns how many did, and the energy
-    over 2 μ.
+@inner(error_model="numpy")
+def unfold(f, cells, c, p, out):
+    """Add what pulls point p of cell c, squeezed to a deformation gradient ``f`` (3, 3), apart to
+    the right side ``out`` (N, 3); returns the energy over 2 μ.
     """
-    joined, energy = 0, 0.0
-    goal = np.empty((3, 3))
-    for i in range(len(f)):
-        m = f[i]
-        det = _determinant(m)
-        if not stiffened[i]:
-            if det >= LEAST or not np.isfinite(det):
-                continue
-            stiffened[i] = True
-            joined += 1
+    count, goal, away = cells.slopes.shape[2] // 3, f, 0.0
+    if _determinant(f) < LEAST:
+        goal = np.empty((3, 3))
+        away = nearest_volume(f, goal)
+    share = STIFFNESS * cells.weights[c * count + p]
+    for k in range(cells.nodes.shape[1]):
         for a in range(3):
+            pull = 0.0
             for b in range(3):
-                goal[a, b] = m[a, b]
-        if det < LEAST:
-            energy += 0.5 * weights[i] * STIFFNESS * nearest_volume(m, goal)
-        share = STIFFNESS * weights[i]
-        for k in range(columns.shape[1]):
-            for a in range(3):
-                out[columns[i, k], a] += share * (
-                    goal[a, 0] * slopes[i, k, 0]
-                    + goal[a, 1] * slopes[i, k, 1]
-                    + goal[a, 2] * slopes[i, k, 2]
-                )
-    return joined, energy
+                pull += goal[a, b] * cells.slopes[c, k, b * count + p]
+            out[cells.nodes[c, k], a] += share * pull
+    return 0.5 * share * away
 
 
 @compiled(error_model="numpy")
@@ -103,13 +89,14 @@ def stiffened_inverse(inverse, cells, points):
     With B the rows sqrt(STIFFNESS w) ∇N of these points the sum is A + BᵀB, and by Woodbury's
     identity its inverse is A⁻¹ - (L⁻¹ B A⁻¹)ᵀ (L⁻¹ B A⁻¹), where L Lᵀ = I + B A⁻¹ Bᵀ.
     """
-    rows, nodes = 3 * len(points), len(inverse)
+    rows, nodes, count = 3 * len(points), len(inverse), cells.slopes.shape[2] // 3
     added = np.zeros((rows, nodes))
     for i in range(rows):
         q, a = points[i // 3], i % 3
         root = np.sqrt(STIFFNESS * cells.weights[q])
-        for k in range(cells.columns.shape[1]):
-            added[i, cells.columns[q, k]] += root * cells.slopes[q, k, a]
+        c, at = q // count, a * count + q % count
+        for k in range(cells.nodes.shape[1]):
+            added[i, cells.nodes[c, k]] += root * cells.slopes[c, k, at]
     answer = np.dot(added, inverse)
     small = np.eye(rows) + np.dot(answer, added.T.copy())
     factor_small(small)

@@ -3,24 +3,43 @@
 At each point R and t minimise the energy (`model.py`), and what is squeezed wants a volume
 (`inversion.py`). The energy is then quadratic in the nodes, with a matrix that does not depend on
 R and t and the right side Σ_q w_q T_q ∇N (Bouaziz et al. 2014, "Projective dynamics").
+
+The points of a cell share its nodes, so that their deformation gradients are one product of
+matrices and the forces on the nodes another; between them processors treat several points at once.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.rotations import quaternion_matrix, rotation_loop
-from rbfmuscle.jit import compiled
-from rbfmuscle.muscle.inversion import unfold_loop
+from rbfmuscle.geometry.rotations import dot, quaternion_matrix, turn_towards
+from rbfmuscle.implicit.placement.lattice import GROUPS as POINTS
+from rbfmuscle.jit import compiled, inner
+from rbfmuscle.muscle.inversion import LEAST, unfold
+
+# What is known at the points of a cell: rows of as many numbers as it has points, matrices row by
+# row. The loop over the points is only compiled for several at once where all is in one array.
+GRADIENT = 0  # 9: F
+ROTATION = 9  # 4: R as a unit quaternion
+STRETCH = 13  # t of slack fibres
+FIBRE = 14  # 3: a
+LOWER = 17  # stretches between which a fibre is slack
+UPPER = 18
+PASSIVE = 19  # stiffness of a fibre, and that of an active one times the stretch that it wants
+ACTIVE = 20
+WEIGHT = 21  # w
+STRESS = 22  # 9: w T
+COFACTOR = 31  # 9: of F, times w
+DETERMINANT = 40
+ROWS = 41
+
+STEPS = 3  # of Newton's method for a stretch in an iteration, which goes on from the last
 
 
 class Local(NamedTuple):
     """What the local step finds."""
 
-    rotations: np.ndarray  # (Q, 4) unit quaternions
-    stretches: np.ndarray  # (Q,) t of slack fibres
-    f: np.ndarray  # (Q, 3, 3) deformation gradients
-    target: np.ndarray  # (Q, 3, 3) R D(t)
+    work: np.ndarray  # (C, ROWS * POINTS) what is known at the points of each cell
     stiffened: np.ndarray  # (Q,) whether a point was squeezed in this solve
     right: np.ndarray  # (N, 3) right side
     gradient: np.ndarray  # (S, 3) of the regions' volumes
@@ -28,189 +47,200 @@ class Local(NamedTuple):
 
 
 @compiled(error_model="numpy")
-def start_local(model, state):
+def start_local(model, state, activation):
     """Arrays for the local steps of a solve."""
-    count = len(model.cells.weights)
+    cells, fibres = model.cells, model.fibres
+    work = np.empty((len(cells.nodes), ROWS * POINTS))
+    for c in range(len(work)):
+        for p in range(POINTS):
+            i = c * POINTS + p
+            for k in range(4):
+                work[c, (ROTATION + k) * POINTS + p] = state.rotations[i, k]
+            for k in range(3):
+                work[c, (FIBRE + k) * POINTS + p] = fibres.direction[i, k]
+            work[c, STRETCH * POINTS + p] = state.stretches[i]
+            work[c, LOWER * POINTS + p] = fibres.lower[i]
+            work[c, UPPER * POINTS + p] = fibres.upper[i]
+            work[c, PASSIVE * POINTS + p] = fibres.passive[i]
+            work[c, ACTIVE * POINTS + p] = activation * fibres.active[i] * fibres.content[i]
+            work[c, WEIGHT * POINTS + p] = cells.weights[i]
     return Local(
-        state.rotations.copy(),
-        state.stretches.copy(),
-        np.empty((count, 3, 3)),
-        np.empty((count, 3, 3)),
-        np.zeros(count, np.bool_),
+        work,
+        np.zeros(len(cells.weights), np.bool_),
         np.empty_like(model.rest),
-        np.empty((len(model.cells.node), 3)),
-        np.empty(len(model.cells.volumes)),
+        np.empty((len(cells.node), 3)),
+        np.empty(len(cells.volumes)),
     )
 
 
+@inner(error_model="numpy")
+def found_rotations(local):
+    """Rotations (Q, 4) as unit quaternions, and stretches (Q,)."""
+    work = local.work
+    rotations, stretches = np.empty((len(work) * POINTS, 4)), np.empty(len(work) * POINTS)
+    for c in range(len(work)):
+        for p in range(POINTS):
+            stretches[c * POINTS + p] = work[c, STRETCH * POINTS + p]
+            for k in range(4):
+                rotations[c * POINTS + p, k] = work[c, (ROTATION + k) * POINTS + p]
+    return rotations, stretches
+
+
 @compiled(error_model="numpy")
-def local_step(model, y, activation, tension, local):
+def local_step(cells, y, tension, local):
     """Fill ``local`` for nodes ``y``: how many points joined the squeezed ones, and the energy of
     these over 2 μ.
     """
-    cells, fibres = model.cells, model.fibres
-    target_loop(y, cells, fibres, tension, local)
-    stress_loop(cells, fibres, activation, local)
-    return unfold_loop(
-        local.f, local.stiffened, cells.weights, cells.columns, cells.slopes, local.right
+    local.right[:] = 0.0
+    local.gradient[:] = 0.0
+    local.volumes[:] = 0.0
+    joined, energy = 0, 0.0
+    corners, forces = np.empty((3, cells.nodes.shape[1])), np.empty((6, cells.nodes.shape[1]))
+    for c in range(len(cells.nodes)):
+        work = local.work[c]
+        deform(cells, y, c, corners, work)
+        _stress_points(work, tension)
+        stresses = work[STRESS * POINTS : DETERMINANT * POINTS].reshape((6, 3 * POINTS))
+        np.dot(stresses, cells.slopes[c].T, forces)
+        for k in range(cells.nodes.shape[1]):
+            for a in range(3):
+                local.right[cells.nodes[c, k], a] += forces[a, k]
+                local.gradient[cells.slot[c, k], a] += forces[3 + a, k]
+        for p in range(POINTS):
+            i, det = c * POINTS + p, work[DETERMINANT * POINTS + p]
+            local.volumes[cells.region[c]] += cells.weights[i] * det
+            if det < LEAST and not local.stiffened[i]:
+                local.stiffened[i] = True
+                joined += 1
+            if local.stiffened[i]:
+                energy += unfold(np.array(_matrix(work, GRADIENT, p)), cells, c, p, local.right)
+    return joined, energy
+
+
+@inner(error_model="numpy")
+def deform(cells, y, c, corners, work):
+    """Write the deformation gradients Σ_k y_k ∇N_k at the points of cell c to its ``work``;
+    ``corners`` (3, 27) is room for its nodes.
+    """
+    for k in range(cells.nodes.shape[1]):
+        for a in range(3):
+            corners[a, k] = y[cells.nodes[c, k], a]
+    found = work[: 9 * POINTS].reshape((3, 3 * POINTS))
+    np.dot(corners, cells.slopes[c], found)
+
+
+@compiled(error_model="numpy")
+def volumes(cells, y):
+    """Volumes (M,) of the regions for nodes y (N, 3)."""
+    out = np.zeros(len(cells.volumes))
+    corners, work = np.empty((3, cells.nodes.shape[1])), np.empty(ROWS * POINTS)
+    for c in range(len(cells.nodes)):
+        deform(cells, y, c, corners, work)
+        for p in range(POINTS):
+            f = _matrix(work, GRADIENT, p)
+            out[cells.region[c]] += cells.weights[c * POINTS + p] * dot(f[0], _cross(f[1], f[2]))
+    return out
+
+
+@inner(error_model="numpy", fastmath={"contract"})
+def _stress_points(work, tension):
+    """R, t, stresses, cofactors and volumes at the points of a cell.
+
+    R is the rotation of F D(t) for the last t, then t minimises |RᵀF - D(t)|² + 2 tension t in
+    [lower, 1]; each by a few steps of Newton's method, and over the iterations both converge. The
+    target is T = R (t aaᵀ + t^(-1/2) (I - aaᵀ)) and what springs along the fibre want.
+    """
+    for p in range(POINTS):
+        f = _matrix(work, GRADIENT, p)
+        a = _vector(work, FIBRE, p)
+        fa = _times(f, a)
+        t = work[STRETCH * POINTS + p]
+        u = 1.0 / np.sqrt(t)
+        fd = _plus(f, u, fa, t - u, a)
+        q = (
+            work[ROTATION * POINTS + p],
+            work[(ROTATION + 1) * POINTS + p],
+            work[(ROTATION + 2) * POINTS + p],
+            work[(ROTATION + 3) * POINTS + p],
+        )
+        q = turn_towards(fd, turn_towards(fd, q))
+        work[ROTATION * POINTS + p] = q[0]
+        work[(ROTATION + 1) * POINTS + p] = q[1]
+        work[(ROTATION + 2) * POINTS + p] = q[2]
+        work[(ROTATION + 3) * POINTS + p] = q[3]
+        r = quaternion_matrix(q)
+        ra = _times(r, a)
+        # S = RᵀF: s is its part along the fibre, across the sum of those across.
+        s = dot(ra, fa)
+        across = dot(r[0], f[0]) + dot(r[1], f[1]) + dot(r[2], f[2]) - s
+        lower = work[LOWER * POINTS + p]
+        for _ in range(STEPS):
+            v = 1.0 / t
+            root = np.sqrt(v)
+            slope = t - v * v - s + 0.5 * across * v * root + tension
+            bend = 1.0 + 2.0 * v * v * v - 0.75 * across * v * v * root
+            t = min(max(t - slope / max(bend, 0.5), lower), 1.0)
+        work[STRETCH * POINTS + p] = t
+        u = 1.0 / np.sqrt(t)
+        length = np.sqrt(dot(fa, fa) + 1e-12)
+        slack = min(max(length, lower), work[UPPER * POINTS + p])
+        pull = (work[PASSIVE * POINTS + p] * slack + work[ACTIVE * POINTS + p]) / length
+        w = work[WEIGHT * POINTS + p]
+        along = (
+            (t - u) * ra[0] + pull * fa[0],
+            (t - u) * ra[1] + pull * fa[1],
+            (t - u) * ra[2] + pull * fa[2],
+        )
+        _put(work, STRESS, p, _plus(r, w * u, along, w, a))
+        cofactors = (_cross(f[1], f[2]), _cross(f[2], f[0]), _cross(f[0], f[1]))
+        _put(work, COFACTOR, p, _plus(cofactors, w, along, 0.0, a))
+        work[DETERMINANT * POINTS + p] = dot(f[0], cofactors[0])
+
+
+@inner(inline="always")
+def _vector(work, row, p):
+    return work[row * POINTS + p], work[(row + 1) * POINTS + p], work[(row + 2) * POINTS + p]
+
+
+@inner(inline="always")
+def _matrix(work, row, p):
+    return _vector(work, row, p), _vector(work, row + 3, p), _vector(work, row + 6, p)
+
+
+@inner(inline="always")
+def _put(work, row, p, matrix):
+    _put_vector(work, row, p, matrix[0])
+    _put_vector(work, row + 3, p, matrix[1])
+    _put_vector(work, row + 6, p, matrix[2])
+
+
+@inner(inline="always")
+def _put_vector(work, row, p, vector):
+    work[row * POINTS + p] = vector[0]
+    work[(row + 1) * POINTS + p] = vector[1]
+    work[(row + 2) * POINTS + p] = vector[2]
+
+
+@inner(inline="always")
+def _times(m, v):
+    return dot(m[0], v), dot(m[1], v), dot(m[2], v)
+
+
+@inner(inline="always")
+def _cross(u, v):
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@inner(inline="always")
+def _plus(m, share, u, factor, v):
+    """Rows of share m + factor u vᵀ."""
+    return (
+        _row(m[0], share, factor * u[0], v),
+        _row(m[1], share, factor * u[1], v),
+        _row(m[2], share, factor * u[2], v),
     )
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
-def gradient_rows(y, columns, slopes, i):
-    """Rows of the deformation gradient Σ_k y_k ∇N_k at point i."""
-    xx = 0.0
-    xy = 0.0
-    xz = 0.0
-    yx = 0.0
-    yy = 0.0
-    yz = 0.0
-    zx = 0.0
-    zy = 0.0
-    zz = 0.0
-    for k in range(columns.shape[1]):
-        j = columns[i, k]
-        u = slopes[i, k, 0]
-        v = slopes[i, k, 1]
-        w = slopes[i, k, 2]
-        x = y[j, 0]
-        xx = xx + x * u
-        xy = xy + x * v
-        xz = xz + x * w
-        x = y[j, 1]
-        yx = yx + x * u
-        yy = yy + x * v
-        yz = yz + x * w
-        x = y[j, 2]
-        zx = zx + x * u
-        zy = zy + x * v
-        zz = zz + x * w
-    return (xx, xy, xz), (yx, yy, yz), (zx, zy, zz)
-
-
-@compiled(error_model="numpy")
-def target_loop(y, cells, fibres, tension, local):
-    """Deformation gradients F and their targets R (t aaᵀ + t^(-1/2) (I - aaᵀ)) at all points.
-
-    R is the rotation of F D(t) for the last t, then t minimises |RᵀF - D(t)|² + 2 tension t in
-    [least, 1] by Newton's method; over the iterations both converge.
-    """
-    columns, slopes = cells.columns, cells.slopes
-    fibre, least = fibres.direction, fibres.lower
-    q = local.rotations
-    t = local.stretches
-    f = local.f
-    target = local.target
-    fd, rotation = np.empty((3, 3)), np.empty(4)
-    for i in range(len(columns)):
-        first, second, third = gradient_rows(y, columns, slopes, i)
-        e0 = fibre[i, 0]
-        e1 = fibre[i, 1]
-        e2 = fibre[i, 2]
-        u = 1.0 / np.sqrt(t[i])
-        for b in range(3):
-            f[i, 0, b] = first[b]
-            f[i, 1, b] = second[b]
-            f[i, 2, b] = third[b]
-        for a in range(3):
-            along = (t[i] - u) * (f[i, a, 0] * e0 + f[i, a, 1] * e1 + f[i, a, 2] * e2)
-            fd[a, 0] = u * f[i, a, 0] + along * e0
-            fd[a, 1] = u * f[i, a, 1] + along * e1
-            fd[a, 2] = u * f[i, a, 2] + along * e2
-        for k in range(4):
-            rotation[k] = q[i, k]
-        rotation_loop(fd, rotation)
-        for k in range(4):
-            q[i, k] = rotation[k]
-        first, second, third = quaternion_matrix(rotation)
-        for b in range(3):
-            target[i, 0, b] = first[b]
-            target[i, 1, b] = second[b]
-            target[i, 2, b] = third[b]
-        if least[i] < 1.0:
-            # S = RᵀF: s is its part along the fibre, m the sum of those across.
-            s, m = 0.0, 0.0
-            for a in range(3):
-                fa = f[i, a, 0] * e0 + f[i, a, 1] * e1 + f[i, a, 2] * e2
-                ra = target[i, a, 0] * e0 + target[i, a, 1] * e1 + target[i, a, 2] * e2
-                s += ra * fa
-                for b in range(3):
-                    m += target[i, a, b] * f[i, a, b]
-            m -= s
-            v = t[i]
-            for _ in range(4):
-                v15 = v * np.sqrt(v)
-                g = v - 1.0 / (v * v) - s + 0.5 * m / v15 + tension
-                h = 1.0 + 2.0 / (v * v * v) - 0.75 * m / (v15 * v)
-                v = min(max(v - g / max(h, 0.5), least[i]), 1.0)
-            t[i] = v
-            u = 1.0 / np.sqrt(v)
-            for a in range(3):
-                ra = target[i, a, 0] * e0 + target[i, a, 1] * e1 + target[i, a, 2] * e2
-                ra *= v - u
-                target[i, a, 0] = u * target[i, a, 0] + ra * e0
-                target[i, a, 1] = u * target[i, a, 1] + ra * e1
-                target[i, a, 2] = u * target[i, a, 2] + ra * e2
-
-
-@compiled(error_model="numpy")
-def stress_loop(cells, fibres, activation, local):
-    """Right side Σ w T ∇N of the fibres and the rest, volumes of the regions and their
-    gradients.
-    """
-    columns = cells.columns
-    slopes = cells.slopes
-    region = cells.region
-    slot = cells.slot
-    weights = cells.weights
-    f = local.f
-    target = local.target
-    out = local.right
-    gradient = local.gradient
-    volume = local.volumes
-    out[:] = 0.0
-    gradient[:] = 0.0
-    volume[:] = 0.0
-    v, c = np.empty((3, 3)), np.empty((3, 3))
-    for i in range(len(f)):
-        m = f[i]
-        c[0, 0] = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
-        c[0, 1] = m[1, 2] * m[2, 0] - m[1, 0] * m[2, 2]
-        c[0, 2] = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
-        c[1, 0] = m[0, 2] * m[2, 1] - m[0, 1] * m[2, 2]
-        c[1, 1] = m[0, 0] * m[2, 2] - m[0, 2] * m[2, 0]
-        c[1, 2] = m[0, 1] * m[2, 0] - m[0, 0] * m[2, 1]
-        c[2, 0] = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
-        c[2, 1] = m[0, 2] * m[1, 0] - m[0, 0] * m[1, 2]
-        c[2, 2] = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-        w = weights[i]
-        volume[region[i]] += w * (m[0, 0] * c[0, 0] + m[0, 1] * c[0, 1] + m[0, 2] * c[0, 2])
-        for a in range(3):
-            for b in range(3):
-                v[a, b] = w * target[i, a, b]
-                c[a, b] *= w
-        active = activation * fibres.active[i]
-        if fibres.passive[i] + active > 0.0:
-            fibre, length = fibres.direction[i], 1e-12
-            for a in range(3):
-                length += (m[a, 0] * fibre[0] + m[a, 1] * fibre[1] + m[a, 2] * fibre[2]) ** 2
-            length = np.sqrt(length)
-            slack = min(max(length, fibres.lower[i]), fibres.upper[i])
-            share = w * (fibres.passive[i] * slack + active * fibres.content[i]) / length
-            for a in range(3):
-                along = m[a, 0] * fibre[0] + m[a, 1] * fibre[1] + m[a, 2] * fibre[2]
-                for b in range(3):
-                    v[a, b] += share * along * fibre[b]
-        for k in range(columns.shape[1]):
-            j, s = columns[i, k], slot[i, k]
-            for a in range(3):
-                out[j, a] += (
-                    v[a, 0] * slopes[i, k, 0]
-                    + v[a, 1] * slopes[i, k, 1]
-                    + v[a, 2] * slopes[i, k, 2]
-                )
-                gradient[s, a] += (
-                    c[a, 0] * slopes[i, k, 0]
-                    + c[a, 1] * slopes[i, k, 1]
-                    + c[a, 2] * slopes[i, k, 2]
-                )
+@inner(inline="always")
+def _row(m, share, factor, v):
+    return share * m[0] + factor * v[0], share * m[1] + factor * v[1], share * m[2] + factor * v[2]

@@ -60,14 +60,18 @@ class Fibres(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Quadrature points of the lattice, and the regions whose volumes are kept."""
+    """The lattice's C cells, each with the same number P of quadrature points, point p of cell c in
+    row c P + p; and the regions whose volumes are kept, which consist of whole cells.
+    """
 
-    columns: np.ndarray  # (Q, 27) nodes of a point
-    slopes: np.ndarray  # (Q, 27, 3) gradients of their shape functions [1 / scene unit]
+    nodes: np.ndarray  # (C, 27) nodes of a cell
+    # (C, 27, 3 P) gradients of their shape functions [1 / scene unit]: in column a P + p that along
+    # axis a at point p.
+    slopes: np.ndarray
     weights: np.ndarray  # (Q,) volume of a point [scene unit cubed]
     points: np.ndarray  # (Q, 3) at rest
-    region: np.ndarray  # (Q,) its region
-    slot: np.ndarray  # (Q, 27) row of its nodes in a gradient of the regions' volumes
+    region: np.ndarray  # (C,) its region
+    slot: np.ndarray  # (C, 27) row of its nodes in a gradient of the regions' volumes
     start: np.ndarray  # (M + 1,) first row of each region
     node: np.ndarray  # (S,) node of each row
     volumes: np.ndarray  # (M,) of the regions at rest [scene unit cubed]
@@ -197,32 +201,43 @@ def _embedded(lattice: Lattice, frame: RestFrame, points: Floats) -> LatticePoin
 
 def _number_regions(lattice: Lattice, frame: RestFrame) -> Cells:
     """The quadrature, and regions of about `NODES_PER_REGION` nodes."""
-    columns, size = lattice.quadrature.indices, len(lattice.rest)
+    size, cells = len(lattice.rest), len(lattice.cells)
     region = lattice.regions(max(1, size // NODES_PER_REGION))
     weights = lattice.weights * frame.size**3
-    known, slot = np.unique(region[:, None] * size + columns, return_inverse=True)
+    known, slot = np.unique(region[:, None] * size + lattice.nodes, return_inverse=True)
     count = int(region.max()) + 1
+    slopes = lattice.quadrature.slopes @ frame.axes / frame.size
+    by_cell = slopes.reshape(cells, -1, lattice.nodes.shape[1], 3).transpose(0, 2, 3, 1)
     return Cells(
-        columns,
-        np.ascontiguousarray(lattice.quadrature.slopes @ frame.axes / frame.size),
+        lattice.nodes,
+        np.ascontiguousarray(by_cell.reshape(cells, lattice.nodes.shape[1], -1)),
         weights,
         frame.points(lattice.points),
         region,
-        slot.reshape(columns.shape).astype(np.int64),
+        slot.reshape(lattice.nodes.shape).astype(np.int64),
         np.searchsorted(known // size, np.arange(count + 1)).astype(np.int64),
         (known % size).astype(np.int64),
-        np.bincount(region, weights, minlength=count),
+        np.bincount(region, weights.reshape(cells, -1).sum(axis=1), minlength=count),
     )
 
 
 def _gram(cells: Cells, nodes: int) -> Floats:
     """Matrix (N, N) of Σ w |F|²."""
-    found, rows = np.zeros((nodes, nodes)), np.arange(len(cells.weights))[:, None]
-    for axis in range(3):
-        full = np.zeros((len(cells.weights), nodes))
-        np.add.at(full, (rows, cells.columns), cells.slopes[:, :, axis])
-        found += (full * cells.weights[:, None]).T @ full
+    found = np.zeros((nodes, nodes))
+    for axis in np.eye(3):
+        along = _derivatives(cells, np.tile(axis, (len(cells.weights), 1)), nodes)
+        found += (along * cells.weights[:, None]).T @ along
     return found
+
+
+def _derivatives(cells: Cells, directions: Floats, nodes: int) -> Floats:
+    """Matrix (Q, N) of the derivatives at the quadrature points along ``directions`` (Q, 3)."""
+    count, corners = cells.nodes.shape
+    slopes = cells.slopes.reshape(count, corners, 3, -1)
+    along = np.einsum("ckap,cpa->cpk", slopes, directions.reshape(count, -1, 3))
+    out = np.zeros((*along.shape[:2], nodes))
+    np.put_along_axis(out, cells.nodes[:, None, :], along, axis=2)
+    return np.asarray(out.reshape(-1, nodes))
 
 
 def _motion_weights(model: SolidModel) -> Floats:
@@ -257,9 +272,7 @@ def stiffness(model: SolidModel, activation: float) -> Stiffness:
     fibres = model.fibres
     stiff = fibres.passive + activation * fibres.active
     if stiff.any():
-        along = np.zeros((len(cells.weights), len(model.rest)))
-        slopes = np.einsum("qka,qa->qk", cells.slopes, fibres.direction)
-        np.add.at(along, (np.arange(len(cells.weights))[:, None], cells.columns), slopes)
+        along = _derivatives(cells, fibres.direction, len(model.rest))
         matrix = matrix + (along * (stiff * cells.weights)[:, None]).T @ along
     inverse = _inverted(matrix)
     move = mobility(model.embedding.columns, model.embedding.shares, inverse)

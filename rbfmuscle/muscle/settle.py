@@ -28,7 +28,7 @@ from rbfmuscle.muscle.global_step import (
     global_step,
 )
 from rbfmuscle.muscle.inversion import stiffened_inverse
-from rbfmuscle.muscle.local_step import gradient_rows, local_step, start_local
+from rbfmuscle.muscle.local_step import found_rotations, local_step, start_local, volumes
 from rbfmuscle.muscle.model import SolidModel, Stiffness, carry
 from rbfmuscle.muscle.near_points import (
     carry_near,
@@ -146,8 +146,8 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     given = Problem(model, stiffness, obstacles, rounded, springs, state.activation[0], pull)
     y = state.nodes.copy()
     pressure = state.pressures.copy()
-    local = start_local(model, state)
-    joined = local_step(model, y, given.activation, pull, local)[0]
+    local = start_local(model, state, given.activation)
+    joined = local_step(model.cells, y, pull, local)[0]
     metric, sound = _new_metric(given, local, joined)
     forces = _start_forces(state.forces, obstacles)
     near = _choose_near(given, forces, y)
@@ -186,7 +186,7 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
             halved = moved
             since = done
         travelled += _advance(y, pressure, step, memory, done - since < STALLED)
-        joined = local_step(model, y, given.activation, pull, local)[0]
+        joined = local_step(model.cells, y, pull, local)[0]
         if joined > 0:
             metric, sound = _new_metric(given, local, joined)
             memory.steps[0] = 0
@@ -199,7 +199,7 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     _note_forces(near, forces)
     lifted_nodes, left = _lifted(given, lifted_nodes, metric, near, answers)
     points = place_points(model, lifted_nodes, state.points)
-    rotations, stretches = local.rotations, local.stretches
+    rotations, stretches = found_rotations(local)
     if room:
         rotations, stretches = state.rotations, state.stretches
     found = Settled(y, lifted_nodes, points, rotations, stretches, pressure, forces)
@@ -365,15 +365,7 @@ def _lifted(given, y, metric, near, answers):
     return y, 1
 
 
-@inner(error_model="numpy")
+@inner(error_model="numpy", inline="always")
 def _volume_error(cells, y):
     """Greatest relative error of a region's volume for nodes y (N, 3)."""
-    volumes = np.zeros(len(cells.volumes))
-    for i in range(len(cells.weights)):
-        r0, r1, r2 = gradient_rows(y, cells.columns, cells.slopes, i)
-        volumes[cells.region[i]] += cells.weights[i] * (
-            r0[0] * (r1[1] * r2[2] - r1[2] * r2[1])
-            - r0[1] * (r1[0] * r2[2] - r1[2] * r2[0])
-            + r0[2] * (r1[0] * r2[1] - r1[1] * r2[0])
-        )
-    return np.abs(volumes / cells.volumes - 1.0).max()
+    return np.abs(volumes(cells, y) / cells.volumes - 1.0).max()

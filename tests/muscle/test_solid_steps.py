@@ -1,6 +1,8 @@
 """Laws of the solid's loops on systems of a few nodes: contact, transposes, volumes,
 acceleration."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,8 @@ from rbfmuscle.muscle.contact_forces import (
     solve_forces,
 )
 from rbfmuscle.muscle.global_step import BULK, Metric, find_metric, press, swell
-from rbfmuscle.muscle.local_step import Local, stress_loop, target_loop
+from rbfmuscle.muscle.local_step import POINTS as IN_CELL
+from rbfmuscle.muscle.local_step import local_step, start_local, volumes
 from rbfmuscle.muscle.model import Cells, Embedding, Fibres, carry, mobility
 from rbfmuscle.muscle.near_points import Near, Touch
 
@@ -111,51 +114,54 @@ def test_acceleration_solves_a_linear_map_in_few_steps(rng, measured):
     np.testing.assert_allclose(x, np.linalg.solve(np.eye(12) - m, b), atol=1e-4)
 
 
+class Solid(NamedTuple):
+    """What the local step reads of a model."""
+
+    rest: np.ndarray
+    cells: Cells
+    fibres: Fibres
+
+
+class State(NamedTuple):
+    """What it starts from."""
+
+    rotations: np.ndarray
+    stretches: np.ndarray
+
+
 class Tetrahedra:
-    """Two tetrahedra on five nodes, a point in each, two regions."""
+    """Two tetrahedra on five nodes, each a cell and a region; of its points one has a weight."""
 
     def __init__(self, rng):
         self.rest = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0.9, 0.8, 1.1]])
-        columns, weights = np.array([[0, 1, 2, 3], [1, 2, 3, 4]]), np.array([0.7, 0.4])
-        slopes = np.empty((2, 4, 3))
-        for q, nodes in enumerate(columns):
-            slopes[q] = np.linalg.inv(np.column_stack([self.rest[nodes], np.ones(4)]))[:3].T
-        self.fibre = rng.normal(size=(2, 3))
-        self.fibre /= np.linalg.norm(self.fibre, axis=1, keepdims=True)
-        start = np.array([0, 4, 8])
-        node = columns.ravel()
-        region = np.array([0, 1])
-        slot = np.arange(8).reshape(2, 4)
+        nodes, weights = np.array([[0, 1, 2, 3], [1, 2, 3, 4]]), np.zeros((2, IN_CELL))
+        weights[:, 2] = [0.7, 0.4]
+        corners = np.concatenate([self.rest[nodes], np.ones((2, 4, 1))], axis=2)
+        slopes = np.linalg.inv(corners)[:, :3].swapaxes(1, 2)
         self.cells = Cells(
-            columns,
-            slopes,
-            weights,
-            self.rest[:2],
-            region,
-            slot,
-            start,
-            node,
-            weights.copy(),
+            nodes,
+            np.repeat(slopes, IN_CELL, axis=2),
+            weights.ravel(),
+            np.zeros((2 * IN_CELL, 3)),
+            np.array([0, 1]),
+            np.arange(8).reshape(2, 4),
+            np.array([0, 4, 8]),
+            nodes.ravel(),
+            weights.sum(axis=1),
         )
+        fibre = rng.normal(size=(2 * IN_CELL, 3))
+        fibre /= np.linalg.norm(fibre, axis=1, keepdims=True)
+        zero, one = np.zeros(2 * IN_CELL), np.ones(2 * IN_CELL)
+        self.fibres = Fibres(fibre, zero, zero, one, one, one)
 
     def stress(self, y):
         """Deformations, gradients of the volumes, and volumes."""
-        zero, one = np.zeros(2), np.ones(2)
-        local = Local(
-            np.tile([1.0, 0, 0, 0], (2, 1)),
-            one.copy(),
-            np.empty((2, 3, 3)),
-            np.empty((2, 3, 3)),
-            np.zeros(2, dtype=bool),
-            np.empty((5, 3)),
-            np.empty((8, 3)),
-            np.empty(2),
-        )
-        fibres = Fibres(self.fibre, zero, zero, one, one, one)
-        for _ in range(20):
-            target_loop(y, self.cells, fibres, 0.05, local)
-        stress_loop(self.cells, fibres, 0.0, local)
-        return local.f, local.gradient, local.volumes
+        solid = Solid(self.rest, self.cells, self.fibres)
+        turns = np.tile([1.0, 0, 0, 0], (2 * IN_CELL, 1))
+        local = start_local(solid, State(turns, np.ones(2 * IN_CELL)), 0.0)
+        local_step(self.cells, y, 0.05, local)
+        f = local.work.reshape(2, -1, IN_CELL)[:, :9, 2].reshape(2, 3, 3)
+        return f, local.gradient, local.volumes
 
 
 @pytest.fixture
@@ -166,7 +172,8 @@ def cells(rng):
 def test_volumes_are_determinants_and_their_gradients_differences(rng, cells):
     y = cells.rest + 0.1 * rng.normal(size=(5, 3))
     f, gradient, volume = cells.stress(y)
-    np.testing.assert_allclose(volume, cells.cells.weights * np.linalg.det(f), rtol=1e-12)
+    np.testing.assert_allclose(volume, cells.cells.volumes * np.linalg.det(f), rtol=1e-12)
+    np.testing.assert_allclose(volumes(cells.cells, y), volume, rtol=1e-12)
     step, direction = 6e-6, rng.normal(size=(5, 3))
     ahead, behind = (cells.stress(y + s * step * direction)[2] for s in (1, -1))
     swollen = swell(direction, cells.cells, gradient)

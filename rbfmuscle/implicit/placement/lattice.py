@@ -160,8 +160,7 @@ class Lattice:
         self.quadrature = self._at(self.cell, np.concatenate(local))
 
     def regions(self, count: int) -> Integers:
-        """Region of each quadrature point: whole cells, halved by volume until there are ``count``
-        regions.
+        """Region of each cell, halved by volume until there are ``count`` regions.
 
         A group of which no part is large enough stays whole: the pressure of a sliver would grow
         without bounds.
@@ -185,7 +184,7 @@ class Lattice:
         out = np.empty(len(self.cells), dtype=np.int64)
         for k, group in enumerate(whole + open_groups):
             out[group] = k
-        return out[self.cell]
+        return out
 
     def second_differences(self) -> Floats:
         """Σ over axes of the squared second differences of the nodes along them, (N, N), zero for
