@@ -33,7 +33,8 @@ def compiled(function: Callable | None = None, **options: object) -> Callable:
 
     It takes arrays, numbers and NamedTuples of these; options are those of ``numba.njit``.
     ``nogil=False`` suits short loops that are called often, because releasing the interpreter's
-    lock takes longer than they do.
+    lock takes longer than they do. ``_nrt=False`` suits inner loops that are called for each point,
+    make no array and return none: references to arrays are then not counted.
     """
     if function is None:
         return lambda inner: compiled(inner, **options)
@@ -41,7 +42,7 @@ def compiled(function: Callable | None = None, **options: object) -> Callable:
         return function
     # No loop is an argument of another: the wrapper for that, an eighth of the time of compiling,
     # is left out.
-    loop = numba.njit(**{"nogil": True, "no_cfunc_wrapper": True, **options})(function)
+    loop = numba.njit(**{"nogil": True, "no_cfunc_wrapper": True, "_nrt": True, **options})(function)
     loop._compiler.compile = _no_collection()(loop._compiler.compile)
     loop.get_call_template = _of_plain_types(loop.get_call_template)
     loop._cache = _LoopCache(function)

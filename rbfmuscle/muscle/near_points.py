@@ -179,9 +179,9 @@ def near_motion(near, y, new, push, margin, travelled):
             continue
         total[:] = 0.0
         for k in range(near.columns.shape[1]):
-            way, share = displacements[near.columns[s, k]], near.shares[s, k]
+            share = near.shares[s, k]
             for a in range(9):
-                total[a] += share * way[a]
+                total[a] += share * displacements[near.columns[s, k], a]
         square = 0.0
         for a in range(3):
             here[s, a] = total[a]

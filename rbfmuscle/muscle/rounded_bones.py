@@ -165,7 +165,7 @@ def no_scratch():
     return Scratch(np.empty(3), np.empty(3), np.empty(3))
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", _nrt=False)
 def rounded_distance(rounded, bones, b, scratch):
     """Distance of the point ``scratch.local`` to bone b, rounded; fills its unit gradient.
 
