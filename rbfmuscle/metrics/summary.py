@@ -81,38 +81,43 @@ class Limits(NamedTuple):
 
 class Limit(NamedTuple):
     """Greatest allowed magnitude of a quantity (of those in `LOWER_BOUNDS` the least), lengths in
-    millimetres.
+    millimetres; ``mesh_remedy`` is that of mesh models, where it is another.
     """
 
     value: float
     title: str
     remedy: str
+    mesh_remedy: str = ""
 
 
-_SETTLE = "raise model.iterations (of a mesh model take one that converges, as pbd-converged)"
+_SETTLE = "raise model.iterations"
+_CONVERGE = "take a model that converges, as pbd-converged"
 _SMALLER_STEPS = "lower contact.substep_angle"
 _MORE_CENTRES = "raise model.centres"
 _LOOK = "look at that frame: rbfmuscle render RUN --frame FRAME -o frame.png"
 _JOINT = "correct the joint's centre, axes or range"
+_APART = "move muscle or bone apart: rbfmuscle check SCENE"
+_REPAIR = "repair the muscle's mesh"
 _ATTACH = "correct the attachment: docs/new.md"
 _LINE = "give the tendon via points, or correct the attachments: docs/new.md"
 LIMITS = {
-    "volume_error": Limit(
-        1e-9, "volume error", "let the model settle: raise its iterations or sweeps"
-    ),
+    "volume_error": Limit(1e-9, "volume error", _SETTLE),
     "penetration_max": Limit(0.1, "surface in a bone", _SMALLER_STEPS),
     "bone_penetration_max": Limit(
-        0.3, "bone in the muscle", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"
+        0.3,
+        "bone in the muscle",
+        f"{_SMALLER_STEPS} or {_MORE_CENTRES}",
+        f"{_SMALLER_STEPS}, or take a finer mesh",
     ),
-    "initial_overlap": Limit(
-        0.3, "overlap left at rest", "move muscle or bone apart: rbfmuscle check SCENE"
+    "initial_overlap": Limit(0.3, "overlap left at rest", _APART),
+    "components": Limit(1.0, "pieces", f"{_LOOK}; {_MORE_CENTRES}", _REPAIR),
+    "euler_characteristic": Limit(
+        2.0, "Euler characteristic", f"{_LOOK}; {_MORE_CENTRES}", _REPAIR
     ),
-    "components": Limit(1.0, "pieces", f"{_LOOK}; {_MORE_CENTRES}"),
-    "euler_characteristic": Limit(2.0, "Euler characteristic", f"{_LOOK}; {_MORE_CENTRES}"),
     "self_crossings": Limit(
-        0.0, "self-crossing triangles", "raise model.iterations, or use model pbd-converged"
+        0.0, "self-crossing triangles", f"{_LOOK}; {_MORE_CENTRES}", f"{_SETTLE}, or {_CONVERGE}"
     ),
-    "solver_residual": Limit(1e-4, "last motion of the solver", _SETTLE),
+    "solver_residual": Limit(1e-4, "last motion of the solver", _SETTLE, _CONVERGE),
     "solid_volume_error": Limit(
         0.02, "volume error of the solid", f"{_SETTLE}, or {_SMALLER_STEPS}"
     ),
@@ -122,7 +127,7 @@ LIMITS = {
     "flicker": Limit(0.5, "flicker", f"take frames closer together, or {_SMALLER_STEPS}"),
     "bowing": Limit(1.03, "centreline over shortest path", _LOOK),
     "tunnelled": Limit(0.0, "points beyond a bone", _SMALLER_STEPS),
-    "rest_error_rms": Limit(0.6, "rest error", _MORE_CENTRES),
+    "rest_error_rms": Limit(0.6, "rest error", _MORE_CENTRES, _APART),
     "end_gap": Limit(25.0, "end away from its bone", "correct the attachment, or give it a tendon"),
     "tendon_depth": Limit(
         0.3, "tendon in a bone", "give the tendon via points, or move them out of the bones"

@@ -71,12 +71,16 @@ def _worst_and_remedies(found, table, missing_bones):
 
 
 def find_remedy(row: Exceedance, table: Table) -> str:
-    """What to do about one excess; smaller steps do not mend an overlap of the meshes at rest."""
+    """What to do about one excess; smaller steps do not mend an overlap of the meshes at rest, and
+    mesh models have no centres.
+    """
     muscle, quantity, _, limit, _ = row
     overlap = table[muscle].get("initial_overlap", {}).get("worst")
     depth = quantity in ("penetration_max", "bone_penetration_max")
     at_rest = depth and overlap is not None and overlap > limit
-    return LIMITS["initial_overlap" if at_rest else quantity.partition(":")[0]].remedy
+    limit_kind = LIMITS["initial_overlap" if at_rest else quantity.partition(":")[0]]
+    is_mesh = "unfitted_fraction" not in table[muscle]
+    return (is_mesh and limit_kind.mesh_remedy) or limit_kind.remedy
 
 
 def _listed(names):

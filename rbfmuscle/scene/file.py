@@ -1,7 +1,8 @@
 """The scene file: its tables, and the scene that they describe."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -22,7 +23,7 @@ from rbfmuscle.scene.options import (
 )
 from rbfmuscle.scene.patches import AttachTable
 from rbfmuscle.scene.toml_file import read_tables
-from rbfmuscle.scene.upgrade import FORMAT, MAIN
+from rbfmuscle.scene.upgrade import FORMAT, MAIN, RENAMED
 from rbfmuscle.validation import SceneError, did_you_mean
 
 
@@ -35,6 +36,9 @@ def _check_format(number):
 class SceneTable(Table):
     """``[scene]``."""
 
+    hints: ClassVar[Mapping[str, str]] = {
+        old: f"did you mean {new!r}?" for old, new in RENAMED.items()
+    }
     format: Annotated[int, AfterValidator(_check_format)]
     name: str | None = None
     units: Literal["m", "cm", "mm"]
@@ -43,6 +47,13 @@ class SceneTable(Table):
     notes: list[str] = Field(default=[])
     superior: Axis | None = None
     anterior: Axis | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _require_format(cls, data: object) -> object:
+        if isinstance(data, dict) and "format" not in data:
+            raise ValueError(f"key format is missing, write format = {FORMAT}")
+        return data
 
     @model_validator(mode="after")
     def _check_directions(self) -> Self:
@@ -93,6 +104,10 @@ class MuscleTable(ClassTable):
 class SceneFile(Table):
     """A whole scene file."""
 
+    hints: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(SceneTable.model_fields, "it belongs into the table [scene]"),
+        "defaults": f"[classes.{MAIN}] holds the keys of all muscles",
+    }
     scene: SceneTable
     classes: dict[str, ClassTable] = Field(default_factory=dict)
     bone: list[BoneTable] = Field(default_factory=list)

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -84,8 +84,11 @@ def check_plain(value: object, *, context: str, depth: int = 0) -> None:
 
 
 class Table(BaseModel):
-    """A table whose unknown keys are errors that name the nearest right one."""
+    """A table whose unknown keys are errors that name the nearest right one, or what ``hints`` say
+    of them: keys of earlier formats or of other tables.
+    """
 
+    hints: ClassVar[Mapping[str, str]] = {}
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, populate_by_name=True)
 
     @model_validator(mode="before")
@@ -99,7 +102,10 @@ class Table(BaseModel):
                 raise PydanticCustomError(
                     "unknown_key",
                     "unknown key '{key}', {hint}",
-                    {"key": shown(str(key)), "hint": did_you_mean(key, known)},
+                    {
+                        "key": shown(str(key)),
+                        "hint": cls.hints.get(key) or did_you_mean(key, known),
+                    },
                 )
         return data
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated, ClassVar, cast
 
 import numpy as np
 from pydantic import BeforeValidator, ValidationInfo, model_validator
@@ -52,6 +53,7 @@ class AttachTable(Table):
     ``via`` the muscle passes there on its way.
     """
 
+    hints: ClassVar[Mapping[str, str]] = {"sphere": "write points = [CENTRE], radius = RADIUS"}
     bone: str
     vertices: Annotated[Path | list[int] | None, BeforeValidator(_check_vertices)] = None
     array: str | None = None

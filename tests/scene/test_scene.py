@@ -109,6 +109,16 @@ class TestMistakes:
                 r"\[classes.main\] attach 1: unknown",
             ),
             ("near = 4", "near = 4, radius = 3", r"'biceps' attach 1: radius belongs to points"),
+            # Keys of the first format, or of another table.
+            (
+                "near = 4",
+                "sphere = { centre = [0, 0, 0], radius = 3 }",
+                r"'biceps' attach 1: unknown key 'sphere', write points = \[CENTRE\], radius =",
+            ),
+            ("[scene]\nformat = 2", "format = 2\n[scene]", r"'format', .* the table \[scene\]"),
+            ("format = 2\n", "", r"\[scene\]: key format is missing, write format = 2$"),
+            ("[classes.main]", "[defaults]", r"'defaults', \[classes.main\] holds"),
+            ("units =", "left_out = []\nunits =", r"'left_out', did you mean 'missing_bones'\?"),
         ],
     )
     def test_one_line_names_file_place_and_remedy(self, folder, old, new, message):
