@@ -36,7 +36,6 @@ def kernels(
     names: Annotated[str | None, Parameter(name="--kernels")] = None,
     centres: str = "150,300",
     muscles: Muscles = None,
-    placement: str = "fitted",
     resolution: int = 0,
     units: str = "",
     error: float | None = None,
@@ -53,9 +52,6 @@ def kernels(
         Kernels, separated by commas; all by default.
     centres
         Numbers of centres, separated by commas.
-    placement
-        Places of the centres: fitted (moved off the surface until the whole surface is met) or
-        greedy (on it).
     resolution
         Cells along the longest side of extracted surfaces; 0 for 128, and more for slender muscles.
     units
@@ -76,13 +72,12 @@ def kernels(
     chosen = split_list(names) or None
     with threads(jobs):
         if error is not None:
-            find = partial(reach_error, error=error, kernels=chosen, placement=placement)
+            find = partial(reach_error, error=error, kernels=chosen)
             return _find_wanted(meshes, output, find, units, printing)
         study = partial(
             study_kernels,
             kernels=chosen,
             centres=[int(count) for count in counts],
-            placement=placement,
             resolution=resolution,
             units=units,
         )

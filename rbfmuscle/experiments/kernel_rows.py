@@ -32,7 +32,7 @@ def row_toml(row: dict) -> str:
         lines.append(f"epsilon = {row['epsilon']:.6g}")
     if row["bound"]:
         lines.append(f"condition = {row['bound']:g}")
-    return "\n".join([*lines, f'placement = "{row["placement"]}"'])
+    return "\n".join(lines)
 
 
 def describe(rows: list[dict]) -> str:

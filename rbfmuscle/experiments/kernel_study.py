@@ -23,7 +23,6 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
 from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
-from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface, spread_points
 from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
@@ -34,8 +33,6 @@ JUDGES, HELD_OUT = 20_000, 2000
 # fall between the nodes: iliacus seems to miss 1.7 mm with 64, sartorius 7.3 with 128, where they
 # miss 0.9 and 1.2.
 CELLS, RANGE = 5.0, (128, 320)
-# Placements of the centres of a muscle.
-PLACEMENTS = ("greedy", FITTED)
 # Points of one timed evaluation, and the processor time after which enough of them, or of fits, are
 # made [s].
 TIMED, MEASURED = 20_000, 0.05
@@ -77,15 +74,11 @@ class ReferenceSurface:
         return rms, float(max(there.max(), back.max()))
 
 
-def check_request(
-    mesh: MeshLike, kernels: Iterable[str], placement: str
-) -> tuple[Floats, Integers, list[Kernel]]:
+def check_request(mesh: MeshLike, kernels: Iterable[str]) -> tuple[Floats, Integers, list[Kernel]]:
     """Vertices and faces of a mesh, and kernels by name; MeshError and UsageError for what cannot
     be studied.
     """
     named = [get_kernel(name) for name in kernels]
-    if placement not in PLACEMENTS:
-        raise UsageError(f"placement must be one of {', '.join(PLACEMENTS)}, got {placement!r}")
     return *check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces))), named
 
 
@@ -100,18 +93,12 @@ class Measured(NamedTuple):
     surface: tuple[Floats, Integers] | None
 
 
-def measure_row(
-    judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel, placement: str
-) -> Measured:
-    """One row of the table, its times left open, and its surface; ``sample`` holds greedy
-    centres.
-    """
-    placement = placement if kernel.hermite else "greedy"
+def measure_row(judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel) -> Measured:
+    """One row of the table, its times left open, and its surface."""
     fit = FieldFit(kernel, 1.0, BOUND if kernel.has_epsilon else np.inf)
     row = {
         "kernel": kernel.name,
         "centres": len(sample.points),
-        "placement": placement,
         "epsilon": 0.0,
         "shape": None,
         "condition": None,
@@ -130,14 +117,7 @@ def measure_row(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
         try:
-            if placement == FITTED:
-                if kernel.has_epsilon:
-                    blind = choose_epsilon(
-                        sample.points, sample.normals, fit, held_out=judge.held_out
-                    )
-                    fit = replace(fit, epsilon=blind.epsilon)
-                sample = fit_sample(sample, judge.vertices, judge.faces, fit=fit)
-            if kernel.has_epsilon:  # what was best for the greedy centres need not be so for these
+            if kernel.has_epsilon:
                 places, unseen = (sample.points, sample.normals), judge.held_out
                 choice = choose_epsilon(
                     *places, fit, held_out=unseen, distance=judge.distance.unsigned
@@ -235,7 +215,6 @@ def study_kernels(
     *,
     kernels: Sequence[str] | None = None,
     centres: Sequence[int] = (150, 300),
-    placement: str = FITTED,
     resolution: int = 0,
     units: str = "",
     progress: OnProgress | None = None,
@@ -249,9 +228,6 @@ def study_kernels(
     kernels : list of str, optional
         All by default.
     centres : sequence of int
-    placement : {"greedy", "fitted"}
-        Fitted centres lie beside the surface, so that the whole of it is met in the least-squares
-        sense (`fit_sample`); kernels that are not C2 have greedy ones.
     resolution : int
         Cells along the longest side of the extracted surfaces; as many as a muscle so slender needs
         by default.
@@ -261,24 +237,23 @@ def study_kernels(
     Raises
     ------
     UsageError, MeshError
-        On an unknown kernel or placement, or a number of centres below 8; on an unusable mesh.
+        On an unknown kernel, or a number of centres below 8; on an unusable mesh.
 
     Examples
     --------
     >>> import trimesh
     >>> ball = trimesh.creation.icosphere(3, 10.0)
-    >>> options = {"placement": "greedy", "resolution": 16}
-    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], **options)
+    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], resolution=16)
     >>> study.rows[0]["kernel"]
     'cubic'
     """
-    vertices, faces, chosen = check_request(mesh, kernels or KERNELS, placement)
+    vertices, faces, chosen = check_request(mesh, kernels or KERNELS)
     if min(centres, default=0) < 8:
         raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
     judge, calls = ReferenceSurface(vertices, faces, resolution), []
     for count in centres:
         sample = sample_surface(vertices, faces, int(count), placement="greedy")
-        calls += [(sample, kernel, placement) for kernel in chosen]
+        calls += [(sample, kernel) for kernel in chosen]
     found = _measure_all(judge, calls, progress)
     _refuse_coarse([one.row for one in found])
     for one in found:  # when nothing else runs
@@ -298,7 +273,7 @@ def study_kernels(
 
 def _measure_all(
     judge: ReferenceSurface,
-    calls: list[tuple[SurfaceSample, Kernel, str]],
+    calls: list[tuple[SurfaceSample, Kernel]],
     progress: OnProgress | None,
 ) -> list[Measured]:
     """What the rows of calls found, in their order, measured side by side on threads."""
@@ -306,7 +281,7 @@ def _measure_all(
 
     lock, done = threading.Lock(), []
 
-    def measure(call: tuple[SurfaceSample, Kernel, str]) -> Measured:
+    def measure(call: tuple[SurfaceSample, Kernel]) -> Measured:
         found = measure_row(judge, *call)
         with lock:
             done.append(found)

@@ -17,7 +17,6 @@ from rbfmuscle.experiments.kernel_rows import row_name
 from rbfmuscle.experiments.sweep_run import OnProgress
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.implicit.kernels.table import Kernel
-from rbfmuscle.implicit.placement.refinement import FITTED
 from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, sample_surface
 from rbfmuscle.validation import UsageError
 
@@ -64,7 +63,6 @@ def reach_error(
     error: float,
     *,
     kernels: Sequence[str] | None = None,
-    placement: str = FITTED,
     progress: OnProgress | None = None,
 ) -> CentreSearchResult:
     """Find the fewest centres, 20 to 1000, the kernel and its setting that meet a surface to a
@@ -78,30 +76,26 @@ def reach_error(
         Root mean square distance both ways between mesh and extracted surface [length].
     kernels : list of str, optional
         By default cubic, quintic, skala_cervenka and matern_52.
-    placement : {"greedy", "fitted"}
-        As in `study_kernels`.
     progress : callable, optional
         Called as ``progress(done, total)``; the total grows with what is found.
 
     Raises
     ------
     UsageError, MeshError
-        On an error that is not positive, or an unknown kernel or placement; on an unusable mesh.
+        On an error that is not positive, or an unknown kernel; on an unusable mesh.
 
     Examples
     --------
     >>> import trimesh
     >>> ball = trimesh.creation.icosphere(3, 10.0)
-    >>> found = reach_error(ball, 0.1, kernels=["cubic"], placement="greedy")
+    >>> found = reach_error(ball, 0.1, kernels=["cubic"])
     >>> found.reached, found.row["kernel"], found.error <= 0.1
     (True, 'cubic', True)
     """
     if not 0.0 < error < np.inf:
         raise UsageError(f"error must be a positive length, got {error}")
-    vertices, faces, named = kernel_study.check_request(mesh, kernels or CANDIDATES, placement)
-    search = _Search(
-        kernel_study.ReferenceSurface(vertices, faces), float(error), placement, progress
-    )
+    vertices, faces, named = kernel_study.check_request(mesh, kernels or CANDIDATES)
+    search = _Search(kernel_study.ReferenceSurface(vertices, faces), float(error), progress)
     for kernel in named:
         search.try_kernel(kernel)
     return search.result()
@@ -114,12 +108,10 @@ class _Search:
         self,
         judge: kernel_study.ReferenceSurface,
         error: float,
-        placement: str,
         progress: OnProgress | None,
     ) -> None:
         self.judge = judge
         self.error = error
-        self.placement = placement
         self.progress = progress
         self.sample = cache(
             partial(sample_surface, judge.vertices, judge.faces, placement="greedy")
@@ -131,9 +123,7 @@ class _Search:
         """Error of a kernel with so many centres [length], infinite where it broke."""
         key = kernel.name, count
         if key not in self.found:
-            self.found[key] = kernel_study.measure_row(
-                self.judge, self.sample(count), kernel, self.placement
-            )
+            self.found[key] = kernel_study.measure_row(self.judge, self.sample(count), kernel)
             if self.progress is not None:
                 self.progress(len(self.found), max(len(self.found) + 1, 8))
         error = _error(self.found[key])

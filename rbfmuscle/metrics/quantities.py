@@ -24,7 +24,7 @@ QUANTITIES = {
     "volume_error": ("1", "volume relative to the input mesh's, minus one"),
     "penetration_max": (
         "length",
-        "deepest surface vertex inside a bone, exact distance to the bone mesh",
+        "deepest surface vertex inside a bone, by its triangles",
     ),
     "penetration_fraction": ("1", "share of surface vertices inside a bone"),
     "bone_penetration_max": ("length", "deepest bone vertex inside the muscle"),
@@ -35,12 +35,11 @@ QUANTITIES = {
     "solver_sweeps": ("1", "sweeps of the last solve of a mesh model"),
     "solver_residual": (
         "1",
-        "how far the last iteration of the last solve would have moved a point, of the muscle's "
-        "size; without the shortening of steps",
+        "greatest unshortened motion of a point in the last iteration, over the muscle's size",
     ),
     "solid_volume_error": (
         "1",
-        "greatest relative error of the volume of a region of the elastic solid",
+        "greatest relative volume error of a region of the elastic solid",
     ),
     "components": ("1", "closed pieces of the surface"),
     "euler_characteristic": (
@@ -54,14 +53,12 @@ QUANTITIES = {
     ),
     "flicker": (
         "length",
-        "greatest change, from frame to frame, of distances from material mesh to surface; "
-        "depends on the frame step",
+        "greatest change, from frame to frame, of distances from material mesh to surface",
     ),
     "tunnelled": ("1", "points that passed through a bone and were not brought back"),
     "rest_error_rms": (
         "length",
-        "distance between surface and input mesh at rest, in both directions; what overlapped "
-        "bones counts where it was moved to",
+        "distance between surface and input mesh at rest, both ways",
     ),
     "rest_error_max": ("length", "the same, greatest (Hausdorff)"),
     "thickness": (
@@ -70,7 +67,7 @@ QUANTITIES = {
     ),
     "articular_share": (
         "1",
-        "share of an attachment that lies on an articular surface at rest, the greatest",
+        "greatest share of an attachment on an articular surface at rest",
     ),
     "tendon_depth": ("length", "deepest point of a tendon inside a bone"),
     "initial_overlap": ("length", "deepest overlap of muscle and bones that is left at rest"),
@@ -81,14 +78,13 @@ QUANTITIES = {
     "length": ("length", "centreline from origin to insertion, with its tendons"),
     "bowing": (
         "1",
-        "length of the centreline without tendons / that of the shortest path between its ends "
-        "that keeps off the bones by the muscle's half thickness at rest",
+        "length of the centreline without tendons / that of the shortest path between its ends",
     ),
     "bowing_at_rest": ("1", "the same at rest, before the first frame"),
     "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
     "moment_arm_jump": (
         "length",
-        "change of the moment arm's slope over 5 degrees, times 5 degrees",
+        "change of the moment arm's slope over 5 degrees, times these",
     ),
     "moment_arm_reversal": ("length", "how far the moment arm goes to either side of zero"),
     **{
@@ -110,14 +106,14 @@ QUANTITIES = {
     ),
     "doubtful_guesses": (
         "1",
-        "doubtful guesses of the file about the muscle, under 'all' about joints; first frame",
+        "doubtful guesses about the muscle, under 'all' about joints; first frame",
     ),
     "missing_bones": ("1", "bones of which no mesh could be used; muscle 'all', first frame"),
     "time": ("s", "time of the frame in the motion file; muscle 'all'"),
     "time_solve": ("s", "prediction, solution and contacts"),
     "time_fit": ("s", "fit of the field"),
     "time_extract": ("s", "extraction of the surface"),
-    "time_frame": ("s", "all of the frame; muscle 'all': wall time of all muscles together"),
+    "time_frame": ("s", "all of the frame; muscle 'all': wall time of all"),
 }
 ALL = "all"
 

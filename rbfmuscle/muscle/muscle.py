@@ -63,7 +63,7 @@ class RBFMuscle:
     Raises
     ------
     SceneError
-        If the placement cannot be had or no centre is left free to move.
+        If no centre is left free to move, or the kernel gives no surface at rest.
 
     Examples
     --------

@@ -1,6 +1,7 @@
 """Settings of an RBF muscle, and what they may be."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
@@ -39,10 +40,12 @@ class RBFOptions(Table):
     ratio of Young's moduli. ``surface`` is shown by a mesh of the ``material`` that is
     brought onto the level set, by the same mesh ``embedded`` in the solid without a field, or by
     ``marching`` cubes; ``resolution`` is the number of edges or cells along the longest side, 0 for
-    the input mesh. ``placement`` of the centres: ``greedy`` where a fit misses the surface, or
-    ``fitted`` beside it so that all of it is met, for slower fits.
+    the input mesh.
     """
 
+    hints: ClassVar[Mapping[str, str]] = {
+        "placement": "remove it: centres lie where a fit misses the surface"
+    }
     centres: Annotated[int, Field(ge=0, le=20_000)] = 0
     rest_error: NotNegative = 0.0
     samples: Annotated[int, Field(ge=50, le=200_000)] = 4000
@@ -54,5 +57,4 @@ class RBFOptions(Table):
     kernel: Annotated[str, AfterValidator(_known_kernel)] = "cubic"
     epsilon: NotNegative = 0.0
     condition: Annotated[NotNegative, AfterValidator(_known_bound)] = 0.0
-    placement: Literal["greedy", "fitted"] = "greedy"
     fibre_ratio: Annotated[float, Field(ge=1.0, le=1e4)] = 1.0

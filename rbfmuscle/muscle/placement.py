@@ -15,7 +15,6 @@ from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.implicit.kernels.table import get_kernel
-from rbfmuscle.implicit.placement.refinement import FITTED, fit_sample
 from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface
 from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing, surface_error
 from rbfmuscle.muscle.options import RBFOptions
@@ -89,7 +88,6 @@ def choose_centres(
         options.kernel,
         round(options.epsilon * frame.size, 9),
         options.condition,
-        options.placement,
         options.samples,
         SEED,
     )
@@ -145,19 +143,12 @@ def place_points(
 ) -> tuple[SurfaceSample, SurfaceSample, FieldFit]:
     """Centres and samples of a muscle in the coordinates of its frame, and their fit in the
     scene's.
-
-    Raises SceneError if the placement cannot be had with this kernel.
     """
-    fitted = options.placement == FITTED
     faces = np.asarray(muscle.mesh.faces)
     centres = cached_sample(frame.local, faces, count, "greedy")
     samples = cached_sample(frame.local, faces, options.samples, "even")
     surface = frame, faces
     fit = _choose_fit(muscle.name, surface, options, centres, samples)
-    if fitted:
-        centres = _fit_centres(muscle.name, surface, options, centres, fit)
-        # what was best for the greedy centres need not be so for these
-        fit = _choose_fit(muscle.name, surface, options, centres, samples)
     if options.condition or (fit.kernel.has_epsilon and not options.epsilon):
         _refuse_broken(muscle.name, surface, fit, centres)
     return centres, samples, fit
@@ -230,24 +221,6 @@ def _refuse_broken(
             f"{said} breaks at rest: {found.components} sheets, {100 * off:+.3g} % of volume; "
             f"{remedy}"
         )
-
-
-def _fit_centres(
-    name: str,
-    mesh: tuple[RestFrame, Integers],
-    options: RBFOptions,
-    centres: SurfaceSample,
-    fit: FieldFit,
-) -> SurfaceSample:
-    """Centres beside the surface, whose field lies nearer to all of it."""
-    frame, faces = mesh
-    if not fit.kernel.hermite:
-        raise SceneError(
-            f"muscle {name!r}: placement {FITTED!r} needs a C2 kernel, got {fit.kernel.name!r}; "
-            "take placement 'greedy'"
-        )
-    local = replace(fit, epsilon=fit.epsilon * frame.size)
-    return fit_sample(centres, frame.local, faces, fit=local, seed=SEED)
 
 
 def cached_sample(

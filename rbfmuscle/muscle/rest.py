@@ -44,9 +44,7 @@ class RestState:
 
     @classmethod
     def from_muscle(cls, muscle: Muscle, scene: Scene, options: RBFOptions) -> RestState:
-        """Measure a muscle; SceneError if the placement cannot be had or no centre is left free to
-        move.
-        """
+        """Measure a muscle; SceneError if no centre is left free to move."""
         frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         count = choose_centres(muscle, scene, options).centres
         centres, samples, fit = place_points(muscle, frame, options, count)

@@ -41,7 +41,6 @@ from rbfmuscle.report.plots import Point, Track, front_plot, line_plot
 # Quantity: heading, factor.
 COLUMNS = {
     "centres": ("centres", 1.0),
-    "placement": ("placement", 1.0),
     "shape": ("epsilon times spacing", 1.0),
     "rms": ("RMS error", 1.0),
     "hausdorff": ("greatest error", 1.0),

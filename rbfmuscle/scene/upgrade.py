@@ -14,6 +14,7 @@ TYPES = {"fixed": "weld", "slider": "slide"}
 RENAMED = {"left_out": "missing_bones"}
 MUSCLE_KEYS = {"tendon": "tendon_region"}
 MODEL_KEYS = {"slack": "slack_ratio"}
+DROPPED = "placement"  # of a model's settings
 
 Tables = dict[str, object]  # of a TOML file, unchecked
 
@@ -58,7 +59,9 @@ def _muscle(row: object) -> object:
         return row
     new = {MUSCLE_KEYS.get(key, key): value for key, value in row.items()}
     if isinstance(model := row.get("model"), dict):
-        new["model"] = {MODEL_KEYS.get(key, key): value for key, value in model.items()}
+        new["model"] = {
+            MODEL_KEYS.get(key, key): value for key, value in model.items() if key != DROPPED
+        }
     if isinstance(row.get("attach"), list):
         new["attach"] = [_attachment(entry) for entry in row["attach"]]
     return new
@@ -77,6 +80,7 @@ def _attachment(entry: object) -> object:
 _BALL = re.compile(
     r"sphere\s*=\s*\{\s*centre\s*=\s*(\[[^][]*\])\s*,\s*radius\s*=\s*([-+.\w]+)\s*,?\s*\}"
 )
+_GIVEN = rf"""{DROPPED}[ \t]*=[ \t]*["']\w*["']"""
 _EDITS: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ...] = (
     (re.compile(r"^(\s*format\s*=\s*)1\b", re.M), rf"\g<1>{FORMAT}"),
     (re.compile(r"^(\s*)\[defaults([].])", re.M), rf"\g<1>[classes.{MAIN}\g<2>"),
@@ -87,6 +91,8 @@ _EDITS: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ...]
     (re.compile(r"^(\s*)tendon(\s*=)", re.M), r"\g<1>tendon_region\g<2>"),
     (re.compile(r"^(\s*\[muscle\.)tendon(\])", re.M), r"\g<1>tendon_region\g<2>"),
     (re.compile(r"\bslack(\s*=)"), r"slack_ratio\g<1>"),
+    (re.compile(rf"^[ \t]*{_GIVEN}[ \t]*(?:#[^\n]*)?\r?\n", re.M), ""),
+    (re.compile(rf"[ \t]*,[ \t]*{_GIVEN}|(?<=[{{ \t]){_GIVEN}[ \t]*,[ \t]*"), ""),
     (_BALL, r"points = [\1], radius = \2"),
 )
 _JOINT = re.compile(r"^\s*\[\[joint\]\]", re.M)

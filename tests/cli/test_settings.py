@@ -1,14 +1,21 @@
 """``--set``: every key that the schemas document, from the command line into the run."""
 
 import json
+import re
+from typing import get_args
 
 import pytest
 from blend_model import arm_files
 from command_line import call
+from conftest import ROOT
+from pydantic import BaseModel
 
 from pbd_baseline.options import PBDOptions
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene import options
+from rbfmuscle.scene.activation.keys import KEYS
+from rbfmuscle.scene.file import MuscleTable, SceneFile
+from rbfmuscle.scene.settings import HEADS
 
 # A value for every key, other than its default; model settings of quick muscles.
 PAIRS = [["biceps", "brachialis"]]
@@ -36,7 +43,6 @@ MODELS = {
             "kernel": "quintic",
             "epsilon": 0.02,
             "slack_ratio": 1.3,
-            "placement": "fitted",
             "surface": "marching",
             "fibre_ratio": 2.0,
             "condition": 1e12,
@@ -102,6 +108,35 @@ def test_every_documented_key_has_a_value_here(table, values):
     assert set(values) == set(fields)
     same = [k for k, v in values.items() if v == fields[k].get_default(call_default_factory=True)]
     assert same == []
+
+
+def tables_in(annotation):
+    """Tables that a value of this type may be."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from tables_in(part)
+
+
+def keys_of(table, names):
+    """Dotted keys of some fields of a table, those of inner tables in place of the tables."""
+    for name in names:
+        field = table.model_fields[name]
+        inner = list(tables_in(field.annotation))
+        for part in inner:
+            yield from (f"{name}.{key}" for key in keys_of(part, part.model_fields))
+        if not inner:
+            yield field.alias or name
+
+
+def test_few_settings_are_to_be_known_and_the_glossary_counts_them():
+    tables = {head for head in HEADS if head in SceneFile.model_fields} - {"muscle"}
+    assert set(HEADS) == {"model", "muscle", *KEYS, *tables}
+    found = [*keys_of(SceneFile, tables), *keys_of(MuscleTable, KEYS)]
+    found += [f"model.{name}.{key}" for name, (_, values) in MODELS.items() for key in values]
+    assert len(set(found)) == len(found) <= 75
+    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    assert re.search(r"^\| setting \|.*; (\d+) in all", text, flags=re.M)[1] == str(len(found))
 
 
 @pytest.mark.parametrize("table", TABLES)

@@ -155,6 +155,15 @@ def test_scene_page_names_every_key_and_its_example_is_read():
     assert SceneFile.model_validate(tomllib.loads(example)).muscle[0].name == "gluteus_maximus"
 
 
+def test_pages_are_short_enough_to_be_read():
+    """Words are what stands between spaces and has a letter, in tables and code too; the list of
+    changes grows with each release and does not count.
+    """
+    texts = [page.read_text(encoding="utf-8") for page in figures.page_files()]
+    texts.remove((ROOT / "docs" / "changes.md").read_text(encoding="utf-8"))
+    assert sum(bool(re.search("[A-Za-z]", word)) for text in texts for word in text.split()) <= 15e3
+
+
 def test_figures_stand_in_one_page_and_the_readme():
     holding = {page.stem for page in PAGES if "<!-- evidence:" in page.read_text(encoding="utf-8")}
     assert holding == {"README", "validation"}

@@ -68,12 +68,7 @@ def test_lines_to_paste_give_the_row(study):
     row = next(row for row in study.rows if row["kernel"] == "matern_52")
     table = tomllib.loads(row_toml(row))["muscle"]["model"]
     assert table["kernel"] == "matern_52" and table["centres"] == row["centres"]
-    assert (
-        table["epsilon"] == pytest.approx(row["epsilon"], rel=1e-5)
-        and table["placement"] == "fitted"
-    )
-    row = next(row for row in study.rows if row["kernel"] == "linear")
-    assert 'placement = "greedy"' in row_toml(row)  # not C2: no Hermite fit to be fitted
+    assert table["epsilon"] == pytest.approx(row["epsilon"], rel=1e-5)
     assert "condition = 1e+10" in row_toml(row | {"bound": 1e10})
 
 
@@ -133,10 +128,10 @@ def test_the_quickest_of_those_alike_is_recommended(rows, wanted):
 
 
 def test_wrong_requests_are_answered(ellipsoid):
-    for wrong in ({"centres": [4]}, {"kernels": ["cubics"]}, {"placement": "even"}):
+    for wrong in ({"centres": [4]}, {"kernels": ["cubics"]}):
         with pytest.raises(UsageError):
             rm.study_kernels(ellipsoid, **wrong)
-    for wrong in ({"error": -1.0}, {"error": np.nan}, {"error": 0.1, "placement": "x"}):
+    for wrong in ({"error": -1.0}, {"error": np.nan}):
         with pytest.raises(UsageError):
             reach_error(ellipsoid, **wrong)
     with pytest.raises(MeshError):
@@ -198,7 +193,7 @@ def egg(ellipsoid):
 
 @pytest.fixture(scope="module")
 def found(egg):
-    return reach_error(egg, 0.1, kernels=["cubic", "linear"], placement="greedy")
+    return reach_error(egg, 0.1, kernels=["cubic", "linear"])
 
 
 def test_the_error_is_reached_by_the_surface_itself(found, egg):
@@ -220,7 +215,7 @@ def test_a_number_four_per_cent_smaller_was_seen_to_fail(found):
 def test_command_with_an_error_says_what_to_paste(tmp_path, ellipsoid, capsys, monkeypatch):
     ellipsoid.export(tmp_path / "muscle.ply")
     words = [tmp_path / "muscle.ply", "-o", tmp_path / "new/out"]
-    words += ["--kernels", "cubic", "--placement", "greedy"]
+    words += ["--kernels", "cubic"]
     code, said, _ = call(capsys, "kernels", *words, "--error", "0.4", "--units", "mm")
     assert code == 0 and "reaches" in said and "mm RMS" in said
     facts = json.loads((tmp_path / "new/out/error.json").read_text(encoding="utf-8"))["muscle"]
@@ -233,9 +228,7 @@ def test_command_with_an_error_says_what_to_paste(tmp_path, ellipsoid, capsys, m
 
 
 def test_page_has_curves_of_epsilon_flags_its_ends_and_folds_unfit_rows(tmp_path, ellipsoid):
-    study = rm.study_kernels(
-        ellipsoid, kernels=["gaussian", "cubic"], centres=[30], placement="greedy", resolution=24
-    )
+    study = rm.study_kernels(ellipsoid, kernels=["gaussian", "cubic"], centres=[30], resolution=24)
     (gaussian,) = (row for row in study.rows if row["kernel"] == "gaussian")
     shapes, errors = np.array(gaussian["trials"]).T
     assert (np.diff(shapes) > 0).all() and len(shapes) > 20 and (errors > 0).all()

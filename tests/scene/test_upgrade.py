@@ -145,6 +145,31 @@ def test_what_cannot_be_rewritten_is_refused_and_stays(old, before, after):
     assert [path.name for path in old.parent.iterdir() if path.name.startswith(".")] == []
 
 
+@pytest.mark.parametrize(
+    ("written", "kept"),
+    [
+        ('model = { name = "rbf", placement = "fitted" }', 'model = { name = "rbf" }'),
+        ("model = { placement = 'greedy' , name = \"rbf\" }", 'model = { name = "rbf" }'),
+        (
+            'model = { name = "rbf", placement="greedy", slack = 2 }',
+            'model = { name = "rbf", slack_ratio = 2 }',
+        ),
+        ('model.name = "rbf"\nmodel.nodes = 99', 'model.name = "rbf"\nmodel.nodes = 99'),
+        (
+            '[defaults.model]\nname = "rbf"\nplacement = "fitted"   # moved',
+            '[classes.main.model]\nname = "rbf"',
+        ),
+    ],
+)
+def test_the_placement_of_centres_is_dropped(old, written, kept):
+    old.write_text(OLD.replace('model = { name = "pbd", slack = 1.3 }', written))
+    before = Scene.load(old)
+    assert before.muscles[0].model == "rbf" and "placement" not in before.muscles[0].options
+    assert upgrade_file(old) and "placement" not in old.read_text()
+    assert f"{kept}\n[[muscle]]" in old.read_text()
+    same(before, Scene.load(old))
+
+
 def test_a_ball_of_six_turns_becomes_a_custom_joint():
     axes = {name: [1, 0, k] for k, name in enumerate("abcdef")}
     (joint,) = upgraded({"joint": [{"name": "j", "axes": axes}]})["joint"]

@@ -39,14 +39,12 @@ _CHUNK = 7
 class Fits(NamedTuple):
     """Solutions of P fits.
 
-    ``weights`` (P, size), ``coefficients`` (P, q) of the polynomials, and for each fit the
-    ``condition`` and the ``ridge`` (P,) on the diagonal, in units of the unknowns.
+    ``weights`` (P, size), ``coefficients`` (P, q) of the polynomials, and the ``condition`` (P,).
     """
 
     weights: np.ndarray
     coefficients: np.ndarray
     condition: np.ndarray
-    ridge: np.ndarray
 
 
 def solve(
@@ -77,12 +75,6 @@ def solve(
     return found.weights, found.coefficients, DOUBTFUL
 
 
-def bounding_ridge(basis: Basis, condition: float) -> Floats:
-    """What `solve` adds to the diagonal (size,) of a single fit for this bound of the condition."""
-    found = _solve_bounded(basis, np.zeros((1, basis.size)), 0.0, condition)
-    return np.asarray(found.ridge[0] / _units(basis, condition) ** 2)
-
-
 def _solve_bounded(basis: Basis, right: Floats, smoothing: float, bound: float) -> Fits:
     """`_solve_all`, or the LinAlgError that says why not."""
     found = _solve_all(basis, right, smoothing, bound)
@@ -106,7 +98,7 @@ def _solve_all(basis: Basis, right: Floats, smoothing: float, bound: float) -> F
     directions, inverse, complete = _orthonormal(basis.polynomials * units)
     if fits == 1 and not complete:
         return None
-    found = Fits(np.empty((fits, size)), np.empty((fits, q)), *np.empty((2, fits)))
+    found = Fits(np.empty((fits, size)), np.empty((fits, q)), np.empty(fits))
 
     def work(start: int, stop: int) -> None:
         for low in range(start, stop, _CHUNK):
@@ -160,7 +152,7 @@ def _orthonormal(polynomials: Floats) -> tuple[Floats, Floats, bool]:
 
 def _solve_some(
     a: Floats, directions: Floats, inverse: Floats, right: Floats, bound: float
-) -> tuple[Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats]:
     """The parts of `Fits` for matrices (m, size, size), which are overwritten; letters as in the
     head of this file.
     """
@@ -177,11 +169,9 @@ def _solve_some(
         a -= np.concatenate([directions, half], axis=2) @ np.swapaxes(both, 1, 2)
     else:
         norm = _largest(a, _probe(np.ones((len(a), size))), 2)
-    ridge = np.zeros(len(a))
     if math.isfinite(bound):  # a constant vector is all but a polynomial, which M has no share of
         norm = _largest(a, _probe(np.ones((len(a), size))), 6)
-        ridge = norm / bound
-        a[:, np.arange(size), np.arange(size)] += ridge[:, None]
+        a[:, np.arange(size), np.arange(size)] += (norm / bound)[:, None]
     lower = _cholesky(a)
 
     def annihilating(vectors: Floats) -> Floats:
@@ -192,7 +182,7 @@ def _solve_some(
     weights = annihilating(solved[:, 0])
     short = turned @ right[:, :, None] - np.swapaxes(products, 1, 2) @ weights[:, :, None]
     condition = np.maximum(1.0, norm * np.linalg.norm(solved[:, 1], axis=1))
-    return weights, (inverse @ short)[:, :, 0], condition, ridge
+    return weights, (inverse @ short)[:, :, 0], condition
 
 
 def _cholesky(a: Floats) -> Floats:
