@@ -48,7 +48,8 @@ class Panel:
             self._add_choices(colour)
         with tabs.add_tab("Plot") as self._tab:
             depth = f"depth in bones [{source.units}]"
-            quantities = ("none", "volume error [%]", depth, "mean of the colour")
+            arm = f"moment arm [{source.units}]"
+            quantities = ("none", "volume error [%]", depth, arm, "mean of the colour")
             self.quantity = self._watch(self.gui.add_dropdown("Quantity", quantities))
             self._plot: GuiUplotHandle | None = None
             self._lines, self._history = [], []
@@ -132,11 +133,13 @@ class Panel:
             html.escape(" / ".join(side.choice for side in sides)),
             "volume [%]",
             f"in bones [{units}]",
+            f"moment arm [{units}]",
         )
+        more = round(-math.log10(self.source.millimetre))  # digits of a length
         rows = [f"<tr><th style='text-align:left'>{'</th><th>'.join(head)}</th></tr>"]
         for name, colour in self.source.colours.items() if sides else ():
             cells = [f"<span style='color:{colour}'>■</span> {html.escape(name.replace('_', ' '))}"]
-            for key, digits in (("volume", 3), ("depth", 2)):
+            for key, digits in (("volume", 3), ("depth", 2 + more), ("moment", 1 + more)):
                 # 0.0 is added so that no -0 is shown.
                 known = (side.numbers.get(name, {}).get(key, math.nan) for side in sides)
                 numbers = (f"{round(number, digits) + 0.0:.{digits}f}" for number in known)

@@ -136,7 +136,8 @@ class ModelView:
 
     ``choice`` is which of the source's models or runs, "none" for none, ``figure`` the one chosen;
     ``picture`` is what is shown of it, ``rest`` what it began with. ``numbers`` are by muscle
-    volume error [%], depth in bones and mean of the coloured quantity, NaN where not known.
+    volume error [%], depth in bones, moment arm and mean of the coloured quantity, NaN where not
+    known.
     """
 
     def __init__(self, server: "ViserServer", root: str, source: LiveSource | SavedSource) -> None:
@@ -192,7 +193,12 @@ class ModelView:
             if self.figure is not None:
                 error = 100.0 * (mesh_volume(*mesh) / self._volumes[name] - 1.0)
                 depth = self.picture.depth.get(name, math.nan)
-                self.numbers[name] = {"volume": error, "depth": depth, "mean": float(values.mean())}
+                self.numbers[name] = {
+                    "volume": error,
+                    "depth": depth,
+                    "moment": self.picture.moment_arms.get(name, math.nan),
+                    "mean": float(values.mean()),
+                }
             part, shown = self._part(mesh, look.cut), name not in look.hidden
             if look.colour == "fibres" and name in self.picture.fibres:
                 shown = False  # the surface would hide them

@@ -13,21 +13,25 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
+from rbfmuscle.metrics.centreline import Centreline
+from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.models import build_models, configure_scene, model_names
 from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.scene.activation.contraction import STEP
+from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
-from rbfmuscle.simulation.frame import FibreLines, MuscleModel
+from rbfmuscle.simulation.frame import FibreLines, Frame, MuscleModel
 from rbfmuscle.simulation.live import LiveSession, live_fields
 from rbfmuscle.validation import UsageError
 from rbfmuscle.viewer.marks import Marks, scene_marks
 
 Mesh = tuple[Floats, Integers]
 REST_TRIANGLES = 3000  # of a muscle, until its model is built
+TRAIL = 16  # pictures along which moment arms are measured
 ACTIVATION = "activation "  # what the name of a muscle's control begins with
 
 
@@ -44,8 +48,8 @@ class Control(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One picture's content by bone or muscle; tendons, activation, depth [scene unit] and fibres
-    of those that have them.
+    """One picture's content by bone or muscle; tendons, activation, depth [scene unit], fibres and
+    moment arm about the coordinate that moved [scene unit] of those that have them.
     """
 
     poses: dict[str, Floats]
@@ -55,6 +59,7 @@ class Picture(NamedTuple):
     depth: dict[str, float]
     text: str
     fibres: Mapping[str, FibreLines] = MappingProxyType({})
+    moment_arms: Mapping[str, float] = MappingProxyType({})
 
 
 class LiveSource:
@@ -123,6 +128,7 @@ class LiveFigure:
     def __init__(self, session: LiveSession, models: list[MuscleModel]) -> None:
         self.session, self._unfinished = session, True
         self._bundles = build_bundles(session.scene, models)
+        self._lengths = LengthTrail(session.scene, models)
         self.stride = math.radians(session.scene.contact.substep_angle)
         session.use(models)
 
@@ -136,6 +142,7 @@ class LiveFigure:
     def rest(self) -> None:
         """Put models and bones back to rest; the target stays."""
         self.session.reset()
+        self._lengths.clear()
         self._unfinished = True
 
     @property
@@ -163,7 +170,46 @@ class LiveFigure:
         known = {name: depth for name, depth in depths.items() if depth is not None}
         places = frame.poses, frame.tendons
         fibres = {name: bundle.at(*places) for name, bundle in self._bundles.items()}
-        return Picture(frame.poses, surfaces, tendons, frame.activations, known, "", fibres)
+        arms = self._lengths.moment_arms(frame)
+        return Picture(frame.poses, surfaces, tendons, frame.activations, known, "", fibres, arms)
+
+
+class LengthTrail:
+    """Lengths of muscles in the last pictures, and their moment arms by these."""
+
+    def __init__(self, scene: Scene, models: list[MuscleModel]) -> None:
+        known = all_coordinates(scene.joints)
+        shifts = {name for name, fact in known.items() if fact.motion == "translation"}
+        self._reach = reaches(known, shifts, scene.units)
+        meshes = {model.name: model.material_mesh() for model in models}
+        self._lines = {
+            muscle.name: Centreline(muscle, scene.joints, *meshes[muscle.name])
+            for muscle in scene.muscles
+            if sum(not held.via for held in muscle.attachments) > 1
+        }
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the pictures."""
+        self._path: list[dict[str, float]] = []
+        self._lengths: list[list[float]] = []
+
+    def moment_arms(self, frame: Frame) -> dict[str, float]:
+        """Moment arm of each muscle about the coordinate that moved alone to reach a frame [scene
+        unit]; none where several moved.
+        """
+        if self._path and self._path[-1] == frame.coordinates:
+            self._path.pop()
+            self._lengths.pop()
+        vertices = {name: frame.material_meshes[name][0] for name in self._lines}
+        lengths = [
+            line.length(vertices[name], frame.poses) + line.tendon_length(frame.tendons)
+            for name, line in self._lines.items()
+        ]
+        self._path = [*self._path, dict(frame.coordinates)][-TRAIL:]
+        self._lengths = [*self._lengths, lengths][-TRAIL:]
+        found = moment_arms(self._path, self._lengths, self._reach)[-1]
+        return {name: float(arm) for arms in found.values() for name, arm in zip(self._lines, arms)}
 
 
 class SavedSource:
@@ -224,11 +270,12 @@ class SavedFigure:
         surfaces = {name: saved.mesh(name, frame) for name in saved.muscles}
         named = {name: tendon_name(name) for name in saved.muscles}
         tendons = {n: saved.mesh(mesh, frame) for n, mesh in named.items() if mesh in saved.tendons}
-        activation, depth = (
-            self._known(quantity) for quantity in ("activation", "penetration_max")
+        activation, depth, arms = (
+            self._known(quantity) for quantity in ("activation", "penetration_max", "moment_arm")
         )
         text, fibres = saved.caption(frame), dict(saved.frame(frame).fibres)
-        return Picture(saved.frame(frame).poses, surfaces, tendons, activation, depth, text, fibres)
+        poses = saved.frame(frame).poses
+        return Picture(poses, surfaces, tendons, activation, depth, text, fibres, arms)
 
     def _known(self, quantity: str) -> dict[str, float]:
         series = {name: self.saved.series(name, quantity) for name in self.saved.muscles}
