@@ -7,7 +7,7 @@ import numpy as np
 from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.jit import compiled
-from rbfmuscle.scene.activation.contraction import resolve_contraction
+from rbfmuscle.scene.activation.contraction import make_contraction
 from rbfmuscle.scene.objects import Muscle
 
 # Weight of tendon edges in the ARAP energy. Beside a belly that shortens by a fifth tendon keeps
@@ -36,7 +36,7 @@ class MeshFibres:
 
     def __init__(self, muscle: Muscle, rest: RestState, *, slack: float) -> None:
         count = len(rest.vertices)
-        self.given = resolve_contraction(muscle)
+        self.given = make_contraction(muscle)
         self.at_tendon = self.given.tendon[rest.order]
         self.slack = 1.0 if self.given.slack else slack
         edges = rest.topology.edges

@@ -262,7 +262,7 @@ def _sides(muscle, ends, vertices):
 
 def _rest_middle(end: End) -> Floats:
     """Middle (3,) of an end's patches at rest."""
-    return _carried_middle(end, {holder: np.eye(4) for holder, _, _ in end})
+    return _carried_middle(end, {frame_name: np.eye(4) for frame_name, _, _ in end})
 
 
 def _carried_middle(end: End, poses: Mapping[str, Floats]) -> Floats:

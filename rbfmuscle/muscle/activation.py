@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.muscle.fibres import flux
 from rbfmuscle.muscle.model import Fibres, SolidModel
-from rbfmuscle.scene.activation.contraction import resolve_contraction
+from rbfmuscle.scene.activation.contraction import make_contraction
 from rbfmuscle.scene.objects import Muscle
 
 PEAK = 30.0  # greatest isometric tension of active fibres, in shear moduli
@@ -34,7 +34,7 @@ def contracting_fibres(model: SolidModel, muscle: Muscle, insertion: Booleans) -
 
     ``insertion`` (h,) are the points held at the muscle's second end.
     """
-    given, passive = resolve_contraction(muscle), model.fibres
+    given, passive = make_contraction(muscle), model.fibres
     tendon = given.tendon[cKDTree(np.asarray(muscle.mesh.vertices)).query(model.cells.points)[1]]
     density = fibre_density(model, ~tendon, insertion)
     slack = 1.0 / given.stretch_at_rest

@@ -6,7 +6,7 @@ points q, the nodes minimise
     E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² - 2 τ (1 - t))
          + μ Σ_q w_q (c (|F_q a| - s_q)² + a_q (|F_q a| - l)²),
     D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    s_q = |F_q a| kept within
-    1 / slack and 1,    τ = min(TONE (1 - d / d₀), MOST_TONE) >= 0,
+    1 / slack and 1,    τ = min(ANTI_BUCKLING_TENSION (1 - d / d₀), GREATEST_TENSION) >= 0,
 
 subject to the volumes of the regions r of the lattice, V_r(y) = Σ_{q in r} w_q det F_q, and to the
 contacts. R is a rotation, a the fibre direction. Between 1 / slack and 1 a fibre shortens without
@@ -40,7 +40,7 @@ NODES_PER_REGION = 8
 MOBILE = 0.02
 # Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.82 of their distance at rest,
 # and for shorter ones, it is 0.03 of that at full activation.
-TONE, MOST_TONE = 2.5, 0.45
+ANTI_BUCKLING_TENSION, GREATEST_TENSION = 2.5, 0.45
 # Greatest pressure that a contact takes, over 2 μ. With 5 the gluteus maximus is pressed 6.6 mm
 # into the femur in 90 degrees of flexion.
 MOST_CONTACT_PRESSURE = 40.0

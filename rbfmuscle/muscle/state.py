@@ -11,7 +11,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import exponential_loop, logarithm_loop
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.jit import compiled, inner
-from rbfmuscle.muscle.model import MOST_TONE, TONE, SolidModel, carry
+from rbfmuscle.muscle.model import GREATEST_TENSION, ANTI_BUCKLING_TENSION, SolidModel, carry
 
 # Greatest multiple of the last sub-step's correction that the next one starts with, and the least
 # motion of an attachment, of the muscle's size, in a step whose correction counts.
@@ -77,7 +77,9 @@ def tension(end, distance, anchors):
     square = 0.0
     for a in range(3):
         square += (middle[0, a] / count[0] - middle[1, a] / count[1]) ** 2
-    return min(max(0.0, TONE * (1.0 - np.sqrt(square) / distance)), MOST_TONE)
+    return min(
+        max(0.0, ANTI_BUCKLING_TENSION * (1.0 - np.sqrt(square) / distance)), GREATEST_TENSION
+    )
 
 
 @inner(error_model="numpy")

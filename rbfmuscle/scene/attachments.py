@@ -22,7 +22,7 @@ THIN = 0.05  # section of a tendon as it is drawn, over the mean section of its 
 PATCH = 16  # points of a belly's end that are kept out of bones, at most
 
 
-def resolve_attachments(
+def make_attachments(
     attach: Sequence[Attachment | AttachTable | Mapping[str, object]],
     read: ReadMesh,
     bones: list[Bone],
@@ -97,7 +97,7 @@ def tendon_ends(muscle: Muscle, bones: list[Bone], joints: list[Joint]) -> list[
         names = bones_between(joints, [bone for bone, _ in (*end.other, *end.line)])
         end.obstacles = [bone for bone in bones if bone.name in names]
     for end, opposite in zip(ends, ends[::-1]):
-        end.slack = 0.0 if held else opposite.length
+        end.opposite_length = 0.0 if held else opposite.length
     return ends
 
 

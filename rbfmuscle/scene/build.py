@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rbfmuscle.scene.activation.contraction import check_activation, resolve_contraction
+from rbfmuscle.scene.activation.contraction import check_activation, make_contraction
 from rbfmuscle.scene.contents import SceneContents
 from rbfmuscle.scene.frames import make_motion
 from rbfmuscle.scene.joints.joint import all_coordinates
@@ -36,5 +36,5 @@ def check_runnable(scene: SceneContents) -> None:
             words = f"is attached to {bones[0]!r} only, give attach a second bone"
             raise SceneError(f"{place} {words}")
         if muscle.contraction is not None:
-            resolve_contraction(muscle)
+            make_contraction(muscle)
             check_activation(muscle, scene.motion)

@@ -13,7 +13,7 @@ from rbfmuscle import showing
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.scene import settings as changes
 from rbfmuscle.scene.activation.keys import contraction_keys
-from rbfmuscle.scene.attachments import resolve_attachments, tendon_ends
+from rbfmuscle.scene.attachments import make_attachments, tendon_ends
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.build import check_runnable, made_motion
 from rbfmuscle.scene.contents import SceneContents
@@ -270,7 +270,7 @@ class Scene(SceneContents):
         lies = mesh_transform(scale, mirror, transform, context=f"muscle {name!r}: ")
         read = as_mesh(mesh, name, lies, may_be_open=False)
         model_name, options = split_model(model, context=f"muscle {name!r}")
-        attachments = resolve_attachments(attach, read, self.bones, muscle=name, transform=lies)
+        attachments = make_attachments(attach, read, self.bones, muscle=name, transform=lies)
         lines = None if fibres is None else read_fibres(fibres, transform=lies, muscle=name)
         keys = contraction_keys(contraction, muscle=name)
         muscle = Muscle(

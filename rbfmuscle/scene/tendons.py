@@ -106,7 +106,7 @@ class TendonEnd:
     # The muscle's other end: a point of its bone, or of its tendon the insertion and the via
     # points.
     other: list[BonePoint] = field(default_factory=list)
-    slack: float = 0.0  # length of that tendon at rest, zero where there is none
+    opposite_length: float = 0.0  # of that tendon at rest, zero where there is none
     obstacles: Sequence[Bone] = ()  # bones that string and tendon go around
 
     @cached_property
@@ -217,7 +217,7 @@ class TendonEnd:
 
     def _strain(self, longer: float) -> float:
         """The tendon's strain where the string is longer than at rest by so much."""
-        tendons = self.length + self.slack
+        tendons = self.length + self.opposite_length
         belly = max(self._rest[0] - tendons, 0.0)
         strain = STIFFNESS_RATIO * longer / max(belly + STIFFNESS_RATIO * tendons, 1e-300)
         return min(max(strain, 0.0), TENDON_STRAIN)

@@ -139,7 +139,7 @@ class Panel:
         rows = [f"<tr><th style='text-align:left'>{'</th><th>'.join(head)}</th></tr>"]
         for name, colour in self.source.colours.items() if sides else ():
             cells = [f"<span style='color:{colour}'>■</span> {html.escape(name.replace('_', ' '))}"]
-            for key, digits in (("volume", 3), ("depth", 2 + more), ("moment", 1 + more)):
+            for key, digits in (("volume", 2), ("depth", 2 + more), ("moment", 1 + more)):
                 # 0.0 is added so that no -0 is shown.
                 known = (side.numbers.get(name, {}).get(key, math.nan) for side in sides)
                 numbers = (f"{round(number, digits) + 0.0:.{digits}f}" for number in known)

@@ -11,7 +11,7 @@ from rbfmuscle.scene.activation.contraction import (
     STEP,
     Activations,
     activation_curve,
-    resolve_contraction,
+    make_contraction,
 )
 from rbfmuscle.scene.activation.keys import contraction_keys
 from rbfmuscle.scene.frames import slice_motion
@@ -61,10 +61,10 @@ def test_tendon_is_measured_from_the_attachments_or_from_one():
     x = np.asarray(muscle.mesh.vertices)[:, 0]
     held = np.zeros(len(x), bool)
     held[np.concatenate([a.vertices for a in muscle.attachments])] = True
-    tendon = resolve_contraction(muscle).tendon
+    tendon = make_contraction(muscle).tendon
     assert tendon[held].all()
     assert np.abs(x[tendon & ~held]).min() == pytest.approx(100.0, abs=6.0)  # an edge of the mesh
-    one = resolve_contraction(
+    one = make_contraction(
         scene(tendon_region={"length": 60.0, "at": "origin"}).muscle(MUSCLE)
     ).tendon
     assert np.array_equal(one, tendon & (x < 0))

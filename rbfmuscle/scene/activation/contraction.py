@@ -31,7 +31,7 @@ STEP = 0.1
 SETTLING = 4  # further solves after activation has changed while no bone moved
 
 
-def resolve_contraction(muscle: Muscle) -> Contraction:
+def make_contraction(muscle: Muscle) -> Contraction:
     """What the keys of a muscle come to on its mesh.
 
     SceneError on fibres outside it, or a tendon that covers all or nothing.
