@@ -4,7 +4,7 @@ import logging
 import sys
 from time import perf_counter
 
-from rbfmuscle.cli.options import Flag, SceneName
+from rbfmuscle.cli.options import Flag, Jobs, SceneName, threads
 from rbfmuscle.cli.printing import USUAL, Printing, print_result
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.validation import SceneError, UsageError
@@ -19,6 +19,7 @@ def check(
     time: Flag = False,
     accuracy: Flag = False,
     upgrade: Flag = False,
+    jobs: Jobs = None,
     printing: Printing = USUAL,
 ) -> int:
     """Check a scene file and its meshes; nothing is solved but what --time and --accuracy ask for.
@@ -43,7 +44,7 @@ def check(
     if time and not plan:
         raise UsageError("--time measures what --plan lists; give check SCENE --plan --time")
     facts: dict[str, object] = {"upgraded": _upgrade(scene)} if upgrade else {}
-    with Progress(f"check {scene.name}"):
+    with Progress(f"check {scene.name}"), threads(jobs):
         if picture:
             from rbfmuscle.report.render import check_picture
 

@@ -26,7 +26,9 @@ def view(
     *,
     model: Model = None,
     at: Pairs = None,
-    colour: Literal["group", "activation", "stretch", "penetration"] = "group",
+    colour: Literal[
+        "group", "fibres", "activation", "stretch", "penetration", "distance"
+    ] = "group",
     browser: bool = True,
     port: int = 0,
     screenshot: Path | None = None,

@@ -11,7 +11,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import exponential_loop, logarithm_loop
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.jit import compiled, inner
-from rbfmuscle.muscle.model import GREATEST_TENSION, ANTI_BUCKLING_TENSION, SolidModel, carry
+from rbfmuscle.muscle.model import ANTI_BUCKLING_TENSION, GREATEST_TENSION, SolidModel, carry
 
 # Greatest multiple of the last sub-step's correction that the next one starts with, and the least
 # motion of an attachment, of the muscle's size, in a step whose correction counts.

@@ -158,6 +158,7 @@ class TestErrors:
             ("run arm.toml -o o --muscle biceps", 2, "Did you mean --muscles?"),
             ("run arm.toml -o o --muscles ,", 2, "--muscles names no muscle"),
             ("run arm.toml -o o --jobs 0", 2, "--jobs must be 1 or more"),
+            ("check arm.toml --jobs 0", 2, "--jobs must be 1 or more"),
             ("export a --format stl obj", 2, "unexpected 'obj'; lists are written with commas"),
             ("check arm.toml --time", 2, "--time measures what --plan lists"),
             ("kernels biceps.ply -o o --muscles a", 2, "biceps.ply is a mesh"),
