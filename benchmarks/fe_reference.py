@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from evidence import write_evidence
 from peers.fibre_material import PassiveFibres
-from peers.finite_element import HexSolid, brick_grid, follow, nearest_bone
+from peers.finite_element import HexSolid, brick_grid
+from peers.load_steps import follow, nearest_bone
 from scipy.spatial import cKDTree
 
 from rbfmuscle.bones.sdf import BoneSDF

@@ -2,8 +2,8 @@
 
 ``python benchmarks/node_counts.py``: the demo's motion with 150, 300, 600 and 1,200 nodes, without
 surfaces. For each number but the last, and each muscle, the RMS distance of its vertices from those
-on a lattice with twice the nodes, greatest over the frames [mm]; and the greatest bowing, beside its
-limit.
+on a lattice with twice the nodes, greatest over the frames [mm]; and the greatest bowing, beside
+its limit.
 """
 
 import argparse

@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 from evidence import write_evidence
-from peers.finite_element import TetSolid, follow, nearest_bone
+from peers.finite_element import TetSolid
+from peers.load_steps import follow, nearest_bone
 from scipy.spatial import cKDTree
 
 from rbfmuscle.metrics.metrics import surface_distance

@@ -117,25 +117,34 @@ def measure_row(judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel) 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
         try:
-            if kernel.has_epsilon:
-                places, unseen = (sample.points, sample.normals), judge.held_out
-                choice = choose_epsilon(
-                    *places, fit, held_out=unseen, distance=judge.distance.unsigned
-                )
-                fit = replace(fit, epsilon=choice.epsilon)
-                row["trials"] = choice.trials.tolist()
-                row["epsilon"], row["shape"] = (
-                    fit.epsilon,
-                    fit.epsilon * float(spacing(sample.points).mean()),
-                )
-                if choice.broken:
-                    raise ValueError(choice.broken)
-            elif fit.fit(sample.points, sample.normals).condition > BOUND:
-                fit, row["bound"] = replace(fit, condition=BOUND), BOUND
+            fit = _chosen_fit(row, judge, sample, fit)
             surface = _measure(row, judge, sample, fit.fit(sample.points, sample.normals))
         except (ValueError, np.linalg.LinAlgError) as error:
             row["unfit"] = " ".join(str(error).split())
     return Measured(row, sample, fit, surface)
+
+
+def _chosen_fit(
+    row: dict, judge: ReferenceSurface, sample: SurfaceSample, fit: FieldFit
+) -> FieldFit:
+    """The fit with the epsilon of the least error, or with a bounded condition where it needs one;
+    both are written into the row.
+    """
+    points, normals = sample.points, sample.normals
+    if fit.kernel.has_epsilon:
+        choice = choose_epsilon(
+            points, normals, fit, held_out=judge.held_out, distance=judge.distance.unsigned
+        )
+        row["trials"] = choice.trials.tolist()
+        row["epsilon"] = choice.epsilon
+        row["shape"] = choice.epsilon * float(spacing(points).mean())
+        if choice.broken:
+            raise ValueError(choice.broken)
+        return replace(fit, epsilon=choice.epsilon)
+    if fit.fit(points, normals).condition > BOUND:
+        row["bound"] = BOUND
+        return replace(fit, condition=BOUND)
+    return fit
 
 
 def _measure(

@@ -191,14 +191,7 @@ class ModelView:
         for name, mesh in self.picture.surfaces.items():
             values = vertex_values(look.colour, name, self.picture, self.rest, probes, other)
             if self.figure is not None:
-                error = 100.0 * (mesh_volume(*mesh) / self._volumes[name] - 1.0)
-                depth = self.picture.depth.get(name, math.nan)
-                self.numbers[name] = {
-                    "volume": error,
-                    "depth": depth,
-                    "moment": self.picture.moment_arms.get(name, math.nan),
-                    "mean": float(values.mean()),
-                }
+                self.numbers[name] = self._measure(name, values)
             part, shown = self._part(mesh, look.cut), name not in look.hidden
             if look.colour == "fibres" and name in self.picture.fibres:
                 shown = False  # the surface would hide them
@@ -216,6 +209,15 @@ class ModelView:
         for node in self._nodes.values():
             # The inside is seen in a cut alone, and software drawing pays for it.
             node.side = "front" if look.cut is None else "double"
+
+    def _measure(self, name: str, values: Floats) -> dict[str, float]:
+        """Numbers of a muscle, of which the vertices have these values of the colour (n,)."""
+        return {
+            "volume": 100.0 * (mesh_volume(*self.picture.surfaces[name]) / self._volumes[name] - 1),
+            "depth": self.picture.depth.get(name, math.nan),
+            "moment": self.picture.moment_arms.get(name, math.nan),
+            "mean": float(values.mean()),
+        }
 
     def _draw_fibres(self, look: ViewSettings) -> None:
         """Show fibres as lines where they are asked for, coloured by their stretch."""
