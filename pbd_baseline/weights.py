@@ -12,7 +12,7 @@ from scipy.sparse.linalg import splu
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import graph_laplacian, harmonic_weights
 
-POWER = 4.0
+POWER = 4.0  # p of the minimised integral of |grad w|^p: smoother at the ends than 2
 # A choice and not an end at convergence: after these the weights are within 0.001 of their limit,
 # and they only predict; what is solved does not depend on them.
 ROUNDS = 8

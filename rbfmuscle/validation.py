@@ -83,7 +83,7 @@ class NumericalWarning(UserWarning):
 
 
 MOST_NAMED = 40  # names that a message lists
-LONGEST_SHOWN = 80
+LONGEST_SHOWN = 80  # characters of a value that a message shows
 
 
 def shown(value: object, *, longest: int = LONGEST_SHOWN) -> str:

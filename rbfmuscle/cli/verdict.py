@@ -10,7 +10,7 @@ from rbfmuscle.report.verdict import describe_excess, describe_unmeasured, find_
 from rbfmuscle.scene.phantom import PHANTOM
 
 MOST = 3  # values beyond limits, and remedies, that are named
-WIDTH = 80
+WIDTH = 80  # characters of a line
 LONGEST = 140  # characters about what was not measured or is doubtful: two lines
 
 

@@ -25,12 +25,12 @@ from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Mesh
 
-FORMAT = 4
+FORMAT = 4  # of comparison.json
 # A model keeps out of bones that is no deeper in one [mm].
 KEPT_OUT = 0.3
 
 
-_TIE = 1.05
+_TIE = 1.05  # models whose values differ by less are equally good
 
 
 class Repeated(NamedTuple):

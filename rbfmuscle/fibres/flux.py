@@ -25,7 +25,7 @@ GRIP = 30.0  # conductance of an end where u is given, over that of a cube of th
 ACROSS = 0.02  # conductivity across polylines, over that along them
 NEAREST = 4  # pieces of polylines that speak for one place
 TOLERANCE = 1e-8  # relative residual of the potential
-MOST_ITERATIONS = 5_000
+MOST_ITERATIONS = 5_000  # of conjugate gradients; some hundreds serve
 _CORNERS = np.indices((2, 2, 2)).reshape(3, -1).T  # of a cell, (8, 3)
 
 

@@ -19,7 +19,7 @@ from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.jit import compiled, inner
 
-SHIFT = 2
+SHIFT = 2  # bits of a cell within its block
 SIDE = 1 << SHIFT  # cells along a block
 WIDE = SIDE + 3  # nodes along it, those of the splines that reach into it too
 MOST = 1 << 20  # blocks along an axis in either direction: beyond any bone

@@ -62,7 +62,7 @@ YIELDING = 1e-4  # how far a contact yields under a pressure of 2 μ
 SHOWN_YIELDING = 0.1
 LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
 
-DONE = 0
+DONE = 0  # how a solve ended
 NO_ROOM = 1
 DIVERGED = 2
 

@@ -51,7 +51,7 @@ COLUMNS = {
     "evaluation_time": ("20,000 values [ms]", 1e3),
 }
 FILES = ("kernels.csv", "kernels.json", "kernels.html")
-_MOST_LIGHTS = 5
+_MOST_LIGHTS = 5  # rows at the top of the page
 _READING = """A kernel's shape parameter is chosen by the error at other points of the mesh.
 Distances are measured both ways between mesh and extracted surface, root mean square and
 greatest. Recommended is the quickest row (a fit and 20,000 values) whose error is at most 5 %

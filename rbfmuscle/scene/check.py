@@ -19,7 +19,7 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SceneError
 
 MOST_ARTICULAR = 0.5  # share of an attachment that may lie on an articular surface
-MOTION_SAMPLES = 10
+MOTION_SAMPLES = 10  # frames in which bones are checked against each other
 COUNTED_DEPTH_MM = 0.05  # bones that touch by less are not reported
 
 

@@ -11,7 +11,7 @@ from rbfmuscle.scene.options import MAX_FRAMES
 from rbfmuscle.scene.storage import read_storage
 from rbfmuscle.validation import SceneError, shown
 
-TURN = 2.0 * math.pi
+TURN = 2.0 * math.pi  # [radian]
 MOST_LISTED = 8  # columns that a note lists
 # A row jumps that is this far [radian] from those beside it, and this many times farther than these
 # are from each other and than the other steps, in the median.

@@ -200,7 +200,7 @@ def _accept_format(value: object) -> object:
     return value
 
 
-DEFAULT_FIBRES, MOST_FIBRES = 32, 1000
+DEFAULT_FIBRES, MOST_FIBRES = 32, 1000  # of each muscle
 
 
 def _accept_true(value: object) -> object:

@@ -24,8 +24,8 @@ from rbfmuscle.scene.phantom_shapes import (
 from rbfmuscle.scene.scene import Scene
 
 PHANTOM = "phantom"
-HEAD_RADIUS = 23.0
-SOCKET_RADIUS = 26.5
+HEAD_RADIUS = 23.0  # of the femur [mm]
+SOCKET_RADIUS = 26.5  # [mm]
 AXES = {"flexion": (-1, 0, 0), "adduction": (0, -1, 0), "internal_rotation": (0, 0, 1)}
 
 

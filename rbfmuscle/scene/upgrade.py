@@ -8,7 +8,7 @@ from pathlib import Path
 from rbfmuscle.scene.joints.joint import BY_TURNS
 from rbfmuscle.validation import SceneError, shown
 
-FORMAT = 2
+FORMAT = 2  # of scene files today
 MAIN = "main"  # the class of all muscles, once [defaults]
 TYPES = {"fixed": "weld", "slider": "slide"}
 RENAMED = {"left_out": "missing_bones"}

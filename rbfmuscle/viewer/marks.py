@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from viser import LabelHandle, LineSegmentsHandle, PointCloudHandle, ViserServer
 
 KINDS = ("Attachments", "Joint axes", "Names")
-AXIS_COLOUR = (0.86, 0.20, 0.18)
-HELD_COLOUR = (0.05, 0.35, 0.75)
+AXIS_COLOUR = (0.86, 0.20, 0.18)  # red, green, blue
+HELD_COLOUR = (0.05, 0.35, 0.75)  # of vertices that bones hold
 REACH = 25.0  # of a joint's axis to either side of its centre [mm]
 POINT = 0.0012  # size of a vertex that a bone holds [m]
 

@@ -29,7 +29,7 @@ READ = (
 )
 LONGEST = 300  # characters of a message
 PACE = 0.04  # Least time of a picture while a motion is played [s].
-FIELD_OF_VIEW = 0.5
+FIELD_OF_VIEW = 0.5  # [radian], upright
 FIRST = (-1.4, 1.6, 0.5)  # Where the camera stands at first, along the body's axes.
 
 

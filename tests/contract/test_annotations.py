@@ -1,5 +1,5 @@
-"""Every public function says what it takes and gives, `Any` has a reason beside it, and statements
-are laid out by the formatter, one assignment each.
+"""Every public function says what it takes and gives, `Any` and constant numbers have a reason
+beside them, and statements are laid out by the formatter, one assignment each.
 """
 
 import ast
@@ -65,6 +65,37 @@ def packed(source):
     return found
 
 
+NUMBERS = (ast.Constant, ast.UnaryOp, ast.BinOp, ast.Tuple)
+
+
+def unexplained(source):
+    """Constant numbers of a module without a comment on their lines, on one of the lines before
+    them up to an empty one, or in a string below.
+    """
+    lines, found = ["", *source.splitlines()], []
+    body = ast.parse(source).body
+    for node, after in zip(body, [*body[1:], None]):
+        if not isinstance(node, ast.Assign) or not isinstance(node.value, NUMBERS):
+            continue
+        names = [part.id for part in ast.walk(node.targets[0]) if isinstance(part, ast.Name)]
+        values = [part.value for part in ast.walk(node.value) if isinstance(part, ast.Constant)]
+        numeric = values and all(type(value) in (int, float) for value in values)
+        if not numeric or not all(name.isupper() for name in names):
+            continue
+        first = node.lineno
+        while lines[first - 1].strip():
+            first -= 1
+        said = any("#" in line for line in lines[first : node.end_lineno + 1])
+        below = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+        found += [] if said or below else names
+    return found
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
+def test_constant_numbers_have_a_comment(path):
+    assert unexplained(path.read_text(encoding="utf-8")) == []
+
+
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
 def test_public_functions_are_annotated(path):
     assert lacking(path.read_text(encoding="utf-8")) == []
@@ -91,3 +122,5 @@ def test_planted_faults_are_found():
     assert vague(source) == [False, True, True]
     source = "a, b = 1, 2\na, b, c = f()\na, b, c = b, c, a\na, b, c = 1, 2, 3\n(a, b, *c) = [1, 2]"
     assert packed(source) == [4, 5]
+    source = 'A = 1  # mm\nB = 2.0\n\nC, D = 1, -2\n\nE = 3\n"""Of what."""\nF = \'x\'\n'
+    assert unexplained(source) == ["C", "D"]

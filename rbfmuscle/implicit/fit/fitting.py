@@ -31,7 +31,7 @@ DOUBTFUL = 1e13
 """Condition above which a fit is reported as doubtful, and a ridge takes part."""
 KEPT = 1e12
 """Condition that this ridge keeps: with a greater one Cholesky may still fail."""
-_DEPENDENT = 1e-9
+_DEPENDENT = 1e-9  # norm of a polynomial beside the others, below which it depends on them
 # Fits that are solved at a time: their matrices stay in the second-level cache.
 _CHUNK = 7
 

@@ -26,11 +26,11 @@ class Form(NamedTuple):
     table: np.ndarray
 
 
-_LOG2E = 1.4426950408889634
+_LOG2E = 1.4426950408889634  # log2(e), and log(2) in two parts
 _LN2_HIGH = 6.93147180369123816490e-01
 _LN2_LOW = 1.90821492927058770002e-10
 _SHIFTER = 6755399441055744.0  # 1.5 * 2**52: adding it leaves the rounded integer in the low bits
-_TINY = 2.2250738585072014e-308
+_TINY = 2.2250738585072014e-308  # the least normal number
 
 
 @compiled(error_model="numpy", fastmath={"contract"})

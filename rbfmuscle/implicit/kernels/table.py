@@ -29,7 +29,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.kernels import radial
 from rbfmuscle.validation import UsageError, check_finite, did_you_mean
 
-_TERMS = 5
+_TERMS = 5  # coefficients of a polynomial: of degree 4 at most
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from rbfmuscle.importers.guess.landmarks import across, fit_sphere, unit
 FLEXIONS = tuple(
     range(0, 131, 10)
 )  # knee flexion from the rest pose [degree] at which the path is taken
-TURN = 0.7
+TURN = 0.7  # of the knee's flexion (Amis et al. 2006)
 # Half the breadth beside the patella's middle that counts as its groove, and its part of the tibia
 # [mm].
 GROOVE, TUBEROSITY = 10.0, 15.0

@@ -25,7 +25,7 @@ from rbfmuscle.scene.joints.functions import (
 from rbfmuscle.scene.names import new_name
 from rbfmuscle.validation import SceneError
 
-_DEEPEST = 50
+_DEEPEST = 50  # parts of a path to a component
 SPLINES = ("SimmSpline", "NaturalCubicSpline", "natCubicSpline")  # older names of the same spline
 # Of polynomials of several coordinates: OpenSim's own fits have at most 6 and 9.
 MOST_COORDINATES = 6

@@ -24,7 +24,7 @@ from rbfmuscle.scene.upgrade import FORMAT
 from rbfmuscle.validation import MeshError, SceneError, check_mesh
 
 WIDEST = 3.0  # a mesh wider than this [m] is a floor or a wall, not a bone
-NARROWEST = 0.002
+NARROWEST = 0.002  # one narrower [m] is in another unit
 LEAST_MISSED = 1e-3  # share of a muscle's volume that its tube may miss without a word
 SCENE = "scene.toml"
 

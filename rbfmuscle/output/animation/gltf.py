@@ -17,7 +17,7 @@ from rbfmuscle.output.animation.parts import AnimatedFibres, AnimatedMesh, Anima
 from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
 from rbfmuscle.validation import UsageError
 
-_FLOAT, _INT = 5126, 5125
+_FLOAT, _INT = 5126, 5125  # types of numbers
 _VERTICES, _INDICES = 34962, 34963  # what a view is bound as
 _LINES = 1  # mode of a primitive
 

@@ -12,7 +12,7 @@ from rbfmuscle.scene.storage import read_storage
 from rbfmuscle.validation import SceneError, did_you_mean
 
 KEYS = ("activation", "fibre_stretch_at_rest", "tendon_region")
-TENDON_STRAIN = 0.033
+TENDON_STRAIN = 0.033  # at full activation (Zajac 1989)
 
 
 class TendonRegionTable(Table):

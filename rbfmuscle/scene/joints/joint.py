@@ -20,7 +20,7 @@ from rbfmuscle.scene.joints.functions import Function, Linear
 from rbfmuscle.validation import SceneError
 
 MotionKind: TypeAlias = Literal["rotation", "translation", "coupled"]
-X = (1.0, 0.0, 0.0)
+X = (1.0, 0.0, 0.0)  # directions
 Y = (0.0, 1.0, 0.0)
 Z = (0.0, 0.0, 1.0)
 

@@ -24,7 +24,7 @@ HOLE_LIMIT = (
 TWISTED_NOTED = 0.005  # of the area
 MOST_TWISTED = 0.3  # of the area: of more it cannot be said what is inside
 WINDING_SAMPLES = 1500  # triangles asked, before and behind them by a small share of their size:
-WINDING_STEP = 1e-3
+WINDING_STEP = 1e-3  # of the root of twice the area
 MOST_WRONG = 0.01  # of the triangles of a bone, dropped where no surface can be made of them
 CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are dropped
 
