@@ -61,7 +61,7 @@ def timed(path, model):
 def measure(path, model):
     """One row: the worst of each quantity, distances between paths, and the time."""
     scene = load(path, model)
-    ((name, ramp),) = scene.resolved()["motion"]["ramp"].items()
+    ((name, ramp),) = scene.motion.options.model_dump(by_alias=True)["ramp"].items()
     runs = {step: rm.simulate(scene.with_options({"motion.step": step})) for step in STEPS}
     ends = [vertices(run.frames[-1]) for run in runs.values()]
     first = ramp.get("from", 0.0)

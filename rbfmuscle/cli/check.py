@@ -59,8 +59,10 @@ def check(
             facts["accuracy"] = _accuracy(loaded)
         if picture:
             facts["picture"] = _draw(loaded, scene.with_suffix(".png"))
+    from rbfmuscle.scene.record import record_scene
+
     lines = [*_scene_lines(loaded), *map(str, findings), *_more_lines(facts, loaded.units)]
-    facts |= {"scene": loaded.resolved(), "findings": [vars(finding) for finding in findings]}
+    facts |= {"scene": record_scene(loaded), "findings": [vars(finding) for finding in findings]}
     print_result(printing, facts, lines)
     if not printing.as_json:
         last = f"usable; next: rbfmuscle run {scene} -o results" if usable else "not usable"

@@ -109,6 +109,7 @@ def import_(
         Make a tube of each muscle of the model, along its path.
     """
     from rbfmuscle.importers.opensim.scene import import_osim, scene_folder, write_scene
+    from rbfmuscle.scene.record import record_scene
 
     scene_folder(output, force=force)
     for folder in geometry or []:
@@ -117,7 +118,7 @@ def import_(
     found = import_osim(model, geometry=geometry, muscles=muscles)
     written = write_scene(found, output, force=force)
     scene = found.scene
-    facts = {"file": str(written), "notes": found.notes, "scene": scene.resolved()}
+    facts = {"file": str(written), "notes": found.notes, "scene": record_scene(scene)}
     return print_result(printing, facts, _import_lines(written, found.notes, scene))
 
 

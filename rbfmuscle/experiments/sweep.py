@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from rbfmuscle.output.writer import versions
+from rbfmuscle.scene.record import record_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_value
 from rbfmuscle.validation import UsageError
@@ -118,7 +119,7 @@ def _model_first(settings):
 
 def scene_content(scene: Scene, frames: str | None = None) -> str:
     """Hash of what a scene would simulate, wherever its files lie, and of the library's version."""
-    facts = _without_files(scene.resolved())
+    facts = _without_files(record_scene(scene))
     ends = [muscle.attachments for muscle in scene.muscles]
     held = [
         [(a.bone, a.vertices.tolist(), a.tendon and a.tendon.model_dump()) for a in end]

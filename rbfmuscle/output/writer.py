@@ -28,6 +28,7 @@ from rbfmuscle.output.info import FORMAT, RunInfo
 from rbfmuscle.output.surface_arrays import RunArrays
 from rbfmuscle.output.vtp import Collection, write_vtp
 from rbfmuscle.scene.motion import shown_value
+from rbfmuscle.scene.record import record_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import Frame
@@ -258,7 +259,7 @@ def build_info(
         "format": FORMAT,
         "started": started.isoformat(timespec="seconds"),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
-        "scene": scene.resolved(),
+        "scene": record_scene(scene),
         "versions": versions(),
         "machine": machine(),
         "inputs": input_hashes(scene),

@@ -39,7 +39,6 @@ from rbfmuscle.scene.options import (
     MotionOptions,
 )
 from rbfmuscle.scene.patches import AttachTable
-from rbfmuscle.scene.record import record_scene
 from rbfmuscle.scene.save import save_scene
 from rbfmuscle.validation import MeshError, SceneError
 
@@ -81,48 +80,10 @@ class Scene(SceneContents):
         scene = cls(tables.scene.name or path.stem, units=tables.scene.units, path=path)
         try:
             scene.guesses = guesses
-            scene._fill(tables)
+            _fill(scene, tables)
             return scene if skeleton and not scene.muscles else scene.validate()
         except (SceneError, MeshError) as error:
             raise type(error)(f"{path}: {error}") from None
-
-    def _fill(self, tables: SceneFile) -> None:
-        about = tables.scene
-        self.missing_bones = about.missing_bones
-        self.doubts = about.doubts
-        self.notes = about.notes
-        self.superior = about.superior
-        self.anterior = about.anterior
-        for bone in tables.bone:
-            self.add_bone(**{key: getattr(bone, key) for key in bone.model_fields_set})
-            if bone.mesh is not None:
-                check_size("bone", bone.name, self.bones[-1], self.units)
-        for joint in tables.joint:
-            self.add_joint(joint.joint())
-            check_centre(joint.name, self.joints[-1].centre, self.bones, self.units)
-        for coupling in tables.coupling:
-            self.add_coupling(make_coupling(coupling, self.joints))
-        for muscle in tables.muscle:
-            given = given_muscle(muscle, tables.classes)
-            read = read_mesh(given.mesh, name=given.name, transform=given)
-            check_size("muscle", given.name, read, self.units)
-            check_place(given.name, read, self.bones, self.units)
-            self.add_muscle(
-                given.name,
-                read,
-                attach=given.attach,
-                model=given.model,
-                fibres=given.fibres,
-                scale=given.scale,
-                mirror=given.mirror,
-                transform=given.transform,
-                **given.contraction,
-            )
-        self.motion = made_motion(self, tables.motion)
-        self.contact = tables.contact
-        self.sliding = tables.sliding
-        self.detect = tables.detect
-        self.output = tables.output
 
     def save(self, path: str | Path) -> Path:
         """Write the scene as a TOML file that loads as the same scene, and return its path.
@@ -330,15 +291,49 @@ class Scene(SceneContents):
         changes.change_scene(changed, settings or {}, model, frames)
         return changed
 
-    def resolved(self) -> dict[str, object]:
-        """Return the scene as plain data for ``run.json``: names, counts, options, sources and
-        hashes.
-        """
-        return record_scene(self)
-
     def show(self, *, model: str | None = None) -> showing.ShownPage:
         """Show the scene in a browser or a notebook, to be moved by hand; see `rbfmuscle.show`."""
         return showing.registered[0].show(self, model=model)
 
     def _repr_html_(self) -> str:
         return showing.registered[0].picture(self) if self.bones else html.escape(repr(self))
+
+
+def _fill(scene: Scene, tables: SceneFile) -> None:
+    """Add what the tables of a file say to an empty scene."""
+    about = tables.scene
+    scene.missing_bones = about.missing_bones
+    scene.doubts = about.doubts
+    scene.notes = about.notes
+    scene.superior = about.superior
+    scene.anterior = about.anterior
+    for bone in tables.bone:
+        scene.add_bone(**{key: getattr(bone, key) for key in bone.model_fields_set})
+        if bone.mesh is not None:
+            check_size("bone", bone.name, scene.bones[-1], scene.units)
+    for joint in tables.joint:
+        scene.add_joint(joint.joint())
+        check_centre(joint.name, scene.joints[-1].centre, scene.bones, scene.units)
+    for coupling in tables.coupling:
+        scene.add_coupling(make_coupling(coupling, scene.joints))
+    for muscle in tables.muscle:
+        given = given_muscle(muscle, tables.classes)
+        read = read_mesh(given.mesh, name=given.name, transform=given)
+        check_size("muscle", given.name, read, scene.units)
+        check_place(given.name, read, scene.bones, scene.units)
+        scene.add_muscle(
+            given.name,
+            read,
+            attach=given.attach,
+            model=given.model,
+            fibres=given.fibres,
+            scale=given.scale,
+            mirror=given.mirror,
+            transform=given.transform,
+            **given.contraction,
+        )
+    scene.motion = made_motion(scene, tables.motion)
+    scene.contact = tables.contact
+    scene.sliding = tables.sliding
+    scene.detect = tables.detect
+    scene.output = tables.output

@@ -11,6 +11,7 @@ import trimesh
 from conftest import ROOT
 
 from rbfmuscle.scene.check import bone_collisions, check_initial, check_scene
+from rbfmuscle.scene.record import record_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_settings, parse_slice
 from rbfmuscle.scene.toml_text import attachment_file
@@ -253,8 +254,8 @@ class TestOptions:
     def test_pickle_and_resolved(self, folder):
         scene = load(folder)
         again = pickle.loads(pickle.dumps(scene))
-        assert again.resolved() == scene.resolved()
-        resolved = json.loads(json.dumps(scene.resolved()))
+        assert record_scene(again) == record_scene(scene)
+        resolved = json.loads(json.dumps(record_scene(scene)))
         assert resolved["muscles"][0]["model"] == {"name": "rbf", "centres": 60}
         assert len(resolved["bones"][0]["sha256"]) == 64
 
