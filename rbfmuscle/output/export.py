@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.folders import OutputFolder
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.solids import SolidDistance
 from rbfmuscle.output.animation.gltf import animated_glb
 from rbfmuscle.output.animation.parts import AnimatedMesh, Animation, read_animation
@@ -16,7 +16,8 @@ from rbfmuscle.output.animation.usd import check_usd, write_usd
 from rbfmuscle.output.fibre_files import write_fibres
 from rbfmuscle.output.run_data import RunData, open_run
 from rbfmuscle.output.surface_arrays import VertexArrays
-from rbfmuscle.output.vtp import Collection, write_vtp
+from rbfmuscle.output.vtp import NORMALS, TEXTURE, Collection, write_vtp
+from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingDependencyError, SolveError, UsageError
 
@@ -163,8 +164,8 @@ def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -
             moved = [p for p in parts if k == 0 or p.poses is None or p.moves]
             files |= {p.name: f"{stems[p.name]}_{frame:04d}.{suffix}" for p in moved}
             for part in moved:
-                arrays = measure.of(part, k) if measure and group == "surfaces" else None
-                write_mesh(folder / files[part.name], *part.mesh(k), arrays)
+                arrays = measure.of(part, k) if measure and group == "surfaces" else {}
+                write_mesh(folder / files[part.name], part.own(k), arrays)
             written += [folder / files[part.name] for part in moved]
             if collection is not None:
                 collection.add(run.times[k] if run.timed else frame, list(files.items()))
@@ -211,16 +212,49 @@ def _at_rest(points: Floats, bone: AnimatedMesh, k: int) -> Floats:
     return (points - pose[:3, 3]) @ pose[:3, :3]
 
 
-def write_mesh(
-    path: Path, vertices: Floats, faces: Integers, arrays: Mapping[str, Floats] | None = None
-) -> None:
-    """Write a triangle mesh as ``.vtp`` (with arrays at its vertices), ``.ply``, ``.stl`` or
-    ``.obj``, by suffix; PLY and STL in single precision.
+def write_mesh(path: Path, mesh: InputMesh, arrays: Mapping[str, Floats]) -> None:
+    """Write a triangle mesh as ``.vtp`` (with arrays at the vertices of the model's mesh),
+    ``.ply``, ``.stl`` or ``.obj``, by suffix; PLY and STL in single precision.
+
+    In OBJ texture coordinates and normals have numbers of their own. In VTP and PLY, which have
+    none, vertices with several come several times, after all others; STL has neither.
     """
+    if path.suffix == ".obj":
+        path.write_text(obj_text(mesh), encoding="ascii")
+        return
+    mesh = mesh.split()
+    corners = mesh.corners
     if path.suffix == ".vtp":
-        write_vtp(path, vertices, faces, arrays)
+        shown = {name: values[mesh.source] for name, values in arrays.items()}
+        shown |= {TEXTURE: corners.texture} if len(corners.texture) else {}
+        shown |= {NORMALS: corners.normals} if len(corners.normals) else {}
+        write_vtp(path, mesh.vertices, mesh.faces, shown)
         return
     import trimesh
 
-    options = {"include_normals": False, "digits": 12} if path.suffix == ".obj" else {}
-    trimesh.Trimesh(vertices, faces, process=False).export(path, **options)
+    normals = corners.normals if len(corners.normals) else None
+    made = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, process=False)
+    if len(corners.texture):
+        made.vertex_attributes.update(zip("st", corners.texture.T.astype(np.float32)))
+    made.export(path, **({"vertex_normal": normals is not None} if path.suffix == ".ply" else {}))
+
+
+def obj_text(mesh: InputMesh) -> str:
+    """A mesh as the text of an OBJ file."""
+    corners = mesh.corners
+    columns, parts = [mesh.faces], [_rows("v", mesh.vertices)]
+    for key, values, numbers in (("vt", *corners[:2]), ("vn", *corners[2:])):
+        parts += [_rows(key, values)] if len(values) else []
+        columns.append(numbers if len(values) else np.full_like(mesh.faces, -1))
+    form = {(0, 0): "%d", (1, 0): "%d/%d", (0, 1): "%d//%d", (1, 1): "%d/%d/%d"}
+    corner = form[len(corners.texture) > 0, len(corners.normals) > 0]
+    used = [c + 1 for c in columns if (c >= 0).all()]
+    line = f"f {corner} {corner} {corner}\n"
+    faces = np.stack(used, axis=2).reshape(len(mesh.faces), -1)
+    return "".join(parts) + (line * len(faces)) % tuple(faces.ravel().tolist())
+
+
+def _rows(key: str, values: Floats) -> str:
+    """Lines of an OBJ file, with twelve digits."""
+    line = key + " %.12g" * values.shape[1] + "\n"
+    return (line * len(values)) % tuple(values.ravel().tolist())

@@ -19,6 +19,7 @@ from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.metrics_table import metrics_table
 from rbfmuscle.output.run_folder import FolderMeshes, Mesh, read_run
 from rbfmuscle.scene.joints.tables import full_name
+from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Event, FibreLines, Frame
@@ -47,6 +48,10 @@ class SceneMeshes:
         """A bone at rest."""
         mesh = self._bones[name]
         return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+    def given(self, muscle: str) -> InputMesh | None:
+        """The mesh of a muscle's file at rest, where it differs from the one that is shown."""
+        return self._muscles[muscle].given
 
     def tendons(self, muscle: str, frame: Frame) -> Mesh:
         """All tendons of a muscle in a frame."""
@@ -147,6 +152,12 @@ class RunData:
         """Vertices and faces of a bone at rest."""
         self._require_surfaces()
         return self._meshes.bone(name)
+
+    def input_mesh(self, muscle: str) -> InputMesh | None:
+        """The mesh of a muscle's file at rest, where its vertices are others than those of
+        surfaces, or it has texture coordinates or normals.
+        """
+        return self._meshes.given(muscle)
 
     def _require_surfaces(self) -> None:
         if not self.has_surfaces:

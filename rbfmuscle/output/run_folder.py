@@ -14,8 +14,10 @@ from pydantic import ValidationError
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.fibre_files import SavedFibres
+from rbfmuscle.output.given_files import read_given
 from rbfmuscle.output.info import FORMAT, FrameInfo, RunInfo
 from rbfmuscle.output.vtp import read_vtp
+from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
 from rbfmuscle.validation import SceneError, UsageError
@@ -38,6 +40,10 @@ class FolderMeshes:
         if name not in self._bones:
             self._bones[name] = read_vtp(self._folder / "bones" / f"{name}.vtp")
         return self._bones[name]
+
+    def given(self, muscle: str) -> InputMesh | None:
+        """The mesh of a muscle's file at rest, where it differs from the one that is shown."""
+        return read_given(self._folder, muscle)
 
     def tendons(self, muscle: str, frame: Frame) -> Mesh:
         """All tendons of a muscle in a frame."""

@@ -20,13 +20,15 @@ _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32"}
 # Last bits of double precision that are rounded away: 1e-11 of a coordinate is kept, and a quarter
 # of the space saved.
 _ROUNDED_BITS = 16
+# Names of arrays that VTK takes for texture coordinates and normals.
+TEXTURE, NORMALS = "texture_coordinates", "normals"
 _HEAD = """<?xml version="1.0"?>
 <VTKFile type="PolyData" version="1.0"
  byte_order="LittleEndian" header_type="UInt32" compressor="vtkZLibDataCompressor">
 <PolyData>
 <Piece NumberOfPoints="{}" NumberOfVerts="0" NumberOfLines="0"
  NumberOfStrips="0" NumberOfPolys="{}">
-<PointData>
+<PointData{}>
 {}</PointData>
 <Points>
 {}</Points>
@@ -45,7 +47,7 @@ def write_vtp(
     arrays: Mapping[str, ArrayLike] | None = None,
 ) -> None:
     """Write vertices (n, 3), single precision as it is, double rounded to 1e-11 of each number,
-    faces (m, 3), and ``arrays`` (n,) by name in single precision.
+    faces (m, 3), and ``arrays`` (n,) or (n, k) by name in single precision.
     """
     points = np.ascontiguousarray(vertices)
     points = _rounded(points) if points.dtype != np.float32 else points
@@ -53,8 +55,10 @@ def write_vtp(
     values = {name: np.asarray(value, dtype="<f4") for name, value in (arrays or {}).items()}
     names = [*values, "Points", "connectivity", "offsets"]
     kinds = ["f4"] * len(values) + [points.dtype.str[1:], "i4", "i4"]
-    widths = [1] * len(values) + [3, 1, 1]
-    blocks = [packed(value.tobytes()) for value in values.values()]
+    widths = [value.size // max(len(value), 1) for value in values.values()] + [3, 1, 1]
+    marks = (("TCoords", TEXTURE), ("Normals", NORMALS))
+    marked = "".join(f' {mark}="{name}"' for mark, name in marks if name in values)
+    blocks = [packed(np.ascontiguousarray(value).tobytes()) for value in values.values()]
     blocks += [packed(points.tobytes()), *_packed_faces(corners.tobytes())]
     elements, offset = [], 0
     for name, kind, components, block in zip(names, kinds, widths, blocks):
@@ -64,7 +68,8 @@ def write_vtp(
         )
         offset += len(block)
     data = "".join(elements[: len(values)])
-    head = _HEAD.format(len(points), len(corners), data, *elements[len(values) :]).encode("ascii")
+    rest = elements[len(values) :]
+    head = _HEAD.format(len(points), len(corners), marked, data, *rest).encode("ascii")
     Path(path).write_bytes(b"".join([head, BEFORE_DATA, *blocks, AFTER_DATA]))
 
 

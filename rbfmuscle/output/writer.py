@@ -24,6 +24,7 @@ from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.output.appearance import tendon_mesh
 from rbfmuscle.output.fibre_files import FOLDER, TABLE, begin_table, fibre_file, write_frame
+from rbfmuscle.output.given_files import given_file, write_given
 from rbfmuscle.output.info import FORMAT, RunInfo
 from rbfmuscle.output.surface_arrays import RunArrays
 from rbfmuscle.output.vtp import Collection, write_vtp
@@ -84,9 +85,18 @@ class RunWriter:
                 self.folder.add(TABLE)
                 begin_table(self.directory)
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
+            if self.meshes:
+                self._write_given()
         except OSError as error:
             message = f"cannot write to {self.directory}: {error.strerror}; choose another folder"
             raise UsageError(message) from None
+
+    def _write_given(self):
+        """The meshes of the files, where surfaces are shown by other ones."""
+        for muscle in self.scene.muscles:
+            if muscle.given is not None:
+                self.folder.add(given_file(muscle.name))
+                write_given(self.directory, muscle.name, muscle.given)
 
     def write(self, frame: Frame, rows: Sequence[Sequence[object]] = ()) -> None:
         """Write one frame, and the rows of metrics that are complete; SolveError if the disk

@@ -13,6 +13,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import Joint
+from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.scene.names import LONGEST_NAME
 from rbfmuscle.scene.options import MotionOptions, Table, Vector
 from rbfmuscle.scene.tendons import TendonEnd, tendon_name
@@ -71,7 +72,8 @@ class Muscle:
     """A closed surface (outward, rest pose) held by bones, and the model that moves it.
 
     ``contraction`` holds the keys of a muscle that contracts, None for any other; ``tendons`` are
-    the ends that tendons hold.
+    the ends that tendons hold; ``given`` is the mesh of the file, where it is another one than
+    ``mesh`` or has texture coordinates or normals.
     """
 
     name: str
@@ -84,6 +86,7 @@ class Muscle:
     notes: list[str] = field(default_factory=list)
     contraction: ContractionTable | None = None
     tendons: list[TendonEnd] = field(default_factory=list)
+    given: InputMesh | None = field(default=None, repr=False)
 
 
 @dataclass(eq=False)

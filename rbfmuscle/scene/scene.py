@@ -237,6 +237,7 @@ class Scene(SceneContents):
         muscle = Muscle(
             name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys
         )
+        muscle.given = read.given
         muscle.tendons = tendon_ends(muscle, self.bones, self.joints)
         self.muscles.append(muscle)
         return self

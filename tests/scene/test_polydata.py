@@ -24,7 +24,7 @@ ASCII, ENCODED = "vtp-Ascii-None", "vtp-Appended-LZMA-UInt32-encoded"
 
 
 def assert_is_ball(path):
-    _, points, triangles, _ = read_part(path)
+    _, points, triangles, *_ = read_part(path)
     np.testing.assert_array_equal(triangles, BALL.faces)
     np.testing.assert_allclose(points, BALL.vertices, atol=2e-6)  # float32
 

@@ -15,6 +15,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.output.animation.parts import AnimatedFibres, AnimatedMesh, Animation
 from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
+from rbfmuscle.scene.meshes.input_mesh import InputMesh, plain_input
 from rbfmuscle.validation import UsageError
 
 _FLOAT, _INT = 5126, 5125  # types of numbers
@@ -53,13 +54,15 @@ def _add_part(file: "_File", part: AnimatedMesh) -> int:
     """Number of a new node: a muscle has a morph target for each frame but the first, a bone a pose
     for each.
     """
-    base, faces = part.vertices[0], part.faces[0]
-    normals, targets = vertex_normals(base, faces), []
-    for vertices in part.vertices[1:]:
-        moved, turned = vertices - base, vertex_normals(vertices, faces) - normals
+    first, *later = (_split(part, k) for k in range(len(part.vertices)))
+    base = first.vertices
+    normals = first.corners.normals
+    targets = []
+    for frame in later:
+        moved, turned = frame.vertices - base, frame.corners.normals - normals
         position = file.add(moved, "VEC3", target=_VERTICES, bounds=True)
         targets.append({"POSITION": position, "NORMAL": file.add(turned, "VEC3", target=_VERTICES)})
-    entry: dict[str, object] = {"name": part.name, "mesh": file.mesh(part, normals, targets)}
+    entry: dict[str, object] = {"name": part.name, "mesh": file.mesh(part, first, targets)}
     node = file.append("nodes", entry)
     if targets:
         weights = np.eye(len(part.vertices))[:, 1:]
@@ -71,6 +74,23 @@ def _add_part(file: "_File", part: AnimatedMesh) -> int:
             file.animate(node, "rotation", file.add(turns, "VEC4"))
             file.animate(node, "translation", file.add(shifts, "VEC3"))
     return node
+
+
+def _split(part: AnimatedMesh, k: int) -> InputMesh:
+    """A frame of a part with one number for all that a corner has; its file's normals, or those of
+    the surface that is shown, on which seams of textures do not show.
+    """
+    if part.poses is not None:
+        vertices, faces = part.vertices[0], part.faces[0]
+        mesh = plain_input(vertices, faces)
+    else:
+        vertices, faces = part.mesh(k)
+        mesh = part.own(k).split()
+    if not len(mesh.corners.normals):
+        smooth = vertex_normals(vertices, faces)[mesh.source]
+        corners = mesh.corners._replace(normals=smooth, normal_faces=mesh.faces)
+        mesh = mesh._replace(corners=corners)
+    return mesh
 
 
 def _add_fibres(file: "_File", fibres: AnimatedFibres) -> int:
@@ -159,17 +179,21 @@ class _File:
             entry |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self.append("accessors", entry)
 
-    def mesh(self, part: AnimatedMesh, normals: Floats, targets: Sequence[object]) -> int:
+    def mesh(self, part: AnimatedMesh, first: InputMesh, targets: Sequence[object]) -> int:
         """Number of a new mesh, that of the first frame, with a material of its own."""
         colour = [*linear_rgb(rgb(part.colour)).tolist(), 1.0]
         look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}
-        position = self.add(part.vertices[0], "VEC3", target=_VERTICES, bounds=True)
+        attributes = {
+            "POSITION": self.add(first.vertices, "VEC3", target=_VERTICES, bounds=True),
+            "NORMAL": self.add(first.corners.normals, "VEC3", target=_VERTICES),
+        }
+        if len(first.corners.texture):
+            # From the upper left in glTF.
+            texture = first.corners.texture * [1.0, -1.0] + [0.0, 1.0]
+            attributes["TEXCOORD_0"] = self.add(texture, "VEC2", target=_VERTICES)
         primitive = {
-            "attributes": {
-                "POSITION": position,
-                "NORMAL": self.add(normals, "VEC3", target=_VERTICES),
-            },
-            "indices": self.add(part.faces[0].reshape(-1, 1), "SCALAR", target=_INDICES),
+            "attributes": attributes,
+            "indices": self.add(first.faces.reshape(-1, 1), "SCALAR", target=_INDICES),
             "material": self.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
         }
         entry: dict[str, object] = {"name": part.name, "primitives": [primitive]}

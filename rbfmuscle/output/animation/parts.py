@@ -1,12 +1,13 @@
 """The muscles, tendons and bones of a run over time, which exports turn into files."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output import appearance as look
 from rbfmuscle.output.run_data import RunData
+from rbfmuscle.scene.meshes.input_mesh import InputMesh, plain_input
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.simulation.frame import FibreLines
 
@@ -21,7 +22,8 @@ class AnimatedMesh:
 
     Vertices (n, 3) and faces (m, 3) are those of each frame, with the same array of faces where it
     stays; of a bone there is one of each, at rest, and poses (T, 4, 4) from there to the world.
-    ``colour`` is "#rrggbb"; muscles of one ``group`` cross the same joints.
+    ``colour`` is "#rrggbb"; muscles of one ``group`` cross the same joints. ``given`` is the mesh
+    of the muscle's file at rest, where its vertices are shown.
     """
 
     name: str
@@ -30,6 +32,7 @@ class AnimatedMesh:
     faces: list[Integers]
     poses: Floats | None = None
     group: str = ""
+    given: InputMesh | None = None
 
     @property
     def keeps_vertices(self) -> bool:
@@ -46,6 +49,13 @@ class AnimatedMesh:
         if self.poses is None:
             return self.vertices[k], self.faces[k]
         return self.vertices[0] @ self.poses[k, :3, :3].T + self.poses[k, :3, 3], self.faces[0]
+
+    def own(self, k: int) -> InputMesh:
+        """The k-th frame by the vertices, triangles, texture coordinates and normals of the
+        muscle's file; of what has none the mesh that is shown.
+        """
+        vertices, faces = self.mesh(k)
+        return plain_input(vertices, faces) if self.given is None else self.given.moved(vertices)
 
 
 @dataclass(frozen=True)
@@ -90,16 +100,17 @@ def read_animation(run: RunData, frames: list[int], *, unit: str) -> Animation:
     factor = MM_PER_UNIT[run.units] / MM_PER_UNIT[unit]
     groups = run.groups | dict.fromkeys(run.tendons, "tendons")
     colours = run.colours | dict.fromkeys(run.tendons, look.TENDON_COLOUR)
-    muscles = [
-        AnimatedMesh(name, colour, [], [], group=groups[name]) for name, colour in colours.items()
-    ]
+    muscles = []
     bones = []
-    for muscle in muscles:
+    for name, colour in colours.items():
+        muscle = AnimatedMesh(name, colour, [], [], group=groups[name])
         for frame in frames:
-            points, faces = run.mesh(muscle.name, frame)
+            points, faces = run.mesh(name, frame)
             same = muscle.faces and np.array_equal(muscle.faces[0], faces)
             muscle.vertices.append(points * factor)
             muscle.faces.append(muscle.faces[0] if same else faces)
+        given = None if name in run.tendons else run.input_mesh(name)
+        muscles.append(replace(muscle, given=_shown_input(muscle, given, factor)))
     for name in run.bones:
         vertices, faces = run.bone(name)
         poses = np.array([run.frame(frame).poses[name] for frame in frames])
@@ -125,6 +136,15 @@ def read_animation(run: RunData, frames: list[int], *, unit: str) -> Animation:
         direction,
         _animated_fibres(run, frames, factor),
     )
+
+
+def _shown_input(muscle: AnimatedMesh, given: InputMesh | None, factor: float) -> InputMesh | None:
+    """The mesh of a muscle's file, lengths scaled, where it is what is shown in every frame."""
+    if given is None or not muscle.keeps_vertices:
+        return None
+    if not np.array_equal(given.source[given.faces], muscle.faces[0]):
+        return None
+    return given._replace(vertices=factor * given.vertices)
 
 
 def _animated_fibres(run: RunData, frames: list[int], factor: float) -> list[AnimatedFibres]:

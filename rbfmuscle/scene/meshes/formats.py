@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.scene.meshes.input_mesh import NO_CORNERS, Corners, vertex_corners
 from rbfmuscle.scene.meshes.obj import read_obj
 from rbfmuscle.scene.meshes.polydata import read_polydata
 from rbfmuscle.scene.meshes.polygons import cut_polygons
@@ -27,12 +28,15 @@ _SOLID = re.compile(rb"^[ \t]*(end)?solid\b([^\r\n]*)", re.IGNORECASE | re.MULTI
 
 
 class FilePart(NamedTuple):
-    """One mesh of a file: vertices (n, 3), triangles (m, 3), and what was left out or assumed."""
+    """One mesh of a file: vertices (n, 3), triangles (m, 3), what was left out or assumed, and
+    texture coordinates and normals.
+    """
 
     name: str  # empty where the file gives none
     vertices: Floats
     faces: Integers
     notes: list[str]
+    corners: Corners = NO_CORNERS
 
 
 def split_path(path: Path) -> tuple[Path, str]:
@@ -242,7 +246,28 @@ def _read_ply(path, content):
         raise ValueError(f"it has {count} points and no faces{strips}; export its triangles")
     if declared and int(declared[1]) != len(faces):
         return _read_polydata(path, declared=int(declared[1]))
-    return FilePart("", np.asarray(mesh.vertices, np.float64), faces, [])
+    vertices = np.asarray(mesh.vertices, np.float64)
+    return FilePart("", vertices, faces, [], _ply_corners(mesh, faces))
+
+
+def _ply_corners(mesh, faces):
+    """Texture coordinates, by vertex or by corner, and normals of a PLY file."""
+    raw = mesh.metadata.get("_ply_raw", {})
+    vertex, face = (raw.get(name, {}).get("data") for name in ("vertex", "face"))
+    columns = vertex.dtype.names if isinstance(vertex, np.ndarray) else (vertex or ())
+    normals = None
+    if {"nx", "ny", "nz"} <= set(columns):
+        normals = np.stack([vertex[name] for name in ("nx", "ny", "nz")], axis=1)
+    found = vertex_corners(faces, getattr(mesh.visual, "uv", None), normals)
+    fields = face.dtype.names if isinstance(face, np.ndarray) else (face or ())
+    if "texcoord" in fields:
+        pairs = face["texcoord"]
+        pairs = np.asarray(pairs["f1"] if isinstance(face, np.ndarray) else pairs)
+        found = found._replace(texture=NO_CORNERS.texture, texture_faces=NO_CORNERS.texture_faces)
+        if pairs.shape == (len(faces), 6) and np.isfinite(pairs).all():
+            pairs, own = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
+            found = found._replace(texture=pairs.astype(float), texture_faces=own.reshape(-1, 3))
+    return found
 
 
 def _read_polydata(path, declared=0):
@@ -250,11 +275,14 @@ def _read_polydata(path, declared=0):
     whole = int((np.diff(found.ends) > 0).sum())
     if whole < declared:
         raise ValueError(f"it is cut off: it declares {declared} faces and holds {whole}")
-    faces, notes = cut_polygons(found.points, found.ends, found.numbers)
+    places, notes = cut_polygons(found.points, found.ends, found.numbers)
+    faces = found.numbers[places]
     other = max(len(found.line_ends) - 1, 0) + found.single
     if other:
         notes.append(f"{other} lines and points left out")
-    return FilePart("", found.points, faces, notes)
+    return FilePart(
+        "", found.points, faces, notes, vertex_corners(faces, found.texture, found.normals)
+    )
 
 
 def read_vertex_array(path: Path, name: str) -> Floats:

@@ -9,13 +9,14 @@ STRAIGHT = 1e-9
 
 
 def cut_polygons(vertices: Floats, ends: Integers, numbers: Integers) -> tuple[Integers, list[str]]:
-    """Return the triangles (m, 3) of polygons in their order, and notes of what was left out.
+    """Return the triangles of polygons in their order, by the places (m, 3) of their corners in
+    ``numbers``, and notes of what was left out.
 
     ``numbers`` are the vertices of all polygons, one after the other; those of polygon k are
     ``numbers[ends[k] : ends[k + 1]]``. Every corner is kept, on straight sides too, so that
     neighbours still fit.
     """
-    ends, numbers = _without_repeats(ends, numbers)
+    ends, kept = _without_repeats(ends, numbers)
     sizes = np.diff(ends)
     notes = []
     if (sizes < 3).any():
@@ -26,12 +27,13 @@ def cut_polygons(vertices: Floats, ends: Integers, numbers: Integers) -> tuple[I
     crossed = 0
     for size in np.unique(sizes[sizes >= 3]):
         chosen = np.flatnonzero(sizes == size)
-        corners = numbers[ends[chosen][:, None] + np.arange(size)]
+        corners = kept[ends[chosen][:, None] + np.arange(size)]
         first = np.repeat(corners[:, :1], size - 2, axis=1)
         fan = np.stack([first, corners[:, 1:-1], corners[:, 2:]], axis=2)
         if size > 3:
-            for k in np.flatnonzero(~_convex(vertices[corners])):
-                ears = _ears(vertices[corners[k]])
+            points = vertices[numbers[corners]]
+            for k in np.flatnonzero(~_convex(points)):
+                ears = _ears(points[k])
                 crossed += ears is None
                 fan[k] = fan[k] if ears is None else corners[k][ears]
         triangles[place[chosen][:, None] + np.arange(size - 2)] = fan
@@ -41,16 +43,18 @@ def cut_polygons(vertices: Floats, ends: Integers, numbers: Integers) -> tuple[I
 
 
 def _without_repeats(ends: Integers, numbers: Integers) -> tuple[Integers, Integers]:
-    """Polygons of more than three corners without those that repeat the one before."""
+    """Ends and places in ``numbers`` of the corners, of polygons of more than three without those
+    that repeat the one before.
+    """
     sizes = np.diff(ends)
     before = np.arange(len(numbers)) - 1
     full = sizes > 0
     before[ends[:-1][full]] = ends[1:][full] - 1
     again = (numbers == numbers[before]) & np.repeat(sizes > 3, sizes)
     if not again.any():
-        return ends, numbers
+        return ends, np.arange(len(numbers))
     dropped = np.concatenate([[0], np.cumsum(again)])
-    return ends - dropped[ends], numbers[~again]
+    return ends - dropped[ends], np.flatnonzero(~again)
 
 
 def _normals(points):

@@ -12,6 +12,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.solids import outer_surface
 from rbfmuscle.geometry.surfaces import repeated_faces
+from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.validation import MeshError
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ class ReadMesh:
     notes: list[str] = field(default_factory=list)  # what was mended
     closed: bool = True
     source: str = ""  # the file
+    # The mesh of the file, where it is another one or has texture coordinates or normals.
+    given: InputMesh | None = field(default=None, repr=False)
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
