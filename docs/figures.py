@@ -187,17 +187,13 @@ def arms_image():
     parts = []
     for facts in plots:
         markup = arms_plot(facts, colours[facts["muscle"]])
-        wide, high = (float(re.search(rf' {key}="([\d.]+)pt"', markup)[1]) for key in SIZE)
+        wide, high = (float(re.search(rf' {key}="([\d.]+)"', markup)[1]) for key in SIZE)
         x = wide * motions.index(facts["motion"])
         y = high * muscles.index(facts["muscle"])
-        # Within a picture a length has no unit.
-        for key, value in zip(SIZE, (wide, high)):
-            markup = re.sub(rf' {key}="[\d.]+pt"', f' {key}="{value:g}"', markup, count=1)
-        markup = re.sub(r"font-family: [^;]*;", "font-family: sans-serif;", markup)
         markup = " ".join(re.sub(r"(\.\d)\d+", r"\1", markup).split())
         parts.append(markup.replace("<svg", f'<svg x="{x:g}" y="{y:g}"', 1))
     box = f"0 0 {wide * len(motions):g} {high * len(muscles):g}"
-    space = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
+    space = 'xmlns="http://www.w3.org/2000/svg"'
     return "\n".join([f'<svg {space} viewBox="{box}">', *parts, "</svg>", ""])
 
 

@@ -1,44 +1,25 @@
-"""Plots as SVG: lines along a motion, and points of error against time."""
+"""Plots: lines along a motion, and points of error against time."""
 
-import io
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import cycle
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.run_data import RunData
+from rbfmuscle.report import svg
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-
-_SOFT, _LIMIT = "#5f646b", "#a3281f"
-_STYLE = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "rbfmuscle",
-    "font.size": 8.5,
-    "axes.titlesize": 9,
-    "axes.titleweight": "bold",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#b9b5ab",
-    "axes.labelcolor": _SOFT,
-    "xtick.color": _SOFT,
-    "ytick.color": _SOFT,
-    "axes.grid": True,
-    "grid.color": "#e8e6e0",
-    "axes.axisbelow": True,
-    "lines.linewidth": 1.4,
-    "legend.frameon": False,
-    "text.parse_math": False,
-}
-# Height of a row of labels, and width of a letter [inch].
-_ROW, _LETTER = 0.16, 0.075
+_LIMIT = "#a3281f"
+# Width and height of a plot of lines, what lies beside its axes, and height of a row of labels
+# [point].
+_WIDE, _TALL = 302.4, 165.6
+_LEFT, _RIGHT = 36.0, 10.0
+_TOP, _BOTTOM = 18.0, 30.0
+_ROW = 11.5
+# Sides of the axes of a plot of points.
+_FRONT = (331.0, 235.0)
 
 
 class Track(NamedTuple):
@@ -90,48 +71,48 @@ def line_plot(
     ``labels`` are those of the axes, ``limits`` dashed lines; the axis begins at ``zero``; a
     ``legend`` stands below.
     """
-    from matplotlib import style
-    from matplotlib.figure import Figure
+    places = [*(track.x for track in tracks), *(band.x for band in bands)]
+    values = [track.y for track in tracks]
+    values += [edge for band in bands for edge in (band.low, band.high)]
+    x = svg.axis_about(places, _LEFT, _WIDE - _RIGHT)
+    known = [*values, np.array(limits, dtype=float)]
+    y = svg.axis_about(known, _TALL - _BOTTOM, _TOP, margin=0.05)
+    if zero:
+        y = y._replace(low=0.0)
+    parts = [svg.frame(x, y, labels)]
+    parts.append(svg.text(title, _LEFT, _TOP - svg.LETTER, colour="black", bold=True))
+    for limit in limits:
+        ends = y.place([limit, limit])
+        parts.append(svg.line([x.start, x.end], ends, _LIMIT, width=0.8, dashed=True))
+    for band in bands:
+        parts.append(_named(band.name, _band(band, x, y)))
+    for track in tracks:
+        parts.append(_named(track.name, svg.line(x.place(track.x), y.place(track.y), track.colour)))
+    for k, track in enumerate(tracks if legend else ()):
+        height = _TALL + _ROW * (k + 0.5)
+        parts.append(svg.line([4.0, 16.0], [height, height], track.colour))
+        parts.append(svg.text(track.name, 20.0, height, colour="black"))
+    return svg.picture(parts, (_WIDE, _TALL + _ROW * len(tracks) * legend), title)
 
-    tall = 2.3 + _ROW * len(tracks) * legend
-    with style.context(["default", _STYLE]):
-        figure = Figure((4.2, tall))
-        axes = figure.add_axes((0.12, 1.0 - 1.9 / tall, 0.86, 1.65 / tall), xlabel=labels[0])
-        axes.set_title(title, loc="left")
-        axes.set_title(labels[1], loc="right", color=_SOFT, weight="normal")
-        for limit in limits:
-            axes.axhline(limit, color=_LIMIT, linestyle="--", linewidth=0.8)
-        for track in tracks:
-            axes.plot(
-                track.x, track.y, color=track.colour, label=track.name, gid=f"muscle:{track.name}"
-            )
-        for band in bands:
-            _draw_band(axes, band)
-        axes.margins(x=0.0)
-        axes.set_ylim(bottom=0.0 if zero else None)
-        if legend:
-            figure.legend(loc="lower left", handlelength=1.0, labelspacing=0.2)
-        return _svg(figure, title)
+
+def _named(name: str, markup: str) -> str:
+    """Markup that is switched on and off with a muscle."""
+    name = svg.escape(name)
+    return f'<g data-muscle="{name}"><title>{name}</title>{markup}</g>\n'
 
 
-def _draw_band(axes: "Axes", band: Band) -> None:
-    name = f"muscle:{band.name}"
+def _band(band: Band, x: svg.Axis, y: svg.Axis) -> str:
+    """A band as an area, or its edges dashed."""
+    at, edges = x.place(band.x), (y.place(band.low), y.place(band.high))
     if not band.dashed:
-        area = axes.fill_between(band.x, band.low, band.high, alpha=0.2, linewidth=0.0, gid=name)
-        area.set_color(band.colour)
-        return
-    for edge in (band.low, band.high):
-        axes.plot(band.x, edge, color=band.colour, linestyle="--", linewidth=0.8, gid=name)
+        return svg.area(at, *edges, band.colour)
+    return "".join(svg.line(at, edge, band.colour, width=0.8, dashed=True) for edge in edges)
 
 
 def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
     """Markup of error against time on logarithmic axes: each group's front joined, it and the
     default labelled.
     """
-    from matplotlib import style
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
-
     shown = [point for point in points if point.x > 0 and point.y > 0]
     if not shown:
         return ""
@@ -139,68 +120,51 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
     groups = colours if len(colours) > 1 else {}
     named = [point for point in shown if point.star or point.front]
     letters = max((len(text) for text in (*groups, *(point.label for point in named))), default=0)
-    wide, tall = 5.4 + _LETTER * letters, max(3.8, 0.6 + _ROW * (len(named) + len(groups)))
-    with style.context(["default", _STYLE]):
-        figure = Figure((wide, tall))
-        place = (0.6 / wide, 0.45 / tall, 4.6 / wide, 1.0 - 0.55 / tall)
-        axes = figure.add_axes(
-            place, xscale="log", yscale="log", xlabel=labels[0], ylabel=labels[1]
-        )
-        for group, colour in colours.items():
-            front = sorted(point for point in shown if point.front and point.group == group)
-            axes.plot(
-                [point.x for point in front],
-                [point.y for point in front],
-                color=colour,
-                linewidth=1.0,
-            )
-        for point in shown:
-            marker, size = ("*", 13.0) if point.star else ("o", 6.0)
-            shade = colours[point.group] + ("" if point.star or point.front else "66")
-            axes.plot(point.x, point.y, marker, color=shade, markersize=size, markeredgewidth=0.0)
-        for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-            axis.set_major_locator(
-                MaxNLocator(5) if high < 10.0 * low else LogLocator(subs=(1, 2, 5))
-            )
-            axis.set_minor_locator(NullLocator())
-            axis.set_major_formatter("{x:.4g}")
-        _label_beside(axes, named, groups, _ROW / (tall - 0.55))
-        return _svg(figure, f"{labels[1]} against {labels[0]}")
+    tall = max(_FRONT[1], _ROW * (len(named) + len(groups)))
+    x = _logarithmic([point.x for point in shown], _LEFT + 8.0, _LEFT + 8.0 + _FRONT[0])
+    y = _logarithmic([point.y for point in shown], _TOP + tall, _TOP)
+    parts = [svg.frame(x, y, labels)]
+    for group, colour in colours.items():
+        front = sorted(point for point in shown if point.front and point.group == group)
+        places = x.place([point.x for point in front]), y.place([point.y for point in front])
+        parts.append(svg.line(*places, colour, width=1.0))
+    for point in shown:
+        place, opacity = _at(point, x, y), 1.0 if point.star or point.front else 0.4
+        parts.append(svg.mark(*place, colours[point.group], star=point.star, opacity=opacity))
+    parts += _labels_beside([(point, _at(point, x, y)) for point in named], groups, x.end, y)
+    size = x.end + 14.0 + svg.WIDE * letters, _TOP + tall + _BOTTOM
+    return svg.picture(parts, size, f"{labels[1]} against {labels[0]}")
 
 
-def _label_beside(axes, points, groups, row):
-    """Write groups, then the points' labels, below each other beside the plot, each joined to its
-    point.
+def _logarithmic(values: Sequence[float], start: float, end: float) -> svg.Axis:
+    """A logarithmic axis about values."""
+    found = svg.axis_about([np.log10(values)], start, end, margin=0.05)
+    return svg.Axis(10.0**found.low, 10.0**found.high, start, end, logarithmic=True)
+
+
+def _at(point: Point, x: svg.Axis, y: svg.Axis) -> tuple[float, float]:
+    return float(x.place(point.x)), float(y.place(point.y))
+
+
+def _labels_beside(
+    places: Sequence[tuple[Point, tuple[float, float]]],
+    groups: Mapping[str, str],
+    side: float,
+    y: svg.Axis,
+) -> list[str]:
+    """Groups, then the points' labels, below each other beside the plot, each joined to its point
+    at a place.
     """
-    top, whole = 1.0, axes.transAxes
+    top, parts = y.end, []
     for name, colour in groups.items():
-        axes.text(1.04, top, name, color=colour, weight="bold", transform=whole, va="center")
-        top -= row
-    line = {"arrowstyle": "-", "linewidth": 0.5, "color": _SOFT, "shrinkA": 0.0, "shrinkB": 0.0}
-    for k, point in enumerate(sorted(points, key=lambda point: -point.y)):
-        height = whole.inverted().transform(axes.transData.transform((point.x, point.y)))[1]
-        top = max(min(height, top), row * (len(points) - 1 - k))
-        weight = "bold" if point.star else "normal"
-        place = (point.x, point.y), (1.04, top), "data", whole
-        axes.annotate(point.label, *place, arrowprops=line, va="center", weight=weight)
-        top -= row
-
-
-def _svg(figure: "Figure", title: str) -> str:
-    """Markup of a figure, without what only a file of its own needs; lines of muscles bear their
-    names.
-    """
-    from markupsafe import escape
-
-    file = io.BytesIO()
-    figure.savefig(
-        file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    )
-    text = file.getvalue().decode()
-    text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text[text.index("<svg") :])
-    text = re.sub(r'<g id="muscle:([^"]*)">', r'<g data-muscle="\1"><title>\1</title>', text)
-    text = re.sub(r'<g id="[^"]*">', "<g>", text)
-    return text.replace("<svg", f'<svg role="img" aria-label="{escape(title)}"', 1)
+        parts.append(svg.text(name, side + 13.0, top, colour=colour, bold=True))
+        top += _ROW
+    for k, (point, (x, height)) in enumerate(sorted(places, key=lambda found: found[1][1])):
+        top = min(max(height, top), y.start - _ROW * (len(places) - 1 - k))
+        parts.append(svg.line([x, side + 11.0], [height, top], svg.SOFT, width=0.5))
+        parts.append(svg.text(point.label, side + 13.0, top, colour="black", bold=point.star))
+        top += _ROW
+    return parts
 
 
 def motion_axis(saved: RunData) -> tuple[dict[int, float], str]:

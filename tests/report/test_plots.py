@@ -3,18 +3,19 @@ axis."""
 
 import re
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import numpy as np
 
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
 from rbfmuscle.output.writer import Neighbours
 from rbfmuscle.report.plots import Point, Track, front_plot, line_plot
+from rbfmuscle.report.svg import Axis
 
 
 def ticks(svg, anchor):
     """Places of the ticks whose numbers have this anchor, and the numbers."""
-    text = rf"text-anchor: {anchor}[^>]*>([−\d.]+)<"
-    pattern = rf'<use [^>]*x="([\d.]+)" y="([\d.]+)"[^<]*(?:<(?!use)[^<]*)*?{text}'
+    pattern = rf'<text x="([\d.]+)" y="([\d.]+)" text-anchor="{anchor}"[^>]*>([−\d.]+)<'
     return np.array(
         [[float(x.replace("−", "-")) for x in found] for found in re.findall(pattern, svg)]
     )
@@ -57,13 +58,13 @@ def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
         Point(x, y, f"point {k}", "one", k == 0, k % 2 == 0) for k, (x, y) in enumerate(places)
     ]
     svg = front_plot(points, ("ms", "mm"))
-    labels = re.findall(r"x=\"[\d.]+\" y=\"([\d.]+)\"[^>]*>point (\d+)</text>", svg)
+    labels = re.findall(r'x="[\d.]+" y="([\d.]+)"[^>]*>point (\d+)</text>', svg)
     heights, numbers = zip(*((float(y), int(number)) for y, number in labels))
     assert sorted(numbers) == list(range(0, 40, 2))
-    assert np.diff(sorted(heights)).min() > 11.0  # a row is 0.16 inches of 72 pixels high
+    assert np.diff(sorted(heights)).min() > 11.0  # a row is 11.5 points high
     colour = MUSCLE_COLOURS[0]
-    assert len(re.findall(rf"<use [^>]*fill: {colour}", svg)) == 40
-    front = re.search(rf'<path d="([^"]*)"[^>]*stroke: {colour}', svg)[1]
+    assert len(re.findall(rf'<(?:circle|path) [^>]* fill="{colour}"', svg)) == 40
+    front = re.search(rf'<path d="([^"]*)"[^>]*stroke="{colour}"', svg)[1]
     x = np.array(re.findall(r"[ML] ([-\d.]+)", front), dtype=float)
     wanted = np.sort([np.log(point.x) for point in points if point.front])
     np.testing.assert_allclose(
@@ -72,14 +73,45 @@ def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
     assert front_plot([Point(1.0, 0.0, "exact", "one")], ("ms", "mm")) == ""
 
 
-def test_plots_do_not_depend_on_the_users_settings_and_take_any_name():
-    import matplotlib
+def test_ticks_are_round_numbers_within_the_axis_wherever_it_lies():
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        size = 10.0 ** rng.uniform(-14, 8)
+        low = rng.normal() * size
+        axis = Axis(low, low + size, 100.0, 0.0)
+        values = np.array([value for value, _ in axis.ticks(20.0)])
+        assert 2 <= len(values) <= 6
+        assert values[0] >= low - 1e-9 * size and values[-1] <= low + size * (1 + 1e-9)
+        step = float(np.ptp(values)) / (len(values) - 1)
+        digits = step / 10.0 ** np.floor(np.log10(step) + 1e-6)
+        assert min(abs(digits - n) for n in (1.0, 2.0, 5.0)) < 1e-3
+        texts = [float(text) for _, text in axis.ticks(20.0)]
+        if abs(low) < 10 * size:  # of a range far from zero three digits say less
+            np.testing.assert_allclose(texts, values, atol=0.051 * step, rtol=6e-3)
 
-    tracks = [Track("strap", "#cc6677", np.arange(3.0), np.arange(3.0))]
-    plain = line_plot(r"$\frac$", tracks, ("angle", "mm"))
-    with matplotlib.rc_context({"axes.facecolor": "black", "text.color": "white", "font.size": 30}):
-        assert line_plot(r"$\frac$", tracks, ("angle", "mm")) == plain
-    assert r">$\frac$</text>" in plain
+
+def test_a_logarithmic_axis_has_ticks_over_less_than_a_decade_and_over_many():
+    for high in (2.0, 9.0, 30.0, 1e4, 1e12):
+        axis = Axis(1.5, high, 0.0, 200.0, logarithmic=True)
+        values = np.array([value for value, _ in axis.ticks(20.0)])
+        assert 1 <= len(values) <= 11
+        assert values[0] >= 1.5 and values[-1] <= high * (1 + 1e-9)
+
+
+def test_a_plot_of_one_value_or_of_none_has_axes():
+    for values in ([3.0, 3.0], [np.nan, np.nan]):
+        svg = line_plot("a", [Track("b", "#cc6677", np.arange(2.0), np.array(values))], ("x", "y"))
+        assert "nan " not in svg and len(ticks(svg, "end")) > 1
+
+
+def test_any_name_stands_in_a_plot_as_it_is():
+    tracks = [Track('<"strap">', "#cc6677", np.arange(3.0), np.arange(3.0))]
+    found = ElementTree.fromstring(
+        line_plot(r"$\frac$ & <b>", tracks, ("angle", "mm"), legend=True)
+    )
+    assert found.get("aria-label") == r"$\frac$ & <b>"
+    assert '<"strap">' in [group.get("data-muscle") for group in found]
+    assert {r"$\frac$ & <b>", '<"strap">'} <= {element.text for element in found.iter("text")}
 
 
 def test_the_worst_of_neighbours_over_the_frames_is_kept():
