@@ -16,6 +16,15 @@ from rbfmuscle.geometry.exact_distance import (
     record_square,
 )
 from rbfmuscle.geometry.threads import in_chunks
+from rbfmuscle.geometry.triangles import (
+    BX,
+    CX,
+    CY,
+    FACE,
+    INVERSE_BC,
+    INVERSE_CA,
+    nearest_in_frame,
+)
 from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.jit import compiled
 
@@ -262,9 +271,22 @@ class MeshDistance:
         in_chunks(len(points), work)
         return out
 
-    def signed(self, points: ArrayLike, *, near: Integers | None = None) -> Floats:
-        """Distance to the surface, negative inside; as `unsigned`."""
-        return np.where(self.inside(points), -1.0, 1.0) * self.unsigned(points, near=near)
+    def signed(
+        self, points: ArrayLike, *, near: Integers | None = None, simple: bool = False
+    ) -> Floats:
+        """Distance to the surface, negative inside; as `unsigned`.
+
+        Of a ``simple`` surface, one closed piece that nowhere crosses itself, the nearest triangle
+        tells the side of a point that is before or behind it, which is much faster.
+        """
+        points = _as_points(points)
+        near = np.full(len(points), -1) if near is None else near
+        distance, side = self.unsigned(points, near=near), np.zeros(len(points))
+        if simple:
+            _side_loop(points, self._exact.records, near, side)
+        unsure = side == 0.0
+        side[unsure] = np.where(self.inside(points[unsure]), -1.0, 1.0)
+        return side * distance
 
     def nearest(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Distance (n,) on the side of the nearest face, nearest point (n, 3) and outward
@@ -297,3 +319,25 @@ def _distance_loop(points, tree, near, out):
         square = np.inf if best < 0 else record_square(tree.records, best, x, y, z)
         best, square = nearest_triangle(tree, (x, y, z), best, square, 0.0, stack)
         near[i], out[i] = best, np.sqrt(square)
+
+
+@compiled
+def _side_loop(points, records, near, side):
+    """1 before and -1 behind the triangle nearest to each point, where it projects into that
+    triangle.
+    """
+    for i in range(len(points)):
+        record = records[near[i]]
+        u = 0.0
+        v = 0.0
+        w = 0.0
+        for k in range(3):
+            offset = points[i, k] - record[k]
+            u += offset * record[3 + k]
+            v += offset * record[6 + k]
+            w += offset * record[9 + k]
+        feature = nearest_in_frame(
+            record[BX], record[CX], record[CY], record[INVERSE_BC], record[INVERSE_CA], u, v
+        )[2]
+        if feature == FACE:
+            side[i] = 1.0 if w >= 0.0 else -1.0

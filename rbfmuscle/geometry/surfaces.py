@@ -295,20 +295,40 @@ def mesh_hash(vertices: Floats, faces: Integers) -> str:
     return hashlib.sha256(points.tobytes() + corners.tobytes()).hexdigest()
 
 
+class EdgeLengths:
+    """Lengths (e,) of the edges of vertices (n, 3) and faces (m, 3), over those at rest; edges
+    without a length there are left out.
+    """
+
+    def __init__(self, rest: Floats, faces: Integers) -> None:
+        edges = unique_edges(faces)
+        lengths = edge_lengths(rest, edges)
+        self.edges = edges[lengths > 0.0]
+        inverse = 1.0 / lengths[lengths > 0.0]
+        rows, shape = np.arange(len(self.edges)), (len(self.edges), len(rest))
+        places = np.tile(rows, 2), self.edges.T.ravel()
+        #: Sparse (e, n), from vertices to edges in units of their lengths at rest.
+        self._vectors = coo_matrix((np.concatenate([inverse, -inverse]), places), shape).tocsr()
+
+    def __call__(self, now: Floats) -> Floats:
+        """The lengths at vertices (n, 3)."""
+        vectors = self._vectors @ now
+        return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+
+
 class EdgeStretch:
     """Mean change of length (n,) of the edges about each vertex, relative to vertices (n, 3) and
     faces (m, 3) at rest.
     """
 
     def __init__(self, rest: Floats, faces: Integers) -> None:
-        self._edges = unique_edges(faces)
-        self._lengths = edge_lengths(rest, self._edges)
-        self._ends = self._edges.T.ravel()
+        self._lengths = EdgeLengths(rest, faces)
+        self._ends = self._lengths.edges.T.ravel()
         self._count = np.maximum(np.bincount(self._ends, minlength=len(rest)), 1)
 
     def __call__(self, now: Floats) -> Floats:
         """The change at vertices (n, 3)."""
-        change = edge_lengths(now, self._edges) / self._lengths - 1.0
+        change = self._lengths(now) - 1.0
         return np.bincount(self._ends, np.tile(change, 2), len(now)) / self._count
 
 

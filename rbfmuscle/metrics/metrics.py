@@ -4,13 +4,12 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import edge_lengths, label_sheets, mesh_volume, unique_edges
+from rbfmuscle.geometry.surfaces import EdgeLengths, label_sheets, mesh_volume
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
 from rbfmuscle.metrics.depths import bone_depth, surface_depth
@@ -87,7 +86,7 @@ class MuscleMeasurer:
         self.mesh = muscle.mesh
         self.attachments = muscle.attachments
         self.rest_volume = float(muscle.mesh.volume)
-        self.edges = _edge_operator(vertices, faces)
+        self.edges = EdgeLengths(vertices, faces)
         #: What is measured once, with the first frame.
         self.first: dict[str, float] = {}
         self.ends = [
@@ -120,9 +119,7 @@ class MuscleMeasurer:
             found.update({q: surface.quantities[q] for q in _FROM_MODEL if q in surface.quantities})
         mine = [event for event in frame.events if event.muscle == self.name]
         found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
-        edges = self.edges @ carried
-        stretch = np.sqrt(np.einsum("ij,ij->i", edges, edges))
-        found["edge_strain_rms"] = math.sqrt(np.mean((stretch - 1.0) ** 2))
+        found["edge_strain_rms"] = math.sqrt(np.mean((self.edges(carried) - 1.0) ** 2))
         if self.line is not None:
             belly, found["bowing"] = self.line.measure(carried, frame.poses, probes)
             if self.line.unsettled:
@@ -149,17 +146,18 @@ class MuscleMeasurer:
         self.distance = MeshDistance(vertices, faces, layout=layout)
         volume = mesh_volume(vertices, faces)
         depth = surface_depth(vertices, probes, poses)
+        form = self.form.measure(surface, same_faces=same)
         return {
             "volume": volume,
             "volume_error": volume / self.rest_volume - 1.0,
             "penetration_max": depth.max(),
             "penetration_fraction": np.mean(depth > 0.0),
             "bone_penetration_max": bone_depth(self.distance, probes, poses),
-            **self.form.measure(surface, same_faces=same),
-            **self._flicker(carried, vertices, same),
+            **form,
+            **self._flicker(carried, vertices, same, self.form.simple),
         }
 
-    def _flicker(self, carried, vertices, same):
+    def _flicker(self, carried, vertices, same, simple):
         """Change of the signed distances of the carried vertices to the surface; of a mesh that is
         shown, none.
         """
@@ -167,7 +165,10 @@ class MuscleMeasurer:
             return {}
         if self.near is None or not same:
             self.near = np.full(len(carried), -1)
-        before, self.offset = self.offset, self.distance.signed(carried, near=self.near)
+        before, self.offset = (
+            self.offset,
+            self.distance.signed(carried, near=self.near, simple=simple),
+        )
         return {"flicker": np.abs(self.offset - before).max() if before is not None else 0.0}
 
     def measure_rest(
@@ -205,18 +206,6 @@ class MuscleMeasurer:
             found["thickness"] = self.line.section(*mesh, poses)["belly_thickness"]
             found["bowing_at_rest"] = self.line.measure(self.carried, poses, probes)[1]
         self.at_rest = found
-
-
-def _edge_operator(vertices: Floats, faces: Integers) -> sparse.csr_matrix:
-    """Sparse matrix (e, n) that maps vertices to edge vectors in units of their lengths at rest."""
-    edges = unique_edges(faces)
-    lengths = edge_lengths(vertices, edges)
-    edges, lengths = edges[lengths > 0.0], lengths[lengths > 0.0]
-    rows, inverse = np.arange(len(edges)), 1.0 / lengths
-    places = np.tile(rows, 2), edges.T.ravel()
-    return sparse.csr_matrix(
-        (np.concatenate([inverse, -inverse]), places), (len(edges), len(vertices))
-    )
 
 
 def carried_shift(points: Floats, at: Floats, shift: Floats) -> Floats:
@@ -277,3 +266,9 @@ class SurfaceForm:
             self._found["self_crossings"] = int(self._tree.crossing(vertices).sum())
         self._drawn = drawn
         return dict(self._found)
+
+    @property
+    def simple(self) -> bool:
+        """Whether the last surface was one closed piece that nowhere crosses itself."""
+        closed = self._tree is not None and self._tree.arrays.closed
+        return closed and self._found["components"] == 1 and not self._found["self_crossings"]

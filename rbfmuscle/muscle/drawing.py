@@ -314,7 +314,7 @@ class _BoneCut:
         self.contacts, self.reach = contacts, reach
 
     def __call__(self, points: Floats) -> Floats:
-        return self.contacts.nearest(points, self.reach)[0]
+        return self.contacts.distance(points, self.reach)
 
     def value_and_gradient_below(self, points: Floats, limit: Floats) -> tuple[Floats, Floats]:
         return self.contacts.nearest(points, limit)

@@ -57,6 +57,6 @@ class RunArrays:
         found = self._first[name].of(mesh)
         contacts = frame.contacts.get(name)
         if contacts is not None and contacts.reached:
-            distance, _ = contacts.nearest(surface.vertices, self._farthest)
+            distance = contacts.distance(surface.vertices, self._farthest)
             found["bone_distance"] = np.minimum(distance, self._farthest)
         return found | dict(surface.arrays)

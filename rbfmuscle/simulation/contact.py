@@ -183,6 +183,16 @@ class BoneContacts:
         direction_loop(points, gradient, pose, self.boxes[self._row[bone_index]])
         return distance, gradient
 
+    def distance(self, points: ArrayLike, limit: Floats | float = np.inf) -> Floats:
+        """Smallest distance (n,) over bones; parameters and result as for `nearest`."""
+        points = check_points(points)
+        smallest, met = self._in_reach(points, limit)
+        for b in met:
+            pose, reach = self.poses[self.names[b]], np.minimum(smallest, limit)
+            found = self.fields[b].distance(points, pose=pose, reach=reach)
+            np.minimum(smallest, found, out=smallest)
+        return smallest
+
     def nearest(self, points: ArrayLike, limit: Floats | float = np.inf) -> tuple[Floats, Floats]:
         """Smallest distance (n,) over bones, and its gradient (n, 3) in world axes, for clipping.
 
@@ -190,18 +200,23 @@ class BoneContacts:
         number or (n,), it is only a lower bound above the limit, without a gradient.
         """
         points = check_points(points)
-        apart = np.empty(len(self.reached))
-        apart_loop(points, self.placed, self.boxes, apart)
-        far = apart > np.max(limit, initial=0.0)
-        smallest, gradient = (
-            np.full(len(points), apart[far].min(initial=np.inf)),
-            np.zeros((len(points), 3)),
-        )
-        for b in np.array(self.reached, dtype=int)[~far].tolist():
+        smallest, met = self._in_reach(points, limit)
+        gradient = np.zeros((len(points), 3))
+        for b in met:
             # No farther than what was found: elsewhere a lower bound will do.
             found = self.distance_and_direction(points, b, np.minimum(smallest, limit))
             closer_loop(*found, smallest, gradient)
         return smallest, gradient
+
+    def _in_reach(self, points: Floats, limit: Floats | float) -> tuple[Floats, list[int]]:
+        """Lower bound (n,) of the distances to bones farther than ``limit``, and the other
+        bones.
+        """
+        apart = np.empty(len(self.reached))
+        apart_loop(points, self.placed, self.boxes, apart)
+        far = apart > np.max(limit, initial=0.0)
+        bound = np.full(len(points), apart[far].min(initial=np.inf))
+        return bound, np.array(self.reached, dtype=int)[~far].tolist()
 
     def excess(self, points: Floats) -> Floats:
         """How far (n,) points (n, 3) of the surface are to move inwards for sliding neighbours

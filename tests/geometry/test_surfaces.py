@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.geometry.surfaces import (
+    EdgeLengths,
     edge_lengths,
     face_normals,
     farthest_move,
@@ -54,6 +55,7 @@ def test_everything_turns_and_scales_with_the_mesh():
     np.testing.assert_allclose(
         edge_lengths(moved, edges), scale * edge_lengths(VERTICES, edges), rtol=1e-11
     )
+    np.testing.assert_allclose(EdgeLengths(VERTICES, FACES)(moved), scale, rtol=1e-11)
     assert mesh_volume(moved, FACES) == pytest.approx(scale**3 * 24.0)
     assert mesh_volume(VERTICES, FACES[:, ::-1]) == pytest.approx(-24.0)
 

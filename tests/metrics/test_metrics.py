@@ -85,6 +85,12 @@ class TestMeshDistance:
         ]  # near zero both round a squared distance
         np.testing.assert_allclose(MeshDistance(*arrays(blob)).signed(points), expected, atol=1e-9)
 
+    @pytest.mark.parametrize("spread", [1e-6, 0.1, 3.0])
+    def test_sides_of_a_simple_surface_are_those_by_winding(self, blob, spread):
+        noise = np.random.default_rng(3).normal(scale=spread, size=blob.vertices.shape)
+        points, distance = np.array(blob.vertices) + noise, MeshDistance(*arrays(blob))
+        np.testing.assert_array_equal(distance.signed(points, simple=True), distance.signed(points))
+
     def test_triangles_near_from_the_frame_before_change_no_distance(self, blob):
         vertices, faces = arrays(blob)
         points = vertices + np.random.default_rng(5).normal(scale=0.3, size=vertices.shape)

@@ -95,6 +95,7 @@ def test_nearest_is_the_smallest_over_bones_and_infinite_without():
     assert 0 < below.sum() < len(points)
     assert np.array_equal(found[below], distance[below])
     assert np.array_equal(slope[below], gradient[below])
+    assert np.array_equal(contacts.distance(points, limit), found)
     assert np.all(found[~below] >= limit[~below]) and np.all(found <= distance + 1e-9)
 
 
