@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from fuzz.meshes import write_mesh
 
-from rbfmuscle.scene.meshes.read import read_mesh
+from rbfmuscle.scene.meshes.read import prepare_mesh, read_mesh
 from rbfmuscle.validation import MeshError
 
 
@@ -171,3 +171,23 @@ class TestUnusable:
             with pytest.raises(MeshError, match=f"junk\\{suffix}"):
                 read_mesh(path)
         assert capfd.readouterr().err == ""
+
+
+def test_a_mended_mesh_is_kept_and_comes_back_alike(tmp_path, monkeypatch):
+    monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path))
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    faces = np.vstack([mesh.faces[:, ::-1], mesh.faces[:1]])  # inside out, one twice
+    given = {"context": "a.stl", "name": "a"}
+    first, again = (prepare_mesh(np.array(mesh.vertices), faces, **given) for _ in range(2))
+    for name in ("vertices", "faces", "vertex_map"):
+        one, other = getattr(first, name), getattr(again, name)
+        np.testing.assert_array_equal(one, other)
+        assert one.dtype == other.dtype and one.flags.c_contiguous == other.flags.c_contiguous
+    assert len(first.notes) == 2 and (first.notes, first.closed) == (again.notes, again.closed)
+    (entry,) = tmp_path.iterdir()
+    arrays = dict(np.load(entry)) | {"notes": np.array("kept")}
+    with entry.open("wb") as file:
+        np.savez(file, **arrays)
+    assert prepare_mesh(np.array(mesh.vertices), faces, **given).notes == ["kept"]
+    moved = prepare_mesh(np.array(mesh.vertices) + 1.0, faces, **given)
+    np.testing.assert_allclose(moved.vertices, first.vertices + 1.0)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import igl
 import numpy as np
 
+from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.solids import outer_surface
 from rbfmuscle.geometry.surfaces import repeated_faces
@@ -27,6 +28,7 @@ MOST_TWISTED = 0.3  # of the area: of more it cannot be said what is inside
 WINDING_SAMPLES = 1500  # triangles asked, before and behind them by a small share of their size:
 WINDING_STEP = 1e-3  # of the root of twice the area
 MOST_WRONG = 0.01  # of the triangles of a bone, dropped where no surface can be made of them
+LEAST_KEPT = 1000  # triangles: smaller meshes are mended as fast as the cache is read
 CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are dropped
 
 
@@ -59,8 +61,24 @@ def repair(
     each message.
 
     Holes and several parts are kept where it ``may_be_open`` (bones), and refused by a MeshError
-    elsewhere.
+    elsewhere. What was mended of a large mesh is kept in the cache.
     """
+    if len(faces) < LEAST_KEPT:
+        return _mend(vertices, faces, context=context, may_be_open=may_be_open)
+    key = content_key(vertices, faces, ("mended", may_be_open))
+    kept = load_arrays(key)
+    if kept is not None:
+        notes = [note for note in str(kept["notes"]).split("\n") if note]
+        arrays = kept["vertices"], kept["faces"], kept["vertex_map"]
+        return ReadMesh(*arrays, notes, closed=bool(kept["closed"]))
+    state = _mend(vertices, faces, context=context, may_be_open=may_be_open)
+    found = {name: getattr(state, name) for name in ("vertices", "faces", "vertex_map", "closed")}
+    store_arrays(key, {**found, "notes": "\n".join(state.notes)})
+    return state
+
+
+def _mend(vertices, faces, *, context, may_be_open):
+    """What `repair` returns."""
     bad = repeated_faces(faces)
     state = ReadMesh(vertices, faces[~bad], np.arange(len(vertices)))
     unused = len(vertices) - len(np.unique(faces))
