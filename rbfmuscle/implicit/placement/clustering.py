@@ -15,7 +15,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.surfaces import face_normals, opposite_half_edges, unique_edges
+from rbfmuscle.geometry.surfaces import (
+    face_normals,
+    opposite_half_edges,
+    unique_edges,
+    vertex_areas,
+)
 from rbfmuscle.jit import compiled
 from rbfmuscle.validation import MeshError
 
@@ -24,10 +29,18 @@ FINENESS = 2.5
 
 
 class FineMesh(NamedTuple):
-    """The input mesh with its long edges split."""
+    """The input mesh with its long edges split, and its vertices' neighbours: those of v are
+    ``other[start[v]:start[v + 1]]``.
+    """
 
-    vertices: Floats
-    faces: Integers
+    vertices: Floats  # (n, 3)
+    faces: Integers  # (m, 3)
+    edges: Integers  # (e, 2)
+    start: Integers  # (n + 1,)
+    tail: Integers  # (2e,) the vertex of each neighbour
+    other: Integers  # (2e,)
+    length: Floats  # (2e,) of the edge to each neighbour
+    area: Floats  # (n,) that each vertex stands for
 
 
 def refine_mesh(vertices: Floats, faces: Integers, count: int) -> FineMesh:
@@ -40,8 +53,20 @@ def refine_mesh(vertices: Floats, faces: Integers, count: int) -> FineMesh:
         )
         long = np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1) > limit
         if not long.any():
-            return FineMesh(vertices, faces)
+            return _with_neighbours(vertices, faces)
         vertices, faces = _split_edges(vertices, faces, sides, long)
+
+
+def _with_neighbours(vertices: Floats, faces: Integers) -> FineMesh:
+    edges = unique_edges(faces)
+    tail = edges.T.ravel()
+    order = np.argsort(tail, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(tail, minlength=len(vertices)))])
+    tail, other = tail[order], edges[:, ::-1].T.ravel()[order]
+    length = np.linalg.norm(vertices[tail] - vertices[other], axis=1)
+    return FineMesh(
+        vertices, faces, edges, start, tail, other, length, vertex_areas(vertices, faces)
+    )
 
 
 def _split_edges(
@@ -82,22 +107,15 @@ def cluster_mesh(
     fine: FineMesh, density: Floats, count: int, seed: int
 ) -> tuple[Integers, Integers]:
     """Cells of equal ``density`` times area, and the triangulation dual to them."""
-    area = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1)
-    weight = np.bincount(fine.faces.ravel(), np.repeat(area / 3, 3), len(fine.vertices)) * density
-    edges = unique_edges(fine.faces)
-    # Rows of neighbours: those of v are other[start[v]:start[v + 1]].
-    tail = np.concatenate([edges[:, 0], edges[:, 1]])
-    order = np.argsort(tail, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(tail, minlength=len(fine.vertices)))])
-    tail, other = tail[order], np.concatenate([edges[:, 1], edges[:, 0]])[order]
-    length = np.linalg.norm(fine.vertices[tail] - fine.vertices[other], axis=1)
+    weight = fine.area * density
+    start, tail, other = fine.start, fine.tail, fine.other
     stretch = np.sqrt(density)
-    length *= 0.5 * (stretch[tail] + stretch[other])
+    length = fine.length * 0.5 * (stretch[tail] + stretch[other])
     used = np.flatnonzero(np.diff(start) > 0)
     first = used[np.random.default_rng(seed).integers(len(used))]
     labels = np.full(len(fine.vertices), -1)
     _farthest_loop(start, other, length, first, count, labels)
-    _equalise_loop(fine.vertices - fine.vertices.mean(axis=0), weight, edges, labels, count)
+    _equalise_loop(fine.vertices - fine.vertices.mean(axis=0), weight, fine.edges, labels, count)
     _mark_loose(tail, other, weight, labels, count)
     _join_loop(start, other, labels)
     return contract_clusters(fine.faces, labels, weight, count)
