@@ -16,9 +16,12 @@ stretch   of fibres, 5th and 95th percentile over all poses; beside it that of t
 """
 
 import argparse
+import tempfile
+from pathlib import Path
 
 import numpy as np
 from evidence import data_folder, write_evidence
+from leg_tendons import convert
 
 from rbfmuscle.fibres.published import published_band
 from rbfmuscle.run import simulate
@@ -35,7 +38,7 @@ DATA = {
         {"flexion": "flexion", "adduction": "adduction", "rotation": "internal_rotation"},
     ),
     "leg": (
-        "tendons/leg.toml",
+        "leg.toml",
         {name: f"hip_{name}" for name in RANGES},
     ),
 }
@@ -45,9 +48,18 @@ PICTURED = "leg"  # the other data may not be
 MUSCLES = ("psoas_major", "iliacus", "gluteus_maximus", "gluteus_medius")
 
 
-def moving(file, coordinate, ends):
+def loaded(data):
+    """The scene of a data folder, with tendons where it has bellies that end before their bones."""
+    file = data_folder(data) / DATA[data][0]
+    if data != "leg":
+        return Scene.load(file)
+    with tempfile.TemporaryDirectory() as folder:
+        return Scene.load(convert(file, Path(folder)))
+
+
+def moving(data, coordinate, ends):
     """A scene in which one coordinate moves, with the muscles of the table."""
-    scene = Scene.load(file)
+    scene = loaded(data)
     angles = np.radians(np.arange(ends[0], ends[1] + 0.5 * STEP, STEP))
     scene.motion = Motion([{coordinate: float(angle)} for angle in angles])
     scene.muscles = [muscle for muscle in scene.muscles if muscle.name in MUSCLES]
@@ -94,11 +106,10 @@ def compared(run, muscle, coordinate, offset):
 
 def table(data, model, settings):
     """Measures by muscle and motion."""
-    file, names = DATA[data]
     found = {}
-    for motion, name in names.items():
+    for motion, name in DATA[data][1].items():
         coordinate = f"hip.{name}"
-        scene = moving(data_folder(data) / file, coordinate, RANGES[motion])
+        scene = moving(data, coordinate, RANGES[motion])
         asked = {"output.fibres": FIBRES, **settings}
         run = simulate(scene, model=model, settings=asked)
         for muscle in run.muscles:

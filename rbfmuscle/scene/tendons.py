@@ -132,13 +132,28 @@ class TendonEnd:
 
     @cached_property
     def _sides(self) -> list[Floats]:
-        """Directions (3,) at rest out of the nearest bone, on whose side each leg of the string
-        passes the bones.
+        """Directions (3,) at rest on whose side each leg of the string passes the bones: out of the
+        nearest bone, or towards the belly's end where the string then passes it at less than half
+        the distance.
         """
         stops = [point for _, point in (*self.other, *self.line)]
         places = [0.5 * (a + b) for a, b in itertools.pairwise(stops)]
-        places[len(self.other) - 1] = self.middle
-        return [self._outwards(*leg) for leg in zip(places, stops, stops[1:])]
+        leg = len(self.other) - 1
+        places[leg] = self.middle
+        sides = [self._outwards(*leg) for leg in zip(places, stops, stops[1:])]
+        own = _across(self.middle - stops[leg], stops[leg + 1] - stops[leg])
+        if self._beside(own) < 0.5 * self._beside(sides[leg]):
+            sides[leg] = own
+        return sides
+
+    def _beside(self, side: Floats) -> float:
+        """Distance at rest from the belly's end of its leg of the string, passing bones on a side
+        (3,).
+        """
+        stops = [*self.other, *self.line][len(self.other) - 1 :][:2]
+        (leg,) = self._legs([point for _, point in stops], stops, [side], AT_REST)
+        places = np.linspace(0.0, line_length(leg), NODES)
+        return float(np.linalg.norm(points_along(leg, places) - self.middle, axis=1).min())
 
     def _outwards(self, place: Floats, start: Floats, end: Floats) -> Floats:
         """Unit direction (3,) across a leg, out of or away from the bone nearest to a place (3,),
@@ -146,9 +161,7 @@ class TendonEnd:
         """
         found = (bone.nearest(place[None]) for bone in self.obstacles)
         distance, closest = min(((float(d[0]), c[0]) for d, c in found), key=lambda one: one[0])
-        way, along = place - closest if distance > 0.0 else closest - place, end - start
-        way = way - (way @ along) / max(float(along @ along), 1e-300) * along
-        return way / max(float(np.linalg.norm(way)), 1e-300)
+        return _across(place - closest if distance > 0.0 else closest - place, end - start)
 
     def place(self, poses: Mapping[str, Floats]) -> tuple[TendonLine, Floats]:
         """The tendon, and the pose (4, 4) of the belly's end from rest to world, at poses (4, 4) of
@@ -286,6 +299,12 @@ def _depths(bone: Bone, points: Floats) -> Floats:
     if np.any(points.min(axis=0) > high) or np.any(points.max(axis=0) < low):
         return np.zeros(len(points))
     return np.maximum(-bone.nearest(points)[0], 0.0)
+
+
+def _across(way: Floats, along: Floats) -> Floats:
+    """Unit direction (3,) of the part of one vector across another."""
+    way = way - (way @ along) / max(float(along @ along), 1e-300) * along
+    return np.asarray(way / max(float(np.linalg.norm(way)), 1e-300))
 
 
 def _moved(bone: str, point: Floats, poses: Mapping[str, Floats]) -> Floats:

@@ -16,7 +16,7 @@ from rbfmuscle.output.appearance import LONGEST_TAPER, TAPER, tendon_mesh
 from rbfmuscle.run import Run
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.tendons import STIFFNESS_RATIO, TendonLine, taut_line
+from rbfmuscle.scene.tendons import AT_REST, STIFFNESS_RATIO, TendonEnd, TendonLine, taut_line
 
 
 def placed(scene, bend, turn=0.0):
@@ -96,6 +96,32 @@ def test_a_taut_line_around_a_cylinder_is_two_tangents_and_an_arc():
         *ends, np.array([0.0, 0.0, -1.0]), [(np.eye(4), points + [0, 0, 50.0])], 5.0
     )
     np.testing.assert_array_equal(straight, ends)
+
+
+def test_a_string_passes_bones_on_the_side_of_the_bellys_end():
+    scene = rm.Scene("head and post", units="mm")
+    turn = trimesh.transformations.rotation_matrix(0.5 * np.pi, [0.0, 1.0, 0.0])
+    scene.add_bone("head", trimesh.creation.cylinder(20.0, 40.0, sections=360, transform=turn))
+    post = trimesh.creation.cylinder(2.0, 30.0).apply_translation([8.0, -30.0, 0.0])
+    scene.add_bone("post", post)
+    middle = np.array([0.0, -30.0, 0.0])
+    end = TendonEnd(
+        name="end",
+        patch=middle[None],
+        middle=middle,
+        radii=(1.0, 1.0),
+        line=[("head", np.array([0.0, 0.0, -60.0]))],
+        other=[("post", np.array([0.0, 0.0, 80.0]))],
+        obstacles=scene.bones,
+    )
+    # The post is nearer, but out of it the string would go around the flat end of the head.
+    (string,) = end._string(AT_REST)
+    tangents = math.sqrt(80.0**2 - 20.0**2) + math.sqrt(60.0**2 - 20.0**2)
+    turned = math.asin(20.0 / 80.0) + math.asin(20.0 / 60.0)
+    # Points of the head are up to 1 mm beside the string's plane, and count as 0.5 mm lower.
+    assert line_length(string) == pytest.approx(tangents + 20.0 * turned, rel=5e-3)
+    assert string[:, 1].min() == pytest.approx(-20.0, abs=0.5)
+    np.testing.assert_allclose(string[:, 0], 0.0, atol=1e-9)
 
 
 def test_the_end_of_a_limb_bent_backwards_goes_around_the_joint_continuously():
