@@ -47,7 +47,7 @@ TENDONS = {
     "vastus_intermedius patella": {"to": [-652.0, -468.0, 529.0]},
     "vastus_medialis patella": {"to": [-621.0, -481.0, 516.0]},
     "vastus_lateralis patella": {"to": [-656.0, -471.0, 521.0]},
-    # The belly ends before the femoral head; its tendon runs on to the tip of the lesser trochanter.
+    # The belly ends before the femoral head, its tendon at the tip of the lesser trochanter.
     "psoas_major femur": {"to": [-638.5, -426.0, 830.0]},
     "tibialis_anterior foot": {
         "to": [-570.5, -441.5, 97.0],

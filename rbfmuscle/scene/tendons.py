@@ -29,6 +29,7 @@ from rbfmuscle.scene.joints.joint import rotation_about
 # (Zajac 1989), and the tendon's strain over the belly's.
 BELLY_STRAIN = 0.6
 STIFFNESS_RATIO = TENDON_STRAIN / BELLY_STRAIN
+SHORTER = 0.9  # a string so much shorter on the belly's side passes bones there
 CHORD = 0.06  # the string's direction is that of a chord so long, in lengths of the string
 # Steps to the place of the end where its tendon has the wanted length, and the relative error that
 # ends them.
@@ -133,8 +134,7 @@ class TendonEnd:
     @cached_property
     def _sides(self) -> list[Floats]:
         """Directions (3,) at rest on whose side each leg of the string passes the bones: out of the
-        nearest bone, or towards the belly's end where the string then passes it at less than half
-        the distance.
+        nearest bone, or towards the belly's end where the string is shorter by a tenth that way.
         """
         stops = [point for _, point in (*self.other, *self.line)]
         places = [0.5 * (a + b) for a, b in itertools.pairwise(stops)]
@@ -142,18 +142,15 @@ class TendonEnd:
         places[leg] = self.middle
         sides = [self._outwards(*leg) for leg in zip(places, stops, stops[1:])]
         own = _across(self.middle - stops[leg], stops[leg + 1] - stops[leg])
-        if self._beside(own) < 0.5 * self._beside(sides[leg]):
+        if self._past_end(own) < SHORTER * self._past_end(sides[leg]):
             sides[leg] = own
         return sides
 
-    def _beside(self, side: Floats) -> float:
-        """Distance at rest from the belly's end of its leg of the string, passing bones on a side
-        (3,).
-        """
+    def _past_end(self, side: Floats) -> float:
+        """Length at rest of the string's leg past the belly's end, passing bones on a side (3,)."""
         stops = [*self.other, *self.line][len(self.other) - 1 :][:2]
         (leg,) = self._legs([point for _, point in stops], stops, [side], AT_REST)
-        places = np.linspace(0.0, line_length(leg), NODES)
-        return float(np.linalg.norm(points_along(leg, places) - self.middle, axis=1).min())
+        return line_length(leg)
 
     def _outwards(self, place: Floats, start: Floats, end: Floats) -> Floats:
         """Unit direction (3,) across a leg, out of or away from the bone nearest to a place (3,),

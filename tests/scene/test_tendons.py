@@ -101,7 +101,7 @@ def test_a_taut_line_around_a_cylinder_is_two_tangents_and_an_arc():
 def test_a_string_passes_bones_on_the_side_of_the_bellys_end():
     scene = rm.Scene("head and post", units="mm")
     turn = trimesh.transformations.rotation_matrix(0.5 * np.pi, [0.0, 1.0, 0.0])
-    scene.add_bone("head", trimesh.creation.cylinder(20.0, 40.0, sections=360, transform=turn))
+    scene.add_bone("head", trimesh.creation.cylinder(20.0, 100.0, sections=360, transform=turn))
     post = trimesh.creation.cylinder(2.0, 30.0).apply_translation([8.0, -30.0, 0.0])
     scene.add_bone("post", post)
     middle = np.array([0.0, -30.0, 0.0])
