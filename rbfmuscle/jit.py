@@ -43,7 +43,9 @@ def compiled(function: Callable | None = None, **options: object) -> Callable:
         return function
     # No loop is an argument of another: the wrapper for that, an eighth of the time of compiling,
     # is left out.
-    loop = numba.njit(**{"nogil": True, "no_cfunc_wrapper": True, "_nrt": True, **options})(function)
+    loop = numba.njit(**{"nogil": True, "no_cfunc_wrapper": True, "_nrt": True, **options})(
+        function
+    )
     loop._compiler.compile = _no_collection()(loop._compiler.compile)
     loop.get_call_template = _of_plain_types(loop.get_call_template)
     loop._cache = _LoopCache(function)

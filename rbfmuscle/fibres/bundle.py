@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rbfmuscle.fibres.trace import POINTS, trace_fibres
 from rbfmuscle.geometry.arrays import Floats, Integers
@@ -11,7 +12,7 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import moving_joints, split_ends
 from rbfmuscle.metrics.depths import bones_about
-from rbfmuscle.scene.objects import Attachment, Muscle
+from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import NODES, TendonLine
 from rbfmuscle.simulation.frame import FibreLines, MuscleModel
@@ -24,22 +25,31 @@ class FibreBundle:
     """Fibres of a muscle at rest, and what carries them.
 
     Inner points go with the material, as the ``model`` says; the ends go with the bones, or with
-    the ends of tendons, that hold the patches they lie on.
+    the ends of tendons, that hold the patches they lie on. Where the muscle has aponeuroses the
+    ends of fibres lie on these and go with the material, and a straight line joins each to the
+    nearest point that a bone holds.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene, model: MuscleModel, count: int) -> None:
         mesh = MeshDistance(muscle.mesh.vertices, muscle.mesh.faces)
         groups = split_ends(muscle, scene.joints, moving_joints(scene))
-        patches = [_end_points(mesh, group) for group in groups]
+        patches = [_end_points(mesh, [a.vertices for a in group]) for group in groups]
+        sheets = [_end_points(mesh, [patch])[0] for patch in muscle.aponeuroses]
         probes = [bone.exact for bone in scene.bones]
         near = bones_about(mesh.vertices, probes, {probe.name: np.eye(4) for probe in probes})
-        ends = (patches[0][0], patches[1][0])
-        traced = trace_fibres(mesh, ends, count, polylines=muscle.fibres, bones=near)
+        first, last = sheets or [points for points, _ in patches]
+        traced = trace_fibres(mesh, (first, last), count, polylines=muscle.fibres, bones=near)
         self.rest = traced.lines
         self.holders = [a.attachment_frame for group in groups for a in group]
-        first = patches[0][1][traced.ends[:, 0]]
-        last = len(groups[0]) + patches[1][1][traced.ends[:, 1]]
-        self._held = np.stack([first, last], axis=1)  # place in holders of each end
+        self.pennate = bool(sheets)
+        held = [
+            cKDTree(points).query(self.rest[:, place])[1]
+            for (points, _), place in zip(patches, (0, -1))
+        ]
+        # Where a bone holds each end (N, 2, 3) at rest, and the place of that bone in holders.
+        self._anchors = np.stack([patch[0][at] for patch, at in zip(patches, held)], axis=1)
+        number = [patch[1][at] for patch, at in zip(patches, held)]
+        self._held = np.stack([number[0], len(groups[0]) + number[1]], axis=1)
         self._segments = _segments(self.rest)
         self._follow = model.follower(np.ascontiguousarray(self.rest.reshape(-1, 3)))
         self._tendon = [[a.tendon is not None for a in group] for group in groups]
@@ -49,36 +59,44 @@ class FibreBundle:
         tendons by the end that each holds.
         """
         belly = self._follow().reshape(self.rest.shape)
-        for end, place in ((0, 0), (1, POINTS - 1)):
-            belly[:, place] = self._carried(end, place, poses)
+        held = [self._carried(end, poses) for end in (0, 1)]
+        if not self.pennate:
+            belly[:, 0], belly[:, -1] = held
         now = _segments(belly)
         ratio = now / self._segments
         local = np.empty((len(belly), POINTS))
         local[:, 1:-1] = 0.5 * (ratio[:, 1:] + ratio[:, :-1])
         local[:, [0, -1]] = ratio[:, [0, -1]]
-        before, after = (self._tendons(end, belly, tendons) for end in (0, 1))
+        before, after = (
+            self._beyond(end, belly[:, place], held[end], tendons)
+            for end, place in ((0, 0), (1, -1))
+        )
         points = np.concatenate([before[:, ::-1], belly, after], axis=1)
         still = [np.ones(part.shape[:2]) for part in (before, after)]
         stretch = now.sum(axis=1) / self._segments.sum(axis=1)
         return FibreLines(points, stretch, np.concatenate([still[0], local, still[1]], axis=1))
 
-    def _carried(self, end: int, place: int, poses: Mapping[str, Floats]) -> Floats:
-        """Ends (N, 3) of the fibres where their bones, or ends of tendons, carry them."""
+    def _carried(self, end: int, poses: Mapping[str, Floats]) -> Floats:
+        """Held points (N, 3) of an end where their bones, or ends of tendons, carry them."""
         pose = np.array([poses[name] for name in self.holders])[self._held[:, end]]
-        turned = np.einsum("nij,nj->ni", pose[:, :3, :3], self.rest[:, place])
+        turned = np.einsum("nij,nj->ni", pose[:, :3, :3], self._anchors[:, end])
         return np.asarray(turned + pose[:, :3, 3])
 
-    def _tendons(self, end: int, belly: Floats, tendons: Mapping[str, TendonLine]) -> Floats:
-        """Points (N, k, 3) of the tendon of each fibre beyond an end, away from the belly: none
-        where no fibre has one there, the end itself for fibres that have none.
+    def _beyond(
+        self, end: int, tips: Floats, held: Floats, tendons: Mapping[str, TendonLine]
+    ) -> Floats:
+        """Points (N, k, 3) of each fibre's aponeurosis and tendon beyond its tips (N, 3) at an end,
+        away from the belly: none where no fibre has these there, the last one repeated for fibres
+        that have no tendon. The aponeurosis ends at the held points (N, 3).
         """
+        sheet = held[:, None] if self.pennate else np.empty((len(tips), 0, 3))
         if not any(self._tendon[end]):
-            return np.empty((len(belly), 0, 3))
-        out = np.repeat(belly[:, [0 if end == 0 else -1]], NODES - 1, axis=1)
+            return sheet
+        out = np.repeat((held if self.pennate else tips)[:, None], NODES - 1, axis=1)
         for place, name in enumerate(self.holders):
             if name in tendons:
                 out[self._held[:, end] == place] = tendons[name].points[1:]
-        return out
+        return np.concatenate([sheet, out], axis=1)
 
 
 def build_bundles(scene: Scene, models: Sequence[MuscleModel]) -> dict[str, FibreBundle]:
@@ -109,20 +127,22 @@ def _segments(lines: Floats) -> Floats:
     return np.asarray(np.linalg.norm(np.diff(lines, axis=1), axis=2))
 
 
-def _end_points(mesh: MeshDistance, group: Sequence[Attachment]) -> tuple[Floats, Integers]:
-    """Points (n, 3) evenly over the area of some attachments, and the number (n,) of each one's."""
+def _end_points(mesh: MeshDistance, patches: Sequence[Integers]) -> tuple[Floats, Integers]:
+    """Points (n, 3) evenly over the area of some patches of vertices, and the number (n,) of each
+    one's.
+    """
     owner = np.full(len(mesh.vertices), -1)
-    for number, attachment in enumerate(group):
-        owner[attachment.vertices] = number
+    for number, patch in enumerate(patches):
+        owner[patch] = number
     corners = owner[mesh.faces]
     whole = (corners[:, 0] >= 0) & (corners == corners[:, :1]).all(axis=1)
     points, face = _on_faces(mesh.vertices, mesh.faces[whole], PATCH_POINTS)
     number = corners[whole][face, 0]
-    # Attachments without a whole triangle count by their vertices.
-    for k, attachment in enumerate(group):
+    # Patches without a whole triangle count by their vertices.
+    for k, patch in enumerate(patches):
         if not (number == k).any():
-            points = np.concatenate([points, mesh.vertices[attachment.vertices]])
-            number = np.concatenate([number, np.full(len(attachment.vertices), k)])
+            points = np.concatenate([points, mesh.vertices[patch]])
+            number = np.concatenate([number, np.full(len(patch), k)])
     return points, number
 
 

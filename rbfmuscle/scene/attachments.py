@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import Joint, bones_between
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.meshes.transform import MeshTransform
 from rbfmuscle.scene.objects import Attachment, LineTable, Muscle, ViaTable, find_named
-from rbfmuscle.scene.patches import AttachTable, select_vertices
+from rbfmuscle.scene.patches import AponeurosesTable, AttachTable, select_vertices
 from rbfmuscle.scene.tendons import BonePoint, TendonEnd
 from rbfmuscle.validation import SceneError
 
@@ -50,7 +50,7 @@ def make_attachments(
         )
         held = Attachment(
             bone.name,
-            np.unique(select_vertices(entry, read, bone, transform, context=context)),
+            np.unique(select_vertices(entry, read, transform, context=context, bone=bone)),
             entry.tendon,
             attachment_frame,
             entry.via,
@@ -66,6 +66,37 @@ def make_attachments(
                 "to both "
                 f"{first.bone!r} and {second.bone!r}, make the attachments smaller"
             )
+    return found
+
+
+def resolve_aponeuroses(
+    given: AponeurosesTable | Mapping[str, object] | None,
+    read: ReadMesh,
+    *,
+    muscle: str,
+    transform: MeshTransform,
+) -> list[Integers]:
+    """Vertices of the aponeuroses of origin and insertion, none where none are given; SceneError on
+    an empty selection, or a vertex of both.
+    """
+    if given is None:
+        return []
+    context = f"muscle {muscle!r} aponeuroses: "
+    table = (
+        given
+        if isinstance(given, AponeurosesTable)
+        else AponeurosesTable.build(given, context=context)
+    )
+    found = [
+        np.unique(select_vertices(patch, read, transform, context=f"{context}{end}: "))
+        for end, patch in (("origin", table.origin), ("insertion", table.insertion))
+    ]
+    shared = np.intersect1d(found[0], found[1])
+    if len(shared):
+        raise SceneError(
+            f"{context}{len(shared)} vertices (first: {shared[0]}) belong to both, "
+            "make the patches smaller"
+        )
     return found
 
 

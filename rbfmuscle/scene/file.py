@@ -21,7 +21,7 @@ from rbfmuscle.scene.options import (
     SlidingOptions,
     Table,
 )
-from rbfmuscle.scene.patches import AttachTable
+from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
 from rbfmuscle.scene.toml_file import read_tables
 from rbfmuscle.scene.upgrade import FORMAT, MAIN, RENAMED
 from rbfmuscle.validation import SceneError, did_you_mean
@@ -86,6 +86,7 @@ class ClassTable(ContractionTable, MeshTransform):
     model: Annotated[str | dict[str, object], BeforeValidator(_check_model)] = "rbf"
     attach: list[AttachTable] = Field(default_factory=list)
     fibres: FileName | None = None
+    aponeuroses: AponeurosesTable | None = None
 
 
 class MuscleTable(ClassTable):

@@ -72,8 +72,9 @@ class Muscle:
     """A closed surface (outward, rest pose) held by bones, and the model that moves it.
 
     ``contraction`` holds the keys of a muscle that contracts, None for any other; ``tendons`` are
-    the ends that tendons hold; ``given`` is the mesh of the file, where it is another one than
-    ``mesh`` or has texture coordinates or normals.
+    the ends that tendons hold. ``aponeuroses`` are the vertices of a pennate muscle's patches,
+    of the origin and of the insertion, between which its fibres run. ``given`` is the mesh of the
+    file, where it is another one than ``mesh`` or has texture coordinates or normals.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Muscle:
     contraction: ContractionTable | None = None
     tendons: list[TendonEnd] = field(default_factory=list)
     given: InputMesh | None = field(default=None, repr=False)
+    aponeuroses: list[Integers] = field(default_factory=list, repr=False)
 
 
 @dataclass(eq=False)

@@ -25,8 +25,6 @@ from rbfmuscle.scene.picked import (
 )
 from rbfmuscle.validation import MeshError, SceneError, check_points, read_text, shown, shown_path
 
-WAYS = ("vertices", "array", "near", "points", "colour", "region")  # to say what a bone holds
-
 
 def _check_vertices(value: object, info: ValidationInfo) -> object:
     value = value.tolist() if isinstance(value, np.ndarray) else value
@@ -46,43 +44,69 @@ def _check_places(value: object, info: ValidationInfo) -> object:
         raise ValueError("must be a file or a list of points [x, y, z]") from None
 
 
-class AttachTable(Table):
-    """A bone, and what it holds: a file or list of vertex numbers, a vertex array of the mesh's
-    file, a distance to the bone, points or a file of them (maybe with a radius), a painted colour,
-    or a region of another mesh (maybe of a colour); maybe a tendon. With
-    ``via`` the muscle passes there on its way.
+class PatchTable(Table):
+    """A part of a muscle's surface: a file or list of vertex numbers, a vertex array of the mesh's
+    file, points or a file of them (maybe with a radius), a painted colour, or a region of another
+    mesh (maybe of a colour).
     """
 
     hints: ClassVar[Mapping[str, str]] = {"sphere": "write points = [CENTRE], radius = RADIUS"}
-    bone: str
+    ways: ClassVar[tuple[str, ...]] = ("vertices", "array", "points", "colour", "region")
+
     vertices: Annotated[Path | list[int] | None, BeforeValidator(_check_vertices)] = None
     array: str | None = None
-    near: NotNegative | None = None
     points: Annotated[Path | list[Vector] | None, BeforeValidator(_check_places)] = None
     radius: Positive | None = None
     colour: str | None = None
     region: FileName | None = None
+
+    @model_validator(mode="after")
+    def _check_ways(self):
+        given = [key for key in self.ways if getattr(self, key) is not None]
+        if given != ["colour", "region"] and len(given) != 1:
+            words = f"{', '.join(self.ways[:-1])} and {self.ways[-1]}"
+            raise ValueError(f"give one of {words}, got {' and '.join(given) or 'none'}")
+        if self.radius is not None and self.points is None:
+            raise ValueError("radius belongs to points")
+        return self
+
+
+class AponeurosesTable(Table):
+    """The two patches of a pennate muscle's surface between which its fibres run."""
+
+    origin: PatchTable
+    insertion: PatchTable
+
+
+class AttachTable(PatchTable):
+    """A bone, and what it holds: a patch, or all within a distance ``near`` of the bone; maybe a
+    tendon. With ``via`` the muscle passes there on its way.
+    """
+
+    ways: ClassVar[tuple[str, ...]] = ("vertices", "array", "near", "points", "colour", "region")
+
+    bone: str
+    near: NotNegative | None = None
     tendon: LineTable | None = None
     via: bool = False
 
     @model_validator(mode="after")
-    def _check_ways(self):
-        given = [key for key in WAYS if getattr(self, key) is not None]
-        if given != ["colour", "region"] and len(given) != 1:
-            words = f"{', '.join(WAYS[:-1])} and {WAYS[-1]}"
-            raise ValueError(f"give one of {words}, got {' and '.join(given) or 'none'}")
-        if self.radius is not None and self.points is None:
-            raise ValueError("radius belongs to points")
+    def _check_via(self):
         if self.via and self.tendon is not None:
             raise ValueError("a tendon belongs to an end of the muscle, which via is not")
         return self
 
 
 def select_vertices(
-    table: AttachTable, read: ReadMesh, bone: Bone, transform: MeshTransform, *, context: str
+    table: PatchTable,
+    read: ReadMesh,
+    transform: MeshTransform,
+    *,
+    context: str,
+    bone: Bone | None = None,
 ) -> Integers:
-    """The vertices (n,) of a muscle's mesh that a table says; SceneError that begins with
-    ``context`` where there are none.
+    """The vertices (n,) of a muscle's mesh that a table says, for an attachment with its bone;
+    SceneError that begins with ``context`` where there are none.
 
     ``transform`` says where the muscle's file, and the mesh of a region, lie in the scene.
     """
@@ -98,6 +122,8 @@ def select_vertices(
         return region_vertices(table.region, *place, read.mesh, context=context)
     if table.colour is not None:
         return painted_vertices(table.colour, read, context=context)
+    if bone is None or not isinstance(table, AttachTable):
+        raise TypeError("near belongs to an attachment and its bone")
     return _within(bone.distances(points), table.near or 0.0, "near", context)
 
 

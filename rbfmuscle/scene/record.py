@@ -55,6 +55,7 @@ def record_muscle(muscle: Muscle) -> dict[str, object]:
             for held in muscle.attachments
         ],
         "fibres": len(muscle.fibres) if muscle.fibres else 0,
+        "aponeuroses": [len(patch) for patch in muscle.aponeuroses],
         **({} if keys is None else keys.model_dump(exclude_none=True)),
         **record_mesh(muscle),
     }

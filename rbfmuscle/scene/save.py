@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.build import made_motion
 from rbfmuscle.scene.contents import SceneContents
@@ -53,9 +54,11 @@ class SceneFiles:
             "attach": attach,
         }
         for number, held in enumerate(muscle.attachments, 1):
-            file = self._new(attachment_file(f"{muscle.name}.{number}", held.bone))
-            np.savetxt(file, held.vertices, fmt="%d")
-            entry: dict[str, object] = {"bone": held.bone, "vertices": self._relative(file)}
+            name = attachment_file(f"{muscle.name}.{number}", held.bone)
+            entry: dict[str, object] = {
+                "bone": held.bone,
+                "vertices": self._listed(name, held.vertices),
+            }
             if held.tendon is not None:
                 entry["tendon"] = held.tendon.model_dump(exclude_unset=True)
             if held.via:
@@ -66,6 +69,11 @@ class SceneFiles:
             lines = [np.asarray(line).tolist() for line in muscle.fibres]
             file.write_text(json.dumps({"polylines": lines}), encoding="utf-8")
             row["fibres"] = self._relative(file)
+        if muscle.aponeuroses:
+            row["aponeuroses"] = {
+                end: {"vertices": self._listed(f"aponeuroses/{muscle.name}.{end}.txt", patch)}
+                for end, patch in zip(("origin", "insertion"), muscle.aponeuroses)
+            }
         if muscle.contraction is not None:
             row |= muscle.contraction.model_dump(exclude_unset=True)
         return row
@@ -98,6 +106,12 @@ class SceneFiles:
         file = self.folder / name
         file.parent.mkdir(exist_ok=True)
         return file
+
+    def _listed(self, name: str, vertices: Integers) -> str:
+        """Write a list of vertices and return its name."""
+        file = self._new(name)
+        np.savetxt(file, vertices, fmt="%d")
+        return self._relative(file)
 
     def _relative(self, file: Path) -> str:
         return file.relative_to(self.path.parent).as_posix()

@@ -13,7 +13,7 @@ from rbfmuscle import showing
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.scene import settings as changes
 from rbfmuscle.scene.activation.keys import contraction_keys
-from rbfmuscle.scene.attachments import make_attachments, tendon_ends
+from rbfmuscle.scene.attachments import make_attachments, resolve_aponeuroses, tendon_ends
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.build import check_runnable, made_motion
 from rbfmuscle.scene.contents import SceneContents
@@ -38,7 +38,7 @@ from rbfmuscle.scene.objects import (
 from rbfmuscle.scene.options import (
     MotionOptions,
 )
-from rbfmuscle.scene.patches import AttachTable
+from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
 from rbfmuscle.scene.save import save_scene
 from rbfmuscle.validation import MeshError, SceneError
 
@@ -203,6 +203,7 @@ class Scene(SceneContents):
         attach: Sequence[Attachment | AttachTable | Mapping[str, object]] = (),
         model: Mapping[str, object] | str = "rbf",
         fibres: str | Path | Sequence[ArrayLike] | None = None,
+        aponeuroses: AponeurosesTable | Mapping[str, object] | None = None,
         scale: float = 1.0,
         mirror: str | None = None,
         transform: TransformInput = None,
@@ -222,6 +223,9 @@ class Scene(SceneContents):
         model : str or dict
             A model's name, or a table with ``name`` and the model's own options.
         fibres : path or list of (k, 3) array_like, optional
+        aponeuroses : dict, optional
+            Of a pennate muscle, ``origin`` and ``insertion``: patches of its surface between which
+            fibres run, each a dict as of an attachment without the bone.
         scale, mirror, transform
             Where the mesh and the fibres lie, as for a bone.
         **contraction
@@ -238,6 +242,7 @@ class Scene(SceneContents):
             name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys
         )
         muscle.given = read.given
+        muscle.aponeuroses = resolve_aponeuroses(aponeuroses, read, muscle=name, transform=lies)
         muscle.tendons = tendon_ends(muscle, self.bones, self.joints)
         self.muscles.append(muscle)
         return self
@@ -328,6 +333,7 @@ def _fill(scene: Scene, tables: SceneFile) -> None:
             attach=given.attach,
             model=given.model,
             fibres=given.fibres,
+            aponeuroses=given.aponeuroses,
             scale=given.scale,
             mirror=given.mirror,
             transform=given.transform,

@@ -11,12 +11,14 @@ from toy_scene import held
 
 import rbfmuscle as rm
 from rbfmuscle.fibres.published import published_band
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.output.appearance import stretch_colours
-from rbfmuscle.validation import UsageError
+from rbfmuscle.validation import SceneError, UsageError
 from rbfmuscle.viewer.sources import SavedSource
 
 FIBRES = 12
+PENNATION = np.radians(25.0)
 
 
 def hinge(model="rbf"):
@@ -40,6 +42,77 @@ def hinge(model="rbf"):
 @pytest.fixture(scope="module", params=["rbf", "pbd"])
 def run(request):
     return rm.simulate(hinge(request.param), settings={"output.fibres": FIBRES})
+
+
+def feather():
+    """A pennate strap 12 mm thick whose fibres slope by 25 degrees between two faces; the ends of
+    these are held, and slide apart.
+    """
+    mesh = trimesh.creation.box((60.0, 12.0, 12.0))
+    while mesh.edges_unique_length.max() > 4.0:
+        mesh = mesh.subdivide()
+    straight = np.array(mesh.vertices)
+    sheared = straight + straight[:, [1]] * [1.0 / np.tan(PENNATION), 0.0, 0.0]
+    scene = rm.Scene("feather", units="mm")
+    for name, x in (("trunk", -60.0), ("limb", 60.0)):
+        scene.add_bone(name, trimesh.creation.box((10.0, 10.0, 10.0)).apply_translation([x, 0, 0]))
+    scene.add_joint("slide", "trunk", "limb", (0, 0, 0), {"by": (1, 0, 0)}, type="slide")
+    below, above = straight[:, 1] < -5.99, straight[:, 1] > 5.99
+    attach = held(
+        trunk=below & (straight[:, 0] < -24.0),
+        limb=above & (straight[:, 0] > 24.0),
+    )
+    sheets = {
+        name: {"vertices": np.flatnonzero(face).tolist()}
+        for name, face in (("origin", below), ("insertion", above))
+    }
+    body = trimesh.Trimesh(sheared, mesh.faces, process=False)
+    scene.add_muscle("strap", body, attach=attach, model="pbd", aponeuroses=sheets)
+    return scene.set_motion(ramp={"slide.by": {"from": 0.0, "to": 2.0, "step": 2.0}})
+
+
+def test_fibres_of_a_pennate_muscle_run_between_its_aponeuroses(tmp_path):
+    scene = rm.Scene.load(feather().save(tmp_path / "feather.toml"))
+    run = rm.simulate(scene, settings={"output.fibres": FIBRES})
+    lines = run["strap"].fibres(0)
+    inner = lines[:, 1:-1]
+    chord = inner[:, -1] - inner[:, 0]
+    angle = np.arctan2(chord[:, 1], chord[:, 0])
+    assert np.degrees(angle) == pytest.approx(np.degrees(PENNATION), abs=2.0)
+    lengths = np.linalg.norm(np.diff(inner, axis=1), axis=2).sum(axis=1)
+    # Either end is found within a cell of 0.7 mm.
+    assert lengths == pytest.approx(12.0 / np.sin(PENNATION), abs=1.5)
+    # Straight aponeuroses join their ends to what is held.
+    lean = 6.0 / np.tan(PENNATION)
+    for x, sign in ((lines[:, 0, 0], -1.0), (lines[:, -1, 0], 1.0)):
+        assert np.all((sign * x <= 30.0 + lean) & (sign * x >= 24.0 + lean))
+    path = np.linalg.norm(np.diff(lines, axis=1), axis=2).sum(axis=1)
+    assert run["strap"].fibre_lengths[0] == pytest.approx(path)
+    # In motion the bones carry the held ends, the material those of the fibres.
+    moved = run["strap"].fibres(1)
+    np.testing.assert_allclose(moved[:, -1] - lines[:, -1], np.tile([2.0, 0, 0], (FIBRES, 1)))
+    np.testing.assert_allclose(moved[:, 0], lines[:, 0])
+    surface = MeshDistance(*run.frames[1].material_meshes["strap"])
+    # The interpolated displacement goes through 300 points of the surface.
+    assert np.abs(surface.signed(moved[:, [1, -2]].reshape(-1, 3))).max() < 0.2
+    middle = 0.5 * (moved[:, 1] + moved[:, -2]) - 0.5 * (lines[:, 1] + lines[:, -2])
+    assert middle[:, 0].mean() == pytest.approx(1.0, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("sheets", "said"),
+    [
+        ({"origin": {"vertices": [0]}}, "aponeuroses: insertion: field"),
+        ({"origin": {"near": 1.0}, "insertion": {"vertices": [1]}}, "near"),
+        ({"origin": {"vertices": [0, 1]}, "insertion": {"vertices": [1]}}, "first: 1"),
+        ({"origin": {"vertices": [10**6]}, "insertion": {"vertices": [1]}}, "origin: vertex"),
+    ],
+)
+def test_wrong_aponeuroses_are_refused_by_name(sheets, said):
+    scene = feather()
+    strap = scene.muscles.pop()
+    with pytest.raises(SceneError, match=said):
+        scene.add_muscle("strap", strap.mesh, attach=strap.attachments, aponeuroses=sheets)
 
 
 def test_fibres_go_from_bone_to_bone_with_their_tendon(run):

@@ -91,6 +91,23 @@ def test_fibres_between_two_aponeuroses_follow_polylines():
     assert angles(free, direction) == pytest.approx(45.0, abs=1.0)
 
 
+def test_fibres_of_a_feather_have_its_pennation_angle():
+    pennation = np.radians(25.0)
+    vertices, faces = bar()
+    lean = np.array([1.0 / np.tan(pennation), 0.0, 0.0])
+    half = 0.5 * SIDE
+    ends = [grid((0.0, -half), (LENGTH, half), 1, y, count=120) for y in (-half, half)]
+    sheared = MeshDistance(vertices + vertices[:, [1]] * lean, faces)
+    lines, _ = trace_fibres(sheared, tuple(end + end[:, [1]] * lean for end in ends), 32)
+    # Even flux along the sloping ends has no divergence and passes no wall: it is the solution.
+    direction = np.array([np.cos(pennation), np.sin(pennation), 0.0])
+    assert angles(lines, direction).max() < 2.0
+    lengths = np.linalg.norm(np.diff(lines, axis=1), axis=2).sum(axis=1)
+    assert lengths.mean() == pytest.approx(SIDE / np.sin(pennation), rel=0.005)
+    # Either end is found within a cell of 0.7 mm.
+    assert lengths == pytest.approx(SIDE / np.sin(pennation), abs=1.5)
+
+
 def test_fibres_stay_in_the_muscle_and_out_of_bones():
     ball = trimesh.creation.icosphere(4, 4.0)
     ball.apply_translation([0.5 * LENGTH, -0.5 * SIDE, 0.0])
