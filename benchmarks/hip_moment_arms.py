@@ -42,8 +42,13 @@ DATA = {
         {name: f"hip_{name}" for name in RANGES},
     ),
 }
-# Clinical angle = coordinate + this [degree], where it is known (data/leg/README.md).
-OFFSETS = {"leg": {"flexion": -3.7, "adduction": 3.3, "rotation": -11.5}}
+# Clinical angle = coordinate + this [degree], of the leg by its README; of the hip by the femur's
+# mechanical axis and condyles (data/hip/scene.json), against the plane of anterior superior iliac
+# spine and pubic tubercle, which leans 4.7 degrees forwards.
+OFFSETS = {
+    "hip": {"flexion": 4.7 - 6.7, "adduction": -2.9, "rotation": -0.2},
+    "leg": {"flexion": -3.7, "adduction": 3.3, "rotation": -11.5},
+}
 PICTURED = "leg"  # the other data may not be
 MUSCLES = ("psoas_major", "iliacus", "gluteus_maximus", "gluteus_medius")
 
@@ -113,7 +118,7 @@ def table(data, model, settings):
         asked = {"output.fibres": FIBRES, **settings}
         run = simulate(scene, model=model, settings=asked)
         for muscle in run.muscles:
-            offset = OFFSETS.get(data, {}).get(motion, 0.0)
+            offset = OFFSETS[data][motion]
             found[muscle, motion] = compared(run, muscle, coordinate, offset)
     return found
 
