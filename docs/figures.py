@@ -50,6 +50,7 @@ COMMANDS = {
     "ischial_cover": "ischial_cover.py",
     "leg_arms": "leg_arms.py",
     "guess_confidence": "guess_confidence.py",
+    "node_counts": "node_counts.py",
 }
 
 
