@@ -32,7 +32,7 @@ def test_what_is_left_is_one_ridge_in_units_of_the_spacing(plate, kernel, bound)
     basis, count = Basis(points, KERNELS[kernel], 0.1, hermite=True), len(points)
     right = np.concatenate([np.zeros(count), normals.T.ravel()]) * basis.scale
     (weights,), (coefficients,), condition = solve(basis, right[None], condition=bound)
-    matrix, polynomials = basis.full_matrix()[: basis.size, : basis.size], basis.polynomials[0]
+    matrix, polynomials = basis.matrices(0, 1)[0], basis.polynomials[0]
     # Units of the unknowns: values 1, derivatives about the spacing.
     unit = np.r_[np.ones(count), np.full(basis.size - count, 1.0 / np.sqrt(count))]
     left = right - matrix @ weights - polynomials.T @ coefficients

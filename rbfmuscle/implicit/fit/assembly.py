@@ -81,14 +81,6 @@ class Basis:
             _matrices_loop(self.points, self.epsilon, self.kernel.form, self.hermite, start, out)
         return out
 
-    def full_matrix(self) -> Floats:
-        """The augmented matrix [A P^T; P 0] of the first fit: (size + q, size + q)."""
-        size, q = self.size, len(self.powers)
-        full = np.zeros((size + q, size + q))
-        full[:size, :size] = self.matrices(0, 1)[0]
-        full[size:, :size], full[:size, size:] = self.polynomials[0], self.polynomials[0].T
-        return full
-
 
 @compiled(error_model="numpy")
 def _polynomials_loop(points, powers, out):
