@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse as sparse
-from scipy.ndimage import distance_transform_edt
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
@@ -147,6 +146,8 @@ class FluxField:
 
     def _spread(self, conductivity: Floats, potential: Floats) -> None:
         """Mean flux of the cells around each node, and beyond the muscle that of the nearest."""
+        from scipy.ndimage import distance_transform_edt
+
         slope = (_CORNERS - 0.5) * 2.0 / (4.0 * self.side)  # at the middle of a cell
         gradient = np.einsum("ck,ka->ca", potential[self.nodes], slope)
         flux = -np.einsum("cab,cb->ca", conductivity, gradient)

@@ -142,6 +142,21 @@ def test_quadrature_gives_volume_middle_and_moments():
     assert np.einsum("q,qa,qa->a", w, p, p) / w.sum() == pytest.approx(wanted, rel=0.03)
 
 
+def test_cells_that_were_kept_give_the_same_lattice(tmp_path, monkeypatch):
+    monkeypatch.setenv("RBFMUSCLE_CACHE", str(tmp_path))
+    mesh = trimesh.creation.icosphere(subdivisions=3).apply_scale([3.0, 1.0, 0.6])
+    first, again = (Lattice(mesh.vertices, np.asarray(mesh.faces), 150) for _ in range(2))
+    for name in ("count", "cells", "nodes", "rest", "points", "weights"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    (entry,) = tmp_path.iterdir()
+    arrays = dict(np.load(entry)) | {"count": np.array([4, 2, 1])}
+    with entry.open("wb") as file:
+        np.savez(file, **arrays)
+    assert Lattice(mesh.vertices, np.asarray(mesh.faces), 150).count.tolist() == [4, 2, 1]
+    other = Lattice(mesh.vertices, np.asarray(mesh.faces), 300)
+    assert len(other.rest) > 1.5 * len(first.rest)
+
+
 @pytest.mark.parametrize("count", [1, 5, 18, 10_000])
 def test_no_region_is_a_sliver(count):
     # Cells across are cut by the surface into parts of any size.

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 
@@ -50,12 +51,19 @@ class Lattice:
         box = vertices @ self.axes.T
         self.low, self.extent = box.min(axis=0), np.ptp(box, axis=0)
         self.distance = ExactDistance(vertices, faces).signed_distance
-        self._choose_spacing(box[np.asarray(faces)], nodes)
+        key, triangles = content_key(vertices, faces, ("cells", nodes)), box[np.asarray(faces)]
+        kept = load_arrays(key)
+        count = self._choose_cells(triangles, nodes) if kept is None else kept["count"]
+        if kept is None:
+            store_arrays(key, {"count": count})
+        self._lay_cells(triangles, count)
         self._number_nodes()
         self._integrate()
 
-    def _choose_spacing(self, triangles: Floats, wanted: float) -> None:
-        """The coarsest cells that give the wanted nodes, by bisection; ``triangles`` (m, 3, 3)."""
+    def _choose_cells(self, triangles: Floats, wanted: float) -> Integers:
+        """The fewest cells (3,) that give the wanted nodes, by bisection; ``triangles`` (m, 3,
+        3).
+        """
         small, large = 0.01 * self.extent.max(), self.extent.max()
         nodes: dict[tuple[int, ...], int] = {}  # by the number of cells along each axis
         for _ in range(25):  # a choice: sides to a millionth, which are whole numbers of cells
@@ -66,7 +74,7 @@ class Lattice:
                 self._number_nodes()
                 nodes[tuple(count)] = len(self.rest)
             small, large = (small, side) if nodes[tuple(count)] < wanted else (side, large)
-        self._lay_cells(triangles, self._count_cells(large))
+        return self._count_cells(large)
 
     def _count_cells(self, side: float) -> Integers:
         """How many cells (3,) of at most this side lie along each axis."""
