@@ -146,9 +146,14 @@ def _new_folder(file, force):
 
 
 def _is_segmentation(source):
-    from rbfmuscle.importers.labels.read import is_volume
+    from rbfmuscle.importers.labels.read import VOLUME_SUFFIXES, is_volume
     from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES
 
+    if source.is_file() and not is_volume(source):
+        raise UsageError(
+            f"{source}: give a folder of meshes or of masks, or a label volume "
+            f"({', '.join(VOLUME_SUFFIXES)}); 3D Slicer and ITK-SNAP write these"
+        )
     if not source.is_dir():
         return is_volume(source)
     files = [path for path in source.iterdir() if path.is_file()]

@@ -8,10 +8,10 @@ from command_line import call
 
 from rbfmuscle.cli.new import _write_surfaces
 from rbfmuscle.importers.guess.guess import guess_scene
-from rbfmuscle.importers.labels.read import read_labels
+from rbfmuscle.importers.labels.read import read_labels, read_names
 from rbfmuscle.importers.labels.surfaces import label_surface
 from rbfmuscle.importers.labels.volume import LAYER, LabelVolume
-from rbfmuscle.validation import MeshError
+from rbfmuscle.validation import MeshError, UsageError
 
 SHAPE = (30, 26, 40)
 SPACING = 2.0
@@ -268,3 +268,44 @@ def test_a_layer_is_a_label_of_its_own():
     volume = LabelVolume(layers, np.eye(4), {}, "x.nrrd")
     assert volume.values().tolist() == [4, 4 + LAYER]
     assert [volume.name(label) for label in volume.values()] == ["label_4", "label_4_layer_2"]
+
+
+QUOTED = '"{}","{}"\n'
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("excel.csv", "{};{}\n"),
+        ("quoted.csv", QUOTED),
+        ("numbers.csv", "{}.0,{},1,2\n"),
+        ("columns.txt", "  {}  {}   128 174 128 255\n"),
+        ("slicer.ctbl", "{} {} 241 214 145 255\n"),
+        ("tab.tsv", "{}\t{}\t0\n"),
+    ],
+)
+@pytest.mark.parametrize("coding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_tables_of_names_are_read_as_programs_write_them(tmp_path, name, line, coding):
+    labels = {3: "gluteus_maximus", 6: "Präparat", 9: "pelvis"}
+    text = "# index name\nlabel,name\n" + "".join(line.format(*row) for row in labels.items())
+    (tmp_path / name).write_bytes(text.encode(coding))
+    assert read_names(tmp_path / name) == labels
+    turned = "".join(f"{label},{number}\n" for number, label in labels.items())
+    (tmp_path / name).write_text(turned, encoding="utf-8")
+    assert read_names(tmp_path / name) == labels
+
+
+def test_a_quoted_name_keeps_its_comma_and_a_second_name_is_refused(tmp_path):
+    table = tmp_path / "names.csv"
+    table.write_text(QUOTED.format(3, "gluteus maximus, left"))
+    assert read_names(table) == {3: "gluteus maximus, left"}
+    table.write_text("3,femur\n6,tibia\n3,pelvis\n")
+    with pytest.raises(UsageError, match="label 3 has two names, 'femur' and 'pelvis'"):
+        read_names(table)
+
+
+@pytest.mark.parametrize("name", ["scan.mha", "pair.img", "series.dcm"])
+def test_files_that_are_no_volume_are_not_called_folders(tmp_path, name, capsys):
+    (tmp_path / name).write_bytes(b"ObjectType = Image\n")
+    code, _, said = call(capsys, "new", tmp_path / name, "--labels", "names.csv")
+    assert code == 2 and "give a folder" in said and ".nrrd" in said

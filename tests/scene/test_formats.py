@@ -296,3 +296,48 @@ def test_new_takes_each_solid_of_a_file_and_writes_what_was_mended(tmp_path, cap
     assert "# 2 nested shells, the inner one is ignored" in scene
     _, out, _ = call(capsys, "check", tmp_path / "scene.toml")
     assert "tibia: 2 nested shells, the inner one is ignored" in out
+
+
+class TestForeignContent:
+    """Files under a name that is not theirs: what they are, not how their bytes fail."""
+
+    @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".vtk", ".vtp"])
+    def test_is_named(self, tmp_path, suffix):
+        points, faces = prism(L_SHAPE)
+        text = obj_text(points, faces)
+        solid = trimesh.creation.box()
+        meshes = {
+            ".stl": [solid.export(file_type="stl"), solid.export(file_type="stl_ascii").encode()],
+            ".obj": [text.encode(), b"\xef\xbb\xbf# made by hand\n\no prism\n" + text.encode()],
+            ".ply": [ply_bytes(points, faces, "ascii")],
+            ".vtk": [b"# vtk DataFile Version 3.0\n"],
+            ".vtp": [b'<?xml version="1.0"?>\n<VTKFile type="PolyData">\n'],
+        }
+        found = [(kind, data) for kind, some in meshes.items() for data in some if kind != suffix]
+        found += [
+            ("Git LFS", b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n"),
+            ("web page", b"<!DOCTYPE html><html><body>404</body></html>"),
+            ("gzip", b"\x1f\x8b\x08\0"),
+            ("zip archive", b"PK\x03\x04"),
+            ("UTF-16", text.encode("utf-16")),
+        ]
+        for words, content in found:
+            path = tmp_path / f"femur{suffix}"
+            path.write_bytes(content)
+            with pytest.raises(MeshError, match=f"not a {suffix[1:].upper()} file but .*{words}"):
+                read_file(path)
+
+    def test_a_binary_stl_may_begin_with_any_words(self, tmp_path):
+        content = trimesh.creation.box().export(file_type="stl")
+        for head in (b"ply ", b"o femur ", b"solid femur facet normal", b"PK\x03\x04"):
+            (tmp_path / "b.stl").write_bytes(head.ljust(80) + content[80:])
+            assert len(read_file(tmp_path / "b.stl")[0].faces) == 12
+
+
+def test_a_mark_of_unicode_before_the_first_vertex_costs_no_vertex(tmp_path):
+    """Numbers count backwards here: without the first vertex every one would be another."""
+    points, faces = prism(L_SHAPE)
+    path = tmp_path / "p.obj"
+    path.write_bytes(b"\xef\xbb\xbf" + obj_text(points, faces, first=-len(points)).encode())
+    part = read_part(path)
+    assert trimesh.Trimesh(part.vertices, part.faces).volume == pytest.approx(20000.0)

@@ -5,6 +5,8 @@ Positions come out in millimetres in the frame of NIfTI (RAS: x to the right, y 
 whatever the order and the signs of the voxels' axes; NRRD files in LPS are turned.
 """
 
+import codecs
+import csv
 import json
 import re
 import tomllib
@@ -31,6 +33,7 @@ NO_DIRECTIONS = (
     "up (RAS), so left and right may be exchanged"
 )
 NO_UNIT = "the header states no unit of length: mm taken"
+NUMBER = r"\s*([-+]?\d+(\.\d*)?)?\s*"  # a cell of a table of names that is none, or empty
 # Places of voxels by a NIfTI's two transforms that differ by more than this [mm] are said.
 SAME_PLACE = 0.1
 
@@ -313,37 +316,52 @@ def _check_affine(affine, path):
 
 
 def read_names(path: Path) -> dict[int, str]:
-    """Names of labels from JSON, from lines as CSV, TSV or ITK-SNAP write them, or from a known
-    table by its name.
+    """Names of labels from JSON, from lines with a number and a name, or from a known table by its
+    name.
     """
     tables = tomllib.loads((Path(__file__).parent / "tables.toml").read_text(encoding="utf-8"))
     if not path.exists() and path.name in tables:
         return dict(enumerate(tables[path.name].split(), start=1))
     try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-        names = (
-            _json_names(json.loads(text)) if path.suffix.lower() == ".json" else _row_names(text)
-        )
+        text = _decoded(path.read_bytes())
     except OSError as error:
         known = ", ".join(tables)
         raise UsageError(f"cannot read {path}: {error.strerror}; known tables: {known}") from None
-    except (ValueError, RecursionError):
-        raise UsageError(f"{path} is no JSON") from None
+    if path.suffix.lower() == ".json":
+        try:
+            names = _json_names(json.loads(text))
+        except (ValueError, RecursionError):
+            raise UsageError(f"{path} is no JSON") from None
+    else:
+        names = _row_names(text, path)
     if not names:
         raise UsageError(f"{path} names no label; write lines of number and name, or JSON")
     return names
 
 
-def _row_names(text):
-    """Names of lines of number and name: CSV, TSV, or ITK-SNAP's descriptions with the name in
-    quotes at the end.
+def _decoded(data):
+    """Text of UTF-8, or of UTF-16 where it begins with its mark, as spreadsheets write it."""
+    marked = data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    return data.decode("utf-16" if marked else "utf-8-sig", errors="replace")
+
+
+def _row_names(text, path):
+    """Names of lines with a number and a name in either order: CSV with any separator, columns
+    with spaces between (3D Slicer, FreeSurfer, ITK-SNAP).
     """
     names = {}
     for line in text.splitlines():
-        snap = re.match(r'\s*(\d+)\s+.*"([^"]+)"\s*$', line)
-        row = snap or re.match(r'\s*(\d+)\s*[,\t]\s*"?([^",\t]+)', line)
-        if row:
-            names[int(row[1])] = row[2].strip()
+        separator = next((mark for mark in ";\t," if mark in re.sub(r'"[^"]*"', "", line)), " ")
+        cells = next(csv.reader([line.strip()], delimiter=separator, skipinitialspace=True), [])
+        numbers = [cell for cell in cells if re.fullmatch(r"\s*\d+(\.0*)?\s*", cell)]
+        words = [cell.strip() for cell in cells if not re.fullmatch(NUMBER, cell)]
+        if not numbers or not words or line.startswith("#"):
+            continue
+        number, name = int(float(numbers[0])), " ".join(words if separator == " " else words[:1])
+        if names.setdefault(number, name) != name:
+            raise UsageError(
+                f"{path}: label {number} has two names, {names[number]!r} and {name!r}; keep one"
+            )
     return names
 
 

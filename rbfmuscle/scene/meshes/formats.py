@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.scene.meshes.foreign import foreign_content
 from rbfmuscle.scene.meshes.input_mesh import NO_CORNERS, Corners, vertex_corners
 from rbfmuscle.scene.meshes.obj import read_obj
 from rbfmuscle.scene.meshes.polydata import read_polydata
@@ -96,6 +97,8 @@ def read_file(path: Path) -> list[FilePart]:
         raise MeshError(f"{path}: cannot read the mesh: {error.strerror}") from None
     if not content:
         raise MeshError(f"{path}: the file is empty")
+    if foreign := foreign_content(content, suffix):
+        raise MeshError(f"{path}: not a {suffix[1:].upper()} file but {foreign}")
     try:
         if suffix == ".stl":
             return _named(_read_stl(content))

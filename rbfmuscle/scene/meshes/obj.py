@@ -29,7 +29,7 @@ class ObjFile:
         self.objects, self.groups = [""], [""]
         self.labels: list[tuple[int, int]] = []
         self.other = 0
-        for number, line in _joined_lines(content):
+        for number, line in _joined_lines(content.removeprefix(b"\xef\xbb\xbf")):
             key, *words = line.partition(b"#")[0].split() or [b""]
             try:
                 self._take(key, words, number)
