@@ -175,7 +175,7 @@ class PBDMuscle:
         inside = SurfaceInterpolation(self.rest.vertices, points)
         return lambda: inside(self.points)
 
-    def carried_mesh(self) -> Mesh:
+    def embedded_mesh(self) -> Mesh:
         """That of the material."""
         return self.material_mesh()
 

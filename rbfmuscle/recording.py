@@ -110,8 +110,8 @@ class Recording:
             check_initial(self.scene)
             self._skeleton = _check_skeleton(self.scene)
             self._models = build_models(self.scene)
-            carried = {model.name: model.material_mesh() for model in self._models}
-            self._measures = MuscleMeasures(self.scene, carried)
+            material = {model.name: model.material_mesh() for model in self._models}
+            self._measures = MuscleMeasures(self.scene, material)
             self._bundles = build_bundles(self.scene, self._models)
         self._fields = bone_sdfs
 
@@ -177,8 +177,8 @@ class Recording:
                 loop = FrameLoop(self.scene, self._models, bone_sdfs=self._fields)
                 surfaces, poses = loop.at_rest()
             with timed(self.times, "metrics"):
-                carried = {m.name: m.material_mesh()[0] for m in self._models}
-                self._measures.measure_rest(surfaces, carried, poses)
+                material = {m.name: m.material_mesh()[0] for m in self._models}
+                self._measures.measure_rest(surfaces, material, poses)
         for coordinates in self.scene.motion.frames:
             with timed(self.times, "simulate"):
                 frame = loop.advance(coordinates)

@@ -53,7 +53,7 @@ class Centreline:
     The harmonic field is 0 on the origin and 1 on the insertion. So many slices are taken at levels
     whose centroids lie evenly along the muscle at rest. Each centroid is a fixed linear combination
     of the vertices, so the line costs one sparse product a frame. Its ends are the centroids of the
-    attached patches of the input mesh, by area, carried by their bones. Bones that no joint, or
+    attached patches of the input mesh, by area, moved by their bones. Bones that no joint, or
     none of the ``moving`` ones, separates count as one.
     """
 
@@ -92,8 +92,8 @@ class Centreline:
         )
 
     def points(self, vertices: Floats, poses: Mapping[str, Floats]) -> Floats:
-        """The line now, (k, 3), from the carried mesh (n, 3) and the poses (4, 4) of the bones."""
-        first, last = (_carried_middle(end, poses) for end in self.ends)
+        """The line now, (k, 3), from the material mesh (n, 3) and the poses (4, 4) of the bones."""
+        first, last = (_moved_middle(end, poses) for end in self.ends)
         return np.vstack([first, self.operator @ vertices, last])
 
     def length(self, vertices: Floats, poses: Mapping[str, Floats]) -> float:
@@ -107,7 +107,7 @@ class Centreline:
         the last frame.
         """
         line = self.points(vertices, poses)
-        via = {node: _carried_middle(patch, poses) for node, patch in self.via.items()}
+        via = {node: _moved_middle(patch, poses) for node, patch in self.via.items()}
         path, settled = shortest_path(line, probes, poses, self.clearance, self._pulled, via)
         self.unsettled += not settled
         self._pulled = path - resampled(line, NODES - 1) if len(path) == NODES else None
@@ -120,7 +120,7 @@ class Centreline:
         """`belly_measures` of a surface across the line between the middles of origin and
         insertion.
         """
-        first, last = (_carried_middle(end, poses) for end in self.ends)
+        first, last = (_moved_middle(end, poses) for end in self.ends)
         return belly_measures(np.asarray(vertices), np.asarray(faces), first, last)
 
     def tendon_length(self, tendons: Mapping[str, TendonLine]) -> float:
@@ -262,10 +262,10 @@ def _sides(muscle, ends, vertices):
 
 def _rest_middle(end: End) -> Floats:
     """Middle (3,) of an end's patches at rest."""
-    return _carried_middle(end, {frame_name: np.eye(4) for frame_name, _, _ in end})
+    return _moved_middle(end, {frame_name: np.eye(4) for frame_name, _, _ in end})
 
 
-def _carried_middle(end: End, poses: Mapping[str, Floats]) -> Floats:
+def _moved_middle(end: End, poses: Mapping[str, Floats]) -> Floats:
     """Middle (3,) of an end's patches where its bones (their poses (4, 4)) carry them."""
     placed = [(poses[bone], points, areas) for bone, points, areas in end]
     moved = [

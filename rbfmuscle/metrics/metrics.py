@@ -39,16 +39,16 @@ _THROUGH = ("reported", "unresolved")
 
 
 class MuscleMeasures:
-    """Measures muscles frame by frame, those with a carried mesh (vertices, faces) at rest; keeps
+    """Measures muscles frame by frame, those with a material mesh (vertices, faces) at rest; keeps
     no surfaces.
     """
 
-    def __init__(self, scene: Scene, carried: Mapping[str, Mesh]) -> None:
+    def __init__(self, scene: Scene, material: Mapping[str, Mesh]) -> None:
         self.probes = [bone.exact for bone in scene.bones]
         surfaces = scene_surfaces(scene)
-        mine = [muscle for muscle in scene.muscles if muscle.name in carried]
+        mine = [muscle for muscle in scene.muscles if muscle.name in material]
         self.trackers = {
-            muscle.name: MuscleMeasurer(muscle, scene, *carried[muscle.name]) for muscle in mine
+            muscle.name: MuscleMeasurer(muscle, scene, *material[muscle.name]) for muscle in mine
         }
         for muscle in mine:
             self.trackers[muscle.name].first = {
@@ -59,17 +59,17 @@ class MuscleMeasures:
     def measure_rest(
         self,
         surfaces: Mapping[str, ModelSurface],
-        carried: Mapping[str, Floats],
+        material: Mapping[str, Floats],
         poses: dict[str, Floats],
     ) -> None:
-        """Measure the surfaces at rest, before the first frame, by muscle; ``carried`` (n, 3) is
+        """Measure the surfaces at rest, before the first frame, by muscle; ``material`` (n, 3) is
         the material there, ``poses`` (4, 4) are those of rest.
 
         The values are among those of the first frame that is measured.
         """
         trackers = list(self.trackers.values())
         given = self.probes, poses
-        each(lambda t: t.measure_rest(surfaces[t.name], carried[t.name], *given), trackers)
+        each(lambda t: t.measure_rest(surfaces[t.name], material[t.name], *given), trackers)
 
     def measure(self, frame: Frame) -> dict[str, Values]:
         """Measure a frame: for each muscle its values by quantity, in the order of `QUANTITIES`."""
@@ -98,7 +98,7 @@ class MuscleMeasurer:
         if len([a for a in muscle.attachments if not a.via]) > 1:
             self.line = Centreline(muscle, scene.joints, vertices, faces, moving=moving)
         self.form = SurfaceForm()
-        self.carried = vertices
+        self.material = vertices
         self.at_rest: Values = {}  # what was measured there, until the first frame takes it
         # Of the last surface.
         self.distance: MeshDistance | None = None
@@ -113,15 +113,15 @@ class MuscleMeasurer:
         points = np.concatenate([np.empty((0, 3)), *lines])
         depth = surface_depth(points, probes, frame.poses)
         found["tendon_depth"] = float(depth.max(initial=0.0))
-        carried, surface = frame.material_meshes[self.name][0], frame.surfaces.get(self.name)
+        material, surface = frame.material_meshes[self.name][0], frame.surfaces.get(self.name)
         if surface is not None:
-            found.update(self._of_surface(surface, carried, probes, frame.poses))
+            found.update(self._of_surface(surface, material, probes, frame.poses))
             found.update({q: surface.quantities[q] for q in _FROM_MODEL if q in surface.quantities})
         mine = [event for event in frame.events if event.muscle == self.name]
         found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
-        found["edge_strain_rms"] = math.sqrt(np.mean((self.edges(carried) - 1.0) ** 2))
+        found["edge_strain_rms"] = math.sqrt(np.mean((self.edges(material) - 1.0) ** 2))
         if self.line is not None:
-            belly, found["bowing"] = self.line.measure(carried, frame.poses, probes)
+            belly, found["bowing"] = self.line.measure(material, frame.poses, probes)
             if self.line.unsettled:
                 count, self.line.unsettled = self.line.unsettled, 0
                 frame.events.append(Event(frame.index, self.name, "", count, "iteration_cap"))
@@ -138,7 +138,7 @@ class MuscleMeasurer:
             found["time_frame"] = times["time_frame"]
         return {quantity: float(found[quantity]) for quantity in QUANTITIES if quantity in found}
 
-    def _of_surface(self, surface, carried, probes, poses):
+    def _of_surface(self, surface, material, probes, poses):
         vertices, faces = surface.vertices, np.asarray(surface.faces)
         # Surfaces that keep their faces share the order of the tree.
         same = self.distance is not None and np.array_equal(self.distance.faces, faces)
@@ -154,27 +154,27 @@ class MuscleMeasurer:
             "penetration_fraction": np.mean(depth > 0.0),
             "bone_penetration_max": bone_depth(self.distance, probes, poses),
             **form,
-            **self._flicker(carried, vertices, same, self.form.simple),
+            **self._flicker(material, vertices, same, self.form.simple),
         }
 
-    def _flicker(self, carried, vertices, same, simple):
-        """Change of the signed distances of the carried vertices to the surface; of a mesh that is
+    def _flicker(self, material, vertices, same, simple):
+        """Change of the signed distances of the material vertices to the surface; of a mesh that is
         shown, none.
         """
-        if np.array_equal(carried, vertices):
+        if np.array_equal(material, vertices):
             return {}
         if self.near is None or not same:
-            self.near = np.full(len(carried), -1)
+            self.near = np.full(len(material), -1)
         before, self.offset = (
             self.offset,
-            self.distance.signed(carried, near=self.near, simple=simple),
+            self.distance.signed(material, near=self.near, simple=simple),
         )
         return {"flicker": np.abs(self.offset - before).max() if before is not None else 0.0}
 
     def measure_rest(
         self,
         surface: ModelSurface,
-        carried: Floats,
+        material: Floats,
         probes: list[BoneDistance],
         poses: dict[str, Floats],
     ) -> None:
@@ -185,7 +185,7 @@ class MuscleMeasurer:
         error of the shape.
         """
         mesh = np.asarray(self.mesh.vertices, dtype=float), np.asarray(self.mesh.faces)
-        there = mesh[0] + carried_shift(mesh[0], self.carried, carried - self.carried)
+        there = mesh[0] + material_shift(mesh[0], self.material, material - self.material)
         for probe in probes:
             inside = probe.inside(there)
             if inside.any():
@@ -204,11 +204,11 @@ class MuscleMeasurer:
         )
         if self.line is not None:
             found["thickness"] = self.line.section(*mesh, poses)["belly_thickness"]
-            found["bowing_at_rest"] = self.line.measure(self.carried, poses, probes)[1]
+            found["bowing_at_rest"] = self.line.measure(self.material, poses, probes)[1]
         self.at_rest = found
 
 
-def carried_shift(points: Floats, at: Floats, shift: Floats) -> Floats:
+def material_shift(points: Floats, at: Floats, shift: Floats) -> Floats:
     """Shifts (n, 3) of points (n, 3): those of the three nearest places ``at`` (k, 3), weighted by
     1 / distance^2.
     """

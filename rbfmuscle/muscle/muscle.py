@@ -198,7 +198,7 @@ class RBFMuscle:
         embedding = embed(self._lattice, self.frame, points)
         return lambda: carry(embedding, self.state.lifted_nodes)
 
-    def carried_mesh(self) -> Mesh:
+    def embedded_mesh(self) -> Mesh:
         """The shown mesh where the solid carries it."""
         return carry(self.drawer.model.embedding, self.state.lifted_nodes), self.drawer.model.faces
 

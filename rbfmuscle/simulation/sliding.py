@@ -210,7 +210,7 @@ class Sliding:
         }
         for stepper in self.steppers:
             if self.links[stepper.name]:
-                self.surfaces[stepper.name].show(stepper.model.carried_mesh())
+                self.surfaces[stepper.name].show(stepper.model.embedded_mesh())
 
     def _make_room(self, stepper):
         with stepper.timed("sliding"):
