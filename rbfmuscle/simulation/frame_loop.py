@@ -194,14 +194,17 @@ class FrameLoop:
         # Coordinates start at rest, which is zero for most.
         here = self.here or dict.fromkeys(coordinates, 0.0) | rest_coordinates(self.scene)
         self.here = completed(self.scene, coordinates)
-        paths: dict[str, Path] = {}
         for stepper in self.steppers:
             stepper.frame = self._number(self._next_index)
-            paths[stepper.name] = [here, *stepper.split(here, self.here)], []
+        # Side by side, as tendons are placed at each stop.
+        stops = each(lambda stepper: stepper.split(here, self.here), self.steppers)
+        paths: dict[str, Path] = {
+            stepper.name: ([here, *found], []) for stepper, found in zip(self.steppers, stops)
+        }
         if any(stepper.rigid_transport is None for stepper in self.steppers):
             # Muscles that slide or contract share the sub-steps of the one that has the most.
-            stops = max((stops for stops, _ in paths.values()), key=len)
-            shared = self.activations.refine(self._next_index, stops)
+            longest = max((stops for stops, _ in paths.values()), key=len)
+            shared = self.activations.refine(self._next_index, longest)
             paths |= {
                 stepper.name: shared for stepper in self.steppers if stepper.rigid_transport is None
             }

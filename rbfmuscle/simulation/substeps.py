@@ -297,7 +297,7 @@ class PoseCache:
     scene : Scene
     """
 
-    MOST = 256
+    MOST = 1024
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
