@@ -51,6 +51,7 @@ COMMANDS = {
     "leg_arms": "leg_arms.py",
     "guess_confidence": "guess_confidence.py",
     "node_counts": "node_counts.py",
+    "whole_run": f"whole_run.py {_FLEXION}",
 }
 
 

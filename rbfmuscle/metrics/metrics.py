@@ -190,13 +190,14 @@ class MuscleMeasurer:
             inside = probe.inside(there)
             if inside.any():
                 there[inside] = probe.nearest(there[inside])[1]
-        rms, worst = surface_distance(surface.vertices, surface.faces, there, mesh[1])
+        # Its tree is that of the first frame too.
+        shown = self.distance = MeshDistance(surface.vertices, surface.faces)
+        rms, worst = distance_between(shown, MeshDistance(there, mesh[1]))
         bones = {probe.name: probe for probe in probes}
         held = [a for a in self.attachments if a.tendon is None and not a.via]
         gaps = [bones[a.bone].unsigned(mesh[0][a.vertices]).min() for a in held]
         found = {"rest_error_rms": rms, "rest_error_max": worst, "end_gap": max(gaps, default=0.0)}
         found["initial_shift"] = float(np.linalg.norm(there - mesh[0], axis=1).max())
-        shown = MeshDistance(surface.vertices, np.asarray(surface.faces))
         found["initial_overlap"] = max(
             float(surface_depth(surface.vertices, probes, poses).max()),
             bone_depth(shown, probes, poses),
@@ -221,12 +222,18 @@ def material_shift(points: Floats, at: Floats, shift: Floats) -> Floats:
 def surface_distance(
     vertices: Floats, faces: Integers, other_vertices: Floats, other_faces: Integers
 ) -> tuple[float, float]:
+    """`distance_between` two surfaces of vertices (n, 3) and faces (m, 3)."""
+    return distance_between(
+        MeshDistance(vertices, faces), MeshDistance(other_vertices, other_faces)
+    )
+
+
+def distance_between(one: MeshDistance, other: MeshDistance) -> tuple[float, float]:
     """Distance between two surfaces, from the vertices of each to the other [scene unit].
 
     Root of the mean of both directions' mean squares, and the greatest distance of either.
     """
-    there = MeshDistance(other_vertices, other_faces).unsigned(vertices)
-    back = MeshDistance(vertices, faces).unsigned(other_vertices)
+    there, back = other.unsigned(one.vertices), one.unsigned(other.vertices)
     rms = math.sqrt((np.mean(there**2) + np.mean(back**2)) / 2)
     return rms, float(max(there.max(), back.max()))
 
