@@ -29,11 +29,12 @@ NEAR_BONE = 1.5  # what is within this of a bone may come to lie on it
 SAME = 0.02  # what moved less than this by a bone need not be asked for anew
 SUNK = 1.0  # deeper in a bone the material is sunk
 LAMELLA = 0.02  # where both sides of a muscle sink into a bone, the far one stays above it by this
-# No vertex goes farther than this from where the material carries it; and where the field's slope
-# has sunk to these shares of its slope at rest, not at all, or as far as it likes within that.
+# No vertex goes farther than this from where the material carries it; in the share that the field's
+# slope there has of its slope at rest, from none at the first, but always so far.
 FARTHEST = 1.0
-UNSURE, SURE = 0.3, 0.7
-KEPT_HEIGHT = 0.5  # the search starts at the last height above the material, up to this
+UNSURE = 0.3
+ALWAYS = 0.05
+SURE = 0.7  # a share of the slope at rest, below which steps are shortened
 SETTLED = 0.01  # a step of less is one whose error, of second order, does not count
 BLOWN = 1e-3  # the same of the material blown up to its volume, whose last digit follows
 # Rounds, at most.
@@ -59,6 +60,9 @@ def start_surface(model, state, obstacles, nodes, fit, fitted):
     outcome = NO_FIT
     if fitted:
         outcome = _reach(model, state, obstacles, fit, work)
+        if outcome == FITTED:
+            # Those after crossings are undone would make every other frame cross anew.
+            _keep_heights(state, work)
     if outcome != FITTED and not _embed(model, state, obstacles, work):
         outcome = NO_VOLUME
     return work, outcome
@@ -128,10 +132,10 @@ def _begin(model, state, obstacles, carried):
     ask_bones(obstacles, state, carried, rows, limit, SAME * edge, work.least, outward)
     for v in range(n):
         along = 0.0
+        height = min(max(state.height[v], -FARTHEST * edge), FARTHEST * edge)
         for a in range(3):
             along += normals[v, a] * outward[v, a]
-            if abs(state.height[v]) <= KEPT_HEIGHT * edge:
-                work.vertices[v, a] += state.height[v] * normals[v, a]
+            work.vertices[v, a] += height * normals[v, a]
         if work.least[v] < limit[v]:
             work.near[v] = True
             work.odd[v] = work.least[v] < -SUNK * edge
@@ -182,8 +186,6 @@ def _project(model, state, obstacles, fit, work, level, allowed):
             square = gradient[v, 0] ** 2 + gradient[v, 1] ** 2 + gradient[v, 2] ** 2
             if not (square < np.inf and abs(value[v]) < np.inf):
                 return False
-            if allowed[v] < 0.0:
-                allowed[v] = edge * _trust(np.sqrt(square), model.slope[v])
             least = SURE * model.slope[v]
             work.odd[v] |= square <= least * least
             square = max(square, least * least, 2.3e-308)
@@ -205,9 +207,32 @@ def _project(model, state, obstacles, fit, work, level, allowed):
     for v in range(n):
         if not work.on_field[v]:
             work.direction[v] = 0.0
+    _measure_trust(model, fit, work, allowed)
     _bound(work, allowed)
     lift(obstacles, state, work, np.flatnonzero(work.left & work.near))
     return True
+
+
+@compiled(error_model="numpy")
+def _measure_trust(model, fit, work, allowed):
+    """How far each vertex may go that went some way, by the slope where the material carries it:
+    measured where the search began, it would depend on the last frame.
+    """
+    n, edge = len(allowed), work.edge
+    asked = np.zeros(n, np.bool_)
+    for v in range(n):
+        if allowed[v] < 0.0:
+            square = 0.0
+            for a in range(3):
+                square += (work.vertices[v, a] - work.carried[v, a]) ** 2
+            asked[v] = not square <= (ALWAYS * edge) ** 2
+    value = np.empty(n)
+    gradient = np.empty((n, 3))
+    blend_loop(work.carried, fit[0], fit[1], model.blend, asked, value, gradient)
+    for v in range(n):
+        if asked[v]:
+            square = gradient[v, 0] ** 2 + gradient[v, 1] ** 2 + gradient[v, 2] ** 2
+            allowed[v] = edge * max(_trust(np.sqrt(square), model.slope[v]), ALWAYS)
 
 
 @compiled(error_model="numpy")
@@ -215,7 +240,7 @@ def _trust(slope, at_rest):
     """How far, in mean edges, a vertex may go from the material for a field of this slope."""
     if not at_rest > UNSURE:
         return 0.0
-    return FARTHEST * min(max((slope / at_rest - UNSURE) / (SURE - UNSURE), 0.0), 1.0)
+    return FARTHEST * min(max((slope / at_rest - UNSURE) / (1.0 - UNSURE), 0.0), 1.0)
 
 
 @compiled(error_model="numpy", inline="always")
@@ -254,7 +279,7 @@ def _bound(work, allowed):
         square = 0.0
         for a in range(3):
             square += (work.vertices[v, a] - work.carried[v, a]) ** 2
-        work.left[v] = bounded and not (square <= allowed[v] ** 2 and allowed[v] > 0.0)
+        work.left[v] = bounded and allowed[v] >= 0.0 and square > allowed[v] ** 2
         if work.left[v]:
             share = allowed[v] / max(np.sqrt(square), 1e-300)
             for a in range(3):
@@ -355,8 +380,6 @@ def _finish(model, state, obstacles, work, excess, embedded):
         if not _fill(model, state, obstacles, work, embedded):
             return -1
         if not untangle(model, state, obstacles, work, embedded, moved):
-            if not embedded:
-                _keep_heights(state, work)
             return 0
         # What was smoothed may lie over a bone's vertex again.
         push_off(model, state, obstacles, work, moved)
