@@ -68,7 +68,9 @@ def unfold(f, cells, c, p, out):
     """Add what pulls point p of cell c, squeezed to a deformation gradient ``f`` (3, 3), apart to
     the right side ``out`` (N, 3); returns the energy over 2 μ.
     """
-    count, goal, away = cells.slopes.shape[2] // 3, f, 0.0
+    count = cells.slopes.shape[2] // 3
+    goal = f
+    away = 0.0
     if _determinant(f) < LEAST:
         goal = np.empty((3, 3))
         away = nearest_volume(f, goal)
@@ -89,7 +91,8 @@ def stiffened_inverse(inverse, cells, points):
     With B the rows sqrt(STIFFNESS w) ∇N of these points the sum is A + BᵀB, and by Woodbury's
     identity its inverse is A⁻¹ - (L⁻¹ B A⁻¹)ᵀ (L⁻¹ B A⁻¹), where L Lᵀ = I + B A⁻¹ Bᵀ.
     """
-    rows, nodes, count = 3 * len(points), len(inverse), cells.slopes.shape[2] // 3
+    rows, nodes = 3 * len(points), len(inverse)
+    count = cells.slopes.shape[2] // 3
     added = np.zeros((rows, nodes))
     for i in range(rows):
         q, a = points[i // 3], i % 3
