@@ -6,7 +6,7 @@ points q, the nodes minimise
     E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² - 2 τ (1 - t))
          + μ Σ_q w_q (c (|F_q a| - s_q)² + a_q (|F_q a| - l)²),
     D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    s_q = |F_q a| kept within
-    1 / slack and 1,    τ = min(ANTI_BUCKLING_TENSION (1 - d / d₀), GREATEST_TENSION) >= 0,
+    1 / slack and 1,    τ = min(ANTI_BUCKLING_TENSION (1 - d / d₀)², GREATEST_TENSION), d <= d₀,
 
 subject to the volumes of the regions r of the lattice, V_r(y) = Σ_{q in r} w_q det F_q, and to the
 contacts. R is a rotation, a the fibre direction. Between 1 / slack and 1 a fibre shortens without
@@ -31,16 +31,20 @@ from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.jit import compiled
 
 # Stiffness of the spring at a held point that stands for a 4000th of the surface, relative to that
-# of a cell: springs are spread evenly over an attachment, however many points it has.
-HOLD, HELD_OF = 10.0, 4000
+# of a cell: springs are spread evenly over an attachment, however many points it has. Stiffer ones
+# clamp whole cells, and the muscle leaves the bone as a stub that turns with it; softer ones let
+# attachments lag (docs/validation.md).
+HOLD, HELD_OF = 3.0, 4000
 # Stiffness of second differences, relative to a cell: for nodes that hold hardly any material.
 GHOST = 1e-3
 NODES_PER_REGION = 8
 # Points that move by less than this fraction of the median for a unit force count as attached.
 MOBILE = 0.02
-# Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.82 of their distance at rest,
-# and for shorter ones, it is 0.03 of that at full activation.
-ANTI_BUCKLING_TENSION, GREATEST_TENSION = 2.5, 0.45
+# Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.83 of their distance at rest,
+# and for shorter ones, it is 0.06 of that at full activation. It begins with no slope: a tension
+# that shortens fibres by more than the ends approach, as any above 1.5 (1 - d / d₀) does, would
+# straighten the muscle at the first motion.
+ANTI_BUCKLING_TENSION, GREATEST_TENSION = 30.0, 0.9
 # Greatest pressure that a contact takes, over 2 μ. With 5 the gluteus maximus is pressed 6.6 mm
 # into the femur in 90 degrees of flexion.
 MOST_CONTACT_PRESSURE = 40.0
@@ -101,8 +105,6 @@ class SolidModel(NamedTuple):
     points: np.ndarray  # (n, 3) contact points at rest
     embedding: Embedding  # of the contact points
     owner: np.ndarray  # (n,) row of the bone that holds a contact point, -1 where it is free
-    fixed: np.ndarray  # (f,) contact points that go exactly with their bone
-    fixed_bone: np.ndarray  # (f,) its row
     held: np.ndarray  # (h,) contact points by which the bones hold the solid
     held_bone: np.ndarray  # (h,) row of the bone
     end: np.ndarray  # (h,) 0 or 1 for held points of the two farthest bones, else -1
@@ -131,7 +133,6 @@ def build_solid(
     owner: Integers,
     held: Integers,
     *,
-    fixed: Integers,
     surface: float,
     area: float,
     iterations: int,
@@ -141,7 +142,7 @@ def build_solid(
     ``points`` (n, 3) at rest are its contact points, each of which stands for an ``area`` of the
     ``surface`` [scene unit squared];
     ``owner`` (n,) is the row of the bone that holds each, -1 where it is free. The bones hold it by
-    the points ``held``; those ``fixed`` go exactly with their bone.
+    the points ``held``.
     """
     side = float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
     rest = frame.points(lattice.rest)
@@ -161,8 +162,6 @@ def build_solid(
         points=points,
         embedding=embedding,
         owner=owner.astype(np.int64),
-        fixed=fixed.astype(np.int64),
-        fixed_bone=owner[fixed].astype(np.int64),
         held=held.astype(np.int64),
         held_bone=owner[held].astype(np.int64),
         end=end,

@@ -120,7 +120,7 @@ class RBFMuscle:
         return self.state.points[len(self.rest.centres) :], self.rest.sample_faces
 
     def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
-        """Go along with the bones; held centres arrive exactly."""
+        """Go along with the bones."""
         old = np.array([before[bone] for bone in self.rest.bones])
         new = np.array([after[bone] for bone in self.rest.bones])
         self.state = predict(self.model, self.state, old, new)
@@ -237,7 +237,6 @@ def _build_solid(
         points,
         owner,
         held,
-        fixed=rest.held,
         surface=float(muscle.mesh.area),
         area=float(muscle.mesh.area) / len(rest.samples),
         iterations=options.iterations,

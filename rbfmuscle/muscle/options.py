@@ -51,7 +51,7 @@ class RBFOptions(Table):
     samples: Annotated[int, Field(ge=50, le=200_000)] = 6000
     nodes: Annotated[int, Field(ge=30, le=3000)] = 300
     iterations: Annotated[int, Field(ge=1, le=1000)] = 100
-    slack_ratio: Annotated[float, Field(ge=1.0, le=5.0)] = 1.6
+    slack_ratio: Annotated[float, Field(ge=1.0, le=5.0)] = 1.8
     surface: Literal["material", "embedded", "marching"] = "material"
     resolution: Annotated[int, Field(ge=0, le=1000)] = 0
     kernel: Annotated[str, AfterValidator(_known_kernel)] = "cubic"

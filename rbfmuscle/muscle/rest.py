@@ -37,8 +37,6 @@ class RestState:
     attached_bone: (
         np.ndarray
     )  # (K + S,) position in ``bones`` of what holds a contact point, -1 where free
-    free: np.ndarray  # centres that move
-    held: np.ndarray  # centres that their bones carry
     mesh_volume: float  # of the muscle's mesh [scene unit cubed]
     axes: np.ndarray  # (3, 3) principal axes as rows
 
@@ -50,8 +48,7 @@ class RestState:
         centres, samples, fit = place_points(muscle, frame, options, count)
         points = frame.points(centres.points)
         held_by = _Attachment(muscle, scene, frame, centres.points, samples.points)
-        free, held = np.flatnonzero(held_by.centres < 0), np.flatnonzero(held_by.centres >= 0)
-        if len(free) == 0:
+        if (held_by.centres >= 0).all():
             raise SceneError(
                 f"muscle {muscle.name!r}: every centre lies on an attachment; nothing is "
                 "free to move"
@@ -66,8 +63,6 @@ class RestState:
             fit.parts(centres.points),
             held_by.bones,
             attached_bone,
-            free,
-            held,
             float(muscle.mesh.volume),
             # Cells along the muscle's own axes are smaller than along the scene's, and turn with
             # the scene.

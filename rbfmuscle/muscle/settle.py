@@ -39,7 +39,7 @@ from rbfmuscle.muscle.near_points import (
     take_near,
 )
 from rbfmuscle.muscle.rounded_bones import RoundedBones
-from rbfmuscle.muscle.state import SolidState, place_points, tension
+from rbfmuscle.muscle.state import SolidState, tension
 
 # All lengths are relative to the muscle's size.
 SETTLED = 1e-5  # an iteration that moves no node farther was the last one
@@ -198,7 +198,7 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
             push[:] = 0.0
     _note_forces(near, forces)
     lifted_nodes, left = _lifted(given, lifted_nodes, metric, near, answers)
-    points = place_points(model, lifted_nodes, state.points)
+    points = carry(model.embedding, lifted_nodes)
     rotations, stretches = found_rotations(local)
     if room:
         rotations, stretches = state.rotations, state.stretches

@@ -27,7 +27,7 @@ class SolidState(NamedTuple):
 
     nodes: np.ndarray  # (N, 3)
     lifted_nodes: np.ndarray  # (N, 3)
-    points: np.ndarray  # (n, 3) contact points, carried by the shown nodes or fixed to a bone
+    points: np.ndarray  # (n, 3) contact points, carried by the shown nodes
     rotations: np.ndarray  # (Q, 4) unit quaternions
     stretches: np.ndarray  # (Q,) of slack fibres
     pressures: np.ndarray  # (M,) over 2 μ
@@ -77,9 +77,8 @@ def tension(end, distance, anchors):
     square = 0.0
     for a in range(3):
         square += (middle[0, a] / count[0] - middle[1, a] / count[1]) ** 2
-    return min(
-        max(0.0, ANTI_BUCKLING_TENSION * (1.0 - np.sqrt(square) / distance)), GREATEST_TENSION
-    )
+    nearer = max(0.0, 1.0 - np.sqrt(square) / distance)
+    return min(ANTI_BUCKLING_TENSION * nearer * nearer, GREATEST_TENSION)
 
 
 @inner(error_model="numpy")
@@ -141,9 +140,6 @@ def _predicted(model, state, before, after):
     for i in range(len(anchors)):
         _along(model.points[model.held[i]], after[model.held_bone[i]], anchors[i])
     points = carry(model.embedding, start)
-    for i in range(len(model.fixed)):
-        at = model.fixed[i]
-        _along(model.points[at], after[model.fixed_bone[i]], points[at])
     step = anchors - state.anchors
     along = 0.0
     square = 0.0
@@ -160,17 +156,6 @@ def _predicted(model, state, before, after):
     nodes = start + share * (state.nodes - state.start)
     pressures = state.pressures + share * (state.pressures - state.start_pressures)
     return nodes, start, points, pressures, anchors, step
-
-
-@compiled(error_model="numpy")
-def place_points(model, nodes, before):
-    """Contact points (n, 3) as nodes carry them, those that a bone holds exactly as they were
-    ``before``.
-    """
-    points = carry(model.embedding, nodes)
-    for at in model.fixed:
-        points[at] = before[at]
-    return points
 
 
 def transform(state: SolidState, motion: Floats) -> SolidState:
