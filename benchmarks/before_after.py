@@ -1,26 +1,30 @@
 """What a version of the library makes of the hip's and the leg's motions, beside another version.
 
-    PYTHONPATH=OTHER python benchmarks/before_after.py record FILE   # in each version's own folder
-    python benchmarks/before_after.py compare FILE FILE [-o EVIDENCE]
+    PYTHONPATH=OTHER python benchmarks/before_after.py --record OTHER.pkl
+    python benchmarks/before_after.py [--before OTHER.pkl] [--after THIS.pkl] [-o EVIDENCE]
 
-`record` runs motions of the real hip and leg, each over a few frames, and keeps surfaces, material
-and poses in FILE. It takes versions from 1.0 on. `compare` measures the recordings of two versions
-by the metrics of this one, so that the same is measured of both: the greatest over frames and
-muscles, and how many muscles flicker or bow beyond the limits. Penetration is that of the surface
-into bones, or of bones into the muscle, whichever is deeper. Time is processor time per frame of
-all muscles, with measuring [ms]; none where loops were compiled meanwhile. One pose is reached by
-three paths: the RMS distance of material points between the two farthest apart. Lengths in mm.
+Motions of the real hip and leg, each over a few frames. `--record` keeps surfaces, material and
+poses of a version, from 1.0 on, in a file. Those of two versions are measured by the metrics of
+this one, so that the same is measured of both, but for the error at rest: the greatest over frames
+and muscles, and how many muscles flicker or bow beyond the limits. Without `--after` the motions
+are run, without `--before` the rows of the other version are those in the file of evidence.
+Penetration is that of the surface into bones, or of bones into the muscle, whichever is deeper.
+Time is processor time per frame of all muscles, with measuring [ms]; none where loops were compiled
+meanwhile. One pose is reached by three paths: the RMS distance of material points between the two
+farthest apart. Lengths in mm.
 """
 
 import argparse
+import json
 import pickle
 import time
 from pathlib import Path
 
 import numpy as np
-from evidence import data_folder, write_evidence
+from evidence import ROOT, data_folder, write_evidence
 
 import rbfmuscle as rm
+from rbfmuscle.scene.objects import Motion
 
 # Scene and frames of each motion: of the hip those from halfway on, of the leg fewer.
 MOTIONS = {
@@ -35,6 +39,7 @@ MOTIONS = {
 FLEXION, ADDUCTION = {"hip.flexion": 60.0}, {"hip.adduction": -25.0}
 END = {**FLEXION, **ADDUCTION}
 PATHS = (([{}, FLEXION, END], 5.0), ([{}, ADDUCTION, END], 5.0), ([{}, END], 10.0))
+PATHS_APART = "one pose by three paths"
 COLUMNS = [
     "motion",
     "version",
@@ -47,13 +52,16 @@ COLUMNS = [
     "bowing, median over rest",
     "penetration",
     "crossing triangles",
+    PATHS_APART,
     "time",
 ]
+NOTE = "Before is commit 6dde41ae."
+EVIDENCE = ROOT / "docs" / "evidence" / "before_after.json"
 
 
-def record(path: Path) -> None:
-    """Run all motions with the library that is imported, and keep what they gave."""
-    found = {}
+def recorded() -> dict[str, object]:
+    """All motions with the library that is imported."""
+    found: dict[str, object] = {}
     for title, (file, frames) in MOTIONS.items():
         folder, _, name = file.partition("/")
         scene = rm.Scene.load(data_folder(folder) / name)
@@ -63,16 +71,29 @@ def record(path: Path) -> None:
         rm.simulate(scene, frames=alone)
         first = spent(scene, alone)[0]
         seconds, run = spent(scene, chosen)
-        rest = spent(scene, "0:1:1")[1].frames[0]
         found[title] = {
             "file": file,
             "time": 1000.0 * (seconds - first) / (len(run.frames) - 1),
-            "rest": plain(rest),
+            **at_rest(scene),
             "frames": [plain(frame) for frame in run.frames],
         }
-        print(title, len(run.frames), "frames", round(found[title]["time"]), "ms", flush=True)
+        print(title, len(run.frames), "frames", flush=True)
     found["paths"] = paths()
-    path.write_bytes(pickle.dumps(found))
+    return found
+
+
+def at_rest(scene):
+    """The muscles at rest, and the version's own rest errors (RMS, greatest)."""
+    still = scene.copy()
+    still.motion = Motion([{}])
+    run = rm.simulate(still)
+    errors = {
+        muscle.name: [
+            float(run.values(muscle.name, f"rest_error_{kind}")[0]) for kind in ("rms", "max")
+        ]
+        for muscle in scene.muscles
+    }
+    return {"rest": plain(run.frames[0]), "rest_errors": errors}
 
 
 def spent(scene, frames):
@@ -104,9 +125,8 @@ def paths():
         scene = rm.Scene.load(data_folder("hip") / "flexion.toml")
         scene.muscles = [scene.muscle(name) for name in ("gluteus_maximus", "iliacus")]
         scene.set_motion(waypoints=waypoints, step=step)
-        last = len(scene.motion.frames) - 1
-        run = rm.simulate(scene, frames=f"{last}:{last + 1}:1")
-        ends.append(plain(run.frames[-1])["material"])
+        # All frames: alone, the last one would be reached straight from rest.
+        ends.append(plain(rm.simulate(scene).frames[-1])["material"])
     return {
         name: max(
             float(np.sqrt(((a[name][0] - b[name][0]) ** 2).sum(axis=1).mean()))
@@ -125,14 +145,10 @@ def measured(kept):
     folder, _, name = kept["file"].partition("/")
     scene = rm.Scene.load(data_folder(folder) / name)
     probes = [bone.exact for bone in scene.bones]
-    still = rest_poses(scene, kept)
     found = {}
     for muscle in scene.muscles:
         vertices, faces = kept["rest"]["material"][muscle.name]
         tracker = MuscleMeasurer(muscle, scene, vertices, faces)
-        points, triangles, deepest = kept["rest"]["surfaces"][muscle.name]
-        surface = ModelSurface(points, triangles, {"solver_penetration_max": deepest})
-        tracker.measure_rest(surface, vertices, probes, still)
         rows = []
         for frame in kept["frames"]:
             points, triangles, _ = frame["surfaces"][muscle.name]
@@ -140,14 +156,9 @@ def measured(kept):
             surface = ModelSurface(points, triangles)
             rows.append(tracker._of_surface(surface, carried, probes, frame["poses"]))
             rows[-1]["bowing"] = tracker.line.measure(carried, frame["poses"], probes)[1]
-        found[muscle.name] = rows, tracker.at_rest
+        still = tracker.line.measure(vertices, kept["rest"]["poses"], probes)[1]
+        found[muscle.name] = rows, still
     return found
-
-
-def rest_poses(scene, kept):
-    """Poses of bones and of ends of tendons at rest."""
-    names = kept["rest"]["poses"]
-    return {name: np.eye(4) for name in names}
 
 
 def row_of(title, version, kept):
@@ -161,51 +172,55 @@ def row_of(title, version, kept):
         name: max(row.get("flicker", 0.0) for row in rows[1:]) for name, (rows, _) in found.items()
     }
     bowing = {name: max(row["bowing"] for row in rows) for name, (rows, _) in found.items()}
-    at_rest = {name: values["bowing_at_rest"] for name, (_, values) in found.items()}
-    beyond = [name for name in bowing if bowing[name] > max(1.03, at_rest[name] + 0.03)]
-    over = [bowing[name] - at_rest[name] for name in bowing]
+    still = {name: value for name, (_, value) in found.items()}
+    beyond = [name for name in bowing if bowing[name] > max(1.03, still[name] + 0.03)]
+    over = [bowing[name] - still[name] for name in bowing]
     return [
         title,
         version,
         len(found),
-        max(values["rest_error_rms"] for _, values in found.values()),
-        max(values["rest_error_max"] for _, values in found.values()),
+        max(error[0] for error in kept["rest_errors"].values()),
+        max(error[1] for error in kept["rest_errors"].values()),
         max(flicker.values()),
-        sum(value > 0.5 for value in flicker.values()),
+        int(sum(value > 0.5 for value in flicker.values())),
         len(beyond),
         float(np.median(over)),
         max(worst("penetration_max"), worst("bone_penetration_max")),
         int(worst("self_crossings")),
+        None,
         kept["time"] if kept["time"] > 0 else None,
     ]
 
 
-def compare(paths_of, output):
-    """Print, and write, the table of recordings, the earlier version's first."""
-    recorded = [pickle.loads(path.read_bytes()) for path in paths_of]
-    rows = []
-    for title in MOTIONS:
-        for version, found in zip(("before", "after"), recorded, strict=True):
-            rows.append(row_of(title, version, found[title]))
-            print(*rows[-1], flush=True)
-    ways = [[name, *(found["paths"][name] for found in recorded)] for name in recorded[0]["paths"]]
-    print(*ways, sep="\n")
-    if output:
-        command = ["benchmarks/before_after.py", "compare", *(path.name for path in paths_of)]
-        write_evidence(output, command, rows, COLUMNS, one_pose=ways)
+def table(version: str, found: dict) -> list[list]:
+    """Rows of one version, printed."""
+    rows = [row_of(title, version, found[title]) for title in MOTIONS]
+    rows[0][COLUMNS.index(PATHS_APART)] = max(found["paths"].values())
+    for row in rows:
+        print(*row, flush=True)
+    return rows
 
 
 def main() -> None:
     """Record, or compare."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("record", "compare"))
-    parser.add_argument("files", nargs="+", type=Path)
+    parser.add_argument("--record", type=Path, help="file for what this version gives")
+    parser.add_argument("--before", type=Path, help="recording of the other version")
+    parser.add_argument("--after", type=Path, help="recording of this version")
     parser.add_argument("-o", "--output", type=Path, help="file of evidence for the pages")
     given = parser.parse_args()
-    if given.what == "record":
-        record(given.files[0])
+    if given.record:
+        given.record.write_bytes(pickle.dumps(recorded()))
+        return
+    if given.before:
+        other = table("before", pickle.loads(given.before.read_bytes()))
     else:
-        compare(given.files, given.output)
+        kept = json.loads(EVIDENCE.read_text(encoding="utf-8"))
+        other = [row for row in kept["rows"] if row[1] == "before"]
+    this = table("after", pickle.loads(given.after.read_bytes()) if given.after else recorded())
+    rows = [row for pair in zip(other, this, strict=True) for row in pair]
+    if given.output:
+        write_evidence(given.output, ["benchmarks/before_after.py"], rows, COLUMNS, note=NOTE)
 
 
 if __name__ == "__main__":

@@ -52,6 +52,7 @@ COMMANDS = {
     "guess_confidence": "guess_confidence.py",
     "node_counts": "node_counts.py",
     "whole_run": f"whole_run.py {_FLEXION}",
+    "before_after": "before_after.py",
 }
 
 
