@@ -331,7 +331,8 @@ def test_tendons_of_the_leg_go_where_the_bellies_end_short(leg_guess, leg_data):
     away = [
         np.linalg.norm(hold.tendon.to - true[muscle.name, hold.tendon.bone.name])
         for muscle, hold in holds
-        if (muscle.name, hold.tendon.bone.name) in true
+        # That of the vastus lateralis is guessed elsewhere, as its own test says.
+        if (muscle.name, hold.tendon.bone.name) in true and muscle.name != "vastus_lateralis"
     ]
     # The landmarks of one bone differ by millimetres from reader to reader.
     assert len(away) > 20 and np.median(away) < 5.0 and np.percentile(away, 90) < 12.0
@@ -376,6 +377,18 @@ def test_the_heads_of_the_calf_are_held_above_the_knees_axis(leg_guess):
         held = next(hold for hold in muscle.holds if hold.bone.name == "femur")
         above = muscle.muscle.points[held.vertices, 2] - knee.centre[2]
         assert above.min() > 5.0 and len(held.vertices) >= 8 and held.confidence == 1.0
+
+
+def test_the_vastus_lateralis_pulls_at_the_middle_of_the_patellas_base(leg_guess):
+    """From its outer corner it slips off the lateral condyle as the knee bends: at 90 degrees its
+    moment arm is 15 mm there, and 25 mm from the middle.
+    """
+    guess, _, _ = leg_guess
+    muscle = next(one for one in guess.muscles if one.muscle.name == "vastus_lateralis")
+    hold = next(hold for hold in muscle.holds if hold.bone.name == "patella")
+    low, high = hold.bone.points.min(axis=0), hold.bone.points.max(axis=0)
+    share = (hold.tendon.to - low) / (high - low)  # x across the body, z up
+    assert abs(share[0] - 0.5) < 0.15 and share[2] > 0.9
 
 
 def test_what_cannot_be_used_is_left_out_with_its_reason_and_the_rest_loads(tmp_path):
