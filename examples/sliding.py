@@ -1,7 +1,7 @@
 """# Neighbours that slide
 
-Two adductors lie on each other. Without `[sliding]` each knows the bones alone: in internal
-rotation they grow into one another. With it, they keep their distance and slide.
+Two adductors lie on each other. Without `[sliding]` each knows the bones alone: in extension they
+grow into one another. With it, they keep their distance and slide.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from rbfmuscle.scene.options import SlidingOptions
 out = folder("sliding")
 scene = rm.phantom_scene()
 scene.muscles = [muscle for muscle in scene.muscles if muscle.name.startswith("adductor")]
-scene.set_motion(ramp={"hip.internal_rotation": {"from": 0.0, "to": 70.0, "step": 10.0}})
+scene.set_motion(ramp={"hip.flexion": {"from": 0.0, "to": -20.0, "step": 4.0}})
 
 
 def gap(run, frame):
@@ -34,9 +34,9 @@ for name, sliding in (("without", None), ("with", SlidingOptions())):
 
 def lines(axes):
     for name, values in gaps.items():
-        axes.plot(10.0 * np.arange(len(values)), values, label=f"{name} [sliding]")
+        axes.plot(4.0 * np.arange(len(values)), values, label=f"{name} [sliding]")
     axes.axhline(0.0, color="#999999", lw=0.8)
-    axes.set(xlabel="internal rotation [degree]", ylabel="gap [mm]")
+    axes.set(xlabel="extension [degree]", ylabel="gap [mm]")
     axes.legend()
 
 
