@@ -57,4 +57,4 @@ class RBFOptions(Table):
     kernel: Annotated[str, AfterValidator(_known_kernel)] = "cubic"
     epsilon: NotNegative = 0.0
     condition: Annotated[NotNegative, AfterValidator(_known_bound)] = 0.0
-    fibre_ratio: Annotated[float, Field(ge=1.0, le=1e4)] = 2.5
+    fibre_ratio: Annotated[float, Field(ge=1.0, le=1e4)] = 1.5
