@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.experiments.comparison_answer import describe, muscles_beyond
 from rbfmuscle.experiments.comparison_table import (
     VALUE_COLUMNS,
     Comparison,
@@ -14,23 +15,17 @@ from rbfmuscle.experiments.comparison_table import (
     Spread,
     Values,
 )
-from rbfmuscle.experiments.measures import DEEPER, FIRST, FROM_METRICS, MEASURES
+from rbfmuscle.experiments.measures import DEEPER, FROM_METRICS, MEASURES
 from rbfmuscle.folders import write_whole
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
 from rbfmuscle.metrics.summary import QuantityFacts, shown_number
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import machine, versions, write_csv, write_json
-from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Mesh
 
 FORMAT = 4  # of comparison.json
-# A model keeps out of bones that is no deeper in one [mm].
-KEPT_OUT = 0.3
-
-
-_TIE = 1.05  # models whose values differ by less are equally good
 
 
 class Repeated(NamedTuple):
@@ -151,6 +146,8 @@ def write_tables(
         n: MeasureFacts(unit=units[n], title=m.title, against=m.against, meaning=m.meaning)
         for n, m in MEASURES.items()
     }
+    runs = {name: RunData.load(folder / name) for name in results}
+    beyond = {name: muscles_beyond(run) for name, run in runs.items()}
     table = Comparison(
         format=FORMAT,
         scene=scene.name,
@@ -160,11 +157,12 @@ def write_tables(
         models=list(results),
         labels={name: labels[name] for name in results},
         failed=failed,
-        answer=describe(results, labels, scene.units),
+        answer=describe(results, labels, scene.units, beyond),
+        within={name: len(runs[name].muscles) - len(found[ALL]) for name, found in beyond.items()},
         unknowns={name: unknowns[name] for name in results},
         measures=measures,
         results=results,
-        statistics={name: statistics(RunData.load(folder / name)) for name in results},
+        statistics={name: statistics(run) for name, run in runs.items()},
         machine=machine(),
         versions=versions(),
     )
@@ -209,67 +207,7 @@ def latex_cells(texts: Iterable[str]) -> str:
     return " & ".join(escaped) + r" \\"
 
 
-def best_models(results: dict[str, Values], quantity: str, units: str) -> list[str]:
-    """Models that are as good as the best in a measure: within 5 %, or within what does not
-    count.
-    """
-    measure = MEASURES[quantity]
-    known = {
-        name: found[ALL][quantity] for name, found in results.items() if quantity in found[ALL]
-    }
-    values = {name: abs(value - measure.ideal) for name, value in known.items()}
-    if measure.against == FIRST or len(values) < 2:
-        return []
-    scale = 1.0 / MM_PER_UNIT[units] if measure.kind == "length" else 1.0
-    limit = _TIE * min(values.values()) + measure.floor * scale
-    return [name for name, value in values.items() if value <= limit]
-
-
 def _deepened(values: Mapping[str, float]) -> float:
     """How deep a muscle is in a bone, or a bone in it, beyond what is left at rest."""
     deepest = max(values.get(name, 0.0) for name in ("penetration_max", "bone_penetration_max"))
     return max(0.0, deepest - values.get("initial_overlap", 0.0))
-
-
-def describe(results: dict[str, Values], labels: dict[str, str], units: str) -> str:
-    """Whether the first model keeps out of bones, its time against the quickest other one, which is
-    nearest in shape.
-
-    Arguments are those of `write_tables`; distances are to the first model.
-    """
-    first, *others = results
-    whole = {name: found[ALL] for name, found in results.items()}
-    depth = {name: values.get(DEEPER, 0.0) for name, values in whole.items()}
-    verb = "keeps out of" if depth[first] <= KEPT_OUT / MM_PER_UNIT[units] else "enters"
-    texts = [
-        f"{labels[first]} {verb} bones: {shown_number(depth[first], units)} deep at most beyond "
-        "the overlap at rest"
-    ]
-    before = whole[first].get("solver_penetration_max", 0.0)
-    if before > whole[first].get("penetration_max", 0.0) + 0.02 / MM_PER_UNIT[units]:
-        texts.append(
-            f"Before it is clipped along bones its points are {shown_number(before, units)} deep"
-        )
-    timed = [
-        name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]
-    ]
-    quick = min(timed, key=lambda name: whole[name]["time_frame"], default=None)
-    if quick:
-        ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
-        name = f"{labels[quick]}{', the quickest of the others' if len(others) > 1 else ''}"
-        texts.append(
-            f"It takes {ratio:.2g} times the time of {name} "
-            f"({shown_number(depth[quick], units)} deep beyond rest)"
-        )
-    apart = {name: whole[name]["distance_rms"] for name in others if "distance_rms" in whole[name]}
-    if apart:
-        near = min(apart, key=apart.__getitem__)
-        away = f"{apart[near]:.2g} {units} RMS"
-        if len(others) == 1:
-            texts.append(f"The two surfaces are {away} apart")
-        else:
-            texts.append(f"Nearest to it in shape is {labels[near]} ({away})")
-            if near in timed and near != quick:
-                ratio = whole[near]["time_frame"] / whole[first]["time_frame"]
-                texts[-1] += f", which takes {ratio:.2g} times the time of {labels[first]}"
-    return f"{'. '.join(texts)}."

@@ -31,9 +31,9 @@ class Comparison(BaseModel):
 
     ``poses`` are the numbers of the frames at which distances were measured, ``labels`` models as
     tables name them, ``failed`` why models were not solved, ``answer`` all of it in sentences,
-    ``unknowns`` the points that each model solves for, in words, by model and muscle. ``results``
-    are by model; ``statistics`` by model, muscle and quantity, of moment arms
-    ``"moment_arm:COORDINATE"``.
+    ``within`` how many muscles of each model are within all limits, ``unknowns`` the points that
+    each model solves for, in words, by model and muscle. ``results`` are by model; ``statistics``
+    by model, muscle and quantity, of moment arms ``"moment_arm:COORDINATE"``.
     """
 
     format: int
@@ -45,6 +45,7 @@ class Comparison(BaseModel):
     labels: dict[str, str]
     failed: dict[str, str]
     answer: str
+    within: dict[str, int] = {}
     unknowns: dict[str, dict[str, str]]
     measures: dict[str, MeasureFacts]
     results: dict[str, Values]

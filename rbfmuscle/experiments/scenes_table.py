@@ -1,6 +1,6 @@
 """Models compared on several scenes: means over the scenes, and the worst."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -81,17 +81,19 @@ def write_scenes(
         summary={name: _summary(found, name) for name in models},
         versions=versions(),
     )
-    table.answer = _answer(table)
+    table.answer = _answer(table, tables)
     write_json(folder / "scenes.json", table.model_dump())
     write_csv(folder / "scenes.csv", _rows(found))
     write_whole(folder / "scenes.tex", _latex(table))
     return table
 
 
-def _answer(table: ScenesComparison) -> str:
-    """Depth beyond rest and time of each model over the scenes, in a sentence."""
+def _answer(table: ScenesComparison, found: Sequence[Comparison]) -> str:
+    """Muscles within limits, depth beyond rest and time of each model over the scenes."""
+    muscles = sum(len(one.results[one.models[0]]) - 1 for one in found)
     parts = [
-        f"{table.labels[name]} lies {table.text(name, DEEPER)} in bones beyond the overlap at rest "
+        f"{table.labels[name]} has {sum(one.within[name] for one in found)} of {muscles} muscles "
+        f"within all limits, lies {table.text(name, DEEPER)} in bones beyond the overlap at rest "
         f"and takes {table.text(name, 'time_frame')} per frame"
         for name in table.models
     ]

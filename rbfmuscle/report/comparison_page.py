@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.experiments.comparison import best_models
+from rbfmuscle.experiments.comparison_answer import best_models
 from rbfmuscle.experiments.comparison_table import Comparison
 from rbfmuscle.experiments.measures import DEEPER, MEASURES
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
@@ -34,7 +34,7 @@ _DRAWN = ("penetration_max", "bone_penetration_max", "bowing")
 _READING = """All models ran through the same frames and sub-steps, with the same bone fields and
 number of threads. The time per frame leaves out the first, which loads and compiles. The
 distance to the first model is no error. A mesh model keeps the overlap with bones that its mesh
-has at rest; the first sentence leaves that out."""
+has at rest; depth beyond rest leaves that out."""
 
 
 def write_page(folder: Path, found: Comparison, *, pictures: bool = True) -> None:

@@ -12,7 +12,7 @@ from blend_model import BlendMuscle, arm_files, arm_scene
 
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.compare import compare_models
-from rbfmuscle.experiments.comparison import best_models, describe
+from rbfmuscle.experiments.comparison_answer import best_models, describe
 from rbfmuscle.experiments.comparison_table import Comparison
 from rbfmuscle.experiments.measures import DEEPER, MEASURES
 from rbfmuscle.experiments.scenes_table import write_scenes
@@ -50,7 +50,7 @@ def test_what_does_not_count_is_a_tie():
     )
     assert [shown(table, *value) for value in values] == ["0 mm", "0.011 mm", "0.4 mm", "0.4 mm"]
     for depth, verb in ((2e-4, "keeps out of"), (4e-4, "enters")):
-        assert f"A {verb} bones" in describe({"a": {"all": {DEEPER: depth}}}, {"a": "A"}, "m")
+        assert f"A {verb} bones" in describe({"a": {"all": {DEEPER: depth}}}, {"a": "A"}, "m", {})
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,12 @@ class TestComparison:
         )
         text = (folder / "report.html").read_text(encoding="utf-8")
         answer = html.escape(table.answer, quote=False)
-        assert answer.startswith("RBF keeps out of bones") and answer in text
+        kept = {name: verdict_count(Run.load(folder / name)) for name in table.models}
+        assert answer.startswith(
+            f"Muscles within all limits: {kept['rbf']} of 4 (RBF), {kept['pbd']} of 4 (PBD, 3 "
+        )
+        assert table.within == kept and kept["pbd"] < 4
+        assert "RBF keeps out of bones" in answer and answer in text
         assert text.index(answer) < text.index("<table")
         assert all(MEASURES[quantity].title in text for quantity in table.results["pbd"]["all"])
 
@@ -148,6 +153,36 @@ class TestComparison:
         assert 0 < table.results["rbf"]["all"]["time_one_thread"] < 60
 
 
+def verdict_count(run):
+    """The number of muscles within all limits, as the verdict of a run says it."""
+    words = run.verdict.split()
+    return len(run.muscles) if words[:2] == ["every", "muscle"] else int(words[0])
+
+
+def test_the_first_sentences_name_what_is_beyond_limits_and_differs():
+    smooth, crossed = (
+        {"self_crossings": 0.0, "bowing": 1.2},
+        {"self_crossings": 18.0, "bowing": 1.0},
+    )
+    found = {
+        "a": {"one": {}, "two": {}, "all": smooth | {"volume_error": 1e-3, "return_rms": 0.1}},
+        "b": {"one": {}, "two": {}, "all": crossed | {"volume_error": 1e-3, "return_rms": 0.5}},
+    }
+    beyond = {
+        "a": {"all": {"one"}, "volume_error": {"one"}, "bowing": {"one"}},
+        "b": {"all": {"one", "two"}, "volume_error": {"one"}, "self_crossings": {"one", "two"}},
+    }
+    text = describe(found, {"a": "A", "b": "B"}, "mm", beyond)
+    assert text.startswith(
+        "Muscles within all limits: 1 of 2 (A), 0 of 2 (B). Worst values: self-crossings 0 (A), "
+        "18 (B); bowing 1.2 (A), 1 (B); return error (RMS) 0.1 mm (A), 0.5 mm (B). A keeps out"
+    )
+    assert "Which shape is right this cannot say" in text
+    assert "self-crossings" not in describe(
+        found | {"b": found["a"]}, {"a": "A", "b": "B"}, "mm", beyond
+    )
+
+
 def one_scene(units, values):
     """A comparison that holds depths beyond rest by model."""
     return Comparison(
@@ -160,6 +195,7 @@ def one_scene(units, values):
         labels={name: name.upper() for name in values},
         failed={},
         answer="So it is.",
+        within=dict.fromkeys(values, 0),
         unknowns={},
         measures={DEEPER: {"unit": units, "title": "depth", "against": "law", "meaning": "deep"}},
         results={name: {"all": {DEEPER: value}} for name, value in values.items()},
