@@ -36,7 +36,7 @@ def row_toml(row: dict) -> str:
 
 
 def describe(rows: list[dict]) -> str:
-    """What to use of the rows of a study, and why, in one sentence."""
+    """What to use of the rows of a study, and why."""
     best = recommend(rows)
     if best is None:
         return "Every field is unfit; take more centres."
@@ -44,6 +44,10 @@ def describe(rows: list[dict]) -> str:
     least = min(row["rms"] for row in good)
     tied = [row for row in good if row["rms"] <= ALIKE * least]
     use = f"Use {best['kernel']} with {best['centres']} centres"
+    counts = {row["centres"] for row in rows}
+    nearest = min((row for row in rows if not row["unfit"]), key=lambda row: row["rms"])
+    most = len(counts) > 1 and nearest["centres"] == max(counts)
+    more = " The most centres that were tried err least; more may err less still." if most else ""
     if len(tied) == 1:
         less = 100 * (
             1 - best["rms"] / min((row["rms"] for row in good if row is not best), default=np.inf)
@@ -53,12 +57,11 @@ def describe(rows: list[dict]) -> str:
             if len(good) > 1
             else ""
         )
-        return f"{use}{behind}."
-    near = (
-        f"the errors of {len(tied)} kernels are within {100 * (ALIKE - 1):.0f} % of the least one"
-    )
+        return f"{use}{behind}.{more}"
+    names = ", ".join(row["kernel"] for row in tied)
+    near = f"the errors of {names} are within {100 * (ALIKE - 1):.0f} % of the least"
     shape = "" if best["epsilon"] else " and needs no shape parameter"
-    return f"{use}: {near}, and of these {best['kernel']} is among the quickest{shape}."
+    return f"{use}: {near}, and of these {best['kernel']} is among the quickest{shape}.{more}"
 
 
 def row_name(row: dict) -> str:

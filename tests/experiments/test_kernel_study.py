@@ -12,7 +12,7 @@ from command_line import call
 
 import rbfmuscle as rm
 from rbfmuscle.experiments import kernel_study, wanted_error
-from rbfmuscle.experiments.kernel_rows import ENDS, at_end, recommend, row_toml
+from rbfmuscle.experiments.kernel_rows import ENDS, at_end, describe, recommend, row_toml
 from rbfmuscle.experiments.kernel_study import ReferenceSurface
 from rbfmuscle.experiments.wanted_error import STEP, reach_error
 from rbfmuscle.geometry.mesh_distance import MeshDistance
@@ -33,6 +33,20 @@ def ellipsoid():
 def study(ellipsoid):
     kernels = ["linear", "cubic", "quintic", "gaussian", "wendland_c2", "matern_52"]
     return rm.study_kernels(ellipsoid, kernels=kernels, centres=[40, 80], resolution=32, units="mm")
+
+
+def test_the_sentence_names_those_alike_and_that_the_most_centres_were_best():
+    def row(kernel, centres, rms):
+        times = {"fit_time": 1.0, "evaluation_time": 1.0}
+        sound = {"epsilon": 0.0, "condition": 1e3, "unfit": ""}
+        return {"kernel": kernel, "centres": centres, "rms": rms} | times | sound
+
+    rows = [row("cubic", 80, 1.0), row("quintic", 80, 1.02), row("cubic", 40, 3.0)]
+    text = describe(rows)
+    assert "errors of cubic, quintic are within 5 % of the least" in text
+    assert text.endswith("more may err less still.")
+    assert "more may" not in describe(rows[:2])
+    assert "more may" not in describe([row("cubic", 80, 1.0), row("cubic", 40, 0.5)])
 
 
 def test_rows_are_ranked_and_more_centres_err_less(study):

@@ -6,7 +6,8 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from rbfmuscle.implicit.fit.assembly import exponents
-from rbfmuscle.implicit.kernels.table import KERNELS
+from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+from rbfmuscle.validation import UsageError
 
 mp.mp.dps = 50
 
@@ -124,3 +125,10 @@ def test_kernel_is_conditionally_definite_of_its_order(name):
     assert least_eigenvalue(KERNELS[name], points, KERNELS[name].degree) > 0
     if name in ("cubic", "multiquadric", "skala_cervenka"):
         assert least_eigenvalue(KERNELS[name], points, KERNELS[name].degree - 1) < 0
+
+
+def test_a_kernel_that_is_no_name_is_refused_as_such():
+    with pytest.raises(UsageError, match="given by its name"):
+        get_kernel(lambda s: s**3)
+    with pytest.raises(UsageError, match="unknown kernel 'cubik', did you mean 'cubic'"):
+        get_kernel("cubik")

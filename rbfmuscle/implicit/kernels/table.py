@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.kernels import radial
-from rbfmuscle.validation import UsageError, check_finite, did_you_mean
+from rbfmuscle.validation import UsageError, check_finite, did_you_mean, shown
 
 _TERMS = 5  # coefficients of a polynomial: of degree 4 at most
 
@@ -210,6 +210,11 @@ def get_kernel(name: Kernel | str) -> Kernel:
     """
     if isinstance(name, Kernel):
         return name
+    if not isinstance(name, str):
+        raise UsageError(
+            f"a kernel is given by its name, for instance 'cubic', got {shown(name)}; "
+            "a new one needs a row in rbfmuscle/implicit/kernels/table.py"
+        )
     if name not in KERNELS:
-        raise UsageError(f"unknown kernel {str(name)!r}, {did_you_mean(name, KERNELS)}")
+        raise UsageError(f"unknown kernel {name!r}, {did_you_mean(name, KERNELS)}")
     return KERNELS[name]
