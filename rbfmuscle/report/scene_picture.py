@@ -44,7 +44,7 @@ def draw_scene(scene: Scene, path: str | Path) -> None:
         _draw_joints(pen, camera, scene)
         _draw_names(pen, camera, scene)
         images.append(np.asarray(image))
-    text = f"{scene.name}: held patches in the colour of their bone"
+    text = f"{scene.name}: attachments in the colour of their bone"
     chips = {**colours, "joint centres and axes": _AXIS, "muscles with doubtful guesses": _DOUBTED}
     save_picture(labelled(np.concatenate(images, axis=1), text, _SCENE_SIDES, chips), Path(path))
 

@@ -153,6 +153,7 @@ def _about(given: Path | list, radius: float | None, points: Floats, context: st
     """Vertices about landmarks: within a radius, or the patch that picked points cover."""
     places = read_points(given, context=context) if isinstance(given, Path) else np.array(given)
     if radius is None:
+        context += f"{shown_path(given)}: " if isinstance(given, Path) else ""
         return picked_vertices(check_patch(places, context=context), points, context=context)
     away = np.min([np.linalg.norm(points - place, axis=1) for place in places], axis=0)
     return _within(away, radius, "radius", context)

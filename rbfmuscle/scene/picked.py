@@ -84,9 +84,11 @@ def picked_vertices(points: Floats, vertices: Floats, *, context: str) -> Intege
     away, nearest = cKDTree(vertices).query(points)
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if away.max() > AWAY * size:
+        far = int(away.argmax())
+        place = ", ".join(f"{value:.4g}" for value in points[far])
         raise SceneError(
-            f"{context}a picked point lies {away.max():.4g} away from the muscle; pick points on "
-            "its mesh, in the scene's frame and unit"
+            f"{context}point {far + 1} of {len(points)}, ({place}), lies {away[far]:.4g} units of "
+            "the scene away from the muscle; pick points on its mesh, in the scene's frame and unit"
         )
     spacing = float(tree.query(points, k=2)[0][:, 1].max())
     near = np.flatnonzero(tree.query(vertices)[0] <= REACH * spacing)
