@@ -49,7 +49,7 @@ QUANTITIES = {
     "self_crossings": ("1", "triangles of the surface that cross others of it"),
     "unfitted_fraction": (
         "1",
-        "share of surface vertices kept off the level set; 1 where none is shown",
+        "share of surface vertices not on the field's level set; 1: the field is not shown",
     ),
     "flicker": (
         "length",

@@ -124,7 +124,11 @@ LIMITS = {
     "unfitted_fraction": Limit(
         0.999, "surface shown without a fit", f"{_SMALLER_STEPS} or {_MORE_CENTRES}"
     ),
-    "flicker": Limit(0.5, "flicker", f"take frames closer together, or {_SMALLER_STEPS}"),
+    "flicker": Limit(
+        0.5,
+        "flicker",
+        f"take all frames of the motion, or make its step smaller, or {_SMALLER_STEPS}",
+    ),
     "bowing": Limit(1.03, "centreline over shortest path", _LOOK),
     "tunnelled": Limit(0.0, "points beyond a bone", _SMALLER_STEPS),
     "rest_error_rms": Limit(0.6, "rest error", _MORE_CENTRES, _APART),

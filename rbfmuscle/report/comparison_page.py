@@ -34,7 +34,8 @@ _DRAWN = ("penetration_max", "bone_penetration_max", "bowing")
 _READING = """All models ran through the same frames and sub-steps, with the same bone fields and
 number of threads. The time per frame leaves out the first, which loads and compiles. The
 distance to the first model is no error. A mesh model keeps the overlap with bones that its mesh
-has at rest; depth beyond rest leaves that out."""
+has at rest; depth beyond rest leaves that out. A law is what every muscle keeps, whatever its
+shape: volume, one piece, no bone inside, the same pose there and back."""
 
 
 def write_page(folder: Path, found: Comparison, *, pictures: bool = True) -> None:

@@ -341,7 +341,9 @@ def _cell(name: str, found: Mapping[str, QuantityFacts], limits: Limits) -> Cell
         return number_cell(facts["median"], "s")
     limit = muscle_limit(name, limits, found) if name in limits.values else None
     state = limit_state(name, facts["worst"], limit)
-    return number_cell(facts["worst"], state=state) if state == BAD else number_cell(facts["worst"])
+    cell = number_cell(facts["worst"], state=state) if state == BAD else number_cell(facts["worst"])
+    own = limit is not None and limit != limits.values[name]
+    return cell._replace(text=f"{cell.text} (≤ {limit:.3g})") if own else cell
 
 
 def _events(events: Sequence[Event]) -> str:
