@@ -40,10 +40,12 @@ def muscles_beyond(saved: RunData) -> dict[str, set[str]]:
     not within all limits, or not measured for one.
     """
     found: dict[str, set[str]] = {ALL: set()}
-    for row in (*saved.info.beyond, *saved.info.not_measured):
-        if row.muscle in saved.muscles:
-            found[ALL].add(row.muscle)
-            found.setdefault(row.quantity, set()).add(row.muscle)
+    pairs = [(row.muscle, row.quantity) for row in saved.info.beyond]
+    pairs += [(row.muscle, row.quantity) for row in saved.info.not_measured]
+    for muscle, quantity in pairs:
+        if muscle in saved.muscles:
+            found[ALL].add(muscle)
+            found.setdefault(quantity, set()).add(muscle)
     return found
 
 
