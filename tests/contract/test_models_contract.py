@@ -185,7 +185,7 @@ def test_every_solve_reports_how_it_ended(name):
 def test_a_solve_at_its_cap_is_an_event_and_beyond_its_limit():
     scene = _scene([0, 20])
     settled, capped = (
-        rm.simulate(scene, "rbf", settings={"model.iterations": count}) for count in (60, 1)
+        rm.simulate(scene, "rbf", settings={"model.iterations": count}) for count in (150, 1)
     )
     actions = [[event.action for event in run.events] for run in (settled, capped)]
     assert "iteration_cap" not in actions[0] and "iteration_cap" in actions[1]
