@@ -352,7 +352,7 @@ def signed_side(record, face, point, normals, closest, normal):
     ``normals`` holds the edge normals, the vertex normals, the faces and their order.
     """
     edge_normals, vertex_normals, faces, _ = normals
-    feature = _closest_in_record(record, point, closest)
+    feature = closest_in_record(record, point, closest)
     _pseudonormal(record, feature, face, edge_normals, vertex_normals, faces, normal)
     side = 0.0
     for k in range(3):
@@ -361,7 +361,7 @@ def signed_side(record, face, point, normals, closest, normal):
 
 
 @compiled
-def _closest_in_record(record, point, closest):
+def closest_in_record(record, point, closest):
     """Fill the point of one triangle that is nearest to a point; return its feature."""
     u = 0.0
     v = 0.0

@@ -12,19 +12,12 @@ from rbfmuscle.geometry.exact_distance import (
     STACK,
     ExactDistance,
     Layout,
+    closest_in_record,
     nearest_triangle,
     record_square,
 )
 from rbfmuscle.geometry.threads import in_chunks
-from rbfmuscle.geometry.triangles import (
-    BX,
-    CX,
-    CY,
-    FACE,
-    INVERSE_BC,
-    INVERSE_CA,
-    nearest_in_frame,
-)
+from rbfmuscle.geometry.triangles import FACE
 from rbfmuscle.geometry.winding import inside_test
 from rbfmuscle.jit import compiled
 
@@ -326,18 +319,11 @@ def _side_loop(points, records, near, side):
     """1 before and -1 behind the triangle nearest to each point, where it projects into that
     triangle.
     """
+    closest = np.empty(3)
     for i in range(len(points)):
         record = records[near[i]]
-        u = 0.0
-        v = 0.0
-        w = 0.0
-        for k in range(3):
-            offset = points[i, k] - record[k]
-            u += offset * record[3 + k]
-            v += offset * record[6 + k]
-            w += offset * record[9 + k]
-        feature = nearest_in_frame(
-            record[BX], record[CX], record[CY], record[INVERSE_BC], record[INVERSE_CA], u, v
-        )[2]
-        if feature == FACE:
-            side[i] = 1.0 if w >= 0.0 else -1.0
+        if closest_in_record(record, points[i], closest) == FACE:
+            before = 0.0
+            for k in range(3):
+                before += (points[i, k] - record[k]) * record[9 + k]
+            side[i] = 1.0 if before >= 0.0 else -1.0

@@ -192,9 +192,11 @@ def _stress_points(work, tension):
             (t - u) * ra[2] + pull * fa[2],
         )
         _put(work, STRESS, p, _plus(r, w * u, along, w, a))
-        cofactors = (_cross(f[1], f[2]), _cross(f[2], f[0]), _cross(f[0], f[1]))
-        _put(work, COFACTOR, p, _plus(cofactors, w, along, 0.0, a))
-        work[DETERMINANT * POINTS + p] = dot(f[0], cofactors[0])
+        first = _cross(f[1], f[2])
+        work[DETERMINANT * POINTS + p] = dot(f[0], first)
+        _put_vector(work, COFACTOR, p, _scaled(first, w))
+        _put_vector(work, COFACTOR + 3, p, _scaled(_cross(f[2], f[0]), w))
+        _put_vector(work, COFACTOR + 6, p, _scaled(_cross(f[0], f[1]), w))
 
 
 @inner(inline="always")
@@ -229,6 +231,11 @@ def _times(m, v):
 @inner(inline="always")
 def _cross(u, v):
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@inner(inline="always")
+def _scaled(v, share):
+    return share * v[0], share * v[1], share * v[2]
 
 
 @inner(inline="always")
