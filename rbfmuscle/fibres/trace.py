@@ -9,6 +9,7 @@ from rbfmuscle.fibres.flux import FluxField
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.tubes import distance_along, points_along
+from rbfmuscle.geometry.vectors import unit
 from rbfmuscle.scene.bone import BoneDistance
 
 POINTS = 25  # of a fibre, at even distances along it
@@ -131,8 +132,8 @@ class _Tracer:
         return [np.array(line) for line in lines], arrived
 
     def _ahead(self, here: Floats, sense: int) -> Floats:
-        half = here + 0.5 * sense * self.step * _unit(self.flux(here))
-        return here + sense * self.step * _unit(self.flux(half))
+        half = here + 0.5 * sense * self.step * unit(self.flux(here))
+        return here + sense * self.step * unit(self.flux(half))
 
     def _inside(self, points: Floats) -> tuple[Floats, Booleans]:
         """Points (n, 3), those outside moved to the surface, and which (n,) these are."""
@@ -140,10 +141,6 @@ class _Tracer:
         if outside.any():
             points[outside] = self.mesh.nearest(points[outside])[1]
         return points, outside
-
-
-def _unit(vectors: Floats) -> Floats:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
 
 
 def _even(line: Floats) -> Floats:
@@ -171,5 +168,5 @@ def _moved_off(points: Floats, mesh: MeshDistance, side: float, depth: float) ->
     distance, closest, outward = mesh.nearest(points)
     distance = np.where(mesh.inside(points), -np.abs(distance), np.abs(distance))
     wrong = side * distance < depth
-    points[wrong] = closest[wrong] + side * depth * _unit(outward[wrong])
+    points[wrong] = closest[wrong] + side * depth * unit(outward[wrong])
     return points

@@ -3,6 +3,7 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.vectors import unit
 
 # Vertices around a tube, where nothing else is asked for.
 SIDES = 12
@@ -42,8 +43,7 @@ def _frames(line: Floats) -> tuple[Floats, Floats]:
     """Unit vectors (n, 3) across a line that turn with it as little as they can, and those across
     both.
     """
-    ahead = np.gradient(line, axis=0)
-    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-300)
+    ahead = unit(np.gradient(line, axis=0))
     across = np.empty_like(line)
     before = np.eye(3)[np.argmin(np.abs(ahead[0]))]
     for k, direction in enumerate(ahead):

@@ -20,6 +20,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
+from rbfmuscle.geometry.vectors import across, unit
 from rbfmuscle.jit import compiled
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.bone import Bone
@@ -141,7 +142,7 @@ class TendonEnd:
         leg = len(self.other) - 1
         places[leg] = self.middle
         sides = [self._outwards(*leg) for leg in zip(places, stops, stops[1:])]
-        own = _across(self.middle - stops[leg], stops[leg + 1] - stops[leg])
+        own = unit(across(self.middle - stops[leg], unit(stops[leg + 1] - stops[leg])))
         if self._past_end(own) < SHORTER * self._past_end(sides[leg]):
             sides[leg] = own
         return sides
@@ -158,7 +159,8 @@ class TendonEnd:
         """
         found = (bone.nearest(place[None]) for bone in self.obstacles)
         distance, closest = min(((float(d[0]), c[0]) for d, c in found), key=lambda one: one[0])
-        return _across(place - closest if distance > 0.0 else closest - place, end - start)
+        outwards = place - closest if distance > 0.0 else closest - place
+        return unit(across(outwards, unit(end - start)))
 
     def place(self, poses: Mapping[str, Floats]) -> tuple[TendonLine, Floats]:
         """The tendon, and the pose (4, 4) of the belly's end from rest to world, at poses (4, 4) of
@@ -296,12 +298,6 @@ def _depths(bone: Bone, points: Floats) -> Floats:
     if np.any(points.min(axis=0) > high) or np.any(points.max(axis=0) < low):
         return np.zeros(len(points))
     return np.maximum(-bone.nearest(points)[0], 0.0)
-
-
-def _across(way: Floats, along: Floats) -> Floats:
-    """Unit direction (3,) of the part of one vector across another."""
-    way = way - (way @ along) / max(float(along @ along), 1e-300) * along
-    return np.asarray(way / max(float(np.linalg.norm(way)), 1e-300))
 
 
 def _moved(bone: str, point: Floats, poses: Mapping[str, Floats]) -> Floats:

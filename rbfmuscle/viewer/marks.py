@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.vectors import unit
 from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Mesh
@@ -51,7 +52,7 @@ def scene_marks(scene: Scene) -> Marks:
     for joint in scene.joints:
         moving = [a for a in (*joint.rotations, *joint.translations) if a.coordinates]
         along = np.array([axis.direction for axis in moving]).reshape(-1, 3)
-        along *= reach / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+        along = reach * unit(along)
         if len(along):
             ends = np.stack([joint.centre - along, joint.centre + along], axis=1)
             axes[joint.name] = Axes(joint.parent, ends)

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbfmuscle.geometry.vectors import across, unit
 from rbfmuscle.importers.guess.landmarks import (
     Fit,
-    across,
     fit_condyles,
     fit_dome,
     sole_direction,
-    unit,
 )
 from rbfmuscle.importers.guess.orientation import Orientation, shank_up
 from rbfmuscle.importers.guess.parts import Part

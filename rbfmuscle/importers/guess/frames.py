@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.geometry.vectors import across, unit
 from rbfmuscle.importers.guess.anatomy import JointGuess
-from rbfmuscle.importers.guess.landmarks import across, fit_condyles, unit
+from rbfmuscle.importers.guess.landmarks import fit_condyles
 from rbfmuscle.importers.guess.orientation import Orientation, shank_up
 from rbfmuscle.importers.guess.parts import Part
 

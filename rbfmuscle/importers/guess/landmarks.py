@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from rbfmuscle.geometry.vectors import across, unit
 from rbfmuscle.importers.guess.parts import Part
 
 # Radii that anatomy allows [mm]: head of the femur, posterior condyle, talar dome, all from child
@@ -71,16 +72,6 @@ class Fit:
     axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
     cover: float = 0.0
     wrong: str = ""
-
-
-def across(vectors: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Part of vectors (3,) or (n, 3) that is across a unit axis."""
-    return vectors - np.multiply.outer(vectors @ axis, axis)
-
-
-def unit(vector: np.ndarray) -> np.ndarray:
-    """A vector at length one."""
-    return vector / max(float(np.linalg.norm(vector)), 1e-300)
 
 
 def main_axes(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rbfmuscle.importers.guess.landmarks import Frame, across, femur_frame, long_axis, unit
+from rbfmuscle.geometry.vectors import across, unit
+from rbfmuscle.importers.guess.landmarks import Frame, femur_frame, long_axis
 from rbfmuscle.importers.guess.names import name_facts
 from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.scene.scene import Scene

@@ -10,8 +10,9 @@ the knee's axis: forwards, and i times downwards.
 
 import numpy as np
 
+from rbfmuscle.geometry.vectors import across, unit
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
-from rbfmuscle.importers.guess.landmarks import across, fit_sphere, unit
+from rbfmuscle.importers.guess.landmarks import fit_sphere
 
 FLEXIONS = tuple(
     range(0, 131, 10)

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.geometry.vectors import unit
 from rbfmuscle.importers.guess.frames import PELVIS, BoneFrame
-from rbfmuscle.importers.guess.landmarks import unit
 from rbfmuscle.importers.guess.parts import Part
 
 STEPS = 20  # points along a leg of a site's line

@@ -13,6 +13,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import face_normals, repeated_faces
+from rbfmuscle.geometry.vectors import unit
 
 
 class Corners(NamedTuple):
@@ -92,9 +93,9 @@ class InputMesh(NamedTuple):
             np.add.at(normal, numbers[:, corner], area)
         first = np.unique(numbers, return_index=True)[1]
         ends = self.faces[first // 3, first % 3], self.faces[first // 3, (first + 1) % 3]
-        normal = _unit(normal)
+        normal = unit(normal)
         side = vertices[ends[1]] - vertices[ends[0]]
-        side = _unit(side - np.einsum("ka,ka->k", side, normal)[:, None] * normal)
+        side = unit(side - np.einsum("ka,ka->k", side, normal)[:, None] * normal)
         return np.stack([normal, side, np.cross(normal, side)], axis=1)
 
     def split(self) -> InputMesh:
@@ -129,11 +130,6 @@ class InputMesh(NamedTuple):
             self.source[of[:, 0]],
             vertex_corners(faces, texture, normals),
         )
-
-
-def _unit(vectors: Floats) -> Floats:
-    """Vectors (n, 3) of length one; zero where they are."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)[:, None]
 
 
 def plain_input(vertices: Floats, faces: Integers) -> InputMesh:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.vectors import unit
 
 # Sine of a corner's turn below which the corner counts as straight.
 STRAIGHT = 1e-9
@@ -65,8 +66,7 @@ def _normals(points):
 
 def _convex(points: Floats) -> Booleans:
     """Which polygons (k, n, 3) turn the same way at every corner, and once around."""
-    normal = _normals(points)
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+    normal = unit(_normals(points))
     before = points - np.roll(points, 1, axis=1)
     after = np.roll(before, -1, axis=1)
     sine = np.einsum("knj,kj->kn", np.cross(before, after), normal)
