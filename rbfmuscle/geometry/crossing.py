@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.rings import plain_loop
 from rbfmuscle.geometry.surfaces import opposite_half_edges
-from rbfmuscle.geometry.triangles import triangle_normal
 from rbfmuscle.jit import compiled
 
 # Triangles in a leaf of the tree, and bits of their places along each axis by which they are
@@ -39,6 +39,13 @@ class TreeArrays(NamedTuple):
     closed: bool  # whether every edge has two triangles that agree on their outside
 
 
+class Boxes(NamedTuple):
+    """Boxes, lower corner and upper corner, as they were when crossings were last sought."""
+
+    face: np.ndarray  # (leaves, 6, LEAF) of the triangles, leaf by leaf
+    node: np.ndarray  # (2 * leaves, 6) of the tree's nodes: node k holds those of 2k and 2k + 1
+
+
 class FaceTree:
     """Boxes around the triangles of a mesh, by nearness at one moment; good for later ones with the
     same faces.
@@ -67,21 +74,31 @@ class FaceTree:
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         asked = np.ones(len(self.faces), dtype=np.bool_) if among is None else among
         found = np.zeros(len(self.faces), dtype=np.bool_)
-        crossing_loop(vertices, self.arrays, asked, True, found)
+        crossing_loop(vertices, self.arrays, asked, True, no_boxes(self.arrays), found)
         return found
 
 
 @compiled
-def crossing_loop(vertices, tree, among, folds, found):
+def no_boxes(tree):
+    """Room for the boxes of a tree."""
+    boxes = Boxes(np.empty((tree.leaves, 6, LEAF)), np.empty((2 * tree.leaves, 6)))
+    boxes.face[:, :3], boxes.face[:, 3:] = np.inf, -np.inf
+    boxes.node[:, :3], boxes.node[:, 3:] = np.inf, -np.inf
+    return boxes
+
+
+@compiled
+def crossing_loop(vertices, tree, among, folds, boxes, found):
     """Mark the triangles (m,) that cross others, among pairs as `FaceTree.crossing` says; how many.
 
-    Without ``folds`` pairs at folded corners are not sought elsewhere. Without a folded corner and
-    without triangles that are asked for no box is made.
+    Without ``folds`` pairs at folded corners are not sought elsewhere, and the ``boxes`` of the
+    other triangles are still right. Without a folded corner and without triangles that are asked
+    for no box is made.
     """
     faces, count = tree.corners, len(tree.corners)
     plain = np.full(len(vertices), tree.closed and folds)
     if tree.closed and folds:
-        _plain_loop(vertices, faces, plain)
+        plain_loop(vertices, faces, plain)
     asked, any_asked = np.empty(count, np.bool_), False
     for f in range(count):
         folded = not (plain[faces[f, 0]] and plain[faces[f, 1]] and plain[faces[f, 2]])
@@ -90,18 +107,17 @@ def crossing_loop(vertices, tree, among, folds, found):
     found[:] = False
     if not any_asked:
         return 0
-    box, node = np.empty((tree.leaves, 6, LEAF)), np.empty((2 * tree.leaves, 6))
-    _boxes_loop(vertices, faces, box, tree.leaves, node)
     wanted = np.zeros(2 * tree.leaves, np.bool_)
     _wanted_loop(asked, tree.leaves, wanted)
+    _boxes_loop(vertices, faces, np.ones_like(wanted) if folds else wanted, boxes)
     room = 16 * tree.leaves
     pairs = np.empty((room, 2), np.int64)
-    met = _pairs_loop(node, wanted, pairs)
+    met = _pairs_loop(boxes.node, wanted, pairs)
     if met > room:
         pairs = np.empty((met, 2), np.int64)
-        _pairs_loop(node, wanted, pairs)
+        _pairs_loop(boxes.node, wanted, pairs)
     crossed = np.zeros(count, np.bool_)
-    _cross_loop(vertices, faces, (pairs[:met], box), (asked, plain), crossed)
+    _cross_loop(vertices, faces, (pairs[:met], boxes.face), (asked, plain), crossed)
     total = 0
     for f in range(count):
         found[tree.order[f]] = crossed[f]
@@ -123,27 +139,33 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
     return FaceTree(vertices, faces).crossing(vertices)
 
 
-@compiled
-def _boxes_loop(vertices, faces, box, leaves, node):
-    """Boxes of the triangles, leaf by leaf, and of the tree's nodes: node k holds those of 2k and
-    2k + 1.
-    """
-    box[:, :3], box[:, 3:] = np.inf, -np.inf
-    node[:, :3], node[:, 3:] = np.inf, -np.inf
-    for f in range(len(faces)):
-        leaf, place = f // LEAF, f % LEAF
+@compiled(error_model="numpy")
+def _boxes_loop(vertices, faces, changed, boxes):
+    """Make the boxes of the nodes that ``changed`` (2 * leaves,) marks, and of their triangles."""
+    box = boxes.face
+    node = boxes.node
+    leaves = len(box)
+    for leaf in range((len(faces) + LEAF - 1) // LEAF):
         k = leaves + leaf
+        if not changed[k]:
+            continue
+        first = LEAF * leaf
         for a in range(3):
-            x = vertices[faces[f, 0], a]
-            y = vertices[faces[f, 1], a]
-            z = vertices[faces[f, 2], a]
-            low, high = min(x, y, z), max(x, y, z)
-            box[leaf, a, place], box[leaf, 3 + a, place] = low, high
-            node[k, a], node[k, 3 + a] = min(node[k, a], low), max(node[k, 3 + a], high)
+            least = np.inf
+            most = -np.inf
+            for place in range(min(LEAF, len(faces) - first)):
+                x = vertices[faces[first + place, 0], a]
+                y = vertices[faces[first + place, 1], a]
+                z = vertices[faces[first + place, 2], a]
+                low, high = min(x, y, z), max(x, y, z)
+                box[leaf, a, place], box[leaf, 3 + a, place] = low, high
+                least, most = min(least, low), max(most, high)
+            node[k, a], node[k, 3 + a] = least, most
     for k in range(leaves - 1, 0, -1):
-        for a in range(3):
-            node[k, a] = min(node[2 * k, a], node[2 * k + 1, a])
-            node[k, 3 + a] = max(node[2 * k, 3 + a], node[2 * k + 1, 3 + a])
+        if changed[k]:
+            for a in range(3):
+                node[k, a] = min(node[2 * k, a], node[2 * k + 1, a])
+                node[k, 3 + a] = max(node[2 * k, 3 + a], node[2 * k + 1, 3 + a])
 
 
 @compiled
@@ -168,66 +190,6 @@ def _apart(one, i, other, j):
         | (one[i, 2] > other[j, 5])
         | (other[j, 2] > one[i, 5])
     )
-
-
-@compiled(error_model="numpy")
-def _plain_loop(vertices, faces, plain):
-    """Unmark the vertices whose triangles do not lie side by side when seen along the mean normal
-    there.
-
-    Of a closed surface these triangles are a ring around the vertex. Where all of them are seen
-    from outside and the ring goes round once, none covers another, so no two of them cross.
-    """
-    areas, normals = np.empty((len(faces), 3)), np.zeros_like(vertices)
-    for f in range(len(faces)):
-        x, y, z = triangle_normal(vertices, faces, f)
-        areas[f, 0] = x
-        areas[f, 1] = y
-        areas[f, 2] = z
-        for k in range(3):
-            v = faces[f, k]
-            normals[v, 0] += x
-            normals[v, 1] += y
-            normals[v, 2] += z
-    across = _across_loop(normals)
-    square = np.empty(len(vertices))
-    turns = np.zeros(len(vertices))
-    for v in range(len(vertices)):
-        square[v] = normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2
-    for f in range(len(faces)):
-        x = areas[f, 0]
-        y = areas[f, 1]
-        z = areas[f, 2]
-        least = 1e-12 * (x * x + y * y + z * z)
-        for k in range(3):
-            v = faces[f, k]
-            p = faces[f, (k + 1) % 3]
-            q = faces[f, (k + 2) % 3]
-            along = x * normals[v, 0] + y * normals[v, 1] + z * normals[v, 2]
-            plain[v] &= (along > 0.0) & (along * along > least * square[v])
-            # The side of a plane through the normal that a neighbour lies on: once round, once from
-            # below to above.
-            below, above = 0.0, 0.0
-            for a in range(3):
-                below += across[v, a] * (vertices[p, a] - vertices[v, a])
-                above += across[v, a] * (vertices[q, a] - vertices[v, a])
-            turns[v] += np.float64((below < 0.0) & (above >= 0.0))
-    for v in range(len(plain)):
-        plain[v] &= turns[v] == 1.0
-
-
-@compiled(error_model="numpy")
-def _across_loop(normals):
-    """A vector (n, 3) at a right angle to each normal."""
-    across = np.zeros_like(normals)
-    for v in range(len(normals)):
-        x = abs(normals[v, 0])
-        y = abs(normals[v, 1])
-        z = abs(normals[v, 2])
-        a = 0 if x <= y and x <= z else (1 if y <= z else 2)
-        b, c = (a + 1) % 3, (a + 2) % 3
-        across[v, b], across[v, c] = normals[v, c], -normals[v, b]
-    return across
 
 
 @compiled

@@ -17,7 +17,7 @@ height above it that the vertex had in the last frame.
 
 import numpy as np
 
-from rbfmuscle.geometry.crossing import crossing_loop
+from rbfmuscle.geometry.crossing import crossing_loop, no_boxes
 from rbfmuscle.geometry.surfaces import _vertex_normal_loop, volume_cubic, volume_rate
 from rbfmuscle.implicit.blend import blend_loop
 from rbfmuscle.jit import compiled
@@ -386,7 +386,8 @@ def _finish(model, state, obstacles, work, excess, embedded):
     if not _fill(model, state, obstacles, work, embedded):
         return -1
     found = np.zeros(len(model.faces), np.bool_)
-    return crossing_loop(work.vertices, model.tree, ~found, True, found.copy())
+    boxes = no_boxes(model.tree)
+    return crossing_loop(work.vertices, model.tree, ~found, True, boxes, found.copy())
 
 
 @compiled(error_model="numpy")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.bones.obstacles import Bones, query_bone
-from rbfmuscle.geometry.crossing import TreeArrays, crossing_loop
+from rbfmuscle.geometry.crossing import TreeArrays, crossing_loop, no_boxes
 from rbfmuscle.implicit.blend import Blend
 from rbfmuscle.implicit.extraction.obstacles import PointGrids, grid_of, push_off_loop
 from rbfmuscle.jit import compiled
@@ -287,9 +287,10 @@ def untangle(model, state, obstacles, work, embedded, moved):
         _touching(model.faces, work.odd | work.left, among)
     moved[:] = False
     last, back = m + 1, not embedded
+    boxes = no_boxes(model.tree)
     for turn in range(ROUNDS):
         # What was not moved does not begin to cross.
-        count = crossing_loop(work.vertices, model.tree, among, turn == 0, found)
+        count = crossing_loop(work.vertices, model.tree, among, turn == 0, boxes, found)
         if count == 0:
             return turn > 0
         # Where the material crosses itself the way back to it does not help.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
+from rbfmuscle.geometry.crossing import FaceTree, crossing_faces, crossing_loop, no_boxes
 
 BALL = trimesh.creation.icosphere(3)
 
@@ -33,3 +33,17 @@ def test_a_tree_made_at_rest_finds_crossings_later_and_rings_that_lie_plain_spar
     np.testing.assert_array_equal(quick, tree.crossing(moved))
     for other in (faces[1:], np.vstack([faces, faces[:1]])):
         assert not FaceTree(points, other).arrays.closed
+
+
+def test_boxes_are_made_anew_where_triangles_moved():
+    points, faces = np.array(BALL.vertices), np.asarray(BALL.faces)
+    tree = FaceTree(points, faces).arrays
+    boxes, found = no_boxes(tree), np.zeros(len(faces), bool)
+    assert crossing_loop(points, tree, np.ones(len(faces), bool), True, boxes, found) == 0
+    dented = points[:, 2] > 0.95
+    points[dented, 2] -= 2.1  # out at the other side
+    among = dented[faces].any(axis=1)
+    assert crossing_loop(points, tree, among, False, boxes, found) > 0
+    np.testing.assert_array_equal(found, crossing_faces(points, faces))
+    points[dented, 2] += 2.1
+    assert crossing_loop(points, tree, among, False, boxes, found) == 0
