@@ -16,8 +16,10 @@ import numpy as np
 from rbfmuscle.jit import compiled, inner
 
 # Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in
-# volume. The surface is drawn at the volume at rest in any case.
-BULK, MOST_PRESSURE = 50.0, 3.0
+# volume, by a share of pressure / bulk modulus. With 50, Poisson's ratio 0.495, muscles of the leg
+# lost up to 4.5 % in a squat; with 200, 0.4988, they lose 1.8 % in as many iterations. The surface
+# is drawn at the volume at rest in any case.
+BULK, MOST_PRESSURE = 200.0, 3.0
 # Over 2 μ: at higher pressures det F bends the energy more than the iteration's matrix does, and
 # steps are shortened.
 CALM_PRESSURE = 0.5
