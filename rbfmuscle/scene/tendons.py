@@ -19,9 +19,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.taut_lines import taut_line
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.geometry.vectors import across, unit
-from rbfmuscle.jit import compiled
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import rotation_about
@@ -36,8 +36,7 @@ CHORD = 0.06  # the string's direction is that of a chord so long, in lengths of
 # ends them.
 STEPS, TOLERANCE = 8, 1e-9
 NODES = 33  # points of a tendon as it is drawn
-STEEPEST = 2.0  # greatest slope of a line against the chord of its ends
-DIRECTIONS = 64  # directions in which a convex hull is begun
+AROUND = 16  # directions around a leg of the string, on one of whose sides it passes the bones
 
 # A bone and a point (3,) of it at rest [scene unit].
 BonePoint: TypeAlias = tuple[str, Floats]
@@ -136,22 +135,41 @@ class TendonEnd:
     def _sides(self) -> list[Floats]:
         """Directions (3,) at rest on whose side each leg of the string passes the bones: out of the
         nearest bone, or towards the belly's end where the string is shorter by a tenth that way.
+
+        A leg that would lie deeper in a bone than its radius, as between two bones, takes the side
+        on which it is shortest of those where it lies least deep.
         """
         stops = [point for _, point in (*self.other, *self.line)]
         places = [0.5 * (a + b) for a, b in itertools.pairwise(stops)]
-        leg = len(self.other) - 1
-        places[leg] = self.middle
+        belly = len(self.other) - 1
+        places[belly] = self.middle
         sides = [self._outwards(*leg) for leg in zip(places, stops, stops[1:])]
-        own = unit(across(self.middle - stops[leg], unit(stops[leg + 1] - stops[leg])))
-        if self._past_end(own) < SHORTER * self._past_end(sides[leg]):
-            sides[leg] = own
+        along = [unit(b - a) for a, b in itertools.pairwise(stops)]
+        own = unit(across(self.middle - stops[belly], along[belly]))
+        by_end, outwards = (line_length(self._leg_at_rest(belly, s)) for s in (own, sides[belly]))
+        if by_end < SHORTER * outwards:
+            sides[belly] = own
+        for leg, side in enumerate(sides):
+            if self._too_deep(self._leg_at_rest(leg, side)) > 0.0:
+                around = [
+                    rotation_about(along[leg], angle, np.zeros(3))[:3, :3] @ side
+                    for angle in 2.0 * np.pi / AROUND * np.arange(AROUND)
+                ]
+                lines = [self._leg_at_rest(leg, direction) for direction in around]
+                faults = [(self._too_deep(line), line_length(line)) for line in lines]
+                sides[leg] = around[faults.index(min(faults))]
         return sides
 
-    def _past_end(self, side: Floats) -> float:
-        """Length at rest of the string's leg past the belly's end, passing bones on a side (3,)."""
-        stops = [*self.other, *self.line][len(self.other) - 1 :][:2]
-        (leg,) = self._legs([point for _, point in stops], stops, [side], AT_REST)
-        return line_length(leg)
+    def _leg_at_rest(self, leg: int, side: Floats) -> Floats:
+        """A leg of the string at rest (n, 3), passing bones on a side (3,)."""
+        stops = [*self.other, *self.line][leg : leg + 2]
+        return self._legs([point for _, point in stops], stops, [side], AT_REST)[0]
+
+    def _too_deep(self, line: Floats) -> float:
+        """How much deeper than its radius a line (n, 3) at rest lies in a bone."""
+        inner = _with_nodes(line)[1:-1]
+        depths = (float(_depths(bone, inner).max()) for bone in self.obstacles)
+        return max(max(depths, default=0.0) - self.radii[1], 0.0)
 
     def _outwards(self, place: Floats, start: Floats, end: Floats) -> Floats:
         """Unit direction (3,) across a leg, out of or away from the bone nearest to a place (3,),
@@ -323,74 +341,3 @@ def _least_turn(now: Floats, before: Floats) -> Floats:
     axis, cosine = np.cross(before, now), float(before @ now)
     skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     return np.eye(3) + skew + skew @ skew / max(1.0 + cosine, 1e-9)
-
-
-def taut_line(
-    start: Floats, end: Floats, side: Floats, bones: Sequence[tuple[Floats, Floats]], width: float
-) -> Floats:
-    """Points (n, 3) of the taut line between two points (3,) that passes bones on one side, a
-    direction (3,).
-
-    The line lies in the plane of its ends and ``side``. A point of a bone at a distance z from the
-    plane is an obstacle in it, lower by z² / (2 ``width``), as for a round band. One that the line
-    could only pass by leaving an end more steeply than `STEEPEST` is lowered below that slope by as
-    much as it is above. So the line changes continuously where the plane comes to meet a bone, and
-    parts of bones that lie far to the side do not count. ``bones`` are poses (4, 4) and points (n,
-    3) at rest.
-    """
-    size = float(np.linalg.norm(end - start))
-    along = (end - start) / max(size, 1e-300)
-    up = side - (side @ along) * along
-    up = up / max(float(np.linalg.norm(up)), 1e-300)
-    axes = np.stack([along, up, np.cross(along, up)])
-    profile = []
-    for pose, points in bones:
-        turn = axes @ pose[:3, :3]
-        shift = axes @ (pose[:3, 3] - start)
-        found = np.empty((len(points), 2))
-        profile.append(found[: _profile_loop(points, turn, shift, size, max(width, 1e-300), found)])
-    if not any(len(found) for found in profile):
-        return np.stack([start, end])
-    return start + _upper_hull(np.concatenate([[[0.0, 0.0], [size, 0.0]], *profile])) @ axes[:2]
-
-
-@compiled(error_model="numpy")
-def _profile_loop(points, turn, shift, size, width, found):
-    """Fill ``found`` with points along and above a chord, counted as in `taut_line`; return how
-    many there are.
-    """
-    count = 0
-    for i in range(len(points)):
-        a = points[i, 0]
-        b = points[i, 1]
-        c = points[i, 2]
-        x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0]
-        if x <= 0.0 or x >= size:
-            continue
-        y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + shift[1]
-        z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + shift[2]
-        y = min(y, 2.0 * STEEPEST * min(x, size - x) - y) - z * z / (2.0 * width)
-        if y > 0.0:
-            found[count, 0], found[count, 1] = x, y
-            count += 1
-    return count
-
-
-def _upper_hull(points: Floats) -> Floats:
-    """Upper convex hull (k, 2) of points (n, 2), from left to right (Andrew 1979)."""
-    # Nearly all points lie below the hull of those that are outermost in some directions.
-    angles = np.linspace(0.0, np.pi, DIRECTIONS)
-    outermost = np.unique(
-        np.argmax(np.stack([-np.cos(angles), np.sin(angles)], axis=1) @ points.T, axis=1)
-    )
-    outermost = outermost[np.argsort(points[outermost, 0], kind="stable")]
-    above = points[:, 1] >= np.interp(points[:, 0], *points[outermost].T)
-    hull: list[Floats] = []
-    for point in points[above][np.lexsort(points[above].T[::-1])]:
-        while len(hull) > 1:
-            (ax, ay), (bx, by) = hull[-2], hull[-1]
-            if (bx - ax) * (point[1] - ay) < (by - ay) * (point[0] - ax):
-                break
-            hull.pop()
-        hull.append(point)
-    return np.array(hull)

@@ -11,12 +11,13 @@ from tendon_scene import END, arm
 from toy_scene import held
 
 import rbfmuscle as rm
+from rbfmuscle.geometry.taut_lines import taut_line
 from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.output.appearance import LONGEST_TAPER, TAPER, tendon_mesh
 from rbfmuscle.run import Run
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.tendons import AT_REST, STIFFNESS_RATIO, TendonEnd, TendonLine, taut_line
+from rbfmuscle.scene.tendons import AT_REST, STIFFNESS_RATIO, TendonEnd, TendonLine
 
 
 def placed(scene, bend, turn=0.0):
@@ -122,6 +123,38 @@ def test_a_string_passes_bones_on_the_side_of_the_bellys_end():
     assert line_length(string) == pytest.approx(tangents + 20.0 * turned, rel=5e-3)
     assert string[:, 1].min() == pytest.approx(-20.0, abs=0.5)
     np.testing.assert_allclose(string[:, 0], 0.0, atol=1e-9)
+
+
+def test_a_tendon_between_two_bones_passes_beside_one_not_through_the_other():
+    radius = 15.0
+    scene = rm.Scene("condyle and plateau", units="mm")
+    scene.add_bone("condyle", trimesh.creation.icosphere(subdivisions=4, radius=radius))
+    plateau = trimesh.creation.box((50.0, 60.0, 20.0))
+    for _ in range(4):
+        plateau = plateau.subdivide()
+    scene.add_bone("plateau", plateau.apply_translation([5.0, 0.0, -27.0]))
+    middle, via, insertion = np.array([[-24.0, 4, -30], [-24.0, 8, -12], [15.5, 8, -3]])
+    end = TendonEnd(
+        name="end",
+        patch=middle[None],
+        middle=middle,
+        radii=(3.0, 1.0),
+        line=[("plateau", via), ("condyle", insertion)],
+        other=[("plateau", np.array([-24.0, 0.0, -90.0]))],
+        obstacles=scene.bones,
+    )
+    line = end.place(AT_REST)[0].points
+    # Out of the condyle, which is nearest, the string would go through the plateau.
+    for bone in scene.bones:
+        assert bone.exact.depth(line).max() < 1e-9
+    away = [float(np.linalg.norm(point)) for point in (via, insertion)]
+    turned = math.acos(via @ insertion / math.prod(away)) - sum(
+        math.acos(radius / one) for one in away
+    )
+    shortest = sum(math.sqrt(one**2 - radius**2) for one in away) + radius * turned
+    past_via = line_length(line) - np.linalg.norm(via - middle)
+    # It lies in a plane, of 16 about its chord.
+    assert shortest - 1e-6 < past_via < 1.04 * shortest
 
 
 def test_the_end_of_a_limb_bent_backwards_goes_around_the_joint_continuously():
