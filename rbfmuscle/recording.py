@@ -29,7 +29,13 @@ from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.writer import Neighbours, RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
 from rbfmuscle.report.verdict import describe_verdict, require_limits
-from rbfmuscle.scene.check import bone_collisions, bone_findings, check_initial, sampled_frames
+from rbfmuscle.scene.check import (
+    bone_collisions,
+    bone_findings,
+    check_initial,
+    sampled_frames,
+    stated_doubts,
+)
 from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Event, Frame
@@ -243,11 +249,12 @@ def timed(times: dict[str, float], part: str) -> Iterator[None]:
 
 
 def _with_doubts(verdict: str, scene: Scene) -> str:
-    """A verdict, and what makes the scene another one than its source."""
-    if not scene.doubts:
+    """A verdict, and what is doubtful about its scene."""
+    doubts = stated_doubts(scene)
+    if not doubts:
         return verdict
-    more = f"; and {len(scene.doubts) - 1} more" if len(scene.doubts) > 1 else ""
-    return f"{verdict}. Doubtful: {scene.doubts[0]}{more} (rbfmuscle check lists all)"
+    more = f"; and {len(doubts) - 1} more" if len(doubts) > 1 else ""
+    return f"{verdict}. Doubtful: {doubts[0]}{more} (rbfmuscle check lists all)"
 
 
 Found = tuple[list[Event], dict[str, float]]

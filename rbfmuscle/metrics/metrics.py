@@ -16,7 +16,8 @@ from rbfmuscle.metrics.depths import bone_depth, surface_depth
 from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
 from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.bone import BoneDistance
-from rbfmuscle.scene.guesses import doubtful
+from rbfmuscle.scene.check import end_gap
+from rbfmuscle.scene.guesses import doubtful, guessed_muscles
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Event, Frame, Mesh, ModelSurface
@@ -46,6 +47,7 @@ class MuscleMeasures:
     def __init__(self, scene: Scene, material: Mapping[str, Mesh]) -> None:
         self.probes = [bone.exact for bone in scene.bones]
         surfaces = scene_surfaces(scene)
+        guessed = guessed_muscles(scene.guesses)
         mine = [muscle for muscle in scene.muscles if muscle.name in material]
         self.trackers = {
             muscle.name: MuscleMeasurer(muscle, scene, *material[muscle.name]) for muscle in mine
@@ -53,6 +55,8 @@ class MuscleMeasures:
         for muscle in mine:
             self.trackers[muscle.name].first = {
                 "articular_share": articular_share(muscle, scene, surfaces)[0],
+                "end_gap": end_gap(muscle, scene)[0],
+                "guessed": muscle.name in guessed,
                 "doubtful_guesses": len(doubtful(scene.guesses, "muscle", muscle.name)),
             }
 
@@ -84,7 +88,6 @@ class MuscleMeasurer:
     def __init__(self, muscle: Muscle, scene: Scene, vertices: Floats, faces: Integers) -> None:
         self.name = muscle.name
         self.mesh = muscle.mesh
-        self.attachments = muscle.attachments
         self.rest_volume = float(muscle.mesh.volume)
         self.edges = EdgeLengths(vertices, faces)
         #: What is measured once, with the first frame.
@@ -193,10 +196,7 @@ class MuscleMeasurer:
         # Its tree is that of the first frame too.
         shown = self.distance = MeshDistance(surface.vertices, surface.faces)
         rms, worst = distance_between(shown, MeshDistance(there, mesh[1]))
-        bones = {probe.name: probe for probe in probes}
-        held = [a for a in self.attachments if a.tendon is None and not a.via]
-        gaps = [bones[a.bone].unsigned(mesh[0][a.vertices]).min() for a in held]
-        found = {"rest_error_rms": rms, "rest_error_max": worst, "end_gap": max(gaps, default=0.0)}
+        found = {"rest_error_rms": rms, "rest_error_max": worst}
         found["initial_shift"] = float(np.linalg.norm(there - mesh[0], axis=1).max())
         found["initial_overlap"] = max(
             float(surface_depth(surface.vertices, probes, poses).max()),

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, percentiles, unit_text
+from rbfmuscle.scene.guesses import guessed_muscles
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, shown_value
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -72,7 +73,7 @@ def moment_arm_rows(
             rows.append(row._replace(muscle=muscle, value=float(moments)))
     known = all_coordinates(scene.joints)
     turning = [row for row in rows if known[row.coordinate].motion == "rotation"]
-    guessed = {guess.name for guess in scene.guesses if guess.table == "muscle"}
+    guessed = guessed_muscles(scene.guesses)
     for arms in _by_muscle(turning):
         rows += _smoothness(arms, guessed=arms[0].muscle in guessed)
     for muscle, of_fibres in fibres.items():

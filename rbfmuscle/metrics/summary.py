@@ -11,7 +11,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row
-from rbfmuscle.scene.check import MOST_ARTICULAR
+from rbfmuscle.scene.check import END_GAP_MM, END_SHARE, MOST_ARTICULAR
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import UsageError, did_you_mean
@@ -132,7 +132,9 @@ LIMITS = {
     "bowing": Limit(1.03, "centreline over shortest path", _LOOK),
     "tunnelled": Limit(0.0, "points beyond a bone", _SMALLER_STEPS),
     "rest_error_rms": Limit(0.6, "rest error", _MORE_CENTRES, _APART),
-    "end_gap": Limit(25.0, "end away from its bone", "correct the attachment, or give it a tendon"),
+    "end_gap": Limit(
+        END_GAP_MM, "end away from its bone", "correct the attachment, or give it a tendon"
+    ),
     "tendon_depth": Limit(
         0.3, "tendon in a bone", "give the tendon via points, or move them out of the bones"
     ),
@@ -165,8 +167,6 @@ NEEDS = {
     "moment_arm_reversal": "moment_arm_reversal",
 }
 COUNTS = ("components", "euler_characteristic", "self_crossings", "tunnelled", "doubtful_guesses")
-# An end without a tendon lies no farther from its bone than this share of the muscle's length.
-END_SHARE = 0.1
 # A muscle thinner than this [mm] may have this rest error [mm].
 THIN, THIN_REST_ERROR = 10.0, 1.0
 # A muscle that bows at rest may do so by this much more.
@@ -289,13 +289,18 @@ def _in_unit(value, quantity, unit):
 
 
 def muscle_limit(quantity: str, limits: Limits, found: Mapping[str, QuantityFacts]) -> float:
-    """Limit of one muscle: of defaults, thin ones and those bowed at rest have wider ones."""
+    """Limit of one muscle: of defaults, thin ones and those bowed at rest have wider ones.
+
+    Where an end lies is a fault of a guess alone, unless the limit is asked for by name.
+    """
     limit = limits.values[quantity]
     if limits.is_given(quantity):
         return limit
-    length = found.get("length", {}).get("first")
-    if quantity == "end_gap" and length is not None:
-        return min(limit, END_SHARE * length)
+    if quantity == "end_gap":
+        if not found.get("guessed", {}).get("first") and not limits.is_named(quantity):
+            return math.inf
+        length = found.get("length", {}).get("first")
+        return limit if length is None else min(limit, END_SHARE * length)
     if quantity == "rest_error_rms" and "thickness" in found:
         unit = found["thickness"]["unit"]
         thickness = found["thickness"]["first"]

@@ -339,7 +339,8 @@ def _cell(name: str, found: Mapping[str, QuantityFacts], limits: Limits) -> Cell
         return Cell(f"{facts['min']:.4g} … {facts['max']:.4g}")
     if name == "time_frame":
         return number_cell(facts["median"], "s")
-    limit = muscle_limit(name, limits, found) if name in limits.values else None
+    limit = muscle_limit(name, limits, found) if name in limits.values else math.inf
+    limit = limit if math.isfinite(limit) else None
     state = limit_state(name, facts["worst"], limit)
     cell = number_cell(facts["worst"], state=state) if state == BAD else number_cell(facts["worst"])
     own = limit is not None and limit != limits.values[name]

@@ -11,14 +11,18 @@ import numpy as np
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.ends import attachment_ends
 from rbfmuscle.scene.extents import check_place, check_size
-from rbfmuscle.scene.guesses import doubtful
+from rbfmuscle.scene.guesses import doubtful, guessed_muscles
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SceneError
 
 MOST_ARTICULAR = 0.5  # share of an attachment that may lie on an articular surface
+# An end without a tendon lies no farther from its bone than this [mm], and than this share of the
+# muscle's length.
+END_GAP_MM, END_SHARE = 25.0, 0.1
 MOTION_SAMPLES = 10  # frames in which bones are checked against each other
 COUNTED_DEPTH_MM = 0.05  # bones that touch by less are not reported
 
@@ -60,6 +64,7 @@ def check_scene(scene: Scene) -> list[Finding]:
         words = "no bone has a mesh, so nothing can be run; give the bones meshes"
         return sort_findings([*findings, Finding("note", scene.name, words)])
     findings += _attachment_findings(scene)
+    findings += [Finding("warning", name, text) for name, text in open_ends(scene).items()]
     try:
         findings += bone_findings(bone_collisions(scene), scene.units)
         check_extents(scene)
@@ -97,6 +102,50 @@ def _attachment_findings(scene):
         for name, share, bone in shares
         if share > MOST_ARTICULAR
     ]
+
+
+def end_gap(muscle: Muscle, scene: Scene) -> tuple[float, str]:
+    """Distance of the end without a tendon that lies farthest from its bone at rest [scene unit],
+    and that bone.
+    """
+    bones = {bone.name: bone for bone in scene.bones}
+    points = np.asarray(muscle.mesh.vertices)
+    gaps = [
+        (float(bones[a.bone].exact.unsigned(points[a.vertices]).min()), a.bone)
+        for a in muscle.attachments
+        if a.tendon is None and not a.via and a.bone in bones
+    ]
+    return max(gaps, default=(0.0, ""))
+
+
+def open_ends(scene: Scene) -> dict[str, str]:
+    """What is said of each muscle that ends short of its bone without a tendon, by name."""
+    found = {}
+    for muscle in scene.muscles:
+        gap, bone = end_gap(muscle, scene)
+        most = scene.length(END_GAP_MM)
+        ends = attachment_ends(muscle, scene.joints)
+        if ends is not None:
+            first, last = (
+                muscle.mesh.vertices[np.concatenate([a.vertices for a in held])].mean(axis=0)
+                for held in ends
+            )
+            most = min(most, END_SHARE * float(np.linalg.norm(last - first)))
+        if gap > most:
+            found[muscle.name] = (
+                f"an end lies {gap:.3g} {scene.units} from {bone!r}, which holds it; correct the "
+                "attachment, or give it a tendon"
+            )
+    return found
+
+
+def stated_doubts(scene: Scene) -> list[str]:
+    """What is doubtful about a scene though no line of it is a guess: ``doubts`` of the scene, and
+    ends of muscles that lie away from their bones, which those who wrote it stated.
+    """
+    guessed = guessed_muscles(scene.guesses)
+    ends = [f"{name}: {text}" for name, text in open_ends(scene).items() if name not in guessed]
+    return [*scene.doubts, *ends]
 
 
 def sort_findings(findings: Iterable[Finding]) -> list[Finding]:

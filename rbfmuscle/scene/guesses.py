@@ -38,6 +38,11 @@ def find_guesses(text: str) -> list[Guess]:
     return [Guess(*tables[at], confidence, said) for at, confidence, said in found]
 
 
+def guessed_muscles(guesses: list[Guess]) -> set[str]:
+    """Names of the muscles about which there are guesses, however sure."""
+    return {guess.name for guess in guesses if guess.table == "muscle"}
+
+
 def doubtful(guesses: list[Guess], table: str, name: str = "") -> list[Guess]:
     """The doubtful ones of some guesses about a table, or about one name in it."""
     return [

@@ -7,6 +7,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.vectors import unit
+from rbfmuscle.scene.check import stated_doubts
 from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Mesh
@@ -67,7 +68,7 @@ def scene_marks(scene: Scene) -> Marks:
         for table in ("joint", "muscle")
         for guess in doubtful(scene.guesses, table)
     ]
-    return Marks(axes, held, [*scene.doubts, *guesses])
+    return Marks(axes, held, [*stated_doubts(scene), *guesses])
 
 
 class MarkView:

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from blend_model import arm_scene, use_blend_model
 
+from rbfmuscle.cli.verdict import verdict_lines
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
 from rbfmuscle.metrics.rows import joint_gaps
 from rbfmuscle.metrics.summary import (
@@ -19,8 +20,11 @@ from rbfmuscle.metrics.summary import (
     parse_limits,
     unmeasured,
 )
+from rbfmuscle.report.report import write_report
 from rbfmuscle.report.verdict import describe_verdict
 from rbfmuscle.run import Run, simulate, stream_run
+from rbfmuscle.scene.check import check_scene, stated_doubts
+from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.validation import LimitExceededError, UsageError
 
 # Of issue and docs, in millimetres: what is just allowed, and what is not.
@@ -69,11 +73,9 @@ def facts(values, *, units="mm", muscle="psoas", **others):
 def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantity, units):
     scale = 0.001 if units == "m" and QUANTITIES[quantity][0] == "length" else 1.0
     limits = parse_limits(None, arm_scene(units=units))
-    # A muscle that is straight and in no bone at rest.
-    allowed, beyond = (
-        {"bowing_at_rest": [1.0], "initial_overlap": [0.0], quantity: [scale * v]}
-        for v in TABLE[quantity]
-    )
+    # A muscle that is guessed, straight and in no bone at rest.
+    at_rest = {"guessed": [1.0], "bowing_at_rest": [1.0], "initial_overlap": [0.0]}
+    allowed, beyond = (at_rest | {quantity: [scale * v]} for v in TABLE[quantity])
     assert set(TABLE) == set(LIMITS) and exceeded(facts(allowed, units=units), limits) == []
     said = describe_verdict(facts(allowed, units=units), limits)
     assert said.startswith("every muscle is within all limits that were measured")
@@ -110,13 +112,17 @@ def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantit
         ({"bowing_at_rest": [1.05], "bowing": [1.07, 1.09]}, False),
         ({"bowing_at_rest": [1.0], "bowing": [1.031]}, False),
         ({"bowing_at_rest": [1.0], "bowing": [1.05, 1.06]}, False),
+        # Only a guess is at fault where a muscle ends away from its bone.
+        ({"end_gap": [24.0], "guessed": [1.0], "length": [250.0]}, True),
+        ({"end_gap": [24.0], "guessed": [1.0], "length": [230.0]}, False),
+        ({"end_gap": [40.0], "guessed": [0.0], "length": [230.0]}, True),
         ({"volume_error": [np.nan]}, False),
     ],
 )
 def test_exceptions_from_limits(values, kept):
     assert (exceeded(facts(values), parse_limits("all", arm_scene())) == []) == kept
     # Of a limit that is asked for there are none, were it the default itself.
-    for quantity, default in (("rest_error_rms", 0.6), ("bowing", 1.03)):
+    for quantity, default in (("rest_error_rms", 0.6), ("bowing", 1.03), ("end_gap", 20.0)):
         asked = parse_limits(f"{quantity}={default}", arm_scene())
         assert quantity not in values or exceeded(facts(values), asked)
 
@@ -210,6 +216,7 @@ def test_overlap_and_ends_away_from_bones_are_seen_in_a_run(
     scene = arm_scene(end=10)  # its muscle moved down, into the bones, or up, away from them
     scene.muscles[0].mesh.apply_translation([0.0, 0.0, shift])
     scene = scene.with_options({"contact.initial": "keep"})
+    scene.guesses = [Guess("muscle", "biceps", 0.9, "held by the nearest bones")]
     assert simulate(arm_scene(end=10)).values("biceps", name)[0] < least
     info = stream_run(scene, tmp_path, pictures=False)  # a warning by default
     found = {row.quantity: row.value for row in info.beyond}
@@ -218,6 +225,25 @@ def test_overlap_and_ends_away_from_bones_are_seen_in_a_run(
     with pytest.raises(LimitExceededError, match=name) as caught:
         stream_run(scene, tmp_path, fail_on="all", pictures=False)
     assert caught.value.exit_code == 6
+
+
+def test_an_end_that_is_stated_to_lie_away_from_its_bone_is_a_doubt(monkeypatch, tmp_path):
+    use_blend_model(monkeypatch)
+    scene = arm_scene(end=10)
+    assert stated_doubts(scene) == []
+    scene.muscles[0].mesh.apply_translation([0.0, 0.0, 40.0])
+    info = stream_run(scene, tmp_path, pictures=False)
+    assert "end_gap" not in {row.quantity for row in info.beyond}
+    said = ". Doubtful: biceps: an end lies"
+    assert said in info.verdict and any("doubtful: " in line for line in verdict_lines(tmp_path))
+    (warning,) = [f for f in check_scene(scene) if "an end lies" in f.message]
+    assert (warning.level, warning.place) == ("warning", "biceps")
+    with pytest.raises(LimitExceededError, match="end_gap"):
+        stream_run(scene, tmp_path, fail_on="end_gap", pictures=False)
+    write_report(tmp_path, pictures=False)
+    assert said.strip(". ") in (tmp_path / "report.html").read_text()
+    scene.guesses = [Guess("muscle", "biceps", 0.9, "")]
+    assert stated_doubts(scene) == []  # it counts
 
 
 def test_rest_is_measured_whatever_frames_are_asked_for(monkeypatch, tmp_path):
