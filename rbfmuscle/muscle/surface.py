@@ -29,8 +29,10 @@ NEAR_BONE = 1.5  # what is within this of a bone may come to lie on it
 SAME = 0.02  # what moved less than this by a bone need not be asked for anew
 SUNK = 1.0  # deeper in a bone the material is sunk
 LAMELLA = 0.02  # where both sides of a muscle sink into a bone, the far one stays above it by this
-# No vertex goes farther than this from where the material carries it; in the share that the field's
-# slope there has of its slope at rest, from none at the first, but always so far.
+# No vertex goes farther than this from where the material carries it, times the square of the share
+# that the field's slope there has of its slope at rest, from none at the first; but always so far.
+# Where sheets of a muscle meet, the slope sinks within few frames: by the share itself vertices of
+# the leg's muscles jump by up to 0.85 mm in a squat, by its square 0.63.
 FARTHEST = 1.0
 UNSURE = 0.3
 ALWAYS = 0.05
@@ -240,7 +242,7 @@ def _trust(slope, at_rest):
     """How far, in mean edges, a vertex may go from the material for a field of this slope."""
     if not at_rest > UNSURE:
         return 0.0
-    return FARTHEST * min(max((slope / at_rest - UNSURE) / (1.0 - UNSURE), 0.0), 1.0)
+    return FARTHEST * min(max((slope / at_rest - UNSURE) / (1.0 - UNSURE), 0.0), 1.0) ** 2
 
 
 @compiled(error_model="numpy", inline="always")

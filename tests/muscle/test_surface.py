@@ -24,6 +24,7 @@ from rbfmuscle.muscle.model import Embedding
 from rbfmuscle.muscle.surface import (
     FITTED,
     NO_FIT,
+    UNSURE,
     clear_rest,
     finish_surface,
     start_surface,
@@ -170,6 +171,10 @@ def test_how_far_a_vertex_may_go_does_not_depend_on_the_last_frame():
     carried = X * (1.0 + 0.4 * EDGE * np.sin(7.0 * X[:, 1:2]))
     first, crossing, outcome, left = drawn(carried)
     assert (crossing, outcome) == (0, FITTED) and left.sum() > 50
+    # The slope is that of the field where carried, 1 to within a tenth.
+    most = ((0.5 - UNSURE) / (1.0 - UNSURE)) ** 2 * EDGE
+    bounded = np.linalg.norm(first[left] - carried[left], axis=1)
+    assert np.median(bounded) == pytest.approx(most, rel=0.1)
     for _ in range(3):
         drawn.state.height[:] = EDGE * rng.uniform(-0.5, 0.5, len(X))
         found, crossing, _, again = drawn(carried)
