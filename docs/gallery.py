@@ -27,7 +27,7 @@ EXAMPLES = (
 TOPICS = {
     "Scenes": ("Scene", "phantom_scene"),
     "Running and comparing": ("simulate", "Run", "compare_models", "show"),
-    "Fields and kernels": ("RBFField", "study_kernels", "reach_error"),
+    "Fields and kernels": ("RBFField", "study_kernels", "reach_error", "register_kernel"),
     "Muscles and bones": ("RBFMuscle", "BoneSDF"),
     "Errors and warnings": (
         "RBFMuscleError",

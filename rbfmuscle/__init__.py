@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rbfmuscle.experiments.kernel_study import study_kernels as study_kernels
     from rbfmuscle.experiments.wanted_error import reach_error as reach_error
     from rbfmuscle.implicit.field import RBFField as RBFField
+    from rbfmuscle.implicit.kernels.table import register_kernel as register_kernel
     from rbfmuscle.muscle.muscle import RBFMuscle as RBFMuscle
     from rbfmuscle.run import Run as Run
     from rbfmuscle.run import simulate as simulate
@@ -59,6 +60,7 @@ _HOME = {
     "compare_models": "rbfmuscle.compare",
     "discretisation_error": "rbfmuscle.accuracy",
     "phantom_scene": "rbfmuscle.scene.phantom",
+    "register_kernel": "rbfmuscle.implicit.kernels.table",
     "reach_error": "rbfmuscle.experiments.wanted_error",
     "show": "rbfmuscle.viewer.page",
     "simulate": "rbfmuscle.run",

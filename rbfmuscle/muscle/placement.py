@@ -85,7 +85,7 @@ def choose_centres(
         np.asarray(muscle.mesh.faces),
     )
     fit = (
-        options.kernel,
+        get_kernel(options.kernel).identity,
         round(options.epsilon * frame.size, 9),
         options.condition,
         options.samples,

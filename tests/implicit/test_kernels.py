@@ -3,10 +3,13 @@
 import mpmath as mp
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.distance import cdist
 
+from rbfmuscle.experiments.kernel_study import study_kernels
+from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.assembly import exponents
-from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel, register_kernel
 from rbfmuscle.validation import UsageError
 
 mp.mp.dps = 50
@@ -132,3 +135,101 @@ def test_a_kernel_that_is_no_name_is_refused_as_such():
         get_kernel(lambda s: s**3)
     with pytest.raises(UsageError, match="unknown kernel 'cubik', did you mean 'cubic'"):
         get_kernel("cubik")
+
+
+def sech(s):
+    return 1 / np.cosh(s)
+
+
+def sech_first(s):
+    return -np.tanh(s) / np.cosh(s) / s
+
+
+def sech_second(s):
+    return (1 - 2 / np.cosh(s) ** 2 + np.tanh(s) / s) / np.cosh(s) / s**2
+
+
+@pytest.fixture
+def outside():
+    """Kernels that a test registers are unknown after it."""
+    known = dict(KERNELS)
+    yield lambda name, *functions, **facts: register_kernel(
+        name, *functions, **{"order": 0, "smoothness": 99, **facts}
+    )
+    KERNELS.clear()
+    KERNELS.update(known)
+
+
+@pytest.mark.parametrize(
+    "name", ["linear", "thin_plate_spline", "gaussian", "matern_52", "wendland_c4", "buhmann"]
+)
+def test_a_kernel_given_as_functions_is_the_built_in_one(outside, name):
+    own = KERNELS[name]
+    functions = [own.phi, own.first, own.second][: 3 if own.hermite else 2]
+    copy = outside(
+        "copy", *functions, order=own.order, smoothness=own.smoothness, compact=own.compact
+    )
+    s = np.concatenate([[0.0], np.geomspace(1e-8, 1e4, 997)])
+    usual = np.linspace(0.5, 1.0, 20, endpoint=False)
+    size = 0.0
+    for function in ["phi", "first", "second"][: len(functions)]:
+        exact, found = getattr(own, function)(s), getattr(copy, function)(s)
+        bound = np.abs(getattr(own, function)(usual)).max()
+        finite = np.isfinite(exact)
+        assert (np.isfinite(found) == finite).all()
+        size = np.maximum(np.maximum(np.abs(exact), bound), size)
+        assert (np.abs(found[finite] - exact[finite]) <= 1e-11 * size[finite]).all()
+        size = np.where(s > 0, size / np.maximum(s, 1e-99) ** 2, 0.0)
+
+
+def test_a_field_is_the_same_with_a_kernel_given_as_functions(outside):
+    gaussian = KERNELS["gaussian"]
+    outside("copy", gaussian.phi, gaussian.first, gaussian.second)
+    normals = np.random.default_rng(3).normal(size=(60, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    at = np.random.default_rng(4).uniform(-1.5, 1.5, (300, 3))
+    own, copy = (
+        RBFField.fit_hermite(normals, normals, kernel=name, epsilon=1.5)
+        for name in ("gaussian", "copy")
+    )
+    # the condition, 1e4, times what is lost by sampling, 1e-12
+    assert np.abs(own(at) - copy(at)).max() < 1e-7
+    assert np.abs(own.gradient(at) - copy.gradient(at)).max() < 1e-7
+
+
+def test_a_registered_kernel_is_studied_beside_the_others(outside):
+    outside("sech", sech, sech_first, sech_second)
+    ball = trimesh.creation.icosphere(3, 10.0)
+    study = study_kernels(ball, kernels=["sech", "cubic"], centres=[60], resolution=24)
+    errors = {row["kernel"]: row["rms"] for row in study.rows}
+    assert errors["sech"] < errors["cubic"]
+
+
+def test_wrong_functions_of_a_kernel_are_refused(outside):
+    with pytest.raises(UsageError, match="'cubic' is known already"):
+        outside("cubic", sech, sech_first, sech_second)
+    with pytest.raises(UsageError, match="letters, digits and _"):
+        outside("a,b", sech, sech_first, sech_second)
+    with pytest.raises(UsageError, match="C99, so it needs its function second"):
+        outside("new", sech, sech_first)
+    with pytest.raises(UsageError, match="first of a kernel is not the derivative of phi"):
+        outside("new", sech, lambda s: -sech_first(s), sech_second)
+    with pytest.raises(UsageError, match="second of a kernel is not the derivative of first"):
+        outside("new", sech, sech_first, lambda s: sech_second(s) + 1e-4)
+    with pytest.raises(UsageError, match="not smooth enough near s = "):
+        outside("new", lambda s: np.where(s < 1.01, sech(s), 0), sech_first, smoothness=0)
+    with pytest.raises(UsageError, match="phi of a kernel is not finite near s = 1"):
+        outside("new", lambda s: np.where(s < 1.01, 1.0, np.inf), sech_first, smoothness=0)
+    with pytest.raises(UsageError, match="phi of a kernel must be finite at s = 0, got nan"):
+        outside("new", lambda s: np.sin(s) / s * sech(s), sech_first, smoothness=0)
+    with pytest.raises(UsageError, match="takes an array"):
+        outside("new", lambda s: 1.0, sech_first, smoothness=0)
+    assert "new" not in KERNELS
+
+
+def test_what_is_kept_of_a_kernel_goes_by_its_formula(outside):
+    first = outside("one", sech, sech_first, sech_second).identity
+    KERNELS.pop("one")
+    functions = [KERNELS["matern_72"].phi, KERNELS["matern_72"].first, KERNELS["matern_72"].second]
+    assert outside("one", *functions, smoothness=6).identity != first
+    assert KERNELS["cubic"].identity == "cubic"

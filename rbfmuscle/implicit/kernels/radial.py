@@ -11,8 +11,15 @@ import numpy as np
 
 from rbfmuscle.jit import compiled
 
-ONE, EXP, GAUSS, BINOMIAL, CUT, LOG, POWER = range(7)
-"""Bases: 1, exp(-s), exp(-s^2), (1+s^2)^beta, (1-s)+, log s, s^a."""
+ONE, EXP, GAUSS, BINOMIAL, CUT, LOG, POWER, SAMPLED = range(8)
+"""Bases: 1, exp(-s), exp(-s^2), (1+s^2)^beta, (1-s)+, log s, s^a; polynomials of `sampled.py`."""
+
+# Of a sampled kernel: panels to an octave of u as a power of 2, from 2^LOW to 2^HIGH, and the
+# coefficients of a panel.
+BITS = 5
+LOW = -60
+HIGH = 30
+SIZE = 8
 
 
 class Form(NamedTuple):
@@ -168,6 +175,11 @@ def _radial_loop(form, wanted, u, work, out):
     zero vectors.
     """
     base, parameter, compact, table = form
+    if base == SAMPLED:
+        for k in range(3):
+            if (wanted >> k) & 1:
+                _sampled_loop(table[k], compact, u, out[k])
+        return
     s = work[0][: u.size]
     b = work[1][: u.size]
     more = work[2][: u.size]
@@ -208,3 +220,26 @@ def _times_power_loop(power, u, s, values):
     for _ in range(-power):
         for i in range(u.size):
             values[i] = values[i] / s[i] if s[i] > 0.0 else 0.0
+
+
+@compiled(error_model="numpy")
+def _sampled_loop(row, compact, u, out):
+    """Values of a sampled function. The panel is in the exponent and the first bits behind it."""
+    last = (HIGH - LOW << BITS) - 1
+    shift = np.int64(52 - BITS)
+    for i in range(u.size):
+        if u[i] < 2.0**LOW or (compact and u[i] >= 1.0):
+            out[i] = row[1] if u[i] < 1.0 else 0.0
+            continue
+        bits = np.float64(min(u[i], 2.0**HIGH)).view(np.int64)
+        panel = np.int64((bits >> shift) - ((1023 + LOW) << BITS))
+        rest = np.int64(bits - ((bits >> shift) << shift))
+        t = 2.0 ** (BITS - 51) * rest - 1.0
+        if panel > last:  # the end of the last
+            panel = last
+            t = 1.0
+        first = 2 + SIZE * panel
+        value = 0.0
+        for c in range(SIZE - 1, -1, -1):
+            value = value * t + row[first + c]
+        out[i] = value

@@ -7,9 +7,10 @@ gradients and Hermite fits need are ``2**k d^k phi / du^k``::
     k = 1   first   phi'/r
     k = 2   second  (phi'' - phi'/r) / r**2
 
-All of them, for all kernels, have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials A
-and B of degree four at most. A row lists j, A and B of phi, the others follow; the loops in
-``radial.py`` know the bases and no kernel.
+For all kernels of the table they have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials
+A and B of degree four at most. A row lists j, A and B of phi, the others follow; the loops in
+``radial.py`` know the bases and no kernel. Kernels of another form are registered, and kept as
+polynomials of pieces (``sampled.py``).
 
 Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann
 (2000); SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: the
@@ -20,6 +21,7 @@ exponent.
 import math
 from dataclasses import dataclass, field
 from fractions import Fraction
+from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +29,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.kernels import radial
+from rbfmuscle.implicit.kernels.sampled import Radial, sample_functions
 from rbfmuscle.validation import UsageError, check_finite, did_you_mean, shown
 
 _TERMS = 5  # coefficients of a polynomial: of degree 4 at most
@@ -74,6 +77,12 @@ class Kernel:
             self.base == radial.ONE and self.table[0, 0] == 3.0 and self.table[0, 2 + _TERMS] == 1.0
         )
 
+    @property
+    def identity(self) -> str:
+        """Name that stands for the formula too, in keys of what is kept on disk."""
+        sampled = self.base == radial.SAMPLED
+        return f"{self.name} {sha256(self.table.tobytes()).hexdigest()}" if sampled else self.name
+
     def phi(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """Kernel at distances r (any shape), shape parameter epsilon [1/length]."""
         return self._radial(r, epsilon, 0)
@@ -98,6 +107,8 @@ class Kernel:
 
     def _limit(self, k: int) -> float:
         """Value of the k-th radial function at s = 0."""
+        if self.base == radial.SAMPLED:
+            return float(self.table[k, 0])
         power = self.table[k, 0]
         inner = self.table[k, 2 : 2 + _TERMS]
         outer = self.table[k, 2 + _TERMS :]
@@ -124,7 +135,7 @@ _P = radial.POWER
 
 class _Phi(NamedTuple):
     """s**power (base * inner + outer), coefficients from the constant up; extra is the base's own
-    exponent.
+    exponent, as of (1 - s)+**4 (1 + 4 s): ``_T, _Phi(0, (1, 4), (), 4)``.
     """
 
     power: int
@@ -213,8 +224,78 @@ def get_kernel(name: Kernel | str) -> Kernel:
     if not isinstance(name, str):
         raise UsageError(
             f"a kernel is given by its name, for instance 'cubic', got {shown(name)}; "
-            "a new one needs a row in rbfmuscle/implicit/kernels/table.py"
+            "rbfmuscle.register_kernel adds one"
         )
     if name not in KERNELS:
         raise UsageError(f"unknown kernel {name!r}, {did_you_mean(name, KERNELS)}")
     return KERNELS[name]
+
+
+def register_kernel(
+    name: str,
+    phi: Radial,
+    first: Radial,
+    second: Radial | None = None,
+    *,
+    order: int,
+    smoothness: int,
+    compact: bool = False,
+    has_epsilon: bool = True,
+) -> Kernel:
+    """Add a kernel under a name of its own, known wherever kernels are named in this process.
+
+    The functions are sampled once, to about 12 digits, for s from 1e-9 to 3e4.
+
+    Parameters
+    ----------
+    name : str
+        Letters, digits and underscores.
+    phi, first, second : callable
+        phi(s), phi'(s)/s and (phi'' - phi'/s)/s**2 of an array of s = epsilon r (n,), n values
+        each. ``second`` is left out for a kernel that is not C2.
+    order : int
+        Of conditional positive definiteness, 0 where phi is positive definite; the sign of phi
+        must be right for it.
+    smoothness : int
+        k, where phi is C^k at the origin; 99 for infinitely often.
+    compact : bool
+        Whether phi ends at s = 1; the functions are then called for s < 1 alone.
+    has_epsilon : bool
+        False where epsilon only rescales the weights.
+
+    Returns
+    -------
+    Kernel
+        Its row of the table of kernels.
+
+    Raises
+    ------
+    UsageError
+        If the name is taken, a function is not finite or changes too fast, or ``first`` or
+        ``second`` is not the derivative of the one before.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> kernel = register_kernel(
+    ...     "matern_92",
+    ...     lambda s: (1 + s + 3 * s**2 / 7 + 2 * s**3 / 21 + s**4 / 105) * np.exp(-s),
+    ...     lambda s: -(1 + s + 2 * s**2 / 5 + s**3 / 15) * np.exp(-s) / 7,
+    ...     lambda s: (1 + s + s**2 / 3) * np.exp(-s) / 35,
+    ...     order=0,
+    ...     smoothness=8,
+    ... )
+    >>> round(float(kernel.phi(1.0)), 9)
+    0.931961251
+    """
+    if not str(name).isidentifier():
+        raise UsageError(f"a kernel's name is letters, digits and _, got {shown(repr(name))}")
+    if name in KERNELS:
+        raise UsageError(f"kernel {shown(repr(name))} is known already, choose another name")
+    if second is None and smoothness >= 2:
+        raise UsageError(f"kernel {name!r} is C{smoothness}, so it needs its function second")
+    functions = [phi, first] if second is None else [phi, first, second]
+    table = sample_functions(functions, compact)
+    kernel = Kernel(name, order, compact, smoothness, has_epsilon, 0.0, radial.SAMPLED, table)
+    KERNELS[name] = kernel
+    return kernel
