@@ -229,16 +229,21 @@ class Run(RunData):
                 _copy_run(self.directory, stage)
 
     def export(
-        self, directory: str | Path, formats: str | Sequence[str], *, units: str | None = None
+        self,
+        directory: str | Path,
+        formats: str | Sequence[str],
+        *,
+        units: str | None = None,
+        muscles: Sequence[str] | None = None,
     ) -> list[Path]:
         """Write the surfaces in other formats, into a folder for each, and return the files.
 
         Formats are ``pvd``, ``vtp``, ``ply``, ``stl``, ``obj``, ``glb``, ``usd`` and
         ``animated-glb``; ``units`` are ``"m"``, ``"cm"`` or ``"mm"``, the scene's where not given;
-        glTF is in metres.
+        glTF is in metres. ``muscles`` are names, all where not given.
         """
         names = [formats] if isinstance(formats, str) else list(formats)
-        return export_run(self, names, output=directory, units=units)
+        return export_run(self, names, output=directory, units=units, muscles=muscles)
 
     def show(self) -> rbfmuscle.ViewerPage:
         """Show the frames in a browser or a notebook; see `rbfmuscle.show`."""

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from rbfmuscle.cli.options import FailOn, Model, OwnFolder, Pairs, RunFolder, split_list
+from rbfmuscle.cli.options import FailOn, Model, Muscles, OwnFolder, Pairs, RunFolder, split_list
 from rbfmuscle.cli.printing import USUAL, Printing, print_result
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.validation import (
@@ -159,6 +159,7 @@ def export(
     formats: Annotated[str, Parameter(name="--format")],
     output: OwnFolder = None,
     units: str | None = None,
+    muscles: Muscles = None,
     frames: str | None = None,
     fps: float | None = None,
     printing: Printing = USUAL,
@@ -174,6 +175,8 @@ def export(
         Folder to write to, DIR/export by default.
     units
         m, cm or mm; the scene's by default (glb, animated-glb: m).
+    muscles
+        Muscles of the run, separated by commas; all by default. Bones are always written.
     frames
         Some of the written frames, FIRST:END:STEP as a Python slice.
     fps
@@ -187,7 +190,13 @@ def export(
         names, failed = split_list(formats), None
         try:
             written = export_run(
-                directory, names, output=output, units=units, frames=chosen, fps=fps
+                directory,
+                names,
+                output=output,
+                units=units,
+                muscles=None if muscles is None else split_list(muscles),
+                frames=chosen,
+                fps=fps,
             )
         except MissingDependencyError as error:
             written, failed = error.written, error

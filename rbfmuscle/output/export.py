@@ -33,6 +33,7 @@ def export_run(
     *,
     output: str | Path | None = None,
     units: str | None = None,
+    muscles: Sequence[str] | None = None,
     frames: slice | None = None,
     fps: float | None = None,
 ) -> list[Path]:
@@ -51,6 +52,8 @@ def export_run(
     units : {"m", "cm", "mm"}, optional
         The scene's unit where not given; metres for ``glb`` and ``animated-glb``, which know no
         other.
+    muscles : sequence of str, optional
+        Muscles of the run, with their tendons and fibres; all where not given.
     frames : slice, optional
         Of the written frames; all where not given.
     fps : float, optional
@@ -60,8 +63,8 @@ def export_run(
     Raises
     ------
     UsageError
-        If the folder holds no run, or a format or unit is unknown, or a surface does not keep its
-        vertices, or the folder of a format holds anything but an earlier export.
+        If the folder holds no run, or a format, unit or muscle is unknown, or a surface does not
+        keep its vertices, or the folder of a format holds anything but an earlier export.
     SolveError
         If a file cannot be written.
     MissingDependencyError
@@ -71,6 +74,9 @@ def export_run(
     run = open_run(run)
     formats = list(dict.fromkeys([formats] if isinstance(formats, str) else formats))
     _check_words(formats, units, fps)
+    names = run.muscles if muscles is None else [run[name].name for name in muscles]
+    if not names:
+        raise UsageError("--muscles names no muscle; leave it out for all")
     chosen = run.frame_numbers[frames] if frames is not None else run.frame_numbers
     if not chosen or not run.has_surfaces:
         raise UsageError(f"{run.directory or 'the run'} has no surfaces to export")
@@ -90,7 +96,7 @@ def export_run(
                 unit = units or ("m" if "glb" in name else run.units)
                 (stage / name).mkdir()
                 for part in [[frame] for frame in chosen] if name == "glb" else [chosen]:
-                    moving = read_animation(run, part, unit=unit)
+                    moving = read_animation(run, names, part, unit=unit)
                     if fps is not None and name in ANIMATIONS:
                         moving = replace(moving, times=np.array(part) / fps)
                     written += _export(moving, stage / name, name, part)

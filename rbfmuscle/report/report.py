@@ -121,7 +121,10 @@ def packed_scene(runs: Mapping[str, RunData]) -> str:
     )
     frames = chosen_frames(first.frame_numbers, max(2, _MOST_POINTS // max(points, 1)))
     return pack_runs(
-        {title: read_animation(run, frames, unit=run.units) for title, run in runs.items()}
+        {
+            title: read_animation(run, run.muscles, frames, unit=run.units)
+            for title, run in runs.items()
+        }
     )
 
 

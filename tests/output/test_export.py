@@ -214,6 +214,17 @@ class TestExport:
             np.testing.assert_allclose(data.points, surface.vertices, rtol=1e-6, atol=1e-5)
             np.testing.assert_array_equal(data.regular_faces, surface.faces)
 
+    def test_named_muscles_alone_come_with_their_tendons_and_all_bones(self, tmp_path):
+        run = simulate("phantom", "pbd", frames="0:1")
+        everything = {path.name for path in run.export(tmp_path / "all", "stl")}
+        names = {path.name for path in run.export(tmp_path / "one", "stl", muscles=["extensor"])}
+        others = {f"{name}_0000.stl" for name in run.muscles if name != "extensor"}
+        assert others and names == everything - others
+        with pytest.raises(UsageError, match="did you mean 'extensor'"):
+            run.export(tmp_path / "none", "stl", muscles=["extensr"])
+        with pytest.raises(UsageError, match="names no muscle"):
+            run.export(tmp_path / "none", "stl", muscles=[])
+
     @pytest.mark.parametrize(("name", "units"), [("fbx", "m"), ("ply", "inch"), ("glb", "mm")])
     def test_wrong_words(self, arm_run, tmp_path, name, units):
         with pytest.raises(UsageError):

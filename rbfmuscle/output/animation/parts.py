@@ -95,15 +95,16 @@ class Animation:
     fibres: list[AnimatedFibres] = field(default_factory=list)
 
 
-def read_animation(run: RunData, frames: list[int], *, unit: str) -> Animation:
-    """Some frames of a run at once, lengths in ``unit``."""
+def read_animation(run: RunData, names: list[str], frames: list[int], *, unit: str) -> Animation:
+    """Some muscles and all bones in some frames of a run at once, lengths in ``unit``."""
     factor = MM_PER_UNIT[run.units] / MM_PER_UNIT[unit]
     groups = run.groups | dict.fromkeys(run.tendons, "tendons")
     colours = run.colours | dict.fromkeys(run.tendons, look.TENDON_COLOUR)
+    tendons = [name for name, muscle in run.info.tendon_muscles.items() if muscle in names]
     muscles = []
     bones = []
-    for name, colour in colours.items():
-        muscle = AnimatedMesh(name, colour, [], [], group=groups[name])
+    for name in [*names, *tendons]:
+        muscle = AnimatedMesh(name, colours[name], [], [], group=groups[name])
         for frame in frames:
             points, faces = run.mesh(name, frame)
             same = muscle.faces and np.array_equal(muscle.faces[0], faces)
@@ -134,7 +135,7 @@ def read_animation(run: RunData, frames: list[int], *, unit: str) -> Animation:
         bones,
         run.body,
         direction,
-        _animated_fibres(run, frames, factor),
+        _animated_fibres(run, names, frames, factor),
     )
 
 
@@ -147,10 +148,12 @@ def _shown_input(muscle: AnimatedMesh, given: InputMesh | None, factor: float) -
     return given._replace(vertices=factor * given.vertices)
 
 
-def _animated_fibres(run: RunData, frames: list[int], factor: float) -> list[AnimatedFibres]:
-    """Fibres of the muscles that have them in all of some frames, lengths scaled."""
+def _animated_fibres(
+    run: RunData, names: list[str], frames: list[int], factor: float
+) -> list[AnimatedFibres]:
+    """Fibres of those muscles that have them in all of some frames, lengths scaled."""
     found = []
-    for name in run.muscles:
+    for name in names:
         lines = [run.frame(frame).fibres.get(name) for frame in frames]
         known = [x._replace(points=factor * x.points) for x in lines if x is not None]
         if len(known) == len(frames):
