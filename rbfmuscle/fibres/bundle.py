@@ -40,13 +40,14 @@ class FibreBundle:
         first, last = sheets or [points for points, _ in patches]
         traced = trace_fibres(mesh, (first, last), count, polylines=muscle.fibres, bones=near)
         self.rest = traced.lines
-        self.holders = [a.attachment_frame for group in groups for a in group]
+        self.attachment_frames = [a.attachment_frame for group in groups for a in group]
         self.pennate = bool(sheets)
         held = [
             cKDTree(points).query(self.rest[:, place])[1]
             for (points, _), place in zip(patches, (0, -1))
         ]
-        # Where a bone holds each end (N, 2, 3) at rest, and the place of that bone in holders.
+        # Where each end (N, 2, 3) is held at rest, and the place of what holds it in
+        # attachment_frames.
         self._anchors = np.stack([patch[0][at] for patch, at in zip(patches, held)], axis=1)
         number = [patch[1][at] for patch, at in zip(patches, held)]
         self._held = np.stack([number[0], len(groups[0]) + number[1]], axis=1)
@@ -78,7 +79,7 @@ class FibreBundle:
 
     def _carried(self, end: int, poses: Mapping[str, Floats]) -> Floats:
         """Held points (N, 3) of an end where their bones, or ends of tendons, carry them."""
-        pose = np.array([poses[name] for name in self.holders])[self._held[:, end]]
+        pose = np.array([poses[name] for name in self.attachment_frames])[self._held[:, end]]
         turned = np.einsum("nij,nj->ni", pose[:, :3, :3], self._anchors[:, end])
         return np.asarray(turned + pose[:, :3, 3])
 
@@ -93,7 +94,7 @@ class FibreBundle:
         if not any(self._tendon[end]):
             return sheet
         out = np.repeat((held if self.pennate else tips)[:, None], NODES - 1, axis=1)
-        for place, name in enumerate(self.holders):
+        for place, name in enumerate(self.attachment_frames):
             if name in tendons:
                 out[self._held[:, end] == place] = tendons[name].points[1:]
         return np.concatenate([sheet, out], axis=1)

@@ -152,8 +152,8 @@ def read_function(node: Node | None) -> Function | None:
     """The function in an element, directly or in its child ``function``; None where there is
     none.
     """
-    holder = node.child("function") if node is not None else None
-    inside = node if holder is None else holder
+    child = node.child("function") if node is not None else None
+    inside = node if child is None else child
     found = (
         [inner for inner in inside.nodes() if inner.tag not in BESIDE] if inside is not None else []
     )

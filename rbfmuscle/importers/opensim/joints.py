@@ -48,9 +48,9 @@ class Reading:
         return self.called.get("/".join(words[-2:]), self.called.get(words[-1], ""))
 
 
-def read_joint(reading: Reading, node: Node, ends: list[End], holder: str) -> None:
-    """Add a joint from its element, its ends as (body, frame), and the tag of what holds its
-    coordinates.
+def read_joint(reading: Reading, node: Node, ends: list[End], tag: str) -> None:
+    """Add a joint from its element, its ends as (body, frame), and the tag of the element that
+    lists its coordinates.
     """
     (parent, first), (child, second) = ends
     model = reading.model
@@ -65,7 +65,7 @@ def read_joint(reading: Reading, node: Node, ends: list[End], holder: str) -> No
         )
     taken = [joint.name for joint in model.joints]
     name = new_name(node.name, taken, file=False)
-    found, names = _coordinates(node, holder, kind)
+    found, names = _coordinates(node, tag, kind)
     # Scene names of the coordinates, by the file's.
     plain: dict[str, str] = {}
     for one in names:
@@ -91,13 +91,13 @@ def read_joint(reading: Reading, node: Node, ends: list[End], holder: str) -> No
     model.joints += joints
 
 
-def _coordinates(node, holder, kind):
+def _coordinates(node, tag, kind):
     """Elements of a joint's coordinates by name, and their names in order.
 
     Those that the file leaves out have the names that OpenSim gives them.
     """
     found: dict[str, Node] = {}
-    for inner in node.objects(holder):
+    for inner in node.objects(tag):
         if inner.tag == "Coordinate":
             if inner.name in found:
                 raise node.error(f"two of its coordinates are named {inner.name!r}; rename one")

@@ -90,10 +90,10 @@ def _add_muscles(found, walk):
     """A tube for each muscle of the model."""
     scene = found.scene
     bones = {bone.name: ExactDistance(bone.mesh.vertices, bone.mesh.faces) for bone in scene.bones}
-    holders = _holders(walk, found.model.bodies, bones)
+    attachment_frames = _attachment_frames(walk, found.model.bodies, bones)
     for muscle in found.model.muscles:
         try:
-            tube = make_tube(muscle, found.places, bones, holders)
+            tube = make_tube(muscle, found.places, bones, attachment_frames)
             attach = [
                 {"bone": body, "vertices": rows.tolist(), "via": via}
                 for held, via in ((tube.held, False), (tube.via, True))
@@ -109,7 +109,7 @@ def _add_muscles(found, walk):
             scene.doubts.append(f"{muscle.title} is not taken: {error}")
 
 
-def _holders(walk, bodies, bones):
+def _attachment_frames(walk, bodies, bones):
     """For each body the one that holds its muscles: itself where it has a mesh, else one with a
     mesh that no coordinate moves against it; without one, itself.
     """

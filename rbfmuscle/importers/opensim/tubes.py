@@ -52,14 +52,14 @@ def make_tube(
     muscle: ModelMuscle,
     places: dict[str, np.ndarray],
     bones: dict[str, ExactDistance],
-    holders: dict[str, str],
+    attachment_frames: dict[str, str],
 ) -> Tube:
     """The tube of a muscle in the scene, or SceneError where no two bodies with a mesh hold it.
 
     ``places`` are (4, 4) from every body of the model to the scene [metre], ``bones`` their meshes,
-    ``holders`` the body that holds what is fixed to each.
+    ``attachment_frames`` the body that holds what is fixed to each.
     """
-    bodies = [holders[body] for body, _ in muscle.points]
+    bodies = [attachment_frames[body] for body, _ in muscle.points]
     if muscle.volume <= 0.0:
         raise SceneError("it has no volume; give it a force and a fibre length above zero")
     if len(set(bodies[:1] + bodies[-1:])) < 2:
