@@ -49,7 +49,8 @@ QUANTITIES = {
     "self_crossings": ("1", "triangles of the surface that cross others of it"),
     "unfitted_fraction": (
         "1",
-        "share of surface vertices not on the field's level set; 1: the field is not shown",
+        "share of surface vertices not on the field's level set; the limit is met unless it is 1, "
+        "where the field is not shown",
     ),
     "flicker": (
         "length",

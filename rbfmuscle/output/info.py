@@ -78,9 +78,12 @@ class OutputInfo(Part):
 
 
 class MotionInfo(Part):
-    """The motion; ``times`` (n,) of its frames [s], where it has any."""
+    """The motion: ``times`` (n,) of its frames [s], where it has any; of how many frames it is
+    the ``whole``, those that ``--frames`` left out included.
+    """
 
     times: list[float] | None = None
+    whole: int | None = None  # None of earlier versions
 
 
 class SceneInfo(Part):

@@ -160,6 +160,9 @@ def _facts(saved: RunData) -> list[str]:
     median = (info.frame_time or {}).get("median")
     numbers = {"muscle": len(saved.muscles), "frame": len(saved.frames)}
     counts = [f"{number} {word}{'' if number == 1 else 's'}" for word, number in numbers.items()]
+    whole = info.scene.motion.whole or 0
+    if whole > len(saved.frames):
+        counts[1] += f" of the motion's {whole}"
     times = [f"{shown_number(median, 's')} per frame", f"{info.times['wall']:.1f} s in all"]
     kernels = sorted(set(info.kernels.values()))
     kernel = [f"kernel{'s' if len(kernels) > 1 else ''} {', '.join(kernels)}"] if kernels else []

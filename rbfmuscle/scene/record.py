@@ -33,7 +33,7 @@ def record_scene(scene: SceneContents) -> dict[str, object]:
         "joints": [joint_row(joint) for joint in scene.joints],
         "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
         "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},
-        "motion": {**motion, "frames": len(scene.motion), **times},
+        "motion": {**motion, "frames": len(scene.motion), "whole": scene.motion.whole, **times},
         "muscles": [record_muscle(muscle) for muscle in scene.muscles],
         "contact": scene.contact.model_dump(),
         "sliding": scene.sliding.model_dump() if scene.sliding else None,

@@ -2,6 +2,7 @@
 leaves.
 """
 
+import html
 import json
 
 import numpy as np
@@ -12,6 +13,7 @@ from run_folders import timeless
 
 from rbfmuscle.output import writer
 from rbfmuscle.output.export import export_run
+from rbfmuscle.report.redraw import redraw_run
 from rbfmuscle.run import Run, simulate, stream_run
 from rbfmuscle.validation import LimitExceededError, SceneWarning, SolveError, UsageError
 
@@ -143,6 +145,7 @@ def test_frames_keep_the_numbers_of_the_motion(tmp_path):
     run.save(tmp_path / "run")
     saved = Run.load(tmp_path / "run")
     for each in (run, saved):
+        assert each.info.scene.motion.whole == 7
         assert [frame.index for frame in each.frames] == [1, 3, 5]
         assert each.series("biceps", "volume")[0].tolist() == [1, 3, 5]
         assert each.series("all", "time")[1].tolist() == [0.5, 1.5, 2.5]
@@ -150,6 +153,9 @@ def test_frames_keep_the_numbers_of_the_motion(tmp_path):
         assert each.caption(5) == "frame 5, 2.5 s, elbow.flexion 50°"
         with pytest.raises(UsageError, match="frame 2 was not written"):
             each.frame(2)
+    redraw_run(tmp_path / "run", pictures=False)
+    page = html.unescape((tmp_path / "run/report.html").read_text(encoding="utf-8"))
+    assert "3 frames of the motion's 7" in page
     names = sorted(path.name for path in (tmp_path / "run/surfaces").iterdir())
     assert names == [f"biceps_{k:04d}.vtp" for k in (1, 3, 5)]
     exported = export_run(saved, "ply", output=tmp_path / "out", frames=slice(1, None))
