@@ -18,6 +18,7 @@ from rbfmuscle.output.run_data import RunData, open_run
 from rbfmuscle.output.surface_arrays import VertexArrays
 from rbfmuscle.output.vtp import NORMALS, TEXTURE, Collection, write_vtp
 from rbfmuscle.scene.meshes.input_mesh import InputMesh
+from rbfmuscle.scene.meshes.obj import obj_text
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingDependencyError, SolveError, UsageError
 
@@ -243,24 +244,3 @@ def write_mesh(path: Path, mesh: InputMesh, arrays: Mapping[str, Floats]) -> Non
     if len(corners.texture):
         made.vertex_attributes.update(zip("st", corners.texture.T.astype(np.float32)))
     made.export(path, **({"vertex_normal": normals is not None} if path.suffix == ".ply" else {}))
-
-
-def obj_text(mesh: InputMesh) -> str:
-    """A mesh as the text of an OBJ file."""
-    corners = mesh.corners
-    columns, parts = [mesh.faces], [_rows("v", mesh.vertices)]
-    for key, values, numbers in (("vt", *corners[:2]), ("vn", *corners[2:])):
-        parts += [_rows(key, values)] if len(values) else []
-        columns.append(numbers if len(values) else np.full_like(mesh.faces, -1))
-    form = {(0, 0): "%d", (1, 0): "%d/%d", (0, 1): "%d//%d", (1, 1): "%d/%d/%d"}
-    corner = form[len(corners.texture) > 0, len(corners.normals) > 0]
-    used = [c + 1 for c in columns if (c >= 0).all()]
-    line = f"f {corner} {corner} {corner}\n"
-    faces = np.stack(used, axis=2).reshape(len(mesh.faces), -1)
-    return "".join(parts) + (line * len(faces)) % tuple(faces.ravel().tolist())
-
-
-def _rows(key: str, values: Floats) -> str:
-    """Lines of an OBJ file, with twelve digits."""
-    line = key + " %.12g" * values.shape[1] + "\n"
-    return (line * len(values)) % tuple(values.ravel().tolist())

@@ -18,6 +18,7 @@ from rbfmuscle.output.export import export_run
 from rbfmuscle.run import Run, simulate
 from rbfmuscle.scene.meshes.input_mesh import InputMesh, vertex_corners
 from rbfmuscle.scene.meshes.read import read_mesh
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import UsageError
 
 SINGLE = 1e-5  # single precision of lengths to 50 mm
@@ -250,6 +251,30 @@ def test_a_mirrored_file_keeps_its_corners(tmp_path, axis):
     found = corners.texture[corners.texture_faces], corners.normals[corners.normal_faces]
     np.testing.assert_allclose(found[0], truth[2][:, ::-1], atol=1e-12)
     np.testing.assert_allclose(found[1], truth[3][:, ::-1] * turn, atol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["obj", "vtp", "ply"])
+def test_a_saved_scene_keeps_its_corners(tmp_path, form):
+    path, points, *_ = write(tmp_path, form)
+    scene = arm_scene()
+    scene.muscles.clear()
+    ends = {"upper": points[:, 0] < -19, "fore": points[:, 0] > 19}
+    attach = [{"bone": bone, "vertices": np.flatnonzero(held)} for bone, held in ends.items()]
+    scene.add_muscle("biceps", path, attach=attach)
+    again = Scene.load(scene.save(tmp_path / "saved.toml"))
+    one, other = scene.muscles[0], again.muscles[0]
+    np.testing.assert_array_equal(one.mesh.vertices, other.mesh.vertices)
+    np.testing.assert_array_equal(one.mesh.faces, other.mesh.faces)
+    for ours, theirs in zip(one.attachments, other.attachments, strict=True):
+        np.testing.assert_array_equal(ours.vertices, theirs.vertices)
+    mine, kept = one.given.corners, other.given.corners
+    np.testing.assert_array_equal(
+        kept.texture[kept.texture_faces], mine.texture[mine.texture_faces]
+    )
+    assert (form == "ply") == (len(kept.normals) == 0)
+    if len(mine.normals):
+        found, wanted = kept.normals[kept.normal_faces], mine.normals[mine.normal_faces]
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-15)  # read as unit vectors
 
 
 def test_a_mesh_with_added_triangles_says_that_its_texture_is_lost(tmp_path):
