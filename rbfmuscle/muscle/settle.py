@@ -42,7 +42,7 @@ from rbfmuscle.muscle.rounded_bones import RoundedBones
 from rbfmuscle.muscle.state import SolidState, tension
 
 # All lengths are relative to the muscle's size.
-SETTLED = 1e-5  # an iteration that moves no node farther was the last one
+SETTLED = 1e-5  # an iteration that moves no material farther was the last one
 SETTLED_BESIDE = 1e-4  # the same beside neighbours, whose planes are not known better
 # The same where the bones stand still and only the activation changes, and how many times the
 # iterations it may take.
@@ -114,7 +114,7 @@ class Step(NamedTuple):
     nodes: np.ndarray  # (N, 3)
     pressures: np.ndarray  # (M,)
     push: np.ndarray  # (N, 3) motion of the nodes by contact
-    moved: float  # greatest motion of a node [scene unit]
+    moved: float  # greatest motion of material [scene unit]
     residual: float  # what that is without shortening
     capped: bool  # whether contact forces are those of a capped solve
     room: bool  # whether the table of rounded bones had room
@@ -209,7 +209,7 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
 
 @inner(error_model="numpy", inline="always")
 def _limits(given, state):
-    """Motion of a node [scene unit] below which a solve ends, and the greatest number of
+    """Motion of material [scene unit] below which a solve ends, and the greatest number of
     iterations.
     """
     size, farthest = given.model.size, 0.0
@@ -276,8 +276,23 @@ def _iterate(given, y, pressure, push, local, metric, near, answers, travelled):
     found = contact_push(touch, motion, near, metric, answers, law, near.forces, TOLERANCE * size)
     pressures = corrected_pressures(pressure, change, found.taken, metric.factor, part)
     new += found.nodes
-    moved = farthest_move(new, y)
+    moved = _material_move(model.reach, y, new)
     return Step(new, pressures, found.nodes, moved, moved / part, found.capped, room)
+
+
+@inner(error_model="numpy", inline="always")
+def _material_move(reach, y, new):
+    """How far material goes, about, when nodes move from y to new (N, 3), infinity where one is not
+    finite: nodes that hold none settle slowly, and move nothing.
+    """
+    most = 0.0
+    for n in range(len(y)):
+        square = 0.0
+        for a in range(3):
+            square += (reach[n] * (new[n, a] - y[n, a])) ** 2
+        if not square <= most:
+            most = square if np.isfinite(square) else np.inf
+    return np.sqrt(most)
 
 
 @inner(error_model="numpy")
@@ -297,7 +312,7 @@ def _law(given, touch, near, yielding, part):
 
 @inner(error_model="numpy", inline="always")
 def _shorten(y, pressure, step, longest):
-    """Shorten a step, in place, where a node goes farther than ``longest``."""
+    """Shorten a step, in place, where material goes farther than ``longest``."""
     if step.moved > longest:
         share = longest / step.moved
         step.nodes[:] = y + share * (step.nodes - y)

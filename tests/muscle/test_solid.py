@@ -25,7 +25,7 @@ from rbfmuscle.muscle.local_step import (
     local_step,
     start_local,
 )
-from rbfmuscle.muscle.model import build_solid, stiffness
+from rbfmuscle.muscle.model import TOGETHER, build_solid, stiffness
 from rbfmuscle.muscle.rounded_bones import round_bones
 from rbfmuscle.muscle.settle import DONE, SETTLED, settle
 from rbfmuscle.muscle.state import predict, rest_state, tension
@@ -228,6 +228,23 @@ def test_right_side_is_the_derivative_of_the_energy(slack):
     force = elastic(solid.model, base) - solid.localise(base, tension)[0].right
     # Differences of an energy some 1e5 times as great.
     assert (found[0] - found[1]) / (2 * h) == pytest.approx(np.vdot(force, way), rel=1e-4)
+
+
+def test_a_solve_ends_when_material_stands_still_whatever_empty_nodes_do():
+    solid = Bar()
+    model, embedding = solid.model, solid.model.embedding
+    share = np.zeros(len(model.rest))
+    np.maximum.at(share, embedding.columns, embedding.shares)
+    assert (model.reach >= np.minimum(TOGETHER * share, 1.0)).all() and model.reach.max() == 1.0
+    # A corner of the block takes an eighth of the motion of the node at the lattice's corner.
+    assert model.reach.min() == pytest.approx(TOGETHER / 8.0, rel=1e-5)
+    for angle in (0.2, 0.4):
+        turn = rotation_about([0, 1, 0], angle, np.array([20.0, 0.0, 0.0]))
+        solid.settle(turn)
+        assert solid.report.residual <= SETTLED and solid.report.iterations > 3
+        before = solid.state.points
+        solid.settle(turn)  # to a hundredth of the motion
+        assert np.abs(solid.state.points - before).max() < 10 * SETTLED * model.size
 
 
 def test_rest_is_a_rest_and_a_turn_of_all_bones_turns_all():
