@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rbfmuscle.experiments.comparison import Repeated, add_distances, measure_run, write_tables
-from rbfmuscle.experiments.comparison_table import Comparison
-from rbfmuscle.experiments.scenes_table import ScenesComparison, write_scenes
+from rbfmuscle.experiments.comparison_table import Comparison, ScenesComparison
+from rbfmuscle.experiments.scenes_table import write_scenes
 from rbfmuscle.experiments.sweep_run import threads_limited
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.quantities import ALL

@@ -12,6 +12,7 @@ from rbfmuscle.experiments.comparison_table import (
     VALUE_COLUMNS,
     Comparison,
     MeasureFacts,
+    ScenesComparison,
     Spread,
     Values,
 )
@@ -141,11 +142,6 @@ def write_tables(
 
     ``unknowns`` are the points that each model solves for, in words, by model and muscle.
     """
-    units = {name: unit_text(m.kind, scene.units) for name, m in MEASURES.items()}
-    measures = {
-        n: MeasureFacts(unit=units[n], title=m.title, against=m.against, meaning=m.meaning)
-        for n, m in MEASURES.items()
-    }
     runs = {name: RunData.load(folder / name) for name in results}
     beyond = {name: muscles_beyond(run) for name, run in runs.items()}
     table = Comparison(
@@ -160,7 +156,7 @@ def write_tables(
         answer=describe(results, labels, scene.units, beyond),
         within={name: len(runs[name].muscles) - len(found[ALL]) for name, found in beyond.items()},
         unknowns={name: unknowns[name] for name in results},
-        measures=measures,
+        measures=measure_facts(scene.units),
         results=results,
         statistics={name: statistics(run) for name, run in runs.items()},
         machine=machine(),
@@ -182,25 +178,43 @@ def _statistics_rows(table: Comparison) -> Iterator[tuple[object, ...]]:
                 yield model, muscle, name, spread.mean, spread.sd, unit
 
 
+def measure_facts(units: str) -> dict[str, MeasureFacts]:
+    """Every measure with its unit where lengths are in ``units``."""
+    return {
+        name: MeasureFacts(
+            unit=unit_text(m.kind, units), title=m.title, against=m.against, meaning=m.meaning
+        )
+        for name, m in MEASURES.items()
+    }
+
+
 def latex(table: Comparison) -> str:
     """The table of every measure over all muscles, as LaTeX."""
-    models = table.models
+    rows = {}
+    for quantity, measure in table.measures.items():
+        values = [table.results[name][ALL].get(quantity) for name in table.models]
+        if any(value is not None for value in values):
+            rows[quantity] = [shown_number(value, measure.unit) for value in values]
+    return latex_table(table, rows, "worst of muscles and frames")
+
+
+def latex_table(
+    table: Comparison | ScenesComparison, rows: Mapping[str, list[str]], about: str
+) -> str:
+    """A LaTeX table with a column for each model and a row of texts for each measure named."""
     lines = [
-        f"% rbfmuscle {table.versions['rbfmuscle']}: worst of muscles and frames",
-        rf"\begin{{tabular}}{{ll{'r' * len(models)}}}",
-        latex_cells(["", "against", *(table.labels[name] for name in models)]),
+        f"% rbfmuscle {table.versions['rbfmuscle']}: {about}",
+        rf"\begin{{tabular}}{{ll{'r' * len(table.models)}}}",
+        _latex_cells(["", "against", *(table.labels[name] for name in table.models)]),
         r"\hline",
     ]
-    for quantity, measure in table.measures.items():
-        values = [table.results[name][ALL].get(quantity) for name in models]
-        if any(value is not None for value in values):
-            texts = [shown_number(value, measure.unit) for value in values]
-            lines.append(latex_cells([measure.title, measure.against, *texts]))
+    for quantity, texts in rows.items():
+        measure = table.measures[quantity]
+        lines.append(_latex_cells([measure.title, measure.against, *texts]))
     return "\n".join([*lines, r"\end{tabular}", ""])
 
 
-def latex_cells(texts: Iterable[str]) -> str:
-    """A row of a LaTeX table."""
+def _latex_cells(texts: Iterable[str]) -> str:
     escaped = (
         re.sub(r"([%_&#$])", r"\\\1", text).replace("–", "--").replace("<", "$<$") for text in texts
     )

@@ -4,57 +4,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel
 
-from rbfmuscle.experiments.comparison import FORMAT, latex_cells
-from rbfmuscle.experiments.comparison_table import VALUE_COLUMNS, Comparison, MeasureFacts
+from rbfmuscle.experiments.comparison import FORMAT, latex_table, measure_facts
+from rbfmuscle.experiments.comparison_table import (
+    VALUE_COLUMNS,
+    Comparison,
+    OverScenes,
+    ScenesComparison,
+)
 from rbfmuscle.experiments.measures import DEEPER, MEASURES
 from rbfmuscle.folders import write_whole
-from rbfmuscle.metrics.quantities import ALL, unit_text
-from rbfmuscle.metrics.summary import shown_number
+from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.output.writer import versions, write_csv, write_json
 from rbfmuscle.scene.objects import MM_PER_UNIT
 
 UNITS = "mm"  # of all lengths, as scenes may have different units
-
-
-class OverScenes(BaseModel):
-    """A measure of a model over scenes: mean and standard deviation of the values of each scene
-    (the worst of its muscles and frames), and the worst of them, in the scene named.
-    """
-
-    mean: float
-    sd: float
-    worst: float
-    scene: str
-
-
-class ScenesComparison(BaseModel):
-    """What ``scenes.json`` holds.
-
-    ``models`` are those that were solved on every scene that any model was solved on; ``answers``
-    are by scene, ``answer`` over all of them; ``failed`` says why, by scene and model, "all" for
-    all models; ``summary`` is by model and measure.
-    """
-
-    format: int
-    scenes: list[str]
-    models: list[str]
-    labels: dict[str, str]
-    answers: dict[str, str]
-    answer: str = ""
-    failed: dict[str, dict[str, str]]
-    measures: dict[str, MeasureFacts]
-    summary: dict[str, dict[str, OverScenes]]
-    versions: dict[str, str]
-
-    def text(self, model: str, quantity: str) -> str:
-        """Mean ± standard deviation with its unit, a dash where it is not known."""
-        found = self.summary[model].get(quantity)
-        unit = self.measures[quantity].unit
-        if found is None:
-            return shown_number(None, unit)
-        return f"{shown_number(found.mean, unit)} ± {shown_number(found.sd, unit)}"
 
 
 def write_scenes(
@@ -72,12 +36,7 @@ def write_scenes(
         labels={name: tables[0].labels[name] for name in models},
         answers={scene: one.answer for scene, one in found.items()},
         failed={scene: reasons for scene, reasons in failed.items() if reasons},
-        measures={
-            name: MeasureFacts(
-                unit=unit_text(m.kind, UNITS), title=m.title, against=m.against, meaning=m.meaning
-            )
-            for name, m in MEASURES.items()
-        },
+        measures=measure_facts(UNITS),
         summary={name: _summary(found, name) for name in models},
         versions=versions(),
     )
@@ -129,15 +88,10 @@ def _rows(found: Mapping[str, Comparison]) -> Iterator[tuple[object, ...]]:
 
 
 def _latex(table: ScenesComparison) -> str:
-    lines = [
-        f"% rbfmuscle {table.versions['rbfmuscle']}: mean and standard deviation over "
-        f"{len(table.scenes)} scenes of the worst of muscles and frames",
-        rf"\begin{{tabular}}{{ll{'r' * len(table.models)}}}",
-        latex_cells(["", "against", *table.labels.values()]),
-        r"\hline",
-    ]
-    for quantity, measure in table.measures.items():
-        if any(quantity in values for values in table.summary.values()):
-            texts = [table.text(model, quantity) for model in table.models]
-            lines.append(latex_cells([measure.title, measure.against, *texts]))
-    return "\n".join([*lines, r"\end{tabular}", ""])
+    rows = {
+        quantity: [table.text(model, quantity) for model in table.models]
+        for quantity in table.measures
+        if any(quantity in values for values in table.summary.values())
+    }
+    scenes = f"{len(table.scenes)} scenes of the worst of muscles and frames"
+    return latex_table(table, rows, f"mean and standard deviation over {scenes}")

@@ -17,6 +17,7 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.fibres import nearest_pieces
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 
 CELLS = 30_000  # of a muscle, about
@@ -185,15 +186,10 @@ def _conductivity(points: Floats, polylines: Sequence[Floats] | None) -> Floats:
     """D (n, 3, 3) at points (n, 3)."""
     if not polylines:
         return np.tile(np.eye(3), (len(points), 1, 1))
-    middles = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in polylines])
-    pieces = np.concatenate([np.diff(line, axis=0) for line in polylines])
-    unit = pieces / np.maximum(np.linalg.norm(pieces, axis=1, keepdims=True), 1e-300)
-    count = min(NEAREST, len(middles))
-    distance, index = cKDTree(middles).query(points, k=np.arange(1, count + 1))
-    share = 1.0 / np.maximum(distance, 1e-9 * np.ptp(points, axis=0).max())
+    unit, share = nearest_pieces(points, polylines, NEAREST)
     share /= share.sum(axis=1, keepdims=True)
     # Dyads have no sense of direction, as fibres have none.
-    dyads = np.einsum("nk,nka,nkb->nab", share, unit[index], unit[index])
+    dyads = np.einsum("nk,nka,nkb->nab", share, unit, unit)
     direction = np.linalg.eigh(dyads)[1][:, :, 2]
     along = np.einsum("na,nb->nab", direction, direction)
     return ACROSS * np.eye(3) + (1.0 - ACROSS) * along

@@ -36,14 +36,21 @@ def fibre_directions(
     return unit
 
 
-def _along_polylines(points: Floats, fibres: Sequence[Floats]) -> Floats:
-    """Mean direction (n, 3) of the nearest pieces, by the inverse of their distance."""
+def nearest_pieces(points: Floats, fibres: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
+    """Unit directions (n, k, 3) of the nearest pieces of polylines to each point (n, 3), ``most``
+    of them, and the inverse of their distances (n, k).
+    """
     middles = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in fibres])
     pieces = np.concatenate([np.diff(line, axis=0) for line in fibres])
-    near = min(NEAREST, len(middles))
-    distance, index = cKDTree(middles).query(points, k=np.arange(1, near + 1))
-    unit = (pieces / np.linalg.norm(pieces, axis=1, keepdims=True))[index]
-    floor = 1e-9 * np.ptp(points, axis=0).max()
+    unit = pieces / np.maximum(np.linalg.norm(pieces, axis=1, keepdims=True), 1e-300)
+    near = np.arange(1, min(most, len(middles)) + 1)
+    distance, index = cKDTree(middles).query(points, k=near)
+    return unit[index], 1.0 / np.maximum(distance, 1e-9 * np.ptp(points, axis=0).max())
+
+
+def _along_polylines(points: Floats, fibres: Sequence[Floats]) -> Floats:
+    """Mean direction (n, 3) of the nearest pieces, by the inverse of their distance."""
+    unit, share = nearest_pieces(points, fibres, NEAREST)
     against = np.einsum("nkd,nd->nk", unit, unit[:, 0]) < 0.0  # a fibre has no sense
     unit = np.where(against[:, :, None], -unit, unit)
-    return (unit / np.maximum(distance, floor)[:, :, None]).sum(axis=1)
+    return (unit * share[:, :, None]).sum(axis=1)

@@ -8,6 +8,7 @@ from scipy.sparse.linalg import splu
 
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
 from rbfmuscle.geometry.rotations import matrix_quaternion
+from rbfmuscle.geometry.surfaces import face_normals
 from rbfmuscle.jit import compiled
 
 
@@ -81,7 +82,7 @@ def surface_gradient(vertices: Floats, faces: Array, values: Floats) -> Floats:
     a = vertices[faces[:, 0]]
     b = vertices[faces[:, 1]]
     c = vertices[faces[:, 2]]
-    normal = np.cross(b - a, c - a)
+    normal = 2.0 * face_normals(vertices, faces)
     squared = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-300)[:, None]
     fa, fb, fc = (values[faces[:, k]][:, None] for k in range(3))
     gradient = np.cross(normal, fa * (c - b) + fb * (a - c) + fc * (b - a)) / squared

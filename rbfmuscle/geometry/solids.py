@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.exact_distance import faces_across
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import repeated_faces
+from rbfmuscle.geometry.surfaces import repeated_faces, sorted_half_edges
 from rbfmuscle.geometry.winding import inside_test
 
 # Parts whose union has less volume than they have together, by more than this share, overlap.
@@ -99,11 +99,7 @@ def label_shells(faces: Integers) -> tuple[Integers, bool]:
 
     Shells are connected by edges of exactly two faces: those that touch along an edge are two.
     """
-    tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    key = np.minimum(tail, head) * (int(faces.max(initial=0)) + 1) + np.maximum(tail, head)
-    order = np.argsort(key, kind="stable")
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
-    size = np.diff(first, append=len(key))
+    order, first, size = sorted_half_edges(faces)
     pair = first[size == 2]
     ends = (order[pair] // 3, order[pair + 1] // 3)
     links = coo_matrix((np.ones(len(pair)), ends), shape=(len(faces), len(faces)))

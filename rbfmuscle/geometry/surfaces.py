@@ -58,6 +58,17 @@ def unique_edges(faces: Integers) -> Integers:
     return ends[np.sort(first)]
 
 
+def sorted_half_edges(faces: Integers) -> tuple[Integers, Integers, Integers]:
+    """Half-edges (3m,), ``3 * face + corner``, so sorted that those of an edge follow each other;
+    where each edge begins there (e,), and how many it has (e,).
+    """
+    tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    key = np.minimum(tail, head) * (int(faces.max(initial=0)) + 1) + np.maximum(tail, head)
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    return order, first, np.diff(first, append=len(key))
+
+
 def opposite_half_edges(faces: Integers) -> Integers:
     """Number (3m,) of the opposite half-edge of each half-edge ``3 * face + corner``, which runs to
     the next corner.
@@ -65,11 +76,8 @@ def opposite_half_edges(faces: Integers) -> Integers:
     -1 where the edge has no other face; -2 where it has several, or one that runs the same way.
     """
     tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    key = np.minimum(tail, head) * (int(faces.max(initial=0)) + 1) + np.maximum(tail, head)
-    order = np.argsort(key, kind="stable")
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
-    count = np.diff(first, append=len(key))
-    opposite = np.full(len(key), -2)
+    order, first, count = sorted_half_edges(faces)
+    opposite = np.full(len(tail), -2)
     opposite[order[first[count == 1]]] = -1
     one, other = (order[first[count == 2] + k] for k in range(2))
     paired = (tail[one] == head[other]) & (one // 3 != other // 3)

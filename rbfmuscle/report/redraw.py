@@ -3,8 +3,7 @@
 import json
 from pathlib import Path
 
-from rbfmuscle.experiments.comparison_table import Comparison
-from rbfmuscle.experiments.scenes_table import ScenesComparison
+from rbfmuscle.experiments.comparison_table import Comparison, ScenesComparison
 from rbfmuscle.experiments.sweep_table import SweepTable
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import Limits, Summary, exceeded, parse_limits, unmeasured

@@ -4,7 +4,7 @@ the page of each scene.
 
 from pathlib import Path
 
-from rbfmuscle.experiments.scenes_table import ScenesComparison
+from rbfmuscle.experiments.comparison_table import ScenesComparison
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.report.comparison_page import LIGHTS
 from rbfmuscle.report.page import BAD, PLAIN, Cell, CheckRow, ReportPage, Section, Table

@@ -85,9 +85,7 @@ def sites_on(names: tuple[str, ...], bone: Part) -> list[str]:
 def find_site(name: str, bone: Part, frame: BoneFrame, articular: np.ndarray) -> Site:
     """A site on a bone; ``articular`` (n, 3) are the points of its articular surfaces."""
     facts = _tables()[0][name]
-    points = _covering(bone)
-    if len(articular):
-        points = points[cKDTree(articular).query(points)[0] > ASIDE * bone.size]
+    points = _covering(bone, articular)
     tree = cKDTree(points)
     stops = []
     for at in facts.at:
@@ -108,13 +106,14 @@ def find_site(name: str, bone: Part, frame: BoneFrame, articular: np.ndarray) ->
 
 def whole_bone(bone: Part, articular: np.ndarray) -> Site:
     """All of a bone but its articular surfaces, where no site is known."""
-    points = _covering(bone)
-    if len(articular):
-        points = points[cKDTree(articular).query(points)[0] > ASIDE * bone.size]
+    points = _covering(bone, articular)
     return Site(bone.name, points, points)
 
 
-def _covering(bone: Part) -> np.ndarray:
-    """Vertices and middles of the triangles of a bone, thinned."""
+def _covering(bone: Part, articular: np.ndarray) -> np.ndarray:
+    """Vertices and middles of the triangles of a bone off its articular surfaces, thinned."""
     points = np.concatenate([bone.points, bone.faces[0]])
-    return points[:: -(-len(points) // MOST)]
+    points = points[:: -(-len(points) // MOST)]
+    if len(articular):
+        points = points[cKDTree(articular).query(points)[0] > ASIDE * bone.size]
+    return points
