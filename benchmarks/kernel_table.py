@@ -95,17 +95,17 @@ def main():
                 start = time.process_time()
                 found = measure_row(judge, sample, kernel)
                 spent, row = time.process_time() - start, found.row
-                own = np.inf if row["unfit"] else row["rms"]
+                own = np.inf if row.unfit else row.rms
                 best = best_of_scan(judge, found, own) if kernel.has_epsilon else own
-                (unfit if row["unfit"] else ratios).append(best if row["unfit"] else own / best)
+                (unfit if row.unfit else ratios).append(best if row.unfit else own / best)
                 said = (
                     f"unfit, the scan has {best:.3g}"
-                    if row["unfit"]
+                    if row.unfit
                     else f"{own:.3g}, ratio {own / best:.3f}"
                 )
                 print(
                     f"{name} {count} {kernel.name}: {said}, "
-                    f"{row['condition'] or np.nan:.1e}, "
+                    f"{row.condition or np.nan:.1e}, "
                     f"{spent:.1f} s",
                     flush=True,
                 )

@@ -110,13 +110,13 @@ def _study(meshes, output, study, printing):
 
 
 def _study_lines(studies, output):
-    from rbfmuscle.experiments.kernel_rows import describe, row_toml
+    from rbfmuscle.experiments.kernel_rows import describe
     from rbfmuscle.report.kernel_page import answer
 
     for name, study in studies.items():
         if study.recommended is not None:
             yield f"{name}: {describe(study.rows)}"
-            yield f"to paste at the end of its [[muscle]]:\n\n{row_toml(study.recommended)}\n"
+            yield f"to paste at the end of its [[muscle]]:\n\n{study.recommended.toml()}\n"
     if len(studies) > 1 or not next(iter(studies.values())).recommended:
         yield answer(studies)
     yield f"all rows: open {output / 'kernels.html'}"
@@ -124,7 +124,6 @@ def _study_lines(studies, output):
 
 def _find_wanted(meshes, output, find, units, printing):
     """Find, print and write what reaches an error; where it is not reached, that is said."""
-    from rbfmuscle.experiments.kernel_rows import row_toml
     from rbfmuscle.output.writer import json_text
     from rbfmuscle.report.kernel_page import kernels_folder
 
@@ -137,9 +136,9 @@ def _find_wanted(meshes, output, find, units, printing):
             "error": found.error,
             "wanted": found.wanted,
             "units": units,
-            "row": found.row,
-            "toml": row_toml(found.row),
-            "tried": found.tried,
+            "row": found.row.model_dump(),
+            "toml": found.row.toml(),
+            "tried": [one._asdict() for one in found.tried],
             "said": found.describe(name, units),
         }
     with kernels_folder(output).staged() as stage:

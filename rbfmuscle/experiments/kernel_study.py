@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.experiments.front import pareto_front
-from rbfmuscle.experiments.kernel_rows import cost, recommend
+from rbfmuscle.experiments.kernel_rows import KernelRow, recommend
 from rbfmuscle.experiments.sweep_run import OnProgress, threads_limited
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.mesh_distance import MeshDistance
@@ -87,7 +87,7 @@ class Measured(NamedTuple):
     the surface.
     """
 
-    row: dict
+    row: KernelRow
     sample: SurfaceSample
     fit: FieldFit
     surface: tuple[Floats, Integers] | None
@@ -96,23 +96,8 @@ class Measured(NamedTuple):
 def measure_row(judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel) -> Measured:
     """One row of the table, its times left open, and its surface."""
     fit = FieldFit(kernel, 1.0, BOUND if kernel.has_epsilon else np.inf)
-    row = {
-        "kernel": kernel.name,
-        "centres": len(sample.points),
-        "epsilon": 0.0,
-        "shape": None,
-        "condition": None,
-        "bound": 0.0,
-        "rms": None,
-        "hausdorff": None,
-        "normal_error": None,
-        "volume_error": None,
-        "fit_time": None,
-        "evaluation_time": None,
-        "trials": [],
-        "unfit": "",
-        "note": "" if kernel.hermite else "values on and off the surface, the kernel is not C2",
-    }
+    note = "" if kernel.hermite else "values on and off the surface, the kernel is not C2"
+    row = KernelRow(kernel=kernel.name, centres=len(sample.points), note=note)
     surface = None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
@@ -120,12 +105,12 @@ def measure_row(judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel) 
             fit = _chosen_fit(row, judge, sample, fit)
             surface = _measure(row, judge, sample, fit.fit(sample.points, sample.normals))
         except (ValueError, np.linalg.LinAlgError) as error:
-            row["unfit"] = " ".join(str(error).split())
+            row.unfit = " ".join(str(error).split())
     return Measured(row, sample, fit, surface)
 
 
 def _chosen_fit(
-    row: dict, judge: ReferenceSurface, sample: SurfaceSample, fit: FieldFit
+    row: KernelRow, judge: ReferenceSurface, sample: SurfaceSample, fit: FieldFit
 ) -> FieldFit:
     """The fit with the epsilon of the least error, or with a bounded condition where it needs one;
     both are written into the row.
@@ -135,27 +120,27 @@ def _chosen_fit(
         choice = choose_epsilon(
             points, normals, fit, held_out=judge.held_out, distance=judge.distance.unsigned
         )
-        row["trials"] = choice.trials.tolist()
-        row["epsilon"] = choice.epsilon
-        row["shape"] = choice.epsilon * float(spacing(points).mean())
+        row.trials = choice.trials.tolist()
+        row.epsilon = choice.epsilon
+        row.shape = choice.epsilon * float(spacing(points).mean())
         if choice.broken:
             raise ValueError(choice.broken)
         return replace(fit, epsilon=choice.epsilon)
     if fit.fit(points, normals).condition > BOUND:
-        row["bound"] = BOUND
+        row.bound = BOUND
         return replace(fit, condition=BOUND)
     return fit
 
 
 def _measure(
-    row: dict, judge: ReferenceSurface, sample: SurfaceSample, field: RBFField
+    row: KernelRow, judge: ReferenceSurface, sample: SurfaceSample, field: RBFField
 ) -> tuple[Floats, Integers]:
     """Write what is measured of a field into the row; its surface."""
-    row["condition"] = float(field.condition)
+    row.condition = float(field.condition)
     gradient = field.gradient(judge.points[::5])
     cosine = np.einsum("ij,ij->i", gradient, judge.normals[::5])
     cosine /= np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(float).tiny)
-    row["normal_error"] = float(
+    row.normal_error = float(
         np.degrees(np.sqrt((np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2).mean()))
     )
     sheets = find_sheets(field, sample.points, judge.distance.unsigned)
@@ -168,12 +153,10 @@ def _measure(
     found = extract_surface(
         field, points=sample.points, resolution=judge.resolution, axes=judge.axes
     )
-    row["volume_error"] = found.volume / judge.volume - 1.0
-    if abs(row["volume_error"]) > VOLUME_BOUND:
-        row["unfit"] = (
-            f"{100 * row['volume_error']:+.3g} % of volume, beyond {100 * VOLUME_BOUND:g}"
-        )
-    row["rms"], row["hausdorff"] = judge.apart(found.vertices, found.faces)
+    row.volume_error = found.volume / judge.volume - 1.0
+    if abs(row.volume_error) > VOLUME_BOUND:
+        row.unfit = f"{100 * row.volume_error:+.3g} % of volume, beyond {100 * VOLUME_BOUND:g}"
+    row.rms, row.hausdorff = judge.apart(found.vertices, found.faces)
     return found.vertices, found.faces
 
 
@@ -187,9 +170,9 @@ def time_row(found: Measured, points: Floats) -> None:
     with warnings.catch_warnings(), threads_limited(1):
         warnings.simplefilter("ignore", NumericalWarning)  # it stands in the row's condition
         field = found.fit.fit(sample.points, sample.normals, parts)
-        row["fit_time"] = _spent(lambda: found.fit.fit(sample.points, sample.normals, parts))
+        row.fit_time = _spent(lambda: found.fit.fit(sample.points, sample.normals, parts))
         field(points[:TIMED])
-        row["evaluation_time"] = _spent(lambda: field(points[:TIMED]))
+        row.evaluation_time = _spent(lambda: field(points[:TIMED]))
 
 
 def _spent(work: Callable[[], object]) -> float:
@@ -205,17 +188,16 @@ def _spent(work: Callable[[], object]) -> float:
 class KernelStudy:
     """What `study_kernels` found.
 
-    ``rows`` holds a dict for each kernel and number of centres, the smallest error first; unfit
-    ones (``unfit`` says why) last. Lengths are in the mesh's unit, times in seconds of one thread.
-    ``surfaces`` (vertices, faces) are those of the rows, None where there is none. ``recommended``
-    is the quickest row that errs at most 5 % more than the best, None where every one is unfit.
-    ``sha256`` is that of the mesh.
+    ``rows`` are `KernelRow` for each kernel and number of centres, the smallest error first, unfit
+    ones last. ``surfaces`` (vertices, faces) are those of the rows, None where there is none.
+    ``recommended`` is the quickest row that errs at most 5 % more than the best, None where every
+    one is unfit. ``sha256`` is that of the mesh.
     """
 
-    rows: list[dict] = field(repr=False)
+    rows: list[KernelRow] = field(repr=False)
     surfaces: list[tuple[Floats, Integers] | None] = field(default_factory=list, repr=False)
     units: str = ""
-    recommended: dict | None = None
+    recommended: KernelRow | None = None
     sha256: str = ""
 
 
@@ -253,7 +235,7 @@ def study_kernels(
     >>> import trimesh
     >>> ball = trimesh.creation.icosphere(3, 10.0)
     >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], resolution=16)
-    >>> study.rows[0]["kernel"]
+    >>> study.rows[0].kernel
     'cubic'
     """
     vertices, faces, chosen = check_request(mesh, kernels or KERNELS)
@@ -266,16 +248,16 @@ def study_kernels(
     found = _measure_all(judge, calls, progress)
     _refuse_coarse([one.row for one in found])
     for one in found:  # when nothing else runs
-        if not one.row["unfit"]:
+        if not one.row.unfit:
             time_row(one, judge.points)
     found.sort(
-        key=lambda one: (bool(one.row["unfit"]), one.row["rms"] is None, one.row["rms"] or 0.0)
+        key=lambda one: (bool(one.row.unfit), np.inf if one.row.rms is None else one.row.rms)
     )
     rows = [one.row for one in found]
-    good = [row for row in rows if not row["unfit"]]
-    front = pareto_front([row["rms"] for row in good], [cost(row) for row in good])
+    good = [row for row in rows if not row.unfit]
+    front = pareto_front([row.error for row in good], [row.cost for row in good])
     for row in rows:  # no other row beats those of the front both in error and in time
-        row["front"] = any(row is good[index] for index in front)
+        row.front = any(row is good[index] for index in front)
     surfaces = [one.surface for one in found]
     return KernelStudy(rows, surfaces, units, recommend(rows), mesh_hash(vertices, faces))
 
@@ -304,14 +286,12 @@ def _measure_all(
         return each(measure, calls)
 
 
-def _refuse_coarse(rows: list[dict]) -> None:
+def _refuse_coarse(rows: list[KernelRow]) -> None:
     """Name rows unfit that err more than `linear`, the coarsest sensible kernel, with as many
     centres.
     """
-    bounds = {
-        row["centres"]: row["rms"] for row in rows if row["kernel"] == "linear" and not row["unfit"]
-    }
+    bounds = {row.centres: row.error for row in rows if row.kernel == "linear" and not row.unfit}
     for row in rows:
-        bound = bounds.get(row["centres"])
-        if not row["unfit"] and bound is not None and row["rms"] > bound:
-            row["unfit"] = f"an error of {row['rms']:.3g}, beyond that of linear, {bound:.3g}"
+        bound = bounds.get(row.centres)
+        if not row.unfit and bound is not None and row.error > bound:
+            row.unfit = f"an error of {row.error:.3g}, beyond that of linear, {bound:.3g}"

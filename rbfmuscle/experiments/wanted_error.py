@@ -9,11 +9,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
+from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.experiments import kernel_study
-from rbfmuscle.experiments.kernel_rows import row_name
+from rbfmuscle.experiments.kernel_rows import KernelRow
 from rbfmuscle.experiments.sweep_run import OnProgress
 from rbfmuscle.geometry.arrays import MeshLike
 from rbfmuscle.implicit.kernels.table import Kernel
@@ -27,27 +28,34 @@ FEWEST, MOST = 20, GREEDY_LARGEST
 STEP, POWER = 0.04, 1.4
 
 
+class TriedFit(NamedTuple):
+    """A kernel with a number of centres, and its error [length], infinite where it is unfit."""
+
+    kernel: str
+    centres: int
+    error: float
+
+
 @dataclass
 class CentreSearchResult:
     """What `reach_error` found.
 
     ``row`` is as in `KernelStudy.rows`: the one that reached the ``wanted`` error, else that of the
-    smallest error; ``error`` is its [length]; ``tried`` lists ``kernel, centres, error`` of all
-    that was measured, in order.
+    smallest error; ``error`` is its [length]; ``tried`` is all that was measured, in order.
     """
 
     reached: bool
-    row: dict
+    row: KernelRow
     error: float
     wanted: float
-    tried: list[dict] = field(default_factory=list)
+    tried: list[TriedFit] = field(default_factory=list)
 
     def describe(self, name: str, units: str = "") -> str:
         """One line on the surface of this name: what reaches the wanted error, or what the best
         reached.
         """
-        unit, said = f" {units}" if units else "", row_name(self.row)
-        if self.row["unfit"]:
+        unit, said = f" {units}" if units else "", self.row.title
+        if self.row.unfit:
             return f"{name}: no field is fit; take more centres or another kernel"
         if self.reached:
             return f"{name}: {said} reaches {self.error:.3g}{unit} RMS, wanted {self.wanted:g}"
@@ -89,7 +97,7 @@ def reach_error(
     >>> import trimesh
     >>> ball = trimesh.creation.icosphere(3, 10.0)
     >>> found = reach_error(ball, 0.1, kernels=["cubic"])
-    >>> found.reached, found.row["kernel"], found.error <= 0.1
+    >>> found.reached, found.row.kernel, found.error <= 0.1
     (True, 'cubic', True)
     """
     if not 0.0 < error < np.inf:
@@ -126,7 +134,7 @@ class _Search:
             self.found[key] = kernel_study.measure_row(self.judge, self.sample(count), kernel)
             if self.progress is not None:
                 self.progress(len(self.found), max(len(self.found) + 1, 8))
-        error = _error(self.found[key])
+        error = self.found[key].row.error
         if error <= self.error and (self.best is None or count < self.best[1]):
             self.best = key
         return error
@@ -152,16 +160,11 @@ class _Search:
 
     def result(self) -> CentreSearchResult:
         """The row of fewest centres that reaches the error, or that of the smallest error."""
-        found = min(self.found.values(), key=_error) if self.best is None else self.found[self.best]
-        if not found.row["unfit"]:
+        least = min(self.found, key=lambda key: self.found[key].row.error)
+        found = self.found[self.best or least]
+        if not found.row.unfit:
             kernel_study.time_row(found, self.judge.points)
-        tried = [
-            {"kernel": k, "centres": n, "error": _error(one)} for (k, n), one in self.found.items()
-        ]
+        tried = [TriedFit(*key, one.row.error) for key, one in self.found.items()]
         return CentreSearchResult(
-            self.best is not None, found.row, _error(found), self.error, tried
+            self.best is not None, found.row, found.row.error, self.error, tried
         )
-
-
-def _error(found: kernel_study.Measured) -> float:
-    return math.inf if found.row["unfit"] else float(found.row["rms"])

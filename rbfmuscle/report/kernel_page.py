@@ -6,19 +6,17 @@ from collections import Counter
 from collections.abc import Mapping
 from itertools import cycle
 from pathlib import Path
-from typing import TypedDict
 
 import numpy as np
 
 from rbfmuscle.experiments.kernel_rows import (
     ALIKE,
     ENDS,
+    KernelFacts,
+    KernelRow,
     at_end,
-    cost,
     describe,
     recommend,
-    row_name,
-    row_toml,
 )
 from rbfmuscle.experiments.kernel_study import KernelStudy
 from rbfmuscle.folders import OutputFolder
@@ -61,18 +59,6 @@ front. A kernel that is not C2 cannot be fitted to normals: it is fitted to valu
 surface."""
 
 
-class KernelFacts(TypedDict):
-    """What ``kernels.json`` holds: the unit, the library's version, the date, the hash of each mesh
-    by its name, and rows as in `KernelStudy`, each with its ``surface``.
-    """
-
-    units: str
-    version: str
-    date: str
-    meshes: dict[str, str]
-    rows: list[dict]
-
-
 def kernels_folder(directory: str | Path) -> OutputFolder:
     """The folder of a kernel study; UsageError if something in it is in the way."""
     return OutputFolder(directory, "kernels", (*FILES, "error.json"))
@@ -82,31 +68,34 @@ def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> 
     """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html`` of studies by the names of their
     surfaces.
     """
-    rows = [{"surface": name, **row} for name, study in studies.items() for row in study.rows]
-    facts: KernelFacts = {
-        "units": next(iter(studies.values())).units,
-        "version": versions()["rbfmuscle"],
-        "date": datetime.date.today().isoformat(),
-        "meshes": {name: study.sha256 for name, study in studies.items()},
-        "rows": rows,
-    }
+    facts = KernelFacts(
+        units=next(iter(studies.values())).units,
+        version=versions()["rbfmuscle"],
+        date=datetime.date.today().isoformat(),
+        meshes={name: study.sha256 for name, study in studies.items()},
+        rows=[
+            row.model_copy(update={"surface": name})
+            for name, study in studies.items()
+            for row in study.rows
+        ],
+    )
     with kernels_folder(directory).staged() as stage:
         with (stage / "kernels.csv").open("w", newline="", encoding="utf-8") as file:
-            names = [name for name in rows[0] if name != "trials"]
+            names = [name for name in KernelRow.model_fields if name != "trials"]
             writer = csv.DictWriter(file, fieldnames=names, extrasaction="ignore")
             writer.writeheader()
-            writer.writerows(rows)
-        (stage / "kernels.json").write_text(json_text(facts), encoding="utf-8")
+            writer.writerows(row.model_dump() for row in facts.rows)
+        (stage / "kernels.json").write_text(json_text(facts.model_dump()), encoding="utf-8")
         write_page(stage, facts)
 
 
 def write_page(directory: Path, facts: KernelFacts) -> None:
     """Write ``kernels.html`` of what ``kernels.json`` holds."""
     studies = {}
-    for name, digest in facts["meshes"].items():
-        rows = [row for row in facts["rows"] if row["surface"] == name]
-        studies[name] = KernelStudy(rows, [], facts["units"], recommend(rows), digest)
-    made = f"rbfmuscle {facts['version']}, {facts['date']}"
+    for name, digest in facts.meshes.items():
+        rows = [row for row in facts.rows if row.surface == name]
+        studies[name] = KernelStudy(rows, [], facts.units, recommend(rows), digest)
+    made = f"rbfmuscle {facts.version}, {facts.date}"
     _page(studies, made).write(directory / "kernels.html")
 
 
@@ -118,11 +107,11 @@ def answer(studies: Mapping[str, KernelStudy]) -> str:
         return describe(next(iter(studies.values())).rows)
     tied: Counter[str] = Counter()
     for study in studies.values():
-        good = [row for row in study.rows if not row["unfit"]]
-        tied.update({row["kernel"] for row in good if row["rms"] <= ALIKE * good[0]["rms"]})
+        good = [row for row in study.rows if not row.unfit]
+        tied.update({row.kernel for row in good if row.error <= ALIKE * good[0].error})
     if not tied:
         return "Every field is unfit on every surface; take more centres."
-    chosen = Counter(study.recommended["kernel"] for study in studies.values() if study.recommended)
+    chosen = Counter(study.recommended.kernel for study in studies.values() if study.recommended)
     kernel = max(chosen, key=lambda name: (tied[name], chosen[name]))
     return (
         f"Use {kernel}: within 5 % of the least error on {tied[kernel]} of {len(studies)} muscles, "
@@ -134,10 +123,10 @@ def _page(studies: Mapping[str, KernelStudy], made: str) -> ReportPage:
     several, rows = len(studies) > 1, [row for study in studies.values() for row in study.rows]
     units = next(iter(studies.values())).units
     surfaces = f"all {len(studies)} muscles" if several else next(iter(studies)).replace("_", " ")
-    kernels = len({row["kernel"] for row in rows})
-    counts = ", ".join(map(str, sorted({row["centres"] for row in rows})))
+    kernels = len({row.kernel for row in rows})
+    counts = ", ".join(map(str, sorted({row.centres for row in rows})))
     found = {name: study.recommended for name, study in studies.items() if study.recommended}
-    code = "\n\n".join(f"# {name}\n{row_toml(row)}" for name, row in found.items())
+    code = "\n\n".join(f"# {name}\n{row.toml()}" for name, row in found.items())
     hint = f"distances in {units or 'mesh units'}"
     return ReportPage(
         f"Kernels for {surfaces}",
@@ -160,12 +149,12 @@ def _page(studies: Mapping[str, KernelStudy], made: str) -> ReportPage:
             *(
                 Section(f"Unfit rows of {name}", hint, table=_rows(s, unfit=True))
                 for name, s in studies.items()
-                if any(row["unfit"] for row in s.rows)
+                if any(row.unfit for row in s.rows)
             ),
             *(
                 Section(f"Error against epsilon: {name}", plots=_curves(s))
                 for name, s in studies.items()
-                if any(row["trials"] for row in s.rows)
+                if any(row.trials for row in s.rows)
             ),
             Section("To paste at the end of a [[muscle]]", code=code),
             Section("How to read this", text=_READING),
@@ -182,17 +171,15 @@ def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[CheckRow]:
     ]
     if len(studies) == 1:
         (study,) = studies.values()
-        good = [row for row in study.rows if not row["unfit"]]
+        good = [row for row in study.rows if not row.unfit]
         others = [row for row in good if row is not study.recommended]
         chosen = [("recommended", row, GOOD) for _, row, _ in chosen]
         chosen += [
-            ("", row, GOOD if row["rms"] <= ALIKE * good[0]["rms"] else PLAIN) for row in others
+            ("", row, GOOD if row.error <= ALIKE * good[0].error else PLAIN) for row in others
         ]
         chosen = chosen[:_MOST_LIGHTS]
-    cells = [
-        [number_cell(row["rms"], units, s), number_cell(cost(row), "s")] for _, row, s in chosen
-    ]
-    return [CheckRow(row_name(row), pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
+    cells = [[number_cell(row.rms, units, s), number_cell(row.cost, "s")] for _, row, s in chosen]
+    return [CheckRow(row.title, pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
 
 
 def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
@@ -202,10 +189,10 @@ def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
     points = []
     for name, study in studies.items():
         for row in study.rows:
-            if not row["unfit"]:
-                group = name if len(studies) > 1 else f"{row['centres']} centres"
-                place = 1e3 * cost(row), row["rms"], row["kernel"], group
-                points.append(Point(*place, row is study.recommended, row["front"]))
+            if not row.unfit:
+                group = name if len(studies) > 1 else f"{row.centres} centres"
+                place = 1e3 * row.cost, row.error, row.kernel, group
+                points.append(Point(*place, row is study.recommended, row.front))
     labels = ("a fit and 20,000 values [ms of one thread]", f"RMS error [{units or 'mesh units'}]")
     return front_plot(points, labels)
 
@@ -214,12 +201,12 @@ def _curves(study: KernelStudy) -> list[str]:
     """For each number of centres the error at the held-out points against epsilon, by kernel."""
     pictures = []
     unit = study.units or "mesh units"
-    for count in dict.fromkeys(row["centres"] for row in study.rows):
-        rows = [row for row in study.rows if row["centres"] == count and row["trials"]]
+    for count in dict.fromkeys(row.centres for row in study.rows):
+        rows = [row for row in study.rows if row.centres == count and row.trials]
         tracks = []
         for row, colour in zip(rows, cycle(MUSCLE_COLOURS)):
-            shapes, errors = np.array(row["trials"]).T
-            tracks.append(Track(row["kernel"], colour, np.log10(shapes), np.log10(errors)))
+            shapes, errors = np.array(row.trials).T
+            tracks.append(Track(row.kernel, colour, np.log10(shapes), np.log10(errors)))
         labels = "log10 of epsilon times spacing", f"log10 of the RMS error [{unit}]"
         if tracks:
             pictures.append(line_plot(f"{count} centres", tracks, labels, legend=True))
@@ -228,17 +215,17 @@ def _curves(study: KernelStudy) -> list[str]:
 
 def _rows(study: KernelStudy, *, unfit: bool = False) -> Table:
     rows = []
-    for row in (row for row in study.rows if bool(row["unfit"]) == unfit):
-        state = GOOD if row is study.recommended else BAD if row["unfit"] else PLAIN
-        front = "on the front" if row["front"] else ""
-        verdict = row["unfit"] or ("recommended" if row is study.recommended else front)
+    for row in (row for row in study.rows if bool(row.unfit) == unfit):
+        state = GOOD if row is study.recommended else BAD if row.unfit else PLAIN
+        front = "on the front" if row.front else ""
+        verdict = row.unfit or ("recommended" if row is study.recommended else front)
         verdict = "; ".join(
-            filter(None, [verdict, ENDS if row["shape"] and at_end(row["shape"]) else ""])
+            filter(None, [verdict, ENDS if row.shape and at_end(row.shape) else ""])
         )
-        values = [(row[name], factor) for name, (_, factor) in COLUMNS.items()]
+        values = [(getattr(row, name), factor) for name, (_, factor) in COLUMNS.items()]
         texts = [
             shown_number(x * factor) if isinstance(x, float) else str(x or "")
             for x, factor in values
         ]
-        rows.append([Cell(row["kernel"]), Cell(verdict, state), *map(Cell, texts)])
+        rows.append([Cell(row.kernel), Cell(verdict, state), *map(Cell, texts)])
     return Table(["kernel", "verdict", *(head for head, _ in COLUMNS.values())], rows)

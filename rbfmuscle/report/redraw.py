@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 from rbfmuscle.experiments.comparison_table import Comparison, ScenesComparison
+from rbfmuscle.experiments.kernel_rows import KernelFacts
 from rbfmuscle.experiments.sweep_table import SweepTable
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import Limits, Summary, exceeded, parse_limits, unmeasured
@@ -88,7 +89,7 @@ def redraw_study(
             elif file == "scenes.json":
                 scenes_page.write_page(directory, ScenesComparison.model_validate(found))
             elif file == "kernels.json":
-                kernel_page.write_page(directory, found)
+                kernel_page.write_page(directory, KernelFacts.model_validate(found))
             else:
                 sweep_page.write_page(SweepTable.model_validate(found), directory)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:

@@ -12,7 +12,14 @@ from command_line import call
 
 import rbfmuscle as rm
 from rbfmuscle.experiments import kernel_study, wanted_error
-from rbfmuscle.experiments.kernel_rows import ENDS, at_end, describe, recommend, row_toml
+from rbfmuscle.experiments.kernel_rows import (
+    ENDS,
+    KernelFacts,
+    KernelRow,
+    at_end,
+    describe,
+    recommend,
+)
 from rbfmuscle.experiments.kernel_study import ReferenceSurface
 from rbfmuscle.experiments.wanted_error import STEP, reach_error
 from rbfmuscle.geometry.mesh_distance import MeshDistance
@@ -38,8 +45,7 @@ def study(ellipsoid):
 def test_the_sentence_names_those_alike_and_that_the_most_centres_were_best():
     def row(kernel, centres, rms):
         times = {"fit_time": 1.0, "evaluation_time": 1.0}
-        sound = {"epsilon": 0.0, "condition": 1e3, "unfit": ""}
-        return {"kernel": kernel, "centres": centres, "rms": rms} | times | sound
+        return KernelRow(kernel=kernel, centres=centres, rms=rms, condition=1e3, **times)
 
     rows = [row("cubic", 80, 1.0), row("quintic", 80, 1.02), row("cubic", 40, 3.0)]
     text = describe(rows)
@@ -50,10 +56,10 @@ def test_the_sentence_names_those_alike_and_that_the_most_centres_were_best():
 
 
 def test_rows_are_ranked_and_more_centres_err_less(study):
-    good = [row["rms"] for row in study.rows if not row["unfit"]]
+    good = [row.rms for row in study.rows if not row.unfit]
     assert good == sorted(good) and len(study.rows) == 12
-    assert all(row["unfit"] for row in study.rows[len(good) :])
-    error = {(row["kernel"], row["centres"]): row["rms"] for row in study.rows}
+    assert all(row.unfit for row in study.rows[len(good) :])
+    error = {(row.kernel, row.centres): row.rms for row in study.rows}
     for kernel in ("linear", "cubic", "quintic", "wendland_c2", "matern_52"):
         assert error[kernel, 80] < error[kernel, 40]
     assert error["cubic", 80] < 0.6 * error["linear", 80]
@@ -62,28 +68,28 @@ def test_rows_are_ranked_and_more_centres_err_less(study):
 def test_numbers_are_those_of_the_surface(study, ellipsoid):
     for row, surface in zip(study.rows, study.surfaces, strict=True):
         if surface is None:
-            assert row["unfit"]
+            assert row.unfit
             continue
         vertices, faces = surface
-        assert 0 < row["rms"] <= row["hausdorff"]
+        assert 0 < row.rms <= row.hausdorff
         volume = trimesh.Trimesh(vertices, faces, process=False).volume
-        assert row["volume_error"] == pytest.approx(volume / ellipsoid.volume - 1.0, abs=1e-9)
+        assert row.volume_error == pytest.approx(volume / ellipsoid.volume - 1.0, abs=1e-9)
         # The implicit form x^2/a^2 + ... = 1 is met where the row says so.
         radius = np.sqrt(((vertices / [40.0, 18.0, 12.0]) ** 2).sum(axis=1))
-        assert np.abs(radius - 1.0).max() * 12.0 <= row["hausdorff"] + 0.2
-        if row[
-            "epsilon"
-        ]:  # the shape parameter is per spacing, about the root of the area of each centre
-            spacing = row["shape"] / row["epsilon"]
-            assert 0.5 < spacing / np.sqrt(ellipsoid.area / row["centres"]) < 1.5
+        assert np.abs(radius - 1.0).max() * 12.0 <= row.hausdorff + 0.2
+        if (
+            row.epsilon
+        ):  # the shape parameter is per spacing, about the root of the area of each centre
+            spacing = row.shape / row.epsilon
+            assert 0.5 < spacing / np.sqrt(ellipsoid.area / row.centres) < 1.5
 
 
 def test_lines_to_paste_give_the_row(study):
-    row = next(row for row in study.rows if row["kernel"] == "matern_52")
-    table = tomllib.loads(row_toml(row))["muscle"]["model"]
-    assert table["kernel"] == "matern_52" and table["centres"] == row["centres"]
-    assert table["epsilon"] == pytest.approx(row["epsilon"], rel=1e-5)
-    assert "condition = 1e+10" in row_toml(row | {"bound": 1e10})
+    row = next(row for row in study.rows if row.kernel == "matern_52")
+    table = tomllib.loads(row.toml())["muscle"]["model"]
+    assert table["kernel"] == "matern_52" and table["centres"] == row.centres
+    assert table["epsilon"] == pytest.approx(row.epsilon, rel=1e-5)
+    assert "condition = 1e+10" in row.model_copy(update={"bound": 1e10}).toml()
 
 
 def test_a_study_on_several_threads_is_that_of_one():
@@ -95,29 +101,28 @@ def test_a_study_on_several_threads_is_that_of_one():
     for count in (1, threads):
         numba.set_num_threads(count)
         rows[count] = {
-            (row["kernel"], row["centres"]): row for row in rm.study_kernels(ball, **asked).rows
+            (row.kernel, row.centres): row for row in rm.study_kernels(ball, **asked).rows
         }
     assert warnings.filters == filters
     for key, row in rows[1].items():
         same = rows[threads][key]
-        assert row["unfit"] == same["unfit"] and row["epsilon"] == pytest.approx(
-            same["epsilon"], rel=1e-9
-        )
-        if not row["unfit"]:
-            assert row["rms"] == pytest.approx(same["rms"], rel=1e-6)
-            assert same["fit_time"] > 0.0 and same["evaluation_time"] > 0.0
+        assert row.unfit == same.unfit and row.epsilon == pytest.approx(same.epsilon, rel=1e-9)
+        if not row.unfit:
+            assert row.rms == pytest.approx(same.rms, rel=1e-6)
+            assert same.fit_time > 0.0 and same.evaluation_time > 0.0
 
 
 def row(kernel, rms, milliseconds, *, condition=1e6, epsilon=0.0, unfit=""):
-    return {
-        "kernel": kernel,
-        "rms": rms,
-        "fit_time": milliseconds * 1e-3,
-        "evaluation_time": 0.0,
-        "condition": condition,
-        "epsilon": epsilon,
-        "unfit": unfit,
-    }
+    return KernelRow(
+        kernel=kernel,
+        centres=80,
+        rms=rms,
+        fit_time=milliseconds * 1e-3,
+        evaluation_time=0.0,
+        condition=condition,
+        epsilon=epsilon,
+        unfit=unfit,
+    )
 
 
 @pytest.mark.parametrize(
@@ -138,7 +143,7 @@ def row(kernel, rms, milliseconds, *, condition=1e6, epsilon=0.0, unfit=""):
 )
 def test_the_quickest_of_those_alike_is_recommended(rows, wanted):
     found = recommend(rows)
-    assert (found and found["kernel"]) == wanted
+    assert (found and found.kernel) == wanted
 
 
 def test_wrong_requests_are_answered(ellipsoid):
@@ -182,9 +187,8 @@ def _muscle(name):
 
 def test_rows_that_err_more_than_the_coarsest_kernel_are_unfit():
     rows = [row("linear", 0.4, 1.0), row("buhmann", 0.9, 1.0), row("cubic", 0.1, 1.0)]
-    rows = [one | {"centres": 80} for one in rows]
     kernel_study._refuse_coarse(rows)
-    assert [one["unfit"] for one in rows] == ["", "an error of 0.9, beyond that of linear, 0.4", ""]
+    assert [one.unfit for one in rows] == ["", "an error of 0.9, beyond that of linear, 0.4", ""]
 
 
 def test_slender_muscles_are_looked_at_with_finer_cells(ellipsoid):
@@ -211,8 +215,8 @@ def found(egg):
 
 
 def test_the_error_is_reached_by_the_surface_itself(found, egg):
-    assert found.reached and found.error <= 0.1 and found.row["kernel"] == "cubic"
-    sample = sample_surface(egg.vertices, egg.faces, found.row["centres"], placement="greedy")
+    assert found.reached and found.error <= 0.1 and found.row.kernel == "cubic"
+    sample = sample_surface(egg.vertices, egg.faces, found.row.centres, placement="greedy")
     surface = RBFField.fit_hermite(sample.points, sample.normals).surface(resolution=96)
     points = trimesh.sample.sample_surface(egg, 3000, seed=5)[0]
     there = MeshDistance(np.asarray(surface.vertices), np.asarray(surface.faces)).unsigned(points)
@@ -220,10 +224,10 @@ def test_the_error_is_reached_by_the_surface_itself(found, egg):
 
 
 def test_a_number_four_per_cent_smaller_was_seen_to_fail(found):
-    count = found.row["centres"]
-    below = [t for t in found.tried if t["kernel"] == "cubic" and t["centres"] < count]
-    assert below and all(t["error"] > 0.1 for t in below)
-    assert count - max(t["centres"] for t in below) <= max(1, STEP * count)
+    count = found.row.centres
+    below = [t for t in found.tried if t.kernel == "cubic" and t.centres < count]
+    assert below and all(t.error > 0.1 for t in below)
+    assert count - max(t.centres for t in below) <= max(1, STEP * count)
 
 
 def test_command_with_an_error_says_what_to_paste(tmp_path, ellipsoid, capsys, monkeypatch):
@@ -243,18 +247,19 @@ def test_command_with_an_error_says_what_to_paste(tmp_path, ellipsoid, capsys, m
 
 def test_page_has_curves_of_epsilon_flags_its_ends_and_folds_unfit_rows(tmp_path, ellipsoid):
     study = rm.study_kernels(ellipsoid, kernels=["gaussian", "cubic"], centres=[30], resolution=24)
-    (gaussian,) = (row for row in study.rows if row["kernel"] == "gaussian")
-    shapes, errors = np.array(gaussian["trials"]).T
+    (gaussian,) = (row for row in study.rows if row.kernel == "gaussian")
+    shapes, errors = np.array(gaussian.trials).T
     assert (np.diff(shapes) > 0).all() and len(shapes) > 20 and (errors > 0).all()
     best = shapes[errors.argmin()]
-    assert errors[np.abs(shapes - gaussian["shape"]).argmin()] <= 1.5 * errors.min()
+    assert errors[np.abs(shapes - gaussian.shape).argmin()] <= 1.5 * errors.min()
     assert SPAN[0] <= best <= SPAN[1]
     assert at_end(SPAN[0]) and at_end(SPAN[1]) and not at_end(1.0)
-    facts = {"units": "mm", "version": "1", "date": "2", "meshes": {"m": "0" * 64}}
-    rows = [row | {"surface": "m"} for row in study.rows]
-    rows[0] |= {"shape": SPAN[1]}
-    rows += [gaussian | {"surface": "m", "unfit": "open", "kernel": "planted"}]
-    write_page(tmp_path, facts | {"rows": rows})
+    rows = [row.model_copy(update={"surface": "m"}) for row in study.rows]
+    rows[0].shape = SPAN[1]
+    planted = {"surface": "m", "unfit": "open", "kernel": "planted"}
+    rows.append(gaussian.model_copy(update=planted))
+    meshes = {"m": "0" * 64}
+    write_page(tmp_path, KernelFacts(units="mm", version="1", date="2", meshes=meshes, rows=rows))
     page = (tmp_path / "kernels.html").read_text(encoding="utf-8")
     assert ENDS in page and "Error against epsilon: m" in page
     assert page.index("Fitted rows of m") < page.index("Unfit rows of m") < page.rindex("planted")

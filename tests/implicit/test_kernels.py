@@ -201,7 +201,7 @@ def test_a_registered_kernel_is_studied_beside_the_others(outside):
     outside("sech", sech, sech_first, sech_second)
     ball = trimesh.creation.icosphere(3, 10.0)
     study = study_kernels(ball, kernels=["sech", "cubic"], centres=[60], resolution=24)
-    errors = {row["kernel"]: row["rms"] for row in study.rows}
+    errors = {row.kernel: row.rms for row in study.rows}
     assert errors["sech"] < errors["cubic"]
 
 
