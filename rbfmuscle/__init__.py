@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from rbfmuscle.accuracy import discretisation_error as discretisation_error
     from rbfmuscle.bones.sdf import BoneSDF as BoneSDF
     from rbfmuscle.compare import compare_models as compare_models
-    from rbfmuscle.experiments.kernel_study import study_kernels as study_kernels
     from rbfmuscle.experiments.wanted_error import reach_error as reach_error
     from rbfmuscle.implicit.field import RBFField as RBFField
     from rbfmuscle.implicit.kernels.table import register_kernel as register_kernel
+    from rbfmuscle.kernels import study_kernels as study_kernels
     from rbfmuscle.muscle.muscle import RBFMuscle as RBFMuscle
     from rbfmuscle.run import Run as Run
     from rbfmuscle.run import simulate as simulate
@@ -64,7 +64,7 @@ _HOME = {
     "reach_error": "rbfmuscle.experiments.wanted_error",
     "show": "rbfmuscle.viewer.page",
     "simulate": "rbfmuscle.run",
-    "study_kernels": "rbfmuscle.experiments.kernel_study",
+    "study_kernels": "rbfmuscle.kernels",
     "sweep": "rbfmuscle.sweeping",
     **dict.fromkeys(_ERRORS, "rbfmuscle.validation"),
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,7 +53,7 @@ ONE_THREAD = 5  # frames that are timed on one thread, the first of which does n
 
 def compare_models(
     scene: Scene | str | Path,
-    directory: str | Path,
+    directory: str | Path | None = None,
     models: Sequence[str] = COMPARED,
     *,
     frames: slice | str | None = None,
@@ -65,8 +66,9 @@ def compare_models(
     Parameters
     ----------
     scene : Scene, path or "phantom"
-    directory : path
-        Takes ``comparison.json``, tables, ``report.html`` and the run of each model.
+    directory : path, optional
+        Takes ``comparison.json``, tables, ``report.html`` and the run of each model; without one
+        nothing is kept but what is returned.
     models : list of str
         Distances are to the first. One that cannot be solved is left out, and named in the tables.
     frames : slice or str, optional
@@ -91,13 +93,22 @@ def compare_models(
 
     Examples
     --------
-    >>> import tempfile
     >>> from rbfmuscle import phantom_scene
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     table = compare_models(phantom_scene(end=2.0), folder, ["pbd", "xpbd"], pictures=False)
+    >>> table = compare_models(phantom_scene(end=2.0), models=["pbd", "xpbd"])
     >>> sorted(table.models)
     ['pbd', 'xpbd']
     """
+    if directory is None:
+        with TemporaryDirectory() as kept:
+            return compare_models(
+                scene,
+                Path(kept, "comparison"),
+                models,
+                frames=frames,
+                settings=settings,
+                pictures=False,
+                progress=progress,
+            )
     variants = _variants(open_scene(scene), list(models), settings or {}, frames)
     folder = Path(directory)
     output = OutputFolder(folder, "compare", FILES)

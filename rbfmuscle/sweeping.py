@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from rbfmuscle.experiments.sweep import plan_sweep
 from rbfmuscle.experiments.sweep_run import VALUES, OnProgress, run_sweep, write_table
@@ -18,7 +19,7 @@ from rbfmuscle.validation import UsageError, did_you_mean
 def sweep(
     scenes: Mapping[str, Scene],
     grid: Mapping[str, Sequence[object]],
-    directory: str | Path,
+    directory: str | Path | None = None,
     *,
     frames: str | None = None,
     reference: Mapping[str, object] | None = None,
@@ -29,7 +30,7 @@ def sweep(
 ) -> SweepTable:
     """Run scenes under every combination of some settings, and write tables and a page.
 
-    Points that the folder holds done are not run again.
+    Points that the folder, where one is given, holds done are not run again.
 
     Parameters
     ----------
@@ -38,8 +39,8 @@ def sweep(
     grid : mapping of str to sequence
         Values of each dotted key, as ``{"model.centres": [100, 200]}``; empty, the scenes are
         compared as they are.
-    directory : path
-        New, empty, or that of an earlier sweep.
+    directory : path, optional
+        New, empty, or that of an earlier sweep; without one nothing is kept but what is returned.
     frames : str, optional
         Frames of the motion, "A:B:S".
     reference : mapping, optional
@@ -60,14 +61,26 @@ def sweep(
 
     Examples
     --------
-    >>> import tempfile
     >>> from rbfmuscle import phantom_scene, sweep
     >>> scene = phantom_scene(end=0.0, spacing=6.0).with_options(model="pbd")
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     table = sweep({"hip": scene}, {}, folder, jobs=1)
+    >>> table = sweep({"hip": scene}, {}, jobs=1)
     >>> table.done, len(table.rows)
     (1, 1)
     """
+    if directory is None:
+        if cluster is not None:
+            raise UsageError("a cluster needs a folder that its workers see")
+        with TemporaryDirectory() as kept:
+            return sweep(
+                scenes,
+                grid,
+                Path(kept, "sweep"),
+                frames=frames,
+                reference=reference,
+                jobs=jobs,
+                error=error,
+                progress=progress,
+            )
     if error not in VALUES:
         raise UsageError(f"unknown quantity {error!r}, {did_you_mean(error, VALUES)}")
     if jobs is not None and jobs < 1:

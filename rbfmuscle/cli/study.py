@@ -60,7 +60,7 @@ def kernels(
         Find the fewest centres, and the kernel, that reach this RMS distance (in the mesh's unit),
         in place of a table.
     """
-    from rbfmuscle.experiments.kernel_study import study_kernels
+    from rbfmuscle.experiments.kernel_study import measure_kernels
     from rbfmuscle.experiments.wanted_error import reach_error
     from rbfmuscle.report.kernel_page import kernels_folder
 
@@ -75,7 +75,7 @@ def kernels(
             find = partial(reach_error, error=error, kernels=chosen)
             return _find_wanted(meshes, output, find, units, printing)
         study = partial(
-            study_kernels,
+            measure_kernels,
             kernels=chosen,
             centres=[int(count) for count in counts],
             resolution=resolution,

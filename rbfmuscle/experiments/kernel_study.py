@@ -186,7 +186,7 @@ def _spent(work: Callable[[], object]) -> float:
 
 @dataclass
 class KernelStudy:
-    """What `study_kernels` found.
+    """What `rbfmuscle.study_kernels` found.
 
     ``rows`` are `KernelRow` for each kernel and number of centres, the smallest error first, unfit
     ones last. ``surfaces`` (vertices, faces) are those of the rows, None where there is none.
@@ -201,7 +201,7 @@ class KernelStudy:
     sha256: str = ""
 
 
-def study_kernels(
+def measure_kernels(
     mesh: MeshLike,
     *,
     kernels: Sequence[str] | None = None,
@@ -210,33 +210,8 @@ def study_kernels(
     units: str = "",
     progress: OnProgress | None = None,
 ) -> KernelStudy:
-    """Fit a surface with many kernels and numbers of centres, and measure each fit.
-
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
-        Closed, outward.
-    kernels : list of str, optional
-        All by default.
-    centres : sequence of int
-    resolution : int
-        Cells along the longest side of the extracted surfaces; as many as a muscle so slender needs
-        by default.
-    units, progress : str, callable, optional
-        Name of the mesh's unit, for the page. ``progress(done, total)`` is called along the way.
-
-    Raises
-    ------
-    UsageError, MeshError
-        On an unknown kernel, or a number of centres below 8; on an unusable mesh.
-
-    Examples
-    --------
-    >>> import trimesh
-    >>> ball = trimesh.creation.icosphere(3, 10.0)
-    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], resolution=16)
-    >>> study.rows[0].kernel
-    'cubic'
+    """Fit a surface with kernels and numbers of centres, and measure each fit; arguments are those
+    of `rbfmuscle.study_kernels`.
     """
     vertices, faces, chosen = check_request(mesh, kernels or KERNELS)
     if min(centres, default=0) < 8:

@@ -180,6 +180,17 @@ def test_command_ranks_and_prints(tmp_path, capsys):
     assert page.read_text(encoding="utf-8") == first
 
 
+def test_a_study_in_python_writes_what_the_command_does(tmp_path, ellipsoid):
+    asked = {"kernels": ["cubic"], "centres": [30], "resolution": 16}
+    (row,) = rm.study_kernels(ellipsoid, tmp_path / "out", **asked).rows
+    kept = json.loads((tmp_path / "out/kernels.json").read_text(encoding="utf-8"))["rows"]
+    assert kept[0]["rms"] == row.rms and (tmp_path / "out/kernels.html").exists()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match=r"notes\.txt"):
+        rm.study_kernels(ellipsoid, tmp_path / "other", **asked)
+
+
 def _muscle(name):
     mesh = rm.phantom_scene().muscle(name).mesh
     return mesh.vertices, mesh.faces
