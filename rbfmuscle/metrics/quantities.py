@@ -72,7 +72,7 @@ QUANTITIES = {
     ),
     "tendon_depth": ("length", "deepest point of a tendon inside a bone"),
     "initial_overlap": ("length", "deepest overlap of muscle and bones that is left at rest"),
-    "initial_shift": ("length", "greatest way that the muscle was moved out of bones at rest"),
+    "initial_shift": ("length", "greatest distance that the muscle was moved out of bones at rest"),
     "end_gap": ("length", "distance of the end that lies furthest from its bone at rest"),
     "edge_strain_rms": ("1", "relative change of edge lengths of the material mesh"),
     "condition": ("1", "condition estimate of the fit"),
