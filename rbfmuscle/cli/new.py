@@ -108,7 +108,7 @@ def import_(
     muscles
         Make a tube of each muscle of the model, along its path.
     """
-    from rbfmuscle.importers.opensim.scene import import_osim, scene_folder, write_scene
+    from rbfmuscle.importers.opensim.scene import import_osim, scene_folder, write_imported
     from rbfmuscle.scene.record import record_scene
 
     scene_folder(output, force=force)
@@ -116,7 +116,7 @@ def import_(
         if not folder.is_dir():
             raise UsageError(f"--geometry {folder}: no such folder")
     found = import_osim(model, geometry=geometry, muscles=muscles)
-    written = write_scene(found, output, force=force)
+    written = write_imported(found, output, force=force)
     scene = found.scene
     facts = {"file": str(written), "notes": found.notes, "scene": record_scene(scene)}
     return print_result(printing, facts, _import_lines(written, found.notes, scene))

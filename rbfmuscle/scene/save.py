@@ -28,19 +28,17 @@ from rbfmuscle.validation import SceneError, UsageError
 if TYPE_CHECKING:
     import trimesh
 
+OPTIONAL = ("sliding", "detect")  # tables that change a scene even where they are empty
+
 
 class SceneFiles:
-    """The files of one scene, each written when its table is made; paths are relative to it."""
+    """The files of one scene, in a folder, each written when its table is made; paths are relative
+    to the scene's own file.
+    """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, folder: Path) -> None:
         self.path = path
-        self.folder = path.with_name(f"{path.stem}_files")
-        if path.suffix != ".toml":
-            raise UsageError(f"{path}: the name of a scene file ends in .toml")
-        for taken in (path, self.folder):
-            if taken.exists():
-                raise UsageError(f"{taken} is there already; choose another name")
-        self.folder.mkdir(parents=True)
+        self.folder = folder
 
     def bone(self, bone: Bone) -> dict[str, object]:
         """``[[bone]]``, its mesh written."""
@@ -90,12 +88,15 @@ class SceneFiles:
         return row
 
     def write(
-        self, tables: Sequence[tuple[str, Mapping[str, object]]], guesses: Sequence[Guess]
+        self,
+        tables: Sequence[tuple[str, Mapping[str, object]]],
+        guesses: Sequence[Guess],
+        comment: str,
     ) -> None:
-        """Write the file itself from the heads and rows of its tables; lines that are guesses are
-        marked.
+        """Write the file itself: a comment, then the heads and rows of its tables; lines that are
+        guesses are marked.
         """
-        parts = []
+        parts = [comment] if comment else []
         for head, row in tables:
             name = row.get("name")
             about = [g for g in guesses if g.table == head.strip("[]") and g.name in ("", name)]
@@ -152,13 +153,30 @@ class SceneFiles:
 
 
 def save_scene(scene: SceneContents, path: Path) -> Path:
-    """Write a scene and the files that it names; the path of its file."""
+    """Write a scene, and the files that it names into a new folder beside it; the path of its
+    file.
+    """
+    folder = path.with_name(f"{path.stem}_files")
+    if path.suffix != ".toml":
+        raise UsageError(f"{path}: the name of a scene file ends in .toml")
+    for taken in (path, folder):
+        if taken.exists():
+            raise UsageError(f"{taken} is there already; choose another name")
     if list(made_motion(scene, scene.motion.options).frames) != list(scene.motion.frames):
         raise SceneError(
             "the frames of the motion are not those of its table [motion]; give it by "
             "set_motion before the scene is saved"
         )
-    files = SceneFiles(path)
+    folder.mkdir(parents=True)
+    write_scene(scene, path, folder)
+    return path
+
+
+def write_scene(scene: SceneContents, path: Path, folder: Path, *, comment: str = "") -> None:
+    """Write a scene's file, which begins with a comment, and the files that it names into a folder
+    that is there.
+    """
+    files = SceneFiles(path, folder)
     about: dict[str, object] = {"format": FORMAT, "name": scene.name, "units": scene.units}
     for key in ("missing_bones", "doubts", "notes", "superior", "anterior"):
         about |= {key: getattr(scene, key)} if getattr(scene, key) else {}
@@ -170,6 +188,8 @@ def save_scene(scene: SceneContents, path: Path) -> Path:
     tables += [("[[muscle]]", files.muscle(muscle)) for muscle in scene.muscles]
     for key in TABLES:
         table = getattr(scene, key) if key != "motion" else scene.motion.options
-        tables += [] if table is None else [(f"[{key}]", files.table(table))]
-    files.write(tables, scene.guesses)
-    return files.path
+        row = {} if table is None else files.table(table)
+        # What a scene may lack is switched on by its mere table.
+        if row or (table is not None and key in OPTIONAL):
+            tables.append((f"[{key}]", row))
+    files.write(tables, scene.guesses, comment)

@@ -14,13 +14,11 @@ from rbfmuscle.importers.opensim.model import ModelMesh, OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.tubes import TUBE_MODEL, make_tube
 from rbfmuscle.scene.joints.joint import all_coordinates
-from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.meshes.formats import ALL, MESH_SUFFIXES, read_part
 from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.scene.meshes.repair import ReadMesh
+from rbfmuscle.scene.save import write_scene
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.scene.toml_text import attachment_file, table_text
-from rbfmuscle.scene.upgrade import FORMAT
 from rbfmuscle.validation import MeshError, SceneError, check_mesh
 
 WIDEST = 3.0  # a mesh wider than this [m] is a floor or a wall, not a bone
@@ -220,32 +218,14 @@ def scene_folder(directory: Path, *, force: bool = False) -> OutputFolder:
     )
 
 
-def write_scene(found: Imported, directory: Path, *, force: bool = False) -> Path:
+def write_imported(found: Imported, directory: Path, *, force: bool = False) -> Path:
     """Write ``scene.toml``, meshes and attachments to a folder, and return the scene file.
 
     The folder is that of `scene_folder`; files take their places when all are written.
     """
-    directory, scene = Path(directory), found.scene
-    facts = {"format": FORMAT, "name": scene.name, "units": scene.units}
-    facts |= {"missing_bones": scene.missing_bones} if scene.missing_bones else {}
-    facts |= {"doubts": scene.doubts} if scene.doubts else {}
-    facts |= {"superior": scene.superior, "anterior": scene.anterior}
+    directory = Path(directory)
     with scene_folder(directory, force=force).staged(replaces=()) as stage:
-        bones = [
-            {"name": bone.name, "mesh": _write_mesh(stage, "bones", bone)} for bone in scene.bones
-        ]
-        parts = [_head(found), table_text("[scene]", facts)]
-        parts += [table_text("[[bone]]", row) for row in bones]
-        parts += [
-            table_text("[[bone]]   # no mesh: joints only", {"name": name})
-            for name in scene.meshless_bones
-        ]
-        parts += [table_text("[[joint]]", joint_row(joint)) for joint in scene.joints]
-        parts += [
-            table_text("[[coupling]]", coupling_row(c, scene.joints)) for c in scene.couplings
-        ]
-        parts += [_muscle_text(stage, muscle) for muscle in scene.muscles]
-        (stage / SCENE).write_text("\n".join(parts), encoding="utf-8")
+        write_scene(found.scene, stage / SCENE, stage, comment=_head(found))
     return directory / SCENE
 
 
@@ -257,31 +237,8 @@ def _head(found):
         "Its meshes, authors and licence are the model's: see its <credits>.",
         "Meshes stand in the model's default pose; angles are degrees. All keys: "
         "docs/scene_file.md.",
+        "A muscle is a tube along the model's path, of its fibres' volume: put a mesh of your own "
+        "in its place, and leave out its model.",
         *(f"note: {note}" for note in found.notes),
     ]
     return "\n".join("# " + " ".join(line.split()) for line in lines) + "\n"
-
-
-def _muscle_text(directory, muscle):
-    """The table of a muscle, its mesh and attachments written."""
-    row = {"name": muscle.name, "mesh": _write_mesh(directory, "muscles", muscle)}
-    row |= {"model": {"name": muscle.model, **muscle.options}, "attach": []}
-    (directory / "attachments").mkdir(exist_ok=True)
-    for held in muscle.attachments:
-        file = attachment_file(muscle.name, f"{held.bone}_via" if held.via else held.bone)
-        np.savetxt(directory / file, held.vertices, fmt="%d")
-        entry = {"bone": held.bone, "vertices": file}
-        row["attach"].append(entry | ({"via": True} if held.via else {}))
-    head = (
-        "[[muscle]]   # a tube along the model's path, of its fibres' volume; put a mesh of "
-        "your own here"
-    )
-    return table_text(head, row, {"model": "enough for a tube; leave it out for your own mesh"})
-
-
-def _write_mesh(directory, folder, item):
-    """Write a mesh and return its file."""
-    file = f"{folder}/{item.name}.ply"
-    (directory / folder).mkdir(exist_ok=True)
-    item.mesh.export(directory / file)
-    return file

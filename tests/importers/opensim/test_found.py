@@ -25,7 +25,7 @@ from osim_text import (
 
 import rbfmuscle as rm
 from rbfmuscle.importers.opensim.read import read_osim
-from rbfmuscle.importers.opensim.scene import import_osim, write_scene
+from rbfmuscle.importers.opensim.scene import import_osim, write_imported
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.joints.joint import joint_poses, rotation_about
 
@@ -48,7 +48,7 @@ def turned(angle):
 def check_written(tmp_path, values):
     """The scene, written and loaded, has the model's poses at some values of its coordinates."""
     found = import_osim(tmp_path / "m.osim")
-    scene = rm.Scene.load(write_scene(found, tmp_path / "scene"), skeleton=True)
+    scene = rm.Scene.load(write_imported(found, tmp_path / "scene"), skeleton=True)
     poses = joint_poses(found.model.bodies, scene.joints, scene.couplings, values)
     wanted = found.model.transforms(values)
     for name, place in found.places.items():
@@ -81,7 +81,7 @@ class TestRoots:
         tail = pin("root", "ground", "tail", 0.0, "0.2 0 0")
         read(model(["upper", "lower", "alone", "tail"], [self.knee, tail]))
         scene = rm.Scene.load(
-            write_scene(import_osim(tmp_path / "m.osim"), tmp_path / "s"), skeleton=True
+            write_imported(import_osim(tmp_path / "m.osim"), tmp_path / "s"), skeleton=True
         )
         warned = [f.message for f in check_scene(scene) if f.level == "warning"]
         assert [message.split("'")[1] for message in warned] == ["upper", "alone"]
@@ -90,7 +90,7 @@ class TestRoots:
 
 def test_a_scene_in_which_no_bone_has_a_mesh_is_a_note_and_not_usable(read, tmp_path, capsys):
     read(model("a", [pin("p", "ground", "a")]))
-    path = write_scene(import_osim(tmp_path / "m.osim"), tmp_path / "s")
+    path = write_imported(import_osim(tmp_path / "m.osim"), tmp_path / "s")
     code, out, err = call(capsys, "check", path)
     assert code == 3 and out.count("note: m: no bone has a mesh") == 1
     assert "not usable" in err and "bug" not in err

@@ -7,7 +7,7 @@ import trimesh
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.importers.opensim.read import read_osim
-from rbfmuscle.importers.opensim.scene import LEAST_MISSED, import_osim, write_scene
+from rbfmuscle.importers.opensim.scene import LEAST_MISSED, import_osim, write_imported
 from rbfmuscle.importers.opensim.tubes import FITTED, SIDES, make_tube
 from rbfmuscle.importers.opensim.xml import read_xml
 from rbfmuscle.scene.check import check_scene
@@ -119,7 +119,7 @@ def test_muscles_of_published_models_are_written_and_load(osim_data, tmp_path):
     model = read_osim(path)
     assert len(model.muscles) == 9
     found = import_osim(path)
-    scene = Scene.load(write_scene(found, tmp_path))
+    scene = Scene.load(write_imported(found, tmp_path))
     scene = scene.with_options({"motion.file": str(path.parent / "leg69_IK_swing.mot")})
     assert len(scene.muscles) == 9 and scene.superior == [0.0, 1.0, 0.0]
     assert all(finding.level != "error" for finding in check_scene(scene))

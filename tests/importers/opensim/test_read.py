@@ -10,7 +10,7 @@ import pytest
 import rbfmuscle as rm
 from rbfmuscle.importers.opensim.elements import frame_at
 from rbfmuscle.importers.opensim.read import read_osim
-from rbfmuscle.importers.opensim.scene import import_osim, write_scene
+from rbfmuscle.importers.opensim.scene import import_osim, write_imported
 from rbfmuscle.scene.joints.joint import all_coordinates, rotation_about
 from rbfmuscle.scene.motion import bone_poses
 
@@ -64,7 +64,7 @@ def test_body_transforms_are_opensims(osim_data, name):
 def test_poses_of_the_written_scene_are_opensims(osim_data, tmp_path, name):
     path, found = reference(osim_data, name)
     imported = import_osim(path)
-    scene = rm.Scene.load(write_scene(imported, tmp_path), skeleton=True)
+    scene = rm.Scene.load(write_imported(imported, tmp_path), skeleton=True)
     full = {coordinate.split(".")[1]: coordinate for coordinate in all_coordinates(scene.joints)}
     for values, bodies in list(poses_of(found))[:20]:
         poses = bone_poses(scene, {full[name]: value for name, value in values.items()})
