@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.jit import compiled, inner
+from rbfmuscle.muscle.global_step import add_responses, add_rows
 
 # Contacts that join the working set in one round, rounds, sweeps in each.
 BATCH = 24
@@ -160,21 +161,21 @@ def deepest(residual, is_chosen, tolerance, most):
 @inner(error_model="numpy")
 def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
     """Motion of the nodes by contact forces, and what these take from the whitened pressures."""
-    push[:] = 0.0
     taken[:] = 0.0
+    some, forces, count = np.empty_like(numbers), np.empty_like(normal), 0
     for c in range(len(strength)):
         if strength[c] == 0.0:
             continue
-        motion = answers.motion[numbers[c]]
-        for j in range(len(push)):
-            for a in range(3):
-                push[j, a] += motion[j] * strength[c] * normal[c, a]
+        some[count] = numbers[c]
+        for a in range(3):
+            forces[count, a] = strength[c] * normal[c, a]
+        count += 1
         for r in range(len(taken)):
             taken[r] += strength[c] * rows[c, r]
-    for r in range(len(taken)):
-        for j in range(len(push)):
-            for a in range(3):
-                push[j, a] -= taken[r] * metric.response[r, a, j]
+    moved = np.zeros((3, len(push)))
+    add_rows(answers.motion, some[:count], forces[:count], moved)
+    add_responses(metric.response, -taken, moved)
+    push[:] = moved.T
 
 
 @inner(error_model="numpy")

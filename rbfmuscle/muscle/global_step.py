@@ -33,18 +33,45 @@ class Metric(NamedTuple):
     factor: np.ndarray  # (M, M) L, in the lower triangle
 
 
+@compiled(error_model="numpy", fastmath={"contract"})
+def add_rows(matrix, rows, shares, out):
+    """Add Σ_s shares[s, a] matrix[rows[s]] to out[a], of shares (s, 3) and out (3, N).
+
+    Four rows at a time, and unsigned indices, so that none is tested for counting from the end.
+    """
+    end, last, s = np.uint64(out.shape[1]), len(rows), 0
+    while s + 3 < last:
+        i = np.uint64(rows[s])
+        j = np.uint64(rows[s + 1])
+        k = np.uint64(rows[s + 2])
+        m = np.uint64(rows[s + 3])
+        for a in range(3):
+            p = shares[s, a]
+            q = shares[s + 1, a]
+            r = shares[s + 2, a]
+            t = shares[s + 3, a]
+            for n in range(end):
+                out[a, n] += (
+                    p * matrix[i, n] + q * matrix[j, n] + r * matrix[k, n] + t * matrix[m, n]
+                )
+        s += 4
+    while s < last:
+        i = np.uint64(rows[s])
+        for a in range(3):
+            p = shares[s, a]
+            for n in range(end):
+                out[a, n] += p * matrix[i, n]
+        s += 1
+
+
 @compiled(error_model="numpy")
 def find_metric(cells, gradient, inverse):
     """The metric for gradients (S, 3) of the volumes, and whether these are independent."""
     count, nodes = len(cells.volumes), len(inverse)
     response, factor = np.zeros((count, 3, nodes)), np.zeros((count, count))
     for r in range(count):
-        for s in range(cells.start[r], cells.start[r + 1]):
-            row = inverse[cells.node[s]]
-            for a in range(3):
-                g = gradient[s, a]
-                for n in range(nodes):
-                    response[r, a, n] += row[n] * g
+        first, end = cells.start[r], cells.start[r + 1]
+        add_rows(inverse, cells.node[first:end], gradient[first:end], response[r])
     for r in range(count):
         for o in range(r + 1):
             value = 0.0
@@ -118,10 +145,12 @@ def global_step(cells, y, pressure, force, local, metric, part):
     """
     right = force.copy()
     press(pressure, cells, local.gradient, right)
-    free = np.dot(metric.inverse, right)
+    free, moved = np.empty_like(y), np.zeros((3, len(y)))
+    # A⁻¹ is symmetric: its rows are its columns.
+    add_rows(metric.inverse, np.arange(len(y)), right, moved)
     for n in range(len(y)):
         for a in range(3):
-            free[n, a] = part * (free[n, a] - y[n, a])
+            free[n, a] = part * (moved[a, n] - y[n, a])
     change = swell(free, cells, local.gradient)
     for r in range(len(change)):
         rest = cells.volumes[r]
@@ -129,12 +158,19 @@ def global_step(cells, y, pressure, force, local, metric, part):
         for o in range(r):
             value -= metric.factor[r, o] * change[o]
         change[r] = value / metric.factor[r, r]
-    step = y + free
-    for r in range(len(change)):
+    moved[:] = 0.0
+    add_responses(metric.response, change, moved)
+    return y + free + moved.T, change
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def add_responses(response, shares, out):
+    """Add Σ_r shares_r response_r to out (3, N)."""
+    end = np.uint64(out.shape[1])
+    for r in range(len(shares)):
         for a in range(3):
-            for n in range(len(y)):
-                step[n, a] += change[r] * metric.response[r, a, n]
-    return step, change
+            for n in range(end):
+                out[a, n] += shares[r] * response[r, a, n]
 
 
 @inner(error_model="numpy")
