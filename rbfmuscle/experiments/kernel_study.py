@@ -120,7 +120,7 @@ def _chosen_fit(
         choice = choose_epsilon(
             points, normals, fit, held_out=judge.held_out, distance=judge.distance.unsigned
         )
-        row.trials = choice.trials.tolist()
+        row.trials = [(shape, error) for shape, error in choice.trials.tolist()]
         row.epsilon = choice.epsilon
         row.shape = choice.epsilon * float(spacing(points).mean())
         if choice.broken:

@@ -163,14 +163,14 @@ def test_command_ranks_and_prints(tmp_path, capsys):
         "--muscles",
         "adductor_posterior",
         "--kernels",
-        "cubic,quintic",
+        "cubic,matern_52",
         "--centres",
         "60",
     ]
     code, out, _ = call(capsys, "kernels", *words, "--resolution", "40", "-o", tmp_path / "new/k")
     assert code == 0 and "use " in out.lower() and "[muscle.model]" in out
     rows = json.loads((tmp_path / "new/k/kernels.json").read_text(encoding="utf-8"))["rows"]
-    assert {row["kernel"] for row in rows} == {"cubic", "quintic"}
+    assert {row["kernel"] for row in rows} == {"cubic", "matern_52"}
     page = tmp_path / "new/k/kernels.html"
     first = page.read_text(encoding="utf-8")
     digest = mesh_hash(*_muscle("adductor_posterior"))
