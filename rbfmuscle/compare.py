@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +13,7 @@ from rbfmuscle.experiments.comparison import Repeated, add_distances, measure_ru
 from rbfmuscle.experiments.comparison_table import Comparison, ScenesComparison
 from rbfmuscle.experiments.scenes_table import write_scenes
 from rbfmuscle.experiments.sweep_run import threads_limited
-from rbfmuscle.folders import OutputFolder
+from rbfmuscle.folders import OutputFolder, given_folder
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.models import (
     COMPARED,
@@ -98,19 +97,18 @@ def compare_models(
     >>> sorted(table.models)
     ['pbd', 'xpbd']
     """
-    if directory is None:
-        with TemporaryDirectory() as kept:
-            return compare_models(
-                scene,
-                Path(kept, "comparison"),
-                models,
-                frames=frames,
-                settings=settings,
-                pictures=False,
-                progress=progress,
-            )
     variants = _variants(open_scene(scene), list(models), settings or {}, frames)
-    folder = Path(directory)
+    with given_folder(directory) as folder:
+        return _compare(variants, folder, pictures and directory is not None, progress)
+
+
+def _compare(
+    variants: Mapping[str, Scene],
+    folder: Path,
+    pictures: bool,
+    progress: Callable[[str, int, int], object] | None,
+) -> Comparison:
+    """Run the scene of each model in a folder of its name, and write tables and a report."""
     output = OutputFolder(folder, "compare", FILES)
     for name in variants:
         run_folder(folder / name)

@@ -224,3 +224,13 @@ def _check_writable(directory: Path) -> None:
         raise UsageError(
             f"cannot write to {directory}: {error.strerror}; choose another folder"
         ) from None
+
+
+@contextmanager
+def given_folder(directory: str | Path | None) -> Iterator[Path]:
+    """Context with a folder, or where none is given with a new one that is removed at the end."""
+    if directory is not None:
+        yield Path(directory)
+        return
+    with tempfile.TemporaryDirectory() as kept:
+        yield Path(kept, "results")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from rbfmuscle.experiments.sweep import plan_sweep
 from rbfmuscle.experiments.sweep_run import VALUES, OnProgress, run_sweep, write_table
 from rbfmuscle.experiments.sweep_table import SweepTable
+from rbfmuscle.folders import given_folder
 from rbfmuscle.models import configure_scene
 from rbfmuscle.report.sweep_page import write_page
 from rbfmuscle.run import Run, simulate
@@ -67,41 +67,30 @@ def sweep(
     >>> table.done, len(table.rows)
     (1, 1)
     """
-    if directory is None:
-        if cluster is not None:
-            raise UsageError("a cluster needs a folder that its workers see")
-        with TemporaryDirectory() as kept:
-            return sweep(
-                scenes,
-                grid,
-                Path(kept, "sweep"),
-                frames=frames,
-                reference=reference,
-                jobs=jobs,
-                error=error,
-                progress=progress,
-            )
     if error not in VALUES:
         raise UsageError(f"unknown quantity {error!r}, {did_you_mean(error, VALUES)}")
     if jobs is not None and jobs < 1:
         raise UsageError(f"jobs must be 1 or more, got {jobs}")
+    if cluster is not None and directory is None:
+        raise UsageError("a cluster needs a folder that its workers see")
     values = {key: list(several) for key, several in grid.items()}
     points = plan_sweep(scenes, values, frames=frames, reference=reference)
     for point in points:  # a mistyped key is reported now, not after the first point
         configure_scene(scenes[point.scene], point.settings, frames=frames)
-    run_sweep(
-        run_point,
-        scenes,
-        points,
-        directory,
-        frames=frames,
-        jobs=jobs,
-        cluster=cluster,
-        progress=progress,
-    )
     units = {name: scene.units for name, scene in scenes.items()}
-    table = write_table(points, directory, units, quantity=error)
-    write_page(table, Path(directory))
+    with given_folder(directory) as folder:
+        run_sweep(
+            run_point,
+            scenes,
+            points,
+            folder,
+            frames=frames,
+            jobs=jobs,
+            cluster=cluster,
+            progress=progress,
+        )
+        table = write_table(points, folder, units, quantity=error)
+        write_page(table, folder)
     return table
 
 
