@@ -72,13 +72,14 @@ def find_metric(cells, gradient, inverse):
     for r in range(count):
         first, end = cells.start[r], cells.start[r + 1]
         add_rows(inverse, cells.node[first:end], gradient[first:end], response[r])
+    forces = np.zeros((count, 3, nodes))
     for r in range(count):
-        for o in range(r + 1):
-            value = 0.0
-            for s in range(cells.start[o], cells.start[o + 1]):
-                for a in range(3):
-                    value += gradient[s, a] * response[r, a, cells.node[s]]
-            factor[r, o] = value
+        for s in range(cells.start[r], cells.start[r + 1]):
+            for a in range(3):
+                forces[r, a, cells.node[s]] += gradient[s, a]
+    rows = forces.reshape((count, 3 * nodes))
+    np.dot(response.reshape((count, 3 * nodes)), rows.T, factor)
+    for r in range(count):
         factor[r, r] += 1e-9 * factor[r, r] + cells.volumes[r] / BULK
     sound = factor_small(factor)
     for r in range(count):

@@ -148,7 +148,9 @@ class RBFMuscle:
         if self._rounded is None or self._rounded[0] is not contacts:
             fields = {contacts.names[b]: contacts.fields[b] for b in contacts.reached}
             spacing = float(np.sqrt(self.model.area))
-            self._rounded = contacts, round_bones(fields, self.frame, spacing, self._meshes)
+            count = len(self.state.points)
+            rounded = round_bones(fields, self.frame, spacing, self._meshes, count)
+            self._rounded = contacts, rounded
         given = self.model, self._stiffness, self.state
         obstacles = contacts.obstacles(len(self.state.points))
         while True:

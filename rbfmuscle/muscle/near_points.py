@@ -15,7 +15,7 @@ from rbfmuscle.bones.broad_phase import (
 from rbfmuscle.bones.obstacles import Known, query_bone
 from rbfmuscle.geometry.surfaces import farthest_move
 from rbfmuscle.jit import inner
-from rbfmuscle.muscle.rounded_bones import SPREAD, no_scratch, rounded_distance
+from rbfmuscle.muscle.rounded_bones import no_scratch, rounded_distance
 
 
 class Near(NamedTuple):
@@ -104,17 +104,15 @@ def plane_gap(planes, p, point):
 
 
 @inner(error_model="numpy")
-def take_near(found, gap, model, most, obstacles, edges, forces, y):
+def take_near(found, gap, model, most, obstacles, rounded, forces, y):
     """The contact points of a mask (n,), with the greatest and the present forces and the gaps of
-    all on them.
-
-    ``edges`` (b,) are those of the cells that bones are rounded over.
+    all on them, and what is known of the distances to bones as they are and ``rounded``.
     """
     which = np.flatnonzero(found)
     columns = model.embedding.columns
     shares = model.embedding.shares
     count = len(which)
-    bones = len(edges)
+    bones = len(rounded.bound)
     width = columns.shape[1]
     near = Near(
         which,
@@ -142,11 +140,22 @@ def take_near(found, gap, model, most, obstacles, edges, forces, y):
         for b in range(bones):
             near.allowed[b, k] = obstacles.allowed[b, i]
             near.exact.bound[b, k] = obstacles.known.bound[b, i]
-            near.rounded.bound[b, k] = obstacles.known.bound[b, i] - SPREAD * edges[b]
+            near.rounded.bound[b, k] = rounded.bound[b, i]
             for a in range(3):
                 near.exact.anchor[b, k, a] = obstacles.known.anchor[b, i, a]
-                near.rounded.anchor[b, k, a] = obstacles.known.anchor[b, i, a]
+                near.rounded.anchor[b, k, a] = rounded.anchor[b, i, a]
     return near
+
+
+@inner(error_model="numpy")
+def keep_rounded(near, known):
+    """Note what is known of the rounded distances of near points for later solves."""
+    for b in range(len(near.rounded.bound)):
+        for k in range(len(near.which)):
+            i = near.which[k]
+            known.bound[b, i] = near.rounded.bound[b, k]
+            for a in range(3):
+                known.anchor[b, i, a] = near.rounded.anchor[b, k, a]
 
 
 @inner(error_model="numpy", inline="always")
@@ -250,7 +259,7 @@ def find_touch(near, here, reach, travelled, obstacles, rounded):
             elif distance == np.inf:
                 room = False
             else:
-                bound[i] = TRUSTED_SHARE * distance
+                bound[i] = TRUSTED_SHARE * scratch.smooth[0]
                 for k in range(3):
                     anchor[i, k] = local[k]
                     normal[k] = 0.0

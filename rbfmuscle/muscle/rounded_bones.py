@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.bones.obstacles import query_bone
+from rbfmuscle.bones.obstacles import Known, query_bone
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.bsplines import bspline_sum
 from rbfmuscle.geometry.fields import BoneField
@@ -33,9 +33,6 @@ FULLEST = 0.6  # share of the room that may be filled
 # 0.06.
 ROUNDING = 1.7
 LEAST_ROUNDING = 0.1  # of that
-# A spline is a mean of the distances at nodes so many cells away (a root mean square of 0.58 along
-# each axis), so where it is positive it errs by less.
-SPREAD = 1.1
 
 
 class RoundedBones(NamedTuple):
@@ -51,6 +48,7 @@ class RoundedBones(NamedTuple):
     keys: np.ndarray  # (room, 2) bone and place of each block, -1 where there is none
     nodes: np.ndarray  # (room, WIDE³) distances, in cells
     filled: np.ndarray  # (1,) blocks that are filled
+    known: Known  # of the muscle's contact points, changed in place
 
 
 def round_bones(
@@ -58,8 +56,9 @@ def round_bones(
     frame: RestFrame,
     spacing: float,
     meshes: Mapping[str, tuple[Floats, Integers]],
+    points: int,
 ) -> RoundedBones:
-    """The bones that a muscle can reach, rounded, without any block.
+    """The bones that a muscle with so many contact points can reach, rounded, without any block.
 
     A bone of ``meshes`` (vertices, faces) is rounded over cells no larger than it is thick, or a
     thin plate would vanish; ``spacing`` is that of the muscle's contact points.
@@ -69,19 +68,23 @@ def round_bones(
     for name, field in bone_sdfs.items():
         thickness = bone_thickness(field, *meshes[name], edge) if name in meshes else edge
         edges.append(max(thickness, LEAST_ROUNDING * edge))
-    return _with_room(np.array(edges, dtype=np.float64), frame.origin, frame.axes, FIRST_ROOM)
+    count = len(edges)
+    known = Known(np.zeros((count, points, 3)), np.full((count, points), -np.inf))
+    lengths = np.array(edges, dtype=np.float64)
+    return _with_room(lengths, frame.origin, frame.axes, FIRST_ROOM, known)
 
 
-def _with_room(edges: Floats, origin: Floats, axes: Floats, room: int) -> RoundedBones:
+def _with_room(
+    edges: Floats, origin: Floats, axes: Floats, room: int, known: Known
+) -> RoundedBones:
     keys = np.full((room, 2), -1, dtype=np.int64)
-    return RoundedBones(
-        edges, origin, axes, keys, np.empty((room, WIDE**3)), np.zeros(1, dtype=np.int64)
-    )
+    nodes, filled = np.empty((room, WIDE**3)), np.zeros(1, dtype=np.int64)
+    return RoundedBones(edges, origin, axes, keys, nodes, filled, known)
 
 
 def grown(rounded: RoundedBones) -> RoundedBones:
     """The same with room for twice as many blocks."""
-    more = _with_room(*rounded[:3], 2 * len(rounded.keys))
+    more = _with_room(*rounded[:3], 2 * len(rounded.keys), rounded.known)
     for old in np.flatnonzero(rounded.keys[:, 0] >= 0):
         new = find_slot(more.keys, *rounded.keys[old])
         more.keys[new], more.nodes[new] = rounded.keys[old], rounded.nodes[old]
@@ -157,17 +160,20 @@ class Scratch(NamedTuple):
     local: np.ndarray  # (3,) the point in bone coordinates
     gradient: np.ndarray  # (3,) of the distance there
     place: np.ndarray  # (3,) in a cell of the lattice
+    # (1,) smoothed distance [scene unit], which moves by no more than the point does
+    smooth: np.ndarray
 
 
 @compiled(error_model="numpy")
 def no_scratch():
     """Room for questions."""
-    return Scratch(np.empty(3), np.empty(3), np.empty(3))
+    return Scratch(np.empty(3), np.empty(3), np.empty(3), np.empty(1))
 
 
 @compiled(error_model="numpy", _nrt=False)
 def rounded_distance(rounded, bones, b, scratch):
-    """Distance of the point ``scratch.local`` to bone b, rounded; fills its unit gradient.
+    """Distance of the point ``scratch.local`` to bone b, rounded: the smoothed one over its slope;
+    fills its unit gradient.
 
     Infinite where there is no room for the block; NaN where the spline is flat.
     """
@@ -197,4 +203,5 @@ def rounded_distance(rounded, bones, b, scratch):
         return np.nan
     for a in range(3):
         gradient[a] = (x * axes[0, a] + y * axes[1, a] + z * axes[2, a]) / steep
+    scratch.smooth[0] = value * edge
     return value / steep * edge

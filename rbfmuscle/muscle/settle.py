@@ -35,6 +35,7 @@ from rbfmuscle.muscle.near_points import (
     find_exact_touch,
     find_near,
     find_touch,
+    keep_rounded,
     near_motion,
     take_near,
 )
@@ -141,7 +142,7 @@ def settle(
 @compiled(error_model="numpy")
 def _settle(model, stiffness, state, obstacles, rounded, room):
     """What changes of a state, and a `Report`; see `settle`."""
-    springs = np.dot(model.springs, state.anchors)
+    springs = _spring_forces(model, state.anchors)
     pull = tension(model.end, model.end_distance, state.anchors)
     given = Problem(model, stiffness, obstacles, rounded, springs, state.activation[0], pull)
     y = state.nodes.copy()
@@ -198,6 +199,7 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
             push[:] = 0.0
     _note_forces(near, forces)
     lifted_nodes, left = _lifted(given, lifted_nodes, metric, near, answers)
+    keep_rounded(near, rounded.known)
     points = carry(model.embedding, lifted_nodes)
     rotations, stretches = found_rotations(local)
     if room:
@@ -205,6 +207,22 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     found = Settled(y, lifted_nodes, points, rotations, stretches, pressure, forces)
     report = Report(status, done, residual, _volume_error(model.cells, lifted_nodes), caps + left)
     return found, report
+
+
+@inner(error_model="numpy")
+def _spring_forces(model, anchors):
+    """Forces (N, 3) of the springs from held points to their anchors (h, 3) on nodes at the
+    origin.
+    """
+    columns = model.embedding.columns
+    shares = model.embedding.shares
+    out = np.zeros_like(model.rest)
+    for i in range(len(anchors)):
+        j = model.held[i]
+        for k in range(columns.shape[1]):
+            for a in range(3):
+                out[columns[j, k], a] += model.spring * shares[j, k] * anchors[i, a]
+    return out
 
 
 @inner(error_model="numpy", inline="always")
@@ -236,8 +254,8 @@ def _choose_near(given, forces, y):
     """The contact points near an obstacle, with the forces on them until now."""
     model, obstacles = given.model, given.obstacles
     found, gap = find_near(carry(model.embedding, y), obstacles, NEAR * model.size)
-    most, edges = given.stiffness.most, given.rounded.edges
-    return take_near(found, gap, model, most, obstacles, edges, forces, y)
+    most, rounded = given.stiffness.most, given.rounded.known
+    return take_near(found, gap, model, most, obstacles, rounded, forces, y)
 
 
 @inner(error_model="numpy", inline="always")

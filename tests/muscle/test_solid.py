@@ -60,7 +60,7 @@ class Bar:
         self.model = model if tension else model._replace(end=np.full_like(model.end, -1))
         self.state = rest_state(model)
         self.contacts = BoneContacts([], [], attached_bone=owner)
-        self.rounded = round_bones({}, frame, 1.0, {})
+        self.rounded = round_bones({}, frame, 1.0, {}, 0)
         self.poses = np.array([np.eye(4), np.eye(4)])
 
     def with_fibres(self, along, ratio=1.0, slack=1.0):

@@ -35,7 +35,7 @@ def ball():
     frame = RestFrame(np.asarray(mesh.vertices))
 
     def rounded(points):
-        bones = grown(grown(round_bones({"ball": field}, frame, EDGE / ROUNDING, {})))
+        bones = grown(grown(round_bones({"ball": field}, frame, EDGE / ROUNDING, {}, 0)))
         normal, gap = np.empty_like(points), np.empty(len(points))
         for i, point in enumerate(points):
             scratch = no_scratch()
@@ -77,7 +77,7 @@ def test_blocks_are_filled_once_kept_when_the_table_grows_and_refused_when_it_is
     field, _, pose = ball
     contacts = BoneContacts(["ball"], [field])
     frame = RestFrame(np.asarray(trimesh.creation.icosphere(2, RADIUS).vertices))
-    bones = round_bones({"ball": field}, frame, 0.2 / ROUNDING, {})
+    bones = round_bones({"ball": field}, frame, 0.2 / ROUNDING, {}, 0)
     points, _ = around(pose)
 
     def ask(table):
@@ -120,3 +120,21 @@ def test_no_contact_point_stays_in_a_bone():
         loop.skip(coordinates)
         for depth in loop.steppers[0].contacts.depths(model.contact_points()).values():
             assert depth.max() < 0.02  # mm
+
+
+def test_smoothed_distance_moves_by_no_more_than_the_point_does(ball):
+    field, _, _ = ball
+    frame = RestFrame(np.asarray(trimesh.creation.icosphere(2, RADIUS).vertices))
+    bones = grown(grown(round_bones({"ball": field}, frame, EDGE / ROUNDING, {}, 0)))
+    rng, scratch = np.random.default_rng(5), no_scratch()
+    points = rng.normal(size=(60, 3)) * 0.6 * RADIUS
+    points[1::2] = points[::2] + rng.normal(size=(30, 3))
+    smooth = []
+    for point in points:
+        scratch.local[:] = point
+        rounded_distance(bones, BoneContacts(["ball"], [field]).bones, 0, scratch)
+        smooth.append(scratch.smooth[0])
+    change = np.abs(np.array(smooth[1::2]) - smooth[::2])
+    # The field of a bone errs by less than a thousandth of the ball's radius.
+    assert (change <= np.linalg.norm(points[1::2] - points[::2], axis=1) + 1e-3 * RADIUS).all()
+    assert change.max() > 0.5
