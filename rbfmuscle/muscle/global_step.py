@@ -155,13 +155,22 @@ def global_step(cells, y, pressure, force, local, metric, part):
     change = swell(free, cells, local.gradient)
     for r in range(len(change)):
         rest = cells.volumes[r]
-        value = rest * (1.0 - pressure[r] / BULK) - local.volumes[r] - change[r]
+        change[r] = rest * (1.0 - pressure[r] / BULK) - local.volumes[r] - change[r]
+    return y + free + expansion(change, metric), change
+
+
+@inner(error_model="numpy")
+def expansion(lacking, metric):
+    """Motion (N, 3) of the nodes that gives the regions the volumes (M,) that they lack, which
+    become, in place, the whitened pressures for it.
+    """
+    for r in range(len(lacking)):
         for o in range(r):
-            value -= metric.factor[r, o] * change[o]
-        change[r] = value / metric.factor[r, r]
-    moved[:] = 0.0
-    add_responses(metric.response, change, moved)
-    return y + free + moved.T, change
+            lacking[r] -= metric.factor[r, o] * lacking[o]
+        lacking[r] /= metric.factor[r, r]
+    moved = np.zeros((3, len(metric.inverse)))
+    add_responses(metric.response, lacking, moved)
+    return moved.T
 
 
 @compiled(error_model="numpy", fastmath={"contract"})

@@ -24,6 +24,7 @@ from rbfmuscle.muscle.contact_forces import Law, contact_push, no_answers
 from rbfmuscle.muscle.global_step import (
     calm_share,
     corrected_pressures,
+    expansion,
     find_metric,
     global_step,
 )
@@ -61,6 +62,7 @@ STALE = 0.4  # share of NEAR by which a node moves before they are chosen again
 YIELDING = 1e-4  # how far a contact yields under a pressure of 2 μ
 # Share of YIELDING by which obstacles yield where room is made in what is shown.
 SHOWN_YIELDING = 0.1
+DRIFT = 5e-3  # relative change of a region's volume by a lift that is undone before the next
 LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
 
 DONE = 0  # how a solve ended
@@ -390,11 +392,17 @@ def _lifted(given, y, metric, near, answers):
     """Nodes (N, 3), moved so far that no contact point is left in an obstacle that does not yield;
     1 where some may be left all the same, else 0.
     """
-    for _ in range(LIFTS):
+    cells = given.model.cells
+    settled = volumes(cells, y)
+    for turn in range(LIFTS):
         push = _push_out(given, near, metric, answers, y, 1.0)
         if not push.any():
             return y, 0
         y = y + push
+        # A push keeps the volumes to first order.
+        lacking = settled - volumes(cells, y)
+        if turn < LIFTS - 1 and (np.abs(lacking) > DRIFT * cells.volumes).any():
+            y = y + expansion(lacking, metric)
     return y, 1
 
 
