@@ -35,6 +35,7 @@ CHORD = 0.06  # the string's direction is that of a chord so long, in lengths of
 # Steps to the place of the end where its tendon has the wanted length, and the relative error that
 # ends them.
 STEPS, TOLERANCE = 8, 1e-9
+LEAST_COSINE = 0.5  # of the way of an end against its tendon, or it would go too far
 NODES = 33  # points of a tendon as it is drawn
 AROUND = 16  # directions around a leg of the string, on one of whose sides it passes the bones
 
@@ -199,9 +200,13 @@ class TendonEnd:
             settled = abs(excess) <= TOLERANCE * length
             if settled:
                 break
-            # A taut line becomes shorter by as much as its end goes along it.
-            ahead = tendon[1] - tendon[0]
-            middle = middle + excess / max(float(np.linalg.norm(ahead)), 1e-300) * ahead
+            # A taut line becomes shorter by as much as its end goes along it. An end goes to a via
+            # point, whatever corners of bones the line passes on the way there.
+            along = unit(tendon[1] - tendon[0])
+            way = along
+            if passed < len(self.line) - 1:
+                way = unit(_moved(*self.line[passed], poses) - middle)
+            middle = middle + excess / max(float(along @ way), LEAST_COSINE) * way
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turn, middle - turn @ self.middle
         line = self._lifted(_with_nodes(tendon), poses)
