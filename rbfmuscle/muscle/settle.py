@@ -57,7 +57,7 @@ MEMORY = 5  # steps that Anderson acceleration combines
 STALLED = 12
 TOLERANCE = 2e-5  # violation of a contact that is left
 MARGIN = 0.003  # obstacles are looked for beyond where a point goes by this
-NEAR = 0.03  # contact points nearer to an obstacle take part in a solve
+NEAR = 0.015  # contact points nearer to an obstacle take part in a solve
 STALE = 0.4  # share of NEAR by which a node moves before they are chosen again
 YIELDING = 1e-4  # how far a contact yields under a pressure of 2 μ
 # Share of YIELDING by which obstacles yield where room is made in what is shown.
