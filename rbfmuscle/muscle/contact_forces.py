@@ -162,7 +162,8 @@ def deepest(residual, is_chosen, tolerance, most):
 def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
     """Motion of the nodes by contact forces, and what these take from the whitened pressures."""
     taken[:] = 0.0
-    some, forces, count = np.empty_like(numbers), np.empty_like(normal), 0
+    some, forces = np.empty_like(numbers), np.empty_like(normal)
+    count = 0
     for c in range(len(strength)):
         if strength[c] == 0.0:
             continue

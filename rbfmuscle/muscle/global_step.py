@@ -39,7 +39,8 @@ def add_rows(matrix, rows, shares, out):
 
     Four rows at a time, and unsigned indices, so that none is tested for counting from the end.
     """
-    end, last, s = np.uint64(out.shape[1]), len(rows), 0
+    end, last = np.uint64(out.shape[1]), len(rows)
+    s = 0
     while s + 3 < last:
         i = np.uint64(rows[s])
         j = np.uint64(rows[s + 1])
