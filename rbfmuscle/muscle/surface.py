@@ -75,20 +75,25 @@ def finish_surface(model, state, obstacles, work, outcome, excess):
     """Room made for neighbours, bone vertices pushed off, crossings undone and the volume met.
 
     ``excess`` (n,) says how far vertices move inwards, (0,) for none. Returns the triangles that
-    cross all the same, and the outcome: where a fitted surface crosses itself or has not the
-    volume, the surface without a field is taken if it has fewer faults.
+    cross all the same, and the outcome: where a fitted surface crosses itself it is that without a
+    field, everywhere if that has fewer faults still or the fitted one has not the volume.
     """
-    crossing = -1
+    none, crossing = np.zeros((0, 3)), -1
     if outcome == FITTED:
-        crossing = _finish(model, state, obstacles, work, excess, False)
+        crossing = _finish(model, state, obstacles, work, excess, none, False)
         if crossing == 0:
             return 0, outcome
-    fitted, left = work.vertices.copy(), work.left.copy()
-    if not _embed(model, state, obstacles, work):
-        other = -1
-    else:
-        other = _finish(model, state, obstacles, work, excess, True)
-    if crossing >= 0 and (other < 0 or other >= crossing):
+    fitted, left, direction = work.vertices.copy(), work.left.copy(), work.direction.copy()
+    other = -1
+    if _embed(model, state, obstacles, work):
+        other = _finish(model, state, obstacles, work, excess, none, True)
+    if crossing > 0 and other == 0:
+        sound = work.vertices.copy()
+        work.vertices[:], work.left[:], work.direction[:] = fitted, left, direction
+        if _finish(model, state, obstacles, work, np.zeros(0), sound, False) == 0:
+            return 0, outcome
+        work.vertices[:], work.left[:] = sound, True
+    elif crossing >= 0 and (other < 0 or other >= crossing):
         work.vertices[:], work.left[:] = fitted, left
         return crossing, outcome
     return other, (NO_VOLUME if other < 0 else (CROSSED if outcome == FITTED else outcome))
@@ -105,7 +110,8 @@ def clear_rest(model, state, obstacles, vertices, held):
     work.near[:] = work.near & held
     if not lift(obstacles, state, work, np.flatnonzero(work.near)):
         return vertices
-    untangle(model, state, obstacles, work, True, np.zeros(len(vertices), np.bool_))
+    none, moved = np.zeros((0, 3)), np.zeros(len(vertices), np.bool_)
+    untangle(model, state, obstacles, work, True, none, moved)
     return work.vertices
 
 
@@ -372,8 +378,10 @@ def _give_room(model, state, obstacles, work, excess):
 
 
 @compiled(error_model="numpy")
-def _finish(model, state, obstacles, work, excess, embedded):
-    """`finish_surface` of a surface with a field or without; -1 where it has not the volume."""
+def _finish(model, state, obstacles, work, excess, sound, embedded):
+    """`finish_surface` of a surface with a field, which goes back to a ``sound`` one where it
+    crosses itself, or without a field; -1 where it has not the volume.
+    """
     if len(excess) > 0:
         _give_room(model, state, obstacles, work, excess)
     moved = np.ones(len(work.vertices), np.bool_)
@@ -381,7 +389,7 @@ def _finish(model, state, obstacles, work, excess, embedded):
     for _ in range(AGAIN):
         if not _fill(model, state, obstacles, work, embedded):
             return -1
-        if not untangle(model, state, obstacles, work, embedded, moved):
+        if not untangle(model, state, obstacles, work, embedded, sound, moved):
             return 0
         # What was smoothed may lie over a bone's vertex again.
         push_off(model, state, obstacles, work, moved)

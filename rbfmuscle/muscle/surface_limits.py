@@ -22,11 +22,11 @@ NEAR_FACE = 0.8
 OUT = 1e-5  # what is no deeper in a bone counts as out of it
 PUSHED = 0.01  # a bone's vertex may lie within the surface by so much
 LIFTS = 2  # rounds of moving what lies in a bone onto it, at most
-# What crosses is taken back towards the material by a share of the way as long as that helps, then
-# smoothed by some sweeps; rounds, at most, and in how many of them the region grows by a ring.
+# What crosses is taken back to the material by a share of the way in each of some rounds, and then
+# smoothed, as what crosses in the material is from the first; rounds, at most, and in how many of
+# them the region grows by a ring.
 BACK = 0.2
-TRIED = 10
-SWEEPS = 1
+TRIED = 20
 ROUNDS = 60
 GROWTH = 6
 
@@ -228,7 +228,7 @@ def push_off(model, state, obstacles, work, among):
         return
     moved = np.zeros(len(work.vertices), np.bool_)
     for turn in range(2):
-        faces = _near_faces(model, work, among if turn == 0 else _grown(model, moved))
+        faces = _near_faces(model, work, among if turn == 0 else _grown(model, moved, 1))
         if len(faces) == 0:
             return
         for b in range(len(obstacles.poses)):
@@ -277,55 +277,63 @@ def _near_faces(model, work, among):
 
 
 @compiled(error_model="numpy")
-def untangle(model, state, obstacles, work, embedded, moved):
-    """Take what crosses itself back towards the material, then smooth it; whether anything was
-    moved for it, and marked.
+def untangle(model, state, obstacles, work, embedded, sound, moved):
+    """Take what crosses itself back to a ``sound`` surface (n, 3), without one, (0, 3), to the
+    material beside the bones; what crosses itself there too, and an ``embedded`` surface, is
+    smoothed. Whether anything was moved for it, and marked.
     """
     m, n = len(model.faces), len(work.vertices)
     found, among = np.zeros(m, np.bool_), np.ones(m, np.bool_)
     if not embedded:
         _touching(model.faces, work.odd | work.left, among)
     moved[:] = False
-    last, back = m + 1, not embedded
+    target, knotted = sound, np.zeros(n, np.bool_)
     boxes = no_boxes(model.tree)
     for turn in range(ROUNDS):
         # What was not moved does not begin to cross.
-        count = crossing_loop(work.vertices, model.tree, among, turn == 0, boxes, found)
-        if count == 0:
+        if crossing_loop(work.vertices, model.tree, among, turn == 0, boxes, found) == 0:
             return turn > 0
-        # Where the material crosses itself the way back to it does not help.
-        back &= turn < TRIED or count < last
-        last = count
-        marked = np.zeros(n, np.bool_)
-        for f in range(m):
-            if found[f]:
-                for k in range(3):
-                    marked[model.faces[f, k]] = True
-        for _ in range(1 + turn // GROWTH):
-            marked = _grown(model, marked)
+        if turn == 0 and len(sound) == 0 and not embedded:
+            target, knotted = _freed(model, state, obstacles, work)
+        if embedded or (turn == TRIED and len(sound) == 0):
+            knotted[:] = True
+        marked = _grown(model, _corners(model, found), 1 + turn // GROWTH)
         _touching(model.faces, marked, among)
         work.odd[:] |= marked
         moved[:] |= marked
-        _calm(model, work, marked, back)
+        if len(sound) > 0:
+            work.left[:] |= marked
+        for v in np.flatnonzero(marked & ~knotted):
+            for a in range(3):
+                work.vertices[v, a] += BACK * (target[v, a] - work.vertices[v, a])
+        smooth_loop(work.vertices, np.flatnonzero(marked & knotted), model.start, model.other)
         mark_near(work)
         lift(obstacles, state, work, np.flatnonzero(marked & work.near))
     return True
 
 
 @compiled(error_model="numpy")
-def _calm(model, work, marked, back):
-    """Move the marked vertices ``back`` towards the material, or smooth them."""
-    rows = np.flatnonzero(marked)
-    if back:
-        # What the material takes into a bone cannot go back there.
-        for v in rows:
-            if work.least[v] >= 0.0:
-                for a in range(3):
-                    away = work.vertices[v, a] - work.carried[v, a]
-                    work.vertices[v, a] -= BACK * away
-        rows = np.flatnonzero(marked & (work.least < 0.0))
-    for _ in range(SWEEPS):
-        smooth_loop(work.vertices, rows, model.start, model.other)
+def _freed(model, state, obstacles, work):
+    """The material (n, 3), brought out of the bones; where it crosses itself then (n,)."""
+    found = np.zeros(len(model.faces), np.bool_)
+    crossing_loop(work.carried, model.tree, ~found, True, no_boxes(model.tree), found)
+    vertices, direction = work.vertices.copy(), work.direction.copy()
+    work.vertices[:] = work.carried
+    lift(obstacles, state, work, np.flatnonzero(work.near))
+    freed = work.vertices.copy()
+    work.vertices[:], work.direction[:] = vertices, direction
+    return freed, _corners(model, found)
+
+
+@compiled(error_model="numpy")
+def _corners(model, found):
+    """The corners of marked triangles."""
+    marked = np.zeros(len(model.offset), np.bool_)
+    for f in range(len(found)):
+        if found[f]:
+            for k in range(3):
+                marked[model.faces[f, k]] = True
+    return marked
 
 
 @compiled(error_model="numpy")
@@ -336,13 +344,16 @@ def _touching(faces, marked, out):
 
 
 @compiled(error_model="numpy")
-def _grown(model, marked):
-    """The marked vertices and their neighbours."""
-    out = marked.copy()
-    for v in range(len(marked)):
-        if marked[v]:
-            for k in range(model.start[v], model.start[v + 1]):
-                out[model.other[k]] = True
+def _grown(model, marked, rings):
+    """The marked vertices and their neighbours, as many times."""
+    out = marked
+    for _ in range(rings):
+        marked = out
+        out = marked.copy()
+        for v in range(len(marked)):
+            if marked[v]:
+                for k in range(model.start[v], model.start[v + 1]):
+                    out[model.other[k]] = True
     return out
 
 

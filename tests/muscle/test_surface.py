@@ -25,11 +25,19 @@ from rbfmuscle.muscle.surface import (
     FITTED,
     NO_FIT,
     UNSURE,
+    _begin,
     clear_rest,
     finish_surface,
     start_surface,
 )
-from rbfmuscle.muscle.surface_limits import Obstacles, SurfaceModel, SurfaceState, ask_bones
+from rbfmuscle.muscle.surface_limits import (
+    Obstacles,
+    SurfaceModel,
+    SurfaceState,
+    ask_bones,
+    lift,
+    untangle,
+)
 
 BALL = trimesh.creation.icosphere(3)
 X = np.array(BALL.vertices)
@@ -195,6 +203,28 @@ def test_tangled_triangles_are_smoothed_until_none_cross(radius, seed):
     found, crossing, _, _ = drawn(carried)
     assert crossing == 0
     assert not radius or drawn.distance(found).min() > -1e-3
+
+
+def test_what_crosses_goes_back_to_the_material_beside_the_bone():
+    rng = np.random.default_rng(4)
+    drawn = Drawn([bone(0.9, 0.9, 0.0, 0.0)])
+    given = drawn.model, drawn.state, drawn.obstacles
+    work = _begin(*given, X)
+    lift(drawn.obstacles, drawn.state, work, np.flatnonzero(work.near))
+    target = work.vertices.copy()
+    assert not crossing_faces(target, FACES).any()
+    among = np.linalg.norm(X - [0.5, 0.0, 0.86], axis=1) < 0.5
+    work.vertices[among] += 0.1 * rng.normal(size=(among.sum(), 3))
+    work.odd[:] = True
+    tangled = work.vertices.copy()
+    assert crossing_faces(tangled, FACES).sum() > 30
+    moved = np.zeros(len(X), np.bool_)
+    assert untangle(*given, work, False, np.zeros((0, 3)), moved)
+    assert not crossing_faces(work.vertices, FACES).any()
+    assert drawn.distance(work.vertices[moved]).min() > -1e-3
+    ways = [np.linalg.norm(x - target, axis=1) for x in (work.vertices, tangled)]
+    assert (ways[0][moved & among] < ways[1][moved & among]).mean() > 0.99, "back, not smoothed"
+    np.testing.assert_array_equal(work.vertices[~moved], tangled[~moved])
 
 
 @pytest.mark.parametrize("bones", [[], [bone(0.5, 1.3, 0.0, 0.0)], [bone(0.9, 0.0, 0.0, 0.9)]])
