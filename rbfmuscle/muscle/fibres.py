@@ -41,7 +41,7 @@ def flux(model: SolidModel, insertion: Booleans) -> Floats:
     ``insertion`` (h,) is one.
     """
     source = np.where(insertion, 1.0 / max(insertion.sum(), 1), -1.0 / max((~insertion).sum(), 1))
-    right = model.springs @ source / model.spring
+    right = model.hangs @ source
     return _gradient(model, np.linalg.lstsq(model.matrix, right, rcond=None)[0])
 
 

@@ -30,11 +30,13 @@ from rbfmuscle.implicit.placement.lattice import Embedding as LatticePoints
 from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.jit import compiled
 
-# Stiffness of the spring at a held point that stands for a 4000th of the surface, relative to that
-# of a cell: springs are spread evenly over an attachment, however many points it has. Stiffer ones
-# clamp whole cells, and the muscle leaves the bone as a stub that turns with it; softer ones let
-# attachments lag (docs/validation.md).
-HOLD, HELD_OF = 3.0, 4000
+# A bone holds its points, and with ten times the stiffness their mean. A spring at a point that
+# stands for such a part of the surface is as stiff as a cell: springs are spread evenly over an
+# attachment, however many points it has. Stiffer ones clamp whole cells, and the muscle leaves the
+# bone as a stub that turns with it; without the mean, contracting muscles pull attachments along
+# (docs/validation.md).
+HELD_OF = 4000
+FIRM, LOOSE = 10.0, 1.0
 # Stiffness of second differences, relative to a cell: for nodes that hold hardly any material.
 GHOST = 1e-3
 # Nodes move together: the greatest motion of a node times its greatest share and this is 0.7 to 2.5
@@ -113,7 +115,8 @@ class SolidModel(NamedTuple):
     end: np.ndarray  # (h,) 0 or 1 for held points of the two farthest bones, else -1
     end_distance: float  # between the middles of these at rest
     springs: np.ndarray  # (N, h) from held points to nodes
-    spring: float  # stiffness of each, over 2 μ
+    spring: float  # stiffness of one that is as stiff as a cell, over 2 μ
+    hangs: np.ndarray  # (N, h) shape functions of the held points
     matrix: np.ndarray  # (N, N) second derivative of E / 2 μ without springs and fibres
     motion_weights: np.ndarray  # (N, b) how much of each bone's motion a node takes
     reach: np.ndarray  # (N,) how much of a node's motion material takes, about
@@ -152,7 +155,7 @@ def build_solid(
     rest = frame.points(lattice.rest)
     cells = _number_regions(lattice, frame)
     embedding = embed(lattice, frame, points)
-    spring = HOLD * side * HELD_OF * area / surface
+    spring = side * HELD_OF * area / surface
     hangs = np.zeros((len(rest), len(held)))
     spots = embedding.columns[held].T, np.arange(len(held))
     np.add.at(hangs, spots, embedding.shares[held].T)
@@ -170,8 +173,9 @@ def build_solid(
         held_bone=owner[held].astype(np.int64),
         end=end,
         end_distance=distance,
-        springs=spring * hangs,
+        springs=_springs(hangs, owner[held], spring),
         spring=spring,
+        hangs=hangs,
         matrix=GHOST * side * lattice.second_differences() + _gram(cells, len(rest)),
         motion_weights=np.empty((0, 0)),
         reach=_reach(len(rest), embedding, embed(lattice, frame, cells.points)),
@@ -191,6 +195,15 @@ def _reach(nodes: int, *embeddings: Embedding) -> Floats:
     for embedding in embeddings:
         np.maximum.at(found, embedding.columns, embedding.shares)
     return np.minimum(TOGETHER * found, 1.0)
+
+
+def _springs(hangs: Floats, bone: Integers, spring: float) -> Floats:
+    """Forces (N, h) on the nodes at the origin of the springs to each held point, one unit away."""
+    springs = LOOSE * spring * hangs
+    for b in np.unique(bone):
+        group = bone == b
+        springs[:, group] += (FIRM - LOOSE) * spring * hangs[:, group].mean(axis=1, keepdims=True)
+    return springs
 
 
 def embed(lattice: Lattice, frame: RestFrame, points: Floats) -> Embedding:
@@ -267,7 +280,7 @@ def _motion_weights(model: SolidModel) -> Floats:
 
 def hung_matrix(model: SolidModel) -> Floats:
     """The matrix (N, N) of a solid with the springs at its held points."""
-    return np.asarray(model.matrix + model.springs @ (model.springs / model.spring).T)
+    return np.asarray(model.matrix + model.springs @ model.hangs.T)
 
 
 def _inverted(matrix: Floats) -> Floats:

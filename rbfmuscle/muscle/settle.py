@@ -30,7 +30,7 @@ from rbfmuscle.muscle.global_step import (
 )
 from rbfmuscle.muscle.inversion import stiffened_inverse
 from rbfmuscle.muscle.local_step import found_rotations, local_step, start_local, volumes
-from rbfmuscle.muscle.model import SolidModel, Stiffness, carry
+from rbfmuscle.muscle.model import FIRM, LOOSE, SolidModel, Stiffness, carry
 from rbfmuscle.muscle.near_points import (
     carry_near,
     find_exact_touch,
@@ -216,14 +216,21 @@ def _spring_forces(model, anchors):
     """Forces (N, 3) of the springs from held points to their anchors (h, 3) on nodes at the
     origin.
     """
+    bones = model.held_bone.max() + 1
+    mean = np.zeros((bones, 3))
+    count = np.zeros(bones)
+    for i in range(len(anchors)):
+        count[model.held_bone[i]] += 1.0
+        mean[model.held_bone[i]] += anchors[i]
     columns = model.embedding.columns
     shares = model.embedding.shares
     out = np.zeros_like(model.rest)
     for i in range(len(anchors)):
-        j = model.held[i]
-        for k in range(columns.shape[1]):
-            for a in range(3):
-                out[columns[j, k], a] += model.spring * shares[j, k] * anchors[i, a]
+        j, b = model.held[i], model.held_bone[i]
+        for a in range(3):
+            pull = LOOSE * anchors[i, a] + (FIRM - LOOSE) * mean[b, a] / count[b]
+            for k in range(columns.shape[1]):
+                out[columns[j, k], a] += model.spring * shares[j, k] * pull
     return out
 
 

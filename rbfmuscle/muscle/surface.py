@@ -83,13 +83,15 @@ def finish_surface(model, state, obstacles, work, outcome, excess):
         crossing = _finish(model, state, obstacles, work, excess, none, False)
         if crossing == 0:
             return 0, outcome
-    fitted, left, direction = work.vertices.copy(), work.left.copy(), work.direction.copy()
+    fitted, left = work.vertices.copy(), work.left.copy()
+    direction = work.direction.copy()
     other = -1
     if _embed(model, state, obstacles, work):
         other = _finish(model, state, obstacles, work, excess, none, True)
     if crossing > 0 and other == 0:
         sound = work.vertices.copy()
-        work.vertices[:], work.left[:], work.direction[:] = fitted, left, direction
+        work.vertices[:], work.left[:] = fitted, left
+        work.direction[:] = direction
         if _finish(model, state, obstacles, work, np.zeros(0), sound, False) == 0:
             return 0, outcome
         work.vertices[:], work.left[:] = sound, True

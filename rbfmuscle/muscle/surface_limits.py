@@ -22,12 +22,12 @@ NEAR_FACE = 0.8
 OUT = 1e-5  # what is no deeper in a bone counts as out of it
 PUSHED = 0.01  # a bone's vertex may lie within the surface by so much
 LIFTS = 2  # rounds of moving what lies in a bone onto it, at most
-# What crosses is taken back to the material by a share of the way in each of some rounds, and then
-# smoothed, as what crosses in the material is from the first; rounds, at most, and in how many of
-# them the region grows by a ring.
-BACK = 0.2
-TRIED = 20
-ROUNDS = 60
+# What crosses is taken back to the material beside the bones by a share of the way in each of some
+# rounds; in as many more its distance from the material is smoothed, then it is, as is what crosses
+# in the material from the first. Rounds, at most, and in how many the region grows by a ring.
+BACK = 0.3
+TRIED = 12
+ROUNDS = 64
 GROWTH = 6
 
 
@@ -278,9 +278,9 @@ def _near_faces(model, work, among):
 
 @compiled(error_model="numpy")
 def untangle(model, state, obstacles, work, embedded, sound, moved):
-    """Take what crosses itself back to a ``sound`` surface (n, 3), without one, (0, 3), to the
-    material beside the bones; what crosses itself there too, and an ``embedded`` surface, is
-    smoothed. Whether anything was moved for it, and marked.
+    """Take what crosses back to a ``sound`` surface (n, 3), or, without one, (0, 3), to the
+    material beside the bones; what crosses there too, and an ``embedded`` surface, is smoothed.
+    Whether anything was moved for it, and marked.
     """
     m, n = len(model.faces), len(work.vertices)
     found, among = np.zeros(m, np.bool_), np.ones(m, np.bool_)
@@ -293,19 +293,18 @@ def untangle(model, state, obstacles, work, embedded, sound, moved):
         # What was not moved does not begin to cross.
         if crossing_loop(work.vertices, model.tree, among, turn == 0, boxes, found) == 0:
             return turn > 0
-        if turn == 0 and len(sound) == 0 and not embedded:
+        if turn == 0 and len(sound) == 0:
             target, knotted = _freed(model, state, obstacles, work)
-        if embedded or (turn == TRIED and len(sound) == 0):
-            knotted[:] = True
         marked = _grown(model, _corners(model, found), 1 + turn // GROWTH)
         _touching(model.faces, marked, among)
         work.odd[:] |= marked
         moved[:] |= marked
         if len(sound) > 0:
             work.left[:] |= marked
-        for v in np.flatnonzero(marked & ~knotted):
-            for a in range(3):
-                work.vertices[v, a] += BACK * (target[v, a] - work.vertices[v, a])
+        whole = len(sound) > 0 or (turn < TRIED and not embedded)
+        _take_back(model, work, marked & ~knotted, target, whole)
+        if embedded or (turn == 2 * TRIED and len(sound) == 0):
+            knotted[:] = True
         smooth_loop(work.vertices, np.flatnonzero(marked & knotted), model.start, model.other)
         mark_near(work)
         lift(obstacles, state, work, np.flatnonzero(marked & work.near))
@@ -314,7 +313,9 @@ def untangle(model, state, obstacles, work, embedded, sound, moved):
 
 @compiled(error_model="numpy")
 def _freed(model, state, obstacles, work):
-    """The material (n, 3), brought out of the bones; where it crosses itself then (n,)."""
+    """The material (n, 3), brought out of the bones, and the corners (n,) of its triangles that
+    cross others before that.
+    """
     found = np.zeros(len(model.faces), np.bool_)
     crossing_loop(work.carried, model.tree, ~found, True, no_boxes(model.tree), found)
     vertices, direction = work.vertices.copy(), work.direction.copy()
@@ -323,6 +324,22 @@ def _freed(model, state, obstacles, work):
     freed = work.vertices.copy()
     work.vertices[:], work.direction[:] = vertices, direction
     return freed, _corners(model, found)
+
+
+@compiled(error_model="numpy")
+def _take_back(model, work, marked, target, whole):
+    """Move marked vertices towards the target (n, 3), or smooth how far they are from where the
+    material carries them.
+    """
+    rows = np.flatnonzero(marked)
+    if whole:
+        for v in rows:
+            for a in range(3):
+                work.vertices[v, a] += BACK * (target[v, a] - work.vertices[v, a])
+        return
+    away = work.vertices - work.carried
+    smooth_loop(away, rows, model.start, model.other)
+    work.vertices[rows] = work.carried[rows] + away[rows]
 
 
 @compiled(error_model="numpy")
