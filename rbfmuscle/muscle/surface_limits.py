@@ -303,7 +303,9 @@ def untangle(model, state, obstacles, work, embedded, sound, moved):
             work.left[:] |= marked
         whole = len(sound) > 0 or (turn < TRIED and not embedded)
         _take_back(model, work, marked & ~knotted, target, whole)
-        if embedded or (turn == 2 * TRIED and len(sound) == 0):
+        # A surface without a field is the material: where that crosses itself, all is smoothed.
+        tangled = embedded and (knotted.any() or turn == TRIED)
+        if tangled or (turn == 2 * TRIED and len(sound) == 0):
             knotted[:] = True
         smooth_loop(work.vertices, np.flatnonzero(marked & knotted), model.start, model.other)
         mark_near(work)
