@@ -114,8 +114,7 @@ class SolidModel(NamedTuple):
     held_bone: np.ndarray  # (h,) row of the bone
     end: np.ndarray  # (h,) 0 or 1 for held points of the two farthest bones, else -1
     end_distance: float  # between the middles of these at rest
-    springs: np.ndarray  # (N, h) from held points to nodes
-    spring: float  # stiffness of one that is as stiff as a cell, over 2 μ
+    springs: np.ndarray  # (N, h) their forces on nodes at the origin, of held points a unit away
     hangs: np.ndarray  # (N, h) shape functions of the held points
     matrix: np.ndarray  # (N, N) second derivative of E / 2 μ without springs and fibres
     motion_weights: np.ndarray  # (N, b) how much of each bone's motion a node takes
@@ -174,7 +173,6 @@ def build_solid(
         end=end,
         end_distance=distance,
         springs=_springs(hangs, owner[held], spring),
-        spring=spring,
         hangs=hangs,
         matrix=GHOST * side * lattice.second_differences() + _gram(cells, len(rest)),
         motion_weights=np.empty((0, 0)),
@@ -198,7 +196,7 @@ def _reach(nodes: int, *embeddings: Embedding) -> Floats:
 
 
 def _springs(hangs: Floats, bone: Integers, spring: float) -> Floats:
-    """Forces (N, h) on the nodes at the origin of the springs to each held point, one unit away."""
+    """Forces (N, h) of the springs on nodes at the origin, for each held point a unit away."""
     springs = LOOSE * spring * hangs
     for b in np.unique(bone):
         group = bone == b

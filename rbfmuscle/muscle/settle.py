@@ -30,7 +30,7 @@ from rbfmuscle.muscle.global_step import (
 )
 from rbfmuscle.muscle.inversion import stiffened_inverse
 from rbfmuscle.muscle.local_step import found_rotations, local_step, start_local, volumes
-from rbfmuscle.muscle.model import FIRM, LOOSE, SolidModel, Stiffness, carry
+from rbfmuscle.muscle.model import SolidModel, Stiffness, carry
 from rbfmuscle.muscle.near_points import (
     carry_near,
     find_exact_touch,
@@ -144,7 +144,7 @@ def settle(
 @compiled(error_model="numpy")
 def _settle(model, stiffness, state, obstacles, rounded, room):
     """What changes of a state, and a `Report`; see `settle`."""
-    springs = _spring_forces(model, state.anchors)
+    springs = np.dot(model.springs, state.anchors)
     pull = tension(model.end, model.end_distance, state.anchors)
     given = Problem(model, stiffness, obstacles, rounded, springs, state.activation[0], pull)
     y = state.nodes.copy()
@@ -209,29 +209,6 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     found = Settled(y, lifted_nodes, points, rotations, stretches, pressure, forces)
     report = Report(status, done, residual, _volume_error(model.cells, lifted_nodes), caps + left)
     return found, report
-
-
-@inner(error_model="numpy")
-def _spring_forces(model, anchors):
-    """Forces (N, 3) of the springs from held points to their anchors (h, 3) on nodes at the
-    origin.
-    """
-    bones = model.held_bone.max() + 1
-    mean = np.zeros((bones, 3))
-    count = np.zeros(bones)
-    for i in range(len(anchors)):
-        count[model.held_bone[i]] += 1.0
-        mean[model.held_bone[i]] += anchors[i]
-    columns = model.embedding.columns
-    shares = model.embedding.shares
-    out = np.zeros_like(model.rest)
-    for i in range(len(anchors)):
-        j, b = model.held[i], model.held_bone[i]
-        for a in range(3):
-            pull = LOOSE * anchors[i, a] + (FIRM - LOOSE) * mean[b, a] / count[b]
-            for k in range(columns.shape[1]):
-                out[columns[j, k], a] += model.spring * shares[j, k] * pull
-    return out
 
 
 @inner(error_model="numpy", inline="always")

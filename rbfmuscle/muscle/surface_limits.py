@@ -278,9 +278,9 @@ def _near_faces(model, work, among):
 
 @compiled(error_model="numpy")
 def untangle(model, state, obstacles, work, embedded, sound, moved):
-    """Take what crosses back to a ``sound`` surface (n, 3), or, without one, (0, 3), to the
-    material beside the bones; what crosses there too, and an ``embedded`` surface, is smoothed.
-    Whether anything was moved for it, and marked.
+    """Bring triangles that cross each other back to a ``sound`` surface (n, 3), or, without one,
+    (0, 3), to the material beside the bones; where these cross too, and those of an ``embedded``
+    surface, are smoothed. Whether vertices were moved for it, which are marked in ``moved``.
     """
     m, n = len(model.faces), len(work.vertices)
     found, among = np.zeros(m, np.bool_), np.ones(m, np.bool_)
@@ -301,11 +301,14 @@ def untangle(model, state, obstacles, work, embedded, sound, moved):
         moved[:] |= marked
         if len(sound) > 0:
             work.left[:] |= marked
-        whole = len(sound) > 0 or (turn < TRIED and not embedded)
-        _take_back(model, work, marked & ~knotted, target, whole)
-        # A surface without a field is the material: where that crosses itself, all is smoothed.
-        tangled = embedded and (knotted.any() or turn == TRIED)
-        if tangled or (turn == 2 * TRIED and len(sound) == 0):
+        rows = np.flatnonzero(marked & ~knotted)
+        if len(sound) > 0 or (turn < TRIED and not embedded):
+            _take_back(work, rows, target)
+        else:
+            _smooth_heights(model, work, rows)
+        # An embedded surface is the material: where that crosses itself, all is smoothed at once.
+        at_once = embedded and (knotted.any() or turn == TRIED)
+        if at_once or (turn == 2 * TRIED and len(sound) == 0):
             knotted[:] = True
         smooth_loop(work.vertices, np.flatnonzero(marked & knotted), model.start, model.other)
         mark_near(work)
@@ -329,16 +332,16 @@ def _freed(model, state, obstacles, work):
 
 
 @compiled(error_model="numpy")
-def _take_back(model, work, marked, target, whole):
-    """Move marked vertices towards the target (n, 3), or smooth how far they are from where the
-    material carries them.
-    """
-    rows = np.flatnonzero(marked)
-    if whole:
-        for v in rows:
-            for a in range(3):
-                work.vertices[v, a] += BACK * (target[v, a] - work.vertices[v, a])
-        return
+def _take_back(work, rows, target):
+    """Move some vertices by a share of the way to the target (n, 3)."""
+    for v in rows:
+        for a in range(3):
+            work.vertices[v, a] += BACK * (target[v, a] - work.vertices[v, a])
+
+
+@compiled(error_model="numpy")
+def _smooth_heights(model, work, rows):
+    """Smooth how far some vertices are from where the material carries them."""
     away = work.vertices - work.carried
     smooth_loop(away, rows, model.start, model.other)
     work.vertices[rows] = work.carried[rows] + away[rows]

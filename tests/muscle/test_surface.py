@@ -227,6 +227,27 @@ def test_what_crosses_goes_back_to_the_material_beside_the_bone():
     np.testing.assert_array_equal(work.vertices[~moved], tangled[~moved])
 
 
+def test_what_crosses_goes_back_to_a_sound_surface_there_alone():
+    rng = np.random.default_rng(6)
+    drawn = Drawn()
+    given = drawn.model, drawn.state, drawn.obstacles
+    work = _begin(*given, X + 0.06 * rng.normal(size=X.shape))
+    assert crossing_faces(work.carried, FACES).sum() > 50, "the material is no help"
+    work.vertices[:] = X
+    among = X[:, 2] > 0.8
+    work.vertices[among] += 0.1 * rng.normal(size=(among.sum(), 3))
+    work.odd[:] = True
+    tangled, moved = work.vertices.copy(), np.zeros(len(X), np.bool_)
+    assert crossing_faces(tangled, FACES).sum() > 20
+    assert untangle(*given, work, False, X, moved)
+    assert not crossing_faces(work.vertices, FACES).any()
+    assert moved.sum() < 0.5 * len(X)
+    np.testing.assert_array_equal(work.left, moved)
+    np.testing.assert_array_equal(work.vertices[~moved], tangled[~moved])
+    away = np.linalg.norm(work.vertices - X, axis=1)
+    assert (away <= np.linalg.norm(tangled - X, axis=1) + 1e-12).all()
+
+
 @pytest.mark.parametrize("bones", [[], [bone(0.5, 1.3, 0.0, 0.0)], [bone(0.9, 0.0, 0.0, 0.9)]])
 @pytest.mark.parametrize("noise", [0.0, 0.05])
 def test_a_surface_without_a_field_keeps_volume_and_leaves_the_bone(bones, noise):
