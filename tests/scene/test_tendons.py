@@ -282,3 +282,13 @@ def test_a_tendon_that_does_not_come_to_its_length_is_an_event(monkeypatch):
     # No difference is small enough.
     monkeypatch.setattr("rbfmuscle.scene.tendons.TOLERANCE", -1.0)
     assert (2, "iteration_cap") in actions()
+
+
+def test_an_end_goes_straight_to_its_via_point_when_a_corner_of_bone_comes_before_it(leg_data):
+    scene = rm.Scene.load(leg_data / "tendons" / "squat.toml")
+    (end,) = scene.muscle("obturator_internus").tendons
+    poses = [bone_poses(scene, frame)[end.name] for frame in scene.motion.frames]
+    places = np.array([pose[:3, :3] @ end.middle + pose[:3, 3] for pose in poses])
+    jumps = np.linalg.norm(np.diff(places, 2, axis=0), axis=1)
+    # mm: 0.3; 3.3 along the tendon, whose first piece turns when it meets the corner.
+    assert len(jumps) > 30 and jumps.max() < 1.0
