@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.rings import plain_loop
+from rbfmuscle.geometry.rings import plain_loop, vertex_rings
 from rbfmuscle.geometry.surfaces import opposite_half_edges
 from rbfmuscle.jit import compiled
 
@@ -37,10 +37,14 @@ class TreeArrays(NamedTuple):
     corners: np.ndarray  # (m, 3) their vertices
     leaves: int
     closed: bool  # whether every edge has two triangles that agree on their outside
+    start: np.ndarray  # (n + 1,) of a closed surface the `vertex_rings`
+    other: np.ndarray
 
 
 class Boxes(NamedTuple):
-    """Boxes, lower corner and upper corner, as they were when crossings were last sought."""
+    """Boxes, lower corner and upper corner, as they were when crossings were last sought; the
+    first node's begins at infinity before that.
+    """
 
     face: np.ndarray  # (leaves, 6, LEAF) of the triangles, leaf by leaf
     node: np.ndarray  # (2 * leaves, 6) of the tree's nodes: node k holds those of 2k and 2k + 1
@@ -56,12 +60,15 @@ class FaceTree:
         middle = (
             vertices[self.faces[:, 0]] + vertices[self.faces[:, 1]] + vertices[self.faces[:, 2]]
         ) / 3.0
-        order = morton_order(middle)
+        order, opposite = morton_order(middle), opposite_half_edges(self.faces)
+        closed = bool((opposite >= 0).all())
+        ringed = (self.faces, opposite) if closed else (self.faces[:0], opposite[:0])
         self.arrays = TreeArrays(
             order,
             self.faces[order],
             1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length(),
-            bool((opposite_half_edges(self.faces) >= 0).all()),
+            closed,
+            *vertex_rings(*ringed, len(vertices)),
         )
 
     def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
@@ -80,10 +87,13 @@ class FaceTree:
 
 @compiled
 def no_boxes(tree):
-    """Room for the boxes of a tree."""
+    """Room for the boxes of a tree, none of which is made: empty ones touch nothing."""
     boxes = Boxes(np.empty((tree.leaves, 6, LEAF)), np.empty((2 * tree.leaves, 6)))
-    boxes.face[:, :3], boxes.face[:, 3:] = np.inf, -np.inf
-    boxes.node[:, :3], boxes.node[:, 3:] = np.inf, -np.inf
+    boxes.node[1, 0] = np.inf
+    # Of leaves without triangles, and of one that has some.
+    full = len(tree.corners) // LEAF
+    boxes.face[full:, :3], boxes.face[full:, 3:] = np.inf, -np.inf
+    boxes.node[tree.leaves + full :, :3], boxes.node[tree.leaves + full :, 3:] = np.inf, -np.inf
     return boxes
 
 
@@ -91,15 +101,15 @@ def no_boxes(tree):
 def crossing_loop(vertices, tree, among, folds, boxes, found):
     """Mark the triangles (m,) that cross others, among pairs as `FaceTree.crossing` says; how many.
 
-    Without ``folds`` pairs at folded corners are not sought elsewhere, and the ``boxes`` of the
-    other triangles are still right. Without a folded corner and without triangles that are asked
-    for no box is made.
+    Without ``folds`` pairs at folded corners are not sought elsewhere, and ``boxes`` of the other
+    triangles that were made before are still right. Without a folded corner and without triangles
+    that are asked for no box is made.
     """
     faces, count = tree.corners, len(tree.corners)
-    plain = np.full(len(vertices), tree.closed and folds)
+    plain = np.zeros(len(vertices), np.bool_)
     if tree.closed and folds:
-        plain_loop(vertices, faces, plain)
-    asked, any_asked = np.empty(count, np.bool_), False
+        plain_loop(vertices, tree.start, tree.other, plain)
+    asked, any_asked = np.zeros(LEAF * tree.leaves, np.bool_), False
     for f in range(count):
         folded = not (plain[faces[f, 0]] and plain[faces[f, 1]] and plain[faces[f, 2]])
         asked[f] = among[tree.order[f]] or (folds and folded)
@@ -109,7 +119,8 @@ def crossing_loop(vertices, tree, among, folds, boxes, found):
         return 0
     wanted = np.zeros(2 * tree.leaves, np.bool_)
     _wanted_loop(asked, tree.leaves, wanted)
-    _boxes_loop(vertices, faces, np.ones_like(wanted) if folds else wanted, boxes)
+    fresh = folds or boxes.node[1, 0] == np.inf
+    _boxes_loop(vertices, faces, np.ones_like(wanted) if fresh else wanted, boxes)
     room = 16 * tree.leaves
     pairs = np.empty((room, 2), np.int64)
     met = _pairs_loop(boxes.node, wanted, pairs)
@@ -228,14 +239,14 @@ def _cross_loop(vertices, faces, leaves, asked, found):
     among, plain = asked
     some = np.empty((STAGE * LEAF * LEAF, 2), np.int64)
     for start in range(0, len(pairs), STAGE):
-        near = _near_loop(pairs[start : start + STAGE], box, some)
+        near = _near_loop(pairs[start : start + STAGE], box, among, some)
         # Nearly all that touch share a corner: those that do not are put in front.
         count = 0
         for k in range(near):
             f, g = some[k, 0], some[k, 1]
             some[count, 0] = f
             some[count, 1] = g
-            count += _meet(faces, f, g, plain) & (among[f] | among[g])
+            count += _meet(faces, f, g, plain)
         for k in range(count):
             f, g = some[k, 0], some[k, 1]
             if not (found[f] and found[g]) and _cross(vertices, faces, f, g):
@@ -243,8 +254,10 @@ def _cross_loop(vertices, faces, leaves, asked, found):
 
 
 @compiled
-def _near_loop(pairs, box, some):
-    """Fill ``some`` with the triangles of pairs of leaves whose boxes touch; how many there are."""
+def _near_loop(pairs, box, among, some):
+    """Fill ``some`` with the triangles of pairs of leaves whose boxes touch, one of them marked;
+    how many there are.
+    """
     # Without branches, as which of them touch is a toss-up.
     near, count = np.empty(LEAF, np.bool_), 0
     for k in range(len(pairs)):
@@ -262,7 +275,8 @@ def _near_loop(pairs, box, some):
             for n in range(LEAF):
                 some[count, 0] = LEAF * i + m
                 some[count, 1] = LEAF * j + n
-                count += near[n] & ((i != j) | (n > m))
+                asked = among[LEAF * i + m] | among[LEAF * j + n]
+                count += near[n] & asked & ((i != j) | (n > m))
     return count
 
 

@@ -29,6 +29,8 @@ BACK = 0.3
 TRIED = 12
 ROUNDS = 64
 GROWTH = 6
+# What may get into that region, in rings of vertices around it, is looked at in the material too.
+WIDER = 4
 
 
 class SurfaceModel(NamedTuple):
@@ -293,9 +295,9 @@ def untangle(model, state, obstacles, work, embedded, sound, moved):
         # What was not moved does not begin to cross.
         if crossing_loop(work.vertices, model.tree, among, turn == 0, boxes, found) == 0:
             return turn > 0
-        if turn == 0 and len(sound) == 0:
-            target, knotted = _freed(model, state, obstacles, work)
         marked = _grown(model, _corners(model, found), 1 + turn // GROWTH)
+        if turn == 0 and len(sound) == 0:
+            target, knotted = _freed(model, state, obstacles, work, _grown(model, marked, WIDER))
         _touching(model.faces, marked, among)
         work.odd[:] |= marked
         moved[:] |= marked
@@ -317,15 +319,16 @@ def untangle(model, state, obstacles, work, embedded, sound, moved):
 
 
 @compiled(error_model="numpy")
-def _freed(model, state, obstacles, work):
-    """The material (n, 3), brought out of the bones, and the corners (n,) of its triangles that
-    cross others before that.
+def _freed(model, state, obstacles, work, region):
+    """The material (n, 3), marked vertices of it brought out of the bones, and which of these (n,)
+    are corners of triangles that cross others before that.
     """
-    found = np.zeros(len(model.faces), np.bool_)
-    crossing_loop(work.carried, model.tree, ~found, True, no_boxes(model.tree), found)
+    found, among = np.zeros(len(model.faces), np.bool_), np.zeros(len(model.faces), np.bool_)
+    _touching(model.faces, region, among)
+    crossing_loop(work.carried, model.tree, among, False, no_boxes(model.tree), found)
     vertices, direction = work.vertices.copy(), work.direction.copy()
     work.vertices[:] = work.carried
-    lift(obstacles, state, work, np.flatnonzero(work.near))
+    lift(obstacles, state, work, np.flatnonzero(region & work.near))
     freed = work.vertices.copy()
     work.vertices[:], work.direction[:] = vertices, direction
     return freed, _corners(model, found)
