@@ -95,17 +95,22 @@ def local_step(cells, y, tension, local):
     local.gradient[:] = 0.0
     local.volumes[:] = 0.0
     joined, energy = 0, 0.0
-    corners, forces = np.empty((3, cells.nodes.shape[1])), np.empty((6, cells.nodes.shape[1]))
+    nodes = cells.nodes
+    slot = cells.slot
+    right = local.right
+    gradient = local.gradient
+    width = nodes.shape[1]
+    forces = np.empty((6, width))
     for c in range(len(cells.nodes)):
         work = local.work[c]
-        deform(cells, y, c, corners, work)
+        deform(y, cells.nodes[c], cells.slopes[c], work)
         _stress_points(work, tension)
         stresses = work[STRESS * POINTS : DETERMINANT * POINTS].reshape((6, 3 * POINTS))
         np.dot(stresses, cells.slopes[c].T, forces)
-        for k in range(cells.nodes.shape[1]):
+        for k in range(width):
             for a in range(3):
-                local.right[cells.nodes[c, k], a] += forces[a, k]
-                local.gradient[cells.slot[c, k], a] += forces[3 + a, k]
+                right[nodes[c, k], a] += forces[a, k]
+                gradient[slot[c, k], a] += forces[3 + a, k]
         for p in range(POINTS):
             i, det = c * POINTS + p, work[DETERMINANT * POINTS + p]
             local.volumes[cells.region[c]] += cells.weights[i] * det
@@ -117,25 +122,37 @@ def local_step(cells, y, tension, local):
     return joined, energy
 
 
-@inner(error_model="numpy")
-def deform(cells, y, c, corners, work):
-    """Write the deformation gradients Σ_k y_k ∇N_k at the points of cell c to its ``work``;
-    ``corners`` (3, 27) is room for its nodes.
+@inner(error_model="numpy", fastmath={"contract"}, _nrt=False)
+def deform(y, nodes, slopes, work):
+    """Write the deformation gradients Σ_k y_k ∇N_k at the points of a cell to its ``work``;
+    ``nodes`` (27,) are its nodes, ``slopes`` (27, 3 POINTS) the gradients of their shape functions.
     """
-    for k in range(cells.nodes.shape[1]):
-        for a in range(3):
-            corners[a, k] = y[cells.nodes[c, k], a]
-    found = work[: 9 * POINTS].reshape((3, 3 * POINTS))
-    np.dot(corners, cells.slopes[c], found)
+    width = 3 * POINTS
+    x = work[:width]
+    y_ = work[width : 2 * width]
+    z = work[2 * width : 3 * width]
+    for i in range(width):
+        x[i] = 0.0
+        y_[i] = 0.0
+        z[i] = 0.0
+    for k in range(len(nodes)):
+        px = y[nodes[k], 0]
+        py = y[nodes[k], 1]
+        pz = y[nodes[k], 2]
+        slope = slopes[k]
+        for i in range(width):
+            x[i] += px * slope[i]
+            y_[i] += py * slope[i]
+            z[i] += pz * slope[i]
 
 
 @compiled(error_model="numpy")
 def volumes(cells, y):
     """Volumes (M,) of the regions for nodes y (N, 3)."""
     out = np.zeros(len(cells.volumes))
-    corners, work = np.empty((3, cells.nodes.shape[1])), np.empty(ROWS * POINTS)
+    work = np.empty(ROWS * POINTS)
     for c in range(len(cells.nodes)):
-        deform(cells, y, c, corners, work)
+        deform(y, cells.nodes[c], cells.slopes[c], work)
         for p in range(POINTS):
             f = _matrix(work, GRADIENT, p)
             out[cells.region[c]] += cells.weights[c * POINTS + p] * dot(f[0], _cross(f[1], f[2]))
