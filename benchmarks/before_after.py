@@ -81,7 +81,7 @@ def recorded() -> dict[str, object]:
 
 def at_rest(scene):
     """The muscles at rest, and the version's own rest errors (RMS)."""
-    still = scene.copy()
+    still = scene.with_options()
     still.motion = Motion([{}])
     run = rm.simulate(still)
     errors = {

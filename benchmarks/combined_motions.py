@@ -161,7 +161,7 @@ def main() -> None:
         }
     found = []
     for title, motion in motions.items():
-        moved = scene.copy()
+        moved = scene.with_options()
         moved.set_motion(**motion)
         rows, spent = measure(moved, arguments.model)
         show(title, len(moved.motion), rows, spent)

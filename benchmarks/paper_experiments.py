@@ -84,7 +84,7 @@ class Experiment:
     """One muscle through one motion; its bones' fields are built once for all models."""
 
     def __init__(self, scene, coordinate, end, step):
-        self.scene = scene.copy()
+        self.scene = scene.with_options()
         known = {f"{joint.name}.{axis}" for joint in scene.joints for axis in joint.coordinates}
         self.possible = coordinate in known
         if not self.possible:

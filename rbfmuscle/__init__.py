@@ -5,6 +5,7 @@ Public names are loaded when first used, so that ``import rbfmuscle`` stays ligh
 
 from __future__ import annotations
 
+import html
 import importlib
 from typing import TYPE_CHECKING
 
@@ -100,7 +101,9 @@ def _picture(shown: Scene) -> str:
     from rbfmuscle.report.render import figure_html
     from rbfmuscle.report.scene_picture import draw_scene
 
-    oriented = orient_scene(shown.copy())
+    if not shown.bones:
+        return html.escape(repr(shown))
+    oriented = orient_scene(shown.with_options())
     return figure_html(lambda file: draw_scene(oriented, file), repr(shown))
 
 

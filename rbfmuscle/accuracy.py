@@ -44,7 +44,7 @@ def discretisation_error(scene: Scene) -> list[LatticeError]:
     coarse.muscles = [muscle for muscle in coarse.muscles if muscle.model == "rbf"]
     if not coarse.muscles:
         raise UsageError(f"scene {scene.name!r} has no RBF muscle: no other model has a lattice")
-    fine = coarse.copy()
+    fine = coarse.with_options()
     nodes = {}
     for muscle in fine.muscles:
         nodes[muscle.name] = RBFOptions.model_validate(muscle.options).nodes

@@ -264,7 +264,7 @@ def _surfaces(scene, chosen):
     """Time to build the models, the surfaces of all muscles in frames of these numbers, in this
     order, and the wall time of each frame.
     """
-    changed = scene.copy()
+    changed = scene.with_options()
     changed.motion = pick_frames(scene.motion, chosen)
     start = time.perf_counter()
     models = build_models(changed)

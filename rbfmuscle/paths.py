@@ -78,7 +78,7 @@ def sample_muscles(
             f"--range {name}: none of the muscles depends on it, or it is locked or follows others"
         )
     for names, muscles in groups.items():
-        part = scene.copy()
+        part = scene.with_options()
         part.muscles = muscles
         values = _poses([ranges[name] for name in names], samples)
         rows = []

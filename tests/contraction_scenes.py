@@ -116,7 +116,7 @@ def bar_scene(*, bar, spacing, model, **contraction):
 def with_frames(scene, pulls, length):
     """The scene with one frame for each pull of the slider [mm, positive shortens]."""
     far = FAR * length
-    moved = scene.copy()
+    moved = scene.with_options()
     moved.motion = Motion([{"slider.pull": math.asin(pull / far)} for pull in pulls])
     return moved.with_options({"contact.substep_angle": math.degrees(length / 50 / far)})
 

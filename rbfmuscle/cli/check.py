@@ -166,7 +166,10 @@ def _describe_field(name, found, units):
 
 def _scene_lines(scene):
     yield f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}"
-    up, front = (", ".join(f"{x:.3g}" for x in v + 0.0) for v in (scene.body[2], -scene.body[1]))
+    from rbfmuscle.scene.objects import body_axes
+
+    body = body_axes(scene.superior, scene.anterior)
+    up, front = (", ".join(f"{x:.3g}" for x in v + 0.0) for v in (body[2], -body[1]))
     unknown = " (assumed, as no femur or tibia shows them; set superior and anterior in [scene])"
     yield f"  superior is ({up}), anterior ({front}){unknown if scene.superior is None else ''}"
     for bone in scene.bones:

@@ -146,7 +146,7 @@ def _posed(scene, stops):
     from rbfmuscle.simulation.live import coordinate_limits
 
     _check_stops(stops, coordinate_limits(scene))
-    rest, scene = rest_coordinates(scene), scene.copy()
+    rest, scene = rest_coordinates(scene), scene.with_options()
     scene.motion = Motion(
         [rest, rest | {name: inner_value(scene, name, x) for name, x in stops.items()}]
     )
@@ -184,7 +184,7 @@ def export(
     """
     with Progress(f"export {directory}"):
         from rbfmuscle.output.export import export_run
-        from rbfmuscle.scene.settings import parse_slice
+        from rbfmuscle.scene.frames import parse_slice
 
         chosen = parse_slice(frames) if frames is not None else None
         names, failed = split_list(formats), None

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt
 
 from rbfmuscle.metrics.summary import Exceedance, QuantityFacts, Unmeasured
-from rbfmuscle.scene.objects import check_name
+from rbfmuscle.scene.names import check_name
 from rbfmuscle.scene.tendons import tendon_name
 
 # Version of ``run.json``: raised where readers of the one before would misread it.

@@ -9,7 +9,7 @@ from rbfmuscle.output import appearance as look
 from rbfmuscle.output.appearance import tendon_mesh
 from rbfmuscle.report.render import Camera, Solid, aim, draw_solids, labelled, save_picture
 from rbfmuscle.scene.guesses import doubtful
-from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.objects import Muscle, body_axes
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import AT_REST
 
@@ -36,8 +36,9 @@ def draw_scene(scene: Scene, path: str | Path) -> None:
     solids += [solid for muscle in scene.muscles for solid in _muscle_solids(muscle, colours)]
     points, images = np.concatenate([solid.vertices for solid in solids]), []
     inner = _SCENE_SIZE[0] - 2 * _NAMES, _SCENE_SIZE[1]
+    body = body_axes(scene.superior, scene.anterior)
     for side in _SCENE_SIDES:
-        camera = aim(look.view_axes(look.VIEWS[side], scene.body), points, inner)
+        camera = aim(look.view_axes(look.VIEWS[side], body), points, inner)
         camera = camera._replace(size=_SCENE_SIZE)
         image = Image.fromarray(draw_solids(solids, camera))
         pen = ImageDraw.Draw(image)

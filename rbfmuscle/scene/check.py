@@ -158,7 +158,6 @@ def check_extents(scene: Scene) -> None:
     for bone in scene.bones:
         check_size("bone", bone.name, bone, scene.units)
     for muscle in scene.muscles:
-        check_size("muscle", muscle.name, muscle, scene.units)
         check_place(muscle.name, muscle, scene.bones, scene.units)
 
 

@@ -39,7 +39,8 @@ def check_size(kind: str, name: str, item: Item, units: str) -> None:
 
 
 def check_place(name: str, muscle: Item, bones: list[Bone], units: str) -> None:
-    """Raise MeshError for a muscle that lies far away from all bones."""
+    """Raise MeshError for a muscle of a wrong size, or one that lies far away from all bones."""
+    check_size("muscle", name, muscle, units)
     away, size = _away_from_bones(bones, *muscle.mesh.bounds)
     if away > FAR_AWAY * size:
         raise MeshError(

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -65,6 +65,10 @@ class SceneTable(Table):
         return self
 
 
+# Keys of ``[scene]`` that a `Scene` has by the same names.
+ABOUT = ("missing_bones", "doubts", "notes", "superior", "anterior")
+
+
 class BoneTable(MeshTransform):
     """``[[bone]]``."""
 
@@ -78,7 +82,16 @@ def _check_model(model):
     return model
 
 
-class ClassTable(ContractionTable, MeshTransform):
+class MuscleKeys(ContractionTable, MeshTransform):
+    """Keys of a muscle that say where its mesh lies, and how it contracts."""
+
+    @property
+    def contraction(self) -> dict[str, object]:
+        """The keys of a muscle that contracts, those that are given."""
+        return {key: getattr(self, key) for key in KEYS if key in self.model_fields_set}
+
+
+class ClassTable(MuscleKeys):
     """``[classes.NAME]``: keys of a muscle, for those of the class that do not give them
     themselves.
     """
@@ -95,11 +108,6 @@ class MuscleTable(ClassTable):
     name: str
     mesh: FileName
     class_: str = Field(alias="class", default=MAIN)
-
-    @property
-    def contraction(self) -> dict[str, object]:
-        """The keys of a muscle that contracts, those that are given."""
-        return {key: getattr(self, key) for key in KEYS if key in self.model_fields_set}
 
 
 class SceneFile(Table):
@@ -133,27 +141,33 @@ def read_scene_file(path: Path) -> tuple[SceneFile, list[Guess]]:
     tables = SceneFile.build(
         data, context=context, folder=folder, name_row=lambda at: _place(at, data)
     )
-    return tables, guesses
+    muscles = [_with_class(muscle, tables.classes, context) for muscle in tables.muscle]
+    return tables.model_copy(update={"muscle": muscles}), guesses
 
 
-def given_muscle(muscle: MuscleTable, classes: dict[str, ClassTable]) -> MuscleTable:
+def _with_class(muscle: MuscleTable, classes: dict[str, ClassTable], context: str) -> MuscleTable:
     """What the file gives of a muscle: its own keys, then those of its class, then those of the
     class ``main``, which all muscles belong to.
     """
     name = muscle.class_
     if name != MAIN and name not in classes:
         hint = did_you_mean(name, classes)
-        raise SceneError(f"muscle {muscle.name!r}: unknown class {name!r}, {hint}")
+        raise SceneError(f"{context}muscle {muscle.name!r}: unknown class {name!r}, {hint}")
     named = [classes[key] for key in dict.fromkeys((MAIN, name)) if key in classes]
     given: dict[str, object] = {"model": "rbf"}
     for table in (*named, muscle):
-        found = {key: getattr(table, key) for key in table.model_fields_set if key != "class_"}
+        found = given_keys(table)
         model = found.get("model")
         if isinstance(model, dict) and "name" not in model:  # some settings of the model change
             before = given["model"]
             found["model"] = {**(before if isinstance(before, dict) else {"name": before}), **model}
         given |= found
     return muscle.model_copy(update=given)
+
+
+def given_keys(row: BoneTable | ClassTable) -> dict[str, Any]:  # of each key its own type
+    """The keys that a row gives, as `Scene.add_bone` and `Scene.add_muscle` take them."""
+    return {key: getattr(row, key) for key in row.model_fields_set if key != "class_"}
 
 
 def _place(location, data):

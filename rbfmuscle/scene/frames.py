@@ -12,7 +12,7 @@ from rbfmuscle.scene.joints.tables import FACTORS, full_name
 from rbfmuscle.scene.motion_file import read_motion_file
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
 NOT_MOVED = 1e-9  # A locked coordinate may be given, at its rest value.
 # Share of a turn [radian] or of a length that rounding may take a coordinate beyond its range.
@@ -43,13 +43,38 @@ def make_motion(
     return Motion(frames, options=options, times=times, notes=notes)
 
 
-def slice_motion(motion: Motion, frames: slice) -> Motion:
-    """Return the motion of the frames in a slice, as ``frames[A:B:S]`` does."""
+def check_coordinates(motion: Motion, joints: list[Joint]) -> None:
+    """Raise SceneError if a motion moves a coordinate that no joint has."""
+    known = all_coordinates(joints)
+    for name in (name for frame in motion.frames for name in frame):
+        if name not in known:
+            hint = did_you_mean(name, sorted(known))
+            raise SceneError(f"[motion]: unknown coordinate {name!r}, {hint}")
+
+
+def slice_motion(motion: Motion, frames: slice | str) -> Motion:
+    """Return the motion of the frames in a slice or "A:B:S", as ``frames[A:B:S]`` does."""
+    frames = parse_slice(frames) if isinstance(frames, str) else frames
     chosen = range(len(motion))[frames]
     if not chosen:
         text = f"{frames.start}:{frames.stop}:{frames.step}".replace("None", "")
         raise SceneError(f"frames {text} selects none of the {len(motion)} frames of the motion")
     return pick_frames(motion, chosen)
+
+
+def parse_slice(text: str) -> slice:
+    """Return the slice of "A:B:S" (each part may be empty), or of a single frame "A"."""
+    try:
+        numbers = [int(part) if part.strip() else None for part in text.split(":")]
+        if len(numbers) == 1:
+            first = int(text)
+            return slice(first, first + 1 or None)
+        if len(numbers) > 3 or numbers[2:] == [0]:
+            raise ValueError
+    except ValueError:
+        example = "A:B:S (whole numbers, S not 0), for instance 0:46:5"
+        raise UsageError(f"frames {text!r} must look like {example}") from None
+    return slice(*numbers)
 
 
 def pick_frames(motion: Motion, chosen: Sequence[int]) -> Motion:

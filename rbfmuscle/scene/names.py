@@ -1,9 +1,13 @@
-"""Names that a scene may have, from names of any kind."""
+"""Names that a scene may have, and what they name."""
 
 import re
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Protocol, TypeVar
 
+from rbfmuscle.validation import SceneError, did_you_mean, shown
+
+_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
 LONGEST_NAME = 100  # a file may be named after two of them, and systems allow 255 letters
 
 
@@ -30,3 +34,52 @@ def new_name(name: str, taken: Iterable[str], *, file: bool = True) -> str:
         found = f"{plain}_{number}"
         number += 1
     return found
+
+
+class Named(Protocol):
+    """Anything with a name."""
+
+    @property
+    def name(self) -> str:
+        """As the scene file has it."""
+
+
+NamedItem = TypeVar("NamedItem", bound=Named)
+
+
+def find_named(items: Sequence[NamedItem], name: str, what: str, *, context: str = "") -> NamedItem:
+    """Return the item of that name, or raise SceneError naming the nearest."""
+    for item in items:
+        if item.name == name:
+            return item
+    hint = did_you_mean(name, [item.name for item in items])
+    raise SceneError(f"{context}unknown {what} {name!r}, {hint}")
+
+
+def check_name(name: object, what: str) -> None:
+    """Raise SceneError if a name is no name for a file."""
+    if not isinstance(name, str) or not name or not set(name) <= _CHARACTERS:
+        allowed = "letters, digits, '_' and '-' only (it becomes a file name)"
+        raise SceneError(f"{what} name {shown(repr(name))} may hold {allowed}")
+    if len(name) > LONGEST_NAME:
+        raise SceneError(
+            f"{what} name {shown(repr(name))} has {len(name)} letters, at most {LONGEST_NAME} are "
+            "allowed (it becomes a file name)"
+        )
+
+
+def check_new_name(items: Sequence[Named], name: str, what: str) -> None:
+    """Raise SceneError if a name is no name for a file, or taken, in letters of another case
+    too.
+    """
+    check_name(name, what)
+    if name == "all":
+        raise SceneError(f"{what} name 'all' stands for the whole scene in tables, choose another")
+    same = [item.name for item in items if item.name.lower() == name.lower()]
+    if name in same:
+        raise SceneError(f"{what} {name!r} is given twice")
+    if same and what != "joint":
+        raise SceneError(
+            f"{what} {name!r} differs from {same[0]!r} in case alone, and their files would be one "
+            "on some systems; choose another name"
+        )

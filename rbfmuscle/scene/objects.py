@@ -1,29 +1,25 @@
-"""What a scene is made of: muscles with their attachments, a motion, and names."""
+"""What a scene is made of: muscles with their attachments, and a motion."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.scene.activation.keys import ContractionTable
-from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.meshes.input_mesh import InputMesh
-from rbfmuscle.scene.names import LONGEST_NAME
 from rbfmuscle.scene.options import MotionOptions, Table, Vector
-from rbfmuscle.scene.tendons import TendonEnd, tendon_name
-from rbfmuscle.validation import SceneError, did_you_mean, shown
+from rbfmuscle.scene.tendons import TendonEnd
+from rbfmuscle.validation import SceneError, shown
 
 if TYPE_CHECKING:
     import trimesh
 
 MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
-_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
 
 
 class ViaTable(Table):
@@ -147,44 +143,6 @@ def body_axes(superior: Sequence[float] | None, anterior: Sequence[float] | None
     return np.stack([left, np.cross(up, left), up])
 
 
-class Named(Protocol):
-    """Anything with a name."""
-
-    @property
-    def name(self) -> str:
-        """As the scene file has it."""
-
-
-NamedItem = TypeVar("NamedItem", bound=Named)
-
-
-def find_named(items: Sequence[NamedItem], name: str, what: str, *, context: str = "") -> NamedItem:
-    """Return the item of that name, or raise SceneError naming the nearest."""
-    for item in items:
-        if item.name == name:
-            return item
-    hint = did_you_mean(name, [item.name for item in items])
-    raise SceneError(f"{context}unknown {what} {name!r}, {hint}")
-
-
-def check_file_names(bones: list[Bone], muscles: list[Muscle]) -> None:
-    """Raise SceneError if two meshes of a run would have one file."""
-    names = {muscle.name.lower(): muscle.name for muscle in muscles}
-    for muscle in muscles:
-        other = names.get(tendon_name(muscle.name).lower())
-        if muscle.tendons and other is not None:
-            raise SceneError(
-                f"muscle {other!r} has the name of the tendons of {muscle.name!r}; choose another"
-            )
-    stems = {bone.name.lower() for bone in bones}
-    for bone in bones:
-        stem, _, number = bone.name.lower().rpartition("_")
-        if stem in stems and len(number) >= 4 and number.isdecimal():
-            raise SceneError(
-                f"bone {bone.name!r} has the name of a frame of bone {stem!r}; choose another"
-            )
-
-
 def split_model(model: object, *, context: str) -> tuple[str, dict[str, object]]:
     """Return (name, options) of a model given as a name or as a table with ``name``, or raise
     SceneError.
@@ -197,32 +155,3 @@ def split_model(model: object, *, context: str) -> tuple[str, dict[str, object]]
         if isinstance(name, str):
             return name, options
     raise SceneError(f"{context}: model must be a name or a table with a name, got {shown(model)}")
-
-
-def check_name(name: object, what: str) -> None:
-    """Raise SceneError if a name is no name for a file."""
-    if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
-        allowed = "letters, digits, '_' and '-' only (it becomes a file name)"
-        raise SceneError(f"{what} name {shown(repr(name))} may hold {allowed}")
-    if len(name) > LONGEST_NAME:
-        raise SceneError(
-            f"{what} name {shown(repr(name))} has {len(name)} letters, at most {LONGEST_NAME} are "
-            "allowed (it becomes a file name)"
-        )
-
-
-def check_new_name(items: Sequence[Bone | Joint | Muscle], name: str, what: str) -> None:
-    """Raise SceneError if a name is no name for a file, or taken, in letters of another case
-    too.
-    """
-    check_name(name, what)
-    if name == "all":
-        raise SceneError(f"{what} name 'all' stands for the whole scene in tables, choose another")
-    same = [item.name for item in items if item.name.lower() == name.lower()]
-    if name in same:
-        raise SceneError(f"{what} {name!r} is given twice")
-    if same and what != "joint":
-        raise SceneError(
-            f"{what} {name!r} differs from {same[0]!r} in case alone, and their files would be one "
-            "on some systems; choose another name"
-        )

@@ -6,13 +6,13 @@ import numpy as np
 
 from rbfmuscle.geometry.surfaces import mesh_hash
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.contents import SceneContents
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 
 
-def record_scene(scene: SceneContents) -> dict[str, object]:
+def record_scene(scene: Scene) -> dict[str, object]:
     """A scene as plain data: names, counts, options, sources and hashes."""
     known = all_coordinates(scene.joints)
     units = {name: coordinate.unit_sign(scene.units) for name, coordinate in known.items()}

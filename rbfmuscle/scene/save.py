@@ -6,43 +6,61 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.build import made_motion
-from rbfmuscle.scene.contents import SceneContents
 from rbfmuscle.scene.guesses import Guess
+from rbfmuscle.scene.joints.joint import Coupling, Joint
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.scene.meshes.obj import obj_text
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.options import Table
-from rbfmuscle.scene.settings import TABLES
 from rbfmuscle.scene.toml_text import attachment_file, table_text
-from rbfmuscle.scene.upgrade import FORMAT
-from rbfmuscle.validation import SceneError, UsageError
+from rbfmuscle.validation import UsageError
 
 if TYPE_CHECKING:
     import trimesh
 
 OPTIONAL = ("sliding", "detect")  # tables that change a scene even where they are empty
+TableRow: TypeAlias = tuple[str, Mapping[str, object]]  # the head of a table, and its keys
 
 
 class SceneFiles:
-    """The files of one scene, in a folder, each written when its table is made; paths are relative
-    to the scene's own file.
+    """The files of one scene, each written when its table is made into a folder that is there, or a
+    new one beside the scene's own file; paths are relative to that file.
+
+    UsageError if the file or the new folder is there already.
     """
 
-    def __init__(self, path: Path, folder: Path) -> None:
+    def __init__(self, path: Path, folder: Path | None = None) -> None:
         self.path = path
-        self.folder = folder
+        self.folder = folder or path.with_name(f"{path.stem}_files")
+        if path.suffix != ".toml":
+            raise UsageError(f"{path}: the name of a scene file ends in .toml")
+        for taken in (path, self.folder)[: 1 if folder else 2]:
+            if taken.exists():
+                raise UsageError(f"{taken} is there already; choose another name")
+        self.folder.mkdir(parents=True, exist_ok=True)
 
-    def bone(self, bone: Bone) -> dict[str, object]:
-        """``[[bone]]``, its mesh written."""
-        return {"name": bone.name, "mesh": self._mesh("bones", bone.name, bone.mesh)}
+    def skeleton(
+        self,
+        bones: Sequence[Bone],
+        meshless_bones: Sequence[str],
+        joints: list[Joint],
+        couplings: Sequence[Coupling],
+    ) -> list[TableRow]:
+        """``[[bone]]``, the meshes written, ``[[joint]]`` and ``[[coupling]]``."""
+        meshes = {bone.name: self._mesh("bones", bone.name, bone.mesh) for bone in bones}
+        return [
+            *(("[[bone]]", {"name": name, "mesh": mesh}) for name, mesh in meshes.items()),
+            *(("[[bone]]", {"name": name}) for name in meshless_bones),
+            *(("[[joint]]", joint_row(joint)) for joint in joints),
+            *(("[[coupling]]", coupling_row(coupling, joints)) for coupling in couplings),
+        ]
 
     def muscle(self, muscle: Muscle) -> dict[str, object]:
         """``[[muscle]]``, its mesh, attached vertices and fibres written."""
@@ -78,23 +96,30 @@ class SceneFiles:
             row |= muscle.contraction.model_dump(exclude_unset=True)
         return row
 
-    def table(self, table: Table) -> dict[str, object]:
-        """A table of settings; the file of a motion is copied."""
-        row = table.model_dump(by_alias=True, exclude_unset=True, exclude_none=True)
-        if "file" in row:
-            file = self._new(row["file"].name)
-            shutil.copyfile(row["file"], file)
-            row["file"] = self._relative(file)
-        return row
+    def settings(self, tables: Mapping[str, Table | None]) -> list[TableRow]:
+        """Tables of settings that say something, by their names; the file of a motion is copied."""
+        found: list[TableRow] = []
+        for key, table in tables.items():
+            if table is None:
+                continue
+            row = table.model_dump(by_alias=True, exclude_unset=True, exclude_none=True)
+            if "file" in row:
+                file = self._new(row["file"].name)
+                shutil.copyfile(row["file"], file)
+                row["file"] = self._relative(file)
+            # What a scene may lack is switched on by its mere table.
+            if row or key in OPTIONAL:
+                found.append((f"[{key}]", row))
+        return found
 
     def write(
         self,
-        tables: Sequence[tuple[str, Mapping[str, object]]],
+        tables: Sequence[TableRow],
         guesses: Sequence[Guess],
         comment: str,
-    ) -> None:
+    ) -> Path:
         """Write the file itself: a comment, then the heads and rows of its tables; lines that are
-        guesses are marked.
+        guesses are marked. Returns its path.
         """
         parts = [comment] if comment else []
         for head, row in tables:
@@ -104,6 +129,7 @@ class SceneFiles:
             keys = [key for key, value in row.items() if not isinstance(value, list)]
             parts.append(table_text(head, row, dict(zip(keys, said))))
         self.path.write_text("\n".join(parts), encoding="utf-8")
+        return self.path
 
     def _new(self, name: str) -> Path:
         file = self.folder / name
@@ -150,46 +176,3 @@ class SceneFiles:
         vertices = np.asarray(mesh.vertices, dtype="<f8")
         file.write_bytes("\n".join(head).encode() + vertices.tobytes() + faces.tobytes())
         return self._relative(file)
-
-
-def save_scene(scene: SceneContents, path: Path) -> Path:
-    """Write a scene, and the files that it names into a new folder beside it; the path of its
-    file.
-    """
-    folder = path.with_name(f"{path.stem}_files")
-    if path.suffix != ".toml":
-        raise UsageError(f"{path}: the name of a scene file ends in .toml")
-    for taken in (path, folder):
-        if taken.exists():
-            raise UsageError(f"{taken} is there already; choose another name")
-    if list(made_motion(scene, scene.motion.options).frames) != list(scene.motion.frames):
-        raise SceneError(
-            "the frames of the motion are not those of its table [motion]; give it by "
-            "set_motion before the scene is saved"
-        )
-    folder.mkdir(parents=True)
-    write_scene(scene, path, folder)
-    return path
-
-
-def write_scene(scene: SceneContents, path: Path, folder: Path, *, comment: str = "") -> None:
-    """Write a scene's file, which begins with a comment, and the files that it names into a folder
-    that is there.
-    """
-    files = SceneFiles(path, folder)
-    about: dict[str, object] = {"format": FORMAT, "name": scene.name, "units": scene.units}
-    for key in ("missing_bones", "doubts", "notes", "superior", "anterior"):
-        about |= {key: getattr(scene, key)} if getattr(scene, key) else {}
-    tables = [("[scene]", about)]
-    tables += [("[[bone]]", files.bone(bone)) for bone in scene.bones]
-    tables += [("[[bone]]", {"name": name}) for name in scene.meshless_bones]
-    tables += [("[[joint]]", joint_row(joint)) for joint in scene.joints]
-    tables += [("[[coupling]]", coupling_row(one, scene.joints)) for one in scene.couplings]
-    tables += [("[[muscle]]", files.muscle(muscle)) for muscle in scene.muscles]
-    for key in TABLES:
-        table = getattr(scene, key) if key != "motion" else scene.motion.options
-        row = {} if table is None else files.table(table)
-        # What a scene may lack is switched on by its mere table.
-        if row or (table is not None and key in OPTIONAL):
-            tables.append((f"[{key}]", row))
-    files.write(tables, scene.guesses, comment)

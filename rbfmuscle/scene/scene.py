@@ -2,52 +2,45 @@
 
 from __future__ import annotations
 
-import html
+import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import Self, TypeAlias
+from typing import Self
 
 from numpy.typing import ArrayLike
 
 from rbfmuscle import showing
-from rbfmuscle.geometry.arrays import MeshLike
-from rbfmuscle.scene import settings as changes
-from rbfmuscle.scene.activation.keys import contraction_keys
-from rbfmuscle.scene.attachments import make_attachments, resolve_aponeuroses, tendon_ends
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.build import check_runnable, made_motion
-from rbfmuscle.scene.contents import SceneContents
 from rbfmuscle.scene.extents import check_centre, check_place, check_size
-from rbfmuscle.scene.file import SceneFile, given_muscle, read_scene_file
+from rbfmuscle.scene.file import ABOUT, SceneFile, given_keys, read_scene_file
+from rbfmuscle.scene.frames import check_coordinates, make_motion, slice_motion
+from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.scene.joints.joint import Coupling, Joint, check_tree, ordered
-from rbfmuscle.scene.joints.tables import (
-    CouplingTable,
-    JointTable,
-    make_coupling,
-)
-from rbfmuscle.scene.meshes.read import as_mesh, read_fibres, read_mesh
-from rbfmuscle.scene.meshes.repair import ReadMesh
+from rbfmuscle.scene.joints.tables import CouplingTable, JointTable, make_coupling
+from rbfmuscle.scene.meshes.read import MeshInput, as_mesh, read_mesh
 from rbfmuscle.scene.meshes.transform import TransformInput, mesh_transform
-from rbfmuscle.scene.objects import (
-    Attachment,
-    Muscle,
-    check_new_name,
-    find_named,
-    split_model,
-)
+from rbfmuscle.scene.muscles import check_file_names, check_muscle, make_muscle, tendon_ends
+from rbfmuscle.scene.names import check_new_name, find_named
+from rbfmuscle.scene.objects import MM_PER_UNIT, Attachment, Motion, Muscle
 from rbfmuscle.scene.options import (
+    ContactOptions,
+    DetectOptions,
     MotionOptions,
+    OutputOptions,
+    SlidingOptions,
+    Table,
 )
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
-from rbfmuscle.scene.save import save_scene
-from rbfmuscle.validation import MeshError, SceneError
+from rbfmuscle.scene.save import SceneFiles
+from rbfmuscle.scene.settings import TABLES, change_settings
+from rbfmuscle.scene.upgrade import FORMAT
+from rbfmuscle.validation import MeshError, SceneError, UsageError
 
-MeshInput: TypeAlias = str | Path | ReadMesh | MeshLike
 
-
-class Scene(SceneContents):
-    """Bones, joints, muscles, a motion and the settings of a simulation; what it holds is that of
-    `SceneContents`.
+@dataclass(eq=False, repr=False)
+class Scene:
+    """Bones, joints, muscles, a motion and the settings of a simulation.
 
     Examples
     --------
@@ -57,6 +50,38 @@ class Scene(SceneContents):
     >>> [bone.name for bone in scene.bones]
     ['upper']
     """
+
+    name: str = "scene"
+    _: KW_ONLY
+    units: str = "mm"  # of every length in the scene: "mm", "cm" or "m"
+    bones: list[Bone] = field(default_factory=list)
+    joints: list[Joint] = field(default_factory=list)
+    couplings: list[Coupling] = field(default_factory=list)  # coordinates that follow others
+    meshless_bones: list[str] = field(default_factory=list)  # they carry joints only
+    muscles: list[Muscle] = field(default_factory=list)
+    motion: Motion = field(default_factory=Motion)
+    contact: ContactOptions = field(default_factory=ContactOptions)
+    sliding: SlidingOptions | None = None
+    detect: DetectOptions | None = None
+    output: OutputOptions = field(default_factory=OutputOptions)
+    path: Path | None = None  # the file it was loaded from
+    # In the verdict of a run: bones without a usable mesh, differences from the source, guesses.
+    missing_bones: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    guesses: list[Guess] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # what was assumed or left out, for a check
+    # Anatomical directions (3,) at rest: those of the file, or found from the bones before a run.
+    superior: list[float] | None = None
+    anterior: list[float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.units not in MM_PER_UNIT:
+            raise SceneError(f"units must be m, cm or mm, got {self.units!r}")
+
+    def __repr__(self) -> str:
+        muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles)
+        counts = f"{len(self.bones)} bones, {muscles or 'no muscles'}, {len(self.motion)} frames"
+        return f"<Scene {self.name!r}, {self.units}: {counts}>"
 
     @classmethod
     def load(cls, path: str | Path, *, skeleton: bool = False) -> Self:
@@ -75,30 +100,50 @@ class Scene(SceneContents):
         MeshError
             If a mesh cannot be used.
         """
-        path = Path(path)
-        tables, guesses = read_scene_file(path)
-        scene = cls(tables.scene.name or path.stem, units=tables.scene.units, path=path)
+        tables, guesses = read_scene_file(Path(path))
+        scene = cls(
+            tables.scene.name or Path(path).stem,
+            units=tables.scene.units,
+            path=Path(path),
+            guesses=guesses,
+            **{key: getattr(tables.scene, key) for key in ABOUT},
+        )
         try:
-            scene.guesses = guesses
-            _fill(scene, tables)
+            _add_rows(scene, tables)
+            _take_settings(scene, {key: getattr(tables, key) for key in TABLES})
             return scene if skeleton and not scene.muscles else scene.validate()
         except (SceneError, MeshError) as error:
             raise type(error)(f"{path}: {error}") from None
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path, *, folder: Path | None = None, comment: str = "") -> Path:
         """Write the scene as a TOML file that loads as the same scene, and return its path.
 
-        Meshes, lists of attached vertices, fibres and a motion's file go into a new folder
-        ``NAME_files`` beside it; nothing that exists is replaced.
+        Meshes, lists of attached vertices, fibres and a motion's file go into ``folder``, by
+        default a new one, ``NAME_files``, beside it. A ``comment`` begins the file.
 
         Raises
         ------
         UsageError
-            If the file or the folder is there already.
+            If the file or the new folder is there already.
         SceneError
             If the frames of the motion were not made from the keys of ``[motion]``.
         """
-        return save_scene(self, Path(path))
+        rest = _made_motion(self, MotionOptions()).frames[0]
+        made = _made_motion(self, self.motion.options).frames
+        if list(made) != [{**rest, **frame} for frame in self.motion.frames]:
+            raise SceneError(
+                "the frames of the motion are not those of its table [motion]; give it by "
+                "set_motion before the scene is saved"
+            )
+        files = SceneFiles(Path(path), folder)
+        about = {key: getattr(self, key) for key in ABOUT if getattr(self, key)}
+        tables = [
+            ("[scene]", {"format": FORMAT, "name": self.name, "units": self.units, **about}),
+            *files.skeleton(self.bones, self.meshless_bones, self.joints, self.couplings),
+            *(("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles),
+            *files.settings(_settings(self)),
+        ]
+        return files.write(tables, self.guesses, comment)
 
     def add_bone(
         self,
@@ -204,10 +249,7 @@ class Scene(SceneContents):
         model: Mapping[str, object] | str = "rbf",
         fibres: str | Path | Sequence[ArrayLike] | None = None,
         aponeuroses: AponeurosesTable | Mapping[str, object] | None = None,
-        scale: float = 1.0,
-        mirror: str | None = None,
-        transform: TransformInput = None,
-        **contraction: object,
+        **keys: object,
     ) -> Self:
         """Add a muscle and return the scene.
 
@@ -226,46 +268,36 @@ class Scene(SceneContents):
         aponeuroses : dict, optional
             Of a pennate muscle, ``origin`` and ``insertion``: patches of its surface between which
             fibres run, each a dict as of an attachment without the bone.
-        scale, mirror, transform
-            Where the mesh and the fibres lie, as for a bone.
-        **contraction
-            ``activation``, ``fibre_stretch_at_rest``, ``tendon_region``.
+        **keys
+            ``scale``, ``mirror`` and ``transform`` of the mesh and the fibres, as for a bone;
+            ``activation``, ``fibre_stretch_at_rest`` and ``tendon_region`` of one that contracts.
         """
         check_new_name(self.muscles, name, "muscle")
-        lies = mesh_transform(scale, mirror, transform, context=f"muscle {name!r}: ")
-        read = as_mesh(mesh, name, lies, may_be_open=False)
-        model_name, options = split_model(model, context=f"muscle {name!r}")
-        attachments = make_attachments(attach, read, self.bones, muscle=name, transform=lies)
-        lines = None if fibres is None else read_fibres(fibres, transform=lies, muscle=name)
-        keys = contraction_keys(contraction, muscle=name)
-        muscle = Muscle(
-            name, read.mesh, model_name, options, attachments, lines, read.source, read.notes, keys
-        )
-        muscle.given = read.given
-        muscle.aponeuroses = resolve_aponeuroses(aponeuroses, read, muscle=name, transform=lies)
+        muscle = make_muscle(name, mesh, self.bones, attach, model, fibres, aponeuroses, keys)
         muscle.tendons = tendon_ends(muscle, self.bones, self.joints)
         self.muscles.append(muscle)
         return self
 
-    def set_motion(self, *, folder: Path | None = None, **options: object) -> Self:
-        """Set the motion from the keys of ``[motion]`` (angles in degrees) and return the scene.
-
-        Parameters
-        ----------
-        folder : path, optional
-            What a relative ``file`` is relative to.
-        **options
-            ``ramp``, ``waypoints`` with ``step``, or ``file``.
+    def set_motion(self, **options: object) -> Self:
+        """Set the motion from the keys of ``[motion]`` (angles in degrees) and return the scene:
+        ``ramp``, ``waypoints`` with ``step``, or ``file``, relative to the scene's own file.
         """
+        folder = self.path and self.path.parent
         table = MotionOptions.build(options, context="[motion] ", folder=folder)
-        self.motion = made_motion(self, table)
+        _take_settings(self, {"motion": table})
         return self
 
     def validate(self) -> Self:
         """Return the scene, or raise SceneError if it cannot be simulated: no bones, no muscles,
         loose muscles.
         """
-        check_runnable(self)
+        for what in ("bones", "muscles"):
+            if not getattr(self, what):
+                raise SceneError(f"scene {self.name!r} has no {what}, add a [[{what[:-1]}]]")
+        check_file_names(self.bones, self.muscles)
+        check_coordinates(self.motion, self.joints)
+        for muscle in self.muscles:
+            check_muscle(muscle, self.motion)
         return self
 
     def with_options(
@@ -293,28 +325,54 @@ class Scene(SceneContents):
         UsageError
             If a key is unknown, with the nearest right one, or a value is not allowed.
         """
-        changed = self.copy()
-        changes.change_scene(changed, settings or {}, model, frames)
+        own = {name: list(held) for name, held in vars(self).items() if isinstance(held, list)}
+        own["muscles"] = [replace(muscle, options=dict(muscle.options)) for muscle in self.muscles]
+        changed = copy.copy(self)
+        vars(changed).update(own)
+        wanted = {**({} if model is None else {"model": model}), **(settings or {})}
+        tables, folder = _settings(self), self.path and self.path.parent
+        try:
+            change_settings(wanted, tables, changed.muscles, folder=folder)
+            _take_settings(changed, tables)
+            if frames is not None:
+                changed.motion = slice_motion(changed.motion, frames)
+        except SceneError as error:
+            raise UsageError(str(error)) from None
         return changed
+
+    def length(self, millimetres: float) -> float:
+        """Return a length given in millimetres in the scene's unit."""
+        return millimetres / MM_PER_UNIT[self.units]
+
+    def bone(self, name: str) -> Bone:
+        """Return the bone of that name, or raise SceneError naming the nearest."""
+        return find_named(self.bones, name, "bone")
+
+    def muscle(self, name: str) -> Muscle:
+        """Return the muscle of that name, or raise SceneError naming the nearest."""
+        return find_named(self.muscles, name, "muscle")
+
+    def attachment_frames(self, muscle: Muscle) -> list[str]:
+        """Names of the bones, then of the ends that tendons of a muscle hold."""
+        return [*(bone.name for bone in self.bones), *(end.name for end in muscle.tendons)]
 
     def show(self, *, model: str | None = None) -> showing.ShownPage:
         """Show the scene in a browser or a notebook, to be moved by hand; see `rbfmuscle.show`."""
         return showing.registered[0].show(self, model=model)
 
     def _repr_html_(self) -> str:
-        return showing.registered[0].picture(self) if self.bones else html.escape(repr(self))
+        return showing.registered[0].picture(self)
 
 
-def _fill(scene: Scene, tables: SceneFile) -> None:
-    """Add what the tables of a file say to an empty scene."""
-    about = tables.scene
-    scene.missing_bones = about.missing_bones
-    scene.doubts = about.doubts
-    scene.notes = about.notes
-    scene.superior = about.superior
-    scene.anterior = about.anterior
+def _made_motion(scene: Scene, options: MotionOptions) -> Motion:
+    """The motion that ``[motion]`` asks of a scene."""
+    return make_motion(options, scene.joints, scene.couplings, metre=scene.length(1000.0))
+
+
+def _add_rows(scene: Scene, tables: SceneFile) -> None:
+    """Add the bones, joints, couplings and muscles of a file to a scene that has none."""
     for bone in tables.bone:
-        scene.add_bone(**{key: getattr(bone, key) for key in bone.model_fields_set})
+        scene.add_bone(**given_keys(bone))
         if bone.mesh is not None:
             check_size("bone", bone.name, scene.bones[-1], scene.units)
     for joint in tables.joint:
@@ -323,24 +381,20 @@ def _fill(scene: Scene, tables: SceneFile) -> None:
     for coupling in tables.coupling:
         scene.add_coupling(make_coupling(coupling, scene.joints))
     for muscle in tables.muscle:
-        given = given_muscle(muscle, tables.classes)
-        read = read_mesh(given.mesh, name=given.name, transform=given)
-        check_size("muscle", given.name, read, scene.units)
-        check_place(given.name, read, scene.bones, scene.units)
-        scene.add_muscle(
-            given.name,
-            read,
-            attach=given.attach,
-            model=given.model,
-            fibres=given.fibres,
-            aponeuroses=given.aponeuroses,
-            scale=given.scale,
-            mirror=given.mirror,
-            transform=given.transform,
-            **given.contraction,
-        )
-    scene.motion = made_motion(scene, tables.motion)
-    scene.contact = tables.contact
-    scene.sliding = tables.sliding
-    scene.detect = tables.detect
-    scene.output = tables.output
+        read = read_mesh(muscle.mesh, name=muscle.name, transform=muscle)
+        check_place(muscle.name, read, scene.bones, scene.units)
+        scene.add_muscle(**{**given_keys(muscle), "mesh": read})
+
+
+def _settings(scene: Scene) -> dict[str, Table | None]:
+    """The tables of settings, by their names in a file; None where a scene has none."""
+    return {key: getattr(scene, key) for key in TABLES} | {"motion": scene.motion.options}
+
+
+def _take_settings(scene: Scene, tables: Mapping[str, Table | None]) -> None:
+    """Give a scene tables of settings, and the motion of its own where that is another one."""
+    for key, table in tables.items():
+        if not isinstance(table, MotionOptions):
+            setattr(scene, key, table)
+        elif table is not scene.motion.options:
+            scene.motion = _made_motion(scene, table)

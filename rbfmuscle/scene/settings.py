@@ -11,9 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
-from rbfmuscle.scene.build import made_motion
-from rbfmuscle.scene.contents import SceneContents
-from rbfmuscle.scene.frames import slice_motion
+from rbfmuscle.scene.names import find_named
 from rbfmuscle.scene.objects import Muscle, split_model
 from rbfmuscle.scene.options import (
     DetectOptions,
@@ -34,48 +32,34 @@ def chooses_model(key: str) -> bool:
     return key == "model" or (key.startswith("muscle.") and key.endswith(".model"))
 
 
-def change_scene(
-    scene: SceneContents,
+def change_settings(
     settings: Mapping[str, object],
-    model: str | Mapping[str, object] | None,
-    frames: slice | str | None,
+    tables: dict[str, Table | None],
+    muscles: Sequence[Muscle],
+    *,
+    folder: Path | None,
 ) -> None:
-    """Give a scene other settings, another model or other frames, in place; `Scene.with_options`
-    says what they are.
+    """Set dotted keys of the tables and of the muscles of a scene, in place;
+    `Scene.with_options` says what they are. Whole models come first.
+
+    Relative names of files are relative to ``folder``.
     """
-    try:
-        if model is not None:
-            set_models(scene.muscles, model)
-        for key in sorted(settings, key=lambda key: not chooses_model(key)):
-            value = settings[key]
-            set_key(scene, key, value.item() if isinstance(value, np.generic) else value)
-        if frames is not None:
-            chosen = parse_slice(frames) if isinstance(frames, str) else frames
-            scene.motion = slice_motion(scene.motion, chosen)
-    except SceneError as error:
-        raise UsageError(str(error)) from None
-
-
-def set_key(scene: SceneContents, key: str, value: object) -> None:
-    """Set one dotted key of a scene, in place."""
-    head, _, rest = key.partition(".")
-    muscles = scene.muscles
-    if head == "muscle":
-        name, head, rest = split_muscle_key(key)
-        muscles = [scene.muscle(name)]
-    if head == "model" or head in KEYS:
-        set_on_muscles(muscles, head, rest, value, key)
-    elif head not in TABLES:
-        raise SceneError(f"{key}: unknown setting, {did_you_mean(head, HEADS)}")
-    elif not rest:
-        raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
-    elif head == "motion":
-        folder = scene.path.parent if scene.path else None
-        options = changed_motion(scene.motion.options, rest, value, key, folder)
-        scene.motion = made_motion(scene, options)
-    else:
-        table = changed_table(head, getattr(scene, head), rest, value, key)
-        setattr(scene, head, table)
+    for key in sorted(settings, key=lambda key: not chooses_model(key)):
+        value = settings[key]
+        value = value.item() if isinstance(value, np.generic) else value
+        head, _, rest = key.partition(".")
+        chosen = muscles
+        if head == "muscle":
+            name, head, rest = split_muscle_key(key)
+            chosen = [find_named(muscles, name, "muscle")]
+        if head == "model" or head in KEYS:
+            set_on_muscles(chosen, head, rest, value, key)
+        elif head not in tables:
+            raise SceneError(f"{key}: unknown setting, {did_you_mean(head, HEADS)}")
+        elif not rest:
+            raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
+        else:
+            tables[head] = changed_table(head, tables[head], rest, value, key, folder)
 
 
 def split_muscle_key(key: str) -> tuple[str, str, str]:
@@ -120,31 +104,40 @@ def _set_contraction(muscle, key, rest, value):
     muscle.contraction = contraction_keys(given, muscle=muscle.name)
 
 
-def changed_table(head: str, table: Table | None, rest: str, value: object, context: str) -> Table:
+def changed_table(
+    head: str,
+    table: Table | None,
+    rest: str,
+    value: object,
+    context: str,
+    folder: Path | None,
+) -> Table:
     """A table of settings with one key changed; one that the scene lacks begins with defaults."""
     table = table or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
     values = table.model_dump(by_alias=True, exclude_unset=True)
-    set_dotted(values, rest, value, context=context)
-    return table.build(values, context=f"{context}: ")
+    if isinstance(table, MotionOptions):
+        _change_motion(values, rest, value, context)
+        context = f"{context}: motion "
+    else:
+        set_dotted(values, rest, value, context=context)
+        context = f"{context}: "
+    return table.build(values, context=context, folder=folder)
 
 
-def changed_motion(
-    options: MotionOptions, rest: str, value: object, key: str, folder: Path | None
-) -> MotionOptions:
-    """The table of a motion with one key changed; names of coordinates hold full stops."""
-    values = options.model_dump(by_alias=True, exclude_unset=True)
-    if rest == "step" and options.ramp is not None:
+def _change_motion(values, rest, value, context):
+    """Set one key of ``[motion]``, in place; names of coordinates hold full stops."""
+    if rest == "step" and "ramp" in values:
         for ramp in values["ramp"].values():
             ramp["step"] = value
     elif rest.startswith("ramp.") and rest.count(".") >= 2:
         name, _, last = rest.removeprefix("ramp.").rpartition(".")
         ramps = values.setdefault("ramp", {})
         if name not in ramps:
-            raise SceneError(f"{key}: the motion has no ramp {name!r}, {did_you_mean(name, ramps)}")
+            hint = did_you_mean(name, ramps)
+            raise SceneError(f"{context}: the motion has no ramp {name!r}, {hint}")
         ramps[name][last] = value
     else:
         values[rest] = value
-    return MotionOptions.build(values, context=f"{key}: motion ", folder=folder)
 
 
 def parse_settings(texts: Sequence[str] | None) -> dict[str, object]:
@@ -175,18 +168,3 @@ def parse_value(text: str, *, context: str) -> dict[str, object] | int | str:
     except SceneError as error:
         raise UsageError(str(error)) from None
     return value
-
-
-def parse_slice(text: str) -> slice:
-    """Return the slice of "A:B:S" (each part may be empty), or of a single frame "A"."""
-    try:
-        numbers = [int(part) if part.strip() else None for part in text.split(":")]
-        if len(numbers) == 1:
-            first = int(text)
-            return slice(first, first + 1 or None)
-        if len(numbers) > 3 or numbers[2:] == [0]:
-            raise ValueError
-    except ValueError:
-        example = "A:B:S (whole numbers, S not 0), for instance 0:46:5"
-        raise UsageError(f"frames {text!r} must look like {example}") from None
-    return slice(*numbers)

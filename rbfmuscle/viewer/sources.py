@@ -21,7 +21,7 @@ from rbfmuscle.output.run_data import RunData
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
-from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import FibreLines, Frame, MuscleModel
@@ -75,7 +75,7 @@ class LiveSource:
         self.title = scene.name
         self.units = scene.units
         self.millimetre = scene.length(1.0)
-        self.body = scene.body
+        self.body = body_axes(scene.superior, scene.anterior)
         first = scene.muscles[0].model
         self.choices = [first, *(name for name in model_names() if name != first)]
         self.bones, self.muscles = (

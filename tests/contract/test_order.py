@@ -58,7 +58,7 @@ def shuffled(scene):
     muscle.
     """
     rng = np.random.default_rng(5)
-    other = scene.copy()
+    other = scene.with_options()
     places = {}
     other.bones = [Bone(b.name, renumbered(b.mesh, rng)[0]) for b in reversed(scene.bones)]
     other.joints, other.muscles = scene.joints[::-1], other.muscles[::-1]

@@ -199,7 +199,7 @@ def ramp(*ends, step):
 )
 def test_promises_hold_in_each_frame_of_a_combined_motion(muscle, ends, flicker, request):
     real = muscle == "gluteus_maximus"
-    scene = request.getfixturevalue("hip_scene").copy() if real else phantom_scene()
+    scene = request.getfixturevalue("hip_scene").with_options() if real else phantom_scene()
     scene.muscles = [scene.muscle(muscle)]
     scene.set_motion(ramp=ramp(*ends, step=6))
     run = rm.simulate(scene)

@@ -11,6 +11,7 @@ from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.output.appearance import VIEWS, motion_direction, view_axes
 from rbfmuscle.report.render import Solid, aim, draw_solids, fitted_size
 from rbfmuscle.run import Run, stream_run
+from rbfmuscle.scene.objects import body_axes
 from rbfmuscle.scene.phantom import phantom_scene
 
 RED, BLUE = "#ff0000", "#0000ff"
@@ -92,16 +93,16 @@ def turned_scene(turn):
 def test_every_view_shows_the_head_of_the_femur_above_its_condyles(name):
     turn = AXES[name]
     scene = orient_scene(turned_scene(turn))
-    np.testing.assert_allclose(
-        scene.body, turn.T, atol=1e-12
-    )  # scans lie along axes, which are taken
+    body = body_axes(scene.superior, scene.anterior)
+    # Scans lie along axes, which are taken.
+    np.testing.assert_allclose(body, turn.T, atol=1e-12)
     femur, plain = (
         scene.bone("femur").mesh.vertices,
         phantom_scene(spacing=6.0).bone("femur").mesh.vertices,
     )
     head, condyles = femur[plain[:, 2].argmax()], femur[plain[:, 2].argmin()]
     for view in ("front", "back", "left", "right"):
-        camera = aim(view_axes(VIEWS[view], scene.body), np.asarray(femur), (300, 400))
+        camera = aim(view_axes(VIEWS[view], body), np.asarray(femur), (300, 400))
         (_, above, _), (_, below, _) = camera.project(np.stack([head, condyles]))
         assert above < 60 and below > 340  # pixels count downwards
     left, posterior, superior = turn.T
@@ -113,13 +114,13 @@ def test_every_view_shows_the_head_of_the_femur_above_its_condyles(name):
         "top": superior,
     }
     for view, direction in towards.items():
-        axes = view_axes(VIEWS[view], scene.body)
+        axes = view_axes(VIEWS[view], body)
         assert axes[2] @ direction > 0.98
         np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(axes) == pytest.approx(1.0)
     # The body's left is at the right hand of who looks at its front or down on it with anterior up.
-    assert view_axes(VIEWS["front"], scene.body)[0] @ left == pytest.approx(1.0)
-    assert view_axes(VIEWS["top"], scene.body)[1] @ -posterior == pytest.approx(1.0)
+    assert view_axes(VIEWS["front"], body)[0] @ left == pytest.approx(1.0)
+    assert view_axes(VIEWS["top"], body)[1] @ -posterior == pytest.approx(1.0)
 
 
 def test_motion_is_seen_along_the_axis_of_the_bone_that_turns_most():
@@ -149,4 +150,6 @@ def test_a_saved_run_knows_the_directions_that_its_bones_showed(tmp_path):
 def test_without_a_bone_that_shows_it_z_is_up_and_minus_y_in_front():
     scene = phantom_scene(spacing=6.0)
     scene.bones = [scene.bone("pelvis")]
-    np.testing.assert_array_equal(orient_scene(scene).body, np.eye(3))
+    oriented = orient_scene(scene)
+    assert (oriented.superior, oriented.anterior) == (None, None)
+    np.testing.assert_array_equal(body_axes(None, None), np.eye(3))

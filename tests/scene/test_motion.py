@@ -67,18 +67,18 @@ class TestOpenSimFile:
 
     def test_degrees_and_radians(self, tmp_path):
         self.write(tmp_path, "0 10 20\n0.1 11 21\n")
-        scene = chain().set_motion(file="walk.mot", folder=tmp_path)
+        scene = chain().set_motion(file=tmp_path / "walk.mot")
         assert degrees(scene, "two.bend") == pytest.approx([10, 11])
         assert degrees(scene, "one.turn") == pytest.approx([20, 21])
         self.write(tmp_path, "0 0.5 1\n", flag="no")
-        frames = chain().set_motion(file="walk.mot", folder=tmp_path).motion.frames
+        frames = chain().set_motion(file=tmp_path / "walk.mot").motion.frames
         assert frames == [{"two.bend": 0.5, "one.turn": 1.0}]
 
     def notes(self, tmp_path, rows, flag="yes", **changed):
         path = self.write(tmp_path, rows, flag)
         for before, after in changed.items():
             path.write_text(path.read_text(encoding="utf-8").replace(before, after, 1))
-        return chain().set_motion(file="walk.mot", folder=tmp_path).motion.notes
+        return chain().set_motion(file=tmp_path / "walk.mot").motion.notes
 
     def test_a_whole_file_has_no_notes(self, tmp_path):
         assert not self.notes(tmp_path, "0 10 20\n0.1 11 21\n")
@@ -90,7 +90,7 @@ class TestOpenSimFile:
     def test_a_column_that_several_joints_have_names_them(self, tmp_path):
         self.write(tmp_path, "0 10 20\n0.1 11 21\n")
         scene = chain().add_joint("three", "c", "d", (30, 0, 0), {"bend": (0, 1, 0)})
-        (note,) = scene.set_motion(file="walk.mot", folder=tmp_path).motion.notes
+        (note,) = scene.set_motion(file=tmp_path / "walk.mot").motion.notes
         assert note.endswith("are not used: bend (of two.bend or three.bend)")
 
     def test_rows_that_are_missing_are_counted(self, tmp_path):
@@ -128,13 +128,13 @@ class TestOpenSimFile:
     def test_text_among_numbers_is_named_with_row_and_column(self, tmp_path, rows, words):
         self.write(tmp_path, rows)
         with pytest.raises(SceneError, match=words):
-            chain().set_motion(file="walk.mot", folder=tmp_path)
+            chain().set_motion(file=tmp_path / "walk.mot")
 
     @pytest.mark.parametrize("rows", ["0 1\n", "0 x 1\n", "0 nan 1\n", "", "\n"])
     def test_bad_rows(self, tmp_path, rows):
         self.write(tmp_path, rows)
         with pytest.raises(SceneError, match=r"walk\.mot"):
-            chain().set_motion(file="walk.mot", folder=tmp_path)
+            chain().set_motion(file=tmp_path / "walk.mot")
 
 
 def test_child_follows_its_parent_and_a_loose_bone_is_fixed():

@@ -11,9 +11,10 @@ import trimesh
 from conftest import ROOT
 
 from rbfmuscle.scene.check import bone_collisions, check_initial, check_scene
+from rbfmuscle.scene.frames import parse_slice
 from rbfmuscle.scene.record import record_scene
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.scene.settings import parse_settings, parse_slice
+from rbfmuscle.scene.settings import parse_settings
 from rbfmuscle.scene.toml_text import attachment_file
 from rbfmuscle.validation import SceneError, UsageError
 

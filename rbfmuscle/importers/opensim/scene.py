@@ -17,7 +17,6 @@ from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.meshes.formats import ALL, MESH_SUFFIXES, read_part
 from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.scene.meshes.repair import ReadMesh
-from rbfmuscle.scene.save import write_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, check_mesh
 
@@ -225,7 +224,7 @@ def write_imported(found: Imported, directory: Path, *, force: bool = False) -> 
     """
     directory = Path(directory)
     with scene_folder(directory, force=force).staged(replaces=()) as stage:
-        write_scene(found.scene, stage / SCENE, stage, comment=_head(found))
+        found.scene.save(stage / SCENE, folder=stage, comment=_head(found))
     return directory / SCENE
 
 

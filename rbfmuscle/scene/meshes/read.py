@@ -8,6 +8,7 @@ became.
 import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,6 +31,7 @@ from rbfmuscle.validation import (
 # In any unit: beyond it, squares of squares of lengths leave the range in which volumes are exact.
 LARGEST_COORDINATE = 1e12
 IN_PLACE = MeshTransform()
+MeshInput: TypeAlias = str | Path | ReadMesh | MeshLike
 
 
 def read_mesh(

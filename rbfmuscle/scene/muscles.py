@@ -1,25 +1,70 @@
-"""Which vertices of a muscle are held by which bone."""
+"""A muscle from its mesh: which vertices are held by which bone, fibres, ends of tendons."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_areas
+from rbfmuscle.scene.activation.contraction import check_activation, make_contraction
+from rbfmuscle.scene.activation.keys import contraction_keys
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.file import MuscleKeys
 from rbfmuscle.scene.joints.joint import Joint, bones_between
+from rbfmuscle.scene.meshes.read import MeshInput, as_mesh, read_fibres
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.meshes.transform import MeshTransform
-from rbfmuscle.scene.objects import Attachment, LineTable, Muscle, ViaTable, find_named
+from rbfmuscle.scene.names import find_named
+from rbfmuscle.scene.objects import (
+    Attachment,
+    LineTable,
+    Motion,
+    Muscle,
+    ViaTable,
+    split_model,
+)
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable, select_vertices
-from rbfmuscle.scene.tendons import BonePoint, TendonEnd
+from rbfmuscle.scene.tendons import BonePoint, TendonEnd, tendon_name
 from rbfmuscle.validation import SceneError
 
 THIN = 0.05  # section of a tendon as it is drawn, over the mean section of its muscle
 PATCH = 16  # points of a belly's end that are kept out of bones, at most
+
+
+def make_muscle(
+    name: str,
+    mesh: MeshInput,
+    bones: list[Bone],
+    attach: Sequence[Attachment | AttachTable | Mapping[str, object]],
+    model: Mapping[str, object] | str,
+    fibres: str | Path | Sequence[ArrayLike] | None,
+    aponeuroses: AponeurosesTable | Mapping[str, object] | None,
+    keys: Mapping[str, object],
+) -> Muscle:
+    """A muscle without the ends of its tendons; `Scene.add_muscle` says what it is given."""
+    context = f"muscle {name!r}"
+    given = {key: value for key, value in keys.items() if value is not None}
+    placed = MuscleKeys.build(given, context=f"{context} ")
+    read = as_mesh(mesh, name, placed, may_be_open=False)
+    model_name, options = split_model(model, context=context)
+    return Muscle(
+        name,
+        read.mesh,
+        model_name,
+        options,
+        make_attachments(attach, read, bones, muscle=name, transform=placed),
+        None if fibres is None else read_fibres(fibres, transform=placed, muscle=name),
+        read.source,
+        read.notes,
+        contraction_keys(placed.contraction, muscle=name),
+        given=read.given,
+        aponeuroses=resolve_aponeuroses(aponeuroses, read, muscle=name, transform=placed),
+    )
 
 
 def make_attachments(
@@ -150,3 +195,39 @@ def _patch(points: Floats, areas: Floats, towards: Floats) -> tuple[Floats, floa
     direction = (towards - middle) / max(float(np.linalg.norm(towards - middle)), 1e-300)
     away = np.linalg.norm(np.cross(points - middle, direction), axis=1)
     return middle, float(np.sqrt(2.0 * np.average(away**2, weights=areas)))
+
+
+def check_muscle(muscle: Muscle, motion: Motion) -> None:
+    """Raise SceneError if fewer than two bones hold a muscle, or its fibres, tendon or activation
+    do not fit it.
+    """
+    bones = sorted({attachment.bone for attachment in muscle.attachments})
+    if not bones:
+        raise SceneError(
+            f"muscle {muscle.name!r} has no attachment, give attach a place on two bones"
+        )
+    if len(bones) == 1:
+        raise SceneError(
+            f"muscle {muscle.name!r} is attached to {bones[0]!r} only, give attach a second bone"
+        )
+    if muscle.contraction is not None:
+        make_contraction(muscle)
+        check_activation(muscle, motion)
+
+
+def check_file_names(bones: list[Bone], muscles: list[Muscle]) -> None:
+    """Raise SceneError if two meshes of a run would have one file."""
+    names = {muscle.name.lower(): muscle.name for muscle in muscles}
+    for muscle in muscles:
+        other = names.get(tendon_name(muscle.name).lower())
+        if muscle.tendons and other is not None:
+            raise SceneError(
+                f"muscle {other!r} has the name of the tendons of {muscle.name!r}; choose another"
+            )
+    stems = {bone.name.lower() for bone in bones}
+    for bone in bones:
+        stem, _, number = bone.name.lower().rpartition("_")
+        if stem in stems and len(number) >= 4 and number.isdecimal():
+            raise SceneError(
+                f"bone {bone.name!r} has the name of a frame of bone {stem!r}; choose another"
+            )
