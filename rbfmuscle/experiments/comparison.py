@@ -21,7 +21,7 @@ from rbfmuscle.folders import write_whole
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
 from rbfmuscle.metrics.summary import QuantityFacts, shown_number
-from rbfmuscle.output.run_data import RunData
+from rbfmuscle.output.run_data import RunData, moment_arm_coordinates
 from rbfmuscle.output.writer import machine, versions, write_csv, write_json
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Mesh
@@ -84,7 +84,7 @@ def statistics(saved: RunData) -> dict[str, dict[str, Spread]]:
     for muscle in saved.muscles:
         whole = (*FROM_METRICS, "length", "time_frame")
         series = {name: saved.series(muscle, name)[1] for name in whole}
-        for about in saved.moment_arm_coordinates(muscle):
+        for about in moment_arm_coordinates(saved, muscle):
             series[f"moment_arm:{about}"] = saved.series(muscle, "moment_arm", about)[1]
         series["time_frame"] = series["time_frame"][1:]  # the first loads and compiles
         found[muscle] = {
@@ -107,7 +107,7 @@ def add_distances(results: dict[str, Values], folder: Path, poses: list[int]) ->
             apart["length_rms"] = _apart(first, run, muscle, "length", None)
             arms = [
                 _apart(first, run, muscle, "moment_arm", about)
-                for about in first.moment_arm_coordinates(muscle)
+                for about in moment_arm_coordinates(first, muscle)
             ]
             apart |= {"moment_arm_rms": max(arms)} if arms else {}
             for name, value in apart.items():

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -13,7 +11,6 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import moment_arms, reaches
-from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.output import appearance as look
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.metrics_table import metrics_table
@@ -22,7 +19,7 @@ from rbfmuscle.scene.joints.tables import full_name
 from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.frame import Event, FibreLines, Frame
+from rbfmuscle.simulation.frame import FibreLines, Frame
 from rbfmuscle.validation import UsageError, did_you_mean
 
 if TYPE_CHECKING:
@@ -73,9 +70,24 @@ class RunData:
         What ``run.json`` holds.
     frames : list of Frame
         Those that were written, in their order.
+    frame_numbers : list of int
+    coordinates : dict of str to (frames,) ndarray
+        Values of each coordinate [degree, of translations scene unit]; NaN where unknown.
     metrics : list of Row
         (frame, coordinate, coordinate_value [degree], muscle, quantity, value, unit), frame by
         frame.
+    quantities : list of str
+        Names of what was measured.
+    summary : dict
+        Muscle -> quantity -> min, max, mean, median, worst.
+    verdict : str
+        Which muscles are within all limits, which not, and the worst value.
+    events : list of Event
+        Those of all frames, in their order.
+    meshes : SceneMeshes or FolderMeshes
+        Bones at rest, and what frames do not hold.
+    has_surfaces : bool
+        Whether there is something to draw.
     directory : Path or None
         The run's folder; None of a run in memory.
     units : {"m", "cm", "mm"}
@@ -98,7 +110,15 @@ class RunData:
         scene = info.scene
         self.info = info
         self.frames = frames
+        self.frame_numbers = [frame.index for frame in frames]
+        self.coordinates = _coordinate_values(info)
         self.metrics = metrics
+        self.quantities = list(dict.fromkeys(row.quantity for row in metrics))
+        self.summary = info.muscles
+        self.verdict = info.verdict
+        self.events = [event for frame in frames for event in frame.events]
+        self.meshes = meshes
+        self.has_surfaces = bool(frames) and bool(frames[0].surfaces)
         self.directory = meshes.directory
         self.units: str = scene.units
         self.body = body_axes(scene.superior, scene.anterior)
@@ -109,8 +129,8 @@ class RunData:
             scene.joints, {muscle.name: [a.bone for a in muscle.attach] for muscle in scene.muscles}
         )
         self.colours = look.muscle_colours(self.muscles, self.groups)
-        self._meshes = meshes
         self._by_number = {frame.index: frame for frame in frames}
+        self._rows = _sorted_rows(metrics)
 
     @classmethod
     def load(cls, directory: str | Path) -> Self:
@@ -120,80 +140,27 @@ class RunData:
         """
         return cls(*read_run(Path(directory)))
 
-    @property
-    def frame_numbers(self) -> list[int]:
-        """Numbers of the frames that were written."""
-        return list(self._by_number)
-
     def frame(self, number: int) -> Frame:
         """The frame of a number; of a negative one counted from the end."""
-        if number not in self._by_number and -len(self.frames) <= number < 0:
+        if number in self._by_number:
+            return self._by_number[number]
+        if -len(self.frames) <= number < 0:
             return self.frames[number]
-        if number not in self._by_number:
-            ends = f"{self.frames[0].index} to {self.frames[-1].index}" if self.frames else "none"
-            raise UsageError(f"frame {number} was not written; the run has {ends}")
-        return self._by_number[number]
-
-    @property
-    def has_surfaces(self) -> bool:
-        """Whether there is something to draw."""
-        return bool(self.frames) and bool(self.frames[0].surfaces)
+        ends = f"{self.frames[0].index} to {self.frames[-1].index}" if self.frames else "none"
+        raise UsageError(f"frame {number} was not written; the run has {ends}")
 
     def mesh(self, name: str, number: int) -> Mesh:
         """Vertices and faces of a muscle, or of its tendons, in the frame of a number."""
-        self._require_surfaces()
-        frame = self.frame(number)
-        if name in self.tendons:
-            return self._meshes.tendons(self.info.tendon_muscles[name], frame)
-        surface = frame.surfaces[name]
-        return surface.vertices, surface.faces
-
-    def bone(self, name: str) -> Mesh:
-        """Vertices and faces of a bone at rest."""
-        self._require_surfaces()
-        return self._meshes.bone(name)
-
-    def input_mesh(self, muscle: str) -> InputMesh | None:
-        """The mesh of a muscle's file at rest, where its vertices are others than those of
-        surfaces, or it has texture coordinates or normals.
-        """
-        return self._meshes.given(muscle)
-
-    def _require_surfaces(self) -> None:
         if not self.has_surfaces:
             raise UsageError(
                 f"{self.directory or 'the run'} has no surfaces: the run's scene had "
                 "output.surfaces = false"
             )
-
-    @property
-    def events(self) -> list[Event]:
-        """Events of all frames, in their order."""
-        return [event for frame in self.frames for event in frame.events]
-
-    @property
-    def summary(self) -> dict[str, dict[str, QuantityFacts]]:
-        """Nested dict: muscle -> quantity -> min, max, mean, median, worst."""
-        return self.info.muscles
-
-    @property
-    def verdict(self) -> str:
-        """Which muscles are within all limits, which not, and the worst value."""
-        return self.info.verdict
-
-    @property
-    def quantities(self) -> list[str]:
-        """Names of what was measured."""
-        return list(dict.fromkeys(row.quantity for row in self.metrics))
-
-    @property
-    def coordinates(self) -> dict[str, Floats]:
-        """Values (frames,) of each coordinate [degree, of translations scene unit]; NaN where
-        unknown.
-        """
-        rows = [row.coordinates for row in self.info.frames]
-        names = sorted({name for row in rows for name in row})
-        return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
+        frame = self.frame(number)
+        if name in self.tendons:
+            return self.meshes.tendons(self.info.tendon_muscles[name], frame)
+        surface = frame.surfaces[name]
+        return surface.vertices, surface.faces
 
     def table(self) -> pandas.DataFrame | np.ndarray:
         """Return the metrics as one table, with the coordinates of each frame.
@@ -222,16 +189,6 @@ class RunData:
     def __iter__(self) -> Iterator[MuscleRun]:
         """All muscles."""
         return (MuscleRun(self, muscle) for muscle in self.muscles)
-
-    @cached_property
-    def _rows(self) -> dict[str, dict[str, list[Row]]]:
-        """Rows of the metrics by muscle and quantity: of dozens of muscles there are tens of
-        thousands.
-        """
-        found: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
-        for row in self.metrics:
-            found[row.muscle][row.quantity].append(row)
-        return {muscle: dict(quantities) for muscle, quantities in found.items()}
 
     def series(
         self, muscle: str, quantity: str, coordinate: str | None = None
@@ -265,29 +222,6 @@ class RunData:
         elif coordinate is not None:
             raise UsageError(f"{quantity!r} has no coordinate; only moment arms have")
         return self.series(muscle, quantity, coordinate)[1]
-
-    def moment_arm_coordinates(self, muscle: str | None = None) -> list[str]:
-        """The coordinates that a muscle, or any, has moment arms about, in their order in
-        ``metrics.csv``.
-        """
-        rows = (
-            r for r in self.metrics if r.quantity == "moment_arm" and muscle in (None, r.muscle)
-        )
-        return list(dict.fromkeys(r.coordinate for r in rows))
-
-    def caption(self, number: int) -> str:
-        """Frame number, time and coordinates of a frame, as text; of many coordinates those that
-        move most.
-        """
-        rows = self.info.frames
-        units = self.info.scene.coordinate_units
-        entry = next(row for row in rows if row.frame == number)
-        values = entry.coordinates
-        spans = {name: np.ptp([row.coordinates.get(name, 0.0) for row in rows]) for name in values}
-        most = sorted(values, key=lambda name: -spans[name])[:MOST_SHOWN]
-        texts = [f"{n} {value:.4g}{units.get(n, '°')}" for n, value in values.items() if n in most]
-        clock = [] if entry.time is None else [f"{entry.time:.4g} s"]
-        return ", ".join([f"frame {number}", *clock, *texts])
 
     def __repr__(self) -> str:
         return f"<Run of {self.info.scene.name!r}: {len(self)} frames, {', '.join(self.muscles)}>"
@@ -357,6 +291,43 @@ class MuscleRun:
                 f"the run has no fibres of {self.name!r}; run it with output.fibres=32"
             )
         return frame.fibres[self.name]
+
+
+def moment_arm_coordinates(run: RunData, muscle: str | None = None) -> list[str]:
+    """The coordinates that a muscle of a run, or any, has moment arms about, in their order in
+    ``metrics.csv``.
+    """
+    rows = (r for r in run.metrics if r.quantity == "moment_arm" and muscle in (None, r.muscle))
+    return list(dict.fromkeys(r.coordinate for r in rows))
+
+
+def frame_caption(run: RunData, number: int) -> str:
+    """Frame number, time and coordinates of a frame, as text; of many coordinates those that move
+    most.
+    """
+    entry = next(row for row in run.info.frames if row.frame == number)
+    units = run.info.scene.coordinate_units
+    spans = {name: np.ptp(np.nan_to_num(run.coordinates[name])) for name in entry.coordinates}
+    most = sorted(spans, key=lambda name: -spans[name])[:MOST_SHOWN]
+    values = [(name, value) for name, value in entry.coordinates.items() if name in most]
+    texts = [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values]
+    clock = [] if entry.time is None else [f"{entry.time:.4g} s"]
+    return ", ".join([f"frame {number}", *clock, *texts])
+
+
+def _coordinate_values(info: RunInfo) -> dict[str, Floats]:
+    """Values (frames,) of each coordinate, by name; NaN where unknown."""
+    rows = [row.coordinates for row in info.frames]
+    names = sorted({name for row in rows for name in row})
+    return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
+
+
+def _sorted_rows(metrics: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
+    """Rows by muscle and quantity: of dozens of muscles there are tens of thousands."""
+    found: dict[str, dict[str, list[Row]]] = {}
+    for row in metrics:
+        found.setdefault(row.muscle, {}).setdefault(row.quantity, []).append(row)
+    return found
 
 
 def _check_coordinate(rows: Sequence[Row], coordinate: str | None) -> None:

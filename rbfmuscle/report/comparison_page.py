@@ -14,7 +14,7 @@ from rbfmuscle.experiments.measures import DEEPER, MEASURES
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.output.run_data import RunData
+from rbfmuscle.output.run_data import RunData, moment_arm_coordinates
 from rbfmuscle.report.page import (
     BAD,
     GOOD,
@@ -154,7 +154,7 @@ def _plots(runs: Mapping[str, RunData]) -> list[str]:
     panels: list[tuple[str, str, str, str, str | None]] = [
         (f"Moment arm: {muscle}, {about}", arm_unit(first, about), muscle, "moment_arm", about)
         for muscle in first.muscles
-        for about in first.moment_arm_coordinates(muscle)
+        for about in moment_arm_coordinates(first, muscle)
     ]
     shapes = {"length": ("Length", first.units)} | {
         name: (MEASURES[name].title.capitalize(), "" if MEASURES[name].kind == "1" else first.units)

@@ -20,7 +20,7 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.jit import compiled
 from rbfmuscle.output import appearance as look
 from rbfmuscle.output.appearance import rgb
-from rbfmuscle.output.run_data import RunData, open_run
+from rbfmuscle.output.run_data import RunData, frame_caption, open_run
 from rbfmuscle.validation import SolveError, UsageError
 
 # Views where none are asked for; muscles that are named, more are named by their groups; pixels of
@@ -233,7 +233,7 @@ def _draw_views(
 
     def draw(frame: int) -> Image.Image:
         image = np.concatenate([_draw_frame(run, camera, frame) for camera in cameras], axis=1)
-        return labelled(image, run.caption(frame), list(axes), chips)
+        return labelled(image, frame_caption(run, frame), list(axes), chips)
 
     return each(draw, frames)
 
@@ -244,7 +244,7 @@ def _draw_frame(run: RunData, camera: Camera, frame: int) -> Integers:
     solids = [Solid(*run.mesh(name, frame), colour) for name, colour in colours.items()]
     poses = run.frame(frame).poses
     for name in run.bones:
-        (vertices, faces), pose = run.bone(name), poses[name]
+        (vertices, faces), pose = run.meshes.bone(name), poses[name]
         solids.append(Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, look.BONE_COLOUR))
     return draw_solids(solids, camera)
 

@@ -26,7 +26,7 @@ from rbfmuscle.metrics.summary import (
 )
 from rbfmuscle.output.animation.page import pack_runs
 from rbfmuscle.output.animation.parts import read_animation
-from rbfmuscle.output.run_data import RunData
+from rbfmuscle.output.run_data import RunData, moment_arm_coordinates
 from rbfmuscle.report.page import (
     BAD,
     GOOD,
@@ -233,7 +233,7 @@ def _plots(saved: RunData) -> list[Section]:
     axis, label = motion_axis(saved)
     mechanics, errors = "Moment arms and lengths", "Errors and times over the motion"
     plots: dict[str, list[str]] = {mechanics: [], errors: []}
-    about = saved.moment_arm_coordinates()
+    about = moment_arm_coordinates(saved)
     arms = [
         (f"Moment arm: {name}", "moment_arm", 1.0, arm_unit(saved, name), name) for name in about
     ]
@@ -270,7 +270,7 @@ def _bands(tracks: Sequence[Track], coordinate: str, label: str, saved: RunData)
 
 def _fibre_arms(saved: RunData) -> list[str]:
     """The coordinates about which fibres have moment arms."""
-    names = saved.moment_arm_coordinates()
+    names = moment_arm_coordinates(saved)
     quantity = "fibre_moment_arm_p50"
     return [c for c in names if any(len(saved.series(m, quantity, c)[0]) for m in saved.muscles)]
 

@@ -17,7 +17,7 @@ from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.models import build_models, configure_scene, model_names
 from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh
-from rbfmuscle.output.run_data import RunData
+from rbfmuscle.output.run_data import RunData, frame_caption
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
@@ -229,7 +229,7 @@ class SavedSource:
         self.units = first.units
         self.body = first.body
         self.millimetre = 1.0 / MM_PER_UNIT[first.units]
-        self.bones = {name: first.bone(name) for name in first.bones}
+        self.bones = {name: first.meshes.bone(name) for name in first.bones}
         self.muscles = {name: first.mesh(name, first.frame_numbers[0]) for name in first.muscles}
         self.colours, self.rest = first.colours, SavedFigure(first).advance()
         self.motion = [{"frame": float(frame)} for frame in first.frame_numbers]
@@ -273,7 +273,7 @@ class SavedFigure:
         activation, depth, arms = (
             self._known(quantity) for quantity in ("activation", "penetration_max", "moment_arm")
         )
-        text, fibres = saved.caption(frame), dict(saved.frame(frame).fibres)
+        text, fibres = frame_caption(saved, frame), dict(saved.frame(frame).fibres)
         poses = saved.frame(frame).poses
         return Picture(poses, surfaces, tendons, activation, depth, text, fibres, arms)
 

@@ -12,7 +12,7 @@ from conftest import ROOT
 
 import rbfmuscle as rm
 from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.output.run_data import SceneMeshes
+from rbfmuscle.output.run_data import SceneMeshes, frame_caption
 
 SCRIPT = ROOT / "tests" / "data" / "user_script.py"
 
@@ -95,9 +95,9 @@ def test_run_in_memory_and_loaded_answer_alike(run, loaded):
     assert (loaded.units, loaded.bones, loaded.colours) == (run.units, run.bones, run.colours)
     assert loaded.frame_numbers == run.frame_numbers == [0, 1, 2]
     assert loaded.metrics == run.metrics and loaded.events == run.events
-    assert loaded.caption(1) == run.caption(1)
+    assert frame_caption(loaded, 1) == frame_caption(run, 1)
     for name in run.bones:
-        for mine, other in zip(run.bone(name), loaded.bone(name), strict=True):
+        for mine, other in zip(run.meshes.bone(name), loaded.meshes.bone(name), strict=True):
             np.testing.assert_allclose(other, mine, rtol=1e-6)  # files are in single precision
 
 

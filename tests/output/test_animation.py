@@ -16,6 +16,7 @@ from rbfmuscle.output.animation import page
 from rbfmuscle.output.animation.gltf import _key_name
 from rbfmuscle.output.animation.parts import AnimatedMesh, Animation
 from rbfmuscle.output.export import export_run
+from rbfmuscle.output.run_data import frame_caption
 from rbfmuscle.output.vtp import write_vtp
 from rbfmuscle.report.page import ReportPage
 from rbfmuscle.run import Run
@@ -38,7 +39,7 @@ def truth(folder):
         found["biceps", frame] = saved.mesh("biceps", frame)[0] * 1e-3
         for bone in saved.bones:
             pose = saved.frame(frame).poses[bone]
-            found[bone, frame] = (saved.bone(bone)[0] @ pose[:3, :3].T + pose[:3, 3]) * 1e-3
+            found[bone, frame] = (saved.meshes.bone(bone)[0] @ pose[:3, :3].T + pose[:3, 3]) * 1e-3
     return found
 
 
@@ -205,7 +206,7 @@ class TestAnimatedGlb:
         tree, _ = read_glb(path)
         (mesh,) = [mesh for mesh in tree["meshes"] if mesh["name"] == "biceps"]
         saved = Run.load(folder)
-        assert mesh["extras"]["targetNames"] == [saved.caption(3), saved.caption(5)]
+        assert mesh["extras"]["targetNames"] == [frame_caption(saved, 3), frame_caption(saved, 5)]
         assert len(_key_name("°" * 40).encode()) == 62  # Blender keeps 63 bytes
 
     def test_frames_per_second_are_those_asked_for(self, folder, tmp_path):

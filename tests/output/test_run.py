@@ -13,6 +13,7 @@ from run_folders import timeless
 
 from rbfmuscle.output import writer
 from rbfmuscle.output.export import export_run
+from rbfmuscle.output.run_data import frame_caption
 from rbfmuscle.report.redraw import redraw_run
 from rbfmuscle.run import Run, simulate, stream_run
 from rbfmuscle.validation import LimitExceededError, SceneWarning, SolveError, UsageError
@@ -150,7 +151,7 @@ def test_frames_keep_the_numbers_of_the_motion(tmp_path):
         assert each.series("biceps", "volume")[0].tolist() == [1, 3, 5]
         assert each.series("all", "time")[1].tolist() == [0.5, 1.5, 2.5]
         assert each.frame(3).coordinates["elbow.flexion"] == pytest.approx(np.radians(30))
-        assert each.caption(5) == "frame 5, 2.5 s, elbow.flexion 50°"
+        assert frame_caption(each, 5) == "frame 5, 2.5 s, elbow.flexion 50°"
         with pytest.raises(UsageError, match="frame 2 was not written"):
             each.frame(2)
     redraw_run(tmp_path / "run", pictures=False)

@@ -6,7 +6,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.output import appearance as look
-from rbfmuscle.output.run_data import RunData
+from rbfmuscle.output.run_data import RunData, frame_caption
 from rbfmuscle.scene.meshes.input_mesh import InputMesh, plain_input
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.simulation.frame import FibreLines
@@ -110,10 +110,10 @@ def read_animation(run: RunData, names: list[str], frames: list[int], *, unit: s
             same = muscle.faces and np.array_equal(muscle.faces[0], faces)
             muscle.vertices.append(points * factor)
             muscle.faces.append(muscle.faces[0] if same else faces)
-        given = None if name in run.tendons else run.input_mesh(name)
+        given = None if name in run.tendons else run.meshes.given(name)
         muscles.append(replace(muscle, given=_shown_input(muscle, given, factor)))
     for name in run.bones:
-        vertices, faces = run.bone(name)
+        vertices, faces = run.meshes.bone(name)
         poses = np.array([run.frame(frame).poses[name] for frame in frames])
         poses[:, :3, 3] *= factor
         bones.append(AnimatedMesh(name, look.BONE_COLOUR, [vertices * factor], [faces], poses))
@@ -123,7 +123,7 @@ def read_animation(run: RunData, names: list[str], frames: list[int], *, unit: s
     if times is not None and np.any(np.diff([times[k] for k in frames]) <= 0.0):
         times = None  # no animation: they stand still, or go backwards
     at = np.array([k / FRAMES_A_SECOND if times is None else times[k] for k in frames], dtype=float)
-    captions = [run.caption(frame) for frame in frames]
+    captions = [frame_caption(run, frame) for frame in frames]
     direction = look.motion_direction([run.frame(frame).poses for frame in frames], run.body)
     return Animation(
         name,
