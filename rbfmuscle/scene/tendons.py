@@ -123,16 +123,6 @@ class TendonEnd:
         return sum(map(line_length, legs)), _mark(legs, self.length)
 
     @cached_property
-    def _share(self) -> float:
-        """Place of the belly's end between the string's fixed points before and after it at rest, 0
-        to 1.
-        """
-        before, after = (
-            float(np.linalg.norm(self.middle - p)) for _, p in (self.other[-1], self.line[0])
-        )
-        return before / max(before + after, 1e-300)
-
-    @cached_property
     def _sides(self) -> list[Floats]:
         """Directions (3,) at rest on whose side each leg of the string passes the bones: out of the
         nearest bone, or towards the belly's end where the string is shorter by a tenth that way.
@@ -144,20 +134,23 @@ class TendonEnd:
         places = [0.5 * (a + b) for a, b in itertools.pairwise(stops)]
         belly = len(self.other) - 1
         places[belly] = self.middle
-        sides = [self._outwards(*leg) for leg in zip(places, stops, stops[1:])]
+        sides = [_outwards(self.obstacles, *leg) for leg in zip(places, stops, stops[1:])]
         along = [unit(b - a) for a, b in itertools.pairwise(stops)]
         own = unit(across(self.middle - stops[belly], along[belly]))
         by_end, outwards = (line_length(self._leg_at_rest(belly, s)) for s in (own, sides[belly]))
         if by_end < SHORTER * outwards:
             sides[belly] = own
         for leg, side in enumerate(sides):
-            if self._too_deep(self._leg_at_rest(leg, side)) > 0.0:
+            if _too_deep(self._leg_at_rest(leg, side), self.obstacles, self.radii[1]) > 0.0:
                 around = [
                     rotation_about(along[leg], angle, np.zeros(3))[:3, :3] @ side
                     for angle in 2.0 * np.pi / AROUND * np.arange(AROUND)
                 ]
                 lines = [self._leg_at_rest(leg, direction) for direction in around]
-                faults = [(self._too_deep(line), line_length(line)) for line in lines]
+                faults = [
+                    (_too_deep(line, self.obstacles, self.radii[1]), line_length(line))
+                    for line in lines
+                ]
                 sides[leg] = around[faults.index(min(faults))]
         return sides
 
@@ -165,21 +158,6 @@ class TendonEnd:
         """A leg of the string at rest (n, 3), passing bones on a side (3,)."""
         stops = [*self.other, *self.line][leg : leg + 2]
         return self._legs([point for _, point in stops], stops, [side], AT_REST)[0]
-
-    def _too_deep(self, line: Floats) -> float:
-        """How much deeper than its radius a line (n, 3) at rest lies in a bone."""
-        inner = _with_nodes(line)[1:-1]
-        depths = (float(_depths(bone, inner).max()) for bone in self.obstacles)
-        return max(max(depths, default=0.0) - self.radii[1], 0.0)
-
-    def _outwards(self, place: Floats, start: Floats, end: Floats) -> Floats:
-        """Unit direction (3,) across a leg, out of or away from the bone nearest to a place (3,),
-        all at rest.
-        """
-        found = (bone.nearest(place[None]) for bone in self.obstacles)
-        distance, closest = min(((float(d[0]), c[0]) for d, c in found), key=lambda one: one[0])
-        outwards = place - closest if distance > 0.0 else closest - place
-        return unit(across(outwards, unit(end - start)))
 
     def place(self, poses: Mapping[str, Floats]) -> tuple[TendonLine, Floats]:
         """The tendon, and the pose (4, 4) of the belly's end from rest to world, at poses (4, 4) of
@@ -209,24 +187,8 @@ class TendonEnd:
             middle = middle + excess / max(float(along @ way), LEAST_COSINE) * way
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turn, middle - turn @ self.middle
-        line = self._lifted(_with_nodes(tendon), poses)
+        line = _lifted(_with_nodes(tendon), self.obstacles, self.radii[1], poses)
         return TendonLine(line, self.radii, settled), pose
-
-    def _lifted(self, line: Floats, poses: Mapping[str, Floats]) -> Floats:
-        """A line (n, 3) whose inner points that graze a bone, no deeper than the tendon's radius,
-        are moved to its surface.
-        """
-        line = line.copy()
-        for bone in self.obstacles:
-            pose = poses[bone.name]
-            local = (line[1:-1] - pose[:3, 3]) @ pose[:3, :3]
-            low, high = bone.bounds
-            near = np.flatnonzero(((local > low) & (local < high)).all(axis=1))
-            if len(near):
-                distance, places = bone.nearest(local[near])
-                graze = (distance < 0.0) & (distance > -self.radii[1])
-                line[1 + near[graze]] = places[graze] @ pose[:3, :3].T + pose[:3, 3]
-        return line
 
     def _lift(
         self, turn: Floats, middle: Floats, direction: Floats, poses: Mapping[str, Floats]
@@ -299,8 +261,47 @@ class TendonEnd:
         skew = np.array(
             [twist[2, 1] - twist[1, 2], twist[0, 2] - twist[2, 0], twist[1, 0] - twist[0, 1]]
         )
-        angle = self._share * np.arctan2(skew @ now, np.trace(twist) - 1.0)
+        # At rest the end lies so far along the way between those points.
+        way = [float(np.linalg.norm(self.middle - p)) for _, p in (self.other[-1], self.line[0])]
+        share = way[0] / max(sum(way), 1e-300)
+        angle = share * np.arctan2(skew @ now, np.trace(twist) - 1.0)
         return rotation_about(now, float(angle), np.zeros(3))[:3, :3] @ first
+
+
+def _too_deep(line: Floats, bones: Sequence[Bone], radius: float) -> float:
+    """How much deeper than a radius a line (n, 3) at rest lies in a bone."""
+    inner = _with_nodes(line)[1:-1]
+    depths = (float(_depths(bone, inner).max()) for bone in bones)
+    return max(max(depths, default=0.0) - radius, 0.0)
+
+
+def _outwards(bones: Sequence[Bone], place: Floats, start: Floats, end: Floats) -> Floats:
+    """Unit direction (3,) across a leg, out of or away from the bone nearest to a place (3,), all
+    at rest.
+    """
+    found = (bone.nearest(place[None]) for bone in bones)
+    distance, closest = min(((float(d[0]), c[0]) for d, c in found), key=lambda one: one[0])
+    outwards = place - closest if distance > 0.0 else closest - place
+    return unit(across(outwards, unit(end - start)))
+
+
+def _lifted(
+    line: Floats, bones: Sequence[Bone], radius: float, poses: Mapping[str, Floats]
+) -> Floats:
+    """A line (n, 3) whose inner points that graze a bone, no deeper than a radius, are moved to its
+    surface.
+    """
+    line = line.copy()
+    for bone in bones:
+        pose = poses[bone.name]
+        local = (line[1:-1] - pose[:3, 3]) @ pose[:3, :3]
+        low, high = bone.bounds
+        near = np.flatnonzero(((local > low) & (local < high)).all(axis=1))
+        if len(near):
+            distance, places = bone.nearest(local[near])
+            graze = (distance < 0.0) & (distance > -radius)
+            line[1 + near[graze]] = places[graze] @ pose[:3, :3].T + pose[:3, 3]
+    return line
 
 
 def _with_nodes(line: Floats) -> Floats:

@@ -88,7 +88,6 @@ class ViewerPage:
         self._resting = False
         self._cost = 0.0
         self._message = "Building the models …"
-        self._place = 0
         self._shown: ViewSettings | None = None
         self.sides = [ModelView(self.server, f"/{name}", source) for name in ("first", "second")]
         self.panel = Panel(self.server, source, at or {}, colour, self._touch)
@@ -183,7 +182,7 @@ class ViewerPage:
         figures = {side: side.figure for side in self.sides if side.figure is not None}
         if self._resting:
             self._rest("")
-        self._follow_motion(not any(figure.pending for figure in figures.values()))
+        panel.follow_motion(not any(figure.pending for figure in figures.values()))
         for figure in figures.values():
             for name, control in panel.controls.items():
                 figure.set(name, control.value)
@@ -199,15 +198,6 @@ class ViewerPage:
             self._shown = look
             self._draw(list(figures), look)
         return panel.play.value or any(figure.pending for figure in figures.values())
-
-    def _follow_motion(self, arrived: bool) -> None:
-        """Set the controls to the frame of the motion where the play bar is."""
-        frame = self.panel.frame
-        if self.panel.play.value and arrived:
-            frame.value = (frame.value + 1) % len(self.source.motion)
-        if frame.value != self._place:
-            self._place = frame.value
-            self.panel.move_to(self.source.motion[frame.value])
 
     def _rest(self, message: str) -> bool:
         """Set controls and models to rest; returns that no picture has to follow by itself."""

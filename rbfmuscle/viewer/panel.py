@@ -38,6 +38,7 @@ class Panel:
         self.gui = server.gui
         self.source = source
         self._touch = touch
+        self._followed = 0  # frame of the motion
         self.gui.configure_theme(show_logo=False, show_share_button=False)
         self.gui.main_panel.dock_right()
         self.gui.main_panel.set_width(WIDTH)
@@ -124,6 +125,16 @@ class Panel:
         """Set controls."""
         for name, value in values.items():
             self.controls[name].value = value
+
+    def follow_motion(self, arrived: bool) -> None:
+        """Set the controls to the frame of the motion where the play bar is: the next one while it
+        plays and pictures have ``arrived`` at the one before.
+        """
+        if self.play.value and arrived:
+            self.frame.value = (self.frame.value + 1) % len(self.source.motion)
+        if self.frame.value != self._followed:
+            self._followed = self.frame.value
+            self.move_to(self.source.motion[self.frame.value])
 
     def write(self, sides: list[ModelView], texts: list[str]) -> None:
         """Write the scale of the colours, the numbers of all muscles and texts."""

@@ -106,7 +106,7 @@ def _coordinates(node, tag, kind):
     if kind == "custom":
         table = node.child("SpatialTransform")
         named = (
-            [name for axis in table.nodes() for name in axis.names("coordinates")]
+            [name for axis in table.nodes() for name in axis.word("coordinates").split()]
             if (table is not None and not names)
             else []
         )
@@ -211,7 +211,7 @@ def _custom_axes(node, names):
         raise node.error("is written as OpenSim 1 did; open the model in OpenSim 4 and save it")
     axes = {}
     for axis in [] if table is None else table.nodes():
-        direction, of = axis.vector("axis", "1 0 0"), axis.names("coordinates")
+        direction, of = axis.vector("axis", "1 0 0"), axis.word("coordinates").split()
         function = read_function(axis)
         if function is None and of and axis.child("function") is not None:
             function = Linear((1.0,))  # so OpenSim takes an empty one; without any nothing moves
@@ -224,7 +224,7 @@ def _custom_axes(node, names):
                 raise axis.error(f"follows {name!r}, which is no coordinate of this joint")
         check_count(function, len(of), axis)
         axes[axis.name] = TransformAxis(
-            tuple((direction / np.linalg.norm(direction)).tolist()), of, function
+            tuple((direction / np.linalg.norm(direction)).tolist()), tuple(of), function
         )
     slots = ("rotation", "translation")
     return {
@@ -303,7 +303,7 @@ def _read_coupler(reading, node):
     function = read_function(node.child("coupled_coordinates_function"))
     if function is None:
         raise node.error("has no function; give it one")
-    named = node.names("independent_coordinate_names")
+    named = node.word("independent_coordinate_names").split()
     target = node.word("dependent_coordinate_name")
     if not named or not target:
         raise node.error("names no coordinates; give it some")

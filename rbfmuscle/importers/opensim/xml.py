@@ -84,10 +84,6 @@ class Node(ElementTree.Element):
         node = self.child(tag)
         return ("" if node is None else node.text or "").strip() or default
 
-    def names(self, tag: str) -> tuple[str, ...]:
-        """The names in the child of that tag."""
-        return tuple(self.word(tag).split())
-
     def truth(self, tag: str, default: bool = False) -> bool:
         """Whether the child of that tag says true."""
         return self.word(tag, str(default)).lower() in ("true", "1", "yes")
