@@ -23,8 +23,7 @@ def sweep(
     *,
     frames: str | None = None,
     reference: Mapping[str, object] | None = None,
-    jobs: int | None = None,
-    cluster: str | None = None,
+    jobs: int | str | None = None,
     error: str = "error_rms",
     progress: OnProgress | None = None,
 ) -> SweepTable:
@@ -45,10 +44,9 @@ def sweep(
         Frames of the motion, "A:B:S".
     reference : mapping, optional
         Settings of the run that errors are measured against, over the finest values of the grid.
-    jobs : int, optional
-        Points that run at the same time; as many as cores by default.
-    cluster : str, optional
-        Address of a Dask scheduler whose workers see the folder.
+    jobs : int or str, optional
+        Points that run at the same time, as many as cores by default; or the address of a Dask
+        scheduler whose workers see the folder.
     error : str
         The error on the axis of the Pareto front.
     progress : callable, optional
@@ -69,9 +67,9 @@ def sweep(
     """
     if error not in VALUES:
         raise UsageError(f"unknown quantity {error!r}, {did_you_mean(error, VALUES)}")
-    if jobs is not None and jobs < 1:
+    if isinstance(jobs, int) and jobs < 1:
         raise UsageError(f"jobs must be 1 or more, got {jobs}")
-    if cluster is not None and directory is None:
+    if isinstance(jobs, str) and directory is None:
         raise UsageError("a cluster needs a folder that its workers see")
     values = {key: list(several) for key, several in grid.items()}
     points = plan_sweep(scenes, values, frames=frames, reference=reference)
@@ -79,16 +77,7 @@ def sweep(
         configure_scene(scenes[point.scene], point.settings, frames=frames)
     units = {name: scene.units for name, scene in scenes.items()}
     with given_folder(directory) as folder:
-        run_sweep(
-            run_point,
-            scenes,
-            points,
-            folder,
-            frames=frames,
-            jobs=jobs,
-            cluster=cluster,
-            progress=progress,
-        )
+        run_sweep(run_point, scenes, points, folder, frames=frames, jobs=jobs, progress=progress)
         table = write_table(points, folder, units, quantity=error)
         write_page(table, folder)
     return table

@@ -4,8 +4,8 @@ import logging
 import sys
 from time import perf_counter
 
-from rbfmuscle.cli.options import Flag, Jobs, SceneName, threads
-from rbfmuscle.cli.printing import USUAL, Printing, print_result
+from rbfmuscle.cli.options import USUAL_WORK, Flag, SceneName, Work
+from rbfmuscle.cli.printing import print_result
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.validation import SceneError, UsageError
 
@@ -19,8 +19,7 @@ def check(
     time: Flag = False,
     accuracy: Flag = False,
     upgrade: Flag = False,
-    jobs: Jobs = None,
-    printing: Printing = USUAL,
+    work: Work = USUAL_WORK,
 ) -> int:
     """Check a scene file and its meshes; nothing is solved but what --time and --accuracy ask for.
 
@@ -44,7 +43,7 @@ def check(
     if time and not plan:
         raise UsageError("--time measures what --plan lists; give check SCENE --plan --time")
     facts: dict[str, object] = {"upgraded": _upgrade(scene)} if upgrade else {}
-    with Progress(f"check {scene.name}"), threads(jobs):
+    with Progress(f"check {scene.name}"), work.threads():
         if picture:
             from rbfmuscle.report.render import check_picture
 
@@ -63,8 +62,8 @@ def check(
 
     lines = [*_scene_lines(loaded), *map(str, findings), *_more_lines(facts, loaded.units)]
     facts |= {"scene": record_scene(loaded), "findings": [vars(finding) for finding in findings]}
-    print_result(printing, facts, lines)
-    if not printing.as_json:
+    print_result(work, facts, lines)
+    if not work.as_json:
         last = f"usable; next: rbfmuscle run {scene} -o results" if usable else "not usable"
         print(last, file=sys.stderr)
     return 0 if usable else SceneError.exit_code
@@ -165,9 +164,9 @@ def _describe_field(name, found, units):
 
 
 def _scene_lines(scene):
-    yield f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}"
     from rbfmuscle.scene.objects import body_axes
 
+    yield f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}"
     body = body_axes(scene.superior, scene.anterior)
     up, front = (", ".join(f"{x:.3g}" for x in v + 0.0) for v in (body[2], -body[1]))
     unknown = " (assumed, as no femur or tibia shows them; set superior and anterior in [scene])"

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from rbfmuscle.cli.options import (
+    USUAL_WORK,
     FailOn,
     Frames,
-    Jobs,
     Output,
     Settings,
+    Work,
     named_scenes,
     split_list,
-    threads,
 )
-from rbfmuscle.cli.printing import USUAL, Printing, print_result
+from rbfmuscle.cli.printing import print_result
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import LimitExceededError, SolveError
 
@@ -24,9 +24,8 @@ def compare(
     settings: Settings = None,
     frames: Frames = None,
     fail_on: FailOn = None,
-    jobs: Jobs = None,
     pictures: bool = True,
-    printing: Printing = USUAL,
+    work: Work = USUAL_WORK,
 ) -> int:
     """Run models on one or several scenes: the same motion, contacts and measures; tables, report,
     pictures.
@@ -58,7 +57,7 @@ def compare(
     with (
         Progress("compare") as progress,
         interruption.keeping(lambda: kept if output.exists() else ""),
-        threads(jobs),
+        work.threads(),
     ):
 
         def advance(model, done, total):
@@ -76,7 +75,7 @@ def compare(
             pictures=pictures,
             progress=advance,
         )
-    return (_print_one if len(opened) == 1 else _print_scenes)(table, output, limits, printing)
+    return (_print_one if len(opened) == 1 else _print_scenes)(table, output, limits, work)
 
 
 def _compare(opened, output, models, **options):

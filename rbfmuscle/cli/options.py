@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from rbfmuscle.cli.printing import Printing
 from rbfmuscle.validation import SceneError, UsageError
 
 if TYPE_CHECKING:
@@ -46,11 +48,49 @@ FailOn = Annotated[
         "exit code 6. For instance volume_error=0.001,penetration_max, or all."
     ),
 ]
-Jobs = Annotated[int | None, Parameter(help="Threads to use; as many as cores by default.")]
 Flag = Annotated[bool, Parameter(negative="")]
 Force = Annotated[bool, Parameter(negative="", help="Replace a scene file that exists.")]
 # KEY=VALUE, once each time that the option is given.
 Pairs = Annotated[list[str] | None, Parameter(negative="")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Changes:
+    """Options that change a scene."""
+
+    model: Model = None
+    settings: Settings = None
+
+    def parse_settings(self) -> dict[str, object]:
+        """Dotted keys with their values."""
+        from rbfmuscle.scene.settings import parse_settings
+
+        return parse_settings(self.settings)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Work(Printing):
+    """Options for the threads that a command uses, and for what it prints."""
+
+    jobs: Annotated[int | None, Parameter(help="Threads to use; as many as cores by default.")] = (
+        None
+    )
+
+    def threads(self) -> AbstractContextManager[None]:
+        """Context in which loops use as many threads as ``--jobs`` says."""
+        if self.jobs is None:
+            return nullcontext()
+        if self.jobs < 1:
+            raise UsageError(f"--jobs must be 1 or more, got {self.jobs}")
+        from rbfmuscle.experiments.sweep_run import threads_limited
+
+        return threads_limited(self.jobs)
+
+
+UNCHANGED = Changes()
+USUAL_WORK = Work()
 
 
 def split_list(text: str | None) -> list[str]:
@@ -72,17 +112,6 @@ def chosen_muscles(scene: "Scene", names: str | None) -> "list[Muscle]":
     if not found:
         raise UsageError("--muscles names no muscle; leave it out for all")
     return found
-
-
-def threads(jobs: int | None) -> AbstractContextManager[None]:
-    """Context in which loops use as many threads as ``--jobs`` says."""
-    if jobs is None:
-        return nullcontext()
-    if jobs < 1:
-        raise UsageError(f"--jobs must be 1 or more, got {jobs}")
-    from rbfmuscle.experiments.sweep_run import threads_limited
-
-    return threads_limited(jobs)
 
 
 def named_scenes(scenes: Sequence[str]) -> dict[str, str]:

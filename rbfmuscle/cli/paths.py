@@ -2,22 +2,23 @@
 
 import math
 import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from rbfmuscle.cli.options import (
-    Jobs,
-    Model,
+    UNCHANGED,
+    USUAL_WORK,
+    Changes,
     Muscles,
     Output,
     Pairs,
     SceneName,
-    Settings,
+    Work,
     chosen_muscles,
-    threads,
 )
-from rbfmuscle.cli.printing import USUAL, Printing, print_result
+from rbfmuscle.cli.printing import print_result
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SceneError, UsageError
 
@@ -26,31 +27,48 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Sampling:
+    """What is sampled."""
+
+    samples: Annotated[
+        int, Parameter(help="Poses for each muscle, of which every fifth is held out of the fit.")
+    ] = 120
+    fibres: Annotated[
+        int,
+        Parameter(
+            help="Of each muscle, for each of which a path is fitted, in place of one for the "
+            "muscle."
+        ),
+    ] = 0
+    ranges: Annotated[
+        Pairs,
+        Parameter(
+            name="--range",
+            help="COORDINATE=LOW:HIGH in degrees or scene units, else the coordinate's range, or "
+            "what the motion covers; may be repeated.",
+        ),
+    ] = None
+
+
+USUAL_SAMPLING = Sampling()
+
+
 def paths(
     scene: SceneName,
     *,
     output: Output,
-    samples: int = 120,
+    sampling: Sampling = USUAL_SAMPLING,
     muscles: Muscles = None,
-    fibres: int = 0,
-    ranges: Annotated[Pairs, Parameter(name="--range")] = None,
     names: Annotated[Pairs, Parameter(name="--coordinate")] = None,
-    model: Model = None,
-    settings: Settings = None,
-    jobs: Jobs = None,
-    printing: Printing = USUAL,
+    changes: Changes = UNCHANGED,
+    work: Work = USUAL_WORK,
 ) -> int:
     """Sample muscles' lengths and moment arms over coordinates and fit paths that OpenSim loads.
 
     Parameters
     ----------
-    samples
-        Poses for each muscle, of which every fifth is held out of the fit.
-    fibres
-        Of each muscle, for each of which a path is fitted, in place of one for the muscle.
-    ranges
-        COORDINATE=LOW:HIGH in degrees or scene units, else the coordinate's range, or what the
-        motion covers; may be repeated.
     names
         COORDINATE=JOINT/COORDINATE, what the OpenSim model calls a coordinate of the scene, for
         instance hip.flexion=hip_r/hip_flexion_r; may be repeated; else the scene's own names.
@@ -58,27 +76,29 @@ def paths(
     from rbfmuscle.models import configure_scene
     from rbfmuscle.paths import paths_folder, report_fits, sample_muscles
     from rbfmuscle.scene.phantom import open_scene
-    from rbfmuscle.scene.settings import parse_settings
 
+    samples = sampling.samples
     if samples < 10:
         raise UsageError(f"--samples {samples} is too few to fit anything, give 10 or more")
-    loaded = configure_scene(open_scene(scene), parse_settings(settings), model=model)
+    loaded = configure_scene(open_scene(scene), changes.parse_settings(), model=changes.model)
     loaded.muscles = chosen_muscles(loaded, muscles)
-    given, targets = parse_ranges(loaded, ranges or []), parse_targets(loaded, names or [])
+    ranges, targets = parse_ranges(loaded, sampling.ranges), parse_targets(loaded, names or [])
     paths_folder(output)
-    with Progress(loaded.name, "pose") as progress, threads(jobs):
-        sampled = sample_muscles(loaded, given, samples=samples, fibres=fibres, progress=progress)
+    with Progress(loaded.name, "pose") as progress, work.threads():
+        sampled = sample_muscles(
+            loaded, ranges, samples=samples, fibres=sampling.fibres, progress=progress
+        )
     rows, lines = report_fits(loaded, sampled, output, targets=targets)
     facts = {"file": str(output / "paths.xml"), "paths": rows}
-    return print_result(printing, facts, lines)
+    return print_result(work, facts, lines)
 
 
-def parse_ranges(scene: "Scene", texts: list[str]) -> "Ranges":
+def parse_ranges(scene: "Scene", texts: Pairs) -> "Ranges":
     """Return the ranges that --range asks for, by full name [radian or scene unit]."""
     from rbfmuscle.scene.motion import inner_value
 
     found = {}
-    for text in texts:
+    for text in texts or ():
         name, _, ends = text.partition("=")
         try:
             low, high = (float(end) for end in ends.split(":"))

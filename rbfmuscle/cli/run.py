@@ -3,22 +3,33 @@
 import time
 from functools import partial
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from rbfmuscle.cli.options import (
+    UNCHANGED,
+    USUAL_WORK,
+    Changes,
     FailOn,
     Frames,
-    Jobs,
     Model,
-    Muscles,
     Output,
     SceneName,
-    Settings,
+    Work,
     chosen_muscles,
-    threads,
 )
-from rbfmuscle.cli.printing import USUAL, Printing, print_result
+from rbfmuscle.cli.printing import print_result
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError
+
+Simulated = Annotated[
+    str | None,
+    Parameter(
+        help="Muscles to simulate, separated by commas, without the others and without [sliding]; "
+        "all by default."
+    ),
+]
 
 
 def demo(
@@ -27,18 +38,16 @@ def demo(
     model: Model = None,
     frames: Frames = None,
     fail_on: FailOn = None,
-    jobs: Jobs = None,
-    printing: Printing = USUAL,
+    work: Work = USUAL_WORK,
 ) -> int:
     """Run the embedded hip: no data, no network. The same as `run phantom`."""
     return run(
         Path("phantom"),
         output=output,
-        model=model,
+        changes=Changes(model),
         frames=frames,
         fail_on=fail_on,
-        jobs=jobs,
-        printing=printing,
+        work=work,
     )
 
 
@@ -46,22 +55,13 @@ def run(
     scene: SceneName,
     *,
     output: Output,
-    model: Model = None,
-    settings: Settings = None,
-    muscles: Muscles = None,
+    changes: Changes = UNCHANGED,
+    muscles: Simulated = None,
     frames: Frames = None,
     fail_on: FailOn = None,
-    jobs: Jobs = None,
-    printing: Printing = USUAL,
+    work: Work = USUAL_WORK,
 ) -> int:
-    """Run a scene through its motion and write surfaces, metrics and a report.
-
-    Parameters
-    ----------
-    muscles
-        Muscles to simulate, separated by commas, without the others and without [sliding]; all by
-        default.
-    """
+    """Run a scene through its motion and write surfaces, metrics and a report."""
     from rbfmuscle import interruption
 
     start, done = time.perf_counter(), 0
@@ -76,18 +76,17 @@ def run(
         interruption.check()
 
     failed: RBFMuscleError | None = None
-    with Progress(scene.stem) as progress, interruption.keeping(kept), threads(jobs):
+    with Progress(scene.stem) as progress, interruption.keeping(kept), work.threads():
         from rbfmuscle.output.run_data import RunData
         from rbfmuscle.run import stream_run
         from rbfmuscle.scene.phantom import open_scene
-        from rbfmuscle.scene.settings import parse_settings
 
-        changes, loaded = parse_settings(settings), open_scene(scene)
+        settings, loaded = changes.parse_settings(), open_scene(scene)
         if muscles is not None:
             loaded.muscles, loaded.sliding = chosen_muscles(loaded, muscles), None
         limited = partial(stream_run, frames=frames, fail_on=fail_on, progress=advance)
         try:
-            limited(loaded, output, model=model, settings=changes)
+            limited(loaded, output, model=changes.model, settings=settings)
         except SolveError as error:
             failed = SolveError("; ".join(filter(None, [str(error), kept()])))
             if not done:
@@ -97,7 +96,7 @@ def run(
         info = RunData.load(output).info
     facts = {"directory": str(output), **info.to_dict()}
     seconds = time.perf_counter() - start
-    return print_result(printing, facts, _lines(output, len(info.frames), seconds), error=failed)
+    return print_result(work, facts, _lines(output, len(info.frames), seconds), error=failed)
 
 
 def _lines(output, frames, seconds):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -11,36 +12,103 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from rbfmuscle.cli.options import (
+    UNCHANGED,
+    USUAL_WORK,
+    Changes,
     FailOn,
     Frames,
-    Jobs,
-    Model,
     Muscles,
     Output,
     Pairs,
-    Settings,
+    Work,
     chosen_muscles,
     named_scenes,
     split_list,
-    threads,
 )
 from rbfmuscle.cli.printing import USUAL, Printing, one_line, print_result
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError, UsageError
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Fits:
+    """Which fits are tried."""
+
+    names: Annotated[
+        str | None,
+        Parameter(name="--kernels", help="Kernels, separated by commas; all by default."),
+    ] = None
+    centres: Annotated[str, Parameter(help="Numbers of centres, separated by commas.")] = "150,300"
+    resolution: Annotated[
+        int,
+        Parameter(
+            help="Cells along the longest side of extracted surfaces; 0 for 128, and more for "
+            "slender muscles."
+        ),
+    ] = 0
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Axes:
+    """What a sweep varies, and the error that it measures."""
+
+    grid: Annotated[
+        Pairs,
+        Parameter(
+            help="KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300; "
+            "may be repeated."
+        ),
+    ] = None
+    reference: Annotated[
+        Pairs,
+        Parameter(
+            help="KEY=VALUE of the reference that errors are measured against; may be repeated; by "
+            "default the finest values of the grid."
+        ),
+    ] = None
+    error: Annotated[
+        str,
+        Parameter(help="The error on the axis of the Pareto front; the other axis is time."),
+    ] = "error_rms"
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Workers:
+    """Where the points of a sweep are run."""
+
+    jobs: Annotated[
+        int | None,
+        Parameter(
+            help="Points that run at the same time; as many as cores by default. Each gets cores / "
+            "jobs threads."
+        ),
+    ] = None
+    cluster: Annotated[
+        str | None,
+        Parameter(
+            help="Address of a Dask scheduler, for instance tcp://127.0.0.1:8786; its workers must "
+            "see the folder."
+        ),
+    ] = None
+
+
+USUAL_FITS = Fits()
+NO_AXES = Axes()
+USUAL_WORKERS = Workers()
+
+
 def kernels(
     source: str,
     *,
     output: Output,
-    names: Annotated[str | None, Parameter(name="--kernels")] = None,
-    centres: str = "150,300",
+    fits: Fits = USUAL_FITS,
     muscles: Muscles = None,
-    resolution: int = 0,
     units: str = "",
     error: float | None = None,
-    jobs: Jobs = None,
-    printing: Printing = USUAL,
+    work: Work = USUAL_WORK,
 ) -> int:
     """Rank kernels, shape parameters and numbers of centres on a surface or a scene's muscles.
 
@@ -48,12 +116,6 @@ def kernels(
     ----------
     source
         A mesh (STL, OBJ, PLY, VTK, VTP), a scene file, or ``phantom``.
-    names
-        Kernels, separated by commas; all by default.
-    centres
-        Numbers of centres, separated by commas.
-    resolution
-        Cells along the longest side of extracted surfaces; 0 for 128, and more for slender muscles.
     units
         Name of the mesh's unit, for tables and plots; nothing is converted.
     error
@@ -64,24 +126,24 @@ def kernels(
     from rbfmuscle.experiments.wanted_error import reach_error
     from rbfmuscle.report.kernel_page import kernels_folder
 
-    counts = split_list(centres)
+    counts = split_list(fits.centres)
     if not counts or not all(count.isdecimal() and int(count) >= 8 for count in counts):
-        raise UsageError(f"--centres must be whole numbers of 8 and more, got {centres!r}")
+        raise UsageError(f"--centres must be whole numbers of 8 and more, got {fits.centres!r}")
     meshes, units = _meshes(source, muscles, units)
     kernels_folder(output)
-    chosen = split_list(names) or None
-    with threads(jobs):
+    chosen = split_list(fits.names) or None
+    with work.threads():
         if error is not None:
             find = partial(reach_error, error=error, kernels=chosen)
-            return _find_wanted(meshes, output, find, units, printing)
+            return _find_wanted(meshes, output, find, units, work)
         study = partial(
             measure_kernels,
             kernels=chosen,
             centres=[int(count) for count in counts],
-            resolution=resolution,
+            resolution=fits.resolution,
             units=units,
         )
-        return _study(meshes, output, study, printing)
+        return _study(meshes, output, study, work)
 
 
 def _meshes(source, muscles, units):
@@ -158,14 +220,10 @@ def _wanted_lines(facts, output):
 def sweep(
     *scenes: str,
     output: Output,
-    grid: Pairs = None,
-    model: Model = None,
-    settings: Settings = None,
+    axes: Axes = NO_AXES,
+    changes: Changes = UNCHANGED,
     frames: Frames = None,
-    reference: Pairs = None,
-    jobs: int | None = None,
-    cluster: str | None = None,
-    error: str = "error_rms",
+    workers: Workers = USUAL_WORKERS,
     fail_on: FailOn = None,
     printing: Printing = USUAL,
 ) -> int:
@@ -177,20 +235,6 @@ def sweep(
     ----------
     scenes
         Scene files (TOML), or "phantom" for the embedded hip.
-    grid
-        KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300; may be
-        repeated.
-    reference
-        KEY=VALUE of the reference that errors are measured against; may be repeated; by default the
-        finest values of the grid.
-    jobs
-        Points that run at the same time; as many as cores by default. Each gets cores / jobs
-        threads.
-    cluster
-        Address of a Dask scheduler, for instance tcp://127.0.0.1:8786; its workers must see the
-        folder.
-    error
-        The error on the axis of the Pareto front; the other axis is time.
     """
     from rbfmuscle import interruption
     from rbfmuscle.experiments.sweep import parse_grid
@@ -200,26 +244,26 @@ def sweep(
     from rbfmuscle.scene.settings import parse_settings
     from rbfmuscle.sweeping import sweep as run_scenes
 
-    axes, changes = parse_grid(grid or []), parse_settings(settings)
-    if not scenes or (len(scenes) == 1 and not axes):
+    grid, settings = parse_grid(axes.grid or []), changes.parse_settings()
+    if not scenes or (len(scenes) == 1 and not grid):
         raise UsageError(
             "a sweep needs several scenes, or a grid, for instance --grid model.centres=100,200"
         )
     opened = {name: open_scene(path) for name, path in named_scenes(scenes).items()}
-    loaded = {name: configure_scene(each, changes, model=model) for name, each in opened.items()}
+    loaded = {
+        name: configure_scene(each, settings, model=changes.model) for name, each in opened.items()
+    }
     limits = {name: parse_limits(fail_on, each) for name, each in loaded.items()}
-    finest = parse_settings(reference)
     progress = Progress("sweep", what="point")
     with progress, interruption.keeping(lambda: f"finished points are kept in {output}"):
         table = run_scenes(
             loaded,
-            axes,
+            grid,
             output,
             frames=frames,
-            reference=finest,
-            jobs=jobs,
-            cluster=cluster,
-            error=error,
+            reference=parse_settings(axes.reference),
+            jobs=workers.cluster or workers.jobs,
+            error=axes.error,
             progress=progress,
         )
     return _finish(table, output, limits, printing)

@@ -108,17 +108,16 @@ def run_sweep(
     directory: str | Path,
     *,
     frames: str | None = None,
-    jobs: int | None = None,
-    cluster: str | None = None,
+    jobs: int | str | None = None,
     progress: OnProgress | None = None,
 ) -> int:
     """Run the points that the folder does not hold done, references first; how many were run.
 
     ``runner(scene, settings, frames)`` gives a finished `Run`; it is module-level, so that it can
     be sent away. ``scenes``, ``points`` and ``frames`` are those of `plan_sweep`. Of ``jobs``
-    points beside each other (as many as cores by default) each has cores / jobs threads.
-    ``cluster`` is the address of a Dask scheduler whose workers see the folder; ``progress(done,
-    total)`` is called along the way.
+    points beside each other (as many as cores by default) each has cores / jobs threads; or it is
+    the address of a Dask scheduler whose workers see the folder. ``progress(done, total)`` is
+    called along the way.
     """
     from joblib import cpu_count, parallel_config
 
@@ -128,23 +127,23 @@ def run_sweep(
     folder.output.add(*(f"references/{p.key}.npz" for p in left if p.role == "reference"))
     for point in left:
         (folder.points / f"{point.key}.json").unlink(missing_ok=True)
-    jobs = jobs or cpu_count()
-    threads = 1 if cluster else max(1, cpu_count() // jobs)
+    beside = -1 if isinstance(jobs, str) else jobs or cpu_count()
+    threads = max(1, cpu_count() // beside)  # one on a cluster
 
     def advance():
         if progress is not None:
             progress(sum(bool(folder.read(point.key)) for point in left), len(left))
 
     with ExitStack() as stack:
-        if cluster:
-            client = stack.enter_context(_connect_cluster(cluster))
+        if isinstance(jobs, str):
+            client = stack.enter_context(_connect_cluster(jobs))
             stack.enter_context(parallel_config(backend="dask", client=client))
-        elif jobs > 1:
+        elif beside > 1:
             stack.enter_context(parallel_config(backend="loky", inner_max_num_threads=threads))
         for first in (True, False):
             stage = [point for point in left if (point.role == "reference") == first]
             calls = [(runner, scenes[p.scene], p, folder, frames, threads) for p in stage]
-            _side_by_side(calls, folder, -1 if cluster else jobs, advance)
+            _side_by_side(calls, folder, beside, advance)
     return len(left)
 
 

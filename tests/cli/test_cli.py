@@ -16,7 +16,7 @@ from command_line import call
 import rbfmuscle as rm
 from rbfmuscle.cli.app import GROUPS
 from rbfmuscle.cli.check import _measure_time
-from rbfmuscle.cli.options import threads
+from rbfmuscle.cli.options import Work
 from rbfmuscle.scene.check import check_extents
 from rbfmuscle.validation import MeshError
 
@@ -266,7 +266,7 @@ class TestOtherCommands:
         assert (tmp_path / "c" / "report.html").exists()
 
     def test_jobs_are_threads(self):
-        with threads(1):
+        with Work(jobs=1).threads():
             assert numba.get_num_threads() == 1
 
     def test_help_lists_the_commands_in_four_groups(self, capsys):

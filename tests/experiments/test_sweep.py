@@ -217,7 +217,7 @@ def test_a_cluster_that_loses_one_of_two_workers_gives_the_same_table(finished, 
         if done == 2:
             workers[0].send_signal(signal.SIGKILL)
 
-    points, count = sweep(tmp_path / "out", cluster=address, progress=kill)
+    points, count = sweep(tmp_path / "out", jobs=address, progress=kill)
     assert count == POINTS and workers[0].wait(timeout=30) != 0
     assert rows_of(points, tmp_path / "out") == rows_of(*finished)
 
