@@ -5,10 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from rbfmuscle.experiments.kernel_study import KernelStudy, measure_kernels
+from rbfmuscle.experiments.kernel_study import (
+    KernelStudy,
+    ReferenceSurface,
+    check_request,
+    measure_fits,
+)
 from rbfmuscle.experiments.sweep_run import OnProgress
 from rbfmuscle.geometry.arrays import MeshLike
+from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.report.kernel_page import kernels_folder, write_studies
+from rbfmuscle.validation import UsageError
 
 
 def study_kernels(
@@ -54,14 +61,12 @@ def study_kernels(
     """
     if directory is not None:
         kernels_folder(directory)  # what is in the way is reported now, not after the study
-    study = measure_kernels(
-        mesh,
-        kernels=kernels,
-        centres=centres,
-        resolution=resolution,
-        units=units,
-        progress=progress,
-    )
+    vertices, faces, chosen = check_request(mesh, kernels or KERNELS)
+    if min(centres, default=0) < 8:
+        raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
+    judge = ReferenceSurface(vertices, faces, resolution)
+    study = measure_fits(judge, chosen, centres, progress)
+    study.units = units
     if directory is not None:
         write_studies({"mesh": study}, directory)
     return study

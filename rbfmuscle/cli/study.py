@@ -122,8 +122,8 @@ def kernels(
         Find the fewest centres, and the kernel, that reach this RMS distance (in the mesh's unit),
         in place of a table.
     """
-    from rbfmuscle.experiments.kernel_study import measure_kernels
     from rbfmuscle.experiments.wanted_error import reach_error
+    from rbfmuscle.kernels import study_kernels
     from rbfmuscle.report.kernel_page import kernels_folder
 
     counts = split_list(fits.centres)
@@ -137,7 +137,7 @@ def kernels(
             find = partial(reach_error, error=error, kernels=chosen)
             return _find_wanted(meshes, output, find, units, work)
         study = partial(
-            measure_kernels,
+            study_kernels,
             kernels=chosen,
             centres=[int(count) for count in counts],
             resolution=fits.resolution,

@@ -22,7 +22,7 @@ from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, ve
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
-from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
+from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
 from rbfmuscle.implicit.placement.sampling import SurfaceSample, sample_surface, spread_points
 from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
@@ -201,25 +201,17 @@ class KernelStudy:
     sha256: str = ""
 
 
-def measure_kernels(
-    mesh: MeshLike,
-    *,
-    kernels: Sequence[str] | None = None,
-    centres: Sequence[int] = (150, 300),
-    resolution: int = 0,
-    units: str = "",
-    progress: OnProgress | None = None,
+def measure_fits(
+    judge: ReferenceSurface,
+    kernels: Sequence[Kernel],
+    counts: Sequence[int],
+    progress: OnProgress | None,
 ) -> KernelStudy:
-    """Fit a surface with kernels and numbers of centres, and measure each fit; arguments are those
-    of `rbfmuscle.study_kernels`.
-    """
-    vertices, faces, chosen = check_request(mesh, kernels or KERNELS)
-    if min(centres, default=0) < 8:
-        raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
-    judge, calls = ReferenceSurface(vertices, faces, resolution), []
-    for count in centres:
-        sample = sample_surface(vertices, faces, int(count), placement="greedy")
-        calls += [(sample, kernel) for kernel in chosen]
+    """Fit a surface with each kernel and number of centres, and measure each fit."""
+    calls = []
+    for count in counts:
+        sample = sample_surface(judge.vertices, judge.faces, int(count), placement="greedy")
+        calls += [(sample, kernel) for kernel in kernels]
     found = _measure_all(judge, calls, progress)
     _refuse_coarse([one.row for one in found])
     for one in found:  # when nothing else runs
@@ -234,7 +226,8 @@ def measure_kernels(
     for row in rows:  # no other row beats those of the front both in error and in time
         row.front = any(row is good[index] for index in front)
     surfaces = [one.surface for one in found]
-    return KernelStudy(rows, surfaces, units, recommend(rows), mesh_hash(vertices, faces))
+    sha256 = mesh_hash(judge.vertices, judge.faces)
+    return KernelStudy(rows, surfaces, recommended=recommend(rows), sha256=sha256)
 
 
 def _measure_all(

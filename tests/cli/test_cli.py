@@ -120,7 +120,7 @@ class TestRun:
         [
             (("run",), "rbfmuscle.run.Recording"),
             (("compare",), "rbfmuscle.compare._measure"),
-            (("kernels", "--centres", "8"), "rbfmuscle.experiments.kernel_study.measure_kernels"),
+            (("kernels", "--centres", "8"), "rbfmuscle.kernels.study_kernels"),
             (("kernels", "--error", "1"), "rbfmuscle.experiments.wanted_error.reach_error"),
             (("paths", "--samples", "10"), "rbfmuscle.paths.sample_muscles"),
         ],

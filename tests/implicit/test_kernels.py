@@ -6,10 +6,10 @@ import pytest
 import trimesh
 from scipy.spatial.distance import cdist
 
-from rbfmuscle.experiments.kernel_study import measure_kernels
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.assembly import exponents
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel, register_kernel
+from rbfmuscle.kernels import study_kernels
 from rbfmuscle.validation import UsageError
 
 mp.mp.dps = 50
@@ -200,7 +200,7 @@ def test_a_field_is_the_same_with_a_kernel_given_as_functions(outside):
 def test_a_registered_kernel_is_studied_beside_the_others(outside):
     outside("sech", sech, sech_first, sech_second)
     ball = trimesh.creation.icosphere(3, 10.0)
-    study = measure_kernels(ball, kernels=["sech", "cubic"], centres=[60], resolution=24)
+    study = study_kernels(ball, kernels=["sech", "cubic"], centres=[60], resolution=24)
     errors = {row.kernel: row.rms for row in study.rows}
     assert errors["sech"] < errors["cubic"]
 
