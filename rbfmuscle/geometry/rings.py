@@ -19,7 +19,8 @@ def vertex_rings(faces: Integers, opposite: Integers, count: int) -> tuple[Integ
     first = np.full(count, -1)
     first[tail] = half_edges
     walks, used = np.flatnonzero(first >= 0), np.bincount(tail, minlength=count)
-    now, rows, steps = first[walks], [], []
+    now = first[walks]
+    rows, steps = [], []
     while len(walks):
         rows.append(walks)
         steps.append(now)
