@@ -31,7 +31,7 @@ from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.substeps import SubSteps
 from rbfmuscle.simulation.tunnelling import find_crossings
@@ -101,7 +101,7 @@ class Experiment:
     def run(self, method, substeps):
         """Angles of the first penetration and tunnelling, and the worst of everything else."""
         model = build_model(self.scene.muscles[0], self.scene, method)
-        contacts = BoneContacts(self.names, self.fields, attached_bone=model.attached_bone)
+        contacts = BoneContacts(BonesInReach(self.names, self.fields), model.attached_bone)
         record = Record(model, self.probes)
         here = {self.coordinate: 0.0}
         for coordinates in self.scene.motion.frames:
@@ -162,7 +162,12 @@ class Record:
             self.bone_depth,
             bone_depth(MeshDistance(*self.model.material_mesh()), self.probes, poses),
         )
-        self.volume = max(self.volume, abs(self.model.volume() / self.model.rest.volume.rest - 1.0))
+        self.volume = max(
+            self.volume,
+            abs(
+                self.model.rest.volume.volume(self.model.points) / self.model.rest.volume.rest - 1.0
+            ),
+        )
         low, high = np.quantile(self.edge_lengths(points) / self.lengths, [0.01, 0.99])
         self.ratio = [min(self.ratio[0], low), max(self.ratio[1], high)]
 

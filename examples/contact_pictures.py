@@ -19,8 +19,8 @@ import rbfmuscle as rm
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import ContactOptions, DetectOptions, SlidingOptions, TunnellingOptions
-from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.stepper import MuscleStepper
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
+from rbfmuscle.simulation.stepper import MuscleStepper, Path
 
 out = folder("contact_pictures")
 pyvista.OFF_SCREEN = True
@@ -118,9 +118,9 @@ for action, title in (("report", "tunnelled"), ("substep", "corrected")):
     model = build_model(muscle, scene, "pbd")
     names = [bone.name for bone in scene.bones]
     stepper = MuscleStepper(
-        model, BoneContacts(names, fields, attached_bone=model.attached_bone), scene
+        model, BoneContacts(BonesInReach(names, fields), model.attached_bone), scene
     )
-    stepper.step(rest, turned)
+    stepper.step(Path.between(rest, turned, stepper.poses))
     remaining[action] = {event.action for event in stepper.collect()[1]}
     panels.append((title, [(*model.material_mesh(), "#a63d38", 0.75), *bones(scene, turned)]))
 picture("tunnelling", panels, view=(0.55, -0.8, 0.1), zoom=1.3)

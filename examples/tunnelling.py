@@ -14,8 +14,8 @@ from pictures import folder, plot
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
-from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.stepper import MuscleStepper
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
+from rbfmuscle.simulation.stepper import MuscleStepper, Path
 
 out = folder("tunnelling")
 scene = rm.phantom_scene()
@@ -28,11 +28,9 @@ def step(action):
     """One step of 40 degrees: the points, and what was noticed."""
     scene.detect = DetectOptions(tunnelling=TunnellingOptions(action=action))
     model = build_model(muscle, scene, "pbd")
-    names = list(fields)
-    stepper = MuscleStepper(
-        model, BoneContacts(names, list(fields.values()), attached_bone=model.attached_bone), scene
-    )
-    stepper.step(stepper.path(rest, turned))
+    reached = BonesInReach(list(fields), list(fields.values()))
+    stepper = MuscleStepper(model, BoneContacts(reached, model.attached_bone), scene)
+    stepper.step(Path.between(rest, turned, stepper.poses))
     _, events, _ = stepper.collect()
     for event in events:
         print(f"{action:8} {event.count:4} points at the {event.bone}: {event.action}")

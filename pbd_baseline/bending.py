@@ -6,7 +6,8 @@ import numpy as np
 
 from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.jit import compiled
+from rbfmuscle.geometry.rotations import cross, dot
+from rbfmuscle.jit import compiled, inner
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no
 # direction.
@@ -141,35 +142,23 @@ def _project_block(g, count, stiffness, compliance):
     stays.
     """
     for t in range(count):
-        ex = g[t]
-        ey = g[t + BLOCK]
-        ez = g[t + 2 * BLOCK]
-        ax = g[t + 3 * BLOCK]
-        ay = g[t + 4 * BLOCK]
-        az = g[t + 5 * BLOCK]
-        bx = g[t + 6 * BLOCK]
-        by = g[t + 7 * BLOCK]
-        bz = g[t + 8 * BLOCK]
-        px = ey * az - ez * ay
-        py = ez * ax - ex * az
-        pz = ex * ay - ey * ax
-        qx = by * ez - bz * ey
-        qy = bz * ex - bx * ez
-        qz = bx * ey - by * ex
-        ee = ex * ex + ey * ey + ez * ez
-        pp, qq = px * px + py * py + pz * pz, qx * qx + qy * qy + qz * qz
-        pq = px * qx + py * qy + pz * qz
+        e = _taken(g, t)
+        a = _taken(g, t + 3 * BLOCK)
+        b = _taken(g, t + 6 * BLOCK)
+        p = cross(e, a)
+        q = cross(b, e)
+        ee = dot(e, e)
+        pp, qq = dot(p, p), dot(q, q)
+        pq = dot(p, q)
         length = np.sqrt(ee)
-        sine = -(ax * qx + ay * qy + az * qz) * length
+        sine = -dot(a, q) * length
         good = 1.0 if min(pp, qq) > TINY * ee * ee else 0.0
         ps, qs = pp + (1.0 - good), qq + (1.0 - good)
-        turned = sine * g[t + 13 * BLOCK] - pq * g[t + 14 * BLOCK]
-        aligned = np.sqrt(ps * qs) + pq * g[t + 13 * BLOCK] + sine * g[t + 14 * BLOCK]
-        half = turned / (max(aligned, abs(turned)) + 1e-300)
+        half = _half_turn(g, t, sine, pq, np.sqrt(ps * qs))
         growth = 1.0 + half * half
         gk, gm = growth * length / ps, growth * length / qs
         per = 1.0 / (ee + (1.0 - good))
-        aj, bj = gk * per * (ax * ex + ay * ey + az * ez), gm * per * (bx * ex + by * ey + bz * ez)
+        aj, bj = gk * per * dot(a, e), gm * per * dot(b, e)
         ai, bi = gk - aj, gm - bj
         wi = g[t + 9 * BLOCK]
         wj = g[t + 10 * BLOCK]
@@ -179,21 +168,35 @@ def _project_block(g, count, stiffness, compliance):
         total += wi * (ai * ai * pp + 2.0 * ai * bi * pq + bi * bi * qq)
         total += wj * (aj * aj * pp + 2.0 * aj * bj * pq + bj * bj * qq)
         change = -good * stiffness * (2.0 * half) / (total + 1e-300)
-        fi = wi * change
-        fj = wj * change
+        _put(g, t, wi * change * ai, p, wi * change * bi, q)
+        _put(g, t + 3 * BLOCK, wj * change * aj, p, wj * change * bj, q)
         fk = wk * change * gk
         fm = wm * change * gm
-        ai, bi = fi * ai, fi * bi
-        aj, bj = fj * aj, fj * bj
-        g[t] = ai * px + bi * qx
-        g[t + BLOCK] = ai * py + bi * qy
-        g[t + 2 * BLOCK] = ai * pz + bi * qz
-        g[t + 3 * BLOCK] = aj * px + bj * qx
-        g[t + 4 * BLOCK] = aj * py + bj * qy
-        g[t + 5 * BLOCK] = aj * pz + bj * qz
-        g[t + 6 * BLOCK] = -fk * px
-        g[t + 7 * BLOCK] = -fk * py
-        g[t + 8 * BLOCK] = -fk * pz
-        g[t + 9 * BLOCK] = -fm * qx
-        g[t + 10 * BLOCK] = -fm * qy
-        g[t + 11 * BLOCK] = -fm * qz
+        g[t + 6 * BLOCK] = -fk * p[0]
+        g[t + 7 * BLOCK] = -fk * p[1]
+        g[t + 8 * BLOCK] = -fk * p[2]
+        g[t + 9 * BLOCK] = -fm * q[0]
+        g[t + 10 * BLOCK] = -fm * q[1]
+        g[t + 11 * BLOCK] = -fm * q[2]
+
+
+@inner(error_model="numpy", inline="always")
+def _half_turn(g, t, sine, pq, aligned):
+    """Tangent, at most 1, of half the angle by which a fold is off its angle at rest."""
+    turned = sine * g[t + 13 * BLOCK] - pq * g[t + 14 * BLOCK]
+    aligned = aligned + pq * g[t + 13 * BLOCK] + sine * g[t + 14 * BLOCK]
+    return turned / (max(aligned, abs(turned)) + 1e-300)
+
+
+@inner(error_model="numpy", inline="always")
+def _taken(g, t):
+    """A vector of column t of a block."""
+    return g[t], g[t + BLOCK], g[t + 2 * BLOCK]
+
+
+@inner(error_model="numpy", inline="always")
+def _put(g, t, a, p, b, q):
+    """Put a p + b q into column t of a block."""
+    g[t] = a * p[0] + b * q[0]
+    g[t + BLOCK] = a * p[1] + b * q[1]
+    g[t + 2 * BLOCK] = a * p[2] + b * q[2]

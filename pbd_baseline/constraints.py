@@ -82,7 +82,7 @@ class VolumeConstraint:
 
     def gradient(self, points: Floats) -> Floats:
         """Gradient (n, 3) of the volume."""
-        out = np.zeros_like(points)
+        out = np.zeros(points.shape)
         _volume_gradient_loop(points, self.faces, out)
         return out
 
@@ -117,6 +117,7 @@ class VolumeConstraint:
         return s
 
 
+@compiled(error_model="numpy")
 def _cubic_step(coefficients, wanted, least):
     """Root of c0 + c1 s + c2 s^2 + c3 s^3 = wanted that continues s = 0, by safeguarded Newton
     steps.

@@ -25,8 +25,8 @@ class ContactConstraint:
     def find(self, contacts: BoneContacts, points: Floats, *, reach: float | None = None) -> float:
         """Ask the contacts where the vertices (n, 3) are now; return the greatest depth."""
         found = contacts.half_spaces(points, self.reach if reach is None else reach)
-        self.index, self.gap = np.ascontiguousarray(found.index), np.ascontiguousarray(found.gap)
-        self.normal, self.anchor = np.ascontiguousarray(found.normal), points[found.index]
+        self.index, self.gap, self.normal, _ = found
+        self.anchor = points[self.index]
         return max(0.0, -float(self.gap.min(initial=0.0)))
 
     def depth(self, points: Floats) -> float:

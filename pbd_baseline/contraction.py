@@ -39,6 +39,7 @@ class MeshFibres:
         self.given = make_contraction(muscle)
         self.at_tendon = self.given.tendon[rest.order]
         self.slack = 1.0 if self.given.slack else slack
+        self._contracts = self.given.stretch_at_rest != 1.0 or bool(self.at_tendon.any())
         edges = rest.topology.edges
         self.edges = edges
         self.tendon = self.at_tendon[edges].all(axis=1)
@@ -76,11 +77,7 @@ class MeshFibres:
     @property
     def passive(self) -> bool:
         """Whether the fibres are those of a muscle that does not contract."""
-        return (
-            self.activation == 0.0
-            and self.given.stretch_at_rest == 1.0
-            and not self.at_tendon.any()
-        )
+        return self.activation == 0.0 and not self._contracts
 
     def targets(self, points: Floats) -> Floats:
         """Wanted vectors of the edges (e, 3) in the rest frame, for the present points (n, 3)."""

@@ -35,6 +35,7 @@ FINISHING_ROUNDS = 4
 DEPTH = 0.05
 # Motion that makes the time of one XPBD step [radian].
 STEP_ANGLE = math.radians(2.0)
+IDENTITY = np.eye(4)
 
 
 class PBDState(NamedTuple):
@@ -101,21 +102,20 @@ class PBDMuscle:
 
     def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
         """Go along with the bones; held vertices arrive exactly."""
-        motions = np.array([_relative(before[bone], after[bone]) for bone in self.rest.bones])
+        bones, rest = self.rest.bones, self.rest
+        old, new = np.array([[poses[bone] for bone in bones] for poses in (before, after)])
+        motions = _relative(old, new)
         self.time = max(1.0, _largest_angle(motions) / STEP_ANGLE)
-        self._move_free(motions)
-        poses = np.array([after[bone] for bone in self.rest.bones])
-        _place_loop(self.rest.vertices, self.rest.attached_bone, poses, self.points)
+        if not (motions == IDENTITY).all():
+            self.points[:] = blended_motion(self.points, rest.weights, motions)
+        _place_loop(rest.vertices, rest.attached_bone, new, self.points)
 
-    def _move_free(self, motions: np.ndarray) -> None:
-        """Predict the free vertices from the motions (b, 4, 4) of the bones."""
-        if not np.array_equal(motions, np.tile(np.eye(4), (len(motions), 1, 1))):
-            self.points[:] = blended_motion(self.points, self.rest.weights, motions)
-
-    def solve(self, contacts: BoneContacts) -> None:
+    def solve(self, contacts: BoneContacts, *, room: bool = False) -> None:
         """Sweep the shape, contacts inside the iteration and last, the volume on what is not in
-        contact.
+        contact; nothing to make ``room``, as every solve moves vertices out of neighbours.
         """
+        if room:
+            return
         for k in range(self.most_sweeps):
             fresh = k % FRESH == 0
             if fresh:
@@ -123,11 +123,11 @@ class PBDMuscle:
             if self.fibres is not None and (fresh or not self.fibres.passive):
                 self.shape.contract(self.fibres, self.points)
             self.swept = k + 1
-            moved = self._sweep(last=self.swept == self.most_sweeps)
+            moved = _sweep(self, last=self.swept == self.most_sweeps)
             if moved < self.still:
                 break
         capped = self.still > 0.0 and not moved < self.still
-        self._finish(contacts)
+        _finish(self, contacts)
         capped = int(capped) + int(self.penetration > self.depth)
         self.log.add(caps=capped, solver_residual=moved / self.size)
 
@@ -135,9 +135,6 @@ class PBDMuscle:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         if self.fibres is not None:
             self.fibres.activate(activation)
-
-    def separate_neighbours(self, contacts: BoneContacts) -> None:
-        """Nothing: `solve` moves vertices out of neighbours all the way."""
 
     def transform(self, motion: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4), as the muscle is."""
@@ -188,33 +185,33 @@ class PBDMuscle:
         }
         return ModelSurface(*self.material_mesh(), quantities, notes)
 
-    def volume(self) -> float:
-        """Enclosed volume now [unit^3]."""
-        return self.rest.volume.volume(self.points)
 
-    def _sweep(self, *, last=False):
-        """One iteration; how far it moved a vertex, asked for where a tolerance ends the sweeps and
-        of the ``last``.
-        """
-        asked = last or self.still > 0.0
-        before = self.points.copy() if asked else self.points
-        self.shape.sweep(self.points, self.time / self.sweeps)
-        self.contact.project(self.points)
-        if self.shape.volume_in_sweeps or self.still > 0.0:
-            self.shape.restore_volume(self.points, self.contact)
-        return farthest_move(before, self.points) if asked else np.inf
+def _sweep(muscle: PBDMuscle, *, last: bool) -> float:
+    """One iteration; how far it moved a vertex, asked for where a tolerance ends the sweeps and of
+    the ``last``.
+    """
+    shape, points = muscle.shape, muscle.points
+    asked = last or muscle.still > 0.0
+    before = points.copy() if asked else points
+    shape.sweep(points, muscle.time / muscle.sweeps)
+    muscle.contact.project(points)
+    if shape.volume_in_sweeps or muscle.still > 0.0:
+        shape.restore_volume(points, muscle.contact)
+    return float(farthest_move(before, points)) if asked else np.inf
 
-    def _finish(self, contacts):
-        """Contact and volume in turn, half-spaces found again, until both hold where the bones are
-        now known to be, or `FINISHING_ROUNDS` are over.
-        """
-        for _ in range(FINISHING_ROUNDS):
-            self.penetration = self.contact.find(contacts, self.points, reach=self.finishing_reach)
-            self.contact.project(self.points)
-            self.shape.restore_volume(self.points, self.contact)
-            if self.penetration <= self.depth:
-                break
-        self.penetration = self.contact.depth(self.points)
+
+def _finish(muscle: PBDMuscle, contacts: BoneContacts) -> None:
+    """Contact and volume in turn, half-spaces found again, until both hold where the bones are now
+    known to be, or `FINISHING_ROUNDS` are over.
+    """
+    contact, points = muscle.contact, muscle.points
+    for _ in range(FINISHING_ROUNDS):
+        depth = contact.find(contacts, points, reach=muscle.finishing_reach)
+        contact.project(points)
+        muscle.shape.restore_volume(points, contact)
+        if depth <= muscle.depth:
+            break
+    muscle.penetration = contact.depth(points)
 
 
 def _bone_numbers(rest, names):
@@ -236,9 +233,10 @@ def _place_loop(rest, attached_bone, poses, points):
 
 
 def _relative(before, after):
-    if np.array_equal(before, after):
-        return np.eye(4)
-    return after @ np.linalg.inv(before)
+    """Motions (b, 4, 4) between poses (b, 4, 4), exactly none of what stands still."""
+    motions = after @ np.linalg.inv(before)
+    motions[(before == after).all(axis=(1, 2))] = IDENTITY
+    return motions
 
 
 def _largest_angle(motions):

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
 from rbfmuscle.metrics.quantities import ALL, Row
@@ -85,7 +85,7 @@ class Recording:
         model: str | dict[str, object] | None = None,
         settings: Mapping[str, object] | None = None,
         frames: slice | str | None = None,
-        bone_sdfs: Mapping[str, BoneField] | None = None,
+        bone_sdfs: Mapping[str, BoneSDF] | None = None,
         fail_on: str | Sequence[str] | None = None,
     ) -> None:
         self.started = datetime.now(UTC)

@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.folders import LIST, read_list
-from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.info import RunInfo
@@ -37,7 +37,7 @@ def simulate(
     settings: Mapping[str, object] | None = None,
     frames: slice | str | None = None,
     progress: Callable[[int, int], None] | bool | None = None,
-    bone_sdfs: Mapping[str, BoneField] | None = None,
+    bone_sdfs: Mapping[str, BoneSDF] | None = None,
 ) -> Run:
     """Run a scene through its motion and keep every frame in memory.
 
@@ -54,7 +54,7 @@ def simulate(
     progress : callable or bool, optional
         Called as ``progress(done, total)`` after each frame; ``True`` shows on stderr what goes on,
         compiling and building included.
-    bone_sdfs : mapping of str to BoneField, optional
+    bone_sdfs : mapping of str to BoneSDF, optional
         Distance fields of the bones, by the bone's name; `BoneSDF` where not given.
 
     Returns

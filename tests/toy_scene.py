@@ -1,9 +1,11 @@
-"""Analytic bones and a small elastic muscle for tests of contact: no distance grids, no real
-model."""
+"""Simple bones and a small elastic muscle for tests of contact: no real model."""
+
+from functools import cache
 
 import numpy as np
 import trimesh
 
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.jit import compiled
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.tables import JointTable
@@ -36,62 +38,21 @@ class Formula:
         return value, gradient
 
 
-class AnalyticBone:
-    """The query interface of a bone's distance field, for a formula in bone coordinates."""
-
-    closed = True
-    memory = 0
-
-    def __init__(self, formula, bounds):
-        self.formula, self.bounds = formula, np.asarray(bounds, dtype=float)
-
-    def distance_and_gradient(self, points, pose=None, reach=np.inf):
-        pose = np.eye(4) if pose is None else pose
-        value, gradient = self.formula((points - pose[:3, 3]) @ pose[:3, :3])
-        return value, gradient @ pose[:3, :3].T
-
-    def distance(self, points, pose=None, reach=np.inf):
-        return self.distance_and_gradient(points, pose)[0]
-
-
-def _round(radius, centre, axes, half):
-    """All within a radius of a centre, by the coordinates of which ``axes`` is 1."""
-    centre = np.asarray(centre, dtype=float)
-
-    def formula(p):
-        d = (p - centre) * axes
-        r = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
-        return r - radius, d / r[:, None]
-
-    return AnalyticBone(formula, [centre - half, centre + half])
-
-
+@cache
 def sphere(radius=1.0, centre=(0, 0, 0)):
-    return _round(radius, centre, np.ones(3), np.full(3, radius))
+    """Field of a ball of 5,120 triangles."""
+    return _field(trimesh.creation.icosphere(4, radius), centre)
 
 
-def cylinder(radius=1.0, half_length=50.0):
-    """Along z, endless inside its box."""
-    return _round(radius, np.zeros(3), np.array([1, 1, 0]), np.array([radius, radius, half_length]))
-
-
+@cache
 def box(half, centre=(0, 0, 0)):
-    """Exact distance of a box with half sizes ``half``: a thin plate where one is small."""
-    half, centre = np.asarray(half, dtype=float), np.asarray(centre, dtype=float)
+    """Field of a box with half sizes ``half``: a thin plate where one is small."""
+    return _field(trimesh.creation.box(2.0 * np.array(half, dtype=float)), centre)
 
-    def formula(p):
-        q = p - centre
-        a = np.abs(q) - half
-        sign = np.where(q < 0, -1.0, 1.0)
-        outer = np.maximum(a, 0)
-        far = np.linalg.norm(outer, axis=1)
-        face = np.eye(3)[np.argmax(a, axis=1)]
-        gradient = (
-            np.where((far > 1e-12)[:, None], outer / np.maximum(far, 1e-12)[:, None], face) * sign
-        )
-        return far + np.minimum(a.max(axis=1), 0), gradient
 
-    return AnalyticBone(formula, [centre - half, centre + half])
+def _field(mesh, centre):
+    mesh.apply_translation(np.asarray(centre, dtype=float))
+    return BoneSDF.from_mesh(mesh, cache=False)
 
 
 @compiled
@@ -166,7 +127,9 @@ class ToyMuscle(MuscleModel):
         self.x = self.x + target - self._blend(before)
         self.target = target
 
-    def solve(self, contacts):
+    def solve(self, contacts, *, room=False):
+        if room:
+            return
         self.solves += 1
         for _ in range(self.sweeps):
             near = contacts.half_spaces(self.x, self.reach)

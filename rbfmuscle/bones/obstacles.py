@@ -18,7 +18,7 @@ from rbfmuscle.bones.broad_phase import (
 )
 from rbfmuscle.bones.query import FieldData, query_loop
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.jit import compiled
+from rbfmuscle.jit import compiled, inner
 
 
 class Bones(NamedTuple):
@@ -160,44 +160,95 @@ def query_bone(bones, b, pose, points, reach, distance, gradient):
         direction_loop(points, gradient, pose, bones.boxes[b])
 
 
+@inner(error_model="numpy")
+def _ask_near(obstacles, b, points, reach):
+    """Numbers (m,) of the free points (n, 3) that may be nearer to bone b than their ``reach``
+    (n,), their distances (m,) and directions (m, 3).
+    """
+    pose = obstacles.poses[b]
+    anchor = obstacles.known.anchor[b]
+    bound = obstacles.known.bound[b]
+    some = np.empty(len(points), np.int64)
+    count = 0
+    for i in range(len(points)):
+        some[count] = i
+        count += obstacles.free[i] & may_reach(
+            points, i, pose, obstacles.bones.boxes[b], anchor, bound, reach[i]
+        )
+    near = some[:count]
+    distance, way = np.empty(count), np.empty((count, 3))
+    query_bone(obstacles.bones, b, pose, points[near], reach[near], distance, way)
+    for k in range(count):
+        note_query(points, near[k], pose, distance[k], anchor, bound)
+    return near, distance, way
+
+
 @compiled(error_model="numpy")
 def find_contacts(obstacles, points, reach):
-    """Pairs of free point (n, 3) and bone nearer than ``reach`` (n,), bone by bone.
+    """Pairs of free point (n, 3) and bone nearer than ``reach``, bone by bone.
 
-    Numbers (c,) of the points, of the bones in reach, gaps (c,) [scene unit] and unit normals (c,
-    3).
+    Numbers (c,) of the points, gaps (c,) [scene unit], unit normals (c, 3) and numbers (c,) of the
+    bones in reach.
     """
-    bones = obstacles.bones
-    free = obstacles.free
-    known = obstacles.known
-    box, farthest = np.empty((2, 3)), -np.inf
-    box_loop(points, free, box)
-    for i in range(len(points)):
-        farthest = max(farthest, reach[i] if free[i] else -np.inf)
-    some = np.empty(len(points), np.int64)
+    box, limit = np.empty((2, 3)), np.full(len(points), reach)
+    box_loop(points, obstacles.free, box)
     index, source = np.empty(0, np.int64), np.empty(0, np.int64)
     gap, normal = np.empty(0), np.empty((0, 3))
     for b in range(len(obstacles.poses)):
-        pose, bounds = obstacles.poses[b], bones.boxes[b]
-        anchor, bound = known.anchor[b], known.bound[b]
-        if boxes_apart(box, pose, bounds) > farthest:
+        if boxes_apart(box, obstacles.poses[b], obstacles.bones.boxes[b]) > reach:
             continue
-        asked, count = 0, 0
-        for i in range(len(points)):
-            some[asked] = i
-            asked += free[i] & may_reach(points, i, pose, bounds, anchor, bound, reach[i])
-        near = some[:asked].copy()
-        distance, way = np.empty(asked), np.empty((asked, 3))
-        query_bone(bones, b, pose, points[near], reach[near], distance, way)
-        for k in range(asked):
+        near, distance, way = _ask_near(obstacles, b, points, limit)
+        count = 0
+        for k in range(len(near)):
             i = near[k]
-            note_query(points, i, pose, distance[k], anchor, bound)
             near[count] = i
             distance[count] = distance[k] + obstacles.allowed[b, i]
             way[count] = way[k]
-            count += distance[count] < reach[i]
+            count += distance[count] < reach
         index = np.concatenate((index, near[:count]))
         source = np.concatenate((source, np.full(count, b)))
         gap = np.concatenate((gap, distance[:count]))
         normal = np.concatenate((normal, way[:count]))
-    return index, source, gap, normal
+    return index, gap, normal, source
+
+
+@compiled(error_model="numpy")
+def greatest_depth(obstacles, points):
+    """Greatest depth of a free point (n, 3) in a bone [scene unit], 0 where all are outside."""
+    depth = 0.0
+    box, nowhere = np.empty((2, 3)), np.zeros(len(points))
+    box_loop(points, obstacles.free, box)
+    for b in range(len(obstacles.poses)):
+        if boxes_apart(box, obstacles.poses[b], obstacles.bones.boxes[b]) == 0.0:
+            distance = _ask_near(obstacles, b, points, nowhere)[1]
+            for k in range(len(distance)):
+                depth = max(depth, -distance[k])
+    return depth
+
+
+@compiled(error_model="numpy")
+def find_nearest(bones, poses, points, limit, gradient):
+    """Smallest distance (n,) of points (n, 3) from bones in poses (b, 4, 4), and its gradient (n,
+    3), or none where ``gradient`` is (0, 3); lower bounds without a gradient beyond the ``limit``
+    (n,).
+    """
+    count = len(points)
+    smallest = np.full(count, np.inf)
+    box, farthest = np.empty((2, 3)), 0.0
+    box_loop(points, np.ones(count, np.bool_), box)
+    for i in range(count):
+        farthest = max(farthest, limit[i])
+    distance, way = np.empty(count), np.empty((len(gradient), 3))
+    for b in range(len(poses)):
+        apart = boxes_apart(box, poses[b], bones.boxes[b])
+        if apart > farthest:
+            smallest = np.minimum(smallest, apart)
+            continue
+        # No farther than what was found: elsewhere a lower bound will do.
+        query_bone(bones, b, poses[b], points, np.minimum(smallest, limit), distance, way)
+        for i in range(count):
+            if distance[i] < smallest[i]:
+                smallest[i] = distance[i]
+                if len(gradient) > 0:
+                    gradient[i] = way[i]
+    return smallest

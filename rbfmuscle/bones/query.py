@@ -20,7 +20,7 @@ from rbfmuscle.bones.cells import (
     _placed,
 )
 from rbfmuscle.geometry.triangles import CORNER, EDGE, FACE, nearest_in_frame
-from rbfmuscle.jit import compiled
+from rbfmuscle.jit import compiled, inner
 
 # What a cell says of its side.
 CROSSED = 0
@@ -253,32 +253,20 @@ def _stage(points, pose, reach, data, found, square):
     reach) and the squared distance (the lower bound where out of reach).
     """
     grid = data.grid
-    blocks = data.blocks
-    cells = data.cells
     lists = data.lists
     far = data.far
     records = data.records
     local = found.local
     entry = found.entry
     best = found.best
-    scale, unit = grid[INVERSE], grid[UNIT]
+    unit = grid[UNIT]
     if len(points) >= LEAST_TOGETHER:
-        bound = _common_bound(points, pose, grid, blocks, cells, lists)
+        bound = _common_bound(points, pose, grid, data.blocks, data.cells, lists)
         if bound > reach.max():
             best[:] = -1
             square[:] = bound
             return
-    for n in range(len(points)):
-        x, y, z = _placed(points[n], pose, grid)
-        local[n, 0] = x
-        local[n, 1] = y
-        local[n, 2] = z
-        entry[n], cell, far_point = _block_entry(x, y, z, scale, blocks)
-        best[n] = cell | (CELL_FAR if far_point else 0)
-        square[n] = _beyond(x, y, z, scale, blocks) if far_point else 0.0
-    for n in range(len(points)):
-        if entry[n] < 0:
-            entry[n] = cells[-1 - entry[n], best[n] & (CELL_FAR - 1)]
+    _find_cells(points, pose, data, found, square)
     for n in range(len(points)):
         bound = (lists[entry[n]] >> BOUND) * unit
         if square[n] > 0.0:
@@ -298,6 +286,25 @@ def _stage(points, pose, reach, data, found, square):
             y = local[n, 1]
             z = local[n, 2]
             best[n], square[n] = _nearest_listed(x, y, z, entry[n], far_point, lists, far, records)
+
+
+@inner(error_model="numpy")
+def _find_cells(points, pose, data, found, square):
+    """Fill places relative to the origin, the entries of their cells, and squared distances from
+    the grid; ``found.best`` gets the flag `CELL_FAR` of what is far.
+    """
+    scale = data.grid[INVERSE]
+    for n in range(len(points)):
+        x, y, z = _placed(points[n], pose, data.grid)
+        found.local[n, 0] = x
+        found.local[n, 1] = y
+        found.local[n, 2] = z
+        found.entry[n], cell, far_point = _block_entry(x, y, z, scale, data.blocks)
+        found.best[n] = cell | (CELL_FAR if far_point else 0)
+        square[n] = _beyond(x, y, z, scale, data.blocks) if far_point else 0.0
+    for n in range(len(points)):
+        if found.entry[n] < 0:
+            found.entry[n] = data.cells[-1 - found.entry[n], found.best[n] & (CELL_FAR - 1)]
 
 
 @compiled(error_model="numpy")

@@ -34,25 +34,3 @@ class ClipDistance(Protocol):
         """Values (n,) and gradients (n, 3), only lower bounds where a value is beyond its limit
         (n,).
         """
-
-
-class BoneField(Protocol):
-    """What tells how far points are from a bone, in bone coordinates or, with a pose (4, 4), in the
-    world.
-    """
-
-    bounds: np.ndarray  # (2, 3) box of the bone, at rest
-
-    def distance(
-        self,
-        points: np.ndarray,
-        pose: np.ndarray | None = None,
-        *,
-        reach: np.ndarray | float = np.inf,
-    ) -> np.ndarray:
-        """Signed distances (n,), negative inside; a lower bound where they are beyond ``reach``."""
-
-    def distance_and_gradient(
-        self, points: np.ndarray, pose: np.ndarray | None = None, reach: np.ndarray | float = np.inf
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The same with gradients (n, 3) in the axes of the points."""

@@ -19,7 +19,7 @@ from rbfmuscle.geometry.exact_distance import (
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import FACE
 from rbfmuscle.geometry.winding import inside_test
-from rbfmuscle.jit import compiled
+from rbfmuscle.jit import compiled, inner
 
 # Cells along the longer side, at most; below that the square root of the number of triangles.
 _MOST_CELLS = 512
@@ -152,51 +152,47 @@ def _inside_loop(points, pose, vertices, faces, grid, out):
 @compiled(error_model="numpy")
 def _above(at, vertices, faces, f, axes):
     """1 where a triangle lies above a point and looks up, -1 where it looks down, else 0."""
-    u = axes[0]
-    v = axes[1]
-    w = axes[2]
+    u, v, w = axes
     x = at[u]
     y = at[v]
     z = at[w]
     if max(vertices[faces[f, 0], w], vertices[faces[f, 1], w], vertices[faces[f, 2], w]) <= z:
         return 0
     found = 0
-    west = 0.0
-    west_height = 0.0
-    west_falls = False
-    east = 0.0
-    east_height = 0.0
-    east_falls = False
+    west = 0.0, 0.0, False
+    east = west
     for k in range(3):
         a, b = faces[f, k], faces[f, (k + 1) % 3]
         if (vertices[a, v] <= y) == (vertices[b, v] <= y):
             continue
-        # Computed alike for both triangles of the edge, so that both find the same place.
-        p, q = min(a, b), max(a, b)
-        t = (y - vertices[p, v]) / (vertices[q, v] - vertices[p, v])
-        place = vertices[p, u] + t * (vertices[q, u] - vertices[p, u])
-        height = vertices[p, w] + t * (vertices[q, w] - vertices[p, w])
-        falls = vertices[a, v] > vertices[b, v]
         if found == 0:
-            west = place
-            west_height = height
-            west_falls = falls
+            west = _met(vertices, a, b, y, axes)
         else:
-            east = place
-            east_height = height
-            east_falls = falls
+            east = _met(vertices, a, b, y, axes)
         found += 1
     if found < 2:
         return 0
-    if east < west:
+    if east[0] < west[0]:
         west, east = east, west
-        west_height, east_height = east_height, west_height
-        west_falls = east_falls
-    if not (west <= x < east):
+    if not (west[0] <= x < east[0]):
         return 0
-    if west_height + (x - west) / (east - west) * (east_height - west_height) <= z:
+    if west[1] + (x - west[0]) / (east[0] - west[0]) * (east[1] - west[1]) <= z:
         return 0
-    return 1 if west_falls else -1
+    return 1 if west[2] else -1
+
+
+@inner(error_model="numpy", inline="always")
+def _met(vertices, a, b, y, axes):
+    """Where the edge from a to b meets a line along the first axis: the place on it, the height,
+    and whether the edge falls, all in the order of ``axes``.
+    """
+    u, v, w = axes
+    # Computed alike for both triangles of the edge, so that both find the same place.
+    p, q = min(a, b), max(a, b)
+    t = (y - vertices[p, v]) / (vertices[q, v] - vertices[p, v])
+    place = vertices[p, u] + t * (vertices[q, u] - vertices[p, u])
+    height = vertices[p, w] + t * (vertices[q, w] - vertices[p, w])
+    return place, height, vertices[a, v] > vertices[b, v]
 
 
 def _as_points(points: ArrayLike) -> Floats:

@@ -70,6 +70,12 @@ def dot(u, v):
 
 
 @compiled(error_model="numpy", inline="always")
+def cross(u, v):
+    """Vector product of two vectors of three numbers."""
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@compiled(error_model="numpy", inline="always")
 def turn_towards(m, q):
     """The unit quaternion q a step nearer to the rotational part of a matrix m, given as rows.
 

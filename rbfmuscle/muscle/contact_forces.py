@@ -194,6 +194,71 @@ def _find_residual(touch, rhs, near, push, residual):
         residual[c] = value
 
 
+class _Contacts(NamedTuple):
+    """What is asked of c contacts."""
+
+    rhs: np.ndarray  # (c,) motion that each needs
+    force: np.ndarray  # (c,) first guess
+    residual: np.ndarray  # (c,) motion that is still needed
+    is_chosen: np.ndarray  # (c,) whether it is in the working set
+
+
+class _WorkingSet(NamedTuple):
+    """Contacts whose forces are solved for together, the first of these arrays' rows."""
+
+    chosen: np.ndarray  # (w,) which contact
+    numbers: np.ndarray  # (w,) of its point among the answers
+    normal: np.ndarray  # (w, 3)
+    wants: np.ndarray  # (w,) motion that it needs
+    strength: np.ndarray  # (w,) force
+    most: np.ndarray  # (w,) greatest force
+    rows: np.ndarray  # (w, M) ρ
+    delassus: np.ndarray  # (w, w) G, on the diagonal what it yields more
+    own: np.ndarray  # (w,) diagonal of G
+
+
+@inner(error_model="numpy")
+def _find_contacts(touch, motion, forces):
+    """What is asked of the contacts when the near points move by ``motion`` (m, 3)."""
+    count = len(touch.point)
+    found = _Contacts(np.empty(count), np.empty(count), np.empty(count), np.empty(count, np.bool_))
+    for c in range(count):
+        i = touch.point[c]
+        found.rhs[c] = -touch.gap[c]
+        for a in range(3):
+            found.rhs[c] -= touch.normal[c, a] * motion[i, a]
+        found.residual[c] = found.rhs[c]
+        found.force[c] = forces[i, touch.source[c]]
+        found.is_chosen[c] = found.force[c] > 0.0
+    return found
+
+
+@inner(error_model="numpy")
+def _no_set(room, regions):
+    """Room for a working set."""
+    return _WorkingSet(
+        np.empty(room, np.int64),
+        np.empty(room, np.int64),
+        np.empty((room, 3)),
+        np.empty(room),
+        np.empty(room),
+        np.empty(room),
+        np.empty((room, regions)),
+        np.empty((room, room)),
+        np.empty(room),
+    )
+
+
+@inner(error_model="numpy")
+def _yield(work, total, law):
+    """Put what contacts yield on the diagonal."""
+    least = 0.0
+    for k in range(total):
+        least = max(least, 1e-7 * abs(work.own[k]))
+    for k in range(total):
+        work.delassus[k, k] = work.own[k] + least + law.yielding[work.chosen[k]]
+
+
 @compiled(error_model="numpy")
 def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
     """What contact forces do when the near points move by ``motion`` (m, 3); fills ``forces`` (m,
@@ -202,65 +267,43 @@ def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
     The working set starts from the contacts that pushed before and takes in the deepest violations
     until none is left; forces solve the complementarity problem on it.
     """
-    count = len(touch.point)
-    rhs = np.empty(count)
-    force = np.empty(count)
-    residual = np.empty(count)
-    is_chosen, total = np.zeros(count, np.bool_), 0
-    for c in range(count):
-        i = touch.point[c]
-        rhs[c] = -touch.gap[c]
-        for a in range(3):
-            rhs[c] -= touch.normal[c, a] * motion[i, a]
-        residual[c] = rhs[c]
-        force[c] = forces[i, touch.source[c]]
-        is_chosen[c] = force[c] > 0.0
-        total += is_chosen[c]
+    asked = _find_contacts(touch, motion, forces)
     forces[:] = 0.0
     push, taken = np.zeros((len(metric.inverse), 3)), np.zeros(len(metric.factor))
-    room = min(count, total + ROUNDS * BATCH)
+    first = np.flatnonzero(asked.is_chosen)
+    total = len(first)
+    work = _no_set(min(len(touch.point), total + ROUNDS * BATCH), len(taken))
+    work.chosen[:total] = first
     done = 0
     capped = False
-    # The working set: its contacts, their numbers among the answers, and rows of the problem.
-    chosen, numbers = np.empty(room, np.int64), np.empty(room, np.int64)
-    chosen[:total] = np.flatnonzero(is_chosen)
-    normal = np.empty((room, 3))
-    wants = np.empty(room)
-    strength = np.empty(room)
-    rows = np.empty((room, len(taken)))
-    delassus = np.empty((room, room))
-    own = np.empty(room)
-    most = np.empty(room)
     for turn in range(ROUNDS):
-        added = deepest(residual, is_chosen, tolerance, BATCH)
+        added = deepest(asked.residual, asked.is_chosen, tolerance, BATCH)
         for c in added:
-            is_chosen[c] = True
-            chosen[total] = c
+            asked.is_chosen[c] = True
+            work.chosen[total] = c
             total += 1
         if total == 0:
             break
         for k in range(done, total):
-            c = chosen[k]
-            numbers[k] = _answer(touch.point[c], near, metric, answers)
-            normal[k] = touch.normal[c]
-            wants[k] = rhs[c]
-            strength[k] = force[c]
-            most[k] = law.most[c]
-        some, ways = numbers[:total], normal[:total]
-        _schur(done, some, ways, answers, rows, delassus, own)
-        done, least = total, 0.0
-        for k in range(done):
-            least = max(least, 1e-7 * abs(own[k]))
-        for k in range(done):
-            delassus[k, k] = own[k] + least + law.yielding[chosen[k]]
-        found = strength[:total]
-        settled = solve_forces(delassus, wants[:total], found, SWEEPS, 0.1 * tolerance, most)
-        _push_nodes(ways, found, some, rows, answers, metric, push, taken)
+            c = work.chosen[k]
+            work.numbers[k] = _answer(touch.point[c], near, metric, answers)
+            work.normal[k] = touch.normal[c]
+            work.wants[k] = asked.rhs[c]
+            work.strength[k] = asked.force[c]
+            work.most[k] = law.most[c]
+        some, ways, found = work.numbers[:total], work.normal[:total], work.strength[:total]
+        _schur(done, some, ways, answers, work.rows, work.delassus, work.own)
+        done = total
+        _yield(work, total, law)
+        wants = work.wants[:total]
+        settled = solve_forces(work.delassus, wants, found, SWEEPS, 0.1 * tolerance, work.most)
+        _push_nodes(ways, found, some, work.rows, answers, metric, push, taken)
         capped = not settled
         if len(added) == 0:
             break
-        _find_residual(touch, rhs, near, push, residual)
-        capped |= turn == ROUNDS - 1 and residual.max() > tolerance
+        _find_residual(touch, asked.rhs, near, push, asked.residual)
+        capped |= turn == ROUNDS - 1 and asked.residual.max() > tolerance
     for k in range(total):
-        forces[touch.point[chosen[k]], touch.source[chosen[k]]] = strength[k]
+        c = work.chosen[k]
+        forces[touch.point[c], touch.source[c]] = work.strength[k]
     return Push(push, taken, capped)

@@ -4,7 +4,6 @@ level set.
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,6 +18,7 @@ from rbfmuscle.muscle.display_mesh import display_mesh, neighbour_lists
 from rbfmuscle.muscle.model import Embedding
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import RestState
+from rbfmuscle.muscle.state import SolidState
 from rbfmuscle.muscle.surface import (
     FITTED,
     NO_VOLUME,
@@ -39,15 +39,6 @@ MARCHING_CELLS = 48
 # A tenth of the edges this much longer than at rest is the cause of what cannot be fitted.
 STRETCHED = 1.6
 NO_EXCESS = np.zeros(0)
-
-
-class Placement(NamedTuple):
-    """Where a muscle's points are now."""
-
-    centres: np.ndarray  # (K, 3)
-    normals: np.ndarray  # (K, 3)
-    points: np.ndarray  # (K + S, 3), contact points
-    nodes: np.ndarray  # (N, 3) of the solid
 
 
 class MuscleFit:
@@ -137,7 +128,7 @@ class SurfaceBuilder:
             np.zeros((0, 0)),
             np.zeros((0, 0, 3)),
         )
-        self._met: tuple[list[int], Obstacles] | None = None
+        self._met: tuple[BoneContacts, Obstacles] | None = None
         self._take(vertices)
 
     def _take(self, vertices: Floats) -> None:
@@ -174,42 +165,42 @@ class SurfaceBuilder:
         there = obstacles._replace(poses=still)
         self._take(clear_rest(self.model, self.state, there, vertices, held))
 
-    def snapshot(self) -> SurfaceState:
-        """What the next search starts from."""
-        return self.state._replace(level=self.state.level.copy(), height=self.state.height.copy())
-
     def restore(self, state: SurfaceState) -> None:
-        """Go back to a snapshot; what is known of the bones stays known."""
-        self.state.level[:] = state.level
-        self.state.height[:] = state.height
+        """Go back to an earlier ``state``; what is known of the bones stays known."""
+        self.state = self.state._replace(level=state.level, height=state.height)
 
-    def draw(self, now: Placement, contacts: BoneContacts) -> ModelSurface:
-        """The closed surface at the rest volume, cut by the contacts.
+    def draw(self, solid: SolidState, normals: Floats, contacts: BoneContacts) -> ModelSurface:
+        """The closed surface at the rest volume, cut by the contacts, with unit normals (K, 3) at
+        the centres.
 
         Raises SolveError where there is none.
         """
         started = time.perf_counter()
+        centres = solid.points[: len(normals)]
+        # Loops change these in place: the state before, which may be a snapshot, stays as it is.
+        level, height, *known = self.state
+        self.state = SurfaceState(level.copy(), height.copy(), *known)
         if self.marching:
-            surface = self._march(now, contacts)
+            surface = self._march(solid.points, centres, normals, contacts)
         else:
-            surface = self._of_material(now, contacts)
+            surface = self._of_material(solid.lifted_nodes, centres, normals, contacts)
         spent = time.perf_counter() - started - surface.quantities["time_fit"]
         surface.quantities["time_extract"] = spent
-        depths = contacts.depths(now.points).values()
-        deepest = max((float(depth.max()) for depth in depths), default=0.0)
-        surface.quantities["solver_penetration_max"] = deepest
+        surface.quantities["solver_penetration_max"] = contacts.depth(solid.points)
         return surface
 
-    def _of_material(self, now: Placement, contacts: BoneContacts) -> ModelSurface:
+    def _of_material(
+        self, nodes: Floats, centres: Floats, normals: Floats, contacts: BoneContacts
+    ) -> ModelSurface:
         """The shown mesh on the level set, or where the material is."""
-        started, fit = time.perf_counter(), self.fit
+        started, fit, time_fit = time.perf_counter(), self.fit, 0.0
         if fit is not None:
-            fit.move(now.centres, now.normals)
-        time_fit = time.perf_counter() - started
+            fit.move(centres, normals)
+            time_fit = time.perf_counter() - started
         obstacles = self._obstacles(contacts)
         fitted = fit is not None and fit.sound and not fit.flat
         given = (fit.terms, fit.form) if fit is not None else (_no_terms(0), None)
-        work, outcome = start_surface(self.model, self.state, obstacles, now.nodes, given, fitted)
+        work, outcome = start_surface(self.model, self.state, obstacles, nodes, given, fitted)
         excess = contacts.excess(work.vertices) if contacts.beside else NO_EXCESS
         _, outcome = finish_surface(self.model, self.state, obstacles, work, outcome, excess)
         if outcome == NO_VOLUME or not np.isfinite(work.vertices).all():
@@ -221,76 +212,78 @@ class SurfaceBuilder:
         quantities = {"time_fit": time_fit}
         notes = []
         if fit is not None:
-            left = 1.0 if outcome != FITTED else float(work.left.mean())
-            quantities |= {"condition": fit.condition, "unfitted_fraction": left}
+            count = len(work.left)
+            left = float(work.left.sum()) / count if outcome == FITTED else 1.0
+            quantities["condition"] = fit.condition
+            quantities["unfitted_fraction"] = left
             if left == 1.0:
-                bone, cause = self._cause(now, work.carried, contacts)
-                notes.append((bone, len(work.left), f"carried_{cause}"))
+                bone, cause = self._cause(centres, work.carried, contacts)
+                notes.append((bone, count, f"carried_{cause}"))
         arrays = {} if fit is None else {"level_offset": self.model.offset}
         return ModelSurface(work.vertices, self.model.faces, quantities, notes, arrays=arrays)
 
     def _obstacles(self, contacts: BoneContacts) -> Obstacles:
-        """The bones in reach, and their poses now."""
-        if self._met is None or self._met[0] != contacts.reached:
-            grids = [self._grids[contacts.names[b]] for b in contacts.reached]
-            met = Obstacles(contacts.bones, contacts.placed, stack_grids(grids))
-            self._met = list(contacts.reached), met
-            count = len(self.mesh[0])
-            self.state = self.state._replace(
-                places=np.zeros((len(grids), count, 3)),
-                bounds=np.full((len(grids), count), -np.inf),
-                outward=np.zeros((len(grids), count, 3)),
-            )
-            self._clear_rest(met)
-        return self._met[1]._replace(poses=contacts.placed)
+        """The bones in reach, whose poses change with the contacts."""
+        if self._met is None or self._met[0] is not contacts:
+            bones = contacts.bones
+            known = self._met is not None and self._met[0].bones.names == bones.names
+            grids = [self._grids[name] for name in bones.names]
+            met = Obstacles(bones.arrays, contacts.placed, stack_grids(grids))
+            self._met = contacts, met
+            if not known:
+                shape = len(grids), len(self.mesh[0])
+                self.state = self.state._replace(
+                    places=np.zeros((*shape, 3)),
+                    bounds=np.full(shape, -np.inf),
+                    outward=np.zeros((*shape, 3)),
+                )
+                self._clear_rest(met)
+        return self._met[1]
 
-    def _march(self, now: Placement, contacts: BoneContacts) -> ModelSurface:
+    def _march(
+        self, points: Floats, centres: Floats, normals: Floats, contacts: BoneContacts
+    ) -> ModelSurface:
         started = time.perf_counter()
-        axes, resolution = self._axes(contacts), self.options.resolution or MARCHING_CELLS
+        # Axes that turn with the scene: what is sorted by them then falls out alike.
+        axes = self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
+        resolution = self.options.resolution or MARCHING_CELLS
         # Farther than a cell from the bones a lower bound will do: no vertex gets there.
-        reach = 1.25 * float(np.ptp(now.points @ axes.T, axis=0).max()) / resolution
+        reach = 1.25 * float(np.ptp(points @ axes.T, axis=0).max()) / resolution
+        names = contacts.bones.names
         try:
-            field = self.rest.field(now.centres, now.normals)
+            field = self.rest.field(centres, normals)
             time_fit = time.perf_counter() - started
             result = extract_surface(
                 field,
-                points=now.points,
+                points=points,
                 resolution=resolution,
-                clip_distance=_BoneCut(contacts, reach) if contacts.names else None,
+                clip_distance=_BoneCut(contacts, reach) if names else None,
                 volume=self.rest.mesh_volume,
                 level=float(self.state.level[0]),
                 axes=axes,
-                obstacles=[
-                    (self._grids[contacts.names[b]], contacts.poses[contacts.names[b]])
-                    for b in contacts.reached
-                ],
+                obstacles=[(self._grids[name], contacts.poses[name]) for name in names],
             )
         except (ValueError, np.linalg.LinAlgError) as error:
             raise SolveError(
                 f"{self.name}: no closed surface by marching cubes with kernel "
-                f"{self.options.kernel!r} and {len(now.centres)} centres: {error}; surface = "
+                f"{self.options.kernel!r} and {len(centres)} centres: {error}; surface = "
                 "'material' shows one"
             ) from error
         self.state.level[0] = result.level
         quantities = {"time_fit": time_fit, "condition": field.condition}
         return ModelSurface(result.vertices, result.faces, quantities, [])
 
-    def _axes(self, contacts: BoneContacts) -> np.ndarray:
-        """Axes that turn with the scene: what is sorted by them then falls out alike."""
-        return self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
-
-    def _cause(self, now: Placement, carried: Floats, contacts: BoneContacts) -> tuple[str, str]:
+    def _cause(self, centres: Floats, carried: Floats, contacts: BoneContacts) -> tuple[str, str]:
         """Bone and cause of a surface that cannot be fitted: a held end in a bone, stretch, or
         sheets that met.
         """
         lengths, found = _lengths(carried, self.mesh[1]), ""
         depth = float(lengths.mean())
-        attached_bone = self.rest.attached_bone[: len(now.centres)]
-        for b in contacts.reached:
-            name = contacts.names[b]
+        attached_bone = self.rest.attached_bone[: len(centres)]
+        for b, name in enumerate(contacts.bones.names):
             own = self.rest.bones.index(name) if name in self.rest.bones else -1
             held: Booleans = (attached_bone >= 0) & (attached_bone != own)
-            deepest = -contacts.distance_and_direction(now.centres[held], b)[0].min(initial=0.0)
+            deepest = -contacts.distance_and_direction(centres[held], b)[0].min(initial=0.0)
             if deepest > depth:
                 depth, found = deepest, name
         if found:
@@ -314,7 +307,7 @@ class _BoneCut:
         self.contacts, self.reach = contacts, reach
 
     def __call__(self, points: Floats) -> Floats:
-        return self.contacts.distance(points, self.reach)
+        return self.contacts.bones.distance(points, self.contacts.poses, self.reach)
 
     def value_and_gradient_below(self, points: Floats, limit: Floats) -> tuple[Floats, Floats]:
-        return self.contacts.nearest(points, limit)
+        return self.contacts.bones.nearest(points, self.contacts.poses, limit)

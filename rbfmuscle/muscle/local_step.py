@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.rotations import dot, quaternion_matrix, turn_towards
+from rbfmuscle.geometry.rotations import cross, dot, quaternion_matrix, turn_towards
 from rbfmuscle.implicit.placement.lattice import GROUPS as POINTS
 from rbfmuscle.jit import compiled, inner
 from rbfmuscle.muscle.inversion import LEAST, unfold
@@ -155,7 +155,7 @@ def volumes(cells, y):
         deform(y, cells.nodes[c], cells.slopes[c], work)
         for p in range(POINTS):
             f = _matrix(work, GRADIENT, p)
-            out[cells.region[c]] += cells.weights[c * POINTS + p] * dot(f[0], _cross(f[1], f[2]))
+            out[cells.region[c]] += cells.weights[c * POINTS + p] * dot(f[0], cross(f[1], f[2]))
     return out
 
 
@@ -174,29 +174,13 @@ def _stress_points(work, tension):
         t = work[STRETCH * POINTS + p]
         u = 1.0 / np.sqrt(t)
         fd = _plus(f, u, fa, t - u, a)
-        q = (
-            work[ROTATION * POINTS + p],
-            work[(ROTATION + 1) * POINTS + p],
-            work[(ROTATION + 2) * POINTS + p],
-            work[(ROTATION + 3) * POINTS + p],
-        )
-        q = turn_towards(fd, turn_towards(fd, q))
-        work[ROTATION * POINTS + p] = q[0]
-        work[(ROTATION + 1) * POINTS + p] = q[1]
-        work[(ROTATION + 2) * POINTS + p] = q[2]
-        work[(ROTATION + 3) * POINTS + p] = q[3]
-        r = quaternion_matrix(q)
+        r = quaternion_matrix(_turned(work, fd, p))
         ra = _times(r, a)
         # S = RᵀF: s is its part along the fibre, across the sum of those across.
         s = dot(ra, fa)
         across = dot(r[0], f[0]) + dot(r[1], f[1]) + dot(r[2], f[2]) - s
         lower = work[LOWER * POINTS + p]
-        for _ in range(STEPS):
-            v = 1.0 / t
-            root = np.sqrt(v)
-            slope = t - v * v - s + 0.5 * across * v * root + tension
-            bend = 1.0 + 2.0 * v * v * v - 0.75 * across * v * v * root
-            t = min(max(t - slope / max(bend, 0.5), lower), 1.0)
+        t = _fibre_stretch(t, s, across, tension, lower)
         work[STRETCH * POINTS + p] = t
         u = 1.0 / np.sqrt(t)
         length = np.sqrt(dot(fa, fa) + 1e-12)
@@ -209,11 +193,40 @@ def _stress_points(work, tension):
             (t - u) * ra[2] + pull * fa[2],
         )
         _put(work, STRESS, p, _plus(r, w * u, along, w, a))
-        first = _cross(f[1], f[2])
+        first = cross(f[1], f[2])
         work[DETERMINANT * POINTS + p] = dot(f[0], first)
         _put_vector(work, COFACTOR, p, _scaled(first, w))
-        _put_vector(work, COFACTOR + 3, p, _scaled(_cross(f[2], f[0]), w))
-        _put_vector(work, COFACTOR + 6, p, _scaled(_cross(f[0], f[1]), w))
+        _put_vector(work, COFACTOR + 3, p, _scaled(cross(f[2], f[0]), w))
+        _put_vector(work, COFACTOR + 6, p, _scaled(cross(f[0], f[1]), w))
+
+
+@inner(inline="always")
+def _turned(work, fd, p):
+    """The rotation (4,) at a point, two steps nearer to that of a matrix."""
+    q = (
+        work[ROTATION * POINTS + p],
+        work[(ROTATION + 1) * POINTS + p],
+        work[(ROTATION + 2) * POINTS + p],
+        work[(ROTATION + 3) * POINTS + p],
+    )
+    q = turn_towards(fd, turn_towards(fd, q))
+    work[ROTATION * POINTS + p] = q[0]
+    work[(ROTATION + 1) * POINTS + p] = q[1]
+    work[(ROTATION + 2) * POINTS + p] = q[2]
+    work[(ROTATION + 3) * POINTS + p] = q[3]
+    return q
+
+
+@inner(inline="always")
+def _fibre_stretch(t, s, across, tension, lower):
+    """The stretch t of slack fibres, some of Newton's steps nearer to that of least energy."""
+    for _ in range(STEPS):
+        v = 1.0 / t
+        root = np.sqrt(v)
+        slope = t - v * v - s + 0.5 * across * v * root + tension
+        bend = 1.0 + 2.0 * v * v * v - 0.75 * across * v * v * root
+        t = min(max(t - slope / max(bend, 0.5), lower), 1.0)
+    return t
 
 
 @inner(inline="always")
@@ -243,11 +256,6 @@ def _put_vector(work, row, p, vector):
 @inner(inline="always")
 def _times(m, v):
     return dot(m[0], v), dot(m[1], v), dot(m[2], v)
-
-
-@inner(inline="always")
-def _cross(u, v):
-    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
 @inner(inline="always")

@@ -11,7 +11,7 @@ from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.muscle.activation import contracting_fibres
-from rbfmuscle.muscle.drawing import Placement, SurfaceBuilder
+from rbfmuscle.muscle.drawing import SurfaceBuilder
 from rbfmuscle.muscle.fibres import along_fibres, held_at_insertion
 from rbfmuscle.muscle.model import (
     SolidModel,
@@ -26,7 +26,7 @@ from rbfmuscle.muscle.model import (
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
 from rbfmuscle.muscle.rounded_bones import RoundedBones, grown, round_bones
-from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, Report, settle
+from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, settle
 from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform
 from rbfmuscle.muscle.surface_limits import SurfaceState
 from rbfmuscle.scene.ends import ordered_muscle
@@ -86,7 +86,7 @@ class RBFMuscle:
         )
         self.state = rest_state(self.model)
         self._stiffness = stiffness(self.model, 0.0)
-        self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
+        self.normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
         embedding = partial(embed, self._lattice, self.frame)
         self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options, embedding)
         # Where the shown mesh is the input mesh, its vertices as numbered there, and its faces.
@@ -106,11 +106,6 @@ class RBFMuscle:
         self._rounded: tuple[BoneContacts, RoundedBones] | None = None
         self.log = SolveLog(solver_residual=0.0, solid_volume_error=0.0)
 
-    @property
-    def points(self) -> np.ndarray:
-        """The centres now, (K, 3)."""
-        return self.state.points[: len(self.rest.centres)]
-
     def contact_points(self) -> np.ndarray:
         """Centres, then surface samples, (K + S, 3); never changed in place."""
         return self.state.points
@@ -121,48 +116,39 @@ class RBFMuscle:
 
     def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
         """Go along with the bones."""
-        old = np.array([before[bone] for bone in self.rest.bones])
-        new = np.array([after[bone] for bone in self.rest.bones])
+        bones = self.rest.bones
+        old, new = np.array([[poses[bone] for bone in bones] for poses in (before, after)])
         self.state = predict(self.model, self.state, old, new)
 
-    def solve(self, contacts: BoneContacts) -> None:
+    def solve(self, contacts: BoneContacts, *, room: bool = False) -> None:
         """Solve for the equilibrium under elasticity, volume and contact at the bones' present
-        poses.
+        poses; with ``room`` only move what is shown out of the planes of neighbours.
         """
-        state, report = self._settled(contacts)
+        if self._rounded is None or self._rounded[0] is not contacts:
+            spacing, count = float(np.sqrt(self.model.area)), len(self.state.points)
+            fields = dict(zip(contacts.bones.names, contacts.bones.fields))
+            rounded = round_bones(fields, self.frame, spacing, self._meshes, count)
+            self._rounded = contacts, rounded
+        given = self.model, self._stiffness, self.state, contacts.obstacles()
+        state, report = settle(*given, self._rounded[1], room=room)
+        while report.status == NO_ROOM:
+            self._rounded = contacts, grown(self._rounded[1])
+            state, report = settle(*given, self._rounded[1], room=room)
         if report.status == DIVERGED:
             raise FloatingPointError("the solid does not settle")
         self.state = state
-        self.log.add(
-            caps=report.caps,
-            solver_residual=report.residual,
-            solid_volume_error=report.volume_error,
-        )
-
-    def separate_neighbours(self, contacts: BoneContacts) -> None:
-        """Move what is shown out of the planes of neighbours."""
-        self.state, _ = self._settled(contacts, room=True)
-
-    def _settled(self, contacts: BoneContacts, *, room: bool = False) -> tuple[SolidState, Report]:
-        """What `settle` gives, with the bones in reach rounded and room for their blocks."""
-        if self._rounded is None or self._rounded[0] is not contacts:
-            fields = {contacts.names[b]: contacts.fields[b] for b in contacts.reached}
-            spacing = float(np.sqrt(self.model.area))
-            count = len(self.state.points)
-            rounded = round_bones(fields, self.frame, spacing, self._meshes, count)
-            self._rounded = contacts, rounded
-        given = self.model, self._stiffness, self.state
-        obstacles = contacts.obstacles(len(self.state.points))
-        while True:
-            state, report = settle(*given, obstacles, self._rounded[1], room=room)
-            if report.status != NO_ROOM:
-                return state, report
-            self._rounded = contacts, grown(self._rounded[1])
+        if not room:
+            self.log.add(
+                caps=report.caps,
+                solver_residual=report.residual,
+                solid_volume_error=report.volume_error,
+            )
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
         if activation != self.state.activation[0]:
-            self._take(self.state._replace(activation=np.array([activation])))
+            self._stiffness = stiffness(self.model, activation)
+            self.state = self.state._replace(activation=np.array([activation]))
 
     def transform(self, motion: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4), as the muscle is."""
@@ -170,30 +156,14 @@ class RBFMuscle:
 
     def snapshot(self) -> tuple[SolidState, SurfaceState, LogState]:
         """Everything that :meth:`restore` needs."""
-        return self.state, self.drawer.snapshot(), self.log.state
+        return self.state, self.drawer.state, self.log.state
 
     def restore(self, state: tuple[SolidState, SurfaceState, LogState]) -> None:
         """Go back to a snapshot."""
         solid, surface, self.log.state = state
         self.drawer.restore(surface)
-        self._take(solid)
-
-    def _take(self, state: SolidState) -> None:
-        """Take a state of the solid, and the stiffness that goes with its activation."""
-        if state.activation[0] != self.state.activation[0]:
-            self._stiffness = stiffness(self.model, float(state.activation[0]))
-        self.state = state
-
-    def normals(self) -> np.ndarray:
-        """Unit normals at the centres, turned with the local deformation by its cofactor, (K,
-        3).
-        """
-        columns = self.model.embedding.columns
-        return turned_normals(self.state.lifted_nodes, columns, self._normals_at, self.rest.normals)
-
-    def field(self) -> RBFField:
-        """The RBF field through the present centres."""
-        return self.rest.field(self.points, self.normals())
+        self.activate(float(solid.activation[0]))
+        self.state = solid
 
     def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
         """What gives the present places (n, 3) of points (n, 3) of the muscle at rest."""
@@ -206,8 +176,7 @@ class RBFMuscle:
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lies in the way."""
-        now = Placement(self.points, self.normals(), self.contact_points(), self.state.lifted_nodes)
-        drawn = self.drawer.draw(now, contacts)
+        drawn = self.drawer.draw(self.state, present_normals(self), contacts)
         quantities, notes = self.log.take()
         drawn.quantities.update(quantities)
         drawn.notes.extend(notes)
@@ -215,6 +184,20 @@ class RBFMuscle:
             place, faces = self._input
             drawn = replace(drawn, vertices=drawn.vertices[place], faces=faces)
         return drawn
+
+
+def present_normals(muscle: RBFMuscle) -> np.ndarray:
+    """Unit normals at the centres now, turned with the local deformation by its cofactor, (K,
+    3).
+    """
+    columns, nodes = muscle.model.embedding.columns, muscle.state.lifted_nodes
+    return turned_normals(nodes, columns, muscle.normals_at, muscle.rest.normals)
+
+
+def present_field(muscle: RBFMuscle) -> RBFField:
+    """The RBF field through the centres now."""
+    normals = present_normals(muscle)
+    return muscle.rest.field(muscle.state.points[: len(normals)], normals)
 
 
 def _build_solid(

@@ -229,7 +229,6 @@ def find_touch(near, here, reach, travelled, obstacles, rounded):
     normal = np.empty(3)
     box = np.empty((2, 3))
     scratch = no_scratch()
-    local = scratch.local
     asked, farthest = near.free & (reach > -np.inf), reach.max() if len(reach) > 0 else -np.inf
     box_loop(here, asked, box)
     for i in range(len(here)):
@@ -249,22 +248,11 @@ def find_touch(near, here, reach, travelled, obstacles, rounded):
             if least >= reach[i]:
                 near.spare[i] = min(near.spare[i], travelled + least)
                 continue
-            for k in range(3):
-                local[k] = 0.0
-                for a in range(3):
-                    local[k] += pose[a, k] * (here[i, a] - pose[a, 3])
-            distance = rounded_distance(rounded, bones, b, scratch)
-            if np.isnan(distance):
-                distance = _exact_distance(bones, b, pose, here[i], normal)
-            elif distance == np.inf:
-                room = False
-            else:
+            distance, smooth = _ask_rounded(rounded, bones, b, pose, here[i], normal, scratch)
+            room &= distance < np.inf
+            if smooth:
                 bound[i] = TRUSTED_SHARE * scratch.smooth[0]
-                for k in range(3):
-                    anchor[i, k] = local[k]
-                    normal[k] = 0.0
-                    for a in range(3):
-                        normal[k] += pose[k, a] * scratch.gradient[a]
+                anchor[i] = scratch.local
             there = trusted(distance) + near.allowed[b, i]
             near.spare[i] = min(near.spare[i], travelled + there)
             if distance + near.allowed[b, i] < reach[i]:
@@ -276,6 +264,28 @@ def find_touch(near, here, reach, travelled, obstacles, rounded):
         i = touch.point[c]
         near.spare[i] = min(near.spare[i], travelled + touch.gap[c])
     return _first(touch, count), room
+
+
+@inner(error_model="numpy", inline="always")
+def _ask_rounded(rounded, bones, b, pose, point, normal, scratch):
+    """Distance of a point from a bone, rounded where it can be, and its ``normal`` (3,); infinity
+    without room for a block. Also whether the distance is that of the rounded bone.
+    """
+    for k in range(3):
+        scratch.local[k] = 0.0
+        for a in range(3):
+            scratch.local[k] += pose[a, k] * (point[a] - pose[a, 3])
+    distance = rounded_distance(rounded, bones, b, scratch)
+    smooth = False
+    if np.isnan(distance):
+        distance = _exact_distance(bones, b, pose, point, normal)
+    elif distance < np.inf:
+        smooth = True
+        for k in range(3):
+            normal[k] = 0.0
+            for a in range(3):
+                normal[k] += pose[k, a] * scratch.gradient[a]
+    return distance, smooth
 
 
 @inner(error_model="numpy")

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.bones.obstacles import Known, query_bone
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.bsplines import bspline_sum
-from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.jit import compiled, inner
 
@@ -52,7 +52,7 @@ class RoundedBones(NamedTuple):
 
 
 def round_bones(
-    bone_sdfs: Mapping[str, BoneField],
+    bone_sdfs: Mapping[str, BoneSDF],
     frame: RestFrame,
     spacing: float,
     meshes: Mapping[str, tuple[Floats, Integers]],
@@ -92,7 +92,7 @@ def grown(rounded: RoundedBones) -> RoundedBones:
     return more
 
 
-def bone_thickness(field: BoneField, vertices: Floats, faces: Integers, most: float) -> float:
+def bone_thickness(field: BoneSDF, vertices: Floats, faces: Integers, most: float) -> float:
     """Thickness that nine tenths of a bone's surface exceed, at most ``most`` [scene unit].
 
     Twice the depth that a path into the bone, from the middle of a face against its normal,

@@ -55,8 +55,8 @@ class RunArrays:
         if name not in self._first:
             self._first[name] = VertexArrays(mesh, self._groups[name])
         found = self._first[name].of(mesh)
-        contacts = frame.contacts.get(name)
-        if contacts is not None and contacts.reached:
-            distance = contacts.distance(surface.vertices, self._farthest)
+        bones = frame.bones.get(name)
+        if bones is not None and bones.names:
+            distance = bones.distance(surface.vertices, frame.poses, self._farthest)
             found["bone_distance"] = np.minimum(distance, self._farthest)
         return found | dict(surface.arrays)

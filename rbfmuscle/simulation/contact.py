@@ -7,43 +7,30 @@ represented.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.bones.broad_phase import (
-    answer_loop,
-    apart_loop,
-    closer_loop,
-    direction_loop,
-    near_loop,
-    path_loop,
-    take_contacts_loop,
-)
 from rbfmuscle.bones.obstacles import (
     Bones,
     Known,
     Obstacles,
     PlaneStack,
     find_contacts,
+    find_nearest,
+    greatest_depth,
+    query_bone,
     stack_bones,
 )
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.fields import BoneField
-from rbfmuscle.scene.tendons import AtRest
-from rbfmuscle.validation import check_points
-
-NONE_ALLOWED: Floats = np.zeros(0)
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.scene.tendons import AT_REST
+from rbfmuscle.validation import check_finite, check_points
 
 
-@dataclass(frozen=True)
-class HalfSpaces:
+class HalfSpaces(NamedTuple):
     """Linearised contacts: moving point ``index`` by ``dp`` is admissible where ``gap + normal . dp
     >= 0``.
     """
@@ -51,7 +38,7 @@ class HalfSpaces:
     index: np.ndarray  # (c,) contact point
     gap: np.ndarray  # (c,) signed distance now [scene unit], negative is violated
     normal: np.ndarray  # (c, 3) unit direction of growing distance, world axes
-    source: np.ndarray  # (c,) index of the bone, or -1 - k for virtual edges of family k
+    source: np.ndarray  # (c,) row of the bone in reach, or -1 - k for virtual edges of family k
 
 
 class Planes:
@@ -85,138 +72,109 @@ class Neighbour(Protocol):
         """How far (n,) points (n, 3) are to move inwards for it [scene unit]."""
 
 
-class BoneContacts:
-    """The obstacles of one muscle, in one pose.
+class BonesInReach:
+    """The bones that a muscle can reach, which never change; the poses are given.
 
-    ``fields`` is given one entry for each bone of the scene, None where the muscle cannot reach it,
-    and holds those in reach by number; muscles may share fields. ``attached_bone`` (n,) holds the
-    bone that each contact point is attached to, -1 where it is free; attached points take no
-    contact. ``reached`` lists the bones that have a field, ``boxes`` (r, 2, 3) has theirs at rest
-    and ``placed`` (r, 4, 4) their poses.
+    Muscles may share the ``fields`` of the r bones, and ``arrays`` of them.
     """
 
     def __init__(
-        self,
-        names: Sequence[str],
-        fields: Sequence[BoneField | None],
-        *,
-        attached_bone: ArrayLike | None = None,
+        self, names: Sequence[str], fields: Sequence[BoneSDF], arrays: Bones | None = None
     ) -> None:
         if len(names) != len(fields):
             raise ValueError(
                 f"one field per bone is needed, got {len(fields)} for {len(names)} bones"
             )
         self.names = list(names)
-        self.fields = {b: field for b, field in enumerate(fields) if field is not None}
-        self.reached = list(self.fields)
-        self._reached = np.array(self.reached, dtype=np.int64)
-        self._row = {b: row for row, b in enumerate(self.reached)}
-        boxes = [self.fields[b].bounds for b in self.reached]
-        self.boxes = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3)
-        self.attached_bone = (
-            None if attached_bone is None else np.asarray(attached_bone, dtype=np.int64)
-        )
-        self.move(AtRest((name, np.eye(4)) for name in self.names))
-        self.allowed: dict[int, Floats] = {}
+        self.fields = list(fields)
+        self.arrays = stack_bones(fields) if arrays is None else arrays
+
+    def place(self, poses: Mapping[str, Floats], out: Floats | None = None) -> Floats:
+        """Poses (r, 4, 4) of the bones, from a dict of bone name to (4, 4) rest-to-world
+        transform.
+        """
+        if out is None:
+            out = np.empty((len(self.names), 4, 4))
+        for row, name in enumerate(self.names):
+            try:
+                out[row] = poses[name]
+            except KeyError:
+                raise ValueError(f"poses lack the bone {name!r}") from None
+        return out
+
+    def distance(
+        self, points: ArrayLike, poses: Mapping[str, Floats], limit: Floats | float = np.inf
+    ) -> Floats:
+        """Smallest distance (n,) over the bones; parameters and result as for `nearest`."""
+        return self._nearest(points, poses, limit, gradient=False)[0]
+
+    def nearest(
+        self, points: ArrayLike, poses: Mapping[str, Floats], limit: Floats | float = np.inf
+    ) -> tuple[Floats, Floats]:
+        """Smallest distance (n,) over the bones of points (n, 3), and the unit direction (n, 3) in
+        which it grows, world axes.
+
+        [scene unit], negative inside a bone, infinity where none is in reach. Beyond ``limit``, a
+        number or (n,), it is only a lower bound above the limit, without a direction.
+        """
+        return self._nearest(points, poses, limit, gradient=True)
+
+    def _nearest(self, points, poses, limit, *, gradient):
+        points = check_points(points)
+        slope = np.zeros((len(points) if gradient else 0, 3))
+        limits = np.full(len(points), limit, dtype=np.float64)
+        distance = find_nearest(self.arrays, self.place(poses), points, limits, slope)
+        return distance, slope
+
+
+class BoneContacts:
+    """The obstacles of one muscle: the bones that it can reach, in one pose, and its neighbours.
+
+    ``attached_bone`` (n,) holds the bone that each contact point is attached to, -1 where it is
+    ``free``; attached points take no contact. ``poses`` are those of all bones by name, ``placed``
+    (r, 4, 4) those of the bones in reach.
+    """
+
+    def __init__(self, bones: BonesInReach, attached_bone: ArrayLike) -> None:
+        self.bones = bones
+        self.free = np.asarray(attached_bone, dtype=np.int64) < 0
+        self.poses: Mapping[str, Floats] = AT_REST
+        self.placed = bones.place(AT_REST)
         #: Planes of sliding neighbours, and those that hold points on their side of a bone.
         self.neighbours: list[Planes] = []
         self.beside: list[Neighbour] = []
-        self._allowed: Floats | None = None
-        self._known = Known(np.zeros((len(self.reached), 0, 3)), np.zeros((len(self.reached), 0)))
+        shape = len(bones.names), len(self.free)
+        known = Known(np.zeros((*shape, 3)), np.full(shape, -np.inf))
+        # Its arrays change in place, so that compiled loops can be given the same at each call.
+        self._alone = Obstacles(
+            bones.arrays, self.placed, self.free, np.zeros(shape), known, NO_PLANES
+        )
 
-    def move(self, poses: dict[str, Floats]) -> None:
+    def move(self, poses: Mapping[str, Floats]) -> None:
         """Take the bones' poses, a dict of bone name to (4, 4) rest-to-world transform."""
-        missing = [self.names[b] for b in self.reached if self.names[b] not in poses]
-        if missing:
-            raise ValueError(f"poses lack the bone {missing[0]!r}")
-        self.poses, self.placed = poses, self.stacked(poses)
+        self.bones.place(poses, self.placed)
+        self.poses = poses
 
-    def at(self, poses: dict[str, Floats]) -> BoneContacts:
-        """A copy with the bones in these poses, for queries while they move on."""
-        other = copy.copy(self)
-        other.move(poses)
-        other.beside, other._known = list(self.beside), Known(*(p[:, :0] for p in self._known))
-        return other
+    def obstacles(self) -> Obstacles:
+        """What the contact points meet in the present poses, whose arrays change with these."""
+        if not self.neighbours:
+            return self._alone
+        return self._alone._replace(planes=_stacked_planes(self.neighbours))
 
-    @cached_property
-    def bones(self) -> Bones | None:
-        """The fields of the bones in reach, for compiled loops; None where one is no `BoneSDF`."""
-        fields = [field for field in self.fields.values() if isinstance(field, BoneSDF)]
-        return stack_bones(fields) if len(fields) == len(self.reached) else None
+    def allow(self, row: int, depth: Floats) -> None:
+        """Let each contact point be up to ``depth`` (n,) inside a bone in reach [scene unit]."""
+        self._alone.allowed[row] = depth
 
-    def obstacles(self, count: int) -> Obstacles:
-        """What ``count`` contact points meet in the present poses."""
-        if self._allowed is None or self._allowed.shape[1] != count:
-            self._allowed = np.zeros((len(self.reached), count))
-            for row, b in enumerate(self.reached):
-                self._allowed[row] = self.allowed.get(b, 0.0)
-        if self.bones is None:
-            raise TypeError("a model that asks bones from compiled loops needs BoneSDF fields")
-        planes = _stacked_planes(self.neighbours) if self.neighbours else NO_PLANES
-        free, known = self.free(count), self._bounds(count)
-        return Obstacles(self.bones, self.placed, free, self._allowed, known, planes)
-
-    def allow(self, bone_index: int, depth: Floats) -> None:
-        """Let each contact point be up to ``depth`` (n,) inside a bone, [scene unit]; zeros take it
-        back.
-        """
-        if np.any(depth > 0.0):
-            self.allowed[bone_index] = np.array(depth, dtype=np.float64)
-        else:
-            self.allowed.pop(bone_index, None)
-        self._allowed = None
-
-    def distance_and_direction(
-        self, points: Floats, bone_index: int, reach: Floats | float = np.inf
-    ) -> tuple[Floats, Floats]:
-        """Signed distance (n,) to one bone and the unit direction (n, 3) in which it grows, world
-        axes.
-
-        Where the bone is farther than ``reach``, a number or (n,), a lower bound beyond it suffices
-        [scene unit].
-        """
-        pose, points = self.poses[self.names[bone_index]], check_points(points)
-        field = self.fields[bone_index]
-        distance, gradient = field.distance_and_gradient(points, pose=pose, reach=reach)
-        # On the medial surface the field has no direction: away from the middle of the bone is
-        # used.
-        direction_loop(points, gradient, pose, self.boxes[self._row[bone_index]])
-        return distance, gradient
-
-    def distance(self, points: ArrayLike, limit: Floats | float = np.inf) -> Floats:
-        """Smallest distance (n,) over bones; parameters and result as for `nearest`."""
-        points = check_points(points)
-        smallest, met = self._in_reach(points, limit)
-        for b in met:
-            pose, reach = self.poses[self.names[b]], np.minimum(smallest, limit)
-            found = self.fields[b].distance(points, pose=pose, reach=reach)
-            np.minimum(smallest, found, out=smallest)
-        return smallest
-
-    def nearest(self, points: ArrayLike, limit: Floats | float = np.inf) -> tuple[Floats, Floats]:
-        """Smallest distance (n,) over bones, and its gradient (n, 3) in world axes, for clipping.
-
-        [scene unit], negative inside a bone, infinity where none is in reach. Beyond ``limit``, a
-        number or (n,), it is only a lower bound above the limit, without a gradient.
+    def distance_and_direction(self, points: Floats, row: int) -> tuple[Floats, Floats]:
+        """Signed distance (n,) to one of the bones in reach and the unit direction (n, 3) in which
+        it grows, world axes.
         """
         points = check_points(points)
-        smallest, met = self._in_reach(points, limit)
-        gradient = np.zeros((len(points), 3))
-        for b in met:
-            # No farther than what was found: elsewhere a lower bound will do.
-            found = self.distance_and_direction(points, b, np.minimum(smallest, limit))
-            closer_loop(*found, smallest, gradient)
-        return smallest, gradient
-
-    def _in_reach(self, points: Floats, limit: Floats | float) -> tuple[Floats, list[int]]:
-        """Lower bound (n,) of the distances to bones farther than ``limit``, and the other
-        bones.
-        """
-        apart = np.empty(len(self.reached))
-        apart_loop(points, self.placed, self.boxes, apart)
-        far = apart > np.max(limit, initial=0.0)
-        bound = np.full(len(points), apart[far].min(initial=np.inf))
-        return bound, np.array(self.reached, dtype=int)[~far].tolist()
+        distance, direction = np.empty(len(points)), np.empty((len(points), 3))
+        everywhere = np.full(len(points), np.inf)
+        pose = self.placed[row]
+        query_bone(self.bones.arrays, row, pose, points, everywhere, distance, direction)
+        return distance, direction
 
     def excess(self, points: Floats) -> Floats:
         """How far (n,) points (n, 3) of the surface are to move inwards for sliding neighbours
@@ -226,130 +184,30 @@ class BoneContacts:
             [np.zeros(len(points)), *(pair.excess(points) for pair in self.beside)], axis=0
         )
 
-    def depths(self, points: Floats) -> dict[int, Floats]:
-        """Depth (n,) of each free contact point in each bone, by the bone's index [scene unit]; 0
-        outside.
-        """
-        points = check_points(points)
-        found = {b: np.zeros(len(points)) for b in self.reached}
-        for b, near in self.near(points, np.zeros((1, len(points)))):
-            found[b][near] = np.maximum(-self._ask(points, near, b, 0.0)[0], 0.0)
-        return found
+    def depth(self, points: Floats) -> float:
+        """Greatest depth of a free contact point (n, 3) in a bone [scene unit]; 0 outside."""
+        return greatest_depth(self._alone, points)
 
-    def half_spaces(self, points: ArrayLike, reach: ArrayLike) -> HalfSpaces:
-        """Pairs of contact point (n, 3) and obstacle nearer than ``reach``, one or (n,) [scene
-        unit].
-        """
-        points = check_points(points)
-        reach = (
-            np.full(len(points), reach)
-            if np.ndim(reach) == 0
-            else np.asarray(reach, dtype=np.float64)
-        )
-        if self.bones is None:
-            spaces = self._asked_one_by_one(points, reach)
-        else:
-            index, row, gap, normal = find_contacts(self.obstacles(len(points)), points, reach)
-            spaces = HalfSpaces(index, gap, normal, self._reached[row])
-        return self.with_planes(spaces, points, reach)
-
-    def _asked_one_by_one(self, points: Floats, reach: Floats) -> HalfSpaces:
-        """Half-spaces of bones whose fields are no arrays that a loop could ask."""
-        near = self.near(points, reach[None])
-        most = sum(len(some) for _, some in near)
-        index, source = np.empty(most, np.int64), np.empty(most, np.int64)
-        gap = np.empty(most)
-        normal = np.empty((most, 3))
-        count = 0
-        for b, some in near:
-            distance, direction = self._ask(points, some, b, reach[some])
-            allowed = self.allowed.get(b, NONE_ALLOWED)
-            limits = reach, allowed if len(allowed) == len(points) else NONE_ALLOWED
-            found = index[count:], gap[count:], normal[count:]
-            end = count + take_contacts_loop(some, distance, direction, limits, found)
-            source[count:end] = b
-            count = end
-        return HalfSpaces(index[:count], gap[:count], normal[:count], source[:count])
-
-    def with_planes(self, spaces: HalfSpaces, points: Floats, reach: Floats) -> HalfSpaces:
-        """Half-spaces of bones and, behind them, of the neighbours of contact points (n, 3) nearer
-        than ``reach``.
-        """
-        if not self.neighbours:
-            return spaces
-        planes = _stacked_planes(self.neighbours)
-        gap = planes.gap + np.einsum(
-            "ij,ij->i", planes.normal, points[planes.point] - planes.anchor
-        )
-        near = gap < float(reach.max(initial=0.0))
-        found = planes.point[near], gap[near], planes.normal[near], -1 - planes.kind[near]
-        bones = spaces.index, spaces.gap, spaces.normal, spaces.source
-        return HalfSpaces(*map(np.concatenate, zip(bones, found)))
-
-    def near(self, points: Floats, reach: Floats) -> list[tuple[int, Integers]]:
-        """Bones in reach, each with the free contact points (n, 3) that may be nearer to it than
-        their reach.
-
-        ``reach`` is (1, n) for all bones, or (r, n) for each of the bones ``reached``.
-        """
-        found = np.empty((len(self.reached), len(points)), dtype=np.int64)
-        counts = np.zeros(len(self.reached), dtype=np.int64)
-        bones = self.placed, self.boxes
-        near_loop(
-            points, self.free(len(points)), reach, bones, self._bounds(len(points)), found, counts
-        )
-        return [
-            (b, near[:count])
-            for b, near, count in zip(self.reached, found, counts.tolist())
-            if count
-        ]
-
-    def path_lengths(
-        self, start: Floats, end: Floats, before: dict[str, Floats], after: dict[str, Floats]
-    ) -> Floats:
-        """Lengths (r, n) of straight paths as each of the bones ``reached`` sees them, moving from
-        pose to pose.
-        """
-        length = np.empty((len(self.reached), len(start)))
-        path_loop(start, end, self.stacked(before), self.stacked(after), length)
-        return length
-
-    def free(self, count: int) -> Booleans:
-        """Mask (n,) of the contact points that are attached to no bone."""
-        if self.attached_bone is None:
-            return np.ones(count, dtype=np.bool_)
-        if len(self.attached_bone) != count:
+    def half_spaces(self, points: Floats, reach: float) -> HalfSpaces:
+        """Pairs of contact point (n, 3) and obstacle nearer than ``reach`` [scene unit]."""
+        if len(points) != len(self.free):
             raise ValueError(
-                f"half-spaces need all {len(self.attached_bone)} contact points, got {count}"
+                f"half-spaces need all {len(self.free)} contact points, got {len(points)}"
             )
-        return self.attached_bone < 0
+        check_finite(points, name="points")
+        obstacles = self.obstacles()
+        spaces = HalfSpaces(*find_contacts(obstacles, points, reach))
+        return _with_planes(spaces, obstacles.planes, points, reach) if self.neighbours else spaces
 
-    def stacked(self, poses: Mapping[str, Floats]) -> Floats:
-        """Poses (r, 4, 4) of the bones that the muscle can reach, in their order."""
-        return np.array([poses[self.names[b]] for b in self.reached]).reshape(-1, 4, 4)
 
-    def _bounds(self, count):
-        """Positions (r, n, 3) of the last queries, in bone coordinates, and lower bounds (r, n) of
-        the distances there; -infinity where nothing is known.
-        """
-        if self._known[1].shape[1] != count:
-            rows = len(self.reached)
-            self._known = Known(np.zeros((rows, count, 3)), np.full((rows, count), -np.inf))
-        return self._known
-
-    def _ask(self, points, near, b, reach):
-        """Distances and directions of some of the contact points to bone b; stored as bounds for
-        later queries.
-        """
-        pose, row = self.poses[self.names[b]], self._row[b]
-        distance, gradient = self.fields[b].distance_and_gradient(
-            points[near], pose=pose, reach=reach
-        )
-        anchor, bound = self._bounds(len(points))
-        answer_loop(
-            points, pose, self.boxes[row], near, distance, gradient, anchor[row], bound[row]
-        )
-        return distance, gradient
+def _with_planes(bones: HalfSpaces, planes: PlaneStack, points: Floats, reach: float) -> HalfSpaces:
+    """Half-spaces of bones and, behind them, the planes of which contact points (n, 3) are nearer
+    than ``reach``.
+    """
+    gap = planes.gap + np.einsum("ij,ij->i", planes.normal, points[planes.point] - planes.anchor)
+    near = gap < reach
+    found = planes.point[near], gap[near], planes.normal[near], -1 - planes.kind[near]
+    return HalfSpaces(*map(np.concatenate, zip(bones, found)))
 
 
 def _stacked_planes(kinds: Sequence[Planes]) -> PlaneStack:

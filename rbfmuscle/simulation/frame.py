@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 
 Mesh: TypeAlias = tuple[np.ndarray, np.ndarray]
 
@@ -103,8 +103,8 @@ class Frame:
     neighbours: dict = field(default_factory=dict)
     # TendonLine by the end that each holds; the poses have these too
     tendons: dict = field(default_factory=dict)
-    # The bones about each muscle, by muscle, in the poses of the frame
-    contacts: Mapping[str, BoneContacts] = field(default_factory=dict, repr=False)
+    # The bones that each muscle can reach, by muscle
+    bones: Mapping[str, BonesInReach] = field(default_factory=dict, repr=False)
     # FibreLines by muscle, where the scene asks for them
     fibres: Mapping[str, FibreLines] = field(default_factory=dict, repr=False)
 
@@ -159,12 +159,11 @@ class MuscleModel(Protocol):
     def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
         """Move with the bones from one set of poses to the next."""
 
-    def solve(self, contacts: BoneContacts) -> None:
-        """Solve for equilibrium under the model's constraints and these contacts."""
+    def solve(self, contacts: BoneContacts, *, room: bool = False) -> None:
+        """Solve for equilibrium under the model's constraints and these contacts.
 
-    def separate_neighbours(self, contacts: BoneContacts) -> None:
-        """Move what is shown out of neighbours, by planes at where these are now; nothing where
-        `solve` does that.
+        With ``room`` only move what is shown out of neighbours, by planes at where these are now;
+        nothing where every solve does that.
         """
 
     def transform(self, motion: np.ndarray) -> None:

@@ -9,13 +9,12 @@ from threadpoolctl import ThreadpoolController
 
 from rbfmuscle.bones.obstacles import pick_bones, stack_bones
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.activation.contraction import Activations
 from rbfmuscle.scene.motion import completed, rest_coordinates
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
 from rbfmuscle.simulation.overlap import resolve_initial_overlap
@@ -46,7 +45,7 @@ class FrameLoop:
         Its motion only determines which bones and neighbours a muscle can meet.
     models : iterable of MuscleModel
         In their rest state.
-    bone_sdfs : mapping of str to BoneField, optional
+    bone_sdfs : mapping of str to BoneSDF, optional
         Distance fields of the bones; built for the bones in reach where not given.
     surfaces : bool
         Whether surfaces are extracted.
@@ -72,7 +71,7 @@ class FrameLoop:
         scene: Scene,
         models: Iterable[MuscleModel],
         *,
-        bone_sdfs: Mapping[str, BoneField] | None = None,
+        bone_sdfs: Mapping[str, BoneSDF] | None = None,
         surfaces: bool = True,
     ) -> None:
         models = list(models)
@@ -244,7 +243,7 @@ class FrameLoop:
             work=dict(zip(carried, (status for _, _, status in found))),
             neighbours={} if self._sliding is None else dict(self._sliding.pairs),
             tendons=dict(poses.tendons),
-            contacts={stepper.name: stepper.contacts.at(poses) for stepper in self.steppers},
+            bones={stepper.name: stepper.contacts.bones for stepper in self.steppers},
         )
 
     def _find_tendons(self, poses: Poses) -> list[Event]:
@@ -266,7 +265,7 @@ def simulate_frames(
     *,
     surfaces: bool = True,
     written: Collection[int] | None = None,
-    bone_sdfs: Mapping[str, BoneField] | None = None,
+    bone_sdfs: Mapping[str, BoneSDF] | None = None,
 ) -> Iterator[Frame]:
     """Run models, from their rest state, through a scene's motion and yield its frames one by one.
 
@@ -295,16 +294,11 @@ def _obstacles(scene, models, bone_sdfs):
             scene, {pair: box for pair, box in regions.items() if pair[1] in met}
         )
     names = [bone.name for bone in scene.bones]
+    order = [name for name in names if name in bone_sdfs]
     # One set of arrays, of which each muscle takes its bones.
-    order = [name for name in names if isinstance(bone_sdfs.get(name), BoneSDF)]
     stack = stack_bones([bone_sdfs[name] for name in order])
     for model in models:
-        reached = [
-            bone_sdfs.get(n) if regions is None or (model.name, n) in regions else None
-            for n in names
-        ]
-        contacts = BoneContacts(names, reached, attached_bone=model.attached_bone)
-        met = [names[b] for b in contacts.reached]
-        if set(met) <= set(order):
-            contacts.bones = pick_bones(stack, [order.index(name) for name in met])
-        yield contacts
+        met = [name for name in order if regions is None or (model.name, name) in regions]
+        arrays = pick_bones(stack, [order.index(name) for name in met])
+        reached = BonesInReach(met, [bone_sdfs[name] for name in met], arrays)
+        yield BoneContacts(reached, model.attached_bone)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from rbfmuscle.geometry.fields import BoneField
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import SHIFT_LEVER
@@ -29,7 +29,7 @@ class LiveSession:
     as `live_fields` builds them.
     """
 
-    def __init__(self, scene: Scene, *, bone_sdfs: Mapping[str, BoneField] | None = None) -> None:
+    def __init__(self, scene: Scene, *, bone_sdfs: Mapping[str, BoneSDF] | None = None) -> None:
         self.scene, self.limits = scene, coordinate_limits(scene)
         self.bone_sdfs = live_fields(scene) if bone_sdfs is None else bone_sdfs
         known = all_coordinates(scene.joints)
@@ -139,7 +139,7 @@ def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
     return limits
 
 
-def live_fields(scene: Scene) -> Mapping[str, BoneField]:
+def live_fields(scene: Scene) -> Mapping[str, BoneSDF]:
     """Distance fields of the bones in reach of a muscle within the coordinates' ranges."""
     return build_fields(scene, find_contact_pairs(_wide_scene(scene)))
 

@@ -12,7 +12,7 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import touching_balls, vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
 from rbfmuscle.geometry.winding import winding_loop
-from rbfmuscle.jit import compiled
+from rbfmuscle.jit import compiled, inner
 
 if TYPE_CHECKING:
     from rbfmuscle.simulation.frame import Mesh, MuscleModel
@@ -299,57 +299,69 @@ def _walk_loop(points, index, skin, nearest, away):
         nearest[q], away[q] = here, np.sqrt(least)
 
 
+class _Foot(NamedTuple):
+    """The place of a surface that is nearest to a point."""
+
+    weights: np.ndarray  # (3,) of the corners of its triangle
+    way: np.ndarray  # (3,) from there to the point
+    true: np.ndarray  # (3,) sum of the unit normals of the triangles that meet there
+
+
 @compiled
 def _distance_loop(points, index, nearest, skin, distance, normal):
-    vertices, normals, faces, start, ring = skin
-    weights = np.empty(3)
-    best = np.empty(3)
-    at = np.empty(3)
-    way = np.empty(3)
-    true = np.empty(3)
+    foot = _Foot(np.empty(3), np.empty(3), np.empty(3))
+    at, weights = np.empty(3), np.empty(3)
     for q in range(len(index)):
-        p = index[q]
-        least, face = np.inf, -1
-        for r in range(start[nearest[q]], start[nearest[q] + 1]):
-            f = ring[r]
-            a = vertices[faces[f, 0]]
-            b = vertices[faces[f, 1]]
-            c = vertices[faces[f, 2]]
-            nearest_weights(points[p], a, b, c, weights)
-            squared = 0.0
-            for k in range(3):
-                here = points[p, k]
-                for corner in range(3):
-                    here -= weights[corner] * vertices[faces[f, corner], k]
-                squared += here * here
-                at[k] = here
-            # The triangles that meet at the nearest point decide the side together.
-            same = squared <= least * (1.0 + 1e-9) and squared >= least * (1.0 - 1e-9)
-            if squared < least or same:
-                if not same:
-                    true[:] = 0.0
-                _add_unit_normal(vertices, faces, f, true)
-            if squared < least:
-                least, face = squared, f
-                best[:], way[:] = weights, at
+        least, face = _find_foot(points[index[q]], nearest[q], skin, weights, at, foot)
         size = 0.0
         side = 0.0
         agree = 0.0
         for k in range(3):
             n = 0.0
             for corner in range(3):
-                n += best[corner] * normals[faces[face, corner], k]
+                n += foot.weights[corner] * skin[1][skin[2][face, corner], k]
             normal[q, k] = n
             size += n * n
-            side += true[k] * way[k]
-            agree += n * way[k]
+            side += foot.true[k] * foot.way[k]
+            agree += n * foot.way[k]
         length, size = np.sqrt(least), max(np.sqrt(size), 1e-300)
         sign = 1.0 if side >= 0.0 else -1.0
         # Around a rim normals vary fast: the direction from the nearest point is better.
         along = sign * agree < RIM * size * length
         for k in range(3):
-            normal[q, k] = sign * way[k] / length if along else normal[q, k] / size
+            normal[q, k] = sign * foot.way[k] / length if along else normal[q, k] / size
         distance[q] = sign * length
+
+
+@inner()
+def _find_foot(point, vertex, skin, weights, at, foot):
+    """Squared distance of a point from the triangles about a vertex, and the nearest of these;
+    fills the foot. ``weights`` and ``at`` (3,) are room for those of one triangle.
+    """
+    vertices, _, faces, start, ring = skin
+    least, face = np.inf, -1
+    for r in range(start[vertex], start[vertex + 1]):
+        f = ring[r]
+        nearest_weights(
+            point, vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]], weights
+        )
+        squared = 0.0
+        for k in range(3):
+            here = point[k]
+            for corner in range(3):
+                here -= weights[corner] * vertices[faces[f, corner], k]
+            squared += here * here
+            at[k] = here
+        # The triangles that meet at the nearest point decide the side together.
+        same = squared <= least * (1.0 + 1e-9) and squared >= least * (1.0 - 1e-9)
+        if squared < least or same:
+            if not same:
+                foot.true[:] = 0.0
+            _add_unit_normal(vertices, faces, f, foot.true)
+        if squared < least:
+            least, face = squared, f
+            foot.weights[:], foot.way[:] = weights, at
+    return least, face
 
 
 @compiled

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.stepper import MuscleStepper
 from rbfmuscle.validation import SceneError
 
@@ -29,10 +30,9 @@ def resolve_initial_overlap(stepper: MuscleStepper) -> None:
     """
     contacts, scene = stepper.contacts, stepper.scene
     least, initial = scene.length(DEPTH), scene.contact.initial
-    overlap = contacts.depths(stepper.model.contact_points())
-    overlap = {b: depth for b, depth in overlap.items() if depth.max(initial=0.0) > least}
+    overlap = _depths_at_rest(contacts, stepper.model.contact_points(), least)
     for b, depth in sorted(overlap.items(), key=lambda found: -found[1].max()):
-        count, bone = int((depth > least).sum()), contacts.names[b]
+        count, bone = int((depth > least).sum()), contacts.bones.names[b]
         if initial == "error":
             raise SceneError(
                 f"muscle {stepper.name!r} overlaps bone {bone!r} at rest: {count} points, "
@@ -43,6 +43,20 @@ def resolve_initial_overlap(stepper: MuscleStepper) -> None:
         stepper.report(bone, count, "overlap_kept" if initial == "keep" else "overlap_resolved")
     if initial == "resolve" and overlap:
         _resolve(stepper, overlap)
+
+
+def _depths_at_rest(contacts: BoneContacts, points: Floats, least: float) -> dict[int, Floats]:
+    """Depth (n,) of each free contact point (n, 3) in each bone that one is deeper in than
+    ``least``.
+    """
+    found = {}
+    for row, field in enumerate(contacts.bones.fields):
+        depth = np.zeros(len(points))
+        distance = field.distance(points[contacts.free], contacts.placed[row], reach=0.0)
+        depth[contacts.free] = np.maximum(-distance, 0.0)
+        if depth.max(initial=0.0) > least:
+            found[row] = depth
+    return found
 
 
 def _resolve(stepper: MuscleStepper, overlap: dict[int, Floats]) -> None:

@@ -52,7 +52,7 @@ def _count_substeps(muscle: Muscle, scene: Scene, bones: list[str], poses: PoseC
     rigid_transport = RigidTransport(muscle, scene)
     count = 0
     here = rest_coordinates(scene)
-    rigid_transport.solved = poses(here)
+    rigid_transport.note_solved(poses(here))
     for index, frame in enumerate(scene.motion.frames):
         there = completed(scene, frame)
         try:
@@ -61,6 +61,7 @@ def _count_substeps(muscle: Muscle, scene: Scene, bones: list[str], poses: PoseC
             raise SceneError(f"muscle {muscle.name!r}, frame {index}: {error}") from None
         for stop in stops:
             if always or not rigid_transport.keeps_shape(poses(stop)):
-                count, rigid_transport.solved = count + 1, poses(stop)
+                count += 1
+                rigid_transport.note_solved(poses(stop))
         here = there
     return count

@@ -24,9 +24,7 @@ CLEAR = 2.0
 STILL = 1e-9
 # Displacement of an attachment, in sizes of its muscle, that counts as a rotation by one radian.
 ARC = 0.5
-# Of a root and a bone the second has the attachment.
-ATTACHED = np.array([1])
-BONES = np.zeros(2, dtype=np.bool_)  # both count as bones, also the ends that tendons hold
+IDENTITY = np.eye(4)
 
 
 class MuscleStatus(NamedTuple):
@@ -39,7 +37,7 @@ class MuscleStatus(NamedTuple):
 class RigidState(NamedTuple):
     """What changes of a `RigidTransport`."""
 
-    solved: Mapping[str, Floats] | None
+    solved: Floats | None  # (b, 4, 4)
     since: Floats  # (4, 4)
     moved: bool
 
@@ -48,49 +46,73 @@ class RigidTransport:
     """Moves one muscle rigidly where its bones do; for a muscle that neither slides on neighbours
     nor contracts.
 
-    ``names`` holds the bones, and ends of tendons, that hold it, first that of most of it;
-    ``solved`` their poses when it was solved last, or None; ``since`` the rigid motion (4, 4) since
-    its surface was drawn last.
+    ``names`` holds the b bones, and ends of tendons, that hold it, first that of most of it;
+    ``solved`` (b, 4, 4) their poses when it was solved last, or None; ``since`` the rigid motion
+    (4, 4) since its surface was drawn last.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene) -> None:
         vertices = np.asarray(muscle.mesh.vertices, dtype=float)
         frame = RestFrame(vertices)
-        self.size = diameter(vertices)
+        size = diameter(vertices)
         self.clear = scene.length(CLEAR)
         held: dict[str, list[np.ndarray]] = {}
         for attachment in muscle.attachments:
             held.setdefault(attachment.attachment_frame, []).append(attachment.vertices)
         parts = {name: np.concatenate(found) for name, found in held.items()}
         self.names = sorted(parts, key=lambda name: -len(parts[name]))
-        self._corners = {name: frame.corners(parts[name]) for name in self.names}
-        self.solved: Mapping[str, Floats] | None = None
-        self.since, self.moved = np.eye(4), False
+        self._corners = np.array([frame.corners(parts[name]) for name in self.names])
+        # What counts as a rotation by one radian; all that hold it count alike.
+        self._lever = np.full(len(self.names), ARC * size)
+        self._owner = np.arange(len(self.names))
+        self._bones = np.zeros(len(self.names), dtype=np.bool_)
+        self.solved: Floats | None = None
+        self.since, self.moved = IDENTITY, False
 
     def keeps_shape(self, after: Mapping[str, Floats]) -> bool:
         """Whether the bones that hold the muscle stand to each other as when it was solved last."""
-        before, root = self.solved or after, self.names[0]
-        return not any(self._moves(before, after, root, name) for name in self.names[1:])
+        return self.solved is None or self._stand_alike(self.solved, self._stacked(after))
+
+    def note_solved(self, poses: Mapping[str, Floats]) -> None:
+        """Take the poses in which the muscle was solved."""
+        self.solved = self._stacked(poses)
 
     def try_carry(
         self,
         model: MuscleModel,
         contacts: BoneContacts,
-        before: dict[str, Floats],
-        after: dict[str, Floats],
+        before: Mapping[str, Floats],
+        after: Mapping[str, Floats],
     ) -> bool:
         """Move the muscle rigidly from one set of poses to the next if it need not be solved;
-        return whether it was.
+        return whether it was. Where it was not, it is taken to be solved there.
         """
-        self.solved, root = self.solved or before, self.names[0]
-        if not self.keeps_shape(after):
-            return False
-        others = [b for b in contacts.reached if contacts.names[b] not in self.names]
-        near = [b for b in others if self._moves(before, after, contacts.names[b], root)]
+        if self.solved is None:
+            self.note_solved(before)
+        new = self._stacked(after)
+        if self._stand_alike(self.solved, new) and self._carry(model, contacts, before, after):
+            return True
+        self.solved = new
+        return False
+
+    def _carry(
+        self,
+        model: MuscleModel,
+        contacts: BoneContacts,
+        before: Mapping[str, Floats],
+        after: Mapping[str, Floats],
+    ) -> bool:
+        """Move the muscle with its bones if no other bone comes near; return whether that was."""
+        root = self.names[0]
+        near = [
+            row
+            for row, name in enumerate(contacts.bones.names)
+            if name not in self.names and self._comes(before, after, name)
+        ]
         if self._touches(model, contacts, near):
             return False
         motion = after[root] @ np.linalg.inv(before[root])
-        moves, saved = np.abs(motion - np.eye(4)).max() > STILL, model.snapshot() if near else None
+        moves, saved = np.abs(motion - IDENTITY).max() > STILL, model.snapshot() if near else None
         if moves:
             model.transform(motion)
         contacts.move(after)
@@ -116,20 +138,26 @@ class RigidTransport:
         return moved
 
     def _touches(self, model: MuscleModel, contacts: BoneContacts, bones: list[int]) -> bool:
-        """Whether one of these bones is near the muscle now."""
+        """Whether one of these bones in reach is near the muscle now."""
         if not bones:
             return False
-        return bool(
-            np.isin(contacts.half_spaces(model.contact_points(), self.clear).source, bones).any()
-        )
+        near = contacts.half_spaces(model.contact_points(), self.clear)
+        return bool(np.isin(near.source, bones).any())
 
-    def _moves(
-        self, before: Mapping[str, Floats], after: Mapping[str, Floats], root: str, name: str
-    ) -> bool:
-        """Whether a bone that holds the muscle rotates, or its attachment moves, as seen from
-        another bone.
+    def _stacked(self, poses: Mapping[str, Floats]) -> Floats:
+        """Poses (b, 4, 4) of what holds the muscle."""
+        return np.array([poses[name] for name in self.names])
+
+    def _stand_alike(self, old: Floats, new: Floats) -> bool:
+        """Whether no bone of two poses (b, 4, 4) rotates, and no attachment moves, as seen from the
+        first.
         """
-        old, new = np.array([before[root], before[name]]), np.array([after[root], after[name]])
-        corners, lever = self._corners[name][None], np.array([ARC * self.size])
-        moved = step_excess(old, new, 0, ATTACHED, corners, lever, 1.0, BONES, len(BONES))
-        return bool(moved.max() > STILL)
+        parts = self._owner[1:], self._corners[1:], self._lever[1:]
+        moved = step_excess(old, new, 0, *parts, 1.0, self._bones, 1)
+        return not moved[0] > STILL
+
+    def _comes(self, before: Mapping[str, Floats], after: Mapping[str, Floats], name: str) -> bool:
+        """Whether the muscle, which keeps its shape, moves as seen from another bone."""
+        old, new = (np.array([poses[name], poses[self.names[0]]]) for poses in (before, after))
+        parts = np.array([1]), self._corners[:1], self._lever[:1]
+        return bool(step_excess(old, new, 0, *parts, 1.0, np.zeros(2, np.bool_), 1)[0] > STILL)

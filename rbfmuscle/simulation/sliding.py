@@ -11,8 +11,10 @@ threads.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -76,7 +78,9 @@ class Sliding:
         self._link_near()
         for stepper in steppers:
             if scene.sliding.bones:
-                held = [BoneLink(stepper, b, limits) for b in stepper.contacts.reached]
+                held = [
+                    BoneLink(stepper, b, limits) for b in range(len(stepper.contacts.bones.names))
+                ]
                 self.bone_links[stepper.name] = held
                 stepper.contacts.neighbours += [link.pull for link in held]
 
@@ -114,10 +118,14 @@ class Sliding:
         for stop in range(1, last + 1):
             due = [s for s in self.steppers if stop == last or stop % strides[s.name] == 0]
             for stepper in due if len(activations) else ():
-                stepper.set_activation(activations[stop - 1])
+                if stepper.name in activations[stop - 1]:
+                    stepper.model.activate(activations[stop - 1][stepper.name])
             if due:
-                ends = stops[stop]
-                self._step(due, {s.name: s.path(stops[here[s.name]], ends) for s in self.steppers})
+                paths = {
+                    s.name: Path.between(stops[here[s.name]], stops[stop], s.poses)
+                    for s in self.steppers
+                }
+                self._step(due, paths)
             here.update((stepper.name, stop) for stepper in due)
         self._link_near()
 
@@ -130,13 +138,14 @@ class Sliding:
 
         def wait(stepper: MuscleStepper) -> None:
             state, path = stepper.model.snapshot(), paths[stepper.name]
-            with stepper.timed("predict"):
-                stepper.model.predict(path.old, path.new)
+            started = perf_counter()
+            stepper.model.predict(path.old, path.new)
+            stepper.times["time_predict"] += perf_counter() - started
             self.refresh(stepper, path)
             stepper.model.restore(state)
 
         def find_planes(stepper: MuscleStepper) -> None:
-            with stepper.timed("sliding"):
+            with _timed(stepper):
                 for link in self.links[stepper.name]:
                     link.update()
                 for bone_link in self.bone_links[stepper.name]:
@@ -144,7 +153,7 @@ class Sliding:
 
         def learn(stepper: MuscleStepper) -> None:
             if stepper.name in self.surfaces:
-                with stepper.timed("sliding"):
+                with _timed(stepper):
                     self.surfaces[stepper.name].learn(*paths[stepper.name][:2])
 
         each(predict, due)
@@ -183,7 +192,7 @@ class Sliding:
     def refresh(self, stepper: MuscleStepper, path: Path | None = None) -> None:
         """Update a muscle's surface from its present state, extrapolated for a path."""
         if stepper.name in self.surfaces:
-            with stepper.timed("sliding"):
+            with _timed(stepper):
                 self.surfaces[stepper.name].refresh(*(() if path is None else path[:2]))
 
     def finish_frame(self) -> None:
@@ -213,14 +222,22 @@ class Sliding:
                 self.surfaces[stepper.name].show(stepper.model.embedded_mesh())
 
     def _make_room(self, stepper):
-        with stepper.timed("sliding"):
+        with _timed(stepper):
             for link in self.links[stepper.name]:
                 link.update(relink=False)
-            stepper.model.separate_neighbours(stepper.contacts)
+            stepper.model.solve(stepper.contacts, room=True)
 
     def _measure(self, stepper):
-        with stepper.timed("sliding"):
+        with _timed(stepper):
             return [link.measure() for link in self.links[stepper.name]]
+
+
+@contextmanager
+def _timed(stepper: MuscleStepper) -> Iterator[None]:
+    """Add the time spent inside to ``time_sliding``."""
+    started = perf_counter()
+    yield
+    stepper.times["time_sliding"] += perf_counter() - started
 
 
 def _stride(stepper, stops):

@@ -81,7 +81,7 @@ class SlidingPair:
         self.other = other
         self.limits = limits
         self.begin_frame()
-        self.free = stepper.contacts.free(len(stepper.model.contact_points()))
+        self.free = stepper.contacts.free
         at = np.flatnonzero(self.free)
         apart = np.full(len(at), limits.reach)
         index, distance, _, _ = (
@@ -248,7 +248,7 @@ class BoneLink:
         self.limits = limits
         points = stepper.model.contact_points()
         distance, _ = stepper.contacts.distance_and_direction(points, bone_index)
-        self.linked = stepper.contacts.free(len(points)) & (distance < limits.threshold)
+        self.linked = stepper.contacts.free & (distance < limits.threshold)
         self.pull = Planes(YIELDS)
 
     def update(self) -> None:

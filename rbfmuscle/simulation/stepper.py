@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from rbfmuscle.simulation.frame import Event, ModelSurface, MuscleModel
 from rbfmuscle.simulation.rigid_transport import MuscleStatus, RigidState, RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 from rbfmuscle.simulation.tunnelling import (
+    Crossing,
     find_crossings,
     one_sided_planes,
     only_grazed,
@@ -33,6 +35,7 @@ TOUCH = 0.1
 FENCES = 4
 # Sub-steps are not halved below this angle [radian].
 SMALLEST_STEP = math.radians(0.1)
+IDENTITY = np.eye(4)
 
 
 class Path(NamedTuple):
@@ -43,12 +46,19 @@ class Path(NamedTuple):
     old: Poses
     new: Poses
 
+    @classmethod
+    def between(
+        cls, before: dict[str, float], after: dict[str, float], poses: Callable[..., Poses]
+    ) -> Path:
+        """The way from coordinates to others, whose poses a function gives."""
+        return cls(before, after, poses(before), poses(after))
+
 
 class StepperState(NamedTuple):
     """What changes of a muscle, its obstacles and its events between sub-steps."""
 
     model: object
-    poses: dict[str, Floats]
+    poses: Mapping[str, Floats]
     neighbours: tuple[Planes, ...]
     beside: tuple[Neighbour, ...]  # sliding pairs, as the contacts have them
     rigid_transport: RigidState | None
@@ -59,26 +69,12 @@ class StepperState(NamedTuple):
     unresolved: bool
 
 
-class _Stage:
-    """Adds the time spent inside to an entry of ``times`` [s]."""
-
-    def __init__(self, times: dict[str, float], key: str) -> None:
-        self.times, self.key = times, key
-
-    def __enter__(self) -> None:
-        self.start = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        spent = time.perf_counter() - self.start
-        self.times[self.key] = self.times.get(self.key, 0.0) + spent
-
-
 class MuscleStepper:
     """Advances one model through sub-steps, against obstacles of its own.
 
     ``substeps`` gives sub-steps by the relative motion of the bones that the muscle meets;
     ``rigid_transport`` moves the muscle rigidly where it need not be solved, None where it is
-    always solved.
+    always solved. ``times`` has the time spent on each stage since the last `collect` [s].
     """
 
     def __init__(
@@ -96,11 +92,11 @@ class MuscleStepper:
         self.poses = poses or PoseCache(scene)
         self.detect = scene.detect.tunnelling if scene.detect is not None else None
         self.tolerance = scene.length(TOUCH)
-        self.times: dict[str, float] = {}
+        self.times: dict[str, float] = defaultdict(float)
         self.events: dict[tuple[int, str, str], int] = {}
         self.frame, self.solves = 0, 0
         self.contracts = scene.muscle(self.name).contraction is not None
-        met = [contacts.names[b] for b in contacts.reached]
+        met = contacts.bones.names
         self.substeps = SubSteps(scene, scene.muscle(self.name), bones=met, poses=self.poses)
         self.rigid_transport: RigidTransport | None = None
         self._path: Path
@@ -110,18 +106,14 @@ class MuscleStepper:
         self._shown: ModelSurface | None = None
         # Whether points crossed a bone in this frame or the last that no step resolved: halving is
         # not tried again.
-        self._unresolved = False
-
-    def timed(self, stage: str) -> _Stage:
-        """Add the time spent inside to ``time_<stage>``."""
-        return _Stage(self.times, f"time_{stage}")
+        self.unresolved = False
 
     def split(self, before: dict[str, float], after: dict[str, float]) -> list[dict[str, float]]:
         """Coordinates of the sub-steps to the next frame; SolveError where there are too many."""
         try:
             return self.substeps.split(before, after)
         except SceneError as error:
-            raise SolveError(f"{self._place(after)}: {error}") from None
+            raise SolveError(f"{_place(self, after)}: {error}") from None
 
     def advance(
         self, stops: list[dict[str, float]], activations: Sequence[Mapping[str, float]] = ()
@@ -129,23 +121,16 @@ class MuscleStepper:
         """Advance through a list of coordinates, the present ones first; ``activations`` by muscle
         at each end.
         """
+        rigid_transport = self.rigid_transport
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
-            self.set_activation(activation or {})
-            path = self.path(before, after)
-            if self.rigid_transport is None or not self.rigid_transport.try_carry(
+            if activation and self.name in activation:
+                self.model.activate(activation[self.name])
+            path = Path.between(before, after, self.poses)
+            if rigid_transport is None or not rigid_transport.try_carry(
                 self.model, self.contacts, path.old, path.new
             ):
                 self.step(path)
         return self
-
-    def path(self, before: dict[str, float], after: dict[str, float]) -> Path:
-        """A way from coordinates to others."""
-        return Path(before, after, self.poses(before), self.poses(after))
-
-    def set_activation(self, activation: Mapping[str, float]) -> None:
-        """Set the model's activation from a dict by muscle, where it is in there."""
-        if self.name in activation:
-            self.model.activate(activation[self.name])
 
     def step(self, path: Path) -> None:
         """One sub-step, with the tunnelling test where the scene has one."""
@@ -158,7 +143,7 @@ class MuscleStepper:
         self._shown = None
         if self.detect is not None:
             self._saved = self.model.snapshot(), self.model.contact_points().copy()
-        self._predict()
+        _follow_bones(self, path)
 
     def correct(self) -> None:
         """Second half: the model solves, and points that passed through a bone are corrected."""
@@ -166,19 +151,17 @@ class MuscleStepper:
         self.solve(path.after)
         self.solves += 1
         if self.detect is not None:
-            crossings = self._crossings(path, self._saved[1])
+            crossings = _crossings(self, path, self._saved[1])
             if crossings:
-                self._correct(path, crossings)
-        if self.rigid_transport is not None:
-            self.rigid_transport.solved = path.new
+                _correct(self, path, self._saved, crossings)
 
     def solve(self, coordinates: Mapping[str, float]) -> None:
         """Solve; raise SolveError with muscle, mesh, frame and coordinates where that fails or is
         not finite.
         """
+        started = perf_counter()
         try:
-            with self.timed("solve"):
-                self.model.solve(self.contacts)
+            self.model.solve(self.contacts)
             points = self.model.contact_points()
             if not math.isfinite(points.sum()):
                 bad = ~np.isfinite(points).all(axis=1)
@@ -186,26 +169,27 @@ class MuscleStepper:
         except (np.linalg.LinAlgError, FloatingPointError, NotFiniteError) as error:
             source = self.scene.muscle(self.name).source
             raise SolveError(
-                f"{self._place(coordinates)}: {error}; look for spikes and thin triangles in "
+                f"{_place(self, coordinates)}: {error}; look for spikes and thin triangles in "
                 "its mesh"
                 f"{f' ({source})' if source else ''} and remesh it, or try a smaller "
                 "substep_angle in [contact]"
             ) from error
+        self.times["time_solve"] += perf_counter() - started
 
     def surface(self) -> ModelSurface:
         """The surface of the present state: the earlier one, moved, where the muscle was not solved
         since and has no neighbours that slide.
         """
-        rigid_transport = self.rigid_transport
-        with self.timed("surface"):
-            if self._shown is not None and not self.contacts.beside:
-                return self._shown.moved(
-                    np.eye(4) if rigid_transport is None else rigid_transport.since
-                )
-            self._shown = self.model.surface(self.contacts)
-        if rigid_transport is not None:
-            rigid_transport.since = np.eye(4)
-        return self._shown
+        started, rigid_transport = perf_counter(), self.rigid_transport
+        shown = self._shown
+        if shown is not None and not self.contacts.beside:
+            drawn = shown.moved(IDENTITY if rigid_transport is None else rigid_transport.since)
+        else:
+            drawn = self._shown = self.model.surface(self.contacts)
+            if rigid_transport is not None:
+                rigid_transport.since = IDENTITY
+        self.times["time_surface"] += perf_counter() - started
+        return drawn
 
     def report(self, bone: str, count: int, action: str) -> None:
         """Record an event of the present frame; of one kind the greatest number of points is
@@ -216,14 +200,14 @@ class MuscleStepper:
 
     def collect(self) -> tuple[dict[str, float], list[Event], MuscleStatus]:
         """Times, events and status since the last call."""
-        times, solves = self.times, self.solves
+        times, solves = dict(self.times), self.solves
         times["time_frame"] = sum(times.values())
-        self._unresolved = any(action == "unresolved" for _, _, action in self.events)
+        self.unresolved = any(action == "unresolved" for _, _, action in self.events)
         events = [
             Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()
         ]
         moved = self.rigid_transport is not None and self.rigid_transport.collect()
-        self.times = {}
+        self.times.clear()
         self.events = {}
         self.solves = 0
         return (
@@ -245,7 +229,7 @@ class MuscleStepper:
             dict(self.events),
             self.frame,
             self.solves,
-            self._unresolved,
+            self.unresolved,
         )
 
     def restore(self, state: StepperState) -> None:
@@ -260,83 +244,114 @@ class MuscleStepper:
         self.events = dict(state.events)
         self.frame = state.frame
         self.solves = state.solves
-        self._unresolved = state.unresolved
+        self.unresolved = state.unresolved
 
-    def _predict(self):
-        path = self._path
-        with self.timed("predict"):
-            self.contacts.move(path.new)
-            self.model.predict(path.old, path.new)
 
-    def _crossings(self, path, start, *, flag=True):
-        """What crossed a bone on the way from contact points (n, 3) to the present ones."""
-        with self.timed("tunnelling"):
-            end = self.model.contact_points()
-            found = find_crossings(
-                self.contacts, start, end, *path[2:], self.detect, tolerance=self.tolerance
-            )
-        for crossing in found:
-            if flag and crossing.flagged:
-                self.report(self.contacts.names[crossing.bone], crossing.flagged, "angle_flag")
-        return [crossing for crossing in found if len(crossing.index)]
+def _follow_bones(stepper: MuscleStepper, path: Path) -> None:
+    """Move the bones, and let the model predict."""
+    started = perf_counter()
+    stepper.contacts.move(path.new)
+    stepper.model.predict(path.old, path.new)
+    stepper.times["time_predict"] += perf_counter() - started
 
-    def _correct(self, path, crossings):
-        """Halve the step, down to the smallest, and then hold points on their side by planes."""
-        if self.detect.action == "report":
-            self._report_all(crossings, "reported")
-            return
-        state, start = self._saved
-        if step_angle(self.scene, path.before, path.after) > 2.0 * SMALLEST_STEP and (
-            not self._unresolved
-        ):
-            self._report_all(crossings, "halved")
-            self.model.restore(state)
-            middle = interpolate(path.before, path.after, 0.5)
-            self.step(self.path(path.before, middle))
-            self.step(self.path(middle, path.after))
-            return
-        for crossing in self._held_back(path, state, start, crossings):
-            name = self.contacts.names[crossing.bone]
-            paths, ends = (start, self.model.contact_points()), (path.old[name], path.new[name])
-            mesh = self.scene.bone(name).mesh
-            touched = only_grazed(crossing, mesh, paths, *ends, self.tolerance)
-            self.report(name, len(crossing.index), "grazed" if touched else "unresolved")
-            self._unresolved |= not touched
 
-    def _held_back(self, path, state, start, crossings):
-        """Solve with crossing points held on their side by planes; return what crosses all the
-        same.
-        """
-        neighbours = self.contacts.neighbours
-        fenced = [*neighbours]
-        self._path = path
-        try:
-            for _ in range(FENCES):
-                fenced += [
-                    one_sided_planes(self.contacts, crossing, start, path.old, path.new)
-                    for crossing in crossings
-                ]
-                self.contacts.neighbours = fenced
-                self.model.restore(state)
-                self._predict()
-                self.solve(path.after)
-                held, crossings = crossings, self._crossings(path, start, flag=False)
-                self._report_all(held, "held_back")
-                if not crossings:
-                    break
-        finally:
-            self.contacts.neighbours = neighbours
-        return crossings
+def _crossings(
+    stepper: MuscleStepper, path: Path, start: Floats, *, flag: bool = True
+) -> list[Crossing]:
+    """What crossed a bone on the way from contact points (n, 3) to the present ones."""
+    started, contacts = perf_counter(), stepper.contacts
+    assert stepper.detect is not None
+    found = find_crossings(
+        contacts,
+        start,
+        stepper.model.contact_points(),
+        path.old,
+        path.new,
+        stepper.detect,
+        tolerance=stepper.tolerance,
+    )
+    stepper.times["time_tunnelling"] += perf_counter() - started
+    crossings = []
+    for crossing in found:
+        if flag and crossing.flagged:
+            stepper.report(contacts.bones.names[crossing.bone], crossing.flagged, "angle_flag")
+        if len(crossing.index):
+            crossings.append(crossing)
+    return crossings
 
-    def _report_all(self, crossings, action):
-        for crossing in crossings:
-            self.report(self.contacts.names[crossing.bone], len(crossing.index), action)
 
-    def _place(self, coordinates):
-        scene = self.scene
-        where = ", ".join(
-            f"{name} = "
-            f"{shown_value(scene, name, value):.6g}{unit_sign(scene, name).replace('°', ' deg')}"
-            for name, value in coordinates.items()
-        )
-        return f"muscle {self.name!r}, frame {self.frame} ({where or 'rest'})"
+def _correct(
+    stepper: MuscleStepper,
+    path: Path,
+    saved: tuple[object, Floats],
+    crossings: Sequence[Crossing],
+) -> None:
+    """Halve the step, down to the smallest, and then hold points on their side by planes."""
+    scene, (state, start) = stepper.scene, saved
+    assert stepper.detect is not None
+    if stepper.detect.action == "report":
+        _report_all(stepper, crossings, "reported")
+        return
+    if step_angle(scene, path.before, path.after) > 2.0 * SMALLEST_STEP and (
+        not stepper.unresolved
+    ):
+        _report_all(stepper, crossings, "halved")
+        stepper.model.restore(state)
+        middle = interpolate(path.before, path.after, 0.5)
+        stepper.step(Path.between(path.before, middle, stepper.poses))
+        stepper.step(Path.between(middle, path.after, stepper.poses))
+        return
+    for crossing in _held_back(stepper, path, saved, crossings):
+        name = stepper.contacts.bones.names[crossing.bone]
+        paths, ends = (start, stepper.model.contact_points()), (path.old[name], path.new[name])
+        touched = only_grazed(crossing, scene.bone(name).mesh, paths, *ends, stepper.tolerance)
+        stepper.report(name, len(crossing.index), "grazed" if touched else "unresolved")
+        stepper.unresolved |= not touched
+
+
+def _held_back(
+    stepper: MuscleStepper,
+    path: Path,
+    saved: tuple[object, Floats],
+    crossings: Sequence[Crossing],
+) -> Sequence[Crossing]:
+    """Solve with crossing points held on their side by planes; return what crosses all the
+    same.
+    """
+    contacts, (state, start) = stepper.contacts, saved
+    neighbours = contacts.neighbours
+    fenced = [*neighbours]
+    try:
+        for _ in range(FENCES):
+            fenced += [
+                one_sided_planes(contacts, crossing, start, path.old, path.new)
+                for crossing in crossings
+            ]
+            contacts.neighbours = fenced
+            stepper.model.restore(state)
+            _follow_bones(stepper, path)
+            stepper.solve(path.after)
+            held, crossings = crossings, _crossings(stepper, path, start, flag=False)
+            _report_all(stepper, held, "held_back")
+            if not crossings:
+                break
+    finally:
+        contacts.neighbours = neighbours
+    return crossings
+
+
+def _report_all(stepper: MuscleStepper, crossings: Sequence[Crossing], action: str) -> None:
+    for crossing in crossings:
+        name = stepper.contacts.bones.names[crossing.bone]
+        stepper.report(name, len(crossing.index), action)
+
+
+def _place(stepper: MuscleStepper, coordinates: Mapping[str, float]) -> str:
+    """Muscle, frame and coordinates, for messages."""
+    scene = stepper.scene
+    where = ", ".join(
+        f"{name} = "
+        f"{shown_value(scene, name, value):.6g}{unit_sign(scene, name).replace('°', ' deg')}"
+        for name, value in coordinates.items()
+    )
+    return f"muscle {stepper.name!r}, frame {stepper.frame} ({where or 'rest'})"

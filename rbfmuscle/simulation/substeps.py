@@ -111,19 +111,22 @@ class SubSteps:
             return [dict(after)]
         if len(moving) == 1 and self._facts[moving[0]].motion == "rotation":
             return [*self._stops_on_grid(before, after, moving[0]), dict(after)]
-        return self._even_stops(before, after)
-
-    def _even_stops(self, before, after):
-        """The fewest equal sub-steps that are short enough."""
         # What does not move these bones against each other does not count.
         start = {**before, **{k: value for k, value in after.items() if k not in self.relevant}}
-        count = max(
-            1, math.ceil(path_angle(self.scene, start, after, self._facts) / self.limit - 1e-9)
-        )
+        angle = path_angle(self.scene, start, after, self._facts)
+        ends = (interpolate(before, after, t) for t in (0.0, 1.0))
+        return self._even_stops(*ends, angle)
+
+    def _even_stops(self, before, after, angle):
+        """The fewest equal sub-steps that are short enough, in which no bone turns by more than
+        ``angle`` [radian] in all; both ends name the same coordinates.
+        """
+        count = max(1, math.ceil(angle / self.limit - 1e-9))
         while True:
             if count > MOST_IN_FRAME:
-                raise SceneError(self._too_many(start, after))
-            stops = [interpolate(before, after, k / count) for k in range(count + 1)]
+                raise SceneError(self._too_many(before, after))
+            between = [interpolate(before, after, k / count) for k in range(1, count)]
+            stops = [before, *between, after]
             poses = [self._matrices(stop) for stop in stops]
             excess = list(map(self._excess, poses[:-1], poses[1:]))
             most = max(excess)
@@ -211,7 +214,8 @@ class SubSteps:
             if len(found) > MOST_IN_FRAME:
                 raise SceneError(self._too_many(before, after))
             found.append(ends[0][name])
-            found += [stop[name] for stop in self._even_stops(*ends)]
+            angle = abs(ends[1][name] - ends[0][name])
+            found += [stop[name] for stop in self._even_stops(*ends, angle)]
         margin = 1e-6 * self.limit
         inner = []
         for value in sorted(found):

@@ -9,17 +9,17 @@ cannot miss what is thicker than its tolerance.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rbfmuscle.bones.broad_phase import box_loop, boxes_apart, may_reach
 from rbfmuscle.bones.obstacles import query_bone
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.jit import compiled, inner
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, Planes
@@ -59,7 +59,9 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Points that passed through one bone in a step, and how many the angle test flags."""
+    """Points that passed through one of the bones in reach in a step, and how many the angle test
+    flags.
+    """
 
     bone: int
     index: np.ndarray
@@ -67,7 +69,7 @@ class Crossing:
 
 
 def sweep_paths(
-    field: BoneField,
+    field: BoneSDF,
     start: Floats,
     end: Floats,
     *,
@@ -105,8 +107,8 @@ def find_crossings(
     contacts: BoneContacts,
     start: Floats,
     end: Floats,
-    before: dict[str, Floats],
-    after: dict[str, Floats],
+    before: Mapping[str, Floats],
+    after: Mapping[str, Floats],
     options: TunnellingOptions,
     *,
     tolerance: float,
@@ -117,55 +119,41 @@ def find_crossings(
     Points are in world coordinates, the contacts in the poses ``after``, the tolerance in the
     scene's unit.
     """
-    crossings = []
+    crossings: list[Crossing] = []
     angle = math.radians(options.angle)
-    for b, index in _suspects(contacts, start, end, before, math.cos(angle), tolerance):
-        name = contacts.names[b]
+    obstacles, old = contacts.obstacles(), contacts.bones.place(before)
+    found, count = suspect_paths(obstacles, start, end, old, math.cos(angle), tolerance)
+    if count == 0:
+        return crossings
+    for b in np.flatnonzero(found.any(axis=1)).tolist():
+        name, index = contacts.bones.names[b], np.flatnonzero(found[b])
         first, second = _local(start[index], before[name]), _local(end[index], after[name])
-        sweep = sweep_paths(contacts.fields[b], first, second, tolerance=tolerance, angle=angle)
+        field = contacts.bones.fields[b]
+        sweep = sweep_paths(field, first, second, tolerance=tolerance, angle=angle)
         if sweep.through.any() or sweep.flagged.any():
             crossed = index[sweep.index[sweep.through]]
             crossings.append(Crossing(b, crossed, int(sweep.flagged.sum())))
     return crossings
 
 
-def _suspects(
-    contacts: BoneContacts,
-    start: Floats,
-    end: Floats,
-    before: dict[str, Floats],
-    cosine: float,
-    tolerance: float,
-) -> Iterable[tuple[int, Integers]]:
-    """Bones, each with the points whose paths are not shown to be clear of it."""
-    if contacts.bones is None:
-        # A path that is shorter than the distance of its end touches nothing.
-        return contacts.near(end, contacts.path_lengths(start, end, before, contacts.poses))
-    obstacles, old = contacts.obstacles(len(end)), contacts.stacked(before)
-    found, count = suspect_paths(obstacles, start, end, old, cosine, tolerance)
-    if count == 0:
-        return []
-    rows = np.flatnonzero(found.any(axis=1))
-    return [(contacts.reached[row], np.flatnonzero(found[row])) for row in rows]
-
-
 def one_sided_planes(
     contacts: BoneContacts,
     crossing: Crossing,
     start: Floats,
-    before: dict[str, Floats],
-    after: dict[str, Floats],
+    before: Mapping[str, Floats],
+    after: Mapping[str, Floats],
 ) -> Planes:
     """A half-space for each point that crossed, to hold it on its side of the bone.
 
     The plane lies between the point and the bone, normal to the distance's gradient, and moves with
     the bone.
     """
-    name = contacts.names[crossing.bone]
+    bones = contacts.bones
+    name, field = bones.names[crossing.bone], bones.fields[crossing.bone]
     motion, points = after[name] @ np.linalg.inv(before[name]), start[crossing.index]
     local = _local(points, before[name])
-    distance = contacts.fields[crossing.bone].distance(local)
-    way = _directions(contacts.fields[crossing.bone], local) @ after[name][:3, :3].T
+    distance = field.distance(local)
+    way = _directions(field, local) @ after[name][:3, :3].T
     planes = Planes()
     planes.set(crossing.index, distance, way, points @ motion[:3, :3].T + motion[:3, 3])
     return planes
@@ -338,6 +326,27 @@ def _to_bone(point, pose, out):
             out[a] += pose[k, a] * (point[k] - pose[k, 3])
 
 
+class Pieces(NamedTuple):
+    """Pieces of straight paths, all of the same share of theirs."""
+
+    path: np.ndarray  # (m,) which path
+    at: np.ndarray  # (m,) where it begins [share of the path]
+    near: np.ndarray  # (m,) distance from the bone there [scene unit]
+    far: np.ndarray  # (m,) and at its other end
+
+
+@inner(error_model="numpy")
+def _doubtful(pieces, length, tolerance, found):
+    """Pieces, of ``length`` by path, that may be deeper in a bone than the tolerance, of paths that
+    are not ``found`` to be.
+    """
+    left = np.empty(len(pieces.path), np.bool_)
+    for k, one in enumerate(pieces.path):
+        deepest = pieces.near[k] + pieces.far[k] - length[one]
+        left[k] = deepest < -2.0 * tolerance and not found[one]
+    return Pieces(pieces.path[left], pieces.at[left], pieces.near[left], pieces.far[left])
+
+
 @compiled(error_model="numpy")
 def unclear_paths(bones, b, start, end, cosine, tolerance):
     """Mask (n,) of straight paths (n, 3), in the coordinates of bone b, that may come deeper into
@@ -354,39 +363,27 @@ def unclear_paths(bones, b, start, end, cosine, tolerance):
     way, out = np.empty((count, 3)), np.empty((count, 3))
     query_bone(bones, b, pose, start, length, first, way)
     query_bone(bones, b, pose, end, length + tolerance, last, out)
-    # Pieces of the paths: which path, where they begin (fraction), the distances at their ends.
-    path = np.arange(count)
-    at = np.zeros(count)
-    near = first
-    far = last
-    size, left = 1.0, np.zeros(count, np.bool_)
-    for k in range(count):
-        left[k] = first[k] < length[k] and first[k] + last[k] <= length[k] + tolerance
-        if left[k]:
-            found[k] = min(first[k], last[k]) < -tolerance or (way[k] * out[k]).sum() < cosine
-    for halvings in range(HALVINGS + 1):
-        for k in range(len(path)):
-            deepest = near[k] + far[k] - size * length[path[k]] / STEP_SHARE
-            left[k] &= deepest < -2.0 * tolerance and not found[path[k]]
-        path = path[left]
-        at = at[left]
-        near = near[left]
-        far = far[left]
-        if len(path) == 0:
-            break
-        if halvings == HALVINGS:
-            for k in path:
-                found[k] = True
-            break
+    left = (first < length) & (first + last <= length + tolerance)
+    path = np.flatnonzero(left)
+    for k in path:
+        found[k] = min(first[k], last[k]) < -tolerance or (way[k] * out[k]).sum() < cosine
+    pieces = Pieces(path, np.zeros(len(path)), first[path], last[path])
+    size = 1.0
+    for _ in range(HALVINGS):
+        pieces = _doubtful(pieces, size * length / STEP_SHARE, tolerance, found)
         size *= 0.5
-        middle, between = np.empty((len(path), 3)), np.empty(len(path))
-        for k in range(len(path)):
-            share = at[k] + size
-            middle[k] = start[path[k]] + share * (end[path[k]] - start[path[k]])
-        query_bone(bones, b, pose, middle, np.full(len(path), np.inf), between, way[:0])
-        for k in range(len(path)):
-            found[path[k]] |= between[k] < -tolerance
-        path, at = np.concatenate((path, path)), np.concatenate((at, at + size))
-        near, far = np.concatenate((near, between)), np.concatenate((between, far))
-        left = np.ones(len(path), np.bool_)
+        middle, between = np.empty((len(pieces.path), 3)), np.empty(len(pieces.path))
+        for k, one in enumerate(pieces.path):
+            middle[k] = start[one] + (pieces.at[k] + size) * (end[one] - start[one])
+        query_bone(bones, b, pose, middle, np.full(len(middle), np.inf), between, way[:0])
+        for k, one in enumerate(pieces.path):
+            found[one] |= between[k] < -tolerance
+        pieces = Pieces(
+            np.concatenate((pieces.path, pieces.path)),
+            np.concatenate((pieces.at, pieces.at + size)),
+            np.concatenate((pieces.near, between)),
+            np.concatenate((between, pieces.far)),
+        )
+    for k in _doubtful(pieces, size * length / STEP_SHARE, tolerance, found).path:
+        found[k] = True
     return found

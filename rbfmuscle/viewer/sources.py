@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
-from rbfmuscle.geometry.fields import BoneField
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.metrics.rows import moment_arms, reaches
@@ -105,7 +105,7 @@ class LiveSource:
         self.motion = [{n: shown_value(scene, n, x) for n, x in frame.items()} for frame in moved]
 
     @cached_property
-    def fields(self) -> Mapping[str, BoneField]:
+    def fields(self) -> Mapping[str, BoneSDF]:
         """Distance fields of the bones, built when a model first asks for them."""
         return live_fields(self.scene)
 

@@ -21,7 +21,7 @@ from peers.known_scenes import Bar
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.activation.keys import ContractionTable
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 
 MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume")
 SETTLED = ("rbf", "arap-volume")
@@ -69,8 +69,7 @@ def test_shapes_do_not_depend_on_how_activation_gets_there(model):
 def test_snapshot_holds_the_activation():
     scene = spindle_scene(model="rbf", frames=2, spacing=6.0)
     model = build_model(scene.muscles[0], scene, "rbf")
-    names = [bone.name for bone in scene.bones]
-    contacts = BoneContacts(names, [None] * len(names), attached_bone=model.attached_bone)
+    contacts = BoneContacts(BonesInReach([], []), model.attached_bone)
 
     def solved():
         model.predict(contacts.poses, contacts.poses)

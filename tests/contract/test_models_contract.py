@@ -14,7 +14,7 @@ from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.options import DetectOptions, SlidingOptions, TunnellingOptions
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 
 paper_models.register()
@@ -81,7 +81,7 @@ def test_frames_are_closed_outward_finite_and_clear_of_bones(name):
 def test_rest_is_a_rest_and_restore_brings_a_snapshot_back(name):
     scene = _scene([0])
     part = build_model(scene.muscles[0], scene, name)
-    contacts = BoneContacts(["trunk", "arm"], [None, None], attached_bone=part.attached_bone)
+    contacts = BoneContacts(BonesInReach([], []), part.attached_bone)
     stops = [bone_poses(scene, {"hinge.bend": np.radians(a)}) for a in (0, 2, 4)]
 
     def go(before, after):

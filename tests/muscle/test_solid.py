@@ -31,7 +31,7 @@ from rbfmuscle.muscle.settle import DONE, SETTLED, settle
 from rbfmuscle.muscle.state import predict, rest_state, tension
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.phantom import phantom_scene
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.frame_loop import simulate_frames
 
 DATA = ROOT / "tests" / "data"
@@ -59,7 +59,7 @@ class Bar:
         )
         self.model = model if tension else model._replace(end=np.full_like(model.end, -1))
         self.state = rest_state(model)
-        self.contacts = BoneContacts([], [], attached_bone=owner)
+        self.contacts = BoneContacts(BonesInReach([], []), owner)
         self.rounded = round_bones({}, frame, 1.0, {}, 0)
         self.poses = np.array([np.eye(4), np.eye(4)])
 
@@ -78,7 +78,7 @@ class Bar:
         """The bones move to poses, the first one stays where only one is given."""
         after = np.array([np.eye(4), *poses][-2:])
         moved = predict(self.model, self.state, self.poses, after)
-        obstacles = self.contacts.obstacles(len(moved.points))
+        obstacles = self.contacts.obstacles()
         self.poses, stiff = after, stiffness(self.model, 0.0)
         self.state, self.report = settle(self.model, stiff, moved, obstacles, self.rounded)
         assert self.report.status == DONE

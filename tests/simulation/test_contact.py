@@ -4,14 +4,12 @@ from itertools import product
 
 import numpy as np
 import pytest
-import trimesh
 from toy_scene import ToyMuscle, attach, box, ellipsoid, muscle, scene, sphere
 
-from rbfmuscle.bones.broad_phase import boxes_apart
-from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.bones.broad_phase import boxes_apart, direction_loop
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.joints.joint import rotation_about
-from rbfmuscle.simulation.contact import BoneContacts, Planes
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach, Planes
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.overlap import resolve_initial_overlap
 from rbfmuscle.simulation.stepper import MuscleStepper
@@ -21,9 +19,9 @@ def _points(count=400, seed=0):
     return np.random.default_rng(seed).uniform(-6, 6, (count, 3))
 
 
-def _pair(fields=None, **options):
-    fields = fields or [sphere(2.0), box((3, 3, 0.5))]
-    contacts = BoneContacts(["ball", "plate"], fields, **options)
+def _pair(attached=None):
+    bones = BonesInReach(["ball", "plate"], [sphere(2.0), box((3, 3, 0.5))])
+    contacts = BoneContacts(bones, np.full(400, -1) if attached is None else attached)
     poses = {"ball": rotation_about([0, 1, 0], 0.3, np.array([5.0, 0, 0])), "plate": np.eye(4)}
     poses["plate"][:3, 3] = [0, 0, 4.0]
     contacts.move(poses)
@@ -33,24 +31,17 @@ def _pair(fields=None, **options):
 def _literal(contacts, poses, points, reach):
     """All pairs nearer than reach, one by one."""
     pairs = {}
-    for b, name in enumerate(contacts.names):
-        distance, gradient = contacts.fields[b].distance_and_gradient(points, poses[name])
+    for b, (name, field) in enumerate(zip(contacts.bones.names, contacts.bones.fields)):
+        distance, gradient = field.distance_and_gradient(points, poses[name])
         for i in np.flatnonzero(distance < reach):
             pairs[i, b] = distance[i], gradient[i]
     return pairs
 
 
-def _meshed():
-    """The same two as fields of meshes, which compiled loops ask."""
-    ball, plate = trimesh.creation.icosphere(3, 2.0), trimesh.creation.box((6, 6, 1))
-    return [BoneSDF.from_mesh(mesh.subdivide(), cache=False) for mesh in (ball, plate)]
-
-
 @pytest.mark.parametrize("reach", [0.5, 3.0, 100.0])
-@pytest.mark.parametrize("kind", ["analytic", "meshed"])
-def test_half_spaces_are_all_pairs_nearer_than_reach(kind, reach):
+def test_half_spaces_are_all_pairs_nearer_than_reach(reach):
     attached = np.where(np.arange(400) % 3 == 0, 0, -1)  # which take no contact
-    contacts, poses = _pair(_meshed() if kind == "meshed" else None, attached_bone=attached)
+    contacts, poses = _pair(attached)
     points, rng = _points(), np.random.default_rng(1)
     for _ in range(10):  # later calls rely on distances known from the earlier ones
         every = _literal(contacts, poses, points, reach)
@@ -64,7 +55,7 @@ def test_half_spaces_are_all_pairs_nearer_than_reach(kind, reach):
 
 
 def test_planes_of_neighbours_come_behind_those_of_bones():
-    contacts, _ = _pair(attached_bone=np.full(400, -1))
+    contacts, _ = _pair()
     points, rng = _points(), np.random.default_rng(4)
     bones = len(contacts.half_spaces(points, 0.5).index)
     contacts.neighbours = [Planes(), Planes(3.0)]
@@ -80,22 +71,21 @@ def test_planes_of_neighbours_come_behind_those_of_bones():
 
 def test_nearest_is_the_smallest_over_bones_and_infinite_without():
     contacts, poses = _pair()
-    points = _points()
+    bones, points = contacts.bones, _points()
     expected = np.min(
-        [f.distance(points, poses[n]) for f, n in zip(contacts.fields.values(), contacts.names)],
-        axis=0,
+        [f.distance(points, poses[n]) for f, n in zip(bones.fields, bones.names)], axis=0
     )
-    assert np.isinf(BoneContacts(["a"], [None]).nearest(points)[0]).all()
-    distance, gradient = contacts.nearest(points)
+    assert np.isinf(BonesInReach([], []).nearest(points, {})[0]).all()
+    distance, gradient = bones.nearest(points, poses)
     assert np.allclose(distance, expected)
     assert np.allclose(np.linalg.norm(gradient, axis=1), 1.0)
     limit = np.random.default_rng(2).uniform(0.0, distance.max(), len(points))
-    found, slope = contacts.nearest(points, limit)
+    found, slope = bones.nearest(points, poses, limit)
     below = distance < limit
     assert 0 < below.sum() < len(points)
     assert np.array_equal(found[below], distance[below])
     assert np.array_equal(slope[below], gradient[below])
-    assert np.array_equal(contacts.distance(points, limit), found)
+    assert np.array_equal(bones.distance(points, poses, limit), found)
     assert np.all(found[~below] >= limit[~below]) and np.all(found <= distance + 1e-9)
 
 
@@ -121,13 +111,9 @@ def test_boxes_are_apart_by_no_more_than_what_is_in_them():
 
 
 def test_point_with_no_direction_still_gets_one():
-    flat = sphere(2.0)
-    flat.formula = lambda p: (np.full(len(p), -1.0), np.zeros_like(p))
-    distance, direction = BoneContacts(["x"], [flat]).distance_and_direction(
-        np.array([[0.5, 0, 0]]), 0
-    )
-    assert np.allclose(direction, [[1, 0, 0]])
-    assert distance[0] == -1.0
+    gradient, corners = np.zeros((1, 3)), np.array([[-2.0, -2, -2], [2, 2, 2]])
+    direction_loop(np.array([[0.5, 0, 0]]), gradient, np.eye(4), corners)
+    assert np.allclose(gradient, [[1, 0, 0]])
 
 
 def test_kept_overlap_is_no_contact_and_deeper_is():
@@ -139,12 +125,13 @@ def test_kept_overlap_is_no_contact_and_deeper_is():
     ]
     made = scene(fields, [], [muscle("belly", mesh, ends)], [{}], initial="keep")
     model = ToyMuscle(made.muscles[0], made)
-    contacts = BoneContacts(list(fields), list(fields.values()), attached_bone=model.attached_bone)
+    contacts = BoneContacts(BonesInReach(list(fields), list(fields.values())), model.attached_bone)
     stepper = MuscleStepper(model, contacts, made)
     points = model.contact_points().copy()
-    # Free points alone count.
-    depth = stepper.contacts.depths(points)[0]
-    assert depth.max() == pytest.approx(2.0, abs=1e-9) and not depth[model.attached_bone >= 0].any()
+    # The field of a bone holds single-precision numbers.
+    assert contacts.depth(points) == pytest.approx(2.0, abs=1e-5)
+    held = BoneContacts(contacts.bones, np.zeros(len(points)))
+    assert held.depth(points) == 0.0  # free points alone count
     resolve_initial_overlap(stepper)
     assert stepper.contacts.half_spaces(points, 0.5).gap.min() >= -1e-12
     assert stepper.contacts.half_spaces(points - [0, 0, 0.1], 0.5).gap.min() == pytest.approx(-0.1)

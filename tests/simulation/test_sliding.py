@@ -12,7 +12,7 @@ import trimesh
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.options import SlidingOptions
 from rbfmuscle.simulation import sliding_pair as links
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 from rbfmuscle.simulation.neighbour_surface import NeighbourSurface
 from rbfmuscle.simulation.sliding import Sliding, sliding_pairs
@@ -217,9 +217,8 @@ def test_drawn_surfaces_yield_by_half_of_their_overlap():
     made, fields = toy.neighbour_scene([{}], sliding=SlidingOptions(), gap=-0.6)
     steppers = []
     for part in [toy.ToyMuscle(m, made) for m in made.muscles]:
-        contacts = BoneContacts(
-            list(fields), list(fields.values()), attached_bone=part.attached_bone
-        )
+        bones = BonesInReach(list(fields), list(fields.values()))
+        contacts = BoneContacts(bones, part.attached_bone)
         steppers.append(MuscleStepper(part, contacts, made))
     Sliding(made, steppers).finish_frame()
     for stepper, other in (steppers, steppers[::-1]):

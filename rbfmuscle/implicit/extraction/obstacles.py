@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.jit import compiled
+from rbfmuscle.jit import compiled, inner
 
 # A chord is never farther from its surface than this share of a cell. As vertices move while points
 # are pushed off, points are looked for so far above and below triangles, and so far beside them in
@@ -195,14 +195,8 @@ def _near_loop(vertices, faces, grid, pairs):
     end = np.empty(3, np.int64)
     met = 0
     for f in range(len(faces)):
-        empty, margin = False, MARGIN * _length(vertices, faces, f)
-        for a in range(3):
-            x = vertices[faces[f, 0], a]
-            y = vertices[faces[f, 1], a]
-            z = vertices[faces[f, 2], a]
-            least[a], most[a] = min(x, y, z) - margin, max(x, y, z) + margin
-            empty |= not (most[a] >= low[a] and least[a] <= low[a] + edge * shape[a])
-        if empty:
+        margin = MARGIN * _length(vertices, faces, f)
+        if not _box_of(vertices, faces, f, margin, grid, least, most):
             continue
         for a in range(3):
             begin[a] = np.int64(max(np.floor((least[a] - low[a]) / edge), 0.0))
@@ -213,27 +207,46 @@ def _near_loop(vertices, faces, grid, pairs):
             for j in range(begin[1], end[1] + 1):
                 row = (i * shape[1] + j) * shape[2]
                 for p in range(start[row + begin[2]], start[row + end[2] + 1]):
-                    x = points[p, 0]
-                    y = points[p, 1]
-                    z = points[p, 2]
-                    height = _height(plane, x, y, z)
-                    if height * height > margin * margin * square:
-                        continue
-                    at_b, at_c = _areas(plane, x, y, z)
-                    if min(at_b, at_c, square - at_b - at_c) < -BESIDE * square:
-                        continue
-                    if (
-                        (least[0] <= x)
-                        & (x <= most[0])
-                        & (least[1] <= y)
-                        & (y <= most[1])
-                        & (least[2] <= z)
-                        & (z <= most[2])
-                    ):
+                    if _is_near(plane, square, margin, points[p], least, most):
                         if met < pairs.shape[1]:
                             pairs[0, met], pairs[1, met] = p, f
                         met += 1
     return met
+
+
+@inner(error_model="numpy", inline="always")
+def _box_of(vertices, faces, f, margin, grid, least, most):
+    """Fill the corners (3,) of a triangle's box, larger by a margin; False where it is outside of
+    the grid.
+    """
+    inside = True
+    for a in range(3):
+        x = vertices[faces[f, 0], a]
+        y = vertices[faces[f, 1], a]
+        z = vertices[faces[f, 2], a]
+        least[a], most[a] = min(x, y, z) - margin, max(x, y, z) + margin
+        inside &= most[a] >= grid[2][a] and least[a] <= grid[2][a] + grid[3] * grid[4][a]
+    return inside
+
+
+@inner(error_model="numpy", inline="always")
+def _is_near(plane, square, margin, point, least, most):
+    """Whether a point is within a margin of a triangle: of its plane, not beside it, in its box."""
+    x = point[0]
+    y = point[1]
+    z = point[2]
+    height = _height(plane, x, y, z)
+    at_b, at_c = _areas(plane, x, y, z)
+    over = height * height <= margin * margin * square
+    over = over and min(at_b, at_c, square - at_b - at_c) >= -BESIDE * square
+    return over and (
+        (least[0] <= x)
+        & (x <= most[0])
+        & (least[1] <= y)
+        & (y <= most[1])
+        & (least[2] <= z)
+        & (z <= most[2])
+    )
 
 
 @compiled(error_model="numpy")
@@ -242,37 +255,17 @@ def _push_loop(vertices, faces, near_points, tolerance, moved):
     points, first, near, order = near_points
     pushed = False
     for p in order:
-        x = points[p, 0]
-        y = points[p, 1]
-        z = points[p, 2]
-        best = -1
-        least = np.inf
-        signed = 0.0
-        for f in near[first[p] : first[p + 1]]:
-            plane = _plane(vertices, faces, f)
-            square, (at_b, at_c) = _square(plane), _areas(plane, x, y, z)
-            if square == 0.0 or min(at_b, at_c, square - at_b - at_c) < -1e-9 * square:
-                continue  # beside it
-            depth = -_height(plane, x, y, z) / np.sqrt(square)
-            # Of triangles that are equally near, but for rounding, the first.
-            if abs(depth) < least * (1.0 - 1e-6):
-                best = f
-                least = abs(depth)
-                signed = depth
-        if (
-            best < 0
-            or signed <= ASKED * tolerance
-            or signed > CHORD * _length(vertices, faces, best)
-        ):
+        best, depth = _triangle_over(vertices, faces, points[p], near[first[p] : first[p + 1]])
+        if best < 0 or depth <= ASKED * tolerance or depth > CHORD * _length(vertices, faces, best):
             continue
         pushed = True
         plane = _plane(vertices, faces, best)
         square = _square(plane)
-        (at_b, at_c) = _areas(plane, x, y, z)
+        at_b, at_c = _areas(plane, points[p, 0], points[p, 1], points[p, 2])
         (nx, ny, nz) = plane[3]
         weight = 1.0 - (at_b + at_c) / square, at_b / square, at_c / square
         # The tolerance is left: what is a little deeper does not leap.
-        way = (signed - tolerance) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2)
+        way = (depth - tolerance) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2)
         way /= np.sqrt(square)
         for k in range(3):
             v = faces[best, k]
@@ -281,6 +274,31 @@ def _push_loop(vertices, faces, near_points, tolerance, moved):
             vertices[v, 1] -= ny * way * weight[k]
             vertices[v, 2] -= nz * way * weight[k]
     return pushed
+
+
+@inner(error_model="numpy", inline="always")
+def _triangle_over(vertices, faces, point, near):
+    """Of the triangles ``near`` a point the one whose plane is nearest, of those that it is not
+    beside, -1 for none, and the point's depth below that.
+    """
+    x = point[0]
+    y = point[1]
+    z = point[2]
+    best = -1
+    least = np.inf
+    signed = 0.0
+    for f in near:
+        plane = _plane(vertices, faces, f)
+        square, (at_b, at_c) = _square(plane), _areas(plane, x, y, z)
+        if square == 0.0 or min(at_b, at_c, square - at_b - at_c) < -1e-9 * square:
+            continue  # beside it
+        depth = -_height(plane, x, y, z) / np.sqrt(square)
+        # Of triangles that are equally near, but for rounding, the first.
+        if abs(depth) < least * (1.0 - 1e-6):
+            best = f
+            least = abs(depth)
+            signed = depth
+    return best, signed
 
 
 @compiled(error_model="numpy", inline="always")
