@@ -123,7 +123,7 @@ class PBDMuscle:
             if self.fibres is not None and (fresh or not self.fibres.passive):
                 self.shape.contract(self.fibres, self.points)
             self.swept = k + 1
-            moved = _sweep(self, last=self.swept == self.most_sweeps)
+            moved = sweep_once(self, last=self.swept == self.most_sweeps)
             if moved < self.still:
                 break
         capped = self.still > 0.0 and not moved < self.still
@@ -186,7 +186,7 @@ class PBDMuscle:
         return ModelSurface(*self.material_mesh(), quantities, notes)
 
 
-def _sweep(muscle: PBDMuscle, *, last: bool) -> float:
+def sweep_once(muscle: PBDMuscle, *, last: bool = False) -> float:
     """One iteration; how far it moved a vertex, asked for where a tolerance ends the sweeps and of
     the ``last``.
     """

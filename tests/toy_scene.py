@@ -133,7 +133,7 @@ class ToyMuscle(MuscleModel):
         self.solves += 1
         for _ in range(self.sweeps):
             near = contacts.half_spaces(self.x, self.reach)
-            self.x = press(self.target, self.x, self.inverse, near.index, near.gap, near.normal)
+            self.x = press(self.target, self.x, self.inverse, near.point, near.gap, near.normal)
 
     def transform(self, motion):
         self.x, self.target = (

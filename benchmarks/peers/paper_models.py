@@ -55,10 +55,13 @@ class PaperMuscle(PBDMuscle):
         self.contact = DeepestContact(reach=self.contact.reach)
         self.before = self.points.copy()
 
-    def _move_free(self, motions):
-        velocity = self.points - self.before
+    def predict(self, before, after):
+        """Let free vertices go on as they went; held ones arrive exactly."""
+        went_on = self.points + DAMPING * (self.points - self.before)
         self.before = self.points.copy()
-        self.points += DAMPING * velocity
+        super().predict(before, after)
+        free = self.attached_bone < 0
+        self.points[free] = went_on[free]
 
     def transform(self, motion):
         """Go along with a rigid motion (4, 4), as the muscle is."""

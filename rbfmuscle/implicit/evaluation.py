@@ -44,6 +44,17 @@ class Terms(NamedTuple):
     radius: np.ndarray
 
 
+class Lots(NamedTuple):
+    """Where n points lie in the balls of P fits, and sums over these.
+
+    For points beyond `RIM` of all balls these grow until the nearest is met there.
+    """
+
+    shares: np.ndarray  # (P, n) squared distances from the middles over squared radii, 0 for one
+    growth: np.ndarray  # (4, n) what the squares grew by, derivatives of half its logarithm
+    total: np.ndarray  # (8, n) sums
+
+
 def evaluate(
     points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool
 ) -> tuple[Floats, Floats]:
@@ -74,31 +85,26 @@ def _evaluate_loop(points, terms, form, start, stop, value, gradient):
     wanted, rows = len(gradient) > 0, np.empty(_BLOCK, np.int64)
     for low in range(start, stop, _CHUNK):
         x = points[low : min(low + _CHUNK, stop)]
-        shares, growth, total = _shares_loop(x, terms)
-        for fit in range(len(shares)):
+        lots = _shares_loop(x, terms)
+        for fit in range(len(lots.shares)):
             first = np.int64(
                 0
             )  # of the type that `_fill_block` returns, which is then compiled once
             while first < len(x):
-                first, p, acc, g = _fill_block(x, terms, fit, shares, first, rows)
+                first, p, acc, g = _fill_block(x, terms, fit, lots.shares, first, rows)
                 if p.shape[1] == 0:  # no point in this fit
                     continue
                 if form is None:
                     _cubic_block_loop(terms, fit, wanted, p, acc, g)
                 else:
                     _general_block_loop(terms, fit, form, wanted, p, acc, g)
-                _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total)
-        _give_loop(low, total, value, gradient)
+                _blend_loop(x, terms, fit, rows, lots, wanted, (p, acc, g))
+        _give_loop(low, lots.total, value, gradient)
 
 
 @compiled(error_model="numpy")
 def _shares_loop(x, terms):
-    """Where points (n, 3) lie in the balls of the fits, and zeros (8, n) for sums over these.
-
-    Squared distances (P, n) from the middles over the squared radii, 0 for a single fit. For points
-    beyond `RIM` of all balls these grow until the nearest is met there: by what the squares are
-    multiplied then, and the derivatives of its logarithm, halved, are (4, n).
-    """
+    """Where points (n, 3) lie in the balls of the fits."""
     fits, n = len(terms.middle), len(x)
     shares, growth = np.zeros((fits, n)), np.zeros((4, n))
     growth[0] = 1.0
@@ -121,7 +127,7 @@ def _shares_loop(x, terms):
                 for c in range(3):
                     way = terms.middle[nearest, c] - x[i, c]
                     growth[1 + c, i] = way / (least * terms.radius[nearest] ** 2)
-    return shares, growth, np.zeros((8, n))
+    return Lots(shares, growth, np.zeros((8, n)))
 
 
 @compiled(error_model="numpy")
@@ -173,12 +179,15 @@ def _closeness_loop(p, centres, soft, gradient, out):
 
 
 @compiled(error_model="numpy")
-def _blend_loop(x, terms, fit, rows, shares, growth, wanted, p, acc, g, total):
-    """Add a fit's weight w, w f, and the gradients of both, to their sums (8, n).
+def _blend_loop(x, terms, fit, rows, lots, wanted, block):
+    """Add a fit's weight w, w f, and the gradients of both, to their sums; a block has points in
+    the fit's coordinates, their values and their gradients.
 
     w is (1 - t^2)^2 at t of the ball's radius, times how close the fit's own centres are: a sheet
     of another part of the muscle may have come into the ball, of which the fit knows nothing.
     """
+    p, acc, g = block
+    shares, growth, total = lots
     size = terms.scale[fit]
     radius = terms.radius[fit]
     single = len(terms.middle) == 1

@@ -291,7 +291,8 @@ def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
             work.wants[k] = asked.rhs[c]
             work.strength[k] = asked.force[c]
             work.most[k] = law.most[c]
-        some, ways, found = work.numbers[:total], work.normal[:total], work.strength[:total]
+        some, ways = work.numbers[:total], work.normal[:total]
+        found = work.strength[:total]
         _schur(done, some, ways, answers, work.rows, work.delassus, work.own)
         done = total
         _yield(work, total, law)

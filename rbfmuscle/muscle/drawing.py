@@ -193,10 +193,10 @@ class SurfaceBuilder:
         self, nodes: Floats, centres: Floats, normals: Floats, contacts: BoneContacts
     ) -> ModelSurface:
         """The shown mesh on the level set, or where the material is."""
-        started, fit, time_fit = time.perf_counter(), self.fit, 0.0
+        started, fit = time.perf_counter(), self.fit
         if fit is not None:
             fit.move(centres, normals)
-            time_fit = time.perf_counter() - started
+        time_fit = time.perf_counter() - started
         obstacles = self._obstacles(contacts)
         fitted = fit is not None and fit.sound and not fit.flat
         given = (fit.terms, fit.form) if fit is not None else (_no_terms(0), None)

@@ -31,11 +31,11 @@ from rbfmuscle.validation import check_finite, check_points
 
 
 class HalfSpaces(NamedTuple):
-    """Linearised contacts: moving point ``index`` by ``dp`` is admissible where ``gap + normal . dp
+    """Linearised contacts: moving ``point`` by ``dp`` is admissible where ``gap + normal . dp
     >= 0``.
     """
 
-    index: np.ndarray  # (c,) contact point
+    point: np.ndarray  # (c,) number of the contact point
     gap: np.ndarray  # (c,) signed distance now [scene unit], negative is violated
     normal: np.ndarray  # (c, 3) unit direction of growing distance, world axes
     source: np.ndarray  # (c,) row of the bone in reach, or -1 - k for virtual edges of family k

@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import MuscleModel
-from rbfmuscle.simulation.substeps import step_excess
+from rbfmuscle.simulation.substeps import StepLimits, step_excess
 
 # Bones farther than this [mm] from a muscle do not act on it.
 CLEAR = 2.0
@@ -61,11 +61,11 @@ class RigidTransport:
             held.setdefault(attachment.attachment_frame, []).append(attachment.vertices)
         parts = {name: np.concatenate(found) for name, found in held.items()}
         self.names = sorted(parts, key=lambda name: -len(parts[name]))
-        self._corners = np.array([frame.corners(parts[name]) for name in self.names])
-        # What counts as a rotation by one radian; all that hold it count alike.
-        self._lever = np.full(len(self.names), ARC * size)
-        self._owner = np.arange(len(self.names))
-        self._bones = np.zeros(len(self.names), dtype=np.bool_)
+        corners = np.array([frame.corners(parts[name]) for name in self.names])
+        count = len(self.names)
+        # All that holds it, as seen from the first, and the first as seen from another bone.
+        self._apart = _at_rest(np.arange(1, count), corners[1:], ARC * size, count)
+        self._whole = _at_rest(np.array([1]), corners[:1], ARC * size, 2)
         self.solved: Floats | None = None
         self.since, self.moved = IDENTITY, False
 
@@ -87,13 +87,11 @@ class RigidTransport:
         """Move the muscle rigidly from one set of poses to the next if it need not be solved;
         return whether it was. Where it was not, it is taken to be solved there.
         """
-        if self.solved is None:
-            self.note_solved(before)
         new = self._stacked(after)
-        if self._stand_alike(self.solved, new) and self._carry(model, contacts, before, after):
-            return True
-        self.solved = new
-        return False
+        old = self._stacked(before) if self.solved is None else self.solved
+        carried = self._stand_alike(old, new) and self._carry(model, contacts, before, after)
+        self.solved = old if carried else new
+        return carried
 
     def _carry(
         self,
@@ -152,12 +150,17 @@ class RigidTransport:
         """Whether no bone of two poses (b, 4, 4) rotates, and no attachment moves, as seen from the
         first.
         """
-        parts = self._owner[1:], self._corners[1:], self._lever[1:]
-        moved = step_excess(old, new, 0, *parts, 1.0, self._bones, 1)
-        return not moved[0] > STILL
+        return not step_excess(old, new, self._apart)[0] > STILL
 
     def _comes(self, before: Mapping[str, Floats], after: Mapping[str, Floats], name: str) -> bool:
         """Whether the muscle, which keeps its shape, moves as seen from another bone."""
         old, new = (np.array([poses[name], poses[self.names[0]]]) for poses in (before, after))
-        parts = np.array([1]), self._corners[:1], self._lever[:1]
-        return bool(step_excess(old, new, 0, *parts, 1.0, np.zeros(2, np.bool_), 1)[0] > STILL)
+        return bool(step_excess(old, new, self._whole)[0] > STILL)
+
+
+def _at_rest(owner: Integers, corners: Floats, lever: float, bones: int) -> StepLimits:
+    """What counts as a motion by one: a rotation by a radian, or one by a lever of attachments,
+    with boxes (a, 8, 3), on some of so many bones, ends of tendons among them.
+    """
+    travel, is_end = np.full(len(owner), lever), np.zeros(bones, dtype=np.bool_)
+    return StepLimits(0, owner, corners, travel, 1.0, is_end, 1)

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -40,6 +40,18 @@ LOOKED_INTO = 64  # where it is about as many, it is first found whether smaller
 PIECES = 8
 
 
+class StepLimits(NamedTuple):
+    """What one step may do to b bones and ends."""
+
+    root: int  # the bone from which they are seen to turn, -1 for the world
+    owner: np.ndarray  # (a,) bone of each attachment
+    corners: np.ndarray  # (a, 8, 3) of a box about it
+    travel: np.ndarray  # (a,) by how much these may move [scene unit]
+    angle: float  # by which a bone may turn [radian]
+    is_end: np.ndarray  # (b,) what is the end of a tendon
+    seen: int  # the first so many are those from which attachments are seen to move
+
+
 class SubSteps:
     """How a scene's motion is cut into sub-steps.
 
@@ -69,7 +81,6 @@ class SubSteps:
         #: first that holds it, a whole scene's from the world.
         guides = [name for _, attachment in attachments for name in attachment.bones]
         if muscle is None:
-            self._root = -1
             self.bones = [*dict.fromkeys([*own, *(bone.name for bone in scene.bones)])]
             self.relevant = set(self._facts)
         else:
@@ -88,15 +99,20 @@ class SubSteps:
             for _, attachment in attachments
             if attachment.tendon is not None
         }
-        # Those from which attached points are seen; behind them come the bones that guide tendons.
-        self._seen = len(self.bones)
+        # Attached points are seen from these; behind them come the bones that guide tendons.
+        seen = len(self.bones)
         self.bones = [*dict.fromkeys([*self.bones, *guides])]
-        if muscle is not None:
-            # Seen from a bone, not from an end that may jump.
-            self._root = self.bones.index(guides[0]) if guides else 0
-        self._is_end = np.array([name in ends for name in self.bones], dtype=bool)
-        self._owner = np.array([self.bones.index(name) for name in own], dtype=int)
-        self._travel, self._corners = TRAVEL * np.array(sizes), np.array(corners).reshape(-1, 8, 3)
+        # Seen from a bone, not from an end that may jump.
+        root = -1 if muscle is None else self.bones.index(guides[0]) if guides else 0
+        self._limits = StepLimits(
+            root,
+            np.array([self.bones.index(name) for name in own], dtype=int),
+            np.array(corners).reshape(-1, 8, 3),
+            TRAVEL * np.array(sizes),
+            self.limit,
+            np.array([name in ends for name in self.bones], dtype=bool),
+            seen,
+        )
 
     def split(self, before: Coordinates, after: Coordinates) -> list[Coordinates]:
         """Coordinates of the sub-steps to the next frame, ``before`` left out; empty where nothing
@@ -114,8 +130,8 @@ class SubSteps:
         # What does not move these bones against each other does not count.
         start = {**before, **{k: value for k, value in after.items() if k not in self.relevant}}
         angle = path_angle(self.scene, start, after, self._facts)
-        ends = (interpolate(before, after, t) for t in (0.0, 1.0))
-        return self._even_stops(*ends, angle)
+        first, last = (interpolate(before, after, t) for t in (0.0, 1.0))
+        return self._even_stops(first, last, angle)
 
     def _even_stops(self, before, after, angle):
         """The fewest equal sub-steps that are short enough, in which no bone turns by more than
@@ -164,12 +180,13 @@ class SubSteps:
         )
         old, new = self._matrices(before), self._matrices(after)
         bone, seen, far = self._farthest(old, new)
+        most = self._limits.travel.min(initial=np.inf)
         moved = f"{bone} moves by {far:.4g} {self.scene.units}{seen and f' against {seen}'}"
         return (
             f"more than {MOST_IN_FRAME} sub-steps in one frame: between {way} {moved}, and a "
-            f"sub-step may move it by {self._travel.min(initial=np.inf):.3g} (1/27 of a muscle's "
-            f"size) and turn it by {math.degrees(self.limit):.3g} deg; correct the joints that "
-            "move it or take frames closer together"
+            f"sub-step may move it by {most:.3g} (1/27 of a muscle's size) and turn it "
+            f"by {math.degrees(self.limit):.3g} deg; correct the joints that move it or take "
+            "frames closer together"
         )
 
     def _farthest(self, old, new):
@@ -177,14 +194,15 @@ class SubSteps:
         bone from which they are seen, and how far.
         """
         found = ("a bone", "", 0.0)
-        for owner, corners in zip(self._owner, self._corners):
-            for seen in range(self._seen):
+        limits = self._limits
+        for owner, corners in zip(limits.owner, limits.corners):
+            for seen in range(limits.seen):
                 ways = [
                     corners @ to[:3, :3].T + to[:3, 3]
                     for to in (np.linalg.inv(pose[seen]) @ pose[owner] for pose in (old, new))
                 ]
                 far = float(np.linalg.norm(ways[1] - ways[0], axis=1).max())
-                if far > found[2] and not self._is_end[[owner, seen]].any():
+                if far > found[2] and not limits.is_end[[owner, seen]].any():
                     found = (self.bones[owner], self.bones[seen], far)
         return found
 
@@ -215,7 +233,7 @@ class SubSteps:
                 raise SceneError(self._too_many(before, after))
             found.append(ends[0][name])
             angle = abs(ends[1][name] - ends[0][name])
-            found += [stop[name] for stop in self._even_stops(*ends, angle)]
+            found += [stop[name] for stop in self._even_stops(ends[0], ends[1], angle)]
         margin = 1e-6 * self.limit
         inner = []
         for value in sorted(found):
@@ -236,21 +254,16 @@ class SubSteps:
         """How far a step between poses (b, 4, 4) goes beyond what one sub-step may do: 1 is just
         allowed.
         """
-        attached = self._owner, self._corners, self._travel
-        ends = self._is_end, self._seen
-        moved = step_excess(old, new, self._root, *attached, self.limit, *ends)
+        moved = step_excess(old, new, self._limits)
         return max(moved[0], min(moved[1], FINER * moved[0]))
 
 
 @compiled(error_model="numpy")
-def step_excess(old, new, root, owner, corners, travel, limit, is_end, seen):
-    """How far a step between poses (b, 4, 4) takes bones, and ends that tendons hold, relative to
-    what is allowed.
-
-    Bones turn by ``limit`` [radian] as seen from the bone ``root``, from the world for -1; corners
-    (a, 8, 3) on the bones ``owner`` (a,) move by ``travel`` (a,) as seen from any of the
-    first ``seen`` bones. ``is_end`` (b,) are ends among the bones.
+def step_excess(old, new, limits):
+    """How far a step between poses (b, 4, 4) takes bones, and ends that tendons hold, (2,) relative
+    to what is allowed.
     """
+    root, owner, corners, travel, angle, is_end, seen = limits
     most = np.zeros(2)
     first = np.empty((3, 4))
     second = np.empty((3, 4))
@@ -265,7 +278,7 @@ def step_excess(old, new, root, owner, corners, travel, limit, is_end, seen):
             for k in range(3):
                 square += (second[a, k] - first[a, k]) ** 2
         # |A - B|² of two rotations by θ apart is 8 sin²(θ / 2).
-        turned = 2.0 * np.arcsin(min(np.sqrt(square / 8.0), 1.0)) / limit
+        turned = 2.0 * np.arcsin(min(np.sqrt(square / 8.0), 1.0)) / angle
         kind = 1 if is_end[b] else 0
         most[kind] = max(most[kind], turned)
         for n in range(len(owner) if b < seen else 0):

@@ -47,8 +47,8 @@ def test_half_spaces_are_all_pairs_nearer_than_reach(reach):
         every = _literal(contacts, poses, points, reach)
         expected = {(i, b): one for (i, b), one in every.items() if i % 3}
         found = contacts.half_spaces(points, reach)
-        assert {(i, b) for i, b in zip(found.index, found.source)} == set(expected)
-        for i, b, gap, normal in zip(found.index, found.source, found.gap, found.normal):
+        assert {(i, b) for i, b in zip(found.point, found.source)} == set(expected)
+        for i, b, gap, normal in zip(found.point, found.source, found.gap, found.normal):
             assert gap == pytest.approx(expected[i, b][0], abs=1e-12)
             assert np.allclose(normal, expected[i, b][1])
         points = points + rng.normal(size=points.shape) * 0.4
@@ -57,7 +57,7 @@ def test_half_spaces_are_all_pairs_nearer_than_reach(reach):
 def test_planes_of_neighbours_come_behind_those_of_bones():
     contacts, _ = _pair()
     points, rng = _points(), np.random.default_rng(4)
-    bones = len(contacts.half_spaces(points, 0.5).index)
+    bones = len(contacts.half_spaces(points, 0.5).point)
     contacts.neighbours = [Planes(), Planes(3.0)]
     wanted = []
     for kind, planes in enumerate(contacts.neighbours):
@@ -65,7 +65,7 @@ def test_planes_of_neighbours_come_behind_those_of_bones():
         planes.set(at, gap, rng.normal(size=(60, 3)), points[at])
         wanted += [(i, -1 - kind, g) for i, g in zip(at, gap) if g < 0.5]
     found = contacts.half_spaces(points, 0.5)
-    rows = list(zip(found.index[bones:], found.source[bones:], found.gap[bones:]))
+    rows = list(zip(found.point[bones:], found.source[bones:], found.gap[bones:]))
     assert rows == wanted and (found.source[:bones] >= 0).all()
 
 

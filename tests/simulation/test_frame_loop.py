@@ -82,8 +82,8 @@ class _Breaking(ToyMuscle):
 
     breaks = None
 
-    def solve(self, contacts):
-        super().solve(contacts)
+    def solve(self, contacts, *, room=False):
+        super().solve(contacts, room=room)
         if self.solves > 12:
             self.x = self.x * np.nan
             if self.breaks is not None:
