@@ -16,10 +16,10 @@ from rbfmuscle.geometry.rotations import quaternion_matrix, rotate
 from rbfmuscle.jit import compiled
 
 # Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.
-# Newton steps at most: the next sweep goes on from where these end.
+# At most so many, or to this squared angle: the next sweep goes on from where these end.
 ROTATION_STEPS = 8
 ROTATION_ERROR = 1e-12
-LEAST_WEIGHT = 1e-9
+LEAST_WEIGHT = 1e-9  # of an edge, so that its compliance is finite
 
 
 class ARAP:

@@ -1,7 +1,5 @@
 """Other ways to detect that a point is in a bone, behind the interface of `BoneSDF`, to be compared
 with it.
-
-A run is driven by them with ``rbfmuscle.simulate(scene, bone_sdfs={bone: field})``.
 """
 
 from __future__ import annotations

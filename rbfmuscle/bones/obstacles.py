@@ -161,23 +161,21 @@ def query_bone(bones, b, pose, points, reach, distance, gradient):
 
 
 @inner(error_model="numpy")
-def _ask_near(obstacles, b, points, reach):
-    """Numbers (m,) of the free points (n, 3) that may be nearer to bone b than their ``reach``
-    (n,), their distances (m,) and directions (m, 3).
+def ask_near(bones, b, pose, free, known, points, reach, wanted):
+    """Numbers (m,) of the free points (n, 3) that may be nearer to bone b in a pose than their
+    ``reach`` (n,), by what is ``known`` of it; their distances (m,), which are noted there, and
+    where they are wanted directions (m, 3), else (0, 3).
     """
-    pose = obstacles.poses[b]
-    anchor = obstacles.known.anchor[b]
-    bound = obstacles.known.bound[b]
+    bounds = bones.boxes[b]
+    anchor, bound = known.anchor[b], known.bound[b]
     some = np.empty(len(points), np.int64)
     count = 0
     for i in range(len(points)):
         some[count] = i
-        count += obstacles.free[i] & may_reach(
-            points, i, pose, obstacles.bones.boxes[b], anchor, bound, reach[i]
-        )
+        count += free[i] & may_reach(points, i, pose, bounds, anchor, bound, reach[i])
     near = some[:count]
-    distance, way = np.empty(count), np.empty((count, 3))
-    query_bone(obstacles.bones, b, pose, points[near], reach[near], distance, way)
+    distance, way = np.empty(count), np.empty((count if wanted else 0, 3))
+    query_bone(bones, b, pose, points[near], reach[near], distance, way)
     for k in range(count):
         note_query(points, near[k], pose, distance[k], anchor, bound)
     return near, distance, way
@@ -190,14 +188,18 @@ def find_contacts(obstacles, points, reach):
     Numbers (c,) of the points, gaps (c,) [scene unit], unit normals (c, 3) and numbers (c,) of the
     bones in reach.
     """
+    bones = obstacles.bones
+    free = obstacles.free
+    known = obstacles.known
     box, limit = np.empty((2, 3)), np.full(len(points), reach)
-    box_loop(points, obstacles.free, box)
+    box_loop(points, free, box)
     index, source = np.empty(0, np.int64), np.empty(0, np.int64)
     gap, normal = np.empty(0), np.empty((0, 3))
     for b in range(len(obstacles.poses)):
-        if boxes_apart(box, obstacles.poses[b], obstacles.bones.boxes[b]) > reach:
+        pose = obstacles.poses[b]
+        if boxes_apart(box, pose, bones.boxes[b]) > reach:
             continue
-        near, distance, way = _ask_near(obstacles, b, points, limit)
+        near, distance, way = ask_near(bones, b, pose, free, known, points, limit, True)
         count = 0
         for k in range(len(near)):
             i = near[k]
@@ -215,12 +217,16 @@ def find_contacts(obstacles, points, reach):
 @compiled(error_model="numpy")
 def greatest_depth(obstacles, points):
     """Greatest depth of a free point (n, 3) in a bone [scene unit], 0 where all are outside."""
+    bones = obstacles.bones
+    free = obstacles.free
+    known = obstacles.known
     depth = 0.0
     box, nowhere = np.empty((2, 3)), np.zeros(len(points))
-    box_loop(points, obstacles.free, box)
+    box_loop(points, free, box)
     for b in range(len(obstacles.poses)):
-        if boxes_apart(box, obstacles.poses[b], obstacles.bones.boxes[b]) == 0.0:
-            distance = _ask_near(obstacles, b, points, nowhere)[1]
+        pose = obstacles.poses[b]
+        if boxes_apart(box, pose, bones.boxes[b]) == 0.0:
+            distance = ask_near(bones, b, pose, free, known, points, nowhere, False)[1]
             for k in range(len(distance)):
                 depth = max(depth, -distance[k])
     return depth

@@ -18,6 +18,7 @@ from rbfmuscle.experiments.kernel_rows import KernelRow, recommend
 from rbfmuscle.experiments.sweep_run import OnProgress, threads_limited
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.mesh_distance import MeshDistance
+from rbfmuscle.geometry.rest_frame import principal_axes
 from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, vertex_areas
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
@@ -53,8 +54,7 @@ class ReferenceSurface:
         self.faces = faces
         self.volume = mesh_volume(vertices, faces)
         radius = 2.0 * self.volume / vertex_areas(vertices, faces).sum()
-        self.axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
-        self.axes[2] *= np.sign(np.linalg.det(self.axes))
+        self.axes = principal_axes(vertices)
         if resolution and resolution < 4:
             raise UsageError(f"resolution must be at least 4 cells, got {resolution}")
         self.resolution = resolution or int(

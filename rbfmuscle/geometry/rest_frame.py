@@ -92,7 +92,7 @@ def on_one_line(vertices: Floats) -> bool:
     return bool(sizes[1] <= 1e-12 * max(sizes[0], 1e-300))
 
 
-def _principal_axes(points: Floats) -> Floats:
+def _certain_axes(points: Floats) -> Floats:
     """Right-handed principal axes as rows; the axes themselves where rounding would choose between
     others.
     """
@@ -101,6 +101,13 @@ def _principal_axes(points: Floats) -> Floats:
         return np.eye(3)
     axes[2] *= np.sign(np.linalg.det(axes))
     return axes
+
+
+def principal_axes(points: Floats) -> Floats:
+    """Right-handed principal axes of points (n, 3) as rows, that of the largest extent first."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    axes[2] *= np.sign(np.linalg.det(axes))
+    return np.asarray(axes)
 
 
 class BoneFrame:
@@ -114,7 +121,7 @@ class BoneFrame:
         frame = RestFrame(vertices)
         # Found in rounded numbers, so that equal moments give the same axes for every pose of the
         # scene.
-        turn = _principal_axes(frame.local)
+        turn = _certain_axes(frame.local)
         self.origin = frame.origin
         self.size = frame.size
         self.axes = turn @ frame.axes

@@ -26,7 +26,7 @@ WIDEST = 0.2  # share of the belly that counts as its widest part
 # fibres through a unit area, in those of the widest part: the rims of attachments draw more
 # together
 DENSEST = 10.0
-LEAST_STRAIN = 1e-3
+LEAST_STRAIN = 1e-3  # of tendon at full activation, so that it is not rigid
 
 
 def contracting_fibres(model: SolidModel, muscle: Muscle, insertion: Booleans) -> Fibres:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
-from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.rest_frame import RestFrame, principal_axes
 from rbfmuscle.geometry.surfaces import face_normals, opposite_half_edges, vertex_normals
 from rbfmuscle.muscle.placement import cached_sample
 from rbfmuscle.muscle.surface_limits import smooth_loop
@@ -90,7 +90,7 @@ def _covering(muscle: Muscle, resolution: int) -> tuple[Floats, Integers]:
     faces = np.ascontiguousarray(muscle.mesh.faces, dtype=np.int64)
     count = MOST_SHOWN
     if resolution:
-        axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+        axes = principal_axes(points)
         edge = float(np.ptp(points @ axes.T, axis=0).max()) / resolution
         count = int(np.clip(VERTICES_AN_EDGE * float(muscle.mesh.area) / edge**2, *WANTED))
     frame = RestFrame(points)

@@ -42,6 +42,7 @@ GHOST = 1e-3
 # Nodes move together: the greatest motion of a node times its greatest share and this is 0.7 to 2.5
 # times that of the material, in solves of the leg and the hip that end slowly.
 TOGETHER = 4.0
+# Nodes, about, of a region whose volume is kept: were it one of each, the solid would lock.
 NODES_PER_REGION = 8
 # Points that move by less than this fraction of the median for a unit force count as attached.
 MOBILE = 0.02

@@ -8,7 +8,6 @@ import numpy as np
 
 from rbfmuscle.geometry.fibres import fibre_directions
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.muscle.activation import contracting_fibres
 from rbfmuscle.muscle.drawing import SurfaceBuilder
@@ -192,12 +191,6 @@ def present_normals(muscle: RBFMuscle) -> np.ndarray:
     """
     columns, nodes = muscle.model.embedding.columns, muscle.state.lifted_nodes
     return turned_normals(nodes, columns, muscle.normals_at, muscle.rest.normals)
-
-
-def present_field(muscle: RBFMuscle) -> RBFField:
-    """The RBF field through the centres now."""
-    normals = present_normals(muscle)
-    return muscle.rest.field(muscle.state.points[: len(normals)], normals)
 
 
 def _build_solid(

@@ -9,10 +9,8 @@ from rbfmuscle.bones.broad_phase import (
     box_loop,
     boxes_apart,
     least_distance,
-    may_reach,
-    note_query,
 )
-from rbfmuscle.bones.obstacles import Known, query_bone
+from rbfmuscle.bones.obstacles import Known, ask_near, query_bone
 from rbfmuscle.geometry.surfaces import farthest_move
 from rbfmuscle.jit import inner
 from rbfmuscle.muscle.rounded_bones import no_scratch, rounded_distance
@@ -56,25 +54,13 @@ def find_near(points, obstacles, reach):
     found, box = np.zeros(len(points), np.bool_), np.empty((2, 3))
     gap = np.full(len(points), reach)
     box_loop(points, free, box)
-    some = np.empty(len(points), np.int64)
+    limit = np.full(len(points), reach)
     for b in range(len(obstacles.poses)):
-        pose, bounds = obstacles.poses[b], bones.boxes[b]
-        if boxes_apart(box, pose, bounds) > reach:
+        pose = obstacles.poses[b]
+        if boxes_apart(box, pose, bones.boxes[b]) > reach:
             continue
-        count = 0
-        anchor, bound = known.anchor[b], known.bound[b]
-        for i in range(len(points)):
-            if free[i] and may_reach(points, i, pose, bounds, anchor, bound, reach):
-                some[count] = i
-                count += 1
-        at, distance = np.empty((count, 3)), np.empty(count)
-        for k in range(count):
-            for a in range(3):
-                at[k, a] = points[some[k], a]
-        query_bone(bones, b, pose, at, np.full(count, reach), distance, np.empty((0, 3)))
-        for k in range(count):
-            i = some[k]
-            note_query(points, i, pose, distance[k], anchor, bound)
+        some, distance, _ = ask_near(bones, b, pose, free, known, points, limit, False)
+        for k, i in enumerate(some):
             found[i] |= distance[k] + obstacles.allowed[b, i] < reach
             gap[i] = min(gap[i], trusted(distance[k]) + obstacles.allowed[b, i])
     planes = obstacles.planes
@@ -296,30 +282,16 @@ def find_exact_touch(near, here, reach, obstacles, softest):
     box, farthest = np.empty((2, 3)), reach.max() if len(reach) > 0 else -np.inf
     free = near.free & (reach > -np.inf)
     box_loop(here, free, box)
-    some, count = np.empty(len(here), np.int64), 0
+    count = 0
     for b in range(len(obstacles.poses)):
-        pose, bounds = obstacles.poses[b], bones.boxes[b]
-        anchor, bound = near.exact.anchor[b], near.exact.bound[b]
-        if boxes_apart(box, pose, bounds) > farthest:
+        pose = obstacles.poses[b]
+        if boxes_apart(box, pose, bones.boxes[b]) > farthest:
             continue
-        asked = 0
-        for i in range(len(here)):
-            if free[i] and may_reach(here, i, pose, bounds, anchor, bound, reach[i]):
-                some[asked] = i
-                asked += 1
-        at = np.empty((asked, 3))
-        distance = np.empty(asked)
-        normal = np.empty((asked, 3))
-        limits = np.empty(asked)
-        for k in range(asked):
-            at[k] = here[some[k]]
-            limits[k] = reach[some[k]]
-        query_bone(bones, b, pose, at, limits, distance, normal)
-        for k in range(asked):
-            i = some[k]
-            note_query(here, i, pose, distance[k], anchor, bound)
-            if distance[k] + near.allowed[b, i] < reach[i]:
-                _add_touch(touch, count, i, distance[k] + near.allowed[b, i], normal[k], b)
+        some, distance, normal = ask_near(bones, b, pose, free, near.exact, here, reach, True)
+        for k, i in enumerate(some):
+            there = distance[k] + near.allowed[b, i]
+            if there < reach[i]:
+                _add_touch(touch, count, i, there, normal[k], b)
                 count += 1
     return _first(touch, _add_planes(touch, count, near, here, reach, obstacles, softest))
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.rest_frame import RestFrame, principal_axes
 from rbfmuscle.implicit.field import FieldFit, RBFField
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import choose_centres, place_points
@@ -66,7 +66,7 @@ class RestState:
             float(muscle.mesh.volume),
             # Cells along the muscle's own axes are smaller than along the scene's, and turn with
             # the scene.
-            frame.directions(_principal_axes(samples.points)),
+            frame.directions(principal_axes(samples.points)),
         )
 
     def field(self, centres: Floats, normals: Floats) -> RBFField:
@@ -127,13 +127,6 @@ class _Attachment:
             left -= 1
             if left == 0:
                 return
-
-
-def _principal_axes(points: Floats) -> Floats:
-    """Right-handed principal axes as rows."""
-    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    axes[2] *= np.sign(np.linalg.det(axes))
-    return axes
 
 
 def solved_points(muscle: Muscle, scene: Scene, options: RBFOptions) -> str:

@@ -17,7 +17,7 @@ SETTLED = 0.01
 # Bones grow into a muscle by this much [mm] in one solve, so that contact never has to guess the
 # way out.
 GROWTH = 1.0
-MOST_SOLVES = 60
+MOST_SOLVES = 60  # after the bones have grown
 
 
 def resolve_initial_overlap(stepper: MuscleStepper) -> None:

@@ -18,7 +18,12 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.contact import BoneContacts, Neighbour, Planes
 from rbfmuscle.simulation.frame import Event, ModelSurface, MuscleModel
-from rbfmuscle.simulation.rigid_transport import MuscleStatus, RigidState, RigidTransport
+from rbfmuscle.simulation.rigid_transport import (
+    IDENTITY,
+    MuscleStatus,
+    RigidState,
+    RigidTransport,
+)
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 from rbfmuscle.simulation.tunnelling import (
     Crossing,
@@ -35,7 +40,6 @@ TOUCH = 0.1
 FENCES = 4
 # Sub-steps are not halved below this angle [radian].
 SMALLEST_STEP = math.radians(0.1)
-IDENTITY = np.eye(4)
 
 
 class Path(NamedTuple):
