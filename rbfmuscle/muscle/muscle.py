@@ -85,7 +85,7 @@ class RBFMuscle:
         )
         self.state = rest_state(self.model)
         self._stiffness = stiffness(self.model, 0.0)
-        self.normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
+        self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
         embedding = partial(embed, self._lattice, self.frame)
         self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options, embedding)
         # Where the shown mesh is the input mesh, its vertices as numbered there, and its faces.
@@ -175,7 +175,9 @@ class RBFMuscle:
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lies in the way."""
-        drawn = self.drawer.draw(self.state, present_normals(self), contacts)
+        columns, nodes = self.model.embedding.columns, self.state.lifted_nodes
+        normals = turned_normals(nodes, columns, self._normals_at, self.rest.normals)
+        drawn = self.drawer.draw(self.state, normals, contacts)
         quantities, notes = self.log.take()
         drawn.quantities.update(quantities)
         drawn.notes.extend(notes)
@@ -183,14 +185,6 @@ class RBFMuscle:
             place, faces = self._input
             drawn = replace(drawn, vertices=drawn.vertices[place], faces=faces)
         return drawn
-
-
-def present_normals(muscle: RBFMuscle) -> np.ndarray:
-    """Unit normals at the centres now, turned with the local deformation by its cofactor, (K,
-    3).
-    """
-    columns, nodes = muscle.model.embedding.columns, muscle.state.lifted_nodes
-    return turned_normals(nodes, columns, muscle.normals_at, muscle.rest.normals)
 
 
 def _build_solid(

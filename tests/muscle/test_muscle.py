@@ -16,7 +16,7 @@ from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.models import build_model, build_models
 from rbfmuscle.muscle import placement
 from rbfmuscle.muscle.display_mesh import MOST_SHOWN, _unfold, display_mesh, neighbour_lists
-from rbfmuscle.muscle.muscle import RBFMuscle, present_normals
+from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import cached_sample
 from rbfmuscle.muscle.rest import LEAST_ATTACHED
@@ -27,9 +27,8 @@ from rbfmuscle.validation import NumericalWarning, SceneError, SolveError
 
 
 def field_of(model):
-    """The RBF field through the centres now."""
-    normals = present_normals(model)
-    return model.rest.field(model.contact_points()[: len(normals)], normals)
+    """The RBF field through the centres at rest."""
+    return model.rest.field(model.rest.centres, model.rest.normals)
 
 
 def _distances(points, vertices, faces):
