@@ -6,10 +6,9 @@ dlambda`` with the compliance a over the time of the step, which is one projecti
 inverse mass, 0 where a vertex is held; constraints between held vertices alone are left out.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
+from pbd_baseline.contact import NO_PLANES, ContactPlanes, clear_way
 from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order, spread
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import volume_cubic, volume_loop
@@ -75,6 +74,8 @@ class VolumeConstraint:
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         self.faces = np.ascontiguousarray(faces)
         self.rest = self.volume(vertices)
+        # A slope below this is rounding: the direction shifts the surface along itself.
+        self._least = 1e-13 * abs(self.rest) ** (2 / 3)
 
     def volume(self, points: Floats) -> float:
         """Signed enclosed volume [unit^3]."""
@@ -96,25 +97,31 @@ class VolumeConstraint:
             points += step * ((self.rest - self.volume(points)) / slope)
 
     def restore(
-        self, points: Floats, direction: Floats, *, clear_way: Callable[..., object] | None = None
+        self, points: Floats, direction: Floats, planes: ContactPlanes = NO_PLANES
     ) -> float:
         """Move points along a direction (n, 3) until the volume is the rest volume; return the
         factor s.
 
         V(x + s d) is a cubic in s, computed exactly, so the volume is met to rounding. Where the
-        direction cannot meet it (no real root near zero), nothing moves and s is 0.
-        ``clear_way(points, direction, s)`` may take parts out of the direction, in place, and says
-        whether it did.
+        direction cannot meet it (no real root near zero), nothing moves and s is 0. What leads into
+        half-spaces is taken out of the direction, in place.
         """
-        coefficients = volume_cubic(points, self.faces, direction)
-        # A slope below this is rounding: the direction shifts the surface along itself.
-        least = 1e-13 * abs(self.rest) ** (2 / 3) * float(np.abs(direction).max(initial=0.0))
-        s = _cubic_step(coefficients, self.rest, least)
-        if clear_way is not None and clear_way(points, direction, s):
-            again = volume_cubic(points, self.faces, direction)
-            s = _cubic_step(again, self.rest, least)
-        points += s * direction
-        return s
+        return _restore_loop(points, self.faces, direction, self.rest, self._least, planes)
+
+
+@compiled(error_model="numpy")
+def _restore_loop(points, faces, direction, rest, least, planes):
+    """Move points along a direction to the rest volume; ``least`` is the slope that counts as none
+    for a direction whose greatest component is 1.
+    """
+    least *= np.abs(direction).max()
+    s = _cubic_step(volume_cubic(points, faces, direction), rest, least)
+    if clear_way(points, planes, direction, s):
+        s = _cubic_step(volume_cubic(points, faces, direction), rest, least)
+    for i in range(len(points)):
+        for a in range(3):
+            points[i, a] += s * direction[i, a]
+    return s
 
 
 @compiled(error_model="numpy")

@@ -48,7 +48,7 @@ class Shape:
 
     def restore_volume(self, points: np.ndarray, contact: ContactConstraint) -> None:
         """Bring the volume back, in place: where there is room, and out of the way of contacts."""
-        self.volume.restore(points, self._swelling(points), clear_way=contact.clear_way)
+        self.volume.restore(points, self._swelling(points), contact.planes)
 
     def transform(self, motion: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4)."""

@@ -6,7 +6,7 @@ Cervenka, Havlicek, Kohout and Váša (GRAPP 2023). ``register()`` makes them kn
 
 import numpy as np
 
-from pbd_baseline.contact import TOUCHING, ContactConstraint
+from pbd_baseline.contact import TOUCHING, ContactConstraint, plane_depths
 from pbd_baseline.muscle import PBDMuscle
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import solved_points
@@ -37,13 +37,14 @@ class DeepestContact(ContactConstraint):
 
     def project(self, points):
         """Push vertices out of the half-spaces, in place."""
-        depth = self.depths(points)
+        planes = self.planes
+        depth = plane_depths(points, planes)
         if depth.max(initial=0.0) <= TOUCHING * self.reach:
             return
         deepest = np.zeros(len(points))
-        np.maximum.at(deepest, self.index, depth)
-        depth[depth < deepest[self.index]] = 0.0
-        np.add.at(points, self.index, depth[:, None] * self.normal)
+        np.maximum.at(deepest, planes.point, depth)
+        depth[depth < deepest[planes.point]] = 0.0
+        np.add.at(points, planes.point, depth[:, None] * planes.normal)
 
 
 class PaperMuscle(PBDMuscle):
