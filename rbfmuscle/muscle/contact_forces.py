@@ -234,9 +234,9 @@ def _find_contacts(touch, motion, forces):
 
 
 @inner(error_model="numpy")
-def _no_set(room, regions):
-    """Room for a working set."""
-    return _WorkingSet(
+def _first_set(first, room, regions):
+    """Room for a working set, which starts with the ``first`` contacts."""
+    work = _WorkingSet(
         np.empty(room, np.int64),
         np.empty(room, np.int64),
         np.empty((room, 3)),
@@ -247,6 +247,8 @@ def _no_set(room, regions):
         np.empty((room, room)),
         np.empty(room),
     )
+    work.chosen[: len(first)] = first
+    return work
 
 
 @inner(error_model="numpy")
@@ -272,8 +274,7 @@ def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
     push, taken = np.zeros((len(metric.inverse), 3)), np.zeros(len(metric.factor))
     first = np.flatnonzero(asked.is_chosen)
     total = len(first)
-    work = _no_set(min(len(touch.point), total + ROUNDS * BATCH), len(taken))
-    work.chosen[:total] = first
+    work = _first_set(first, min(len(touch.point), total + ROUNDS * BATCH), len(taken))
     done = 0
     capped = False
     for turn in range(ROUNDS):
