@@ -45,10 +45,7 @@ class Terms(NamedTuple):
 
 
 class Lots(NamedTuple):
-    """Where n points lie in the balls of P fits, and sums over these.
-
-    For points beyond `RIM` of all balls these grow until the nearest is met there.
-    """
+    """Where n points lie in the balls of P fits, which grow until they are met, and sums."""
 
     shares: np.ndarray  # (P, n) squared distances from the middles over squared radii, 0 for one
     growth: np.ndarray  # (4, n) what the squares grew by, derivatives of half its logarithm
@@ -87,9 +84,7 @@ def _evaluate_loop(points, terms, form, start, stop, value, gradient):
         x = points[low : min(low + _CHUNK, stop)]
         lots = _shares_loop(x, terms)
         for fit in range(len(lots.shares)):
-            first = np.int64(
-                0
-            )  # of the type that `_fill_block` returns, which is then compiled once
+            first = np.int64(0)  # the type that `_fill_block` returns, so that it is compiled once
             while first < len(x):
                 first, p, acc, g = _fill_block(x, terms, fit, lots.shares, first, rows)
                 if p.shape[1] == 0:  # no point in this fit
@@ -112,9 +107,8 @@ def _shares_loop(x, terms):
         for k in range(fits):
             (a, b, c), scale = terms.middle[k], 1.0 / terms.radius[k] ** 2
             for i in range(n):
-                shares[k, i] = scale * (
-                    (x[i, 0] - a) ** 2 + (x[i, 1] - b) ** 2 + (x[i, 2] - c) ** 2
-                )
+                square = (x[i, 0] - a) ** 2 + (x[i, 1] - b) ** 2 + (x[i, 2] - c) ** 2
+                shares[k, i] = scale * square
         for i in range(n):
             nearest = 0
             for k in range(fits):
@@ -204,10 +198,8 @@ def _blend_loop(x, terms, fit, rows, lots, wanted, block):
         total[0, i] += ball * close
         total[1, i] += ball * close * acc[n]
         for c in range(3):
-            away = (
-                growth[0, i] * (x[i, c] - terms.middle[fit, c])
-                + share * radius**2 * growth[1 + c, i]
-            )
+            away = growth[0, i] * (x[i, c] - terms.middle[fit, c])
+            away += share * radius**2 * growth[1 + c, i]
             slope = steep * away * close + ball * near[1 + c, n] / size**9
             total[2 + c, i] += slope
             total[5 + c, i] += ball * close * g[c, n] / size + slope * acc[n]
@@ -220,9 +212,8 @@ def _give_loop(low, total, value, gradient):
         value[low + i] = total[1, i] / total[0, i]
         if len(gradient) > 0:
             for c in range(3):
-                gradient[low + i, c] = (total[5 + c, i] - value[low + i] * total[2 + c, i]) / total[
-                    0, i
-                ]
+                slope = total[5 + c, i] - value[low + i] * total[2 + c, i]
+                gradient[low + i, c] = slope / total[0, i]
 
 
 @compiled(error_model="numpy")
