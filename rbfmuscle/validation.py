@@ -2,11 +2,28 @@
 
 import difflib
 import os
+import struct
+import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+# What libraries raise, besides errors of their own, of a file that is not as it should be.
+BROKEN_FILE = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zlib.error,
+)
 
 
 class RBFMuscleError(Exception):

@@ -132,7 +132,7 @@ sys.stdout.buffer.write({{
         with monkeypatch.context() as patch:
             patch.setattr(
                 polydata,
-                "start_child",
+                "_start_child",
                 lambda *_: subprocess.Popen([sys.executable, "-c", code], **pipes),
             )
             assert_refused(path, capfd)

@@ -17,7 +17,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Array, Floats
 from rbfmuscle.importers.labels.volume import LAYER, LabelVolume
-from rbfmuscle.validation import MeshError, UsageError
+from rbfmuscle.validation import BROKEN_FILE, MeshError, UsageError
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
 # Stated limits: bytes of one volume once unpacked, labels, and the edge of a voxel [mm].
@@ -142,7 +142,7 @@ def _read_file(path):
         data, header = read(path)
     except MeshError:
         raise
-    except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
+    except (*BROKEN_FILE, *_own_errors(kind)) as error:
         why = " ".join(str(error).split())[:120] or type(error).__name__
         raise MeshError(f"{path}: no readable {kind} volume ({why}); export it again") from None
     if header.unit not in _TO_MM:
@@ -158,6 +158,19 @@ def _read_file(path):
     if empty:
         volume.notes.append(f"{len(empty)} named labels have no voxel: {', '.join(empty)}")
     return volume
+
+
+def _own_errors(kind):
+    """What the library for a kind of file raises besides usual errors."""
+    if kind == "NRRD":
+        from nrrd.errors import NRRDError
+
+        return (NRRDError,)
+    from nibabel.filebasedimages import ImageFileError
+    from nibabel.spatialimages import HeaderDataError
+    from nibabel.wrapstruct import WrapStructError
+
+    return ImageFileError, HeaderDataError, WrapStructError
 
 
 def _read_nifti(path):

@@ -15,7 +15,7 @@ from rbfmuscle.scene.meshes.input_mesh import NO_CORNERS, Corners, vertex_corner
 from rbfmuscle.scene.meshes.obj import read_obj
 from rbfmuscle.scene.meshes.polydata import read_polydata
 from rbfmuscle.scene.meshes.polygons import cut_polygons
-from rbfmuscle.validation import MeshError, did_you_mean, shown, shown_path
+from rbfmuscle.validation import BROKEN_FILE, MeshError, did_you_mean, shown, shown_path
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
 # Part of a file's path that names one of its meshes, and what names all of them.
@@ -107,7 +107,7 @@ def read_file(path: Path) -> list[FilePart]:
         return [_read_ply(path, content) if suffix == ".ply" else _read_polydata(path)]
     except MeshError:
         raise
-    except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
+    except BROKEN_FILE as error:
         why = shown(" ".join(str(error).split())) or type(error).__name__
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} file ({why})") from None
 
@@ -235,7 +235,7 @@ def _read_ply(path, content):
                 fix_texture=False,
                 skip_materials=True,
             )
-    except Exception as error:  # noqa: BLE001 - any error of trimesh: VTK may read it
+    except (*BROKEN_FILE, DeprecationWarning) as error:  # VTK may read it
         try:
             return _read_polydata(path)
         except MeshError:

@@ -3,8 +3,11 @@
 import atexit
 import contextlib
 import io
+import json
 import os
+import queue
 import subprocess
+import sys
 import threading
 from functools import cache
 from pathlib import Path
@@ -12,9 +15,8 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from rbfmuscle.child import Outbox, end_child, listen, send, start_child
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
-from rbfmuscle.validation import MeshError
+from rbfmuscle.validation import BROKEN_FILE, MeshError
 
 PATIENCE = 120.0  # Time after which a file that is not read is refused [s].
 MEMORY = (
@@ -50,13 +52,14 @@ def read_polydata(path: str | Path, *, array: str = "") -> PolyData:
     """
     with _LOCK:
         child = _child(os.getpid())
-        assert child.stdin is not None  # start_child asks for pipes
+        assert child.stdin is not None  # _start_child asks for pipes
         assert child.stdout is not None
         late = threading.Timer(PATIENCE, child.kill)
         late.daemon = True
         late.start()
         try:
-            send(child.stdin, (str(Path(path).absolute()), array))
+            child.stdin.write(json.dumps([str(Path(path).absolute()), array]).encode() + b"\n")
+            child.stdin.flush()
             found = _receive(child.stdout)
         except (OSError, EOFError, ValueError, MemoryError):
             _end(child)
@@ -74,7 +77,7 @@ def read_polydata(path: str | Path, *, array: str = "") -> PolyData:
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
-    end_child(child)
+    _end_child(child)
     _child.cache_clear()
 
 
@@ -134,28 +137,63 @@ def _reply(pipe: IO[bytes], *arrays: Array) -> None:
 @cache
 def _child(process: int) -> subprocess.Popen[bytes]:
     """The process that reads for the process of this number: none is shared after a fork."""
-    child = start_child(__name__, 1)
-    atexit.register(end_child, child)
+    child = _start_child()
+    atexit.register(_end_child, child)
     return child
+
+
+def _start_child() -> subprocess.Popen[bytes]:
+    """Start this module as a process with pipes and one thread for loops; modules in the present
+    folder are not imported.
+
+    It is started by command and not by `multiprocessing`, so that a script needs no guard of its
+    main part.
+    """
+    places = [str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(place for place in places if place)}
+    counts = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    environment |= dict.fromkeys(counts, "1")
+    command, pipe = [sys.executable, "-P", "-m", __name__], subprocess.PIPE
+    # A process group of its own: an interrupt reaches this process, which ends the child.
+    return subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, process_group=0)
+
+
+def _end_child(process: subprocess.Popen[bytes]) -> None:
+    """End a process and close its pipes."""
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        with contextlib.suppress(OSError):  # what it did not read is lost
+            if pipe is not None:
+                pipe.close()
+
+
+def _listen(asked: queue.Queue[list[str]]) -> None:
+    """Queue the questions on standard input; the process ends when its parent does."""
+    for line in sys.stdin.buffer:
+        asked.put(json.loads(line))
+    os._exit(0)
 
 
 def _answer() -> None:
     """Take paths, and give what the files hold or why they cannot be read."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # VTK prints pages
+    answers = os.fdopen(os.dup(1), "wb")
+    for output in (1, 2):  # VTK prints pages
+        os.dup2(os.open(os.devnull, os.O_WRONLY), output)
     with contextlib.suppress(ImportError):  # Windows has no such limit
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    outbox, asked = Outbox(), listen()
+    asked: queue.Queue[list[str]] = queue.Queue()
+    threading.Thread(target=_listen, args=(asked,), daemon=True).start()
     while True:
-        question = asked.get()
-        assert isinstance(question, tuple)  # a path and the name of an array
+        path, array = asked.get()
         try:
-            arrays = _read(*question)
-        except Exception as error:  # noqa: BLE001 - any error of a library becomes one line
+            arrays = _read(path, array)
+        except BROKEN_FILE as error:
             text = " ".join(str(error).split())[:200] or type(error).__name__
             arrays = (np.array(text),)
-        _reply(outbox.file, *arrays)
+        _reply(answers, *arrays)
 
 
 def _read(path: str, array: str) -> tuple[Array, ...]:
