@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 # In the order of the gallery.
 EXAMPLES = (
@@ -41,6 +40,7 @@ TOPICS = {
         "SceneWarning",
     ),
 }
+PAGES = ("../leg",)  # of the gallery too, on data that are not in the repository
 _TIMEOUT = 600
 _LONGEST = 60  # lines of an example's output that are shown
 
@@ -64,12 +64,11 @@ def write_gallery(root):
     folder.mkdir(exist_ok=True)
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(lambda name: _write_page(root, folder, name), EXAMPLES))
-    listed = "\n".join(EXAMPLES)
+    listed = "\n".join([*EXAMPLES, *PAGES])
     (folder / "index.md").write_text(
         "# Gallery\n\nEach page is a script or a notebook of `examples/`, run when these pages "
-        "were built; "
-        f"each ends with a check of its own result.\n\n```{{toctree}}\n:maxdepth: "
-        f"1\n\n{listed}\n```\n",
+        "were built, and ends with a check of its own result; the last shows data that are not in "
+        f"this repository.\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n",
         encoding="utf-8",
     )
 
@@ -247,8 +246,3 @@ def _allowed(field):
 
 def _value(value):
     return "" if value is None or isinstance(value, (dict, list)) else f"`{json.dumps(value)}`"
-
-
-def pages(root):
-    """Names of all pages in ``docs/``, without suffix."""
-    return sorted(path.stem for path in Path(root / "docs").glob("*.md") if path.stem != "index")

@@ -10,6 +10,7 @@ import re
 import shlex
 import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 from conftest import ROOT
@@ -22,6 +23,7 @@ from rbfmuscle.scene.file import SceneFile
 
 sys.path.insert(0, str(ROOT / "docs"))
 import figures
+import gallery
 
 PAGES = [*figures.page_files(), ROOT / "CONTRIBUTING.md"]
 TOPS = ("rbfmuscle", "pbd_baseline", "benchmarks", "tests", "docs", "examples")
@@ -169,9 +171,10 @@ def test_figures_stand_in_one_page_and_the_readme():
     assert holding == {"README", "validation"}
 
 
-def test_every_page_is_in_the_index():
+def test_every_page_is_in_the_index_or_in_the_gallery():
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     listed = {line for line in index.splitlines() if re.fullmatch(r"[\w/]+", line)} - GENERATED
+    listed |= {Path(page).name for page in gallery.PAGES}
     assert listed == {path.stem for path in (ROOT / "docs").glob("*.md")} - {"index"}
 
 
