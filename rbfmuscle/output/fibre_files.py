@@ -1,28 +1,22 @@
 """Fibres of a run in its folder: a file of polylines for each muscle and frame, and one table."""
 
 import csv
-import re
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.output.vtp import AFTER_DATA, BEFORE_DATA, packed, unpacked
+from rbfmuscle.output.vtp import (
+    made_block,
+    numbers_of,
+    read_blocks,
+    refusing_damage,
+    write_blocks,
+)
 from rbfmuscle.simulation.frame import FibreLines
-from rbfmuscle.validation import MeshError
 
 FOLDER, TABLE = "fibres", "fibres.csv"
 COLUMNS = ("frame", "muscle", "fibre", "length", "stretch")
-_ARRAYS = {  # name: VTK's type, components, where it belongs
-    "Points": ("Float64", 3, "Points"),
-    "connectivity": ("Int32", 1, "Lines"),
-    "offsets": ("Int32", 1, "Lines"),
-    "local_stretch": ("Float64", 1, "PointData"),
-    "length": ("Float64", 1, "CellData"),
-    "stretch": ("Float64", 1, "CellData"),
-}
-_NUMPY = {"Float64": "<f8", "Int32": "<i4"}
 
 
 def fibre_file(muscle: str, frame: int) -> str:
@@ -36,53 +30,26 @@ def write_fibres(path: Path, fibres: FibreLines) -> None:
     """
     lines, points = fibres.points.shape[:2]
     count = lines * points
-    arrays = {
-        "Points": fibres.points,
-        "connectivity": np.arange(count),
-        "offsets": points * np.arange(1, lines + 1),
-        "local_stretch": fibres.local_stretch,
-        "length": fibres.lengths,
-        "stretch": fibres.stretch,
-    }
-    parts = dict.fromkeys(("PointData", "CellData", "Points", "Lines"), "")
-    blocks = []
-    offset = 0
-    for name, (kind, components, part) in _ARRAYS.items():
-        block = packed(np.ascontiguousarray(arrays[name], dtype=_NUMPY[kind]).tobytes())
-        parts[part] += (
-            f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}" '
-            f'format="appended" offset="{offset}"/>\n'
-        )
-        offset += len(block)
-        blocks.append(block)
-    inner = "".join(f"<{part}>\n{text}</{part}>\n" for part, text in parts.items())
-    head = (
-        '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" '
-        'header_type="UInt32" compressor="vtkZLibDataCompressor">\n<PolyData>\n'
-        f'<Piece NumberOfPoints="{count}" NumberOfVerts="0" NumberOfLines="{lines}" '
-        f'NumberOfStrips="0" NumberOfPolys="0">\n{inner}</Piece>\n</PolyData>\n'
-    )
-    path.write_bytes(b"".join([head.encode("ascii"), BEFORE_DATA, *blocks, AFTER_DATA]))
+    blocks = [
+        made_block("PointData", "local_stretch", fibres.local_stretch.ravel(), "Float64"),
+        made_block("CellData", "length", fibres.lengths, "Float64"),
+        made_block("CellData", "stretch", fibres.stretch, "Float64"),
+        made_block("Points", "Points", fibres.points.reshape(-1, 3), "Float64"),
+        made_block("Lines", "connectivity", np.arange(count), "Int32"),
+        made_block("Lines", "offsets", points * np.arange(1, lines + 1), "Int32"),
+    ]
+    write_blocks(path, blocks, points=count, lines=lines)
 
 
 def read_fibres(path: Path) -> FibreLines:
     """Fibres of a file that `write_fibres` has written; MeshError if missing or damaged."""
-    try:
-        text, _, data = path.read_bytes().partition(BEFORE_DATA)
-        starts = re.findall(rb'type="(\w+)" Name="(\w+)"[^>]*offset="(\d+)"', text)
-        found = {
-            name.decode(): unpacked(data, kind.decode(), int(start)) for kind, name, start in starts
-        }
-        lines = len(found["stretch"])
-        points = found["Points"].reshape(lines, -1, 3)
-        local = found["local_stretch"].reshape(lines, -1)
-        return FibreLines(points.copy(), found["stretch"].copy(), local.copy())
-    except FileNotFoundError:
-        raise MeshError(f"{path} is missing") from None
-    except (KeyError, ValueError, IndexError, StopIteration, zlib.error):
-        raise MeshError(
-            f"{path} is damaged or was not written by a run; run the scene again"
-        ) from None
+    with refusing_damage(path):
+        blocks = read_blocks(path)
+        points, stretch, local = (
+            numbers_of(*blocks[name]).copy() for name in ("Points", "stretch", "local_stretch")
+        )
+        lines = len(stretch)
+        return FibreLines(points.reshape(lines, -1, 3), stretch, local.reshape(lines, -1))
 
 
 def begin_table(directory: Path) -> None:

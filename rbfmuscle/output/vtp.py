@@ -4,10 +4,12 @@ loading VTK.
 
 import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from html import escape
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,25 +18,30 @@ from rbfmuscle.folders import write_whole
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
 from rbfmuscle.validation import MeshError
 
-_TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32"}
+_TYPES = {"Float64": "<f8", "Float32": "<f4", "Int32": "<i4"}  # of VTK, in NumPy's words
 # Names of arrays that VTK takes for texture coordinates and normals.
 TEXTURE, NORMALS = "texture_coordinates", "normals"
+_PARTS = ("PointData", "CellData", "Points", "Lines", "Polys")
 _HEAD = """<?xml version="1.0"?>
 <VTKFile type="PolyData" version="1.0"
  byte_order="LittleEndian" header_type="UInt32" compressor="vtkZLibDataCompressor">
 <PolyData>
-<Piece NumberOfPoints="{}" NumberOfVerts="0" NumberOfLines="0"
- NumberOfStrips="0" NumberOfPolys="{}">
-<PointData{}>
-{}</PointData>
-<Points>
-{}</Points>
-<Polys>
-{}{}</Polys>
-</Piece>
+<Piece NumberOfPoints="{points}" NumberOfVerts="0" NumberOfLines="{lines}"
+ NumberOfStrips="0" NumberOfPolys="{faces}">
+{parts}</Piece>
 </PolyData>
 """
 BEFORE_DATA, AFTER_DATA = b'<AppendedData encoding="raw">\n_', b"\n</AppendedData>\n</VTKFile>\n"
+
+
+class Block(NamedTuple):
+    """An array of a PolyData file."""
+
+    part: str  # that it belongs to, one of `_PARTS`
+    name: str
+    kind: str  # VTK's type
+    width: int  # numbers of one element
+    data: bytes  # as VTK stores them
 
 
 def write_vtp(
@@ -46,35 +53,58 @@ def write_vtp(
     """Write vertices (n, 3) in their precision, faces (m, 3), and ``arrays`` (n,) or (n, k) by name
     in single precision.
     """
-    points = np.ascontiguousarray(vertices)
-    points = points.astype("<f4" if points.dtype == np.float32 else "<f8", copy=False)
-    corners = np.ascontiguousarray(faces, dtype="<i4")
-    values = {name: np.asarray(value, dtype="<f4") for name, value in (arrays or {}).items()}
-    names = [*values, "Points", "connectivity", "offsets"]
-    kinds = ["f4"] * len(values) + [points.dtype.str[1:], "i4", "i4"]
-    widths = [value.size // max(len(value), 1) for value in values.values()] + [3, 1, 1]
-    marks = (("TCoords", TEXTURE), ("Normals", NORMALS))
-    marked = "".join(f' {mark}="{name}"' for mark, name in marks if name in values)
-    contents = [np.ascontiguousarray(value) for value in values.values()]
+    points, corners = np.asarray(vertices), np.asarray(faces)
     blocks = [
-        packed(value.tobytes()) if len(value) and np.ptp(value) else _compressed(value.tobytes())
-        for value in contents
-    ]
-    blocks += [packed(points.tobytes()), _compressed(corners.tobytes()), _ends(len(corners))]
-    elements, offset = [], 0
-    for name, kind, components, block in zip(names, kinds, widths, blocks):
-        elements.append(
-            f'<DataArray type="{_TYPES[kind]}" Name="{escape(name)}" '
-            f'NumberOfComponents="{components}" format="appended" offset="{offset}"/>\n'
+        made_block(
+            "PointData", name, values, "Float32", same=not (np.size(values) and np.ptp(values))
         )
-        offset += len(block)
-    data = "".join(elements[: len(values)])
-    rest = elements[len(values) :]
-    head = _HEAD.format(len(points), len(corners), marked, data, *rest).encode("ascii")
-    Path(path).write_bytes(b"".join([head, BEFORE_DATA, *blocks, AFTER_DATA]))
+        for name, values in (arrays or {}).items()
+    ]
+    kind = "Float32" if points.dtype == np.float32 else "Float64"
+    blocks += [
+        made_block("Points", "Points", points, kind),
+        made_block("Polys", "connectivity", corners.ravel(), "Int32", same=True),
+        made_block("Polys", "offsets", np.arange(3, corners.size + 1, 3), "Int32", same=True),
+    ]
+    write_blocks(path, blocks, points=len(points), faces=len(corners))
 
 
-def packed(raw: bytes, *, level: int = 0) -> bytes:
+def made_block(part: str, name: str, values: ArrayLike, kind: str, *, same: bool = False) -> Block:
+    """The block of an array (n,) or (n, k); ``same`` is one that a mesh has alike in every
+    frame.
+    """
+    array = np.ascontiguousarray(values, dtype=_TYPES[kind])
+    width = 1 if array.ndim == 1 else array.shape[1]
+    data = (_packed_once if same else _packed)(array.tobytes())
+    return Block(part, name, kind, width, data)
+
+
+def write_blocks(
+    path: str | Path, blocks: Sequence[Block], *, points: int, lines: int = 0, faces: int = 0
+) -> None:
+    """Write a PolyData file of so many points, lines and faces."""
+    names = [block.name for block in blocks if block.part == "PointData"]
+    marks = (("TCoords", TEXTURE), ("Normals", NORMALS))
+    marked = "".join(f' {mark}="{name}"' for mark, name in marks if name in names)
+    elements = dict.fromkeys(_PARTS, "")
+    offset = 0
+    for block in blocks:
+        elements[block.part] += (
+            f'<DataArray type="{block.kind}" Name="{escape(block.name)}" '
+            f'NumberOfComponents="{block.width}" format="appended" offset="{offset}"/>\n'
+        )
+        offset += len(block.data)
+    parts = "".join(
+        f"<{part}{marked if part == 'PointData' else ''}>\n{text}</{part}>\n"
+        for part, text in elements.items()
+        if text
+    )
+    head = _HEAD.format(points=points, lines=lines, faces=faces, parts=parts).encode("ascii")
+    contents = [head, BEFORE_DATA, *(block.data for block in blocks), AFTER_DATA]
+    Path(path).write_bytes(b"".join(contents))
+
+
+def _packed(raw: bytes, level: int = 0) -> bytes:
     """VTK's header with the sizes of one zlib block, then the block.
 
     Stored as it is by default: compressing numbers takes ten times as long as writing them, and
@@ -84,56 +114,57 @@ def packed(raw: bytes, *, level: int = 0) -> bytes:
     return np.array([1, len(raw), 0, len(block)], dtype="<u4").tobytes() + block
 
 
-@lru_cache(maxsize=128)
-def _compressed(raw: bytes) -> bytes:
-    """A block of what a mesh has alike in every frame."""
-    return packed(raw, level=1)
-
-
-@lru_cache(maxsize=128)
-def _ends(faces: int) -> bytes:
-    """The block of where each of so many faces ends."""
-    return packed(np.arange(3, 3 * faces + 1, 3, dtype="<i4").tobytes(), level=1)
+@lru_cache(maxsize=256)
+def _packed_once(raw: bytes) -> bytes:
+    """A compressed block, kept because meshes have it in every frame."""
+    return _packed(raw, level=1)
 
 
 def read_vtp(path: str | Path) -> tuple[Floats, Integers]:
     """Vertices (n, 3) and faces (m, 3) of what `write_vtp` has written; MeshError if missing,
     another or damaged.
     """
+    with refusing_damage(path):
+        found = read_blocks(path)
+        points = numbers_of(*found["Points"]).reshape(-1, 3)
+        return points.astype(float), _corners(*found["connectivity"])
+
+
+@contextmanager
+def refusing_damage(path: str | Path) -> Iterator[None]:
+    """Context that raises MeshError for a file that is missing, or none that a run has written."""
     try:
-        text, _, data = Path(path).read_bytes().partition(BEFORE_DATA)
-        starts = re.findall(rb'type="(\w+)" Name="(Points|connectivity)"[^>]*offset="(\d+)"', text)
-        found = {name: (_block(data, int(start)), kind.decode()) for kind, name, start in starts}
-        points = _numbers(*found[b"Points"]).reshape(-1, 3)
-        return points.astype(float), _corners(*found[b"connectivity"])
+        yield
     except FileNotFoundError:
         raise MeshError(f"{path} is missing") from None
-    except (KeyError, ValueError, IndexError, StopIteration, zlib.error):
+    except (KeyError, ValueError, IndexError, zlib.error):
         raise MeshError(
             f"{path} is damaged or was not written by a run; run the scene again"
         ) from None
 
 
-def unpacked(data: bytes, kind: str, start: int) -> Array:
-    """Numbers of a block of VTK's type ``kind`` that begins at a byte of the appended data."""
-    return _numbers(_block(data, start), kind)
+def read_blocks(path: str | Path) -> dict[str, tuple[bytes, str]]:
+    """The zlib block of each array of a file that `write_blocks` has written, and VTK's type, by
+    the array's name.
+    """
+    text, _, data = Path(path).read_bytes().partition(BEFORE_DATA)
+    found = {}
+    for kind, name, place in re.findall(rb'type="(\w+)" Name="([^"]+)"[^>]*offset="(\d+)"', text):
+        start = int(place)
+        size = int(np.frombuffer(data, "<u4", 4, start)[3])
+        found[name.decode()] = data[start + 16 : start + 16 + size], kind.decode()
+    return found
 
 
-def _block(data: bytes, start: int) -> bytes:
-    """The zlib block behind VTK's header at a byte of the appended data."""
-    size = int(np.frombuffer(data, "<u4", 4, start)[3])
-    return data[start + 16 : start + 16 + size]
-
-
-def _numbers(block: bytes, kind: str) -> Array:
-    code = next(f"<{code}" for code, name in _TYPES.items() if name == kind)
-    return np.frombuffer(zlib.decompress(block), code)
+def numbers_of(block: bytes, kind: str) -> Array:
+    """Numbers of a zlib block, of VTK's type."""
+    return np.frombuffer(zlib.decompress(block), _TYPES[kind])
 
 
 @lru_cache(maxsize=64)
 def _corners(block: bytes, kind: str) -> Integers:
     """Faces (m, 3), kept because a mesh has the same ones in every frame."""
-    return _numbers(block, kind).reshape(-1, 3).astype(int)
+    return numbers_of(block, kind).reshape(-1, 3).astype(int)
 
 
 class Collection:
