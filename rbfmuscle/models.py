@@ -1,6 +1,6 @@
 """Model names and what builds them; the only module that knows both models."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import NamedTuple
 
@@ -139,15 +139,12 @@ def kernel_names(scene: Scene) -> dict[str, str]:
     return {name: found.kernel for name, found in options.items() if hasattr(found, "kernel")}
 
 
-def build_models(scene: Scene, names: Collection[str] | None = None) -> list[MuscleModel]:
-    """Return the models of a scene's muscles, all or those named, in the scene's order, built side
-    by side.
-    """
+def build_models(scene: Scene) -> list[MuscleModel]:
+    """Return the models of a scene's muscles, in the scene's order, built side by side."""
     from threadpoolctl import threadpool_limits
 
-    muscles = [muscle for muscle in scene.muscles if names is None or muscle.name in names]
     with threadpool_limits(limits=1, user_api="blas"):
-        return each(lambda muscle: build_model(muscle, scene), muscles)
+        return each(lambda muscle: build_model(muscle, scene), scene.muscles)
 
 
 def configure_scene(

@@ -14,7 +14,7 @@ from rbfmuscle.folders import LIST, read_list
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.output.export import export_run
 from rbfmuscle.output.info import RunInfo
-from rbfmuscle.output.run_data import RunData, SceneMeshes
+from rbfmuscle.output.run_data import RunData, SceneMeshes, named_coordinates
 from rbfmuscle.output.run_folder import FolderMeshes
 from rbfmuscle.output.writer import RunWriter, run_folder
 from rbfmuscle.progress import Progress
@@ -190,30 +190,17 @@ class Run(RunData):
 
         place, label = motion_axis(self)
         rows = [row for row in self.metrics if row.quantity == quantity]
-        several = "moment_arm" in quantity and len({row.coordinate for row in rows}) > 1
+        about = named_coordinates(quantity, rows, coordinate)
         axes = pyplot.figure().add_subplot()
-        for muscle, about in self._tracks(quantity, coordinate):
-            frames, values = self.series(muscle, quantity, about)
-            name = f"{muscle}, {about}" if several and about else muscle
-            axes.plot([place[frame] for frame in frames.tolist()], values, label=name)
+        for muscle in dict.fromkeys(row.muscle for row in rows):
+            for name in about or [""]:
+                frames, values = self.series(muscle, quantity, name or None)
+                if len(frames):
+                    line = f"{muscle}, {name}" if len(about) > 1 else muscle
+                    axes.plot([place[frame] for frame in frames.tolist()], values, label=line)
         axes.set(title=quantity, xlabel=label, ylabel=rows[0].unit)
         axes.legend()
         return axes
-
-    def _tracks(self, quantity: str, coordinate: str | None) -> list[tuple[str, str | None]]:
-        """Muscle and coordinate of each line of a plot; no coordinate of what has none."""
-        rows = [row for row in self.metrics if row.quantity == quantity]
-        if "moment_arm" not in quantity:
-            if coordinate is not None:
-                raise UsageError(f"{quantity!r} has no coordinate; only moment arms have")
-            return [(muscle, None) for muscle in dict.fromkeys(row.muscle for row in rows)]
-        names = list(dict.fromkeys(row.coordinate for row in rows))
-        if coordinate is not None and coordinate not in names:
-            raise UsageError(
-                f"unknown coordinate {coordinate!r}, {did_you_mean(coordinate, names)}"
-            )
-        found = dict.fromkeys((row.muscle, row.coordinate) for row in rows)
-        return [(muscle, about) for muscle, about in found if coordinate in (None, about)]
 
     def save(self, directory: str | Path, *, pictures: bool = True) -> None:
         """Write what `stream_run` would have written; a run that was loaded is copied.

@@ -217,10 +217,11 @@ class RunData:
             raise UsageError(
                 f"{quantity!r} was not measured of {muscle!r}, {did_you_mean(quantity, found)}"
             )
-        if "moment_arm" in quantity:
-            _check_coordinate(found[quantity], coordinate)
-        elif coordinate is not None:
-            raise UsageError(f"{quantity!r} has no coordinate; only moment arms have")
+        names = named_coordinates(quantity, found[quantity], coordinate)
+        if len(names) > 1:
+            raise UsageError(
+                f"{muscle!r} has moment arms about {', '.join(names)}; name one with coordinate="
+            )
         return self.series(muscle, quantity, coordinate)[1]
 
     def __repr__(self) -> str:
@@ -330,16 +331,17 @@ def _sorted_rows(metrics: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
     return found
 
 
-def _check_coordinate(rows: Sequence[Row], coordinate: str | None) -> None:
-    """Raise UsageError unless rows of moment arms are about one coordinate, or one is named."""
+def named_coordinates(quantity: str, rows: Sequence[Row], coordinate: str | None) -> list[str]:
+    """The coordinates that rows of a quantity are about, or the one that is asked for; none of what
+    is no moment arm. UsageError where there is no such coordinate.
+    """
+    if "moment_arm" not in quantity:
+        if coordinate is not None:
+            raise UsageError(f"{quantity!r} has no coordinate; only moment arms have")
+        return []
     names = list(dict.fromkeys(row.coordinate for row in rows))
-    if coordinate is None and len(names) > 1:
-        raise UsageError(
-            f"{rows[0].muscle!r} has moment arms about {', '.join(names)}; name one with "
-            "coordinate="
-        )
-    if coordinate is not None and coordinate not in names:
-        raise UsageError(
-            f"{rows[0].muscle!r} has no moment arm about {coordinate!r}, "
-            f"{did_you_mean(coordinate, names)}"
-        )
+    if coordinate is None:
+        return names
+    if coordinate not in names:
+        raise UsageError(f"no moment arm about {coordinate!r}, {did_you_mean(coordinate, names)}")
+    return [coordinate]

@@ -171,7 +171,7 @@ def test_plot_shows_every_value(run):
     (arms,) = run.plot("moment_arm").lines
     np.testing.assert_allclose(arms.get_xdata(), [0.0, 2.0, 4.0], atol=1e-12)  # degrees
     np.testing.assert_array_equal(arms.get_ydata(), run.values("abductor", "moment_arm"))
-    with pytest.raises(rm.UsageError, match=r"unknown coordinate 'hip\.twist'"):
+    with pytest.raises(rm.UsageError, match=r"no moment arm about 'hip\.twist'"):
         run.plot("moment_arm", coordinate="hip.twist")
     with pytest.raises(rm.UsageError, match="did you mean 'length'"):
         run.plot("lenght")
