@@ -66,7 +66,7 @@ class SceneTable(Table):
 
 
 # Keys of ``[scene]`` that a `Scene` has by the same names.
-ABOUT = ("missing_bones", "doubts", "notes", "superior", "anterior")
+ABOUT = ("units", "missing_bones", "doubts", "notes", "superior", "anterior")
 
 
 class BoneTable(MeshTransform):

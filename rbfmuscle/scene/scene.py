@@ -65,10 +65,10 @@ class Scene:
     detect: DetectOptions | None = None
     output: OutputOptions = field(default_factory=OutputOptions)
     path: Path | None = None  # the file it was loaded from
-    # In the verdict of a run: bones without a usable mesh, differences from the source, guesses.
-    missing_bones: list[str] = field(default_factory=list)
-    doubts: list[str] = field(default_factory=list)
-    guesses: list[Guess] = field(default_factory=list)
+    # These three are in the verdict of a run.
+    missing_bones: list[str] = field(default_factory=list)  # those without a usable mesh
+    doubts: list[str] = field(default_factory=list)  # what differs from the source, in sentences
+    guesses: list[Guess] = field(default_factory=list)  # lines of the file marked GUESS
     notes: list[str] = field(default_factory=list)  # what was assumed or left out, for a check
     # Anatomical directions (3,) at rest: those of the file, or found from the bones before a run.
     superior: list[float] | None = None
@@ -103,7 +103,6 @@ class Scene:
         tables, guesses = read_scene_file(Path(path))
         scene = cls(
             tables.scene.name or Path(path).stem,
-            units=tables.scene.units,
             path=Path(path),
             guesses=guesses,
             **{key: getattr(tables.scene, key) for key in ABOUT},
@@ -129,8 +128,8 @@ class Scene:
             If the frames of the motion were not made from the keys of ``[motion]``.
         """
         rest = _made_motion(self, MotionOptions()).frames[0]
-        made = _made_motion(self, self.motion.options).frames
-        if list(made) != [{**rest, **frame} for frame in self.motion.frames]:
+        own = [{**rest, **frame} for frame in self.motion.frames]
+        if list(_made_motion(self, self.motion.options).frames) != own:
             raise SceneError(
                 "the frames of the motion are not those of its table [motion]; give it by "
                 "set_motion before the scene is saved"
@@ -138,7 +137,7 @@ class Scene:
         files = SceneFiles(Path(path), folder)
         about = {key: getattr(self, key) for key in ABOUT if getattr(self, key)}
         tables = [
-            ("[scene]", {"format": FORMAT, "name": self.name, "units": self.units, **about}),
+            ("[scene]", {"format": FORMAT, "name": self.name, **about}),
             *files.skeleton(self.bones, self.meshless_bones, self.joints, self.couplings),
             *(("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles),
             *files.settings(_settings(self)),

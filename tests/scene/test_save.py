@@ -91,6 +91,23 @@ def test_a_saved_scene_reaches_the_command_line_and_replaces_nothing(tmp_path, c
     assert path.read_text() == text
 
 
+def test_a_scene_without_motion_is_saved_where_rest_is_not_zero(tmp_path):
+    scene = built()
+    scene.add_bone("tip")
+    turn = {"bend": {"rest": 20.0}}
+    axes = {"bend": [0, 1, 0]}
+    scene.add_joint("wrist", "lower", "tip", (90, 0, 0), axes, type="hinge", coordinates=turn)
+    again = rm.Scene.load(scene.save(tmp_path / "arm.toml"))
+    assert again.motion.frames[0] == pytest.approx({"wrist.bend": np.radians(20.0)})
+
+
+def test_several_settings_of_a_motion_are_one_motion():
+    scene = rich().with_options({"motion.step": 5, "motion.ramp.elbow.flexion.to": 10})
+    assert np.degrees([frame["elbow.flexion"] for frame in scene.motion.frames]) == pytest.approx(
+        [0.0, 5.0, 10.0]
+    )
+
+
 def test_frames_of_no_table_and_files_of_another_kind_are_refused(tmp_path):
     scene = built()
     scene.motion = Motion([{}, {"elbow.flexion": 0.1}])
