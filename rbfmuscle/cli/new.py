@@ -2,7 +2,6 @@
 OpenSim models.
 """
 
-import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -174,11 +173,11 @@ def _write_surfaces(volume, stage):
     from rbfmuscle.importers.guess.names import name_facts
     from rbfmuscle.importers.labels.surfaces import label_surface
     from rbfmuscle.progress import Progress
+    from rbfmuscle.scene.names import new_name, plain_name
 
     meshes = stage / "meshes"
     meshes.mkdir()
     values = volume.values()
-    files = set()
     capped = {}
     frame = "right, forward, up (RAS), mm"
     notes = [f"surfaces of {Path(volume.source).name}, in its frame: {frame}", *volume.notes]
@@ -193,14 +192,10 @@ def _write_surfaces(volume, stage):
             except MeshError as error:
                 notes.append(f"{error}; left out")
                 continue
-            file = plain = re.sub(r"[^A-Za-z0-9_-]+", "_", surface.name)
-            count = 1
-            while file.lower() in files:  # two labels of one name are two parts
-                count += 1
-                file = f"{plain}_{count}"
-            if count > 1:
-                notes.append(f"{count} labels are named {plain}: one of them is {file} here")
-            files.add(file.lower())
+            plain = plain_name(surface.name)
+            file = new_name(surface.name, capped)
+            if plain.lower() in map(str.lower, capped):  # they are two parts
+                notes.append(f"several labels are named {plain}: one of them is {file} here")
             surface.mesh.export(meshes / f"{file}.ply")
             capped[file] = surface.capped
             notes += [f"{surface.name}: {note}" for note in surface.notes]

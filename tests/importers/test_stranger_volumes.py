@@ -180,7 +180,7 @@ def test_two_labels_of_one_name_have_two_names_and_that_is_said(tmp_path):
     nrrd.write(str(folder / "femur.nrrd"), FEMUR.astype(np.uint8), NRRD_HEAD)
     meshes, _, notes = _write_surfaces(read_labels(folder), tmp_path)
     assert {file.stem for file in meshes.iterdir()} == {"femur", "femur_2", "pelvis"}
-    assert "2 labels are named femur: one of them is femur_2 here" in notes
+    assert "several labels are named femur: one of them is femur_2 here" in notes
 
 
 def test_a_header_beside_its_voxels_is_read_and_lost_voxels_are_said(tmp_path):

@@ -2,7 +2,6 @@
 its reason.
 """
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -21,6 +20,7 @@ from rbfmuscle.importers.guess.tendons import unused_tendons
 from rbfmuscle.scene.articular import articular_points
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.guesses import DOUBTFUL
+from rbfmuscle.scene.names import plain_name
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.toml_text import attachment_file, table_text
 from rbfmuscle.scene.upgrade import FORMAT, MAIN
@@ -247,7 +247,7 @@ def _head(guess):
         "# All keys: docs/scene_file.md. Then: rbfmuscle check --picture, rbfmuscle run.",
         *(f"# NOT USED: {file}: {reason}" for file, reason in parts.unusable.items()),
     ]
-    name = re.sub(r"[^A-Za-z0-9_-]+", "_", folder.resolve().name) or "scene"
+    name = plain_name(folder.resolve().name or "scene")
     row = {"format": FORMAT, "name": name, "units": parts.units}
     comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
     if parts.missing_bones:
