@@ -1,7 +1,6 @@
 """The meshes of a folder, sorted into bones, muscles and tendons; the unit of their lengths."""
 
 import os
-import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +14,8 @@ from rbfmuscle.importers.guess.names import MuscleFacts, name_facts
 from rbfmuscle.scene.extents import LARGEST_MM, SMALLEST_MM
 from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES, read_file
 from rbfmuscle.scene.meshes.read import prepare_mesh
+from rbfmuscle.scene.names import new_name
+from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MeshError, UsageError
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 FOLDERS = {"bones": "bone", "bone": "bone", "knochen": "bone", "os": "bone"}
 FOLDERS |= {"muscles": "muscle", "muscle": "muscle", "muskeln": "muscle"}
 FOLDERS |= {"tendons": "tendon", "tendon": "tendon", "sehnen": "tendon"}
-MILLIMETRE = {"mm": 1.0, "cm": 0.1, "m": 0.001}
 # Length of a bone [mm] by its class, and of the largest one where none is known, from child to
 # large adult.
 LENGTHS = {"femur": (200, 600), "tibia": (150, 500), "humerus": (120, 420), "pelvis": (100, 450)}
@@ -101,7 +101,7 @@ class Parts:
     @property
     def millimetre(self) -> float:
         """Its length in scene units."""
-        return MILLIMETRE[self.units]
+        return 1.0 / MM_PER_UNIT[self.units]
 
 
 def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
@@ -210,9 +210,7 @@ def _file_meshes(folder, notes):
 def _read_part(path, stem, mesh, base, names, facts, found, *, closed):
     if isinstance(mesh, MeshError):
         raise mesh
-    name = re.sub(r"[^a-z0-9_-]+", "_", stem.lower()).strip("_") or "part"
-    while name in names:
-        name += "_2"
+    name = new_name(stem.lower().strip("_ ") or "part", names)
     names.add(name)
     vertices, faces = mesh.vertices, mesh.faces
     coarse = len(faces) > MOST_TRIANGLES and not closed  # cells of thin walls may open a surface
@@ -235,8 +233,8 @@ def _guess_units(found):
     known = [bone for bone in found.bones if bone.kind in LENGTHS]
     bone = max(known or found.bones, key=lambda bone: bone.size)
     low, high = LENGTHS.get(bone.kind, LARGEST_BONE)
-    for units, millimetre in MILLIMETRE.items():
-        if low <= bone.size / millimetre <= high:
+    for units, millimetres in MM_PER_UNIT.items():
+        if low <= bone.size * millimetres <= high:
             found.notes.append(f"units are {units}: {bone.name} is {bone.size:.4g} {units} long")
             return units
     raise UsageError(
