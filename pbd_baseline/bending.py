@@ -7,7 +7,7 @@ import numpy as np
 from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.rotations import cross, dot
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no
 # direction.
@@ -180,7 +180,7 @@ def _project_block(g, count, stiffness, compliance):
         g[t + 11 * BLOCK] = -fm * q[2]
 
 
-@inner(error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _half_turn(g, t, sine, pq, aligned):
     """Tangent, at most 1, of half the angle by which a fold is off its angle at rest."""
     turned = sine * g[t + 13 * BLOCK] - pq * g[t + 14 * BLOCK]
@@ -188,13 +188,13 @@ def _half_turn(g, t, sine, pq, aligned):
     return turned / (max(aligned, abs(turned)) + 1e-300)
 
 
-@inner(error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _taken(g, t):
     """A vector of column t of a block."""
     return g[t], g[t + BLOCK], g[t + 2 * BLOCK]
 
 
-@inner(error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _put(g, t, a, p, b, q):
     """Put a p + b q into column t of a block."""
     g[t] = a * p[0] + b * q[0]

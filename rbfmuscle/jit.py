@@ -20,11 +20,20 @@ from pathlib import Path
 
 import numba
 import platformdirs
-from llvmlite.binding import ModuleRef, parse_assembly, parse_bitcode
+from llvmlite.binding import ModuleRef, ValueRef, parse_assembly, parse_bitcode
+from numba.core import types
 from numba.core.caching import FunctionCache
+from numba.core.codegen import Codegen
 from numba.core.compiler import CompileResult
+from numba.core.cpu import CPUContext
+from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
+from numba.core.typing import Signature
 
+from rbfmuscle.compiling import LoopCompiler
+
+# Instructions of a loop, less its arguments, from which on callers refer to its code.
+LARGE = 100
 _IMPORT = re.compile(r"^(?:from\s+([\w.]+)\s+)?import\s+(\([^)]*\)|.*)", re.MULTILINE)
 
 
@@ -34,21 +43,38 @@ def compiled(function: Callable | None = None, **options: object) -> Callable:
 
     It takes arrays, numbers and NamedTuples of these; options are those of ``numba.njit``.
     ``nogil=False`` suits short loops that are called often, because releasing the interpreter's
-    lock takes longer than they do. ``_nrt=False`` suits inner loops that are called for each point,
-    make no array and return none: references to arrays are then not counted.
+    lock takes longer than they do.
     """
     if function is None:
         return lambda inner: compiled(inner, **options)
     if numba.config.DISABLE_JIT:
         return function
-    # No loop is an argument of another: the wrapper for that, an eighth of the time of compiling,
-    # is left out.
-    loop = numba.njit(**{"nogil": True, "no_cfunc_wrapper": True, "_nrt": True, **options})(
-        function
-    )
+    called = _declared(function, None, no_cpython_wrapper=True, **options)
+    return _declared(function, called, **options)
+
+
+def _declared(function: Callable, called: Dispatcher | None, **options: object) -> Dispatcher:
+    """A loop that Python calls, or where ``called`` is None the form of it that other loops call:
+    what Python calls a loop by takes longer to compile than many a loop where arguments hold dozens
+    of arrays.
+    """
+    # No loop is an argument of another: the wrapper for that is left out.
+    settings = {
+        "pipeline_class": LoopCompiler,
+        "error_model": "numpy",
+        "nogil": True,
+        "no_cfunc_wrapper": True,
+        "_nrt": True,
+        **options,
+    }
+    loop = numba.njit(**settings)(function)
     loop._compiler.compile = _no_collection()(loop._compiler.compile)
-    loop.get_call_template = _of_plain_types(loop.get_call_template)
-    loop._cache = _LoopCache(function)
+    loop._cache = _LoopCache(function, called is None)
+    if called is None:
+        loop._compiler.compile = _kept_apart(loop._compiler.compile)
+    else:
+        loop.get_call_template = _of_plain_types(called.get_call_template)
+        loop.get_overload = called.get_overload
     return loop
 
 
@@ -59,18 +85,45 @@ def _of_plain_types(find: Callable) -> Callable:
 
     def find_plain(args, kws):
         return find(
-            [numba.types.unliteral(kind) for kind in args],
-            {name: numba.types.unliteral(kind) for name, kind in kws.items()},
+            [types.unliteral(kind) for kind in args],
+            {name: types.unliteral(kind) for name, kind in kws.items()},
         )
 
     return find_plain
 
 
-def inner(**options: object) -> Callable:
-    """Declare a loop that only other loops call: what Python would call it by is not compiled,
-    which takes longer than many a loop where arguments hold dozens of arrays.
+# Loops whose code is not copied into that of their callers: by symbol, the entry of the cache that
+# holds them, empty where none does.
+_apart: dict[str, str] = {}
+# Loops of the cache that this process has loaded, by the name of the entry.
+_loaded: dict[str, CompileResult] = {}
+
+
+def _kept_apart(compile_loop: Callable) -> Callable:
+    """Callers of a large loop refer to its machine code. Numba would optimise and translate a copy
+    for each caller and each caller of that; only small loops gain by it.
     """
-    return compiled(None, no_cpython_wrapper=True, **options)
+
+    def compile_apart(args, return_type):
+        result = compile_loop(args, return_type)
+        library, symbol = result.library, result.fndesc.llvm_func_name
+        if _is_large(library._final_module.get_function(symbol)):
+            empty = parse_bitcode(_empty_bitcode(library.codegen))
+            library._get_module_for_linking = lambda: empty
+            _apart[symbol] = ""
+        return result
+
+    return compile_apart
+
+
+def _is_large(function: ValueRef) -> bool:
+    """Whether a loop has more instructions than a caller would take in."""
+    count = -len(list(function.arguments))
+    for block in function.blocks:
+        count += sum(1 for _ in block.instructions)
+        if count > LARGE:
+            return True
+    return False
 
 
 def loops_path() -> Path:
@@ -84,13 +137,15 @@ def loops_path() -> Path:
 class _LoopCache(FunctionCache):
     """Numba's cache of one function, with other files."""
 
-    def __init__(self, function: Callable) -> None:
+    def __init__(self, function: Callable, is_inner: bool) -> None:
         # Read when the module is imported: the file may be edited before the loop is called.
         digest = None if function.__closure__ else _sources_digest(function.__module__)
         self._py_func, self._cache_path = function, f"{function.__module__}-{digest}"
         self._enabled = digest is not None
+        self._is_inner = is_inner
 
-    def _path(self, signature, codegen):
+    def _entry(self, signature: Signature | tuple, codegen: Codegen) -> str:
+        """Name of a loop's file in the folder of loops."""
         code = self._py_func.__code__
         types = [_spelled(kind) for kind in getattr(signature, "args", signature)]
         facts = (
@@ -98,47 +153,82 @@ class _LoopCache(FunctionCache):
             codegen.magic_tuple(),
             code.co_firstlineno,
             code.co_code,
+            self._is_inner,
             numba.config.BOUNDSCHECK,
         )
         name = f"{self._py_func.__qualname__}-{_digest(repr(facts).encode())}".replace(
             "<locals>", "local"
         )
-        return loops_path() / self._cache_path / name
+        return f"{self._cache_path}/{name}"
 
     def _load_overload(self, sig, target_context):
-        path = self._path(sig, target_context.codegen())
-        with contextlib.suppress(OSError, ValueError):
-            head, content = path.read_bytes().split(b"\n", 1)
-            if self._enabled and head == _digest(content).encode():  # whole
-                _note_use(path.parent)
-                return _rebuilt(target_context, pickle.loads(content))
+        if self._enabled:
+            result = _load(self._entry(sig, target_context.codegen()), target_context)
+            if result is not None:
+                return result
         _say("compiling loops for this processor, once; a first run takes a minute or two longer")
         return None
 
     def _save_overload(self, sig, data):
         if not self._enabled or data.lifted or data.library.has_dynamic_globals:
             return
-        module = data.library._get_module_for_linking()
+        module = data.library._final_module
         values = (*module.functions, *module.global_variables)
         symbols = [value.name for value in values if not value.is_declaration]
-        path, content = self._path(sig, data.codegen), dumps((symbols, data._reduce()))
-        part = path.with_name(f"{path.name}.{os.getpid()}")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_bytes(_digest(content).encode() + b"\n" + content)
-            part.replace(path)  # whole or absent, whoever else writes it
-        except OSError as error:
-            _say(
-                f"cannot keep compiled loops in {loops_path()} ({error.strerror}); every process "
-                "compiles them"
-            )
+        needs = [
+            (_apart[one.name], one.name)
+            for one in module.functions
+            if one.is_declaration and one.name in _apart
+        ]
+        if not all(entry for entry, _ in needs):
+            return
+        entry = self._entry(sig, data.codegen)
+        if _store(loops_path() / entry, dumps((needs, symbols, data._reduce()))):
+            symbol = data.fndesc.llvm_func_name
+            _apart.update({symbol: entry} if symbol in _apart else {})
 
 
-def _rebuilt(target_context, parts):
+def _store(path: Path, content: bytes) -> bool:
+    """Write an entry, whole or not at all, whoever else writes it; whether it could be written."""
+    part = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(_digest(content).encode() + b"\n" + content)
+        part.replace(path)
+    except OSError as error:
+        _say(
+            f"cannot keep compiled loops in {loops_path()} ({error.strerror}); every process "
+            "compiles them"
+        )
+        return False
+    return True
+
+
+def _load(entry: str, target_context: CPUContext) -> CompileResult | None:
+    """A loop from its entry with those that it calls, None where one of them is not there."""
+    if entry in _loaded:
+        return _loaded[entry]
+    path = loops_path() / entry
+    with contextlib.suppress(OSError, ValueError):
+        head, content = path.read_bytes().split(b"\n", 1)
+        if head == _digest(content).encode():  # whole
+            needs, symbols, parts = pickle.loads(content)
+            for other, symbol in needs:
+                result = _load(other, target_context)
+                if result is None or result.fndesc.llvm_func_name != symbol:
+                    return None
+            _note_use(path.parent)
+            result = _loaded[entry] = _rebuilt(target_context, symbols, parts)
+            _apart[result.fndesc.llvm_func_name] = entry
+            return result
+    return None
+
+
+def _rebuilt(target_context, symbols, parts):
     """A loop from what was kept of it. Its bitcode, which only a caller that is compiled needs, is
     read then: that is half the time of loading.
     """
-    symbols, ((name, kind, (machine_code, bitcode)), *rest) = parts
+    (name, kind, (machine_code, bitcode)), *rest = parts
     codegen = target_context.codegen()
     codegen._engine._defined_symbols.update(symbols)
     result = CompileResult._rebuild(

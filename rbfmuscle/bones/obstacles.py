@@ -18,7 +18,7 @@ from rbfmuscle.bones.broad_phase import (
 )
 from rbfmuscle.bones.query import FieldData, query_loop
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 
 
 class Bones(NamedTuple):
@@ -160,7 +160,7 @@ def query_bone(bones, b, pose, points, reach, distance, gradient):
         direction_loop(points, gradient, pose, bones.boxes[b])
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def ask_near(bones, b, pose, free, known, points, reach, wanted):
     """Numbers (m,) of the free points (n, 3) that may be nearer to bone b in a pose than their
     ``reach`` (n,), by what is ``known`` of it; their distances (m,), which are noted there, and

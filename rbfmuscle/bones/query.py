@@ -20,7 +20,7 @@ from rbfmuscle.bones.cells import (
     _placed,
 )
 from rbfmuscle.geometry.triangles import CORNER, EDGE, FACE, nearest_in_frame
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 
 # What a cell says of its side.
 CROSSED = 0
@@ -288,7 +288,7 @@ def _stage(points, pose, reach, data, found, square):
             best[n], square[n] = _nearest_listed(x, y, z, entry[n], far_point, lists, far, records)
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _find_cells(points, pose, data, found, square):
     """Fill places relative to the origin, the entries of their cells, and squared distances from
     the grid; ``found.best`` gets the flag `CELL_FAR` of what is far.

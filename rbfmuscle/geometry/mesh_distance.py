@@ -19,7 +19,7 @@ from rbfmuscle.geometry.exact_distance import (
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import FACE
 from rbfmuscle.geometry.winding import inside_test
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 
 # Cells along the longer side, at most; below that the square root of the number of triangles.
 _MOST_CELLS = 512
@@ -181,7 +181,7 @@ def _above(at, vertices, faces, f, axes):
     return 1 if west[2] else -1
 
 
-@inner(error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _met(vertices, a, b, y, axes):
     """Where the edge from a to b meets a line along the first axis: the place on it, the height,
     and whether the edge falls, all in the order of ``axes``.

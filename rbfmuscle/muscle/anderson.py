@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 
 
 class Memory(NamedTuple):
@@ -67,7 +67,7 @@ def mix(memory, state, image):
     return out
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _solve_definite(matrix, right):
     """Solve a small system with a positive definite matrix by elimination, both in place.
 

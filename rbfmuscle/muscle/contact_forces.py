@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 from rbfmuscle.muscle.global_step import add_responses, add_rows
 
 # Contacts that join the working set in one round, rounds, sweeps in each.
@@ -63,7 +63,7 @@ def no_answers(near, metric):
     )
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _answer(i, near, metric, answers):
     """Number of near point i; its answers are found when it is first asked for."""
     if answers.number[i] >= 0:
@@ -94,7 +94,7 @@ def _answer(i, near, metric, answers):
     return number
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _schur(start, numbers, normal, answers, rows, delassus, own):
     """Rows ρ and entries of G of the contacts from ``start`` on; ``own`` is its diagonal."""
     for c in range(start, len(numbers)):
@@ -158,7 +158,7 @@ def deepest(residual, is_chosen, tolerance, most):
     return found[:count]
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
     """Motion of the nodes by contact forces, and what these take from the whitened pressures."""
     taken[:] = 0.0
@@ -179,7 +179,7 @@ def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
     push[:] = moved.T
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _find_residual(touch, rhs, near, push, residual):
     """Motion that each contact still needs after a push of the nodes."""
     for c in range(len(rhs)):
@@ -217,7 +217,7 @@ class _WorkingSet(NamedTuple):
     own: np.ndarray  # (w,) diagonal of G
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _find_contacts(touch, motion, forces):
     """What is asked of the contacts when the near points move by ``motion`` (m, 3)."""
     count = len(touch.point)
@@ -233,7 +233,7 @@ def _find_contacts(touch, motion, forces):
     return found
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _first_set(first, room, regions):
     """Room for a working set, which starts with the ``first`` contacts."""
     work = _WorkingSet(
@@ -251,7 +251,7 @@ def _first_set(first, room, regions):
     return work
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _yield(work, total, law):
     """Put what contacts yield on the diagonal."""
     least = 0.0

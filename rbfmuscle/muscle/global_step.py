@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 
 # Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in
 # volume, by a share of pressure / bulk modulus. With 50, Poisson's ratio 0.495, muscles of the leg
@@ -93,7 +93,7 @@ def find_metric(cells, gradient, inverse):
     return Metric(inverse, response, factor), sound
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def factor_small(matrix):
     """Turn the lower triangle of a small matrix into its Cholesky factor; returns whether it is
     positive definite.
@@ -130,7 +130,7 @@ def swell(motion, cells, gradient):
     return out
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def calm_share(pressure):
     """Share of a full step that is taken under these pressures."""
     highest = 0.0
@@ -139,7 +139,7 @@ def calm_share(pressure):
     return 1.0 / max(1.0, highest / CALM_PRESSURE)
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def global_step(cells, y, pressure, force, local, metric, part):
     """Nodes (N, 3) after ``part`` of a step from ``y`` under the ``force`` of targets and springs
     and the pressures, with the volumes corrected, and the whitened correction (M,) of the
@@ -160,7 +160,7 @@ def global_step(cells, y, pressure, force, local, metric, part):
     return y + free + expansion(change, metric), change
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def expansion(lacking, metric):
     """Motion (N, 3) of the nodes that gives the regions the volumes (M,) that they lack, which
     become, in place, the whitened pressures for it.
@@ -184,7 +184,7 @@ def add_responses(response, shares, out):
                 out[a, n] += shares[r] * response[r, a, n]
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def corrected_pressures(pressure, change, taken, factor, part):
     """Pressures (M,) after a whitened change, of which contacts ``taken`` some: q = L⁻ᵀ (change -
     taken), in units of a full step.

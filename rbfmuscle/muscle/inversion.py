@@ -8,7 +8,7 @@ only the points that need it.
 
 import numpy as np
 
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 from rbfmuscle.muscle.global_step import factor_small
 
 LEAST = 0.5  # det F that a point keeps
@@ -18,7 +18,7 @@ SMALLEST = 0.1  # stretch that the search for the nearest deformation starts wit
 ROUNDS = 10
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _determinant(m):
     return (
         m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
@@ -63,7 +63,7 @@ def nearest_volume(f, out):
     return away
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def unfold(f, cells, c, p, out):
     """Add what pulls point p of cell c, squeezed to a deformation gradient ``f`` (3, 3), apart to
     the right side ``out`` (N, 3); returns the energy over 2 μ.

@@ -14,7 +14,7 @@ import numpy as np
 
 from rbfmuscle.geometry.rotations import cross, dot, quaternion_matrix, turn_towards
 from rbfmuscle.implicit.placement.lattice import GROUPS as POINTS
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 from rbfmuscle.muscle.inversion import LEAST, unfold
 
 # What is known at the points of a cell: rows of as many numbers as it has points, matrices row by
@@ -73,7 +73,7 @@ def start_local(model, state, activation):
     )
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def found_rotations(local):
     """Rotations (Q, 4) as unit quaternions, and stretches (Q,)."""
     work = local.work
@@ -122,7 +122,7 @@ def local_step(cells, y, tension, local):
     return joined, energy
 
 
-@inner(error_model="numpy", fastmath={"contract"}, _nrt=False)
+@compiled(error_model="numpy", fastmath={"contract"})
 def deform(y, nodes, slopes, work):
     """Write the deformation gradients Σ_k y_k ∇N_k at the points of a cell to its ``work``;
     ``nodes`` (27,) are its nodes, ``slopes`` (27, 3 POINTS) the gradients of their shape functions.
@@ -159,7 +159,7 @@ def volumes(cells, y):
     return out
 
 
-@inner(error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def _stress_points(work, tension):
     """R, t, stresses, cofactors and volumes at the points of a cell.
 
@@ -200,7 +200,7 @@ def _stress_points(work, tension):
         _put_vector(work, COFACTOR + 6, p, _scaled(cross(f[0], f[1]), w))
 
 
-@inner(inline="always")
+@compiled(inline="always")
 def _turned(work, fd, p):
     """The rotation (4,) at a point, two steps nearer to that of a matrix."""
     q = (
@@ -217,7 +217,7 @@ def _turned(work, fd, p):
     return q
 
 
-@inner(inline="always")
+@compiled(inline="always")
 def _fibre_stretch(t, s, across, tension, lower):
     """The stretch t of slack fibres, some of Newton's steps nearer to that of least energy."""
     for _ in range(STEPS):
@@ -229,41 +229,41 @@ def _fibre_stretch(t, s, across, tension, lower):
     return t
 
 
-@inner(inline="always")
+@compiled(inline="always")
 def _vector(work, row, p):
     return work[row * POINTS + p], work[(row + 1) * POINTS + p], work[(row + 2) * POINTS + p]
 
 
-@inner(inline="always")
+@compiled(inline="always")
 def _matrix(work, row, p):
     return _vector(work, row, p), _vector(work, row + 3, p), _vector(work, row + 6, p)
 
 
-@inner(inline="always")
+@compiled(inline="always")
 def _put(work, row, p, matrix):
     _put_vector(work, row, p, matrix[0])
     _put_vector(work, row + 3, p, matrix[1])
     _put_vector(work, row + 6, p, matrix[2])
 
 
-@inner(inline="always")
+@compiled(inline="always")
 def _put_vector(work, row, p, vector):
     work[row * POINTS + p] = vector[0]
     work[(row + 1) * POINTS + p] = vector[1]
     work[(row + 2) * POINTS + p] = vector[2]
 
 
-@inner(inline="always")
+@compiled(inline="always")
 def _times(m, v):
     return dot(m[0], v), dot(m[1], v), dot(m[2], v)
 
 
-@inner(inline="always")
+@compiled(inline="always")
 def _scaled(v, share):
     return share * v[0], share * v[1], share * v[2]
 
 
-@inner(inline="always")
+@compiled(inline="always")
 def _plus(m, share, u, factor, v):
     """Rows of share m + factor u vᵀ."""
     return (
@@ -273,6 +273,6 @@ def _plus(m, share, u, factor, v):
     )
 
 
-@inner(inline="always")
+@compiled(inline="always")
 def _row(m, share, factor, v):
     return share * m[0] + factor * v[0], share * m[1] + factor * v[1], share * m[2] + factor * v[2]

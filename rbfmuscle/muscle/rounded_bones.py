@@ -17,7 +17,7 @@ from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.bsplines import bspline_sum
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 
 SHIFT = 2  # bits of a cell within its block
 SIDE = 1 << SHIFT  # cells along a block
@@ -124,7 +124,7 @@ def find_slot(keys, b, key):
     return slot
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _fill_block(rounded, bones, b, key, slot):
     """Find the distances at the nodes of a block of bone b."""
     edge = rounded.edges[b]
@@ -170,7 +170,7 @@ def no_scratch():
     return Scratch(np.empty(3), np.empty(3), np.empty(3), np.empty(1))
 
 
-@compiled(error_model="numpy", _nrt=False)
+@compiled
 def rounded_distance(rounded, bones, b, scratch):
     """Distance of the point ``scratch.local`` to bone b, rounded: the smoothed one over its slope;
     fills its unit gradient.

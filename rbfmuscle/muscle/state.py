@@ -10,7 +10,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import exponential_loop, logarithm_loop
 from rbfmuscle.geometry.rotations import turned_quaternions
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 from rbfmuscle.muscle.model import ANTI_BUCKLING_TENSION, GREATEST_TENSION, SolidModel, carry
 
 # Greatest multiple of the last sub-step's correction that the next one starts with, and the least
@@ -81,7 +81,7 @@ def tension(end, distance, anchors):
     return min(ANTI_BUCKLING_TENSION * nearer * nearer, GREATEST_TENSION)
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _along(rest, pose, out):
     """A point at rest where a pose of its bone takes it."""
     for a in range(3):
@@ -90,7 +90,7 @@ def _along(rest, pose, out):
             out[a] += pose[a, k] * rest[k]
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _relative(before, after):
     """Rigid motion (4, 4) from one pose to another: after · before⁻¹."""
     out = np.eye(4)

@@ -12,7 +12,7 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import touching_balls, vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
 from rbfmuscle.geometry.winding import winding_loop
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 
 if TYPE_CHECKING:
     from rbfmuscle.simulation.frame import Mesh, MuscleModel
@@ -333,7 +333,7 @@ def _distance_loop(points, index, nearest, skin, distance, normal):
         distance[q] = sign * length
 
 
-@inner()
+@compiled()
 def _find_foot(point, vertex, skin, weights, at, foot):
     """Squared distance of a point from the triangles about a vertex, and the nearest of these;
     fills the foot. ``weights`` and ``at`` (3,) are room for those of one triangle.

@@ -9,7 +9,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.joints.joint import Coordinate, all_coordinates
 from rbfmuscle.scene.motion import (
@@ -296,7 +296,7 @@ def step_excess(old, new, limits):
     return most
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _seen_from(root, pose, out):
     """A pose as seen from another: root⁻¹ · pose, (3, 4)."""
     for a in range(3):

@@ -20,7 +20,7 @@ from rbfmuscle.bones.obstacles import query_bone
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, Planes
 
@@ -283,7 +283,7 @@ def suspect_paths(obstacles, start, end, before, cosine, tolerance):
     return found, total
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _greatest_move(start, end, free):
     """How far a free point moves at most."""
     most = 0.0
@@ -295,7 +295,7 @@ def _greatest_move(start, end, free):
     return np.sqrt(most)
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _bone_move(box, before, after):
     """How far a bone takes a point of a box (2, 3) at most, from one pose to another; it is a
     corner.
@@ -317,7 +317,7 @@ def _bone_move(box, before, after):
     return np.sqrt(most)
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _to_bone(point, pose, out):
     """A point in the coordinates of a bone in a rigid pose."""
     for a in range(3):
@@ -335,7 +335,7 @@ class Pieces(NamedTuple):
     far: np.ndarray  # (m,) and at its other end
 
 
-@inner(error_model="numpy")
+@compiled(error_model="numpy")
 def _doubtful(pieces, length, tolerance, found):
     """Pieces, of ``length`` by path, that may be deeper in a bone than the tolerance, of paths that
     are not ``found`` to be.

@@ -9,7 +9,7 @@ from conftest import ROOT
 
 MODULES = sorted([*(ROOT / "rbfmuscle").rglob("*.py"), *(ROOT / "pbd_baseline").rglob("*.py")])
 # Loops that are compiled take plain arrays; their public half is annotated.
-COMPILED = ("compiled", "inner", "njit", "vectorize")
+COMPILED = ("compiled", "njit", "vectorize")
 FOLDERS = ("rbfmuscle", "pbd_baseline", "tests", "benchmarks", "docs", "examples")
 SOURCES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 MOST_ANY = 15

@@ -7,8 +7,10 @@ import subprocess
 import sys
 
 import numba
+import numpy as np
 import pytest
 from conftest import ROOT
+from numba.core.runtime import _nrt_python, rtsys
 
 from rbfmuscle.jit import compiled
 
@@ -164,6 +166,58 @@ def test_folders_that_are_unused_are_removed(place):
     assert all(path.stat().st_mtime > before[path] + 86400.0 for path in called)
 
 
+def test_code_of_a_large_loop_is_not_copied_into_its_callers(place):
+    """The caller is loaded with it, and compiled again where it is gone or another."""
+    large = 60 * "    x = 0.5 * x + 50.0 * SHIFT\n"  # each halves the distance to 100 SHIFT
+    text = SOURCES["later"] + "\nSHIFT = 1.0\n\n@compiled\ndef far(x):\n" + large + "    return x\n"
+    (place / "loops" / "later.py").write_text(text)
+    outer = SOURCES["outer"].replace("later.later(x)", "later.far(x)")
+    (place / "loops" / "outer.py").write_text(outer)
+    assert run(place) == ([102.5, 1.0], SAID)
+    kept = files(place)
+    (apart,) = [path for path in kept if path.name.startswith("far-")]
+    (caller,) = [path for path in kept if path.name.startswith("outer-")]
+    symbol = b"5later3far"
+    assert caller.read_bytes().count(symbol) > 0
+    assert run(place) == ([102.5, 1.0], "")
+    apart.unlink()
+    assert run(place) == ([102.5, 1.0], SAID)
+    assert run(place) == ([102.5, 1.0], "")
+    (place / "loops" / "later.py").write_text(text.replace("SHIFT = 1.0", "SHIFT = 2.0"))
+    assert run(place)[0] == [202.5, 1.0]
+
+
+def test_references_are_counted_where_arrays_are_made_or_handed_out():
+    @compiled
+    def handed(pair):
+        return pair[0]
+
+    @compiled
+    def filled(x, out):
+        for i in range(len(x)):
+            out[i] = 2.0 * x[i]
+
+    @compiled
+    def caller(x):
+        for _ in range(1000):
+            out = np.empty(len(x))
+            filled(x[1:], out)
+            last = handed((out, x))
+        return last
+
+    x = np.arange(5.0)
+    count = sys.getrefcount(x)
+    _nrt_python.memsys_enable_stats()
+    before = rtsys.get_allocation_stats()
+    result = caller(x)
+    assert list(result[:4]) == [2.0, 4.0, 6.0, 8.0]
+    del result
+    after = rtsys.get_allocation_stats()
+    _nrt_python.memsys_disable_stats()
+    assert sys.getrefcount(x) == count
+    assert after.alloc - before.alloc == after.free - before.free >= 1000
+
+
 def test_nothing_is_compiled_where_numba_is_switched_off(place):
     assert run(place, NUMBA_DISABLE_JIT="1") == ([102.5, 1.0], "")
     assert not (place / "cache").exists()
@@ -179,4 +233,6 @@ def test_a_loop_is_compiled_once_for_all_constants_that_it_is_called_with():
         return chosen(x, True, 0) + chosen(x, False, 2) + chosen(x, flag, factor=3)
 
     assert caller(2.0, False) == 3.0 + 4.0 + 6.0
-    assert len(chosen.signatures) == 1
+    types = (numba.float64, numba.boolean, numba.int64)
+    chosen.get_call_template(types, {})  # which knows the one form that there is
+    assert len(chosen.get_call_template(types, {})[0].cases) == 1

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.jit import compiled, inner
+from rbfmuscle.jit import compiled
 
 # A chord is never farther from its surface than this share of a cell. As vertices move while points
 # are pushed off, points are looked for so far above and below triangles, and so far beside them in
@@ -214,7 +214,7 @@ def _near_loop(vertices, faces, grid, pairs):
     return met
 
 
-@inner(error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _box_of(vertices, faces, f, margin, grid, least, most):
     """Fill the corners (3,) of a triangle's box, larger by a margin; False where it is outside of
     the grid.
@@ -229,7 +229,7 @@ def _box_of(vertices, faces, f, margin, grid, least, most):
     return inside
 
 
-@inner(error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _is_near(plane, square, margin, point, least, most):
     """Whether a point is within a margin of a triangle: of its plane, not beside it, in its box."""
     x = point[0]
@@ -276,7 +276,7 @@ def _push_loop(vertices, faces, near_points, tolerance, moved):
     return pushed
 
 
-@inner(error_model="numpy", inline="always")
+@compiled(error_model="numpy", inline="always")
 def _triangle_over(vertices, faces, point, near):
     """Of the triangles ``near`` a point the one whose plane is nearest, of those that it is not
     beside, -1 for none, and the point's depth below that.
