@@ -198,24 +198,36 @@ def test_references_are_counted_where_arrays_are_made_or_handed_out():
             out[i] = 2.0 * x[i]
 
     @compiled
-    def caller(x):
+    def summed(x):
+        total = 0.0
         for _ in range(1000):
             out = np.empty(len(x))
-            filled(x[1:], out)
+            filled(x, out)
             last = handed((out, x))
-        return last
+            out = x
+            other = np.full(len(x), -1.0)  # in the place of what was handed out, were that freed
+            total += last[1] + other[1]
+        return total
+
+    @compiled
+    def caller(x):
+        made = np.ones(3)
+        return summed(x), handed((made, x)), handed((x, made))
 
     x = np.arange(5.0)
     count = sys.getrefcount(x)
     _nrt_python.memsys_enable_stats()
     before = rtsys.get_allocation_stats()
-    result = caller(x)
-    assert list(result[:4]) == [2.0, 4.0, 6.0, 8.0]
-    del result
+    total, made, same = caller(x)
+    assert total == 1000.0
+    assert np.shares_memory(same, x)
+    again = [np.full(3, -1.0) for _ in range(9)]
+    assert (made == 1.0).all() and len(again) == 9
+    del made, same
     after = rtsys.get_allocation_stats()
     _nrt_python.memsys_disable_stats()
     assert sys.getrefcount(x) == count
-    assert after.alloc - before.alloc == after.free - before.free >= 1000
+    assert after.alloc - before.alloc == after.free - before.free >= 2000
 
 
 def test_nothing_is_compiled_where_numba_is_switched_off(place):
