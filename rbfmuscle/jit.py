@@ -15,7 +15,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numba
@@ -49,47 +49,40 @@ def compiled(function: Callable | None = None, **options: object) -> Callable:
         return lambda inner: compiled(inner, **options)
     if numba.config.DISABLE_JIT:
         return function
-    called = _declared(function, None, no_cpython_wrapper=True, **options)
-    return _declared(function, called, **options)
+    return _declared(function, False, options)
 
 
-def _declared(function: Callable, called: Dispatcher | None, **options: object) -> Dispatcher:
-    """A loop that Python calls, or where ``called`` is None the form of it that other loops call:
-    what Python calls a loop by takes longer to compile than many a loop where arguments hold dozens
-    of arrays.
-    """
+def _declared(function: Callable, is_inner: bool, options: dict[str, object]) -> Dispatcher:
     # No loop is an argument of another: the wrapper for that is left out.
     settings = {
         "pipeline_class": LoopCompiler,
         "error_model": "numpy",
         "nogil": True,
         "no_cfunc_wrapper": True,
+        "no_cpython_wrapper": is_inner,
         "_nrt": True,
         **options,
     }
     loop = numba.njit(**settings)(function)
     loop._compiler.compile = _no_collection()(loop._compiler.compile)
-    loop._cache = _LoopCache(function, called is None)
-    if called is None:
+    loop._cache = _LoopCache(function, is_inner)
+    if is_inner:
         loop._compiler.compile = _kept_apart(loop._compiler.compile)
-    else:
-        loop.get_call_template = _of_plain_types(called.get_call_template)
-        loop.get_overload = called.get_overload
+        return loop
+    # Other loops call a form of its own: what Python calls a loop by takes longer to compile than
+    # many a loop where arguments hold dozens of arrays.
+    inner = cache(partial(_declared, function, True, options))
+    loop.get_call_template = lambda args, kws: inner().get_call_template(*_plain(args, kws))
+    loop.get_overload = lambda signature: inner().get_overload(signature)
     return loop
 
 
-def _of_plain_types(find: Callable) -> Callable:
-    """A loop that is called with constants is compiled once for all of them: numba would compile
-    it for each ``True``, ``False`` and 0 that another loop gives it.
+def _plain(args, kws):
+    """Types of arguments without constants: numba would compile a loop for each ``True``, ``False``
+    and 0 that another loop gives it.
     """
-
-    def find_plain(args, kws):
-        return find(
-            [types.unliteral(kind) for kind in args],
-            {name: types.unliteral(kind) for name, kind in kws.items()},
-        )
-
-    return find_plain
+    plain = {name: types.unliteral(kind) for name, kind in kws.items()}
+    return [types.unliteral(kind) for kind in args], plain
 
 
 # Loops whose code is not copied into that of their callers: by symbol, the entry of the cache that
