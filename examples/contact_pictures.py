@@ -170,20 +170,20 @@ inside = igl.fast_winding_number(
 )
 slices("overlap", panels, height=float(np.median(thick.vertices[free][inside > 0.5, 2])))
 
-# Apart and sliding: two neighbours in internal rotation.
+# Apart and sliding: two neighbours in extension.
 panels, overlap = [], {}
 pair = ("adductor_anterior", "adductor_posterior")
 for sliding, title in ((None, "without [sliding]"), (SlidingOptions(), "with [sliding]")):
     scene = rm.phantom_scene()
     scene.muscles = [scene.muscle(name) for name in pair]
     scene.sliding = sliding
-    scene.set_motion(ramp={"hip.internal_rotation": {"from": 0, "to": 40, "step": 4}})
+    scene.set_motion(ramp={"hip.flexion": {"from": 0, "to": -20, "step": 2}})
     run = rm.simulate(scene, model="rbf")
     one, two = (run[name].surface() for name in pair)
     overlap[title] = depth(one.vertices, [(two.vertices, two.faces)])
     text = f"{title}: {overlap[title]:.1f} mm into each other"
     meshes = [(one.vertices, one.faces, "#7a2340", 1.0), (two.vertices, two.faces, "#c4698f", 0.7)]
-    panels.append((text, [*meshes, *bones(scene, {"hip.internal_rotation": math.radians(40.0)})]))
+    panels.append((text, [*meshes, *bones(scene, {"hip.flexion": math.radians(-20.0)})]))
 slices("sliding", panels, height=float(one.vertices[:, 2].mean()))
 
 print(remaining, deep, overlap)
