@@ -89,19 +89,10 @@ class RigidTransport:
         """
         new = self._stacked(after)
         old = self._stacked(before) if self.solved is None else self.solved
-        carried = self._stand_alike(old, new) and self._carry(model, contacts, before, after)
-        self.solved = old if carried else new
-        return carried
-
-    def _carry(
-        self,
-        model: MuscleModel,
-        contacts: BoneContacts,
-        before: Mapping[str, Floats],
-        after: Mapping[str, Floats],
-    ) -> bool:
-        """Move the muscle with its bones if no other bone comes near; return whether that was."""
-        root = self.names[0]
+        self.solved = new
+        if not self._stand_alike(old, new):
+            return False
+        # No other bone may come near.
         near = [
             row
             for row, name in enumerate(contacts.bones.names)
@@ -109,6 +100,7 @@ class RigidTransport:
         ]
         if self._touches(model, contacts, near):
             return False
+        root = self.names[0]
         motion = after[root] @ np.linalg.inv(before[root])
         moves, saved = np.abs(motion - IDENTITY).max() > STILL, model.snapshot() if near else None
         if moves:
@@ -118,6 +110,7 @@ class RigidTransport:
             model.restore(saved)
             contacts.move(before)
             return False
+        self.solved = old
         if moves:
             self.since, self.moved = motion @ self.since, True
         return True
