@@ -105,7 +105,7 @@ def _rotation_loop(points, rings, rest, weights, quaternions):
                 break
 
 
-@compiled(error_model="numpy")
+@compiled
 def _turn_towards(moment, q):
     """One Newton step of maximising tr(R^T A) over rotations R; return its squared angle.
 
@@ -178,7 +178,7 @@ def _target_loop(edges, rest, weights, quaternions, out):
             out[j, k] -= pull
 
 
-@compiled(error_model="numpy")
+@compiled
 def _constraint_loop(points, inverse_mass, edges, rest, quaternions, compliance, time):
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]

@@ -109,7 +109,7 @@ class VolumeConstraint:
         return _restore_loop(points, self.faces, direction, self.rest, self._least, planes)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _restore_loop(points, faces, direction, rest, least, planes):
     """Move points along a direction to the rest volume; ``least`` is the slope that counts as none
     for a direction whose greatest component is 1.
@@ -124,7 +124,7 @@ def _restore_loop(points, faces, direction, rest, least, planes):
     return s
 
 
-@compiled(error_model="numpy")
+@compiled
 def _cubic_step(coefficients, wanted, least):
     """Root of c0 + c1 s + c2 s^2 + c3 s^3 = wanted that continues s = 0, by safeguarded Newton
     steps.
@@ -148,7 +148,7 @@ def _cubic_step(coefficients, wanted, least):
     return s
 
 
-@compiled(error_model="numpy")
+@compiled
 def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance):
     # A flat array and unsigned numbers: no index is tested for counting from the end.
     x = points.reshape(-1)

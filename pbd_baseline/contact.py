@@ -52,7 +52,7 @@ class ContactConstraint:
         _push_loop(points, self.planes, TOUCHING * self.reach)
 
 
-@compiled(error_model="numpy")
+@compiled
 def plane_depths(points, planes):
     """Depth (c,) of each point in its half-space, 0 outside."""
     depth = np.empty(len(planes.point))
@@ -64,14 +64,14 @@ def plane_depths(points, planes):
     return depth
 
 
-@compiled(error_model="numpy")
+@compiled
 def _greatest_depth(points, planes):
     """Greatest depth of a point in its half-space, 0 where all are outside."""
     depth = plane_depths(points, planes)
     return depth.max() if len(depth) > 0 else 0.0
 
 
-@compiled(error_model="numpy")
+@compiled
 def _push_loop(points, planes, least):
     """Push points out of their half-spaces, all by where they are now, if one is deeper than
     ``least``.

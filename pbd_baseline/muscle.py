@@ -220,7 +220,7 @@ def _bone_numbers(rest, names):
     return np.where(rest.attached_bone < 0, -1, numbers[rest.attached_bone])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _place_loop(rest, attached_bone, poses, points):
     """Put held vertices where their bones' poses (b, 4, 4) take them."""
     for i in range(len(points)):

@@ -11,7 +11,7 @@ from rbfmuscle.jit import compiled
 TRUSTED_SHARE = 0.8
 
 
-@compiled(error_model="numpy", nogil=False)
+@compiled(nogil=False)
 def direction_loop(points, gradient, pose, box):
     """Normalise gradients in place; away from the middle of the bone's box where there is none."""
     for i in range(len(points)):
@@ -30,7 +30,7 @@ def direction_loop(points, gradient, pose, box):
             gradient[i, a] /= length
 
 
-@compiled(error_model="numpy")
+@compiled
 def note_query(points, i, pose, distance, anchor, bound):
     """Keep where point i was asked about, in bone coordinates, and a lower bound of its distance
     there.
@@ -42,7 +42,7 @@ def note_query(points, i, pose, distance, anchor, bound):
             anchor[i, k] += pose[j, k] * (points[i, j] - pose[j, 3])
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _squares(points, i, pose, bounds, anchor):
     """Squares of how far point i has moved against a bone since it was asked about, and of its
     distance from the bone's box.
@@ -58,7 +58,7 @@ def _squares(points, i, pose, bounds, anchor):
     return moved, outside
 
 
-@compiled(error_model="numpy")
+@compiled
 def may_reach(points, i, pose, bounds, anchor, bound, reach):
     """Whether point i may be as near to a bone as ``reach``, by the bone's box and by what an
     earlier bound less the motion since says.
@@ -70,7 +70,7 @@ def may_reach(points, i, pose, bounds, anchor, bound, reach):
     return ((spare <= 0.0) | (moved >= spare * spare)) & (not away)
 
 
-@compiled(error_model="numpy")
+@compiled
 def least_distance(points, i, pose, bounds, anchor, bound):
     """Lower bound of the distance of point i from a bone, by the bone's box and by what an earlier
     bound less the motion since says.
@@ -80,7 +80,7 @@ def least_distance(points, i, pose, bounds, anchor, bound):
     return max(least, np.sqrt(outside)) if outside > 0.0 else least
 
 
-@compiled(error_model="numpy")
+@compiled
 def box_loop(points, chosen, box):
     """Fill ``box`` (2, 3) with the least and greatest coordinates of the chosen points."""
     low, high = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
@@ -95,7 +95,7 @@ def box_loop(points, chosen, box):
     box[1, :] = high
 
 
-@compiled(error_model="numpy")
+@compiled
 def boxes_apart(box, pose, bounds):
     """Lower bound of the distance between a box in world axes and a box (2, 3) in bone axes, in a
     pose of the bone.

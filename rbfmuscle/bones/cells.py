@@ -14,7 +14,7 @@ BLOCK = 4
 INVERSE, UNIT = 3, 4
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _block_entry(x, y, z, scale, blocks):
     """Entry of the block that holds a point relative to the origin, the fine cell in it, and
     whether it is far.
@@ -35,7 +35,7 @@ def _block_entry(x, y, z, scale, blocks):
     return blocks[i, j, k], cell, far
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _beyond(x, y, z, scale, blocks):
     """Squared distance of a point relative to the origin from the grid."""
     nx, ny, nz = blocks.shape
@@ -45,7 +45,7 @@ def _beyond(x, y, z, scale, blocks):
     return dx * dx + dy * dy + dz * dz
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _placed(point, pose, grid):
     """A point of the world relative to the grid's origin."""
     p = point[0] - pose[0, 3]
@@ -57,7 +57,7 @@ def _placed(point, pose, grid):
     return x, y, z
 
 
-@compiled(error_model="numpy")
+@compiled
 def _common_bound(points, pose, grid, blocks, cells, lists):
     """Distance from the bone that all of these points have at least, by the bound at the one in
     their middle.

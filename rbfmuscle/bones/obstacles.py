@@ -117,7 +117,7 @@ def pick_bones(bones: Bones, rows: Sequence[int]) -> Bones:
     return bones._replace(**few)
 
 
-@compiled(error_model="numpy")
+@compiled
 def field_of(bones, b):
     """The field of bone b: views into the arrays of all."""
     first = bones.span[b, 0]
@@ -138,7 +138,7 @@ def field_of(bones, b):
     )
 
 
-@compiled(error_model="numpy")
+@compiled
 def query_bone(bones, b, pose, points, reach, distance, gradient):
     """Signed distances (n,) to bone b in a pose (4, 4) of points (n, 3) in the world.
 
@@ -160,7 +160,7 @@ def query_bone(bones, b, pose, points, reach, distance, gradient):
         direction_loop(points, gradient, pose, bones.boxes[b])
 
 
-@compiled(error_model="numpy")
+@compiled
 def ask_near(bones, b, pose, free, known, points, reach, wanted):
     """Numbers (m,) of the free points (n, 3) that may be nearer to bone b in a pose than their
     ``reach`` (n,), by what is ``known`` of it; their distances (m,), which are noted there, and
@@ -181,7 +181,7 @@ def ask_near(bones, b, pose, free, known, points, reach, wanted):
     return near, distance, way
 
 
-@compiled(error_model="numpy")
+@compiled
 def find_contacts(obstacles, points, reach):
     """Pairs of free point (n, 3) and bone nearer than ``reach``, bone by bone.
 
@@ -214,7 +214,7 @@ def find_contacts(obstacles, points, reach):
     return index, gap, normal, source
 
 
-@compiled(error_model="numpy")
+@compiled
 def greatest_depth(obstacles, points):
     """Greatest depth of a free point (n, 3) in a bone [scene unit], 0 where all are outside."""
     bones = obstacles.bones
@@ -232,7 +232,7 @@ def greatest_depth(obstacles, points):
     return depth
 
 
-@compiled(error_model="numpy")
+@compiled
 def find_nearest(bones, poses, points, limit, gradient):
     """Smallest distance (n,) of points (n, 3) from bones in poses (b, 4, 4), and its gradient (n,
     3), or none where ``gradient`` is (0, 3); lower bounds without a gradient beyond the ``limit``

@@ -76,7 +76,7 @@ class Found(NamedTuple):
     offset: np.ndarray
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _square(n, x, y, z, records):
     """Squared distance to record n of a point relative to the origin, in single precision; without
     branches, as they are a toss-up.
@@ -105,7 +105,7 @@ def _square(n, x, y, z, records):
     return w * w + np.float32(not inside) * min(min(ab, bc), ca)
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _nearest_listed(x, y, z, entry, far_point, lists, far, records):
     """Nearest of the triangles of a cell: record and squared distance."""
     best, square = np.int32(-1), np.float32(np.inf)
@@ -124,7 +124,7 @@ def _nearest_listed(x, y, z, entry, far_point, lists, far, records):
     return best, square
 
 
-@compiled(error_model="numpy")
+@compiled
 def _mixed_side(x, y, z, entry, lists, corners):
     """Trilinear interpolation of the signed distances at the corners of the cell."""
     row = lists[entry + 1 + (lists[entry] & COUNT)]
@@ -140,7 +140,7 @@ def _mixed_side(x, y, z, entry, lists, corners):
     return side
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _in_frame(n, x, y, z, records):
     """A point in the frame of record n."""
     qx = x - records[n, 0]
@@ -152,7 +152,7 @@ def _in_frame(n, x, y, z, records):
     return u, v, w
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _offset(n, x, y, z, records):
     """Offset of a point from its nearest point of record n, in the record's frame; and whether that
     is inside.
@@ -169,7 +169,7 @@ def _offset(n, x, y, z, records):
     return du, dv, w, False
 
 
-@compiled(error_model="numpy")
+@compiled
 def _walk(best, square, x, y, z, records, across):
     """Record at which a walk over neighbours, always to a nearer one, ends.
 
@@ -201,7 +201,7 @@ def _walk(best, square, x, y, z, records, across):
     return best
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _world(n, du, dv, dw, records):
     gx = du * records[n, 3] + dv * records[n, 6] + dw * records[n, 9]
     gy = du * records[n, 4] + dv * records[n, 7] + dw * records[n, 10]
@@ -209,7 +209,7 @@ def _world(n, du, dv, dw, records):
     return gx, gy, gz
 
 
-@compiled(error_model="numpy")
+@compiled
 def _crossed_side(x, y, z, n, records, edge_normals, vertex_normals, vertices):
     """Projection of the offset from an edge or a corner of record n on its pseudonormal."""
     u, v, w = _in_frame(n, x, y, z, records)
@@ -227,7 +227,7 @@ def _crossed_side(x, y, z, n, records, edge_normals, vertex_normals, vertices):
     return gx * vertex_normals[k, 0] + gy * vertex_normals[k, 1] + gz * vertex_normals[k, 2]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _slow_side(x, y, z, entry, n, data):
     """Positive outside: where neither the cell nor the side of a face tells."""
     if data.lists[entry] >> SIDE & 3 == MIXED:
@@ -237,7 +237,7 @@ def _slow_side(x, y, z, entry, n, data):
     )
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _unit_gradient(n, distance, du, dv, dw, least, records):
     """Gradient of the distance; the normal of the triangle where the offset is lost in rounding."""
     lost = abs(distance) <= least
@@ -245,7 +245,7 @@ def _unit_gradient(n, distance, du, dv, dw, least, records):
     return _world(n, scale * du, scale * dv, 1.0 if lost else scale * dw, records)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _stage(points, pose, reach, data, found, square):
     """Nearest record of up to STAGE points; each pass reads what the next one needs.
 
@@ -288,7 +288,7 @@ def _stage(points, pose, reach, data, found, square):
             best[n], square[n] = _nearest_listed(x, y, z, entry[n], far_point, lists, far, records)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _find_cells(points, pose, data, found, square):
     """Fill places relative to the origin, the entries of their cells, and squared distances from
     the grid; ``found.best`` gets the flag `CELL_FAR` of what is far.
@@ -307,7 +307,7 @@ def _find_cells(points, pose, data, found, square):
             found.entry[n] = data.cells[-1 - found.entry[n], found.best[n] & (CELL_FAR - 1)]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _finish(count, data, found, square):
     """Turn squared into signed distances, and fill the offsets from the surface in the frames of
     the records.
@@ -341,7 +341,7 @@ def _finish(count, data, found, square):
         square[n] = d if side >= 0.0 else -d
 
 
-@compiled(error_model="numpy")
+@compiled
 def query_loop(points, pose, reach, size, distance, gradient, data):
     """Distances (n,) and gradients (n, 3), world axes, of points in world coordinates; ``gradient``
     may be empty.
@@ -371,7 +371,7 @@ def query_loop(points, pose, reach, size, distance, gradient, data):
             d[n] *= size
 
 
-@compiled(error_model="numpy")
+@compiled
 def _turn(count, pose, size, least, found, distance, records, gradient):
     """Gradients in world axes; zero where the bone is out of reach."""
     best, offset = found.best, found.offset

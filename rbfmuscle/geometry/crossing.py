@@ -150,7 +150,7 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
     return FaceTree(vertices, faces).crossing(vertices)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _boxes_loop(vertices, faces, changed, boxes):
     """Make the boxes of the nodes that ``changed`` (2 * leaves,) marks, and of their triangles."""
     box = boxes.face

@@ -79,7 +79,7 @@ class Columns:
         return out
 
 
-@compiled(error_model="numpy")
+@compiled
 def _count_loop(vertices, faces, grid, covered):
     """Cells that each triangle's box covers, by column and row, and in ``starts`` how many
     triangles each cell has.
@@ -111,7 +111,7 @@ def _count_loop(vertices, faces, grid, covered):
                 grid.ends[cell, 1] = max(grid.ends[cell, 1], top)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _sort_loop(covered, width, starts, items):
     """Put the triangles into their cells, each cell's from its end on."""
     for f in range(len(covered)):
@@ -121,7 +121,7 @@ def _sort_loop(covered, width, starts, items):
                 items[starts[cell]] = f
 
 
-@compiled(error_model="numpy")
+@compiled
 def _inside_loop(points, pose, vertices, faces, grid, out):
     low = grid.low
     high = grid.high
@@ -149,7 +149,7 @@ def _inside_loop(points, pose, vertices, faces, grid, out):
         out[n] = count > 0
 
 
-@compiled(error_model="numpy")
+@compiled
 def _above(at, vertices, faces, f, axes):
     """1 where a triangle lies above a point and looks up, -1 where it looks down, else 0."""
     u, v, w = axes
@@ -181,7 +181,7 @@ def _above(at, vertices, faces, f, axes):
     return 1 if west[2] else -1
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _met(vertices, a, b, y, axes):
     """Where the edge from a to b meets a line along the first axis: the place on it, the height,
     and whether the edge falls, all in the order of ``axes``.

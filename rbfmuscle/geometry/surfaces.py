@@ -178,7 +178,7 @@ def mesh_volume(vertices: Floats, faces: Integers) -> float:
     return float(volume_loop(np.asarray(vertices, dtype=np.float64), np.asarray(faces)))
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def six_volumes(p, q, r):
     """Six times the signed volume of the tetrahedron of the origin and three points: r . (p x
     q).
@@ -190,13 +190,13 @@ def six_volumes(p, q, r):
     )
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def corner_from(vertices, v, origin):
     """Vertex v relative to an origin, as three numbers."""
     return vertices[v, 0] - origin[0], vertices[v, 1] - origin[1], vertices[v, 2] - origin[2]
 
 
-@compiled(error_model="numpy")
+@compiled
 def volume_loop(vertices, faces):
     """Enclosed volume, measured from a corner of the first face; 0 without faces."""
     if len(faces) == 0:
@@ -210,7 +210,7 @@ def volume_loop(vertices, faces):
     return total / 6.0
 
 
-@compiled(error_model="numpy")
+@compiled
 def volume_rate(vertices, faces, direction):
     """The volume of a closed mesh, and how fast it grows along directions d (n, 3)."""
     volume, rate = 0.0, 0.0
@@ -238,7 +238,7 @@ def volume_rate(vertices, faces, direction):
     return volume / 6.0, rate / 6.0
 
 
-@compiled(error_model="numpy")
+@compiled
 def volume_cubic(vertices, faces, direction):
     """Coefficients c of the volume V(x + s d) = c0 + c1 s + c2 s^2 + c3 s^3 of a closed mesh along
     directions d (n, 3).
@@ -340,7 +340,7 @@ class EdgeStretch:
         return np.bincount(self._ends, np.tile(change, 2), len(now)) / self._count
 
 
-@compiled(error_model="numpy")
+@compiled
 def farthest_move(before, after):
     """How far a point (n, 3) moved at most; infinity where one is not finite."""
     most = 0.0

@@ -40,7 +40,7 @@ def taut_line(
     return start + _upper_hull(np.concatenate([[[0.0, 0.0], [size, 0.0]], *profile])) @ axes[:2]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _profile_loop(points, turn, shift, size, width, found):
     """Fill ``found`` with points along and above a chord, counted as in `taut_line`; return how
     many there are.

@@ -25,7 +25,7 @@ def inside_test(
     return inside
 
 
-@compiled(error_model="numpy")
+@compiled
 def winding_loop(vertices, faces, points, out):
     """Winding numbers (n,) of a few points by the sum over all triangles' solid angles, without a
     tree.

@@ -75,7 +75,7 @@ def material_blend(points: Floats, terms: Terms) -> Blend:
     return Blend(start, point, weights[fit, point])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _weights_loop(x, terms, shares, weights):
     """Weights (P, n) of the fits at points (n, 3), not normalised."""
     p, near = np.empty((3, len(x))), np.empty((4, len(x)))
@@ -91,7 +91,7 @@ def _weights_loop(x, terms, shares, weights):
             weights[fit, i] = inside * inside * near[0, i] / size**8
 
 
-@compiled(error_model="numpy")
+@compiled
 def blend_loop(x, terms, form, blend, todo, value, gradient):
     """The blended field's values and gradients at those of the points x (n, 3) that ``todo`` (n,)
     marks; form None is the cube with epsilon 1.
@@ -134,7 +134,7 @@ def blend_loop(x, terms, form, blend, todo, value, gradient):
                     gradient[i, c] += weight[n] * g[c, n] / scale
 
 
-@compiled(error_model="numpy")
+@compiled
 def refit_loop(centres, normals, parts, terms, form, epsilon):
     """Hermite fits to parts (P, n) of centres (K, 3) that moved, with f = 0 and unit normals
     (K, 3), put into ``terms``.
@@ -176,7 +176,7 @@ def refit_loop(centres, normals, parts, terms, form, epsilon):
     return worst
 
 
-@compiled(error_model="numpy")
+@compiled
 def _place_part(centres, part, terms, fit):
     """Origin, scale, ball and scaled centres of a fit, as `Basis` has them."""
     for c in range(3):
@@ -199,7 +199,7 @@ def _place_part(centres, part, terms, fit):
             terms.centres[fit, c, i] = (centres[part[i], c] - terms.origin[fit, c]) / scale
 
 
-@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _solve_part(a, polynomials, right, coefficients):
     """Weights (size,) in place of the right side, and the polynomial's coefficients (q,).
 
@@ -232,7 +232,7 @@ def _solve_part(a, polynomials, right, coefficients):
     return (max(most, np.sqrt(norm)) / least) ** 2
 
 
-@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _project_matrix(a, polynomials):
     """Put M in place of A (size, w); its upper triangle counts.
 
@@ -272,7 +272,7 @@ def _project_matrix(a, polynomials):
     return product, norm
 
 
-@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _subtract_rows(row, start, rows, shares, count):
     """row -= sum of shares[k] * rows[k] over k < count, from the cache line of ``start`` on.
 
@@ -298,7 +298,7 @@ def _subtract_rows(row, start, rows, shares, count):
         k += one
 
 
-@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _dot(one, other):
     total = 0.0
     for i in range(len(one)):
@@ -306,7 +306,7 @@ def _dot(one, other):
     return total
 
 
-@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _leave_out(x, direction):
     """Take the part of x along a unit vector, which may be longer, out of x; how long it was."""
     share = 0.0
@@ -317,7 +317,7 @@ def _leave_out(x, direction):
     return share
 
 
-@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _orthonormalise(rows, size, triangle):
     """Gram-Schmidt, twice: P^T = Q R with the columns of Q in the rows (q, size and zeros) and R
     (q, q); rows that depend on others become zero.
@@ -333,7 +333,7 @@ def _orthonormalise(rows, size, triangle):
             rows[k, i] = rows[k, i] / length if kept else 0.0
 
 
-@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _factor(a):
     """Upper factor U, U^T U = A, in place of a symmetric matrix's upper triangle (size, w); whether
     it is definite. What stands left of the diagonal means nothing then.
@@ -368,7 +368,7 @@ def _factor(a):
     return True
 
 
-@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _substitute(upper, x):
     """Solve U^T U x = b in place."""
     one, size = np.uint64(1), np.uint64(len(x))

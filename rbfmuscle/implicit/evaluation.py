@@ -74,7 +74,7 @@ def evaluate(
 # muscles need not wait for the others.
 
 
-@compiled(error_model="numpy")
+@compiled
 def _evaluate_loop(points, terms, form, start, stop, value, gradient):
     """Value and, where there is room for it, gradient at points[start:stop]; form None is the cube
     with epsilon 1.
@@ -97,7 +97,7 @@ def _evaluate_loop(points, terms, form, start, stop, value, gradient):
         _give_loop(low, lots.total, value, gradient)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _shares_loop(x, terms):
     """Where points (n, 3) lie in the balls of the fits."""
     fits, n = len(terms.middle), len(x)
@@ -124,7 +124,7 @@ def _shares_loop(x, terms):
     return Lots(shares, growth, np.zeros((8, n)))
 
 
-@compiled(error_model="numpy")
+@compiled
 def _fill_block(x, terms, fit, shares, first, rows):
     """The next points that lie in a fit's ball, from the first on: where to go on, and these in the
     fit's coordinates.
@@ -149,7 +149,7 @@ def _fill_block(x, terms, fit, shares, first, rows):
     return first, p, np.zeros(size), np.zeros((3, size))
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _closeness_loop(p, centres, soft, gradient, out):
     """Add the sum over a fit's centres of 1 / (distance^2 + soft^2)^4 at points (3, m), and its
     gradient, to (4, m).
@@ -172,7 +172,7 @@ def _closeness_loop(p, centres, soft, gradient, out):
                 out[3, i] += w * dz
 
 
-@compiled(error_model="numpy")
+@compiled
 def _blend_loop(x, terms, fit, rows, lots, wanted, block):
     """Add a fit's weight w, w f, and the gradients of both, to their sums; a block has points in
     the fit's coordinates, their values and their gradients.
@@ -205,7 +205,7 @@ def _blend_loop(x, terms, fit, rows, lots, wanted, block):
             total[5 + c, i] += ball * close * g[c, n] / size + slope * acc[n]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _give_loop(low, total, value, gradient):
     """f = sum w f / sum w, and its gradient."""
     for i in range(total.shape[1]):
@@ -216,7 +216,7 @@ def _give_loop(low, total, value, gradient):
                 gradient[low + i, c] = slope / total[0, i]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _general_block_loop(terms, fit, form, gradient, p, acc, g):
     """Any kernel: radial functions into scratch blocks, then their sums."""
     d, u = np.empty_like(p), np.empty_like(acc)
@@ -240,7 +240,7 @@ def _general_block_loop(terms, fit, form, gradient, p, acc, g):
     _polynomial_loop(terms.coefficients[fit], terms.powers, gradient, p, acc, g)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _ball(p):
     """Centre and radius of a ball around the points (3, n): that of their box."""
     middle, square = np.empty(3), 0.0
@@ -253,7 +253,7 @@ def _ball(p):
     return middle[0], middle[1], middle[2], np.sqrt(square)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _out_of_reach(ball, at, epsilon):
     """Whether a kernel that ends at 1 / epsilon is zero in the whole ball."""
     dx = ball[0] - at[0]
@@ -263,7 +263,7 @@ def _out_of_reach(ball, at, epsilon):
     return dx * dx + dy * dy + dz * dz >= reach * reach
 
 
-@compiled(error_model="numpy")
+@compiled
 def _monomial_loop(p, i, j, k, factor, term, out):
     """out += factor x^i y^j z^k."""
     for n in range(term.size):
@@ -276,7 +276,7 @@ def _monomial_loop(p, i, j, k, factor, term, out):
         out[n] += term[n]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
     """Adds a fit's polynomial to acc, its gradient to g."""
     term = np.empty_like(acc)
@@ -294,7 +294,7 @@ def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
             _monomial_loop(p, i, j, k - 1, c * k, term, g[2])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _cubic_block_loop(terms, fit, wanted, p, acc, g):
     """The cubic kernel with epsilon 1, whose polynomial is linear."""
     centres = terms.centres[fit]
@@ -314,7 +314,7 @@ def _cubic_block_loop(terms, fit, wanted, p, acc, g):
                 g[k, i] += c[1 + k]
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _cubic_value_loop(p, at, a, b, acc):
     """acc += a r^3 - 3 r (B . d)."""
     bx, by, bz = b
@@ -326,7 +326,7 @@ def _cubic_value_loop(p, at, a, b, acc):
         acc[i] += np.sqrt(u) * (a * u - 3.0 * (bx * dx + by * dy + bz * dz))
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _cubic_gradient_loop(p, centres, weight, slope, acc, g):
     """Adds 3 a r d - 3 r B - 3/r (B . d) d of each centre to g, the value to acc."""
     for j in range(centres.shape[1]):
@@ -352,7 +352,7 @@ def _cubic_gradient_loop(p, centres, weight, slope, acc, g):
             g[2, i] += radial * dz - r3 * bz
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _offsets_loop(p, at, e2, d, u):
     """d = p - centre, u = e2 |d|^2."""
     for i in range(u.size):
@@ -365,7 +365,7 @@ def _offsets_loop(p, at, e2, d, u):
         u[i] = e2 * (dx * dx + dy * dy + dz * dz)
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _add_value_loop(a, b, e2, hermite, radial, d, acc):
     """acc += a phi - first (B . d)."""
     bx, by, bz = b
@@ -378,7 +378,7 @@ def _add_value_loop(a, b, e2, hermite, radial, d, acc):
         acc[i] += a * phi[i] - e2 * first[i] * (bx * d[0, i] + by * d[1, i] + bz * d[2, i])
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _add_gradient_loop(a, b, e2, hermite, radial, d, g):
     """g += a first d - first B - second (B . d) d."""
     bx, by, bz = b

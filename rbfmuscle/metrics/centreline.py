@@ -380,7 +380,7 @@ def _planes(
     return gap, normal
 
 
-@compiled(error_model="numpy")
+@compiled
 def _tighten_loop(string, held, normal, offset, sweeps, relaxation):
     """Move nodes that are not held (n,) to where the squared segments are least with normal · node
     >= offset, by projected SOR.

@@ -17,7 +17,7 @@ class Memory(NamedTuple):
     steps: np.ndarray  # (1,) since the last restart: plain steps until there is memory
 
 
-@compiled(error_model="numpy")
+@compiled
 def no_memory(memory, size, measured):
     """Memory of ``memory`` steps, 0 for plain ones, of states (size,)."""
     return Memory(
@@ -29,7 +29,7 @@ def no_memory(memory, size, measured):
     )
 
 
-@compiled(error_model="numpy")
+@compiled
 def mix(memory, state, image):
     """Next state (size,) from a state and its image: the image less the combination of past images
     whose residuals come nearest to the present one.
@@ -67,7 +67,7 @@ def mix(memory, state, image):
     return out
 
 
-@compiled(error_model="numpy")
+@compiled
 def _solve_definite(matrix, right):
     """Solve a small system with a positive definite matrix by elimination, both in place.
 

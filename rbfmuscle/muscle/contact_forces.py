@@ -50,7 +50,7 @@ class Push(NamedTuple):
     capped: bool  # whether rounds or sweeps ended before the forces were found
 
 
-@compiled(error_model="numpy")
+@compiled
 def no_answers(near, metric):
     """Room for the answers of all near points."""
     count = len(near.which)
@@ -63,7 +63,7 @@ def no_answers(near, metric):
     )
 
 
-@compiled(error_model="numpy")
+@compiled
 def _answer(i, near, metric, answers):
     """Number of near point i; its answers are found when it is first asked for."""
     if answers.number[i] >= 0:
@@ -94,7 +94,7 @@ def _answer(i, near, metric, answers):
     return number
 
 
-@compiled(error_model="numpy")
+@compiled
 def _schur(start, numbers, normal, answers, rows, delassus, own):
     """Rows ρ and entries of G of the contacts from ``start`` on; ``own`` is its diagonal."""
     for c in range(start, len(numbers)):
@@ -112,7 +112,7 @@ def _schur(start, numbers, normal, answers, rows, delassus, own):
         own[c] = delassus[c, c]
 
 
-@compiled(error_model="numpy")
+@compiled
 def solve_forces(delassus, rhs, force, sweeps, tolerance, most):
     """Contact forces with 0 <= force <= most and delassus · force >= rhs where force < most.
 
@@ -139,7 +139,7 @@ def solve_forces(delassus, rhs, force, sweeps, tolerance, most):
     return False
 
 
-@compiled(error_model="numpy")
+@compiled
 def deepest(residual, is_chosen, tolerance, most):
     """Contacts, not yet chosen, that lack the most motion, deepest first; of equals the first."""
     found = np.empty(most, np.int64)
@@ -158,7 +158,7 @@ def deepest(residual, is_chosen, tolerance, most):
     return found[:count]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
     """Motion of the nodes by contact forces, and what these take from the whitened pressures."""
     taken[:] = 0.0
@@ -179,7 +179,7 @@ def _push_nodes(normal, strength, numbers, rows, answers, metric, push, taken):
     push[:] = moved.T
 
 
-@compiled(error_model="numpy")
+@compiled
 def _find_residual(touch, rhs, near, push, residual):
     """Motion that each contact still needs after a push of the nodes."""
     for c in range(len(rhs)):
@@ -217,7 +217,7 @@ class _WorkingSet(NamedTuple):
     own: np.ndarray  # (w,) diagonal of G
 
 
-@compiled(error_model="numpy")
+@compiled
 def _find_contacts(touch, motion, forces):
     """What is asked of the contacts when the near points move by ``motion`` (m, 3)."""
     count = len(touch.point)
@@ -233,7 +233,7 @@ def _find_contacts(touch, motion, forces):
     return found
 
 
-@compiled(error_model="numpy")
+@compiled
 def _first_set(first, room, regions):
     """Room for a working set, which starts with the ``first`` contacts."""
     work = _WorkingSet(
@@ -251,7 +251,7 @@ def _first_set(first, room, regions):
     return work
 
 
-@compiled(error_model="numpy")
+@compiled
 def _yield(work, total, law):
     """Put what contacts yield on the diagonal."""
     least = 0.0
@@ -261,7 +261,7 @@ def _yield(work, total, law):
         work.delassus[k, k] = work.own[k] + least + law.yielding[work.chosen[k]]
 
 
-@compiled(error_model="numpy")
+@compiled
 def contact_push(touch, motion, near, metric, answers, law, forces, tolerance):
     """What contact forces do when the near points move by ``motion`` (m, 3); fills ``forces`` (m,
     obstacles), which hold the first guess.

@@ -33,7 +33,7 @@ class Metric(NamedTuple):
     factor: np.ndarray  # (M, M) L, in the lower triangle
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def add_rows(matrix, rows, shares, out):
     """Add Σ_s shares[s, a] matrix[rows[s]] to out[a], of shares (s, 3) and out (3, N).
 
@@ -65,7 +65,7 @@ def add_rows(matrix, rows, shares, out):
         s += 1
 
 
-@compiled(error_model="numpy")
+@compiled
 def find_metric(cells, gradient, inverse):
     """The metric for gradients (S, 3) of the volumes, and whether these are independent."""
     count, nodes = len(cells.volumes), len(inverse)
@@ -93,7 +93,7 @@ def find_metric(cells, gradient, inverse):
     return Metric(inverse, response, factor), sound
 
 
-@compiled(error_model="numpy")
+@compiled
 def factor_small(matrix):
     """Turn the lower triangle of a small matrix into its Cholesky factor; returns whether it is
     positive definite.
@@ -110,7 +110,7 @@ def factor_small(matrix):
     return True
 
 
-@compiled(error_model="numpy")
+@compiled
 def press(pressure, cells, gradient, out):
     """Add the forces Σ_r p_r g_r of the regions' pressures to ``out`` (N, 3)."""
     for r in range(len(pressure)):
@@ -119,7 +119,7 @@ def press(pressure, cells, gradient, out):
                 out[cells.node[s], a] += pressure[r] * gradient[s, a]
 
 
-@compiled(error_model="numpy")
+@compiled
 def swell(motion, cells, gradient):
     """Volumes (M,), g_r · dy, that a motion (N, 3) of the nodes adds to the regions."""
     out = np.zeros(len(cells.volumes))
@@ -130,7 +130,7 @@ def swell(motion, cells, gradient):
     return out
 
 
-@compiled(error_model="numpy")
+@compiled
 def calm_share(pressure):
     """Share of a full step that is taken under these pressures."""
     highest = 0.0
@@ -139,7 +139,7 @@ def calm_share(pressure):
     return 1.0 / max(1.0, highest / CALM_PRESSURE)
 
 
-@compiled(error_model="numpy")
+@compiled
 def global_step(cells, y, pressure, force, local, metric, part):
     """Nodes (N, 3) after ``part`` of a step from ``y`` under the ``force`` of targets and springs
     and the pressures, with the volumes corrected, and the whitened correction (M,) of the
@@ -160,7 +160,7 @@ def global_step(cells, y, pressure, force, local, metric, part):
     return y + free + expansion(change, metric), change
 
 
-@compiled(error_model="numpy")
+@compiled
 def expansion(lacking, metric):
     """Motion (N, 3) of the nodes that gives the regions the volumes (M,) that they lack, which
     become, in place, the whitened pressures for it.
@@ -174,7 +174,7 @@ def expansion(lacking, metric):
     return moved.T
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def add_responses(response, shares, out):
     """Add Σ_r shares_r response_r to out (3, N)."""
     end = np.uint64(out.shape[1])
@@ -184,7 +184,7 @@ def add_responses(response, shares, out):
                 out[a, n] += shares[r] * response[r, a, n]
 
 
-@compiled(error_model="numpy")
+@compiled
 def corrected_pressures(pressure, change, taken, factor, part):
     """Pressures (M,) after a whitened change, of which contacts ``taken`` some: q = L⁻ᵀ (change -
     taken), in units of a full step.

@@ -18,7 +18,7 @@ SMALLEST = 0.1  # stretch that the search for the nearest deformation starts wit
 ROUNDS = 10
 
 
-@compiled(error_model="numpy")
+@compiled
 def _determinant(m):
     return (
         m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
@@ -27,7 +27,7 @@ def _determinant(m):
     )
 
 
-@compiled(error_model="numpy")
+@compiled
 def nearest_volume(f, out):
     """The nearest matrix to ``f`` (3, 3) with a determinant of at least `LEAST`: squared distance,
     and ``out``.
@@ -63,7 +63,7 @@ def nearest_volume(f, out):
     return away
 
 
-@compiled(error_model="numpy")
+@compiled
 def unfold(f, cells, c, p, out):
     """Add what pulls point p of cell c, squeezed to a deformation gradient ``f`` (3, 3), apart to
     the right side ``out`` (N, 3); returns the energy over 2 μ.
@@ -84,7 +84,7 @@ def unfold(f, cells, c, p, out):
     return 0.5 * share * away
 
 
-@compiled(error_model="numpy")
+@compiled
 def stiffened_inverse(inverse, cells, points):
     """Inverse (N, N) of the matrix with `STIFFNESS` w |F|² of squeezed points added.
 

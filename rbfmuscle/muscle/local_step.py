@@ -46,7 +46,7 @@ class Local(NamedTuple):
     volumes: np.ndarray  # (M,) of the regions
 
 
-@compiled(error_model="numpy")
+@compiled
 def start_local(model, state, activation):
     """Arrays for the local steps of a solve."""
     cells, fibres = model.cells, model.fibres
@@ -73,7 +73,7 @@ def start_local(model, state, activation):
     )
 
 
-@compiled(error_model="numpy")
+@compiled
 def found_rotations(local):
     """Rotations (Q, 4) as unit quaternions, and stretches (Q,)."""
     work = local.work
@@ -86,7 +86,7 @@ def found_rotations(local):
     return rotations, stretches
 
 
-@compiled(error_model="numpy")
+@compiled
 def local_step(cells, y, tension, local):
     """Fill ``local`` for nodes ``y``: how many points joined the squeezed ones, and the energy of
     these over 2 μ.
@@ -122,7 +122,7 @@ def local_step(cells, y, tension, local):
     return joined, energy
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def deform(y, nodes, slopes, work):
     """Write the deformation gradients Σ_k y_k ∇N_k at the points of a cell to its ``work``;
     ``nodes`` (27,) are its nodes, ``slopes`` (27, 3 POINTS) the gradients of their shape functions.
@@ -146,7 +146,7 @@ def deform(y, nodes, slopes, work):
             z[i] += pz * slope[i]
 
 
-@compiled(error_model="numpy")
+@compiled
 def volumes(cells, y):
     """Volumes (M,) of the regions for nodes y (N, 3)."""
     out = np.zeros(len(cells.volumes))
@@ -159,7 +159,7 @@ def volumes(cells, y):
     return out
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _stress_points(work, tension):
     """R, t, stresses, cofactors and volumes at the points of a cell.
 

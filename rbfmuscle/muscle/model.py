@@ -331,7 +331,7 @@ def _farthest_ends(held: Floats, own: Integers) -> tuple[Integers, float]:
     return end.astype(np.int64), most
 
 
-@compiled(error_model="numpy")
+@compiled
 def mobility(columns, shares, inverse):
     """Motion (n,) of each embedded point for a unit force at it: w A⁻¹ w."""
     out = np.zeros(len(columns))
@@ -342,7 +342,7 @@ def mobility(columns, shares, inverse):
     return out
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def carry(embedding, y):
     """Places (n, 3) of embedded points, Σ_k share_k y_k, for nodes y (N, 3); cell by cell."""
     nodes = embedding.nodes
@@ -368,7 +368,7 @@ def carry(embedding, y):
     return out
 
 
-@compiled(error_model="numpy")
+@compiled
 def turned_normals(y, columns, slopes, normals):
     """Unit normals of the deformed surface at embedded points: the cofactor of the deformation
     gradient times those at rest.

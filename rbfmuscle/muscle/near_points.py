@@ -43,7 +43,7 @@ class Touch(NamedTuple):
     source: np.ndarray  # (c,) obstacle: the bones in reach, then kinds of planes
 
 
-@compiled(error_model="numpy")
+@compiled
 def find_near(points, obstacles, reach):
     """Mask (n,) of the contact points nearer than ``reach`` to an obstacle, and lower bounds (n,)
     of the gaps, at most ``reach``.
@@ -72,7 +72,7 @@ def find_near(points, obstacles, reach):
     return found, gap
 
 
-@compiled(error_model="numpy")
+@compiled
 def trusted(distance):
     """Lower bound of a distance that a field answers: it is exact near its bone, coarser far
     away.
@@ -80,7 +80,7 @@ def trusted(distance):
     return TRUSTED_SHARE * distance if distance > 0.0 else distance
 
 
-@compiled(error_model="numpy")
+@compiled
 def plane_gap(planes, p, point):
     """Signed distance of a point from plane p."""
     value = planes.gap[p]
@@ -89,7 +89,7 @@ def plane_gap(planes, p, point):
     return value
 
 
-@compiled(error_model="numpy")
+@compiled
 def take_near(found, gap, model, most, obstacles, rounded, forces, y):
     """The contact points of a mask (n,), with the greatest and the present forces and the gaps of
     all on them, and what is known of the distances to bones as they are and ``rounded``.
@@ -133,7 +133,7 @@ def take_near(found, gap, model, most, obstacles, rounded, forces, y):
     return near
 
 
-@compiled(error_model="numpy")
+@compiled
 def keep_rounded(near, known):
     """Note what is known of the rounded distances of near points for later solves."""
     for b in range(len(near.rounded.bound)):
@@ -144,7 +144,7 @@ def keep_rounded(near, known):
                 known.anchor[b, i, a] = near.rounded.anchor[b, k, a]
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def near_motion(near, y, new, push, margin, travelled):
     """Where near points are (m, 3), their motion in a step of the nodes, and how far to look for
     obstacles: half as far again as they go in the step with the last push on top, and a margin.
@@ -186,7 +186,7 @@ def near_motion(near, y, new, push, margin, travelled):
     return here, motion, reach
 
 
-@compiled(error_model="numpy")
+@compiled
 def carry_near(near, y, margin):
     """Where near points are, (m, 3), and how far to look for obstacles: -∞ for points that nothing
     can be so near to.
@@ -203,7 +203,7 @@ def carry_near(near, y, margin):
     return out, reach
 
 
-@compiled(error_model="numpy")
+@compiled
 def find_touch(near, here, reach, travelled, obstacles, rounded):
     """Half-spaces that near points ``here`` (m, 3) meet within ``reach`` (m,), bones rounded.
 
@@ -252,7 +252,7 @@ def find_touch(near, here, reach, travelled, obstacles, rounded):
     return _first(touch, count), room
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _ask_rounded(rounded, bones, b, pose, point, normal, scratch):
     """Distance of a point from a bone, rounded where it can be, and its ``normal`` (3,); infinity
     without room for a block. Also whether the distance is that of the rounded bone.
@@ -274,7 +274,7 @@ def _ask_rounded(rounded, bones, b, pose, point, normal, scratch):
     return distance, smooth
 
 
-@compiled(error_model="numpy")
+@compiled
 def find_exact_touch(near, here, reach, obstacles, softest):
     """The same with bones as they are, and without planes softer than ``softest``."""
     bones, planes = obstacles.bones, obstacles.planes
@@ -296,7 +296,7 @@ def find_exact_touch(near, here, reach, obstacles, softest):
     return _first(touch, _add_planes(touch, count, near, here, reach, obstacles, softest))
 
 
-@compiled(error_model="numpy")
+@compiled
 def _exact_distance(bones, b, pose, point, normal):
     """Distance of one point to a bone as it is, and its gradient."""
     at = point.reshape((1, 3))
@@ -307,19 +307,19 @@ def _exact_distance(bones, b, pose, point, normal):
     return distance[0]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _no_touch(room):
     return Touch(
         np.empty(room, np.int64), np.empty(room), np.empty((room, 3)), np.empty(room, np.int64)
     )
 
 
-@compiled(error_model="numpy")
+@compiled
 def _first(touch, count):
     return Touch(touch.point[:count], touch.gap[:count], touch.normal[:count], touch.source[:count])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _add_touch(touch, count, i, gap, normal, source):
     touch.point[count] = i
     touch.gap[count] = gap
@@ -328,7 +328,7 @@ def _add_touch(touch, count, i, gap, normal, source):
         touch.normal[count, a] = normal[a]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _add_planes(touch, count, near, here, reach, obstacles, softest):
     """Add the planes nearer than ``reach`` to near points; returns how many half-spaces there
     are.

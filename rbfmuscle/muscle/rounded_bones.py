@@ -113,7 +113,7 @@ def bone_thickness(field: BoneSDF, vertices: Floats, faces: Integers, most: floa
     return min(2.0 * float(np.quantile(depth, 0.1)), most)
 
 
-@compiled(error_model="numpy")
+@compiled
 def find_slot(keys, b, key):
     """Where a block of bone b stands in the table, or would stand; its room is a power of two."""
     last = len(keys) - 1
@@ -124,7 +124,7 @@ def find_slot(keys, b, key):
     return slot
 
 
-@compiled(error_model="numpy")
+@compiled
 def _fill_block(rounded, bones, b, key, slot):
     """Find the distances at the nodes of a block of bone b."""
     edge = rounded.edges[b]
@@ -164,7 +164,7 @@ class Scratch(NamedTuple):
     smooth: np.ndarray
 
 
-@compiled(error_model="numpy")
+@compiled
 def no_scratch():
     """Room for questions."""
     return Scratch(np.empty(3), np.empty(3), np.empty(3), np.empty(1))

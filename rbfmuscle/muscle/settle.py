@@ -141,7 +141,7 @@ def settle(
     return state._replace(**found._asdict()), report
 
 
-@compiled(error_model="numpy")
+@compiled
 def _settle(model, stiffness, state, obstacles, rounded, room):
     """What changes of a state, and a `Report`; see `settle`."""
     springs = np.dot(model.springs, state.anchors)
@@ -211,7 +211,7 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     return found, report
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _limits(given, state):
     """Motion of material [scene unit] below which a solve ends, and the greatest number of
     iterations.
@@ -226,7 +226,7 @@ def _limits(given, state):
     return (SETTLED_BESIDE if beside else SETTLED) * size, given.model.iterations
 
 
-@compiled(error_model="numpy")
+@compiled
 def _new_metric(given, local, joined):
     """The metric of corrections, with the stiffness of squeezed points; whether there is one."""
     model, inverse = given.model, given.stiffness.inverse
@@ -235,7 +235,7 @@ def _new_metric(given, local, joined):
     return find_metric(model.cells, local.gradient, inverse)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _choose_near(given, forces, y):
     """The contact points near an obstacle, with the forces on them until now."""
     model, obstacles = given.model, given.obstacles
@@ -244,7 +244,7 @@ def _choose_near(given, forces, y):
     return take_near(found, gap, model, most, obstacles, rounded, forces, y)
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _start_forces(forces, obstacles):
     """Contact forces (n, obstacles) that a solve starts from: none where the obstacles are
     others.
@@ -253,7 +253,7 @@ def _start_forces(forces, obstacles):
     return forces.copy() if forces.shape[1] == sources else np.zeros((len(forces), sources))
 
 
-@compiled(error_model="numpy")
+@compiled
 def _note_forces(near, forces):
     """Fill the forces (n, obstacles) on all contact points."""
     forces[:] = 0.0
@@ -261,7 +261,7 @@ def _note_forces(near, forces):
         forces[near.which[k]] = near.forces[k]
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _iterate(given, y, pressure, push, local, metric, near, answers, travelled):
     """One global step with volumes and contacts.
 
@@ -284,7 +284,7 @@ def _iterate(given, y, pressure, push, local, metric, near, answers, travelled):
     return Step(new, pressures, found.nodes, moved, moved / part, found.capped, room)
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _material_move(reach, y, new):
     """How far material goes, about, when nodes move from y to new (N, 3), infinity where one is not
     finite: nodes that hold none settle slowly, and move nothing.
@@ -299,7 +299,7 @@ def _material_move(reach, y, new):
     return np.sqrt(most)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _law(given, touch, near, yielding, part):
     """How contacts yield: by ``yielding`` of the muscle's size under a pressure of 2 μ, soft planes
     more, up to a ``part`` of their greatest forces.
@@ -314,7 +314,7 @@ def _law(given, touch, near, yielding, part):
     return law
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _shorten(y, pressure, step, longest):
     """Shorten a step, in place, where material goes farther than ``longest``."""
     if step.moved > longest:
@@ -323,7 +323,7 @@ def _shorten(y, pressure, step, longest):
         step.pressures[:] = pressure + share * (step.pressures - pressure)
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _advance(y, pressure, step, memory, accelerated):
     """Turn nodes and pressures, in place, into those that the next iteration starts from; returns
     how far the nodes go at most.
@@ -338,7 +338,7 @@ def _advance(y, pressure, step, memory, accelerated):
     return farthest_move(y, before)
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _accelerate(y, pressure, step, memory):
     """Turn nodes and pressures, in place, into the mixture of the last steps."""
     count = y.size
@@ -352,7 +352,7 @@ def _accelerate(y, pressure, step, memory):
     pressure[:] = mixed[count:]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _push_out(given, near, metric, answers, y, softest):
     """Motion (N, 3) of nodes y that stand still, out of obstacles that are at most so soft.
 
@@ -371,7 +371,7 @@ def _push_out(given, near, metric, answers, y, softest):
     return found.nodes
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _lifted(given, y, metric, near, answers):
     """Nodes (N, 3), moved so far that no contact point is left in an obstacle that does not yield;
     1 where some may be left all the same, else 0.
@@ -390,7 +390,7 @@ def _lifted(given, y, metric, near, answers):
     return y, 1
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _volume_error(cells, y):
     """Greatest relative error of a region's volume for nodes y (N, 3)."""
     return np.abs(volumes(cells, y) / cells.volumes - 1.0).max()

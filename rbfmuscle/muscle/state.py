@@ -61,7 +61,7 @@ def rest_state(model: SolidModel) -> SolidState:
     )
 
 
-@compiled(error_model="numpy")
+@compiled
 def tension(end, distance, anchors):
     """Tension τ of slack fibres: it grows as the muscle's ends, those of the anchors (h, 3) whose
     ``end`` is 0 or 1, approach from their ``distance`` at rest.
@@ -81,7 +81,7 @@ def tension(end, distance, anchors):
     return min(ANTI_BUCKLING_TENSION * nearer * nearer, GREATEST_TENSION)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _along(rest, pose, out):
     """A point at rest where a pose of its bone takes it."""
     for a in range(3):
@@ -90,7 +90,7 @@ def _along(rest, pose, out):
             out[a] += pose[a, k] * rest[k]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _relative(before, after):
     """Rigid motion (4, 4) from one pose to another: after · before⁻¹."""
     out = np.eye(4)
@@ -125,7 +125,7 @@ def predict(model: SolidModel, state: SolidState, before: Floats, after: Floats)
     )
 
 
-@compiled(error_model="numpy")
+@compiled
 def _predicted(model, state, before, after):
     """Nodes, these without the last correction, contact points, pressures, anchors, and the
     anchors' step.

@@ -51,7 +51,7 @@ AGAIN = 4
 FITTED, NO_FIT, NOT_FINITE, NO_LEVEL, CROSSED, NO_VOLUME = range(6)
 
 
-@compiled(error_model="numpy")
+@compiled
 def start_surface(model, state, obstacles, nodes, fit, fitted):
     """The vertices on the level set at the volume, or where the material is if that cannot be;
     and how it ended.
@@ -70,7 +70,7 @@ def start_surface(model, state, obstacles, nodes, fit, fitted):
     return work, outcome
 
 
-@compiled(error_model="numpy")
+@compiled
 def finish_surface(model, state, obstacles, work, outcome, excess):
     """Room made for neighbours, bone vertices pushed off, crossings undone and the volume met.
 
@@ -101,7 +101,7 @@ def finish_surface(model, state, obstacles, work, outcome, excess):
     return other, (NO_VOLUME if other < 0 else (CROSSED if outcome == FITTED else outcome))
 
 
-@compiled(error_model="numpy")
+@compiled
 def clear_rest(model, state, obstacles, vertices, held):
     """Bring vertices (n, 3) at rest that a bone holds, marked by ``held`` (n,), out of the bones,
     without crossings.
@@ -117,7 +117,7 @@ def clear_rest(model, state, obstacles, vertices, held):
     return work.vertices
 
 
-@compiled(error_model="numpy")
+@compiled
 def _begin(model, state, obstacles, carried):
     """The vertices where the solid carries them, moved by the last heights, and the bones there."""
     n, edge = len(model.offset), model.edge
@@ -154,7 +154,7 @@ def _begin(model, state, obstacles, carried):
     return work
 
 
-@compiled(error_model="numpy")
+@compiled
 def _reach(model, state, obstacles, fit, work):
     """Bring the vertices onto the level set that has the volume; how that ended."""
     edge, level = work.edge, state.level[0]
@@ -175,7 +175,7 @@ def _reach(model, state, obstacles, fit, work):
     return NO_LEVEL
 
 
-@compiled(error_model="numpy")
+@compiled
 def _project(model, state, obstacles, fit, work, level, allowed):
     """Newton steps of all vertices onto the level, no farther from the material than the field is
     to be trusted; False where the field is not finite.
@@ -223,7 +223,7 @@ def _project(model, state, obstacles, fit, work, level, allowed):
     return True
 
 
-@compiled(error_model="numpy")
+@compiled
 def _measure_trust(model, fit, work, allowed):
     """How far each vertex may go that went some way, by the slope where the material carries it:
     measured where the search began, it would depend on the last frame.
@@ -245,7 +245,7 @@ def _measure_trust(model, fit, work, allowed):
             allowed[v] = edge * max(_trust(np.sqrt(square), model.slope[v]), ALWAYS)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _trust(slope, at_rest):
     """How far, in mean edges, a vertex may go from the material for a field of this slope."""
     if not at_rest > UNSURE:
@@ -253,7 +253,7 @@ def _trust(slope, at_rest):
     return FARTHEST * min(max((slope / at_rest - UNSURE) / (1.0 - UNSURE), 0.0), 1.0) ** 2
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _move(vertices, v, direction, share, most):
     """x += share * direction, by no more than a length; the length that it asked for."""
     length = np.sqrt(direction[v, 0] ** 2 + direction[v, 1] ** 2 + direction[v, 2] ** 2)
@@ -264,7 +264,7 @@ def _move(vertices, v, direction, share, most):
     return length
 
 
-@compiled(error_model="numpy")
+@compiled
 def _turn_to_bones(obstacles, state, work, rows, limit, miss):
     """Where a bone is the surface, the step onto it replaces that onto the field."""
     distance, outward = np.empty(len(rows)), np.empty((len(rows), 3))
@@ -279,7 +279,7 @@ def _turn_to_bones(obstacles, state, work, rows, limit, miss):
                 work.direction[v, a] = outward[i, a]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _bound(work, allowed):
     """Bring back what went beyond where the field is to be trusted, which stays, and mark it."""
     edge = work.edge
@@ -298,7 +298,7 @@ def _bound(work, allowed):
                 work.direction[v, a] = 0.0
 
 
-@compiled(error_model="numpy")
+@compiled
 def _fastest(work):
     """Greatest motion of a vertex for a unit of level."""
     most = 2.3e-308
@@ -310,7 +310,7 @@ def _fastest(work):
     return np.sqrt(most)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _level_step(model, work):
     """Change of the level that brings the mesh to its volume, by Newton steps; NaN where no level
     does.
@@ -328,7 +328,7 @@ def _level_step(model, work):
     return change
 
 
-@compiled(error_model="numpy")
+@compiled
 def _shift(work, step):
     """Move the vertices as the level set moves with its level, to first order."""
     for v in range(len(work.vertices)):
@@ -336,7 +336,7 @@ def _shift(work, step):
             work.vertices[v, a] += step * work.direction[v, a]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _embed(model, state, obstacles, work):
     """The material out of the bones, blown up along its normals to the volume: the surface without
     a field. False where no such surface has the volume.
@@ -358,14 +358,14 @@ def _embed(model, state, obstacles, work):
     return True
 
 
-@compiled(error_model="numpy")
+@compiled
 def _take_normals(model, work):
     """Let vertices move along their normals when the level changes."""
     work.direction[:] = 0.0
     _vertex_normal_loop(work.vertices, model.faces, work.direction)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _give_room(model, state, obstacles, work, excess):
     """Move vertices inwards by their excess (n,) over neighbours, where they stay."""
     normals = np.zeros_like(work.vertices)
@@ -379,7 +379,7 @@ def _give_room(model, state, obstacles, work, excess):
     lift(obstacles, state, work, np.flatnonzero((excess > 0.0) & work.near))
 
 
-@compiled(error_model="numpy")
+@compiled
 def _finish(model, state, obstacles, work, excess, sound, embedded):
     """`finish_surface` of a surface with a field, which goes back to a ``sound`` one where it
     crosses itself, or without a field; -1 where it has not the volume.
@@ -402,7 +402,7 @@ def _finish(model, state, obstacles, work, excess, sound, embedded):
     return crossing_loop(work.vertices, model.tree, ~found, True, boxes, found.copy())
 
 
-@compiled(error_model="numpy")
+@compiled
 def _fill(model, state, obstacles, work, embedded):
     """The volume to the last digit; what its last step drove into a bone is brought out and stays
     there. False where no level has the volume.
@@ -425,7 +425,7 @@ def _fill(model, state, obstacles, work, embedded):
     return True
 
 
-@compiled(error_model="numpy")
+@compiled
 def _keep_heights(state, work):
     """Heights of the vertices above the carried material, for the next frame."""
     for v in range(len(work.normals)):

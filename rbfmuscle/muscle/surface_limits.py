@@ -93,7 +93,7 @@ class Question(NamedTuple):
     outward: np.ndarray  # (k, 3)
 
 
-@compiled(error_model="numpy")
+@compiled
 def ask_bones(obstacles, state, x, rows, limit, same, distance, outward):
     """Distances (k,) of vertices x[rows] to the nearest bone and the directions (k, 3) in which
     they grow; beyond a limit (k,) a lower bound without a direction.
@@ -119,7 +119,7 @@ def ask_bones(obstacles, state, x, rows, limit, same, distance, outward):
             _ask_bone(obstacles, state, b, rows, ask, m, distance, outward)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _recall(pose, state, b, x, rows, limit, same, distance, outward, ask):
     """What is known of bone b; puts the points that have to be asked into ``ask`` and counts
     them.
@@ -159,7 +159,7 @@ def _recall(pose, state, b, x, rows, limit, same, distance, outward, ask):
     return m
 
 
-@compiled(error_model="numpy")
+@compiled
 def _ask_bone(obstacles, state, b, rows, ask, m, distance, outward):
     """Ask bone b about the first m points, and keep what it says."""
     pose = obstacles.poses[b]
@@ -182,7 +182,7 @@ def _ask_bone(obstacles, state, b, rows, ask, m, distance, outward):
                 outward[i, a] = way[j, a] if reached else 0.0
 
 
-@compiled(error_model="numpy")
+@compiled
 def lift(obstacles, state, work, rows):
     """Move vertices that lie in a bone onto it, where they stay; whether any did."""
     moved = False
@@ -211,7 +211,7 @@ def lift(obstacles, state, work, rows):
     return moved
 
 
-@compiled(error_model="numpy")
+@compiled
 def mark_near(work):
     """Mark what has gone so far from where the material carries it that it may lie in a bone."""
     for v in range(len(work.near)):
@@ -221,7 +221,7 @@ def mark_near(work):
         work.near[v] |= square >= least * least
 
 
-@compiled(error_model="numpy")
+@compiled
 def push_off(model, state, obstacles, work, among):
     """Move the corners of triangles, of those with a marked corner, that a bone's vertices came
     through, and out of the bones again what that drove into another.
@@ -244,7 +244,7 @@ def push_off(model, state, obstacles, work, among):
             return
 
 
-@compiled(error_model="numpy")
+@compiled
 def _near_faces(model, work, among):
     """The triangles with a marked corner that a bone's vertex may have come through."""
     x = work.vertices
@@ -278,7 +278,7 @@ def _near_faces(model, work, among):
     return faces[:count]
 
 
-@compiled(error_model="numpy")
+@compiled
 def untangle(model, state, obstacles, work, embedded, sound, moved):
     """Bring triangles that cross each other back to a ``sound`` surface (n, 3), or, without one,
     (0, 3), to the material beside the bones; where these cross too, and those of an ``embedded``
@@ -318,7 +318,7 @@ def untangle(model, state, obstacles, work, embedded, sound, moved):
     return True
 
 
-@compiled(error_model="numpy")
+@compiled
 def _freed(model, state, obstacles, work, region):
     """The material (n, 3), marked vertices of it brought out of the bones, and which of these (n,)
     are corners of triangles that cross others before that.
@@ -334,7 +334,7 @@ def _freed(model, state, obstacles, work, region):
     return freed, _corners(model, found)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _take_back(work, rows, target):
     """Move some vertices by a share of the way to the target (n, 3)."""
     for v in rows:
@@ -342,7 +342,7 @@ def _take_back(work, rows, target):
             work.vertices[v, a] += BACK * (target[v, a] - work.vertices[v, a])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _smooth_heights(model, work, rows):
     """Smooth how far some vertices are from where the material carries them."""
     away = work.vertices - work.carried
@@ -350,7 +350,7 @@ def _smooth_heights(model, work, rows):
     work.vertices[rows] = work.carried[rows] + away[rows]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _corners(model, found):
     """The corners of marked triangles."""
     marked = np.zeros(len(model.offset), np.bool_)
@@ -361,14 +361,14 @@ def _corners(model, found):
     return marked
 
 
-@compiled(error_model="numpy")
+@compiled
 def _touching(faces, marked, out):
     """Mark the triangles with a marked corner."""
     for f in range(len(faces)):
         out[f] = marked[faces[f, 0]] or marked[faces[f, 1]] or marked[faces[f, 2]]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _grown(model, marked, rings):
     """The marked vertices and their neighbours, as many times."""
     out = marked
@@ -382,7 +382,7 @@ def _grown(model, marked, rings):
     return out
 
 
-@compiled(error_model="numpy")
+@compiled
 def smooth_loop(vertices, rows, start, other):
     """Half the way to the mean of the neighbours, one vertex after the other."""
     for v in rows:

@@ -242,7 +242,7 @@ def _local(points, pose):
     return (points - pose[:3, 3]) @ pose[:3, :3]
 
 
-@compiled(error_model="numpy")
+@compiled
 def suspect_paths(obstacles, start, end, before, cosine, tolerance):
     """Mask (b, n) of paths of points that may touch a bone by more than the tolerance, or that the
     angle test flags: whose directions at the bone differ by less than the ``cosine``.
@@ -283,7 +283,7 @@ def suspect_paths(obstacles, start, end, before, cosine, tolerance):
     return found, total
 
 
-@compiled(error_model="numpy")
+@compiled
 def _greatest_move(start, end, free):
     """How far a free point moves at most."""
     most = 0.0
@@ -295,7 +295,7 @@ def _greatest_move(start, end, free):
     return np.sqrt(most)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _bone_move(box, before, after):
     """How far a bone takes a point of a box (2, 3) at most, from one pose to another; it is a
     corner.
@@ -317,7 +317,7 @@ def _bone_move(box, before, after):
     return np.sqrt(most)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _to_bone(point, pose, out):
     """A point in the coordinates of a bone in a rigid pose."""
     for a in range(3):
@@ -335,7 +335,7 @@ class Pieces(NamedTuple):
     far: np.ndarray  # (m,) and at its other end
 
 
-@compiled(error_model="numpy")
+@compiled
 def _doubtful(pieces, length, tolerance, found):
     """Pieces, of ``length`` by path, that may be deeper in a bone than the tolerance, of paths that
     are not ``found`` to be.
@@ -347,7 +347,7 @@ def _doubtful(pieces, length, tolerance, found):
     return Pieces(pieces.path[left], pieces.at[left], pieces.near[left], pieces.far[left])
 
 
-@compiled(error_model="numpy")
+@compiled
 def unclear_paths(bones, b, start, end, cosine, tolerance):
     """Mask (n,) of straight paths (n, 3), in the coordinates of bone b, that may come deeper into
     it than the tolerance, or whose directions at the ends differ by less than the ``cosine``.

@@ -84,7 +84,7 @@ def stack_grids(grids: Sequence[PointGrid]) -> PointGrids:
     )
 
 
-@compiled(error_model="numpy")
+@compiled
 def grid_of(grids, b):
     """Grid b: views into the arrays of all."""
     low, high = grids.first[b], grids.first[b + 1]
@@ -102,7 +102,7 @@ def grid_of(grids, b):
 Obstacles = list[tuple[PointGrid, Floats]]
 
 
-@compiled(error_model="numpy")
+@compiled
 def push_off_loop(vertices, faces, grid, pose, tolerance, moved):
     """Move the vertices (n, 3) of triangles (m, 3) that obstacle points have come through, into the
     surface, and mark them.
@@ -145,7 +145,7 @@ def push_off_loop(vertices, faces, grid, pose, tolerance, moved):
             break
 
 
-@compiled(error_model="numpy")
+@compiled
 def _sort_loop(pairs, met, count):
     """Points that triangles are near, and the triangles of point k: ``near[first[k] : first[k +
     1]]``.
@@ -171,7 +171,7 @@ def _sort_loop(pairs, met, count):
     return point, first, near
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _length(vertices, faces, f):
     """Length of the longest edge of a triangle."""
     square = 0.0
@@ -184,7 +184,7 @@ def _length(vertices, faces, f):
     return np.sqrt(square)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _near_loop(vertices, faces, grid, pairs):
     """Pairs of a point and a triangle near it; how many there are, also beyond the room for
     them.
@@ -214,7 +214,7 @@ def _near_loop(vertices, faces, grid, pairs):
     return met
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _box_of(vertices, faces, f, margin, grid, least, most):
     """Fill the corners (3,) of a triangle's box, larger by a margin; False where it is outside of
     the grid.
@@ -229,7 +229,7 @@ def _box_of(vertices, faces, f, margin, grid, least, most):
     return inside
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _is_near(plane, square, margin, point, least, most):
     """Whether a point is within a margin of a triangle: of its plane, not beside it, in its box."""
     x = point[0]
@@ -249,7 +249,7 @@ def _is_near(plane, square, margin, point, least, most):
     )
 
 
-@compiled(error_model="numpy")
+@compiled
 def _push_loop(vertices, faces, near_points, tolerance, moved):
     """One pass over the points; returns whether any had to be pushed off."""
     points, first, near, order = near_points
@@ -276,7 +276,7 @@ def _push_loop(vertices, faces, near_points, tolerance, moved):
     return pushed
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _triangle_over(vertices, faces, point, near):
     """Of the triangles ``near`` a point the one whose plane is nearest, of those that it is not
     beside, -1 for none, and the point's depth below that.
@@ -301,7 +301,7 @@ def _triangle_over(vertices, faces, point, near):
     return best, signed
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _plane(vertices, faces, f):
     """Corner A of a triangle, its sides to B and C, and its normal, as long as twice its area."""
     a = faces[f, 0]
@@ -324,21 +324,21 @@ def _plane(vertices, faces, f):
     )
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _square(plane):
     """Square of the normal's length."""
     nx, ny, nz = plane[3]
     return nx * nx + ny * ny + nz * nz
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _height(plane, x, y, z):
     """Height of a point above a triangle, times the normal's length."""
     (ax, ay, az), (nx, ny, nz) = plane[0], plane[3]
     return nx * (x - ax) + ny * (y - ay) + nz * (z - az)
 
 
-@compiled(error_model="numpy", inline="always")
+@compiled(inline="always")
 def _areas(plane, x, y, z):
     """Areas at B and C of a point's foot on a triangle's plane, times twice the normal's length."""
     (ax, ay, az), (ux, uy, uz), (vx, vy, vz), (nx, ny, nz) = plane

@@ -82,7 +82,7 @@ class Basis:
         return out
 
 
-@compiled(error_model="numpy")
+@compiled
 def _polynomials_loop(points, powers, out):
     """Monomials at points (P, 3, n), and where there is room for them their derivatives."""
     n = points.shape[2]
@@ -92,7 +92,7 @@ def _polynomials_loop(points, powers, out):
                 _monomial_loop(points[p], powers[q], c, out[p, q, (c + 1) * n : (c + 2) * n])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _monomial_loop(x, powers, axis, out):
     """A monomial at points (3, n), or its derivative along an axis that is not negative."""
     out[:] = powers[axis] if axis >= 0 else 1.0
@@ -102,7 +102,7 @@ def _monomial_loop(x, powers, axis, out):
                 out[i] *= x[c, i]
 
 
-@compiled(error_model="numpy")
+@compiled
 def _matrices_loop(points, epsilon, form, hermite, start, out):
     """Matrices of fits from start on, of points (P, 3, n), for any kernel."""
     n = points.shape[2]
@@ -121,7 +121,7 @@ def _matrices_loop(points, epsilon, form, hermite, start, out):
                 _derivatives_loop(j, e2, d, radial, out[p])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _cubic_matrices_loop(points, epsilon, start, out):
     """As `_matrices_loop` for the kernel s^3, which muscles use and which should not wait for
     others.
@@ -142,7 +142,7 @@ def _cubic_matrices_loop(points, epsilon, start, out):
             _derivatives_loop(j, e2, d, radial, out[p])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _derivatives_loop(j, e2, d, radial, out):
     """Derivatives in the four rows of centre j, from the offsets of all centres and the radial
     functions there.

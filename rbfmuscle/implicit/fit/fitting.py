@@ -222,7 +222,7 @@ def _probe(pivots: Floats) -> Floats:
     return found
 
 
-@compiled(error_model="numpy", fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _substitute_loop(lower, both):
     """Solve L L^T x = b in place for two right sides (m, 2, size)."""
     for p in range(len(lower)):

@@ -40,7 +40,7 @@ _SHIFTER = 6755399441055744.0  # 1.5 * 2**52: adding it leaves the rounded integ
 _TINY = 2.2250738585072014e-308  # the least normal number
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _exp(x):
     """exp(x), relative error below 3e-16; 0 where x < -708: x = n log 2 + r, n goes into the
     exponent's bits.
@@ -56,7 +56,7 @@ def _exp(x):
     return p * power if x >= -708.0 else 0.0
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _log(x):
     """log(x) for x > 0, relative error below 4e-16; 0 is taken as the smallest normal number."""
     bits = np.float64(max(x, _TINY)).view(np.int64)
@@ -74,21 +74,21 @@ def _log(x):
     return exponent * _LN2_HIGH + (f - s * (f - 2.0 * z * p) + exponent * _LN2_LOW)
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _exp_loop(factor, x, out):
     """out = exp(factor * x)."""
     for i in range(x.size):
         out[i] = _exp(factor * x[i])
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _log_loop(x, out):
     """out = log(x)."""
     for i in range(x.size):
         out[i] = _log(x[i])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _base_loop(base, parameter, u, s, b, more):
     """s = sqrt(u) and b = the kernel's base; more is scratch."""
     if base != GAUSS and base != BINOMIAL:  # functions of u alone
@@ -114,7 +114,7 @@ def _base_loop(base, parameter, u, s, b, more):
             b[i] = max(1.0 - s[i], 0.0)
 
 
-@compiled(error_model="numpy")
+@compiled
 def _binomial_loop(beta, u, b):
     """b = (1 + u)**beta for beta = 1.5, 0.5, -0.5 and -1."""
     if beta == 0.5:
@@ -131,7 +131,7 @@ def _binomial_loop(beta, u, b):
             b[i] = (1.0 + u[i]) * np.sqrt(1.0 + u[i])
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def _inner_loop(base, row, u, s, b, out):
     """out = base * A(s)."""
     a0 = row[2]
@@ -166,7 +166,7 @@ def _inner_loop(base, row, u, s, b, out):
                 out[i] = out[i] / (1.0 + u[i])
 
 
-@compiled(error_model="numpy")
+@compiled
 def _radial_loop(form, wanted, u, work, out):
     """Fill out[k] (3, n) with the k-th radial function of u = s**2 for each bit k of wanted; work
     (3, n) is scratch.
@@ -207,7 +207,7 @@ def _radial_loop(form, wanted, u, work, out):
                 values[i] = values[i] if u[i] < 1.0 else 0.0
 
 
-@compiled(error_model="numpy")
+@compiled
 def _times_power_loop(power, u, s, values):
     """values *= s**power; for a negative power the value at s = 0 becomes 0."""
     if power > 0:
@@ -222,7 +222,7 @@ def _times_power_loop(power, u, s, values):
             values[i] = values[i] / s[i] if s[i] > 0.0 else 0.0
 
 
-@compiled(error_model="numpy")
+@compiled
 def _sampled_loop(row, compact, u, out):
     """Values of a sampled function. The panel is in the exponent and the first bits behind it."""
     last = (HIGH - LOW << BITS) - 1
