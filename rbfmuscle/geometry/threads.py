@@ -5,7 +5,9 @@ the lock.
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
+from heapq import heapify, heappop, heappush
 from itertools import pairwise
+from threading import Lock
 from typing import TypeVar
 
 import numba
@@ -39,6 +41,47 @@ def each(act: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
         for future in futures:
             future.cancel()
         wait(futures)
+
+
+def in_stages(
+    first: Callable[[Item], object],
+    second: Callable[[Item], Result],
+    items: Sequence[Item],
+    costs: Sequence[tuple[float, float]],
+) -> list[Result]:
+    """``[second(item) for item in items]``, each after ``first(item)``, as `each` does it.
+
+    ``costs`` says how long both will take of each item: what has the most left to do goes first,
+    so that no thread waits long for the last of them.
+    """
+    ready = [(-sum(cost), number) for number, cost in enumerate(costs)]
+    heapify(ready)
+    begun: set[int] = set()
+    results: dict[int, Result] = {}
+    lock = Lock()
+
+    def work(_: int) -> None:
+        # A thread ends where nothing is ready: what becomes ready later, others go on with.
+        while True:
+            with lock:
+                if not ready:
+                    return
+                _, number = heappop(ready)
+            try:
+                if number in begun:
+                    results[number] = second(items[number])
+                    continue
+                first(items[number])
+            except BaseException:
+                with lock:
+                    ready.clear()
+                raise
+            with lock:
+                begun.add(number)
+                heappush(ready, (-costs[number][1], number))
+
+    each(work, range(min(numba.get_num_threads(), len(items))))
+    return [results[number] for number in range(len(items))]
 
 
 def in_chunks(count: int, work: Callable[[int, int], object], *, least: int = LEAST_SHARE) -> None:

@@ -9,7 +9,7 @@ from threadpoolctl import ThreadpoolController
 
 from rbfmuscle.bones.obstacles import pick_bones, stack_bones
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.threads import each
+from rbfmuscle.geometry.threads import each, in_stages
 from rbfmuscle.scene.activation.contraction import Activations
 from rbfmuscle.scene.motion import completed, rest_coordinates
 from rbfmuscle.scene.scene import Scene
@@ -143,9 +143,12 @@ class FrameLoop:
         with self.working():
             paths = self._path_to(coordinates)
             if self.surfaces and self._sliding is None:
-                # No muscle waits for another: each thread takes one through all its sub-steps.
-                drawn = each(
-                    lambda stepper: stepper.advance(*paths[stepper.name]).surface(), self.steppers
+                # No muscle waits for another.
+                drawn = in_stages(
+                    lambda stepper: stepper.advance(*paths[stepper.name]),
+                    MuscleStepper.surface,
+                    self.steppers,
+                    [stepper.cost for stepper in self.steppers],
                 )
             else:
                 self._solve(paths)

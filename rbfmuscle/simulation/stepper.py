@@ -78,7 +78,8 @@ class MuscleStepper:
 
     ``substeps`` gives sub-steps by the relative motion of the bones that the muscle meets;
     ``rigid_transport`` moves the muscle rigidly where it need not be solved, None where it is
-    always solved. ``times`` has the time spent on each stage since the last `collect` [s].
+    always solved. ``times`` has the time spent on each stage since the last `collect` [s], ``cost``
+    what was spent before that on sub-steps and on surfaces [s].
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class MuscleStepper:
         self.detect = scene.detect.tunnelling if scene.detect is not None else None
         self.tolerance = scene.length(TOUCH)
         self.times: dict[str, float] = defaultdict(float)
+        self.cost = (0.0, 0.0)
         self.events: dict[tuple[int, str, str], int] = {}
         self.frame, self.solves = 0, 0
         self.contracts = scene.muscle(self.name).contraction is not None
@@ -121,7 +123,7 @@ class MuscleStepper:
 
     def advance(
         self, stops: list[dict[str, float]], activations: Sequence[Mapping[str, float]] = ()
-    ) -> MuscleStepper:
+    ) -> None:
         """Advance through a list of coordinates, the present ones first; ``activations`` by muscle
         at each end.
         """
@@ -134,7 +136,6 @@ class MuscleStepper:
                 self.model, self.contacts, path.old, path.new
             ):
                 self.step(path)
-        return self
 
     def step(self, path: Path) -> None:
         """One sub-step, with the tunnelling test where the scene has one."""
@@ -206,6 +207,8 @@ class MuscleStepper:
         """Times, events and status since the last call."""
         times, solves = dict(self.times), self.solves
         times["time_frame"] = sum(times.values())
+        drawing = times.get("time_surface", 0.0)
+        self.cost = (times["time_frame"] - drawing, drawing)
         self.unresolved = any(action == "unresolved" for _, _, action in self.events)
         events = [
             Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()
