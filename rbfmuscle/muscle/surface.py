@@ -22,7 +22,15 @@ from rbfmuscle.geometry.surfaces import _vertex_normal_loop, volume_cubic, volum
 from rbfmuscle.implicit.blend import blend_loop
 from rbfmuscle.jit import compiled
 from rbfmuscle.muscle.model import carry
-from rbfmuscle.muscle.surface_limits import Work, ask_bones, lift, mark_near, push_off, untangle
+from rbfmuscle.muscle.surface_limits import (
+    Work,
+    ask_bones,
+    lift,
+    mark_near,
+    push_off,
+    touching,
+    untangle,
+)
 
 # Lengths below are in mean edges of the mesh at rest.
 NEAR_BONE = 1.5  # what is within this of a bone may come to lie on it
@@ -112,8 +120,8 @@ def clear_rest(model, state, obstacles, vertices, held):
     work.near[:] = work.near & held
     if not lift(obstacles, state, work, np.flatnonzero(work.near)):
         return vertices
-    none, moved = np.zeros((0, 3)), np.zeros(len(vertices), np.bool_)
-    untangle(model, state, obstacles, work, True, none, moved)
+    everywhere = np.ones(len(model.faces), np.bool_)
+    untangle(model, state, obstacles, work, True, np.zeros((0, 3)), everywhere)
     return work.vertices
 
 
@@ -386,12 +394,18 @@ def _finish(model, state, obstacles, work, excess, sound, embedded):
     """
     if len(excess) > 0:
         _give_room(model, state, obstacles, work, excess)
-    moved = np.ones(len(work.vertices), np.bool_)
-    push_off(model, state, obstacles, work, moved)
-    for _ in range(AGAIN):
+    push_off(model, state, obstacles, work, np.ones(len(work.vertices), np.bool_))
+    # The material may have met itself anywhere.
+    asked = np.ones(len(model.faces), np.bool_)
+    for turn in range(AGAIN):
         if not _fill(model, state, obstacles, work, embedded):
             return -1
-        if not untangle(model, state, obstacles, work, embedded, sound, moved):
+        if not embedded:
+            touching(model.faces, work.odd | work.left, asked)
+        elif turn > 0:
+            touching(model.faces, work.odd, asked)
+        moved = untangle(model, state, obstacles, work, embedded, sound, asked)
+        if not moved.any():
             return 0
         # What was smoothed may lie over a bone's vertex again.
         push_off(model, state, obstacles, work, moved)

@@ -279,26 +279,25 @@ def _near_faces(model, work, among):
 
 
 @compiled
-def untangle(model, state, obstacles, work, embedded, sound, moved):
-    """Bring triangles that cross each other back to a ``sound`` surface (n, 3), or, without one,
-    (0, 3), to the material beside the bones; where these cross too, and those of an ``embedded``
-    surface, are smoothed. Whether vertices were moved for it, which are marked in ``moved``.
+def untangle(model, state, obstacles, work, embedded, sound, asked):
+    """Bring triangles that cross one of those ``asked`` for (m,), or at a fold, back to a ``sound``
+    surface (n, 3), or, without one, (0, 3), to the material beside the bones; where these cross
+    too, and those of an ``embedded`` surface, are smoothed. Returns a mask (n,) of the vertices
+    that were moved for it.
     """
-    m, n = len(model.faces), len(work.vertices)
-    found, among = np.zeros(m, np.bool_), np.ones(m, np.bool_)
-    if not embedded:
-        _touching(model.faces, work.odd | work.left, among)
-    moved[:] = False
+    n = len(work.vertices)
+    found, among = np.zeros(len(model.faces), np.bool_), asked.copy()
+    moved = np.zeros(n, np.bool_)
     target, knotted = sound, np.zeros(n, np.bool_)
     boxes = no_boxes(model.tree)
     for turn in range(ROUNDS):
         # What was not moved does not begin to cross.
         if crossing_loop(work.vertices, model.tree, among, turn == 0, boxes, found) == 0:
-            return turn > 0
+            break
         marked = _grown(model, _corners(model, found), 1 + turn // GROWTH)
         if turn == 0 and len(sound) == 0:
             target, knotted = _freed(model, state, obstacles, work, _grown(model, marked, WIDER))
-        _touching(model.faces, marked, among)
+        touching(model.faces, marked, among)
         work.odd[:] |= marked
         moved[:] |= marked
         if len(sound) > 0:
@@ -315,7 +314,7 @@ def untangle(model, state, obstacles, work, embedded, sound, moved):
         smooth_loop(work.vertices, np.flatnonzero(marked & knotted), model.start, model.other)
         mark_near(work)
         lift(obstacles, state, work, np.flatnonzero(marked & work.near))
-    return True
+    return moved
 
 
 @compiled
@@ -324,7 +323,7 @@ def _freed(model, state, obstacles, work, region):
     are corners of triangles that cross others before that.
     """
     found, among = np.zeros(len(model.faces), np.bool_), np.zeros(len(model.faces), np.bool_)
-    _touching(model.faces, region, among)
+    touching(model.faces, region, among)
     crossing_loop(work.carried, model.tree, among, False, no_boxes(model.tree), found)
     vertices, direction = work.vertices.copy(), work.direction.copy()
     work.vertices[:] = work.carried
@@ -362,7 +361,7 @@ def _corners(model, found):
 
 
 @compiled
-def _touching(faces, marked, out):
+def touching(faces, marked, out):
     """Mark the triangles with a marked corner."""
     for f in range(len(faces)):
         out[f] = marked[faces[f, 0]] or marked[faces[f, 1]] or marked[faces[f, 2]]
