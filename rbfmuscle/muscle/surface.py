@@ -121,7 +121,7 @@ def clear_rest(model, state, obstacles, vertices, held):
     if not lift(obstacles, state, work, np.flatnonzero(work.near)):
         return vertices
     everywhere = np.ones(len(model.faces), np.bool_)
-    untangle(model, state, obstacles, work, True, np.zeros((0, 3)), everywhere)
+    untangle(model, state, obstacles, work, True, np.zeros((0, 3)), everywhere, True)
     return work.vertices
 
 
@@ -404,7 +404,7 @@ def _finish(model, state, obstacles, work, excess, sound, embedded):
             touching(model.faces, work.odd | work.left, asked)
         elif turn > 0:
             touching(model.faces, work.odd, asked)
-        moved = untangle(model, state, obstacles, work, embedded, sound, asked)
+        moved = untangle(model, state, obstacles, work, embedded, sound, asked, turn == 0)
         if not moved.any():
             return 0
         # What was smoothed may lie over a bone's vertex again.

@@ -279,11 +279,11 @@ def _near_faces(model, work, among):
 
 
 @compiled
-def untangle(model, state, obstacles, work, embedded, sound, asked):
-    """Bring triangles that cross one of those ``asked`` for (m,), or at a fold, back to a ``sound``
-    surface (n, 3), or, without one, (0, 3), to the material beside the bones; where these cross
-    too, and those of an ``embedded`` surface, are smoothed. Returns a mask (n,) of the vertices
-    that were moved for it.
+def untangle(model, state, obstacles, work, embedded, sound, asked, folds):
+    """Bring triangles that cross one of those ``asked`` for (m,), or any at ``folds``, back to a
+    ``sound`` surface (n, 3), or, without one, (0, 3), to the material beside the bones; where these
+    cross too, and those of an ``embedded`` surface, are smoothed. Returns a mask (n,) of the
+    vertices that were moved for it.
     """
     n = len(work.vertices)
     found, among = np.zeros(len(model.faces), np.bool_), asked.copy()
@@ -292,7 +292,7 @@ def untangle(model, state, obstacles, work, embedded, sound, asked):
     boxes = no_boxes(model.tree)
     for turn in range(ROUNDS):
         # What was not moved does not begin to cross.
-        if crossing_loop(work.vertices, model.tree, among, turn == 0, boxes, found) == 0:
+        if crossing_loop(work.vertices, model.tree, among, folds and turn == 0, boxes, found) == 0:
             break
         marked = _grown(model, _corners(model, found), 1 + turn // GROWTH)
         if turn == 0 and len(sound) == 0:
