@@ -203,6 +203,17 @@ def carry_near(near, y, margin):
     return out, reach
 
 
+class Question(NamedTuple):
+    """Where the near points are, and how far to look for obstacles from there."""
+
+    here: np.ndarray  # (m, 3)
+    reach: np.ndarray  # (m,) [scene unit], -∞ for points that are passed over
+    asked: np.ndarray  # (m,) whether bones count for it
+    box: np.ndarray  # (2, 3) of these
+    farthest: float  # greatest reach
+    travelled: float  # how far nodes have gone since points were chosen [scene unit]
+
+
 @compiled
 def find_touch(near, here, reach, travelled, obstacles, rounded):
     """Half-spaces that near points ``here`` (m, 3) meet within ``reach`` (m,), bones rounded.
@@ -210,40 +221,18 @@ def find_touch(near, here, reach, travelled, obstacles, rounded):
     Points with a reach of -∞ are passed over. Also whether there was room for all blocks of the
     rounded bones. Fills ``near.spare`` for nodes that have ``travelled`` so far.
     """
-    bones, planes = obstacles.bones, obstacles.planes
-    touch = _no_touch(len(obstacles.poses) * len(here) + len(planes.point))
-    normal = np.empty(3)
-    box = np.empty((2, 3))
-    scratch = no_scratch()
+    touch = _no_touch(len(obstacles.poses) * len(here) + len(obstacles.planes.point))
     asked, farthest = near.free & (reach > -np.inf), reach.max() if len(reach) > 0 else -np.inf
-    box_loop(here, asked, box)
+    question = Question(here, reach, asked, np.empty((2, 3)), farthest, travelled)
+    box_loop(here, asked, question.box)
     for i in range(len(here)):
         if reach[i] > -np.inf:
             near.spare[i] = np.inf
     count, room = 0, True
+    scratch = no_scratch()
     for b in range(len(obstacles.poses)):
-        pose, bounds = obstacles.poses[b], bones.boxes[b]
-        anchor, bound = near.rounded.anchor[b], near.rounded.bound[b]
-        apart = boxes_apart(box, pose, bounds)
-        for i in range(len(here)):
-            if not asked[i]:
-                continue
-            least = apart
-            if apart <= farthest:
-                least = least_distance(here, i, pose, bounds, anchor, bound)
-            if least >= reach[i]:
-                near.spare[i] = min(near.spare[i], travelled + least)
-                continue
-            distance, smooth = _ask_rounded(rounded, bones, b, pose, here[i], normal, scratch)
-            room &= distance < np.inf
-            if smooth:
-                bound[i] = TRUSTED_SHARE * scratch.smooth[0]
-                anchor[i] = scratch.local
-            there = trusted(distance) + near.allowed[b, i]
-            near.spare[i] = min(near.spare[i], travelled + there)
-            if distance + near.allowed[b, i] < reach[i]:
-                _add_touch(touch, count, i, distance + near.allowed[b, i], normal, b)
-                count += 1
+        count, fits = _touch_bone(near, question, obstacles, rounded, b, touch, count, scratch)
+        room &= fits
     first = count
     count = _add_planes(touch, count, near, here, reach, obstacles, np.inf)
     for c in range(first, count):
@@ -252,10 +241,47 @@ def find_touch(near, here, reach, travelled, obstacles, rounded):
     return _first(touch, count), room
 
 
-@compiled(inline="always")
-def _ask_rounded(rounded, bones, b, pose, point, normal, scratch):
-    """Distance of a point from a bone, rounded where it can be, and its ``normal`` (3,); infinity
-    without room for a block. Also whether the distance is that of the rounded bone.
+@compiled
+def _touch_bone(near, question, obstacles, rounded, b, touch, count, scratch):
+    """Add the half-spaces of bone b to the first ``count``; how many there are then, and whether
+    there was room for all of its blocks.
+    """
+    here = question.here
+    reach = question.reach
+    spare = near.spare
+    allowed = near.allowed[b]
+    pose = obstacles.poses[b]
+    bounds = obstacles.bones.boxes[b]
+    anchor = near.rounded.anchor[b]
+    bound = near.rounded.bound[b]
+    apart, room = boxes_apart(question.box, pose, bounds), True
+    for i in range(len(here)):
+        if not question.asked[i]:
+            continue
+        least = apart
+        if apart <= question.farthest:
+            least = least_distance(here, i, pose, bounds, anchor, bound)
+        if least >= reach[i]:
+            spare[i] = min(spare[i], question.travelled + least)
+            continue
+        distance, smooth = _ask_rounded(rounded, obstacles.bones, b, pose, here[i], scratch)
+        room &= distance < np.inf
+        if smooth:
+            bound[i] = TRUSTED_SHARE * scratch.smooth[0]
+            for a in range(3):
+                anchor[i, a] = scratch.local[a]
+        there = trusted(distance) + allowed[i]
+        spare[i] = min(spare[i], question.travelled + there)
+        if distance + allowed[i] < reach[i]:
+            _add_touch(touch, count, i, distance + allowed[i], scratch.normal, b)
+            count += 1
+    return count, room
+
+
+@compiled
+def _ask_rounded(rounded, bones, b, pose, point, scratch):
+    """Distance of a point from a bone, rounded where it can be; infinity without room for a block.
+    Also whether the distance is that of the rounded bone. Fills the normal.
     """
     for k in range(3):
         scratch.local[k] = 0.0
@@ -264,13 +290,13 @@ def _ask_rounded(rounded, bones, b, pose, point, normal, scratch):
     distance = rounded_distance(rounded, bones, b, scratch)
     smooth = False
     if np.isnan(distance):
-        distance = _exact_distance(bones, b, pose, point, normal)
+        distance = _exact_distance(bones, b, pose, point, scratch.normal)
     elif distance < np.inf:
         smooth = True
         for k in range(3):
-            normal[k] = 0.0
+            scratch.normal[k] = 0.0
             for a in range(3):
-                normal[k] += pose[k, a] * scratch.gradient[a]
+                scratch.normal[k] += pose[k, a] * scratch.gradient[a]
     return distance, smooth
 
 

@@ -162,12 +162,13 @@ class Scratch(NamedTuple):
     place: np.ndarray  # (3,) in a cell of the lattice
     # (1,) smoothed distance [scene unit], which moves by no more than the point does
     smooth: np.ndarray
+    normal: np.ndarray  # (3,) of the answer, in the world
 
 
 @compiled
 def no_scratch():
     """Room for questions."""
-    return Scratch(np.empty(3), np.empty(3), np.empty(3), np.empty(1))
+    return Scratch(np.empty(3), np.empty(3), np.empty(3), np.empty(1), np.empty(3))
 
 
 @compiled
