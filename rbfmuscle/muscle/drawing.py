@@ -15,18 +15,12 @@ from rbfmuscle.implicit.evaluation import Terms
 from rbfmuscle.implicit.extraction.obstacles import PointGrid, stack_grids
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.muscle.display_mesh import display_mesh, neighbour_lists
+from rbfmuscle.muscle.level_set import FITTED, NO_VOLUME, UNSURE
 from rbfmuscle.muscle.model import Embedding
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import RestState
 from rbfmuscle.muscle.state import SolidState
-from rbfmuscle.muscle.surface import (
-    FITTED,
-    NO_VOLUME,
-    UNSURE,
-    clear_rest,
-    finish_surface,
-    start_surface,
-)
+from rbfmuscle.muscle.surface import clear_rest, finish_surface, start_surface
 from rbfmuscle.muscle.surface_limits import Obstacles, SurfaceModel, SurfaceState
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene

@@ -1,9 +1,10 @@
 """Bringing an RBF muscle's solid to equilibrium, in one compiled call that needs no lock.
 
-Each iteration finds rotations and stretches (`local_step.py`), then the nodes for these with a
-matrix that never changes and pressures that keep the volumes (`global_step.py`), and contacts in
-the same metric (`contact_forces.py`). Pressures are kept from iteration to iteration, so that the
-fixed point of the iteration is the equilibrium; Anderson acceleration gets there sooner.
+Each iteration (`iteration.py`) finds rotations and stretches (`local_step.py`), then the nodes for
+these with a matrix that never changes and pressures that keep the volumes (`global_step.py`), and
+contacts in the same metric (`contact_forces.py`). Pressures are kept from iteration to iteration,
+so that the fixed point of the iteration is the equilibrium; Anderson acceleration gets there
+sooner.
 
 A surface of points on a bone of flat facets has many equilibria, because each point has to be
 lifted over each edge. A muscle on a bone has not. So the solid settles with contacts that yield a
@@ -17,27 +18,30 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.bones.obstacles import Obstacles
-from rbfmuscle.geometry.surfaces import farthest_move
 from rbfmuscle.jit import compiled
-from rbfmuscle.muscle.anderson import mix, no_memory
-from rbfmuscle.muscle.contact_forces import Law, contact_push, no_answers
-from rbfmuscle.muscle.global_step import (
-    calm_share,
-    corrected_pressures,
-    expansion,
-    find_metric,
-    global_step,
-)
+from rbfmuscle.muscle.anderson import no_memory
+from rbfmuscle.muscle.contact_forces import contact_push, no_answers
+from rbfmuscle.muscle.global_step import expansion, find_metric
 from rbfmuscle.muscle.inversion import stiffened_inverse
+from rbfmuscle.muscle.iteration import (
+    MARGIN,
+    TOLERANCE,
+    YIELDING,
+    Iterate,
+    Problem,
+    Solver,
+    advance,
+    contact_law,
+    iterate,
+    shorten,
+)
 from rbfmuscle.muscle.local_step import found_rotations, local_step, start_local, volumes
 from rbfmuscle.muscle.model import SolidModel, Stiffness, carry
 from rbfmuscle.muscle.near_points import (
     carry_near,
     find_exact_touch,
     find_near,
-    find_touch,
     keep_rounded,
-    near_motion,
     take_near,
 )
 from rbfmuscle.muscle.rounded_bones import RoundedBones
@@ -55,11 +59,8 @@ MEMORY = 5  # steps that Anderson acceleration combines
 # Iterations in which the motion has not halved, after which steps are plain until it has: where a
 # muscle slips over an edge of a bone, accelerated ones go round in circles.
 STALLED = 12
-TOLERANCE = 2e-5  # violation of a contact that is left
-MARGIN = 0.003  # obstacles are looked for beyond where a point goes by this
 NEAR = 0.015  # contact points nearer to an obstacle take part in a solve
 STALE = 0.4  # share of NEAR by which a node moves before they are chosen again
-YIELDING = 1e-4  # how far a contact yields under a pressure of 2 μ
 # Share of YIELDING by which obstacles yield where room is made in what is shown.
 SHOWN_YIELDING = 0.1
 DRIFT = 5e-3  # relative change of a region's volume by a lift that is undone before the next
@@ -99,28 +100,13 @@ class Settled(NamedTuple):
     forces: np.ndarray
 
 
-class Problem(NamedTuple):
-    """What is given through a solve."""
+class Ended(NamedTuple):
+    """How the iteration ended, as in `Report`."""
 
-    model: SolidModel
-    stiffness: Stiffness
-    obstacles: Obstacles
-    rounded: RoundedBones
-    springs: np.ndarray  # (N, 3) forces of the springs at held points on nodes at the origin
-    activation: float
-    tension: float  # of slack fibres
-
-
-class Step(NamedTuple):
-    """One step of the iteration."""
-
-    nodes: np.ndarray  # (N, 3)
-    pressures: np.ndarray  # (M,)
-    push: np.ndarray  # (N, 3) motion of the nodes by contact
-    moved: float  # greatest motion of material [scene unit]
-    residual: float  # what that is without shortening
-    capped: bool  # whether contact forces are those of a capped solve
-    room: bool  # whether the table of rounded bones had room
+    status: int
+    iterations: int
+    residual: float
+    caps: int
 
 
 def settle(
@@ -147,68 +133,81 @@ def _settle(model, stiffness, state, obstacles, rounded, room):
     springs = np.dot(model.springs, state.anchors)
     pull = tension(model.end, model.end_distance, state.anchors)
     given = Problem(model, stiffness, obstacles, rounded, springs, state.activation[0], pull)
-    y = state.nodes.copy()
-    pressure = state.pressures.copy()
+    now = Iterate(state.nodes.copy(), state.pressures.copy(), np.zeros_like(state.nodes))
     local = start_local(model, state, given.activation)
-    joined = local_step(model.cells, y, pull, local)[0]
-    metric, sound = _new_metric(given, local, joined)
     forces = _start_forces(state.forces, obstacles)
-    near = _choose_near(given, forces, y)
-    answers, push = no_answers(near, metric), np.zeros_like(y)
-    memory = no_memory(MEMORY, y.size + len(pressure), y.size)
-    limit, most = _limits(given, state)
-    least = np.inf
-    status = DONE
-    done = 0
-    caps = 0
-    residual = 0.0
-    halved = np.inf
-    since = 0
-    travelled = 0.0
-    lifted_nodes = y
+    joined = local_step(model.cells, now.y, pull, local)[0]
+    metric, sound = _new_metric(given, local, joined)
+    near = _choose_near(given, forces, now.y)
+    solver = Solver(metric, sound, near, no_answers(near, metric))
+    rotations, stretches = state.rotations, state.stretches
     if room:
-        lifted_nodes = y + _push_out(given, near, metric, answers, y, np.inf)
-    while not room:
-        step = _iterate(given, y, pressure, push, local, metric, near, answers, travelled)
+        ended = Ended(DONE, 0, 0.0, 0)
+        shown = now.y + _push_out(given, solver, now.y, np.inf)
+    else:
+        solver, ended = _converge(given, state, now, local, solver, forces)
+        rotations, stretches = found_rotations(local)
+        shown = now.y
+    _note_forces(solver.near, forces)
+    lifted_nodes, left = _lifted(given, solver, shown)
+    keep_rounded(solver.near, rounded.known)
+    points = carry(model.embedding, lifted_nodes)
+    found = Settled(now.y, lifted_nodes, points, rotations, stretches, now.pressure, forces)
+    error = _volume_error(model.cells, lifted_nodes)
+    caps = ended.caps + left
+    return found, Report(ended.status, ended.iterations, ended.residual, error, caps)
+
+
+@compiled
+def _converge(given, state, now, local, solver, forces):
+    """Iterate until no material moves any farther; the solver in the end, and how it `Ended`."""
+    size = given.model.size
+    memory = no_memory(MEMORY, now.y.size + len(now.pressure), now.y.size)
+    limit, most = _limits(given, state)
+    least, halved = np.inf, np.inf
+    done, since = 0, 0
+    travelled = 0.0
+    while True:
+        step = iterate(given, now, local, solver, travelled)
         moved = step.moved
         done += 1
-        push[:] = step.push
-        if moved > GROWTH * least or moved > LONGEST * model.size:
+        now.push[:] = step.push
+        if moved > GROWTH * least or moved > LONGEST * size:
             memory.steps[0] = 0
         least = moved if moved > GROWTH * least else min(least, moved)
-        _shorten(y, pressure, step, LONGEST * model.size)
-        if not sound or not step.room or not np.isfinite(moved):
+        shorten(now, step, LONGEST * size)
+        status = DONE
+        if not solver.sound or not step.room or not np.isfinite(moved):
             status = DIVERGED if step.room else NO_ROOM
         if status != DONE or moved < limit or done == most:
-            y[:] = step.nodes
-            pressure[:] = step.pressures
+            now.y[:] = step.nodes
+            now.pressure[:] = step.pressures
             caps = int(not moved < limit) + int(step.capped)
-            residual = step.residual / model.size
-            break
+            return solver, Ended(status, done, step.residual / size, caps)
         if moved < 0.5 * halved:
             halved = moved
             since = done
-        travelled += _advance(y, pressure, step, memory, done - since < STALLED)
-        joined = local_step(model.cells, y, pull, local)[0]
-        if joined > 0:
-            metric, sound = _new_metric(given, local, joined)
-            memory.steps[0] = 0
-            answers = no_answers(near, metric)
-        if np.abs(y - near.y).max() > STALE * NEAR * model.size:
-            _note_forces(near, forces)
-            near = _choose_near(given, forces, y)
-            answers = no_answers(near, metric)
-            push[:] = 0.0
-    _note_forces(near, forces)
-    lifted_nodes, left = _lifted(given, lifted_nodes, metric, near, answers)
-    keep_rounded(near, rounded.known)
-    points = carry(model.embedding, lifted_nodes)
-    rotations, stretches = found_rotations(local)
-    if room:
-        rotations, stretches = state.rotations, state.stretches
-    found = Settled(y, lifted_nodes, points, rotations, stretches, pressure, forces)
-    report = Report(status, done, residual, _volume_error(model.cells, lifted_nodes), caps + left)
-    return found, report
+        travelled += advance(now, step, memory, done - since < STALLED)
+        solver = _renewed(given, now, local, solver, forces, memory)
+
+
+@compiled
+def _renewed(given, now, local, solver, forces, memory):
+    """The local step where the iteration is now, and the solver for it: with another metric where
+    points were squeezed, and other near points where nodes moved far.
+    """
+    metric, sound, near, answers = solver
+    joined = local_step(given.model.cells, now.y, given.tension, local)[0]
+    if joined > 0:
+        metric, sound = _new_metric(given, local, joined)
+        memory.steps[0] = 0
+        answers = no_answers(near, metric)
+    if np.abs(now.y - near.y).max() > STALE * NEAR * given.model.size:
+        _note_forces(near, forces)
+        near = _choose_near(given, forces, now.y)
+        answers = no_answers(near, metric)
+        now.push[:] = 0.0
+    return Solver(metric, sound, near, answers)
 
 
 @compiled(inline="always")
@@ -261,132 +260,44 @@ def _note_forces(near, forces):
         forces[near.which[k]] = near.forces[k]
 
 
-@compiled(inline="always")
-def _iterate(given, y, pressure, push, local, metric, near, answers, travelled):
-    """One global step with volumes and contacts.
-
-    ``push`` is that of the step before, ``travelled`` how far nodes have gone at most.
-    """
-    model = given.model
-    size = given.model.size
-    part = calm_share(pressure)
-    force = local.right + given.springs
-    new, change = global_step(model.cells, y, pressure, force, local, metric, part)
-    # Contacts that push now push in the next iteration too: where the points will then go decides
-    # what they meet.
-    here, motion, reach = near_motion(near, y, new, push, MARGIN * size, travelled)
-    touch, room = find_touch(near, here, reach, travelled, given.obstacles, given.rounded)
-    law = _law(given, touch, near, YIELDING / part, part)
-    found = contact_push(touch, motion, near, metric, answers, law, near.forces, TOLERANCE * size)
-    pressures = corrected_pressures(pressure, change, found.taken, metric.factor, part)
-    new += found.nodes
-    moved = _material_move(model.reach, y, new)
-    return Step(new, pressures, found.nodes, moved, moved / part, found.capped, room)
-
-
-@compiled(inline="always")
-def _material_move(reach, y, new):
-    """How far material goes, about, when nodes move from y to new (N, 3), infinity where one is not
-    finite: nodes that hold none settle slowly, and move nothing.
-    """
-    most = 0.0
-    for n in range(len(y)):
-        square = 0.0
-        for a in range(3):
-            square += (reach[n] * (new[n, a] - y[n, a])) ** 2
-        if not square <= most:
-            most = square if np.isfinite(square) else np.inf
-    return np.sqrt(most)
-
-
 @compiled
-def _law(given, touch, near, yielding, part):
-    """How contacts yield: by ``yielding`` of the muscle's size under a pressure of 2 μ, soft planes
-    more, up to a ``part`` of their greatest forces.
-    """
-    bones, softness = len(given.obstacles.poses), given.obstacles.planes.softness
-    give = yielding * given.model.size / given.model.area
-    law = Law(np.empty(len(touch.point)), np.empty(len(touch.point)))
-    for c in range(len(touch.point)):
-        kind = touch.source[c] - bones
-        law.yielding[c] = give * (softness[kind] if kind >= 0 else 1.0)
-        law.most[c] = near.most[touch.point[c]] * part
-    return law
-
-
-@compiled(inline="always")
-def _shorten(y, pressure, step, longest):
-    """Shorten a step, in place, where material goes farther than ``longest``."""
-    if step.moved > longest:
-        share = longest / step.moved
-        step.nodes[:] = y + share * (step.nodes - y)
-        step.pressures[:] = pressure + share * (step.pressures - pressure)
-
-
-@compiled(inline="always")
-def _advance(y, pressure, step, memory, accelerated):
-    """Turn nodes and pressures, in place, into those that the next iteration starts from; returns
-    how far the nodes go at most.
-    """
-    before = y.copy()
-    if accelerated:
-        _accelerate(y, pressure, step, memory)
-    else:
-        memory.steps[0] = 0
-        y[:] = step.nodes
-        pressure[:] = step.pressures
-    return farthest_move(y, before)
-
-
-@compiled(inline="always")
-def _accelerate(y, pressure, step, memory):
-    """Turn nodes and pressures, in place, into the mixture of the last steps."""
-    count = y.size
-    here, there = np.empty(count + len(pressure)), np.empty(count + len(pressure))
-    here[:count] = y.ravel()
-    here[count:] = pressure
-    there[:count] = step.nodes.ravel()
-    there[count:] = step.pressures
-    mixed = mix(memory, here, there)
-    y[:] = mixed[:count].reshape(y.shape)
-    pressure[:] = mixed[count:]
-
-
-@compiled
-def _push_out(given, near, metric, answers, y, softest):
+def _push_out(given, solver, y, softest):
     """Motion (N, 3) of nodes y that stand still, out of obstacles that are at most so soft.
 
     Bones and planes as hard do not yield; where softer planes are asked for too, all yield a
     little. Zero where nothing is left in one of them.
     """
     size, push = given.model.size, np.zeros_like(y)
+    near = solver.near
     here, reach = carry_near(near, y, MARGIN * size)
     touch = find_exact_touch(near, here, reach, given.obstacles, softest)
     hard = softest <= 1.0
     if hard and (len(touch.gap) == 0 or touch.gap.min() > -TOLERANCE * size):
         return push
     still, none = np.zeros((len(near.which), 3)), np.zeros_like(near.forces)
-    law = _law(given, touch, near, 0.0 if hard else SHOWN_YIELDING * YIELDING, 1.0)
-    found = contact_push(touch, still, near, metric, answers, law, none, TOLERANCE * size)
+    law = contact_law(given, touch, near, 0.0 if hard else SHOWN_YIELDING * YIELDING, 1.0)
+    found = contact_push(
+        touch, still, near, solver.metric, solver.answers, law, none, TOLERANCE * size
+    )
     return found.nodes
 
 
 @compiled(inline="always")
-def _lifted(given, y, metric, near, answers):
+def _lifted(given, solver, y):
     """Nodes (N, 3), moved so far that no contact point is left in an obstacle that does not yield;
     1 where some may be left all the same, else 0.
     """
     cells = given.model.cells
     settled = volumes(cells, y)
     for turn in range(LIFTS):
-        push = _push_out(given, near, metric, answers, y, 1.0)
+        push = _push_out(given, solver, y, 1.0)
         if not push.any():
             return y, 0
         y = y + push
         # A push keeps the volumes to first order.
         lacking = settled - volumes(cells, y)
         if turn < LIFTS - 1 and (np.abs(lacking) > DRIFT * cells.volumes).any():
-            y = y + expansion(lacking, metric)
+            y = y + expansion(lacking, solver.metric)
     return y, 1
 
 

@@ -1,15 +1,8 @@
 """The surface of an RBF muscle in one frame: compiled functions of constants, state and nodes.
 
-With F the field that a vertex blends (`rbfmuscle.implicit.blend`), r its level offset, d the
-distance to the bones and s the level that gives the muscle its volume at rest, each vertex is
-brought onto the zero set of
-
-    max(F(x) - r - s, -d(x)).
-
-A Newton step on the field is  x += (s + r - F) g / max(|g|, g_0)^2,  g = grad F, with g_0 a share
-of |g| at rest, so that what falls on a fold of the field does not leap; a change ds of the level
-moves the vertex by  ds g / |g|^2. On a bone it is  x -= d grad d. The volume is a cubic polynomial
-of ds, which is met by Newton steps too.
+The vertices are brought onto the level set that has the muscle's volume at rest (`level_set.py`),
+out of bones and of each other (`surface_limits.py`). The volume is a cubic polynomial of a change
+of the level, and is met by Newton steps.
 
 The search starts from where the solid carries the vertex, moved along the normal there by the
 height above it that the vertex had in the last frame.
@@ -19,8 +12,17 @@ import numpy as np
 
 from rbfmuscle.geometry.crossing import crossing_loop, no_boxes
 from rbfmuscle.geometry.surfaces import _vertex_normal_loop, volume_cubic, volume_rate
-from rbfmuscle.implicit.blend import blend_loop
 from rbfmuscle.jit import compiled
+from rbfmuscle.muscle.level_set import (
+    CROSSED,
+    FARTHEST,
+    FITTED,
+    LEVELS,
+    NO_FIT,
+    NO_VOLUME,
+    reach_level,
+    shift,
+)
 from rbfmuscle.muscle.model import carry
 from rbfmuscle.muscle.surface_limits import (
     Work,
@@ -37,26 +39,13 @@ NEAR_BONE = 1.5  # what is within this of a bone may come to lie on it
 SAME = 0.02  # what moved less than this by a bone need not be asked for anew
 SUNK = 1.0  # deeper in a bone the material is sunk
 LAMELLA = 0.02  # where both sides of a muscle sink into a bone, the far one stays above it by this
-# No vertex goes farther than this from where the material carries it, times the square of the share
-# that the field's slope there has of its slope at rest, from none at the first; but always so far.
-# Where sheets of a muscle meet, the slope sinks within few frames: by the share itself vertices of
-# the leg's muscles jump by up to 0.85 mm in a squat, by its square 0.63.
-FARTHEST = 1.0
-UNSURE = 0.3
-ALWAYS = 0.05
-SURE = 0.7  # a share of the slope at rest, below which steps are shortened
-SETTLED = 0.01  # a step of less is one whose error, of second order, does not count
-BLOWN = 1e-3  # the same of the material blown up to its volume, whose last digit follows
+BLOWN = 1e-3  # a step of less of the material blown up to its volume, whose last digit follows
 # Rounds, at most.
-NEWTON = 6
-LEVELS = 20
 CUBIC = 4
 MEET = 4
 # Bones, crossings and volume are met up to so many times, as the way back to the volume can make
 # triangles cross.
 AGAIN = 4
-# Outcomes.
-FITTED, NO_FIT, NOT_FINITE, NO_LEVEL, CROSSED, NO_VOLUME = range(6)
 
 
 @compiled
@@ -69,7 +58,7 @@ def start_surface(model, state, obstacles, nodes, fit, fitted):
     work = _begin(model, state, obstacles, carry(model.embedding, nodes))
     outcome = NO_FIT
     if fitted:
-        outcome = _reach(model, state, obstacles, fit, work)
+        outcome = reach_level(model, state, obstacles, fit, work)
         if outcome == FITTED:
             # Those after crossings are undone would make every other frame cross anew.
             _keep_heights(state, work)
@@ -163,162 +152,6 @@ def _begin(model, state, obstacles, carried):
 
 
 @compiled
-def _reach(model, state, obstacles, fit, work):
-    """Bring the vertices onto the level set that has the volume; how that ended."""
-    edge, level = work.edge, state.level[0]
-    allowed = np.full(len(model.offset), -1.0)
-    for _ in range(LEVELS):
-        if not _project(model, state, obstacles, fit, work, level, allowed):
-            return NOT_FINITE
-        volume, rate = volume_rate(work.vertices, model.faces, work.direction)
-        if not rate > 0.0:
-            return NO_LEVEL
-        step, largest = (model.volume - volume) / rate, _fastest(work)
-        step = min(max(step, -edge / largest), edge / largest)
-        level += step
-        _shift(work, step)
-        if abs(step) * largest < SETTLED * edge:
-            state.level[0] = level
-            return FITTED
-    return NO_LEVEL
-
-
-@compiled
-def _project(model, state, obstacles, fit, work, level, allowed):
-    """Newton steps of all vertices onto the level, no farther from the material than the field is
-    to be trusted; False where the field is not finite.
-    """
-    n, edge = len(model.offset), work.edge
-    value = np.empty(n)
-    gradient = np.empty((n, 3))
-    todo = np.ones(n, np.bool_)
-    rows = np.empty(n, np.int64)
-    limit = np.empty(n)
-    miss = np.empty(n)
-    for _ in range(NEWTON):
-        blend_loop(work.vertices, fit[0], fit[1], model.blend, todo, value, gradient)
-        count, settled = 0, True
-        for v in range(n):
-            if not todo[v]:
-                continue
-            square = gradient[v, 0] ** 2 + gradient[v, 1] ** 2 + gradient[v, 2] ** 2
-            if not (square < np.inf and abs(value[v]) < np.inf):
-                return False
-            least = SURE * model.slope[v]
-            work.odd[v] |= square <= least * least
-            square = max(square, least * least, 2.3e-308)
-            miss[v] = level + model.offset[v] - value[v]
-            for a in range(3):
-                work.direction[v, a] = gradient[v, a] / square
-            work.on_field[v] = True
-            if work.near[v]:
-                rows[count] = v
-                limit[count] = work.clearance[v] + miss[v] / np.sqrt(square)
-                count += 1
-        _turn_to_bones(obstacles, state, work, rows[:count], limit[:count], miss)
-        for v in range(n):
-            if todo[v]:
-                todo[v] = _move(work.vertices, v, work.direction, miss[v], edge) > SETTLED * edge
-                settled &= not todo[v]
-        if settled:
-            break
-    for v in range(n):
-        if not work.on_field[v]:
-            work.direction[v] = 0.0
-    _measure_trust(model, fit, work, allowed)
-    _bound(work, allowed)
-    lift(obstacles, state, work, np.flatnonzero(work.left & work.near))
-    return True
-
-
-@compiled
-def _measure_trust(model, fit, work, allowed):
-    """How far each vertex may go that went some way, by the slope where the material carries it:
-    measured where the search began, it would depend on the last frame.
-    """
-    n, edge = len(allowed), work.edge
-    asked = np.zeros(n, np.bool_)
-    for v in range(n):
-        if allowed[v] < 0.0:
-            square = 0.0
-            for a in range(3):
-                square += (work.vertices[v, a] - work.carried[v, a]) ** 2
-            asked[v] = not square <= (ALWAYS * edge) ** 2
-    value = np.empty(n)
-    gradient = np.empty((n, 3))
-    blend_loop(work.carried, fit[0], fit[1], model.blend, asked, value, gradient)
-    for v in range(n):
-        if asked[v]:
-            square = gradient[v, 0] ** 2 + gradient[v, 1] ** 2 + gradient[v, 2] ** 2
-            allowed[v] = edge * max(_trust(np.sqrt(square), model.slope[v]), ALWAYS)
-
-
-@compiled
-def _trust(slope, at_rest):
-    """How far, in mean edges, a vertex may go from the material for a field of this slope."""
-    if not at_rest > UNSURE:
-        return 0.0
-    return FARTHEST * min(max((slope / at_rest - UNSURE) / (1.0 - UNSURE), 0.0), 1.0) ** 2
-
-
-@compiled(inline="always")
-def _move(vertices, v, direction, share, most):
-    """x += share * direction, by no more than a length; the length that it asked for."""
-    length = np.sqrt(direction[v, 0] ** 2 + direction[v, 1] ** 2 + direction[v, 2] ** 2)
-    length *= abs(share)
-    share = share * most / length if length > most else share
-    for a in range(3):
-        vertices[v, a] += share * direction[v, a]
-    return length
-
-
-@compiled
-def _turn_to_bones(obstacles, state, work, rows, limit, miss):
-    """Where a bone is the surface, the step onto it replaces that onto the field."""
-    distance, outward = np.empty(len(rows)), np.empty((len(rows), 3))
-    ask_bones(obstacles, state, work.vertices, rows, limit, 0.0, distance, outward)
-    for i in range(len(rows)):
-        v = rows[i]
-        gap = distance[i] - work.clearance[v]
-        if distance[i] < limit[i]:
-            work.on_field[v] = False
-            miss[v] = -gap
-            for a in range(3):
-                work.direction[v, a] = outward[i, a]
-
-
-@compiled
-def _bound(work, allowed):
-    """Bring back what went beyond where the field is to be trusted, which stays, and mark it."""
-    edge = work.edge
-    for v in range(len(allowed)):
-        # A way to a bone from outside it, which the field asked for, is bounded too.
-        bounded = work.on_field[v] or (work.least[v] >= 0.0 and allowed[v] < FARTHEST * edge)
-        square = 0.0
-        for a in range(3):
-            square += (work.vertices[v, a] - work.carried[v, a]) ** 2
-        work.left[v] = bounded and allowed[v] >= 0.0 and square > allowed[v] ** 2
-        if work.left[v]:
-            share = allowed[v] / max(np.sqrt(square), 1e-300)
-            for a in range(3):
-                away = work.vertices[v, a] - work.carried[v, a]
-                work.vertices[v, a] = work.carried[v, a] + share * away
-                work.direction[v, a] = 0.0
-
-
-@compiled
-def _fastest(work):
-    """Greatest motion of a vertex for a unit of level."""
-    most = 2.3e-308
-    for v in range(len(work.direction)):
-        square = 0.0
-        for a in range(3):
-            square += work.direction[v, a] ** 2
-        most = max(most, square)
-    return np.sqrt(most)
-
-
-@compiled
 def _level_step(model, work):
     """Change of the level that brings the mesh to its volume, by Newton steps; NaN where no level
     does.
@@ -337,14 +170,6 @@ def _level_step(model, work):
 
 
 @compiled
-def _shift(work, step):
-    """Move the vertices as the level set moves with its level, to first order."""
-    for v in range(len(work.vertices)):
-        for a in range(3):
-            work.vertices[v, a] += step * work.direction[v, a]
-
-
-@compiled
 def _embed(model, state, obstacles, work):
     """The material out of the bones, blown up along its normals to the volume: the surface without
     a field. False where no such surface has the volume.
@@ -359,7 +184,7 @@ def _embed(model, state, obstacles, work):
         if not rate > 0.0:
             return False
         step = min(max((model.volume - volume) / rate, -most), most)
-        _shift(work, step)
+        shift(work, step)
         lift(obstacles, state, work, near)
         if abs(step) < BLOWN * work.edge:
             break
@@ -433,7 +258,7 @@ def _fill(model, state, obstacles, work, embedded):
             return False
         if not embedded:
             state.level[0] += step
-        _shift(work, step)
+        shift(work, step)
         if turn == MEET or not lift(obstacles, state, work, near):
             break
     return True

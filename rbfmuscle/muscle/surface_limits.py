@@ -82,6 +82,22 @@ class Work(NamedTuple):
     edge: float  # of the model
 
 
+class Asked(NamedTuple):
+    """Vertices about which the bones are asked."""
+
+    x: np.ndarray  # (n, 3)
+    rows: np.ndarray  # (k,) which of them
+    limit: np.ndarray  # (k,) beyond which a lower bound will do [scene unit]
+    same: float  # how far one may have moved since it was found [scene unit]
+
+
+class Found(NamedTuple):
+    """What the bones answered."""
+
+    distance: np.ndarray  # (k,) to the nearest bone
+    outward: np.ndarray  # (k, 3) in which it grows
+
+
 class Question(NamedTuple):
     """Room for asking one bone about some of k points."""
 
@@ -113,20 +129,26 @@ def ask_bones(obstacles, state, x, rows, limit, same, distance, outward):
     )
     distance[:count] = np.inf
     outward[:count] = 0.0
+    asked, found = Asked(x, rows, limit, same), Found(distance, outward)
     for b in range(len(obstacles.poses)):
-        m = _recall(obstacles.poses[b], state, b, x, rows, limit, same, distance, outward, ask)
+        m = _recall(obstacles.poses[b], state, b, asked, ask, found)
         if m > 0:
-            _ask_bone(obstacles, state, b, rows, ask, m, distance, outward)
+            _ask_bone(obstacles, state, b, rows, ask, m, found)
 
 
 @compiled
-def _recall(pose, state, b, x, rows, limit, same, distance, outward, ask):
+def _recall(pose, state, b, asked, ask, found):
     """What is known of bone b; puts the points that have to be asked into ``ask`` and counts
     them.
     """
     places = state.places[b]
     bounds = state.bounds[b]
     ways = state.outward[b]
+    x = asked.x
+    rows = asked.rows
+    same = asked.same
+    distance = found.distance
+    outward = found.outward
     m = 0
     for i in range(len(rows)):
         v = rows[i]
@@ -137,7 +159,7 @@ def _recall(pose, state, b, x, rows, limit, same, distance, outward, ask):
         py = dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]
         pz = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
         square = (px - places[v, 0]) ** 2 + (py - places[v, 1]) ** 2 + (pz - places[v, 2]) ** 2
-        least, most = bounds[v] - np.sqrt(square), min(distance[i], limit[i])
+        least, most = bounds[v] - np.sqrt(square), min(distance[i], asked.limit[i])
         if least > most:
             distance[i] = min(distance[i], least)
         elif square <= same * same and (
@@ -160,7 +182,7 @@ def _recall(pose, state, b, x, rows, limit, same, distance, outward, ask):
 
 
 @compiled
-def _ask_bone(obstacles, state, b, rows, ask, m, distance, outward):
+def _ask_bone(obstacles, state, b, rows, ask, m, found):
     """Ask bone b about the first m points, and keep what it says."""
     pose = obstacles.poses[b]
     one = ask.distance
@@ -176,10 +198,10 @@ def _ask_bone(obstacles, state, b, rows, ask, m, distance, outward):
             if reached:
                 for k in range(3):
                     state.outward[b, v, a] += pose[k, a] * way[j, k]
-        if one[j] < distance[i]:
-            distance[i] = one[j]
+        if one[j] < found.distance[i]:
+            found.distance[i] = one[j]
             for a in range(3):
-                outward[i, a] = way[j, a] if reached else 0.0
+                found.outward[i, a] = way[j, a] if reached else 0.0
 
 
 @compiled

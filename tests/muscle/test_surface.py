@@ -20,16 +20,9 @@ from rbfmuscle.implicit.extraction.obstacles import (
 )
 from rbfmuscle.implicit.field import SMALL, RBFField, overlapping_parts
 from rbfmuscle.muscle.display_mesh import neighbour_lists
+from rbfmuscle.muscle.level_set import FITTED, NO_FIT, UNSURE
 from rbfmuscle.muscle.model import Embedding
-from rbfmuscle.muscle.surface import (
-    FITTED,
-    NO_FIT,
-    UNSURE,
-    _begin,
-    clear_rest,
-    finish_surface,
-    start_surface,
-)
+from rbfmuscle.muscle.surface import _begin, clear_rest, finish_surface, start_surface
 from rbfmuscle.muscle.surface_limits import (
     Obstacles,
     SurfaceModel,
@@ -218,8 +211,8 @@ def test_what_crosses_goes_back_to_the_material_beside_the_bone():
     work.odd[:] = True
     tangled = work.vertices.copy()
     assert crossing_faces(tangled, FACES).sum() > 30
-    moved = np.zeros(len(X), np.bool_)
-    assert untangle(*given, work, False, np.zeros((0, 3)), moved)
+    moved = untangle(*given, work, False, np.zeros((0, 3)), np.ones(len(FACES), np.bool_), True)
+    assert moved.any()
     assert not crossing_faces(work.vertices, FACES).any()
     assert drawn.distance(work.vertices[moved]).min() > -1e-3
     ways = [np.linalg.norm(x - target, axis=1) for x in (work.vertices, tangled)]
@@ -237,9 +230,10 @@ def test_what_crosses_goes_back_to_a_sound_surface_there_alone():
     among = X[:, 2] > 0.8
     work.vertices[among] += 0.1 * rng.normal(size=(among.sum(), 3))
     work.odd[:] = True
-    tangled, moved = work.vertices.copy(), np.zeros(len(X), np.bool_)
+    tangled = work.vertices.copy()
     assert crossing_faces(tangled, FACES).sum() > 20
-    assert untangle(*given, work, False, X, moved)
+    moved = untangle(*given, work, False, X, np.ones(len(FACES), np.bool_), True)
+    assert moved.any()
     assert not crossing_faces(work.vertices, FACES).any()
     assert moved.sum() < 0.5 * len(X)
     np.testing.assert_array_equal(work.left, moved)
