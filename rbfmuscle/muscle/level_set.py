@@ -18,7 +18,8 @@ import numpy as np
 from rbfmuscle.geometry.surfaces import volume_rate
 from rbfmuscle.implicit.blend import blend_loop
 from rbfmuscle.jit import compiled
-from rbfmuscle.muscle.surface_limits import ask_bones, lift
+from rbfmuscle.muscle.bone_distances import ask_bones
+from rbfmuscle.muscle.surface_limits import lift
 
 # Lengths below are in mean edges of the mesh at rest. No vertex goes farther than this from where
 # the material carries it, times the square of the share that the field's slope there has of its

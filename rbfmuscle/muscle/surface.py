@@ -13,6 +13,7 @@ import numpy as np
 from rbfmuscle.geometry.crossing import crossing_loop, no_boxes
 from rbfmuscle.geometry.surfaces import _vertex_normal_loop, volume_cubic, volume_rate
 from rbfmuscle.jit import compiled
+from rbfmuscle.muscle.bone_distances import ask_bones
 from rbfmuscle.muscle.level_set import (
     CROSSED,
     FARTHEST,
@@ -26,7 +27,6 @@ from rbfmuscle.muscle.level_set import (
 from rbfmuscle.muscle.model import carry
 from rbfmuscle.muscle.surface_limits import (
     Work,
-    ask_bones,
     lift,
     mark_near,
     push_off,

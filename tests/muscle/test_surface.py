@@ -19,6 +19,7 @@ from rbfmuscle.implicit.extraction.obstacles import (
     stack_grids,
 )
 from rbfmuscle.implicit.field import SMALL, RBFField, overlapping_parts
+from rbfmuscle.muscle.bone_distances import ask_bones
 from rbfmuscle.muscle.display_mesh import neighbour_lists
 from rbfmuscle.muscle.level_set import FITTED, NO_FIT, UNSURE
 from rbfmuscle.muscle.model import Embedding
@@ -27,7 +28,6 @@ from rbfmuscle.muscle.surface_limits import (
     Obstacles,
     SurfaceModel,
     SurfaceState,
-    ask_bones,
     lift,
     untangle,
 )
