@@ -158,9 +158,10 @@ def write_reference(root, package):
             lines += [f"## {topic}", ""]
         for name in names:
             value = getattr(package, name)
-            kind, options = (
-                ("autoclass", "   :members:\n") if isinstance(value, type) else ("autofunction", "")
-            )
+            kind, options = "autofunction", ""
+            if isinstance(value, type):  # with what it has from a class of the package
+                kind = "autoclass"
+                options = "   :members:\n   :inherited-members: BaseException\n"
             directive = f".. {kind}:: {value.__module__}.{name}\n{options}"
             lines += [f"### {name}", "", f"```{{eval-rst}}\n{directive}```", ""]
     (folder / "reference.md").write_text("\n".join(lines), encoding="utf-8")
@@ -219,7 +220,9 @@ def _table(name, meaning, rows):
 
 
 def _allowed(field):
-    """What a field of a JSON schema may hold, in words."""
+    """What a field of a JSON schema may hold, in words; True is the schema of anything."""
+    if field is True:
+        return "any"
     if "$ref" in field:
         name = field["$ref"].rsplit("/", 1)[-1]
         return f"table [{name}](#{name.lower()})"

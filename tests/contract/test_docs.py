@@ -178,6 +178,16 @@ def test_every_page_is_in_the_index_or_in_the_gallery():
     assert listed == {path.stem for path in (ROOT / "docs").glob("*.md")} - {"index"}
 
 
+def test_reference_of_the_scene_file_names_every_table_and_its_keys(tmp_path):
+    (tmp_path / "docs" / "gallery").mkdir(parents=True)
+    gallery.write_scene_reference(tmp_path)
+    text = (tmp_path / "docs" / "gallery" / "scene_reference.md").read_text(encoding="utf-8")
+    tables = re.findall(r"\(#(\w+)\)", text)
+    assert {"bonetable", "muscletable"} <= set(tables)
+    assert set(tables) <= {name.lower() for name in re.findall(r"^## (\w+)", text, flags=re.M)}
+    assert '| `model` | string or table of any | `"rbf"` |' in text
+
+
 @pytest.mark.parametrize("name", ["fast.txt", "nojit.txt"])
 def test_what_is_listed_is_there_and_named_once(name):
     lines = re.findall(
