@@ -28,6 +28,7 @@ from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.models import build_models
+from rbfmuscle.scene.muscles import attachment_frames
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame_loop import FrameLoop
@@ -162,7 +163,7 @@ def holders(scene, models, surfaces):
     """
     found = {}
     for model in models:
-        names = np.array([*scene.attachment_frames(scene.muscle(model.name)), ""])
+        names = np.array([*attachment_frames(scene.bones, scene.muscle(model.name)), ""])
         nearest = cKDTree(model.contact_points()).query(surfaces[model.name][0])[1]
         found[model.name] = names[np.asarray(model.attached_bone)[nearest]]
     return found

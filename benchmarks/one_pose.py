@@ -19,7 +19,7 @@ from evidence import write_evidence
 
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
-from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.objects import Motion, from_mm
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_settings
@@ -80,7 +80,7 @@ def ends(scene, pose, others, settings):
         model = RBFMuscle(muscle, part, RBFOptions(**{**muscle.options, **settings}))
         last = len(part.motion.frames) - 1
         (frame,) = simulate_frames(part, [model], surfaces=False, written={last})
-        found[name] = frame.material_meshes[muscle.name][0] / part.length(1.0)
+        found[name] = frame.material_meshes[muscle.name][0] / from_mm(1.0, part.units)
     return found, time.process_time() - start
 
 

@@ -28,6 +28,7 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.metrics.depths import bone_depth, surface_depth
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
@@ -127,7 +128,7 @@ class Experiment:
             model.contact_points(),
             *poses,
             TunnellingOptions(),
-            tolerance=self.scene.length(0.1),
+            tolerance=from_mm(0.1, self.scene.units),
         )
         if record.tunnelling is None and any(len(crossing.index) for crossing in crossings):
             record.tunnelling = after[self.coordinate]

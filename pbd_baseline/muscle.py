@@ -18,7 +18,8 @@ from rbfmuscle.geometry.interpolation import SurfaceInterpolation
 from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.geometry.surfaces import farthest_move
 from rbfmuscle.jit import compiled
-from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.muscles import attachment_frames
+from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
@@ -86,9 +87,10 @@ class PBDMuscle:
         self.still = method.tolerance * self.size
         self.log = SolveLog(solver_residual=0.0)
         self.contact_spacing = 0.0
-        self.attached_bone = _bone_numbers(self.rest, scene.attachment_frames(muscle))
-        self.contact = ContactConstraint(reach=scene.length(REACH))
-        self.finishing_reach, self.depth = scene.length(FINISHING_REACH), scene.length(DEPTH)
+        self.attached_bone = _bone_numbers(self.rest, attachment_frames(scene.bones, muscle))
+        self.contact = ContactConstraint(reach=from_mm(REACH, scene.units))
+        self.finishing_reach = from_mm(FINISHING_REACH, scene.units)
+        self.depth = from_mm(DEPTH, scene.units)
         # The mesh's own numbers of the vertices, for `material_mesh`.
         self._place = np.argsort(self.rest.order)
         self._faces = self.rest.order[self.rest.topology.faces]

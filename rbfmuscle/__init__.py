@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from rbfmuscle.validation import SceneWarning as SceneWarning
     from rbfmuscle.validation import SolveError as SolveError
     from rbfmuscle.validation import UsageError as UsageError
-    from rbfmuscle.viewer.page import ViewerPage as ViewerPage
     from rbfmuscle.viewer.page import show as show
 
 __version__ = "1.1.0"
@@ -69,16 +68,11 @@ _HOME = {
     "sweep": "rbfmuscle.sweeping",
     **dict.fromkeys(_ERRORS, "rbfmuscle.validation"),
 }
-# For modules that may not import it themselves.
-_INNER = {
-    "ViewerPage": "rbfmuscle.viewer.page",
-}
-
 __all__ = [*_HOME, "__version__"]
 
 
 def __getattr__(name: str) -> object:
-    home = _HOME.get(name) or _INNER.get(name)
+    home = _HOME.get(name)
     if home is None:
         raise AttributeError(f"module 'rbfmuscle' has no attribute {name!r}")
     value = getattr(importlib.import_module(home), name)
@@ -90,21 +84,25 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-def _show(shown: Scene, *, model: str | None = None) -> ViewerPage:
+def _show(shown: Scene | Run, *, model: str | None = None) -> showing.ShownPage:
     from rbfmuscle.viewer.page import show
 
     return show(shown, model=model)
 
 
-def _picture(shown: Scene) -> str:
+def _picture(shown: Scene | Run) -> str:
+    """HTML of a picture of a scene or a run, or of its text where there is nothing to draw."""
     from rbfmuscle.importers.guess.orientation import orient_scene
-    from rbfmuscle.report.render import figure_html
+    from rbfmuscle.report.render import figure_html, render_run
     from rbfmuscle.report.scene_picture import draw_scene
+    from rbfmuscle.scene.scene import Scene
 
-    if not shown.bones:
-        return html.escape(repr(shown))
-    oriented = orient_scene(shown.with_options())
-    return figure_html(lambda file: draw_scene(oriented, file), repr(shown))
+    if isinstance(shown, Scene) and shown.bones:
+        oriented = orient_scene(shown.with_options())
+        return figure_html(lambda file: draw_scene(oriented, file), repr(shown))
+    if not isinstance(shown, Scene) and shown.has_surfaces:
+        return figure_html(lambda file: render_run(shown, file), f"{shown!r} {shown.verdict}")
+    return html.escape(repr(shown))
 
 
 showing.registered[:] = [showing.Views(_show, _picture)]

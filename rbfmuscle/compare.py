@@ -30,6 +30,7 @@ from rbfmuscle.run import stream_run
 from rbfmuscle.scene.frames import pick_frames
 from rbfmuscle.scene.options import OutputOptions
 from rbfmuscle.scene.phantom import open_scene
+from rbfmuscle.scene.scene import require_complete
 from rbfmuscle.scene.settings import chooses_model
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.validation import SolveError, UsageError
@@ -237,7 +238,7 @@ def _variants(scene, models, settings, frames):
         whole = {key: value for key, value in mine.items() if chooses_model(key)}
         own = {key: value for key, value in mine.items() if not chooses_model(key)}
         variant = configure_scene(scene, whole).with_options(model=name)
-        variants[name] = configure_scene(variant, own, frames=frames).validate()
+        variants[name] = require_complete(configure_scene(variant, own, frames=frames))
         variants[name].output = OutputOptions(report=False)
     return variants
 

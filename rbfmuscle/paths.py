@@ -18,8 +18,8 @@ from rbfmuscle.models import build_models
 from rbfmuscle.output.path_files import fit_path, write_paths
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.objects import Motion
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.objects import Motion, from_mm
+from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.validation import SceneError, SolveError, UsageError
@@ -67,7 +67,7 @@ def sample_muscles(
     over `STEP` to both sides, the muscle settling there too. Ranges that are ``given`` stand for
     the coordinates' own; ``progress`` is called with the poses that are done, and of how many.
     """
-    scene = scene.validate().with_options({"output.fibres": fibres})
+    scene = require_complete(scene).with_options({"output.fibres": fibres})
     scene.sliding = None
     groups = _groups(scene)
     found = []
@@ -162,7 +162,7 @@ def _row(loop, gauges, pose):
     known = all_coordinates(loop.scene.joints)
     for name, value in pose.items():
         turns = known[name].motion != "translation"
-        step = math.radians(STEP) if turns else loop.scene.length(STEP)
+        step = math.radians(STEP) if turns else from_mm(STEP, loop.scene.units)
         ends = [known[name].clamped_value(value + side * step) for side in (-1.0, 1.0)]
         below, above = (_settled(loop, gauges, {**pose, name: end}) for end in ends)
         arms.append(-(above - below) / (ends[1] - ends[0]))
@@ -268,7 +268,9 @@ def report_fits(
     unit = scene.units
     turning = {name: f.motion != "translation" for name, f in all_coordinates(scene.joints).items()}
     for found in sampled:
-        radian = [1.0 if turning[name] else scene.length(SHIFT) for name in found.coordinates]
+        radian = [
+            1.0 if turning[name] else from_mm(SHIFT, scene.units) for name in found.coordinates
+        ]
         path, row = _fit(found, np.array(radian))
         fitted.append(path)
         errors.append(row)
@@ -281,7 +283,9 @@ def report_fits(
             + (f"; at {found.unsettled} poses it did not settle" if found.unsettled else "")
         )
     with paths_folder(directory).staged() as stage:
-        write_paths(stage / "paths.xml", fitted, scene.length(1000.0), turning, targets or {})
+        write_paths(
+            stage / "paths.xml", fitted, from_mm(1000.0, scene.units), turning, targets or {}
+        )
         with (stage / "errors.csv").open("w", encoding="utf-8", newline="") as out:
             writer = csv.DictWriter(out, fieldnames=list(errors[0]), lineterminator="\n")
             writer.writeheader()

@@ -37,7 +37,8 @@ from rbfmuscle.scene.check import (
     stated_doubts,
 )
 from rbfmuscle.scene.guesses import doubtful
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.objects import from_mm
+from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.simulation.substeps import check_substeps
@@ -92,7 +93,7 @@ class Recording:
         self._start = time.perf_counter()
         self._end = 0.0
         scene = configure_scene(scene, settings, model=model, frames=frames)
-        self.scene = orient_scene(scene.validate())
+        self.scene = orient_scene(require_complete(scene))
         self.limits: Limits = parse_limits(fail_on, self.scene)
         if bone_sdfs is not None and set(bone_sdfs) != {bone.name for bone in scene.bones}:
             bones = ", ".join(bone.name for bone in scene.bones)
@@ -282,7 +283,7 @@ def _check_skeleton(scene: Scene) -> dict[int, Found]:
     values["missing_bones"] = float(len(scene.missing_bones))
     if doubts := doubtful(scene.guesses, "joint"):
         values["doubtful_guesses"] = float(len(doubts))
-    opened = scene.length(LIMITS["joint_gap"].value)
+    opened = from_mm(LIMITS["joint_gap"].value, scene.units)
     for place, parent, child, opening in joint_gaps(scene, sampled):
         frame = numbers[place]
         events, values = found.setdefault(frame, ([], {}))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -21,13 +20,12 @@ from rbfmuscle.progress import Progress
 from rbfmuscle.recording import MemorySink, Recording
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.showing import Displayed
 from rbfmuscle.simulation.frame import Frame
 from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    import rbfmuscle
 
 
 def simulate(
@@ -141,7 +139,7 @@ def stream_run(
     return recording.finish(writer, pictures=pictures)
 
 
-class Run(RunData):
+class Run(RunData, Displayed):
     """A run: what `simulate` returns, and what `Run.load` reads from a folder.
 
     Attributes are those of `RunData`, and:
@@ -232,12 +230,6 @@ class Run(RunData):
         names = [formats] if isinstance(formats, str) else list(formats)
         return export_run(self, names, output=directory, units=units, muscles=muscles)
 
-    def show(self) -> rbfmuscle.ViewerPage:
-        """Show the frames in a browser or a notebook; see `rbfmuscle.show`."""
-        import rbfmuscle
-
-        return rbfmuscle.show(self)
-
     def _write(self, directory):
         writer = RunWriter(directory, self.scene)
         for frame in self.frames:
@@ -245,13 +237,6 @@ class Run(RunData):
         writer.close(self.metrics)
         writer.write_info(self.info)
         return writer
-
-    def _repr_html_(self) -> str:
-        from rbfmuscle.report.render import figure_html, render_run
-
-        if not self.has_surfaces:
-            return html.escape(repr(self))
-        return figure_html(lambda file: render_run(self, file), f"{self!r} {self.verdict}")
 
 
 def _copy_run(source: Path, target: Path) -> None:

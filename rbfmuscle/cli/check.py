@@ -7,6 +7,7 @@ from time import perf_counter
 from rbfmuscle.cli.options import USUAL_WORK, Flag, SceneName, Work
 from rbfmuscle.cli.printing import print_result
 from rbfmuscle.progress import Progress, stage
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.validation import SceneError, UsageError
 
 
@@ -183,7 +184,7 @@ def _scene_lines(scene):
         )
     for muscle in scene.muscles:
         held = ", ".join(f"{len(a.vertices)} {_held_how(a)} {a.bone}" for a in muscle.attachments)
-        volume = muscle.mesh.volume / scene.length(10.0) ** 3
+        volume = muscle.mesh.volume / from_mm(10.0, scene.units) ** 3
         yield (
             f"  muscle {muscle.name}: model {muscle.model}, {len(muscle.mesh.vertices)} vertices, "
             f"{volume:.4g} cm3, attached: {held}"

@@ -15,7 +15,7 @@ from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, percentiles, unit
 from rbfmuscle.scene.guesses import guessed_muscles
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, shown_value
-from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.objects import MM_PER_UNIT, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame
 
@@ -221,7 +221,7 @@ def joint_gaps(scene: Scene, frames: Iterable[int]) -> list[tuple[int, str, str,
         child: vertices[child][:: -(-len(vertices[child]) // _VERTICES)] for _, child in pairs
     }
     rest = {(p, c): float(trees[p].query(points[c])[0].min()) for p, c in pairs}
-    meeting = [pair for pair in pairs if rest[pair] < scene.length(MEETING)]
+    meeting = [pair for pair in pairs if rest[pair] < from_mm(MEETING, scene.units)]
     found = []
     for frame in frames:
         poses: Mapping[str, Floats] = bone_poses(scene, scene.motion.frames[frame])

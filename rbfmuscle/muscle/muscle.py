@@ -30,6 +30,7 @@ from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform
 from rbfmuscle.muscle.surface_limits import SurfaceState
 from rbfmuscle.scene.ends import ordered_muscle
 from rbfmuscle.scene.joints.joint import Joint
+from rbfmuscle.scene.muscles import attachment_frames
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
@@ -93,7 +94,7 @@ class RBFMuscle:
         if not self.options.resolution and len(self.drawer.model.offset) == len(order):
             faces = np.ascontiguousarray(given.mesh.faces, dtype=np.int64)
             self._input = np.argsort(order), faces
-        names = scene.attachment_frames(muscle)
+        names = attachment_frames(scene.bones, muscle)
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
         owner = attached_owner(self.model)
         self.contact_spacing = CONTACT_SPACING * self.model.side

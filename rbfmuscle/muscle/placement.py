@@ -18,7 +18,7 @@ from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface
 from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing, surface_error
 from rbfmuscle.muscle.options import RBFOptions
-from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import NumericalWarning, SceneError
 
@@ -47,7 +47,9 @@ SEED = 0
 
 def default_centres(area: float, scene: Scene) -> int:
     """Number of centres of a muscle of this area [scene unit squared]."""
-    return max(LEAST_CENTRES, int(round(area / (AREA_FOR_EACH * scene.length(1.0) ** 2), -1)))
+    return max(
+        LEAST_CENTRES, int(round(area / (AREA_FOR_EACH * from_mm(1.0, scene.units) ** 2), -1))
+    )
 
 
 def wanted_error(muscle: Muscle, scene: Scene, options: RBFOptions) -> float:
@@ -57,7 +59,7 @@ def wanted_error(muscle: Muscle, scene: Scene, options: RBFOptions) -> float:
     if options.rest_error:
         return options.rest_error
     thickness = 2.0 * float(muscle.mesh.volume) / float(muscle.mesh.area)
-    return min(scene.length(REST_ERROR), REST_SHARE * thickness)
+    return min(from_mm(REST_ERROR, scene.units), REST_SHARE * thickness)
 
 
 class Chosen(NamedTuple):

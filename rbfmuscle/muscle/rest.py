@@ -13,6 +13,7 @@ from rbfmuscle.implicit.field import FieldFit, RBFField
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import choose_centres, place_points
 from rbfmuscle.scene.ends import ordered_muscle
+from rbfmuscle.scene.muscles import attachment_frames
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
@@ -93,7 +94,7 @@ class _Attachment:
         centres: np.ndarray,
         samples: np.ndarray,
     ) -> None:
-        names = sorted(scene.attachment_frames(muscle))
+        names = sorted(attachment_frames(scene.bones, muscle))
         patches = [np.asarray(attachment.vertices) for attachment in muscle.attachments]
         numbers = np.array(
             [names.index(attachment.attachment_frame) for attachment in muscle.attachments]

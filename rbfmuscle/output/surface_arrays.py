@@ -7,6 +7,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.surfaces import EdgeStretch
 from rbfmuscle.output.appearance import muscle_groups
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame, Mesh
 
@@ -45,7 +46,7 @@ class RunArrays:
         groups = muscle_groups(scene.joints, held)
         numbers = sorted(set(groups.values()))
         self._groups = {name: numbers.index(group) for name, group in groups.items()}
-        self._farthest = scene.length(FARTHEST)
+        self._farthest = from_mm(FARTHEST, scene.units)
         self._first: dict[str, VertexArrays] = {}
 
     def of(self, frame: Frame, name: str) -> Mapping[str, Floats]:

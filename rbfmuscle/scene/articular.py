@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def scene_surfaces(scene: Scene) -> dict[str, Floats]:
         for joint in scene.joints
         if joint.coordinates
     ]
-    return articular_points(joints, meshes, scene.length(1.0))
+    return articular_points(joints, meshes, from_mm(1.0, scene.units))
 
 
 def articular_share(
@@ -78,7 +78,7 @@ def articular_share(
         if held.tendon is None and len(surface):
             points = np.asarray(muscle.mesh.vertices)[held.vertices]
             near, _ = cKDTree(surface).query(points)
-            touched, beside = scene.length(TOUCHED), scene.length(BESIDE)
+            touched, beside = from_mm(TOUCHED, scene.units), from_mm(BESIDE, scene.units)
             some = near < touched + beside  # others cannot lie on it
             away = scene.bone(held.bone).exact.unsigned(points[some])
             lies = (near[some] <= away + beside) & (away < touched)

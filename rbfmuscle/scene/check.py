@@ -15,8 +15,8 @@ from rbfmuscle.scene.ends import attachment_ends
 from rbfmuscle.scene.extents import check_place, check_size
 from rbfmuscle.scene.guesses import doubtful, guessed_muscles
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.objects import Muscle
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.objects import Muscle, from_mm
+from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.validation import RBFMuscleError, SceneError
 
 MOST_ARTICULAR = 0.5  # share of an attachment that may lie on an articular surface
@@ -68,7 +68,7 @@ def check_scene(scene: Scene) -> list[Finding]:
     try:
         findings += bone_findings(bone_collisions(scene), scene.units)
         check_extents(scene)
-        scene.validate()
+        require_complete(scene)
     except RBFMuscleError as error:
         findings.append(Finding("error", scene.name, str(error)))
     return sort_findings(findings)
@@ -123,7 +123,7 @@ def open_ends(scene: Scene) -> dict[str, str]:
     found = {}
     for muscle in scene.muscles:
         gap, bone = end_gap(muscle, scene)
-        most = scene.length(END_GAP_MM)
+        most = from_mm(END_GAP_MM, scene.units)
         ends = attachment_ends(muscle, scene.joints)
         if ends is not None:
             first, last = (
@@ -206,7 +206,7 @@ def bone_collisions(
     found = []
     for frame in sampled_frames(scene) if frames is None else frames:
         depths = _pair_depths(scene, bone_poses(scene, scene.motion.frames[frame]))
-        least = scene.length(COUNTED_DEPTH_MM)
+        least = from_mm(COUNTED_DEPTH_MM, scene.units)
         found += [(frame, *pair, depth) for pair, depth in depths.items() if depth > least]
     return found
 

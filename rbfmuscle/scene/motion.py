@@ -12,6 +12,7 @@ from rbfmuscle.scene.joints.joint import (
     joint_poses,
     joint_values,
 )
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError, did_you_mean
@@ -67,7 +68,7 @@ def step_angle(
     first, second, rest = (
         joint_values(scene.joints, scene.couplings, q) for q in (before, after, {})
     )
-    lever, largest = scene.length(SHIFT_LEVER), 0.0
+    lever, largest = from_mm(SHIFT_LEVER, scene.units), 0.0
     for joint in scene.joints:
         name = joint.name
         if first[name] == second[name]:

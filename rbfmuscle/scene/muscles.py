@@ -231,3 +231,8 @@ def check_file_names(bones: list[Bone], muscles: list[Muscle]) -> None:
             raise SceneError(
                 f"bone {bone.name!r} has the name of a frame of bone {stem!r}; choose another"
             )
+
+
+def attachment_frames(bones: Sequence[Bone], muscle: Muscle) -> list[str]:
+    """Names of the bones, then of the ends that tendons of a muscle hold."""
+    return [*(bone.name for bone in bones), *(end.name for end in muscle.tendons)]

@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
 
 
+def from_mm(millimetres: float, units: str) -> float:
+    """A length given in millimetres, in other units ("mm", "cm" or "m")."""
+    return millimetres / MM_PER_UNIT[units]
+
+
 class ViaTable(Table):
     """A via point of a tendon on another bone than the insertion's."""
 

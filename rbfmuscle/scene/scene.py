@@ -10,7 +10,6 @@ from typing import Self
 
 from numpy.typing import ArrayLike
 
-from rbfmuscle import showing
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.extents import check_centre, check_place, check_size
 from rbfmuscle.scene.file import ABOUT, SceneFile, given_keys, read_scene_file
@@ -22,7 +21,7 @@ from rbfmuscle.scene.meshes.read import MeshInput, as_mesh, read_mesh
 from rbfmuscle.scene.meshes.transform import TransformInput, mesh_transform
 from rbfmuscle.scene.muscles import check_file_names, check_muscle, make_muscle, tendon_ends
 from rbfmuscle.scene.names import check_new_name, find_named
-from rbfmuscle.scene.objects import MM_PER_UNIT, Attachment, Motion, Muscle
+from rbfmuscle.scene.objects import MM_PER_UNIT, Attachment, Motion, Muscle, from_mm
 from rbfmuscle.scene.options import (
     ContactOptions,
     DetectOptions,
@@ -35,11 +34,12 @@ from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
 from rbfmuscle.scene.save import SceneFiles
 from rbfmuscle.scene.settings import TABLES, change_settings
 from rbfmuscle.scene.upgrade import FORMAT
+from rbfmuscle.showing import Displayed
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
 
 @dataclass(eq=False, repr=False)
-class Scene:
+class Scene(Displayed):
     """Bones, joints, muscles, a motion and the settings of a simulation.
 
     Examples
@@ -110,9 +110,11 @@ class Scene:
         try:
             _add_rows(scene, tables)
             _take_settings(scene, {key: getattr(tables, key) for key in TABLES})
-            return scene if skeleton and not scene.muscles else scene.validate()
+            if scene.muscles or not skeleton:
+                require_complete(scene)
         except (SceneError, MeshError) as error:
             raise type(error)(f"{path}: {error}") from None
+        return scene
 
     def save(self, path: str | Path, *, folder: Path | None = None, comment: str = "") -> Path:
         """Write the scene as a TOML file that loads as the same scene, and return its path.
@@ -286,19 +288,6 @@ class Scene:
         _take_settings(self, {"motion": table})
         return self
 
-    def validate(self) -> Self:
-        """Return the scene, or raise SceneError if it cannot be simulated: no bones, no muscles,
-        loose muscles.
-        """
-        for what in ("bones", "muscles"):
-            if not getattr(self, what):
-                raise SceneError(f"scene {self.name!r} has no {what}, add a [[{what[:-1]}]]")
-        check_file_names(self.bones, self.muscles)
-        check_coordinates(self.motion, self.joints)
-        for muscle in self.muscles:
-            check_muscle(muscle, self.motion)
-        return self
-
     def with_options(
         self,
         settings: Mapping[str, object] | None = None,
@@ -339,10 +328,6 @@ class Scene:
             raise UsageError(str(error)) from None
         return changed
 
-    def length(self, millimetres: float) -> float:
-        """Return a length given in millimetres in the scene's unit."""
-        return millimetres / MM_PER_UNIT[self.units]
-
     def bone(self, name: str) -> Bone:
         """Return the bone of that name, or raise SceneError naming the nearest."""
         return find_named(self.bones, name, "bone")
@@ -351,21 +336,24 @@ class Scene:
         """Return the muscle of that name, or raise SceneError naming the nearest."""
         return find_named(self.muscles, name, "muscle")
 
-    def attachment_frames(self, muscle: Muscle) -> list[str]:
-        """Names of the bones, then of the ends that tendons of a muscle hold."""
-        return [*(bone.name for bone in self.bones), *(end.name for end in muscle.tendons)]
 
-    def show(self, *, model: str | None = None) -> showing.ShownPage:
-        """Show the scene in a browser or a notebook, to be moved by hand; see `rbfmuscle.show`."""
-        return showing.registered[0].show(self, model=model)
-
-    def _repr_html_(self) -> str:
-        return showing.registered[0].picture(self)
+def require_complete(scene: Scene) -> Scene:
+    """Return the scene, or raise SceneError if it cannot be simulated: no bones, no muscles, loose
+    muscles.
+    """
+    for what in ("bones", "muscles"):
+        if not getattr(scene, what):
+            raise SceneError(f"scene {scene.name!r} has no {what}, add a [[{what[:-1]}]]")
+    check_file_names(scene.bones, scene.muscles)
+    check_coordinates(scene.motion, scene.joints)
+    for muscle in scene.muscles:
+        check_muscle(muscle, scene.motion)
+    return scene
 
 
 def _made_motion(scene: Scene, options: MotionOptions) -> Motion:
     """The motion that ``[motion]`` asks of a scene."""
-    return make_motion(options, scene.joints, scene.couplings, metre=scene.length(1000.0))
+    return make_motion(options, scene.joints, scene.couplings, metre=from_mm(1000.0, scene.units))
 
 
 def _add_rows(scene: Scene, tables: SceneFile) -> None:

@@ -10,7 +10,7 @@ from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import SHIFT_LEVER
-from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.objects import Motion, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Frame, MuscleModel
@@ -38,7 +38,7 @@ class LiveSession:
         self.activation = {m.name: 0.0 for m in scene.muscles if m.contraction is not None}
         #: A shift counts as the turn that moves a place at this lever as far.
         self._lever = {
-            n: scene.length(SHIFT_LEVER) if known[n].motion == "translation" else 1.0
+            n: from_mm(SHIFT_LEVER, scene.units) if known[n].motion == "translation" else 1.0
             for n in self.rest
         }
         self._loop: FrameLoop
@@ -126,7 +126,7 @@ def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
         if name in followers or coordinate.locked:
             continue
         free = (
-            scene.length(FREE_RANGE)
+            from_mm(FREE_RANGE, scene.units)
             if coordinate.motion == "translation"
             else math.radians(FREE_RANGE)
         )

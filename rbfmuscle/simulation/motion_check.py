@@ -14,7 +14,7 @@ from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import Finding
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 
 # Greatest numbers of frames and of vertices of an attachment that are checked.
@@ -83,7 +83,7 @@ def _followed(
             if not all(np.allclose(place, places[0], atol=1e-9) for place in places[1:]):
                 depths = np.array([_depth(points, bounds, place, other) for place in places])
                 deeper = np.maximum(depths - depths[0], 0.0)
-                yield (bone, other.name), deeper, deeper[1:] > scene.length(DEEPER)
+                yield (bone, other.name), deeper, deeper[1:] > from_mm(DEEPER, scene.units)
     for pair in itertools.combinations(patches, 2):
         one, other = (np.append(patches[bone].mean(axis=0), 1.0) for bone in pair)
         away = np.array(

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.stepper import MuscleStepper
 from rbfmuscle.validation import SceneError
@@ -29,7 +30,7 @@ def resolve_initial_overlap(stepper: MuscleStepper) -> None:
     raises SceneError.
     """
     contacts, scene = stepper.contacts, stepper.scene
-    least, initial = scene.length(DEPTH), scene.contact.initial
+    least, initial = from_mm(DEPTH, scene.units), scene.contact.initial
     overlap = _depths_at_rest(contacts, stepper.model.contact_points(), least)
     for b, depth in sorted(overlap.items(), key=lambda found: -found[1].max()):
         count, bone = int((depth > least).sum()), contacts.bones.names[b]
@@ -66,8 +67,8 @@ def _resolve(stepper: MuscleStepper, overlap: dict[int, Floats]) -> None:
     contacts, model = stepper.contacts, stepper.model
     model.predict(contacts.poses, contacts.poses)
     deepest = max(float(depth.max()) for depth in overlap.values())
-    growths = max(1, math.ceil(deepest / stepper.scene.length(GROWTH)))
-    settled = stepper.scene.length(SETTLED)
+    growths = max(1, math.ceil(deepest / from_mm(GROWTH, stepper.scene.units)))
+    settled = from_mm(SETTLED, stepper.scene.units)
     for k in range(MOST_SOLVES + growths):
         for b, depth in overlap.items():
             contacts.allow(b, depth * max(0.0, 1.0 - (k + 1) / growths))

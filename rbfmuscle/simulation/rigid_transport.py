@@ -11,7 +11,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
-from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import MuscleModel
@@ -55,7 +55,7 @@ class RigidTransport:
         vertices = np.asarray(muscle.mesh.vertices, dtype=float)
         frame = RestFrame(vertices)
         size = diameter(vertices)
-        self.clear = scene.length(CLEAR)
+        self.clear = from_mm(CLEAR, scene.units)
         held: dict[str, list[np.ndarray]] = {}
         for attachment in muscle.attachments:
             held.setdefault(attachment.attachment_frame, []).append(attachment.vertices)

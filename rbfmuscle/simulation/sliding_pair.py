@@ -10,6 +10,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.simulation.contact import Planes
 from rbfmuscle.simulation.neighbour_surface import Found, NeighbourSurface
 
@@ -271,12 +272,14 @@ class SlidingLimits:
 
     def __init__(self, options: SlidingOptions, scene: Scene) -> None:
         self.threshold = (
-            scene.length(THRESHOLD) if options.threshold is None else float(options.threshold)
+            from_mm(THRESHOLD, scene.units)
+            if options.threshold is None
+            else float(options.threshold)
         )
-        self.strip = scene.length(STRIP)
+        self.strip = from_mm(STRIP, scene.units)
         self.hold = self.threshold + self.strip
-        self.release = scene.length(RELEASE)
-        self.search = max(scene.length(SEARCH), self.threshold)
+        self.release = from_mm(RELEASE, scene.units)
+        self.search = max(from_mm(SEARCH, scene.units), self.threshold)
         self.reach = max(self.search, self.hold + self.release)
-        self.clear, self.deep = scene.length(CLEAR), scene.length(DEEP)
-        self.drawn, self.most = scene.length(DRAWN), scene.length(MOST)
+        self.clear, self.deep = from_mm(CLEAR, scene.units), from_mm(DEEP, scene.units)
+        self.drawn, self.most = from_mm(DRAWN, scene.units), from_mm(MOST, scene.units)

@@ -14,6 +14,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.motion import shown_value, step_angle, unit_sign
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.contact import BoneContacts, Neighbour, Planes
@@ -96,7 +97,7 @@ class MuscleStepper:
         self.name = model.name
         self.poses = poses or PoseCache(scene)
         self.detect = scene.detect.tunnelling if scene.detect is not None else None
-        self.tolerance = scene.length(TOUCH)
+        self.tolerance = from_mm(TOUCH, scene.units)
         self.times: dict[str, float] = defaultdict(float)
         self.cost = (0.0, 0.0)
         self.events: dict[tuple[int, str, str], int] = {}

@@ -19,7 +19,7 @@ from rbfmuscle.scene.motion import (
     step_angle,
     unit_sign,
 )
-from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError
@@ -211,7 +211,7 @@ class SubSteps:
         may be infinite.
         """
         turns = self._facts[name].motion == "rotation"
-        probe = self.limit if turns else self.scene.length(1.0)
+        probe = self.limit if turns else from_mm(1.0, self.scene.units)
         rest = rest_coordinates(self.scene)
         moved = {**rest, name: rest.get(name, 0.0) + probe}
         with np.errstate(all="ignore"):

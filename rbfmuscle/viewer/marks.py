@@ -9,6 +9,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.vectors import unit
 from rbfmuscle.scene.check import stated_doubts
 from rbfmuscle.scene.guesses import doubtful
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Mesh
 
@@ -49,7 +50,7 @@ class Marks(NamedTuple):
 
 def scene_marks(scene: Scene) -> Marks:
     """The marks of a scene; attachments that tendons hold are left out."""
-    axes, reach = {}, scene.length(REACH)
+    axes, reach = {}, from_mm(REACH, scene.units)
     for joint in scene.joints:
         moving = [a for a in (*joint.rotations, *joint.translations) if a.coordinates]
         along = np.array([axis.direction for axis in moving]).reshape(-1, 3)

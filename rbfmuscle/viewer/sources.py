@@ -21,8 +21,8 @@ from rbfmuscle.output.run_data import RunData, frame_caption
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
-from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes, from_mm
+from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import FibreLines, Frame, MuscleModel
 from rbfmuscle.simulation.live import LiveSession, live_fields
@@ -71,10 +71,10 @@ class LiveSource:
     """
 
     def __init__(self, scene: Scene, model: str | None = None) -> None:
-        self.scene = scene = orient_scene(configure_scene(scene, model=model).validate())
+        self.scene = scene = orient_scene(require_complete(configure_scene(scene, model=model)))
         self.title = scene.name
         self.units = scene.units
-        self.millimetre = scene.length(1.0)
+        self.millimetre = from_mm(1.0, scene.units)
         self.body = body_axes(scene.superior, scene.anterior)
         first = scene.muscles[0].model
         self.choices = [first, *(name for name in model_names() if name != first)]

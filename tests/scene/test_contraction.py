@@ -16,7 +16,7 @@ from rbfmuscle.scene.activation.contraction import (
 from rbfmuscle.scene.activation.keys import contraction_keys
 from rbfmuscle.scene.frames import slice_motion
 from rbfmuscle.scene.objects import Motion, Muscle
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.validation import SceneError
 
 
@@ -85,7 +85,7 @@ def test_tendon_is_measured_from_the_attachments_or_from_one():
 )
 def test_wrong_keys_are_one_line(keys, words):
     with pytest.raises(SceneError, match=words) as caught:
-        scene(**keys).validate()
+        require_complete(scene(**keys))
     assert "\n" not in str(caught.value) and MUSCLE in str(caught.value)
 
 
@@ -93,7 +93,7 @@ def test_fibres_that_leave_the_muscle_are_refused():
     made = scene()
     made.muscle(MUSCLE).fibres = [line + [0, 0, 80.0] for line in made.muscle(MUSCLE).fibres]
     with pytest.raises(SceneError, match="leaves the muscle"):
-        made.validate()
+        require_complete(made)
 
 
 STO = """activations
@@ -159,7 +159,7 @@ class TestOverTime:
     def test_time_needs_a_motion_with_times(self):
         made = scene(activation={"times": [0, 1], "values": [0, 1]})
         with pytest.raises(SceneError, match="goes by time, and the motion has none"):
-            made.validate()
+            require_complete(made)
 
     def test_a_saved_scene_has_the_same_curve(self, tmp_path):
         made = arm_scene()

@@ -12,8 +12,9 @@ from conftest import ROOT
 
 from rbfmuscle.scene.check import bone_collisions, check_initial, check_scene
 from rbfmuscle.scene.frames import parse_slice
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.record import record_scene
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.scene.settings import parse_settings
 from rbfmuscle.scene.toml_text import attachment_file
 from rbfmuscle.validation import SceneError, UsageError
@@ -64,7 +65,7 @@ class TestLoading:
         metres = load(
             folder, ('units = "mm"', 'units = "m"'), ("near = 4", "near = 0.004"), *scaled
         )
-        assert metres.length(4) == pytest.approx(0.004)
+        assert from_mm(4, metres.units) == pytest.approx(0.004)
         assert metres.muscles[0].mesh.volume * 1e9 == pytest.approx(
             load(folder).muscles[0].mesh.volume
         )
@@ -139,7 +140,7 @@ class TestMistakes:
                 "to 'upper' only",
             ),
             (lambda: load(folder, (muscle, "")), r"has no muscles, add a \[\[muscle\]\]$"),
-            (Scene("bare").validate, r"has no bones, add a \[\[bone\]\]$"),
+            (lambda: require_complete(Scene("bare")), r"has no bones, add a \[\[bone\]\]$"),
             (lambda: Scene.load(folder), "is a folder"),
             (
                 lambda: built().add_joint("again", "upper", "lower", (0, 0, 0), axes),
@@ -185,7 +186,7 @@ class TestFileNames:
                     },
                 ]
                 scene.add_muscle(name, ball, attach=held)
-            scene.validate()
+            require_complete(scene)
 
     def test_names_that_stay_apart_are_taken(self):
         scene = Scene(units="mm").add_bone("rib").add_bone("rib_1").add_bone("rib_x001")
