@@ -107,18 +107,19 @@ def crossing_loop(vertices, tree, among, folds, boxes, found):
     """
     faces, count = tree.corners, len(tree.corners)
     plain = np.zeros(len(vertices), np.bool_)
-    if tree.closed and folds:
-        plain_loop(vertices, tree.start, tree.other, plain)
-    asked, any_asked = np.zeros(LEAF * tree.leaves, np.bool_), False
+    asked = np.zeros(LEAF * tree.leaves, np.bool_)
     for f in range(count):
-        folded = not (plain[faces[f, 0]] and plain[faces[f, 1]] and plain[faces[f, 2]])
-        asked[f] = among[tree.order[f]] or (folds and folded)
-        any_asked |= asked[f]
+        asked[f] = among[tree.order[f]]
+    if folds:
+        if tree.closed:
+            plain_loop(vertices, tree.start, tree.other, plain)
+        for f in range(count):
+            asked[f] |= not (plain[faces[f, 0]] and plain[faces[f, 1]] and plain[faces[f, 2]])
     found[:] = False
-    if not any_asked:
-        return 0
     wanted = np.zeros(2 * tree.leaves, np.bool_)
     _wanted_loop(asked, tree.leaves, wanted)
+    if not wanted[1]:
+        return 0
     fresh = folds or boxes.node[1, 0] == np.inf
     _boxes_loop(vertices, faces, np.ones_like(wanted) if fresh else wanted, boxes)
     room = 16 * tree.leaves
@@ -131,8 +132,9 @@ def crossing_loop(vertices, tree, among, folds, boxes, found):
     _cross_loop(vertices, faces, (pairs[:met], boxes.face), (asked, plain), crossed)
     total = 0
     for f in range(count):
-        found[tree.order[f]] = crossed[f]
-        total += crossed[f]
+        if crossed[f]:
+            found[tree.order[f]] = True
+            total += 1
     return total
 
 
@@ -182,8 +184,11 @@ def _boxes_loop(vertices, faces, changed, boxes):
 @compiled
 def _wanted_loop(asked, leaves, wanted):
     """Mark the nodes that hold triangles among which crossings are sought."""
-    for f in range(len(asked)):
-        wanted[leaves + f // LEAF] |= asked[f]
+    for leaf in range(leaves):
+        some = False
+        for place in range(LEAF):
+            some |= asked[LEAF * leaf + place]
+        wanted[leaves + leaf] = some
     for k in range(leaves - 1, 0, -1):
         wanted[k] = wanted[2 * k] or wanted[2 * k + 1]
 

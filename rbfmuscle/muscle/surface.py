@@ -246,7 +246,7 @@ def _fill(model, state, obstacles, work, embedded):
     """The volume to the last digit; what its last step drove into a bone is brought out and stays
     there. False where no level has the volume.
     """
-    mark_near(work)
+    mark_near(work, np.arange(len(work.near)))
     near = np.flatnonzero(work.near)
     if embedded:
         # What was smoothed stays put otherwise, and that may be all of it.

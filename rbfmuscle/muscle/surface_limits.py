@@ -113,9 +113,11 @@ def lift(obstacles, state, work, rows):
 
 
 @compiled
-def mark_near(work):
-    """Mark what has gone so far from where the material carries it that it may lie in a bone."""
-    for v in range(len(work.near)):
+def mark_near(work, rows):
+    """Mark those of some vertices that have gone so far from where the material carries them that
+    they may lie in a bone.
+    """
+    for v in rows:
         square, least = 0.0, max(work.least[v], 0.0)
         for a in range(3):
             square += (work.vertices[v, a] - work.carried[v, a]) ** 2
@@ -161,6 +163,8 @@ def _near_faces(model, work, among):
         p = model.faces[f, 0]
         q = model.faces[f, 1]
         r = model.faces[f, 2]
+        if not (among[p] or among[q] or among[r]):
+            continue
         one = 0.0
         two = 0.0
         three = 0.0
@@ -169,9 +173,7 @@ def _near_faces(model, work, among):
             two += (x[r, a] - x[q, a]) ** 2
             three += (x[p, a] - x[r, a]) ** 2
         near, side = min(least[p], least[q], least[r]), max(one, two, three)
-        if (near <= 0.0 or near * near < NEAR_FACE * NEAR_FACE * side) and (
-            among[p] or among[q] or among[r]
-        ):
+        if near <= 0.0 or near * near < NEAR_FACE * NEAR_FACE * side:
             faces[count, 0] = p
             faces[count, 1] = q
             faces[count, 2] = r
@@ -213,7 +215,7 @@ def untangle(model, state, obstacles, work, embedded, sound, asked, folds):
         if at_once or (turn == 2 * TRIED and len(sound) == 0):
             knotted[:] = True
         smooth_loop(work.vertices, np.flatnonzero(marked & knotted), model.start, model.other)
-        mark_near(work)
+        mark_near(work, np.flatnonzero(marked))
         lift(obstacles, state, work, np.flatnonzero(marked & work.near))
     return moved
 

@@ -131,44 +131,39 @@ def push_off_loop(vertices, faces, grid, pose, tolerance, moved):
         met = _near_loop(local, faces, grid, pairs)
     if met == 0:
         return
-    point, first, near = _sort_loop(pairs, met, len(grid.points))
+    point, first, near = _sort_loop(pairs[:, :met], grid.number, len(faces))
     places = np.empty((len(point), 3))
     for p in range(len(point)):
         for a in range(3):
             places[p, a] = pose[a, 3]
             for b in range(3):
                 places[p, a] += pose[a, b] * grid.points[point[p], b]
-    # In the order of the bone's vertices, so that a scene that is turned is drawn alike.
-    order = np.argsort(grid.number[point])
     for _ in range(ROUNDS):
-        if not _push_loop(vertices, faces, (places, first, near, order), tolerance, moved):
+        if not _push_loop(vertices, faces, (places, first, near), tolerance, moved):
             break
 
 
 @compiled
-def _sort_loop(pairs, met, count):
+def _sort_loop(pairs, number, faces):
     """Points that triangles are near, and the triangles of point k: ``near[first[k] : first[k +
     1]]``.
+
+    In the order of the points' ``number``, so that a scene that is turned is drawn alike.
     """
-    begin = np.zeros(count + 1, np.int64)
+    met = pairs.shape[1]
+    key = np.empty(met, np.int64)
     for m in range(met):
-        begin[pairs[0, m] + 1] += 1
+        key[m] = number[pairs[0, m]] * faces + pairs[1, m]
+    point, first, near = np.empty(met, np.int64), np.empty(met + 1, np.int64), np.empty_like(key)
     used = 0
-    for p in range(count):
-        used += begin[p + 1] > 0
-    point = np.empty(used, np.int64)
-    first = np.zeros(used + 1, np.int64)
-    near = np.empty(met, np.int64)
-    used = 0
-    for p in range(count):
-        if begin[p + 1] > 0:
-            point[used], first[used + 1] = p, first[used] + begin[p + 1]
+    for place, m in enumerate(np.argsort(key)):
+        if used == 0 or point[used - 1] != pairs[0, m]:
+            point[used] = pairs[0, m]
+            first[used] = place
             used += 1
-        begin[p + 1] += begin[p]
-    for m in range(met):
-        near[begin[pairs[0, m]]] = pairs[1, m]
-        begin[pairs[0, m]] += 1
-    return point, first, near
+        near[place] = pairs[1, m]
+    first[used] = met
+    return point[:used], first[: used + 1], near
 
 
 @compiled(inline="always")
@@ -252,9 +247,9 @@ def _is_near(plane, square, margin, point, least, most):
 @compiled
 def _push_loop(vertices, faces, near_points, tolerance, moved):
     """One pass over the points; returns whether any had to be pushed off."""
-    points, first, near, order = near_points
+    points, first, near = near_points
     pushed = False
-    for p in order:
+    for p in range(len(points)):
         best, depth = _triangle_over(vertices, faces, points[p], near[first[p] : first[p + 1]])
         if best < 0 or depth <= ASKED * tolerance or depth > CHORD * _length(vertices, faces, best):
             continue
