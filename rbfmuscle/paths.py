@@ -13,6 +13,7 @@ import numpy as np
 from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
 from rbfmuscle.output.path_files import fit_path, write_paths
@@ -180,7 +181,7 @@ def _settled(loop, gauges, pose):
 
 def _settle(stepper, here):
     points = stepper.model.contact_points().copy()
-    small = SETTLED * float(np.linalg.norm(np.ptp(points, axis=0)))
+    small = SETTLED * box_size(points)
     for _ in range(MOST_SOLVES):
         stepper.solve(dict(here))
         before, points = points, stepper.model.contact_points().copy()

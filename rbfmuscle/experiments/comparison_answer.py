@@ -7,7 +7,7 @@ from rbfmuscle.experiments.measures import DEEPER, FIRST, MEASURES
 from rbfmuscle.metrics.quantities import ALL, unit_text
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.run_data import RunData
-from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.objects import from_mm
 
 # A model keeps out of bones that is no deeper in one [mm].
 KEPT_OUT = 0.3
@@ -30,7 +30,7 @@ def best_models(results: dict[str, Values], quantity: str, units: str) -> list[s
     values = {name: abs(value - measure.ideal) for name, value in known.items()}
     if measure.against == FIRST or len(values) < 2:
         return []
-    scale = 1.0 / MM_PER_UNIT[units] if measure.kind == "length" else 1.0
+    scale = from_mm(1.0, units) if measure.kind == "length" else 1.0
     limit = _TIE * min(values.values()) + measure.floor * scale
     return [name for name, value in values.items() if value <= limit]
 
@@ -106,13 +106,13 @@ def _depths(whole: Values, labels: dict[str, str], units: str) -> list[str]:
     """Whether the first model keeps out of bones; ``whole`` are values of all muscles by model."""
     first = next(iter(whole))
     depth = whole[first].get(DEEPER, 0.0)
-    verb = "keeps out of" if depth <= KEPT_OUT / MM_PER_UNIT[units] else "enters"
+    verb = "keeps out of" if depth <= from_mm(KEPT_OUT, units) else "enters"
     texts = [
         f"{labels[first]} {verb} bones: {shown_number(depth, units)} deep at most beyond "
         "the overlap at rest"
     ]
     before = whole[first].get("solver_penetration_max", 0.0)
-    if before > whole[first].get("penetration_max", 0.0) + 0.02 / MM_PER_UNIT[units]:
+    if before > whole[first].get("penetration_max", 0.0) + from_mm(0.02, units):
         texts.append(
             f"Before it is clipped along bones its points are {shown_number(before, units)} deep"
         )

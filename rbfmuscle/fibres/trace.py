@@ -9,7 +9,7 @@ from rbfmuscle.fibres.flux import FluxField
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.tubes import distance_along, points_along
-from rbfmuscle.geometry.vectors import unit
+from rbfmuscle.geometry.vectors import box_size, unit
 from rbfmuscle.scene.bone import BoneDistance
 
 POINTS = 25  # of a fibre, at even distances along it
@@ -104,7 +104,7 @@ class _Tracer:
         self.flux = flux
         self.ends = [cKDTree(end) for end in ends]
         self.step = STEP * flux.side
-        size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+        size = box_size(mesh.vertices)
         self.most = int(LONGEST * size / self.step)
 
     def trace(self, seeds: Floats, sense: int) -> tuple[list[Floats], Integers]:

@@ -1,4 +1,4 @@
-"""Directions: vectors at length one, and their parts across an axis."""
+"""Directions, points under rigid motions, and the size of a set of points."""
 
 import numpy as np
 
@@ -14,3 +14,18 @@ def unit(vectors: Floats) -> Floats:
 def across(vectors: Floats, axis: Floats) -> Floats:
     """Part of vectors (3,) or (n, 3) that is across a unit axis (3,)."""
     return np.asarray(vectors - np.multiply.outer(vectors @ axis, axis))
+
+
+def to_world(points: Floats, pose: Floats) -> Floats:
+    """Points (..., 3) of a frame (4, 4) in the world; the frame may be any affine map."""
+    return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
+
+
+def to_local(points: Floats, pose: Floats) -> Floats:
+    """Points (..., 3) of the world in a frame (4, 4) of unit axes."""
+    return np.asarray((points - pose[:3, 3]) @ pose[:3, :3])
+
+
+def box_size(points: Floats) -> float:
+    """Diagonal of the box along the axes that holds points (n, 3)."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))

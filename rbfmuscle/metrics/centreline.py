@@ -19,6 +19,7 @@ from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import connected_vertices, vertex_areas
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
+from rbfmuscle.geometry.vectors import to_local
 from rbfmuscle.jit import compiled
 from rbfmuscle.metrics.depths import bones_about
 from rbfmuscle.scene.bone import BoneDistance
@@ -371,7 +372,7 @@ def _planes(
     gap, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
     for probe in probes:
         pose = poses[probe.name]
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        local = to_local(points, pose)
         distance, closest, outward = probe.nearest(local)
         far = np.abs(distance) > least
         outward[far] = (local[far] - closest[far]) / distance[far, None]

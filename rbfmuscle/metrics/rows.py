@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, percentiles, unit_text
 from rbfmuscle.scene.guesses import guessed_muscles
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, shown_value
-from rbfmuscle.scene.objects import MM_PER_UNIT, from_mm
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame
 
@@ -142,7 +143,7 @@ def reaches(names: Iterable[str], shifts: Collection[str], units: str) -> dict[s
     """Over how much of each of some coordinates moment arms are fitted [radian, or of ``shifts``
     scene unit].
     """
-    near = REACH / MM_PER_UNIT[units]
+    near = from_mm(REACH, units)
     return {name: near if name in shifts else math.radians(REACH) for name in names}
 
 
@@ -226,8 +227,8 @@ def joint_gaps(scene: Scene, frames: Iterable[int]) -> list[tuple[int, str, str,
     for frame in frames:
         poses: Mapping[str, Floats] = bone_poses(scene, scene.motion.frames[frame])
         for parent, child in meeting:
-            relative = np.linalg.solve(poses[parent], poses[child])
-            moved = points[child] @ relative[:3, :3].T + relative[:3, 3]
+            relative = np.asarray(np.linalg.solve(poses[parent], poses[child]), dtype=np.float64)
+            moved = to_world(points[child], relative)
             gap = float(trees[parent].query(moved)[0].min())
             found.append((frame, parent, child, gap - rest[parent, child]))
     return found

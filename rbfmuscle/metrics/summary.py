@@ -12,7 +12,7 @@ from typing_extensions import TypedDict
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row
 from rbfmuscle.scene.check import END_GAP_MM, END_SHARE, MOST_ARTICULAR
-from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import UsageError, did_you_mean
 
@@ -285,7 +285,7 @@ def default_limit(quantity: str, scene: Scene) -> float:
 
 
 def _in_unit(value, quantity, unit):
-    return value / MM_PER_UNIT[unit] if QUANTITIES[quantity][0] == "length" else value
+    return from_mm(value, unit) if QUANTITIES[quantity][0] == "length" else value
 
 
 def muscle_limit(quantity: str, limits: Limits, found: Mapping[str, QuantityFacts]) -> float:

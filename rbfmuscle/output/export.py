@@ -10,6 +10,7 @@ import numpy as np
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.solids import SolidDistance
+from rbfmuscle.geometry.vectors import to_local
 from rbfmuscle.output.animation.gltf import animated_glb
 from rbfmuscle.output.animation.parts import AnimatedMesh, Animation, read_animation
 from rbfmuscle.output.animation.usd import check_usd, write_usd
@@ -216,7 +217,7 @@ class SurfaceArrays:
 def _at_rest(points: Floats, bone: AnimatedMesh, k: int) -> Floats:
     """Points (n, 3) in the frame of a bone at rest."""
     pose = np.eye(4) if bone.poses is None else bone.poses[k]
-    return (points - pose[:3, 3]) @ pose[:3, :3]
+    return to_local(points, pose)
 
 
 def write_mesh(path: Path, mesh: InputMesh, arrays: Mapping[str, Floats]) -> None:

@@ -1,7 +1,7 @@
 """Fibres of a run in its folder: a file of polylines for each muscle and frame, and one table."""
 
 import csv
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -67,20 +67,3 @@ def write_frame(directory: Path, frame: int, fibres: Mapping[str, FibreLines]) -
         for muscle, lines in fibres.items():
             for number, row in enumerate(zip(lines.lengths.tolist(), lines.stretch.tolist())):
                 writer.writerow((frame, muscle, number, *row))
-
-
-class SavedFibres(Mapping[str, FibreLines]):
-    """Fibres of the muscles in a frame of a run's folder, each read when it is asked for."""
-
-    def __init__(self, directory: Path, muscles: list[str], frame: int) -> None:
-        self._files = {name: directory / fibre_file(name, frame) for name in muscles}
-        self._files = {name: file for name, file in self._files.items() if file.is_file()}
-
-    def __getitem__(self, muscle: str) -> FibreLines:
-        return read_fibres(self._files[muscle])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._files)
-
-    def __len__(self) -> int:
-        return len(self._files)

@@ -2,6 +2,7 @@
 read.
 """
 
+from functools import partial
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt
@@ -14,19 +15,9 @@ from rbfmuscle.scene.tendons import tendon_name
 FORMAT = 2
 
 
-def _check_bone(name: str) -> str:
-    check_name(name, "bone")
-    return name
-
-
-def _check_muscle(name: str) -> str:
-    check_name(name, "muscle")
-    return name
-
-
 # Names become those of files.
-BoneName = Annotated[str, AfterValidator(_check_bone)]
-MuscleName = Annotated[str, AfterValidator(_check_muscle)]
+BoneName = Annotated[str, AfterValidator(partial(check_name, what="bone"))]
+MuscleName = Annotated[str, AfterValidator(partial(check_name, what="muscle"))]
 
 
 class Part(BaseModel):

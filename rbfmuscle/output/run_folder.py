@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.output.fibre_files import SavedFibres
+from rbfmuscle.output.fibre_files import fibre_file, read_fibres
 from rbfmuscle.output.given_files import read_given
 from rbfmuscle.output.info import FORMAT, FrameInfo, RunInfo
 from rbfmuscle.output.vtp import read_vtp
@@ -24,6 +24,7 @@ from rbfmuscle.validation import SceneError, UsageError
 
 Mesh = tuple[Floats, Integers]
 _Row = TypeVar("_Row")
+_Content = TypeVar("_Content")
 Poses = dict[int, dict[str, Floats]]  # (4, 4) by frame and bone
 
 
@@ -50,20 +51,24 @@ class FolderMeshes:
         return read_vtp(surface_file(self._folder, tendon_name(muscle), frame.index))
 
 
-class FolderSurfaces(Mapping[str, ModelSurface]):
-    """Surfaces of some muscles in a frame of a run's folder, each read when it is asked for."""
+class ReadFiles(Mapping[str, _Content]):
+    """What files hold by muscle, each read when it is asked for."""
 
-    def __init__(self, directory: Path, muscles: list[str], frame: int) -> None:
-        self._files = {name: surface_file(directory, name, frame) for name in muscles}
+    def __init__(self, files: Mapping[str, Path], read: Callable[[Path], _Content]) -> None:
+        self._files, self._read = files, read
 
-    def __getitem__(self, muscle: str) -> ModelSurface:
-        return ModelSurface(*read_vtp(self._files[muscle]))
+    def __getitem__(self, muscle: str) -> _Content:
+        return self._read(self._files[muscle])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._files)
 
     def __len__(self) -> int:
         return len(self._files)
+
+
+def _read_surface(path: Path) -> ModelSurface:
+    return ModelSurface(*read_vtp(path))
 
 
 def surface_file(directory: Path, name: str, frame: int) -> Path:
@@ -187,16 +192,20 @@ def _read_frames(info: RunInfo, directory: Path, poses: Poses) -> list[Frame]:
         if lost is not None:
             what = f"lacks frame {index} of bone {lost!r}"
             raise UsageError(f"{directory / 'poses.csv'} {what}; run the scene again")
+        shown = muscles if scene.output.surfaces else []
+        surfaces = {name: surface_file(directory, name, index) for name in shown}
+        fibres = {name: directory / fibre_file(name, index) for name in muscles}
+        fibres = {name: file for name, file in fibres.items() if file.is_file()}
         frame = Frame(
             index,
             {name: value if name in units else math.radians(value) for name, value in values},
             placed,
-            FolderSurfaces(directory, muscles if scene.output.surfaces else [], index),
+            ReadFiles(surfaces, _read_surface),
             {},
             events.get(index, []),
             {},
             math.nan if entry.wall is None else entry.wall,
-            fibres=SavedFibres(directory, muscles, index),
+            fibres=ReadFiles(fibres, read_fibres),
         )
         found.append(frame)
     return found

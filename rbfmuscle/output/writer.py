@@ -20,6 +20,7 @@ from rbfmuscle.folders import OutputFolder, write_whole
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.output.appearance import tendon_mesh
@@ -188,7 +189,7 @@ class RunWriter:
                 if name not in self._light:
                     self._light[name] = _light_mesh(mesh.vertices, mesh.faces)
                 vertices, faces = self._light[name]
-                moved = vertices @ pose[:3, :3].T + pose[:3, 3]
+                moved = to_world(vertices, pose)
                 end = _frame_end(frame.index)
                 self._write_bone(name, pose.copy(), end, moved.astype(np.float32), faces)
         return [(bone.name, self._bones[bone.name][1]) for bone in self.scene.bones]

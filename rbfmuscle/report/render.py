@@ -17,6 +17,7 @@ from rbfmuscle.folders import write_whole
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.jit import compiled
 from rbfmuscle.output import appearance as look
 from rbfmuscle.output.appearance import rgb
@@ -245,7 +246,7 @@ def _draw_frame(run: RunData, camera: Camera, frame: int) -> Integers:
     poses = run.frame(frame).poses
     for name in run.bones:
         (vertices, faces), pose = run.meshes.bone(name), poses[name]
-        solids.append(Solid(vertices @ pose[:3, :3].T + pose[:3, 3], faces, look.BONE_COLOUR))
+        solids.append(Solid(to_world(vertices, pose), faces, look.BONE_COLOUR))
     return draw_solids(solids, camera)
 
 

@@ -41,7 +41,7 @@ from rbfmuscle.report.page import (
 from rbfmuscle.report.plots import Band, Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, render_run
 from rbfmuscle.report.verdict import describe_unmeasured
-from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.simulation.frame import Event
 
 # What the rows beside the picture say, and the quantities that each holds to a limit.
@@ -262,7 +262,7 @@ def _bands(tracks: Sequence[Track], coordinate: str, label: str, saved: RunData)
     for track in tracks:
         known = published_band(track.name, coordinate)
         if known is not None and label.startswith(coordinate):
-            scale = 1.0 / MM_PER_UNIT[saved.units]
+            scale = from_mm(1.0, saved.units)
             ends = scale * known.least, scale * known.greatest
             bands.append(Band(track.name, track.colour, known.angle, *ends, dashed=True))
     return bands

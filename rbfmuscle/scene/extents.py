@@ -6,6 +6,7 @@ from typing import TypeAlias
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.objects import MM_PER_UNIT, Muscle
@@ -25,7 +26,7 @@ FARTHEST_CENTRE = (
 
 def check_size(kind: str, name: str, item: Item, units: str) -> None:
     """Raise MeshError for a mesh smaller than a mouse's or larger than a person's."""
-    size = float(np.linalg.norm(np.ptp(item.mesh.vertices, axis=0)))
+    size = box_size(item.mesh.vertices)
     millimetres = size * MM_PER_UNIT[units]
     if not SMALLEST_MM <= millimetres <= LARGEST_MM:
         best = 10.0 ** round(math.log10(300.0 / max(millimetres, 1e-12)))

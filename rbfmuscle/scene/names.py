@@ -56,8 +56,8 @@ def find_named(items: Sequence[NamedItem], name: str, what: str, *, context: str
     raise SceneError(f"{context}unknown {what} {name!r}, {hint}")
 
 
-def check_name(name: object, what: str) -> None:
-    """Raise SceneError if a name is no name for a file."""
+def check_name(name: object, what: str) -> str:
+    """Return the name, or raise SceneError if it is no name for a file."""
     if not isinstance(name, str) or not name or not set(name) <= _CHARACTERS:
         allowed = "letters, digits, '_' and '-' only (it becomes a file name)"
         raise SceneError(f"{what} name {shown(repr(name))} may hold {allowed}")
@@ -66,6 +66,7 @@ def check_name(name: object, what: str) -> None:
             f"{what} name {shown(repr(name))} has {len(name)} letters, at most {LONGEST_NAME} are "
             "allowed (it becomes a file name)"
         )
+    return name
 
 
 def check_new_name(items: Sequence[Named], name: str, what: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.meshes.formats import read_part
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.meshes.transform import MeshTransform
@@ -82,7 +83,7 @@ def picked_vertices(points: Floats, vertices: Floats, *, context: str) -> Intege
     """The vertices (n, 3) about picked points (k, 3)."""
     tree = cKDTree(points)
     away, nearest = cKDTree(vertices).query(points)
-    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    size = box_size(vertices)
     if away.max() > AWAY * size:
         far = int(away.argmax())
         place = ", ".join(f"{value:.4g}" for value in points[far])

@@ -21,7 +21,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.taut_lines import taut_line
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
-from rbfmuscle.geometry.vectors import across, unit
+from rbfmuscle.geometry.vectors import across, to_local, to_world, unit
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.joint import rotation_about
@@ -200,7 +200,7 @@ class TendonEnd:
         deepest = 0.0
         for bone, at_rest in zip(self.obstacles, self._rest_depths):
             pose = poses[bone.name]
-            local = (points - pose[:3, 3]) @ pose[:3, :3]
+            local = to_local(points, pose)
             deepest = max(deepest, float((_depths(bone, local) - at_rest).max()))
         near, far = (poses[bone][:3, :3] for bone, _ in (self.other[-1], self.line[0]))
         side = (near + far) @ self._sides[len(self.other) - 1]
@@ -294,13 +294,13 @@ def _lifted(
     line = line.copy()
     for bone in bones:
         pose = poses[bone.name]
-        local = (line[1:-1] - pose[:3, 3]) @ pose[:3, :3]
+        local = to_local(line[1:-1], pose)
         low, high = bone.bounds
         near = np.flatnonzero(((local > low) & (local < high)).all(axis=1))
         if len(near):
             distance, places = bone.nearest(local[near])
             graze = (distance < 0.0) & (distance > -radius)
-            line[1 + near[graze]] = places[graze] @ pose[:3, :3].T + pose[:3, 3]
+            line[1 + near[graze]] = to_world(places[graze], pose)
     return line
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.vectors import unit
+from rbfmuscle.geometry.vectors import to_world, unit
 from rbfmuscle.scene.check import stated_doubts
 from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.objects import from_mm
@@ -95,11 +95,11 @@ class MarkView:
         if "Joint axes" in shown:
             for name, axes in self._marks.axes.items():
                 if axes.parent in poses:
-                    self._add_axes(name, _moved(axes.lines, poses[axes.parent]))
+                    self._add_axes(name, to_world(axes.lines, poses[axes.parent]))
         if "Attachments" in shown:
             for number, held in enumerate(self._marks.held):
                 if held.muscle not in hidden:
-                    self._add_points(number, _moved(held.points, poses[held.bone]))
+                    self._add_points(number, to_world(held.points, poses[held.bone]))
         if "Names" in shown:
             for name, (vertices, _) in surfaces.items():
                 if name not in hidden:
@@ -131,8 +131,3 @@ class MarkView:
             self._nodes[place] = self._server.scene.add_label(place, name)
         self._nodes[place].position = middle * self._factor
         self._nodes[place].visible = True
-
-
-def _moved(points: Floats, pose: Floats) -> Floats:
-    """Points (..., 3) in a pose (4, 4)."""
-    return points @ pose[:3, :3].T + pose[:3, 3]

@@ -11,6 +11,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import EdgeStretch, mesh_volume
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.depths import surface_depth
 from rbfmuscle.output.appearance import (
     BONE_COLOUR,
@@ -178,7 +179,7 @@ class ModelView:
 
         for name, (vertices, faces) in self._bones.items():
             pose = self.picture.poses[name]
-            _, kept = self._part((vertices @ pose[:3, :3].T + pose[:3, 3], faces), look.cut)
+            _, kept = self._part((to_world(vertices, pose), faces), look.cut)
             part, place = (
                 self._part((vertices, kept), None),
                 f"bones/{name}",
@@ -285,5 +286,5 @@ class ModelView:
         poses = [
             (vertices, self.picture.poses[name]) for name, (vertices, _) in self._bones.items()
         ]
-        bones = [vertices @ pose[:3, :3].T + pose[:3, 3] for vertices, pose in poses]
+        bones = [to_world(vertices, pose) for vertices, pose in poses]
         return bones + [vertices for vertices, _ in self.picture.surfaces.values()]

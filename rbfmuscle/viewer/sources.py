@@ -21,7 +21,7 @@ from rbfmuscle.output.run_data import RunData, frame_caption
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
-from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes, from_mm
+from rbfmuscle.scene.objects import body_axes, from_mm
 from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import FibreLines, Frame, MuscleModel
@@ -228,7 +228,7 @@ class SavedSource:
         self.title = str(first.directory or first.info.scene.name)
         self.units = first.units
         self.body = first.body
-        self.millimetre = 1.0 / MM_PER_UNIT[first.units]
+        self.millimetre = from_mm(1.0, first.units)
         self.bones = {name: first.meshes.bone(name) for name in first.bones}
         self.muscles = {name: first.mesh(name, first.frame_numbers[0]) for name in first.muscles}
         self.colours, self.rest = first.colours, SavedFigure(first).advance()

@@ -15,7 +15,7 @@ from rbfmuscle.scene.extents import LARGEST_MM, SMALLEST_MM
 from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES, read_file
 from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.scene.names import new_name
-from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.objects import MM_PER_UNIT, from_mm
 from rbfmuscle.validation import MeshError, UsageError
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class Parts:
     @property
     def millimetre(self) -> float:
         """Its length in scene units."""
-        return 1.0 / MM_PER_UNIT[self.units]
+        return from_mm(1.0, self.units)
 
 
 def read_parts(folder: Path, units: str | None, base: Path) -> Parts:

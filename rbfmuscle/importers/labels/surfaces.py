@@ -16,6 +16,7 @@ from scipy.ndimage import label as connected
 
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normals
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.importers.labels.volume import LabelVolume
 from rbfmuscle.validation import MeshError
 
@@ -90,7 +91,7 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     capped = np.zeros(len(places), dtype=bool)
     for axis, end in cuts:
         capped |= np.abs(places[:, axis] - end) < ON_CAP
-    world = places @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+    world = to_world(places, volume.affine)
     mesh = trimesh.Trimesh(world, faces, process=False)
     if mesh.volume < 0:
         mesh.invert()

@@ -10,6 +10,7 @@ import numpy as np
 
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.vectors import box_size, to_world
 from rbfmuscle.importers.opensim.model import ModelMesh, OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.tubes import TUBE_MODEL, make_tube
@@ -201,8 +202,8 @@ def _placed(
     part = read_part(file.with_name(f"{file.name}#{ALL}"))
     vertices, faces = check_mesh(part.vertices, part.faces)
     transform = place @ mesh.transform
-    vertices = (vertices * mesh.scale) @ transform[:3, :3].T + transform[:3, 3]
-    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    vertices = to_world(vertices * mesh.scale, transform)
+    size = box_size(vertices)
     if not NARROWEST <= size <= WIDEST:
         raise MeshError(f"it is {size:.3g} m across, which no bone is")
     return file, vertices, faces[:, ::-1] if np.prod(mesh.scale) < 0 else faces

@@ -12,6 +12,7 @@ import numpy as np
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import mesh_volume, unique_edges
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along, tube_mesh
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.validation import SceneError
 
@@ -109,8 +110,8 @@ def _clear_line(line, fixed, radius, wraps, bones):
         line[fixed] = 0.5 * (line[fixed] + start[fixed])
         for wrap, frame in wraps:
             back = np.linalg.inv(frame)
-            local = line @ back[:3, :3].T + back[:3, 3]
-            line = _out_of_shape(wrap, local) @ frame[:3, :3].T + frame[:3, 3]
+            local = to_world(line, back)
+            line = to_world(_out_of_shape(wrap, local), frame)
         if number % 10 == 9:
             for bone in bones:
                 line = _out_of_bone(bone, line, 0.8 * radius)

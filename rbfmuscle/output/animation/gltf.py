@@ -62,18 +62,34 @@ def _add_part(file: "_File", part: AnimatedMesh) -> int:
         moved, turned = frame.vertices - base, frame.corners.normals - normals
         position = file.add(moved, "VEC3", target=_VERTICES, bounds=True)
         targets.append({"POSITION": position, "NORMAL": file.add(turned, "VEC3", target=_VERTICES)})
-    entry: dict[str, object] = {"name": part.name, "mesh": file.mesh(part, first, targets)}
-    node = file.append("nodes", entry)
-    if targets:
-        weights = np.eye(len(part.vertices))[:, 1:]
-        file.animate(node, "weights", file.add(weights.reshape(-1, 1), "SCALAR"))
+    node = file.add_node(part.name, _primitive(file, part, first), targets)
     if part.poses is not None:
         turns, shifts = _quaternions(part.poses[:, :3, :3]), part.poses[:, :3, 3]
-        entry |= {"rotation": turns[0].tolist(), "translation": shifts[0].tolist()}
+        place = {"rotation": turns[0].tolist(), "translation": shifts[0].tolist()}
+        file.lists["nodes"][node] |= place
         if part.moves:
             file.animate(node, "rotation", file.add(turns, "VEC4"))
             file.animate(node, "translation", file.add(shifts, "VEC3"))
     return node
+
+
+def _primitive(file: "_File", part: AnimatedMesh, first: InputMesh) -> dict[str, object]:
+    """The triangles of the first frame of a part, with a material of its own."""
+    colour = [*linear_rgb(rgb(part.colour)).tolist(), 1.0]
+    look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}
+    attributes = {
+        "POSITION": file.add(first.vertices, "VEC3", target=_VERTICES, bounds=True),
+        "NORMAL": file.add(first.corners.normals, "VEC3", target=_VERTICES),
+    }
+    if len(first.corners.texture):
+        # From the upper left in glTF.
+        texture = first.corners.texture * [1.0, -1.0] + [0.0, 1.0]
+        attributes["TEXCOORD_0"] = file.add(texture, "VEC2", target=_VERTICES)
+    return {
+        "attributes": attributes,
+        "indices": file.add(first.faces.reshape(-1, 1), "SCALAR", target=_INDICES),
+        "material": file.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
+    }
 
 
 def _split(part: AnimatedMesh, k: int) -> InputMesh:
@@ -106,24 +122,11 @@ def _add_fibres(file: "_File", fibres: AnimatedFibres) -> int:
         },
         "indices": file.add(fibres.segments.reshape(-1, 1), "SCALAR", target=_INDICES),
     }
-    targets = [
-        {
-            "POSITION": file.add(
-                lines.points.reshape(-1, 3) - base, "VEC3", target=_VERTICES, bounds=True
-            )
-        }
-        for lines in fibres.lines[1:]
-    ]
-    entry: dict[str, object] = {"name": fibres.name, "primitives": [primitive]}
-    if targets:
-        primitive["targets"] = targets
-        entry["weights"] = [0.0] * len(targets)
-    mesh = file.append("meshes", entry)
-    node = file.append("nodes", {"name": fibres.name, "mesh": mesh})
-    if targets:
-        weights = np.eye(len(fibres.lines))[:, 1:]
-        file.animate(node, "weights", file.add(weights.reshape(-1, 1), "SCALAR"))
-    return node
+    targets = []
+    for lines in fibres.lines[1:]:
+        moved = lines.points.reshape(-1, 3) - base
+        targets.append({"POSITION": file.add(moved, "VEC3", target=_VERTICES, bounds=True)})
+    return file.add_node(fibres.name, primitive, targets)
 
 
 def _quaternions(rotations):
@@ -147,11 +150,11 @@ class _File:
         self.parts: list[bytes] = []
         self.size, self.times = 0, 0
         keys = "bufferViews", "accessors", "meshes", "materials", "nodes"
-        self.lists: dict[str, list[object]] = {key: [] for key in keys}
+        self.lists: dict[str, list[dict[str, object]]] = {key: [] for key in keys}
         self.samplers: list[object] = []
         self.channels: list[object] = []
 
-    def append(self, key: str, entry: Mapping[str, object]) -> int:
+    def append(self, key: str, entry: dict[str, object]) -> int:
         """Number of a new entry of a list."""
         self.lists[key].append(entry)
         return len(self.lists[key]) - 1
@@ -169,7 +172,7 @@ class _File:
         """
         whole = np.issubdtype(values.dtype, np.integer)
         rows = np.ascontiguousarray(values, dtype="<u4" if whole else "<f4")
-        view = {"buffer": 0, "byteOffset": self.size, "byteLength": rows.nbytes}
+        view: dict[str, object] = {"buffer": 0, "byteOffset": self.size, "byteLength": rows.nbytes}
         view |= {} if target is None else {"target": target}
         self.parts.append(rows.tobytes())
         self.size += rows.nbytes
@@ -179,29 +182,22 @@ class _File:
             entry |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self.append("accessors", entry)
 
-    def mesh(self, part: AnimatedMesh, first: InputMesh, targets: Sequence[object]) -> int:
-        """Number of a new mesh, that of the first frame, with a material of its own."""
-        colour = [*linear_rgb(rgb(part.colour)).tolist(), 1.0]
-        look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}
-        attributes = {
-            "POSITION": self.add(first.vertices, "VEC3", target=_VERTICES, bounds=True),
-            "NORMAL": self.add(first.corners.normals, "VEC3", target=_VERTICES),
-        }
-        if len(first.corners.texture):
-            # From the upper left in glTF.
-            texture = first.corners.texture * [1.0, -1.0] + [0.0, 1.0]
-            attributes["TEXCOORD_0"] = self.add(texture, "VEC2", target=_VERTICES)
-        primitive = {
-            "attributes": attributes,
-            "indices": self.add(first.faces.reshape(-1, 1), "SCALAR", target=_INDICES),
-            "material": self.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
-        }
-        entry: dict[str, object] = {"name": part.name, "primitives": [primitive]}
+    def add_node(
+        self, name: str, primitive: dict[str, object], targets: Sequence[Mapping[str, int]]
+    ) -> int:
+        """Number of a new node with one primitive, which takes the forms of its morph targets, one
+        for each frame but the first.
+        """
+        entry: dict[str, object] = {"name": name, "primitives": [primitive]}
         if targets:
             primitive["targets"] = list(targets)
             entry["weights"] = [0.0] * len(targets)
             entry["extras"] = {"targetNames": list(self.names[1:])}
-        return self.append("meshes", entry)
+        node = self.append("nodes", {"name": name, "mesh": self.append("meshes", entry)})
+        if targets:
+            weights = np.eye(len(targets) + 1)[:, 1:]
+            self.animate(node, "weights", self.add(weights.reshape(-1, 1), "SCALAR"))
+        return node
 
     def animate(self, node: int, path: str, values: int) -> None:
         """Let an accessor move a node's ``path`` over the times."""

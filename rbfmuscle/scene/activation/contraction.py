@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.activation.keys import (
     TENDON_STRAIN,
     ActivationTable,
@@ -47,7 +48,7 @@ def _check_fibres(muscle):
     mesh = muscle.mesh
     vertices = np.asarray(mesh.vertices, dtype=float)
     distance = ExactDistance(vertices, np.asarray(mesh.faces))
-    limit = OUTSIDE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    limit = OUTSIDE * box_size(vertices)
     for number, line in enumerate(muscle.fibres or ()):
         outside = float(distance.signed_distance(np.asarray(line, dtype=float)).max())
         if outside > limit:

@@ -13,6 +13,7 @@ from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.solids import outer_surface
 from rbfmuscle.geometry.surfaces import repeated_faces
+from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.validation import MeshError
 
@@ -197,7 +198,7 @@ def _merge_equal(state):
     """
     faces, used = state.faces, np.unique(state.faces)
     vertices = state.vertices[used]
-    size = max(MERGE_TOLERANCE * np.linalg.norm(np.ptp(vertices, axis=0)), 1e-300)
+    size = max(MERGE_TOLERANCE * box_size(vertices), 1e-300)
     keys = np.round((vertices - vertices.min(axis=0)) / size).astype(np.int64)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     merged = np.arange(len(state.vertices))
@@ -259,7 +260,7 @@ def _fill_holes(state, context):
             f"{bad[0, 0]} and "
             f"{bad[0, 1]}); make the surface manifold, for instance by remeshing"
         )
-    limit, filled = HOLE_LIMIT * np.linalg.norm(np.ptp(state.vertices, axis=0)), 0
+    limit, filled = HOLE_LIMIT * box_size(state.vertices), 0
     for rim in _rims(state.faces):
         points = state.vertices[rim]
         if (

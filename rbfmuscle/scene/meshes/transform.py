@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from pydantic import BeforeValidator, Field
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.scene.joints.joint import X, Y, Z, rotation_about
 from rbfmuscle.scene.options import Finite, Positive, Table, Vector
 
@@ -82,7 +83,7 @@ class MeshTransform(Table):
     def points(self, points: Floats) -> Floats:
         """Points (n, 3) of a file, in the scene."""
         scaled, matrix = np.asarray(points, dtype=float) * self.scale, self.matrix
-        return scaled if matrix is None else scaled @ matrix[:3, :3].T + matrix[:3, 3]
+        return scaled if matrix is None else to_world(scaled, matrix)
 
     def normals(self, normals: Floats) -> Floats:
         """Unit normals (n, 3) of a file, in the scene."""
