@@ -2,7 +2,6 @@
 well they hold.
 """
 
-import csv
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
 from rbfmuscle.output.path_files import fit_path, write_paths
+from rbfmuscle.output.writer import write_csv
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Motion, from_mm
@@ -287,10 +287,8 @@ def report_fits(
         write_paths(
             stage / "paths.xml", fitted, from_mm(1000.0, scene.units), turning, targets or {}
         )
-        with (stage / "errors.csv").open("w", encoding="utf-8", newline="") as out:
-            writer = csv.DictWriter(out, fieldnames=list(errors[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(errors)
+        rows = [list(errors[0]), *(list(row.values()) for row in errors)]
+        write_csv(stage / "errors.csv", rows)
     file = directory / "paths.xml"
     return errors, [
         *lines,

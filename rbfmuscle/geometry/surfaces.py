@@ -1,6 +1,7 @@
 """Normals, edges, enclosed volumes and motions of triangle meshes."""
 
 import hashlib
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -84,6 +85,13 @@ def opposite_half_edges(faces: Integers) -> Integers:
     one, other = one[paired], other[paired]
     opposite[one], opposite[other] = other, one
     return opposite
+
+
+def joined_meshes(vertices: Sequence[Floats], faces: Sequence[Integers]) -> tuple[Floats, Integers]:
+    """Meshes as one, each of vertices (n, 3) and faces (m, 3), in their order."""
+    starts = np.cumsum([0, *map(len, vertices)])
+    moved = [part + start for part, start in zip(faces, starts)]
+    return np.concatenate(vertices), np.concatenate(moved)
 
 
 def repeated_faces(faces: Integers) -> Booleans:

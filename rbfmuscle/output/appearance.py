@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.surfaces import joined_meshes
 from rbfmuscle.geometry.tubes import distance_along, tube_mesh
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.tendons import TendonLine
@@ -186,10 +187,7 @@ def tendon_mesh(
     tubes = [_tube(tendons[end.name]) for end in muscle.tendons if end.name in tendons]
     if not tubes:
         return None
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in tubes[:-1])])
-    return np.concatenate([v for v, _ in tubes]), np.concatenate(
-        [f + n for (_, f), n in zip(tubes, starts)]
-    )
+    return joined_meshes(*zip(*tubes))
 
 
 def _tube(tendon: TendonLine) -> tuple[Floats, Integers]:

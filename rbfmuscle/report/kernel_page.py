@@ -1,6 +1,5 @@
 """The kernel study of one or several surfaces as files: tables and a page."""
 
-import csv
 import datetime
 from collections import Counter
 from collections.abc import Mapping
@@ -22,7 +21,7 @@ from rbfmuscle.experiments.kernel_study import KernelStudy
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.output.writer import json_text, versions
+from rbfmuscle.output.writer import json_text, versions, write_csv
 from rbfmuscle.report.page import (
     BAD,
     GOOD,
@@ -80,11 +79,9 @@ def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> 
         ],
     )
     with kernels_folder(directory).staged() as stage:
-        with (stage / "kernels.csv").open("w", newline="", encoding="utf-8") as file:
-            names = [name for name in KernelRow.model_fields if name != "trials"]
-            writer = csv.DictWriter(file, fieldnames=names, extrasaction="ignore")
-            writer.writeheader()
-            writer.writerows(row.model_dump() for row in facts.rows)
+        names = [name for name in KernelRow.model_fields if name != "trials"]
+        rows = [[getattr(row, name) for name in names] for row in facts.rows]
+        write_csv(stage / "kernels.csv", [names, *rows])
         (stage / "kernels.json").write_text(json_text(facts.model_dump()), encoding="utf-8")
         write_page(stage, facts)
 

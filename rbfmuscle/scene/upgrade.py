@@ -5,6 +5,7 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
+from rbfmuscle.folders import write_whole
 from rbfmuscle.scene.joints.joint import BY_TURNS
 from rbfmuscle.validation import SceneError, shown
 
@@ -149,11 +150,8 @@ def upgrade_file(path: Path) -> bool:
         raise SceneError(f"{path}: cannot read it: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, or not to be rewritten
         raise SceneError(f"{path}: {shown(str(error))}") from None
-    staged = path.with_name(f".{path.name}.new")
     try:
-        staged.write_bytes(new.encode("utf-8"))
-        staged.replace(path)
+        write_whole(path, new)
     except OSError as error:
-        staged.unlink(missing_ok=True)
         raise SceneError(f"{path}: cannot write it: {error.strerror}") from None
     return True

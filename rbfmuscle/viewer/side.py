@@ -10,7 +10,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import EdgeStretch, mesh_volume
+from rbfmuscle.geometry.surfaces import EdgeStretch, joined_meshes, mesh_volume
 from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.depths import surface_depth
 from rbfmuscle.output.appearance import (
@@ -266,12 +266,9 @@ class ModelView:
 
         self.forget(bool(painted))
         if painted:
-            counts = [len(vertices) for vertices, _, _ in painted]
-            vertices, faces, colours = (np.concatenate(parts) for parts in zip(*painted))
-            starts = np.repeat(np.cumsum([0, *counts[:-1]]), [len(part) for _, part, _ in painted])
-            mesh = trimesh.Trimesh(
-                vertices, faces + starts[:, None], vertex_colors=colours, process=False
-            )
+            vertices, faces, shades = zip(*painted)
+            whole, colours = joined_meshes(vertices, faces), np.concatenate(shades)
+            mesh = trimesh.Trimesh(*whole, vertex_colors=colours, process=False)
             free = "a" if self._painted and self._painted[0].name.endswith("b") else "b"
             glb = mesh.export(file_type="glb", tree_postprocessor=_make_matt)
             self._painted.append(self.server.scene.add_glb(f"{self.root}/painted_{free}", glb))

@@ -196,7 +196,7 @@ def _best_of(kinds, muscle, distances):
     """The bone to hold at: of the first class that is there, on the muscle's side, the nearest."""
     for kind in kinds:
         here = [bone for bone in distances if bone.kind == kind]
-        fitting = [bone for bone in here if _same_side(bone, muscle)]
+        fitting = [bone for bone in here if bone.may_be_beside(muscle)]
         if fitting:
             return min(fitting, key=lambda bone: distances[bone].min())
     return None
@@ -276,7 +276,7 @@ def _hold_by_tendon(place, ends, muscle, skeleton):
     if muscle.facts is None or place.stands_in:
         return None
     for part in skeleton.tendons:
-        if muscle.facts.name not in part.tendon_of or not _same_side(part, muscle):
+        if muscle.facts.name not in part.tendon_of or not part.may_be_beside(muscle):
             continue
         tendon = see_tendon(part, muscle)
         begins = tendon.begins[ends.along(place.end)[tendon.begins] <= UPPER]
@@ -288,10 +288,6 @@ def _hold_by_tendon(place, ends, muscle, skeleton):
         guess = tendon_by_mesh(tendon, place.bone, skeleton)
         return AttachmentGuess(place.bone, begins, gap, reason, BESIDE, guess)
     return None
-
-
-def _same_side(one, other):
-    return not one.side or not other.side or one.side == other.side
 
 
 def _touching(distance, along):

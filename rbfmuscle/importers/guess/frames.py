@@ -103,7 +103,7 @@ def _add_shank(found, femur, bones, joints, sign):
     if knee is None or "flexion" not in knee.axes or knee.confidence <= BELIEVED:
         return
     tibia, right = knee.child, -knee.axis
-    side = [b for b in bones if not b.side or not femur.side or b.side == femur.side]
+    side = [b for b in bones if b.may_be_beside(femur)]
     for patella in [j.child for j in joints if j.child.kind == "patella" and j.parent is femur]:
         axes = _axes(femur.frame.superior, right, sign)
         low, high = patella.points.min(axis=0), patella.points.max(axis=0)

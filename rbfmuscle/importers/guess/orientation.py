@@ -91,9 +91,7 @@ def orient_scene(scene: Scene) -> Scene:
 def neighbours(bone: Part, bones: list[Part], table: dict[str, tuple[str, ...]]) -> list[Part]:
     """The bones of the classes that a table lists for a bone, on its side."""
     kinds = table.get(bone.kind, ())
-    return [
-        b for b in bones if b.kind in kinds and (not b.side or not bone.side or b.side == bone.side)
-    ]
+    return [b for b in bones if b.kind in kinds and b.may_be_beside(bone)]
 
 
 def shank_up(tibia: Part, bones: list[Part]) -> np.ndarray:

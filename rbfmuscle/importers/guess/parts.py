@@ -54,6 +54,10 @@ class Part:
         """The mended mesh, trimesh.Trimesh [scene unit]."""
         return self.read.mesh
 
+    def may_be_beside(self, other: "Part") -> bool:
+        """Whether it may be of the same side of the body as another."""
+        return not self.side or not other.side or self.side == other.side
+
     @property
     def size(self) -> float:
         """Diagonal of its box [scene unit]."""

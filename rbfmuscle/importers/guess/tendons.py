@@ -83,7 +83,7 @@ def via_places(known: Anatomy, muscle: Part, skeleton: Skeleton) -> tuple[BonePl
     found = []
     for name in known.via:
         bones = [b for b in skeleton.bones if sites_on((name,), b)]
-        bones = [b for b in bones if not b.side or not muscle.side or b.side == muscle.side]
+        bones = [b for b in bones if b.may_be_beside(muscle)]
         sites = ((b, skeleton.site(name, b, muscle.points)) for b in bones)
         bone, site = next(((b, s) for b, s in sites if s is not None), (None, None))
         if bone is not None and site is not None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.surfaces import joined_meshes
 from rbfmuscle.geometry.vectors import box_size, to_world
 from rbfmuscle.importers.opensim.model import ModelMesh, OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
@@ -182,11 +183,11 @@ def _body_meshes(
 
 def _joined(parts, body):
     """Meshes of a body as one; MeshError where that cannot be used."""
-    starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts)])
-    vertices = np.concatenate([part[0] for part in parts])
-    faces = np.concatenate([part[1] + start for part, start in zip(parts, starts)])
-    source = ", ".join(part[2] for part in parts)
-    mesh = prepare_mesh(vertices, faces, context=source, name=body, may_be_open=True)
+    vertices, faces, files = zip(*parts)
+    source = ", ".join(files)
+    mesh = prepare_mesh(
+        *joined_meshes(vertices, faces), context=source, name=body, may_be_open=True
+    )
     mesh.source = source
     return mesh
 

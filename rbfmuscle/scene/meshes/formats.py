@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.surfaces import joined_meshes
 from rbfmuscle.scene.meshes.foreign import foreign_content
 from rbfmuscle.scene.meshes.input_mesh import NO_CORNERS, Corners, vertex_corners
 from rbfmuscle.scene.meshes.obj import read_obj
@@ -72,13 +73,11 @@ def read_part(path: Path) -> FilePart:
 
 def _together(parts):
     """All meshes of a file as one."""
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    faces = [part.faces + start for part, start in zip(parts, starts)]
     notes = [note for part in parts for note in part.notes]
     if len(parts) > 1:
         notes.append(f"{len(parts)} meshes of the file taken as one")
-    vertices = np.concatenate([part.vertices for part in parts])
-    return FilePart("", vertices, np.concatenate(faces), notes)
+    whole = joined_meshes([part.vertices for part in parts], [part.faces for part in parts])
+    return FilePart("", *whole, notes)
 
 
 def read_file(path: Path) -> list[FilePart]:
