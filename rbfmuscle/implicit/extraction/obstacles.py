@@ -154,7 +154,9 @@ def _sort_loop(pairs, number, faces):
     key = np.empty(met, np.int64)
     for m in range(met):
         key[m] = number[pairs[0, m]] * faces + pairs[1, m]
-    point, first, near = np.empty(met, np.int64), np.empty(met + 1, np.int64), np.empty_like(key)
+    point = np.empty(met, np.int64)
+    first = np.empty(met + 1, np.int64)
+    near = np.empty(met, np.int64)
     used = 0
     for place, m in enumerate(np.argsort(key)):
         if used == 0 or point[used - 1] != pairs[0, m]:
