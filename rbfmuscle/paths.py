@@ -202,10 +202,8 @@ def _poses(ranges, samples):
 
 def _groups(scene):
     """Muscles by the coordinates that they depend on; those of a group are sampled together."""
-    known, followers = (
-        all_coordinates(scene.joints),
-        {coupling.coordinate for coupling in scene.couplings},
-    )
+    known = all_coordinates(scene.joints)
+    followers = {coupling.coordinate for coupling in scene.couplings}
     free = [name for name, fact in known.items() if name not in followers and not fact.locked]
     groups = {}
     for muscle in scene.muscles:

@@ -6,7 +6,7 @@ from textwrap import fill, shorten
 
 from rbfmuscle.metrics.summary import LIMITS, Summary
 from rbfmuscle.output.run_data import RunData
-from rbfmuscle.report.verdict import describe_excess, describe_unmeasured, find_remedy
+from rbfmuscle.report.verdict import describe_excess, describe_unmeasured, find_remedy, worst_first
 from rbfmuscle.scene.phantom import PHANTOM
 
 MOST = 3  # values beyond limits, and remedies, that are named
@@ -21,9 +21,7 @@ def verdict_lines(directory: Path) -> Iterator[str]:
     summary.add(saved.metrics)
     table = summary.table()
     yield _wrapped("verdict: ", info.verdict.partition(". ")[0])
-    # The worst of each muscle first, then whatever else is beyond a limit.
-    first = {row.muscle: row for row in reversed(info.beyond)}.values()
-    named = sorted(info.beyond, key=lambda row: row not in first)[:MOST]
+    named = worst_first(info.beyond)[:MOST]
     for row in named:
         yield _wrapped("  ", describe_excess(row, table, info.scene.missing_bones))
     if len(info.beyond) > len(named):

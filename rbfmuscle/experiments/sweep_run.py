@@ -94,10 +94,8 @@ class SweepFolder:
         """Whether a point need not be run again: it is done, and was measured against the same
         reference.
         """
-        kept, found = (
-            point.role != "reference" or self.surfaces(point.key).exists(),
-            self.read(point.key),
-        )
+        kept = point.role != "reference" or self.surfaces(point.key).exists()
+        found = self.read(point.key)
         return kept and (found.get("status"), found.get("reference")) == ("done", point.reference)
 
 

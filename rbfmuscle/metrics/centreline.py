@@ -40,9 +40,8 @@ NODES = 33
 ROUNDS = 40  # in which planes are taken, at most
 STILL = 1e-4  # of the string's length: what counts as the same place
 SWEEPS, OVER_RELAXATION = 100, 1.8  # of a round
-RENEWED = (
-    0.1  # of its distance to the nearest bone: a node that has moved farther gets another plane
-)
+# Of its distance to the nearest bone: a node that has moved farther gets another plane.
+RENEWED = 0.1
 # Nearer to a bone than this its distance is no way to tell the normal, in lengths of the string.
 TOUCHING = 1e-9
 
@@ -88,9 +87,8 @@ class Centreline:
         self.via = _passed(muscle, areas, resampled(line, NODES - 1))
         #: Shortest paths that did not come to rest, since they were last asked for.
         self.unsettled = 0
-        self._pulled: Floats | None = (
-            None  # from the points along the line to the last shortest path
-        )
+        # From the points along the line to the last shortest path.
+        self._pulled: Floats | None = None
 
     def points(self, vertices: Floats, poses: Mapping[str, Floats]) -> Floats:
         """The line now, (k, 3), from the material mesh (n, 3) and the poses (4, 4) of the bones."""

@@ -168,10 +168,8 @@ class MuscleMeasurer:
             return {}
         if self.near is None or not same:
             self.near = np.full(len(material), -1)
-        before, self.offset = (
-            self.offset,
-            self.distance.signed(material, near=self.near, simple=simple),
-        )
+        before = self.offset
+        self.offset = self.distance.signed(material, near=self.near, simple=simple)
         return {"flicker": np.abs(self.offset - before).max() if before is not None else 0.0}
 
     def measure_rest(

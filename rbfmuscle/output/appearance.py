@@ -114,14 +114,14 @@ def muscle_colours(names: Sequence[str], groups: Mapping[str, str] | None = None
 
 def mixed_colour(colour: str, share: float) -> str:
     """A colour brought nearer to white (share above 0) or to black (below)."""
-    values = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    values = bytes.fromhex(colour[1:])
     end = 255 if share > 0 else 0
-    return "#" + "".join(f"{round(value + abs(share) * (end - value)):02x}" for value in values)
+    return "#" + bytes(round(value + abs(share) * (end - value)) for value in values).hex()
 
 
 def rgb(colour: str) -> Floats:
     """Red, green and blue (3,) of a colour like "#cc6677", 0 to 1."""
-    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
+    return np.array(list(bytes.fromhex(colour[1:]))) / 255.0
 
 
 def linear_rgb(colour: Floats) -> Floats:

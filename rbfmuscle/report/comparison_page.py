@@ -56,10 +56,8 @@ def _page(found: Comparison, runs: Mapping[str, RunData]) -> ReportPage:
     failed = [f"{name} did not finish: {reason}" for name, reason in found.failed.items()]
     counts = {"muscles": len(first.muscles), "frames": found.frames, **found.machine}
     # Of the bowing each muscle has a limit of its own.
-    limits, terms = (
-        first.info.limits | {"bowing": None, DEEPER: first.info.limits.get("penetration_max")},
-        [(m.title, m.meaning) for m in MEASURES.values()],
-    )
+    limits = first.info.limits | {"bowing": None, DEEPER: first.info.limits.get("penetration_max")}
+    terms = [(m.title, m.meaning) for m in MEASURES.values()]
     return ReportPage(
         f"{found.scene}: models compared",
         [f"{counts[what]} {what}" for what in ("muscles", "frames", "threads")],

@@ -93,10 +93,8 @@ def draw_solids(solids: Sequence[Solid], camera: Camera) -> Integers:
     depth = np.full(fine.size[::-1], -np.inf, dtype=np.float32)
     image = np.ones((*depth.shape, 3), dtype=np.float32)
     for solid in sorted(solids, key=lambda solid: -solid.opacity):
-        points, shades = (
-            fine.project(np.asarray(solid.vertices, dtype=float)),
-            _shaded(solid, camera.axes),
-        )
+        points = fine.project(np.asarray(solid.vertices, dtype=float))
+        shades = _shaded(solid, camera.axes)
         _raster_loop(
             points, np.asarray(solid.faces, dtype=np.int64), shades, solid.opacity, depth, image
         )

@@ -209,10 +209,8 @@ def _light(saved: RunData, title: str, quantities: Sequence[str]) -> CheckRow | 
     if not found:
         return None
     _, muscle, name, worst, facts, limit = max(found, key=lambda entry: entry[0])
-    unit, place = (
-        facts["unit"],
-        f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}",
-    )
+    unit = facts["unit"]
+    place = f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}"
     allowed = (
         f"{'≥' if name in LOWER_BOUNDS else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}"
     )
@@ -298,10 +296,9 @@ def _tracks(
     """Lines of the muscles in the colours of the picture; of times without the first frame, and all
     together.
     """
-    tracks, together = (
-        [],
-        {ALL: "#26282b"} if quantity == "time_frame" and len(saved.muscles) > 1 else {},
-    )
+    tracks = []
+    several = quantity == "time_frame" and len(saved.muscles) > 1
+    together = {ALL: "#26282b"} if several else {}
     for name, colour in (saved.colours | together).items():
         frames, values = saved.series(name, quantity, coordinate)
         if quantity == "time_frame":

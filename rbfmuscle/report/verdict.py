@@ -56,9 +56,7 @@ def describe_unmeasured(missing: Sequence[tuple[str, str]]) -> str:
 
 
 def _worst_and_remedies(found, table, missing_bones):
-    # The worst of each muscle first, then whatever else is beyond a limit.
-    first = {row[0]: row for row in reversed(found)}.values()
-    named = sorted(found, key=lambda row: row not in first)[:MOST_NAMED]
+    named = worst_first(found)[:MOST_NAMED]
     remedies: dict[str, str] = {}
     for row in named:
         if row[1].partition(":")[0] in LIMITS:
@@ -68,6 +66,12 @@ def _worst_and_remedies(found, table, missing_bones):
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
     to_do = f". What to do: {'; '.join(remedies.values())}" if remedies else ""
     return f". Worst: {values}{more}{to_do}"
+
+
+def worst_first(found: Sequence[Exceedance]) -> list[Exceedance]:
+    """The worst excess of each muscle, then the others; ``found`` are the worst first."""
+    first = {row.muscle: row for row in reversed(found)}.values()
+    return sorted(found, key=lambda row: row not in first)
 
 
 def find_remedy(row: Exceedance, table: Table) -> str:

@@ -16,12 +16,10 @@ Item: TypeAlias = Bone | Muscle | ReadMesh
 
 SMALLEST_MM = 2.0  # across: the bones of a mouse
 LARGEST_MM = 3000.0  # across: a person with arms raised
-FAR_AWAY = (
-    1.0  # a muscle further from the bones than this many diagonals of their box is in another frame
-)
-FARTHEST_CENTRE = (
-    1000.0  # the same for the centre of a joint: a nearly straight path has one far away
-)
+# A muscle further from the bones than this many diagonals of their box is in another frame.
+FAR_AWAY = 1.0
+# The same for the centre of a joint: a nearly straight path has one far away.
+FARTHEST_CENTRE = 1000.0
 
 
 def check_size(kind: str, name: str, item: Item, units: str) -> None:

@@ -24,10 +24,8 @@ def rest_coordinates(scene: Scene) -> dict[str, float]:
     """Return the coordinates that follow no other and whose rest value is not zero [radian or scene
     unit].
     """
-    known, followers = (
-        all_coordinates(scene.joints),
-        {coupling.coordinate for coupling in scene.couplings},
-    )
+    known = all_coordinates(scene.joints)
+    followers = {coupling.coordinate for coupling in scene.couplings}
     if not any(coordinate.rest for coordinate in known.values()):
         return {}
     rest = coordinate_values({}, known, scene.couplings)

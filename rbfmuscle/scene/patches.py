@@ -175,10 +175,8 @@ def _listed(listed: Path | list[int], count: int, context: str) -> Integers:
     """
     numbers = listed if isinstance(listed, list) else []
     if isinstance(listed, Path):
-        words, context = (
-            read_text(listed, context=context).split(),
-            f"{context}{shown_path(listed)}: ",
-        )
+        words = read_text(listed, context=context).split()
+        context = f"{context}{shown_path(listed)}: "
         for word in words:
             try:
                 numbers.append(int(word))

@@ -24,9 +24,8 @@ if TYPE_CHECKING:
 
 # Where a picture takes longer [s], those on the way to the controls' places are drawn coarse.
 COSTLY = 0.1
-READ = (
-    1.0  # Time in which a browser has read a coloured mesh [s]; the one before it is removed then.
-)
+# Time in which a browser has read a coloured mesh [s]; the one before it is removed then.
+READ = 1.0
 LONGEST = 300  # characters of a message
 PACE = 0.04  # Least time of a picture while a motion is played [s].
 FIELD_OF_VIEW = 0.5  # [radian], upright

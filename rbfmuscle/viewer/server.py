@@ -30,9 +30,8 @@ class Gate:
 
     def __init__(self, token: str) -> None:
         self.token = token
-        self.inner: Callable[..., Response | None] | None = (
-            None  # what answers requests that are let in
-        )
+        # What answers requests that are let in.
+        self.inner: Callable[..., Response | None] | None = None
 
     def __call__(self, connection: "ServerConnection", request: "Request") -> "Response | None":
         """Answer a request; None lets a websocket begin."""

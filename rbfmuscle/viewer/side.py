@@ -180,10 +180,8 @@ class ModelView:
         for name, (vertices, faces) in self._bones.items():
             pose = self.picture.poses[name]
             _, kept = self._part((to_world(vertices, pose), faces), look.cut)
-            part, place = (
-                self._part((vertices, kept), None),
-                f"bones/{name}",
-            )  # a muscle may have its name
+            part = self._part((vertices, kept), None)
+            place = f"bones/{name}"  # a muscle may have its name
             self._show(place, part, BONE_COLOUR, visible=name not in look.hidden)
             node = self._nodes[place]
             node.position = pose[:3, 3] * (0.001 / self.source.millimetre)

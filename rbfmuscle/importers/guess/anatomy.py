@@ -64,9 +64,8 @@ class JointGuess:
     kind: str  # "ball", "hinge", "custom" (the patella) or "weld"
     centre: np.ndarray  # (3,) [scene unit]
     axes: dict[str, np.ndarray]  # (3,) by coordinate
-    confidence: (
-        float  # 0 to 1: where something was fitted, one minus half the misfit over its limit
-    )
+    # 0 to 1: where something was fitted, one minus half the misfit over its limit.
+    confidence: float
     reason: str
     name: str = ""
     ranges: dict[str, tuple] = field(default_factory=dict)  # of coordinates [degree]
@@ -75,9 +74,8 @@ class JointGuess:
         default_factory=dict
     )  # rotations and translations of a custom joint
     follows: str = ""  # full name of the coordinate that the first one follows
-    ligament: np.ndarray | None = (
-        None  # ends (2, 3) of a patella's, on it and on the tibia, at rest
-    )
+    # Ends (2, 3) of a patella's, on it and on the tibia, at rest.
+    ligament: np.ndarray | None = None
 
     @property
     def axis(self) -> np.ndarray:
@@ -158,10 +156,8 @@ def _take(
         return
     radii = " and ".join(f"{radius:.4g}" for radius in fit.radii)
     joint.reason = f"{method}, radii {radii}, misfit {fit.misfit:.2g}"
-    joint.centre, joint.axes = (
-        fit.centre,
-        {coordinate: fit.axis * np.copysign(1.0, fit.axis @ direction)},
-    )
+    joint.centre = fit.centre
+    joint.axes = {coordinate: fit.axis * np.copysign(1.0, fit.axis @ direction)}
     joint.confidence = max(1.0 - 0.5 * fit.misfit / (MISFIT * min(fit.radii)), 0.1)
     joint.confidence -= 0.2 * (
         len(fit.radii) < 2

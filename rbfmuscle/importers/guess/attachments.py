@@ -40,9 +40,8 @@ MAYBE = 4.0  # a bone that only may hold a muscle does so where it is nearer tha
 CAP, CAP_SHARE = 8.0, 0.12
 # Fewest vertices of a patch, and the greatest share of the muscle that all patches may hold.
 FEWEST, LARGEST = 8, 0.6
-REACH = (
-    0.75  # how far along the muscle a patch at one end may reach (0 at that end, 1 at the other)
-)
+# How far along the muscle a patch at one end may reach (0 at that end, 1 at the other).
+REACH = 0.75
 ASIDE = 60.0  # how much farther a bone counts that an end does not point to
 # An end farther than this from its site gets a tendon: [mm], and as a share of the muscle.
 FAR, FAR_SHARE = 25.0, 0.1

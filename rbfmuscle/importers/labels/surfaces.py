@@ -23,10 +23,8 @@ from rbfmuscle.validation import MeshError
 if TYPE_CHECKING:
     import trimesh
 
-SMOOTHING, PASSES = (
-    1.3,
-    4,
-)  # deviation of the Gaussian [voxels], and how often what it lost is smoothed again
+# Deviation of the Gaussian [voxels], and how often what it lost is smoothed again.
+SMOOTHING, PASSES = 1.3, 4
 CUT_OFF = 0.4  # area in the outermost slice against the fourth: that of a ball is 0.14
 ON_CAP = 1.2  # vertices nearer than this to the scan's end are on a cap [voxels]
 MARGIN = 6  # voxels kept around a label, beyond which the filter sees nothing

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.output import appearance as look
 from rbfmuscle.output.run_data import RunData, frame_caption
 from rbfmuscle.scene.meshes.input_mesh import InputMesh, plain_input
@@ -48,7 +49,7 @@ class AnimatedMesh:
         """Vertices and faces in the k-th frame."""
         if self.poses is None:
             return self.vertices[k], self.faces[k]
-        return self.vertices[0] @ self.poses[k, :3, :3].T + self.poses[k, :3, 3], self.faces[0]
+        return to_world(self.vertices[0], self.poses[k]), self.faces[0]
 
     def own(self, k: int) -> InputMesh:
         """The k-th frame by the vertices, triangles, texture coordinates and normals of the

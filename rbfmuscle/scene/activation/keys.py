@@ -127,9 +127,8 @@ class Contraction(NamedTuple):
     stretch_at_rest: float
     tendon: Booleans  # vertices (n,) of the muscle's mesh that are tendon
     tendon_strain: float = TENDON_STRAIN  # at full activation
-    slack: bool = (
-        False  # the scene says where passive fibres are slack, in place of the model's slack band
-    )
+    # The scene says where passive fibres are slack, in place of the model's slack band.
+    slack: bool = False
 
     @property
     def shortest(self) -> float:

@@ -58,9 +58,8 @@ class Coordinate:
 
     # What the number is; a coupled one drives several axes by functions and has no unit of its own.
     motion: MotionKind = "rotation"
-    rest: float = (
-        0.0  # in the pose in which the meshes are, and in a motion that does not mention it
-    )
+    # In the pose in which the meshes are, and in a motion that does not mention it.
+    rest: float = 0.0
     range: tuple[float, float] | None = None
     clamped: bool = False  # cut to the range; others may leave it, which is reported
     locked: bool = False  # stays at rest whatever is asked of it

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     import trimesh
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
-HOLE_LIMIT = (
-    0.1  # of the diagonal: a longer rim (of more than four edges) is not closed by guesswork
-)
+# Of the diagonal: a longer rim (of more than four edges) is not closed by guesswork.
+HOLE_LIMIT = 0.1
 TWISTED_NOTED = 0.005  # of the area
 MOST_TWISTED = 0.3  # of the area: of more it cannot be said what is inside
 WINDING_SAMPLES = 1500  # triangles asked, before and behind them by a small share of their size:
