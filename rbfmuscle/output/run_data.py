@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -13,7 +13,6 @@ from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.output import appearance as look
 from rbfmuscle.output.info import RunInfo
-from rbfmuscle.output.metrics_table import metrics_table
 from rbfmuscle.output.run_folder import FolderMeshes, Mesh, read_run
 from rbfmuscle.scene.joints.tables import full_name
 from rbfmuscle.scene.meshes.input_mesh import InputMesh
@@ -172,7 +171,7 @@ class RunData:
             by its name, ``muscle``, ``quantity``, ``coordinate`` (that of a moment arm, else
             empty), ``value`` and ``unit``.
         """
-        return metrics_table(self.metrics, self.frame_numbers, self.coordinates)
+        return _metrics_table(self.metrics, self.frame_numbers, self.coordinates)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -321,6 +320,34 @@ def _coordinate_values(info: RunInfo) -> dict[str, Floats]:
     rows = [row.coordinates for row in info.frames]
     names = sorted({name for row in rows for name in row})
     return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
+
+
+def _metrics_table(
+    rows: Sequence[Row], frames: Sequence[int], coordinates: Mapping[str, Floats]
+) -> pandas.DataFrame | np.ndarray:
+    """Rows of metrics as a table, see `RunData.table`; ``coordinates`` (n,) are by name, at the
+    frames (n,).
+    """
+    place = {frame: k for k, frame in enumerate(frames)}
+    at = np.array([place[row.frame] for row in rows], dtype=int)
+    about = [row.coordinate if "moment_arm" in row.quantity else "" for row in rows]
+    columns = {
+        "frame": np.array([row.frame for row in rows], dtype=int),
+        **{name: values[at] for name, values in coordinates.items()},
+        "muscle": np.array([row.muscle for row in rows], dtype=str),
+        "quantity": np.array([row.quantity for row in rows], dtype=str),
+        "coordinate": np.array(about, dtype=str),
+        "value": np.array([row.value for row in rows], dtype=float),
+        "unit": np.array([row.unit for row in rows], dtype=str),
+    }
+    try:
+        import pandas
+    except ImportError:
+        table = np.empty(len(rows), dtype=[(name, x.dtype) for name, x in columns.items()])
+        for name, values in columns.items():
+            table[name] = values
+        return table
+    return pandas.DataFrame(columns)
 
 
 def _sorted_rows(metrics: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:

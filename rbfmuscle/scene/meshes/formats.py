@@ -11,7 +11,6 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import joined_meshes
-from rbfmuscle.scene.meshes.foreign import foreign_content
 from rbfmuscle.scene.meshes.input_mesh import NO_CORNERS, Corners, vertex_corners
 from rbfmuscle.scene.meshes.obj import read_obj
 from rbfmuscle.scene.meshes.polydata import read_polydata
@@ -27,6 +26,22 @@ _HEAD = 84
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
 _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 _SOLID = re.compile(rb"^[ \t]*(end)?solid\b([^\r\n]*)", re.IGNORECASE | re.MULTILINE)
+# First bytes of what is saved under a wrong name, and what to do about it.
+_NO_MESH = (
+    (rb"version https://git-lfs", "a pointer of Git LFS: fetch the file itself (git lfs pull)"),
+    (rb"\s*<(!doctype\s+html|html)", "a web page: download the file itself"),
+    (rb"\x1f\x8b", "compressed: unpack it (gzip -d)"),
+    (rb"PK\x03\x04", "a zip archive: unpack it"),
+    (rb"\xff\xfe|\xfe\xff", "text in UTF-16: save it as UTF-8"),
+)
+# Mesh formats by their first bytes. A binary STL may begin with any of these, but not be so long.
+_MESHES = (
+    (rb"ply\s", ".ply"),
+    (rb"# vtk DataFile", ".vtk"),
+    (rb"(<\?xml[^>]*>\s*)?<VTKFile", ".vtp"),
+    (rb"solid\b[^\r\n]*\s+facet\s", ".stl"),
+    (rb"(#[^\n]*\n|\s)*(mtllib|o|g|v|vn|vt)[ \t]+\S", ".obj"),
+)
 
 
 class FilePart(NamedTuple):
@@ -96,7 +111,7 @@ def read_file(path: Path) -> list[FilePart]:
         raise MeshError(f"{path}: cannot read the mesh: {error.strerror}") from None
     if not content:
         raise MeshError(f"{path}: the file is empty")
-    if foreign := foreign_content(content, suffix):
+    if foreign := _foreign_content(content, suffix):
         raise MeshError(f"{path}: not a {suffix[1:].upper()} file but {foreign}")
     try:
         if suffix == ".stl":
@@ -109,6 +124,22 @@ def read_file(path: Path) -> list[FilePart]:
     except BROKEN_FILE as error:
         why = shown(" ".join(str(error).split())) or type(error).__name__
         raise MeshError(f"{path}: not a readable {suffix[1:].upper()} file ({why})") from None
+
+
+def _foreign_content(content: bytes, suffix: str) -> str:
+    """What content is and what to do, where it is not of its file's ``suffix``; empty where it may
+    be.
+    """
+    if _has_stl_length(content):
+        return "" if suffix == ".stl" else "a .stl file: rename it"
+    start = content[:1000].removeprefix(b"\xef\xbb\xbf")
+    for pattern, said in _NO_MESH:
+        if re.match(pattern, start, re.IGNORECASE):
+            return said
+    for pattern, kind in _MESHES:
+        if re.match(pattern, start) and (kind != ".obj" or b"\0" not in start):
+            return "" if kind == suffix else f"a {kind} file: rename it"
+    return ""
 
 
 def _neighbours(path):
@@ -170,10 +201,15 @@ def _read_stl(content):
     return parts
 
 
+def _has_stl_length(content):
+    """Whether content is as long as a binary STL file of its triangles, of which it has some."""
+    count = int.from_bytes(content[80:_HEAD], "little")
+    return count > 0 and len(content) == _HEAD + 50 * count
+
+
 def _is_binary(content):
     """Whether an STL file is binary: by its length, or by bytes that no text has."""
-    count = int.from_bytes(content[80:_HEAD], "little")
-    if len(content) == _HEAD + 50 * count and count:
+    if _has_stl_length(content):
         return True
     text = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:5].lower() == b"solid"
     return len(content) >= _HEAD and (not text or b"\0" in content)
