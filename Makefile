@@ -74,7 +74,7 @@ bench: $(DEV)
 figures: $(DEV)
 	$(BIN)/python docs/figures.py --measure
 
-# A wheel and an sdist, installed in a clean environment each, and the embedded hip run there.
+# A wheel and an sdist, installed in a clean environment each, and the phantom hip run there.
 release-check: $(DEV)
 	$(BIN)/python -m pytest -q -m slow tests/contract/test_release.py
 

@@ -42,7 +42,7 @@ def simulate(
     Parameters
     ----------
     scene : Scene, path or "phantom"
-        A scene, its file, or the embedded hip.
+        A scene, its file, or the phantom hip.
     model : str or dict, optional
         For every muscle; the scene's own choice where not given.
     settings : mapping, optional

@@ -40,7 +40,7 @@ def demo(
     fail_on: FailOn = None,
     work: Work = USUAL_WORK,
 ) -> int:
-    """Run the embedded hip: no data, no network. The same as `run phantom`."""
+    """Run the phantom hip: no data, no network. The same as `run phantom`."""
     return run(
         Path("phantom"),
         output=output,

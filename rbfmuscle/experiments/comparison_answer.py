@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from rbfmuscle.experiments.comparison_table import Values
 from rbfmuscle.experiments.measures import DEEPER, FIRST, MEASURES
 from rbfmuscle.metrics.quantities import ALL, unit_text
-from rbfmuscle.metrics.summary import shown_number
+from rbfmuscle.metrics.summary import LIMITS, shown_number
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.scene.objects import from_mm
 
@@ -49,6 +49,25 @@ def muscles_beyond(saved: RunData) -> dict[str, set[str]]:
     return found
 
 
+def _failures(beyond: Beyond, labels: dict[str, str]) -> list[str]:
+    """For each model what its muscles are not within the limits of, most muscles first."""
+    texts = []
+    for model, found in beyond.items():
+        named = {quantity: sorted(muscles) for quantity, muscles in found.items() if muscles}
+        named.pop(ALL, None)
+        most = sorted(named, key=lambda quantity: len(named[quantity]), reverse=True)[:MOST_TOLD]
+        told = [f"{LIMITS[quantity].title} ({_some(named[quantity])})" for quantity in most]
+        if told:
+            texts.append(f"Beyond limits, {labels[model]}: {', '.join(told)}")
+    return texts
+
+
+def _some(names: list[str]) -> str:
+    """A few of some names."""
+    more = f" and {len(names) - MOST_TOLD} more" if len(names) > MOST_TOLD else ""
+    return ", ".join(names[:MOST_TOLD]) + more
+
+
 def _differences(
     results: dict[str, Values],
     labels: dict[str, str],
@@ -78,9 +97,9 @@ def _differences(
 
 
 def describe(results: dict[str, Values], labels: dict[str, str], units: str, beyond: Beyond) -> str:
-    """How many muscles of each model are within all limits, and where the models differ; then
-    whether the first keeps out of bones, its time against the quickest other one, which is nearest
-    in shape.
+    """How many muscles of each model are within all limits, what the others are beyond, and where
+    the models differ; then whether the first keeps out of bones, its time against the quickest
+    other one, which is nearest in shape.
 
     Arguments are those of `write_tables`, ``beyond`` is `muscles_beyond` of each model; distances
     are to the first model.
@@ -91,6 +110,7 @@ def describe(results: dict[str, Values], labels: dict[str, str], units: str, bey
         for name, found in beyond.items()
     ]
     texts = [f"Muscles within all limits: {', '.join(kept)}"] if kept else []
+    texts += _failures(beyond, labels)
     if differ := _differences(results, labels, units, beyond):
         texts.append(f"Worst values: {'; '.join(differ)}")
     whole = {name: found[ALL] for name, found in results.items()}
@@ -103,13 +123,18 @@ def describe(results: dict[str, Values], labels: dict[str, str], units: str, bey
 
 
 def _depths(whole: Values, labels: dict[str, str], units: str) -> list[str]:
-    """Whether the first model keeps out of bones; ``whole`` are values of all muscles by model."""
-    first = next(iter(whole))
+    """Whether the first model keeps out of bones, and how deep the others are; ``whole`` are values
+    of all muscles by model.
+    """
+    first, *others = whole
     depth = whole[first].get(DEEPER, 0.0)
     verb = "keeps out of" if depth <= from_mm(KEPT_OUT, units) else "enters"
+    there = [
+        f"{labels[name]}: {shown_number(whole[name].get(DEEPER, 0.0), units)}" for name in others
+    ]
     texts = [
         f"{labels[first]} {verb} bones: {shown_number(depth, units)} deep at most beyond "
-        "the overlap at rest"
+        "the overlap at rest" + (f" ({'; '.join(there)})" if there else "")
     ]
     before = whole[first].get("solver_penetration_max", 0.0)
     if before > whole[first].get("penetration_max", 0.0) + from_mm(0.02, units):
@@ -130,10 +155,7 @@ def _times_and_shapes(whole: Values, labels: dict[str, str], units: str) -> list
     if quick:
         ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
         name = f"{labels[quick]}{', the quickest of the others' if len(others) > 1 else ''}"
-        texts.append(
-            f"It takes {ratio:.2g} times the time of {name} "
-            f"({shown_number(whole[quick].get(DEEPER, 0.0), units)} deep beyond rest)"
-        )
+        texts.append(f"{labels[first]} takes {ratio:.2g} times the time of {name}")
     apart = {name: whole[name]["distance_rms"] for name in others if "distance_rms" in whole[name]}
     if apart:
         near = min(apart, key=apart.__getitem__)

@@ -1,4 +1,4 @@
-"""The embedded hip: two bones and four muscles from formulas, no data files.
+"""The phantom hip: two bones and four muscles from formulas, no data files.
 
 A right hip in millimetres with the joint's centre at the origin: +x medial, +y posterior, +z up.
 """
@@ -130,7 +130,7 @@ def _parts(spacing):
 def phantom_scene(
     *, model: str = "rbf", end: float = 90.0, step: float = 2.0, spacing: float = 3.0
 ) -> Scene:
-    """Return the embedded hip as a scene: flexion from 0 to ``end`` by ``step`` [degree].
+    """Return the phantom hip as a scene: flexion from 0 to ``end`` by ``step`` [degree].
 
     The muscles' volumes are known in closed form (``MUSCLES[name].volume``); a mesh of triangles
     with edges of 3 mm, its vertices on the surface, holds up to 1.5 % less.
@@ -168,7 +168,7 @@ def phantom_scene(
 
 
 def open_scene(scene: Scene | str | Path, *, skeleton: bool = False) -> Scene:
-    """Return the scene of a file; the embedded hip for "phantom" where there is no file of that
+    """Return the scene of a file; the phantom hip for "phantom" where there is no file of that
     name.
 
     A Scene is returned as it is; ``skeleton`` is that of `Scene.load`.
