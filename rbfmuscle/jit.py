@@ -27,6 +27,7 @@ from numba.core.codegen import Codegen
 from numba.core.compiler import CompileResult
 from numba.core.cpu import CPUContext
 from numba.core.dispatcher import Dispatcher
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 from numba.core.typing import Signature
 
@@ -153,6 +154,11 @@ class _LoopCache(FunctionCache):
             "<locals>", "local"
         )
         return f"{self._cache_path}/{name}"
+
+    def load_overload(self, sig, target_context):
+        # Numba would read all that it compiles by before it loads a loop: 0.25 s.
+        rtsys.initialize(target_context)
+        return self._load_overload(sig, target_context)
 
     def _load_overload(self, sig, target_context):
         if self._enabled:

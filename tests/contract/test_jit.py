@@ -70,13 +70,13 @@ def place(tmp_path):
     return tmp_path
 
 
-def start(place, cache="cache", **settings):
+def start(place, cache="cache", main=MAIN, **settings):
     paths = os.pathsep.join([str(place), str(ROOT)])
     # Python takes sources of one size that change within a second for the same.
     own = {"PYTHONPATH": paths, "RBFMUSCLE_LOOPS": str(place / cache)}
     env = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **own, **settings}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen([sys.executable, "-c", MAIN], env=env, cwd=place, **pipes)
+    return subprocess.Popen([sys.executable, "-c", main], env=env, cwd=place, **pipes)
 
 
 def finish(process):
@@ -103,6 +103,14 @@ def test_second_process_and_a_copy_of_the_sources_compile_nothing(place):
         [102.5, 1.0],
         "",
     )
+    assert files(place) == kept
+
+
+def test_loading_needs_nothing_that_numba_compiles_by(place):
+    run(place)
+    kept = files(place)
+    main = MAIN + "import sys; print(float('numba.np.npyimpl' in sys.modules))"
+    assert run(place, main=main) == ([102.5, 1.0, 0.0], "")
     assert files(place) == kept
 
 
