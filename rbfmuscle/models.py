@@ -35,11 +35,19 @@ class ModelKind(NamedTuple):
 
 
 def _rbf() -> ModelKind:
-    from rbfmuscle.muscle.muscle import RBFMuscle
     from rbfmuscle.muscle.options import RBFOptions
-    from rbfmuscle.muscle.rest import solved_points
 
-    return ModelKind(RBFMuscle, RBFOptions, solved_points, "RBF")
+    def build(muscle: Muscle, scene: Scene, options: RBFOptions) -> MuscleModel:
+        from rbfmuscle.muscle.muscle import RBFMuscle
+
+        return RBFMuscle(muscle, scene, options)
+
+    def points(muscle: Muscle, scene: Scene, options: RBFOptions) -> str:
+        from rbfmuscle.muscle.rest import solved_points
+
+        return solved_points(muscle, scene, options)
+
+    return ModelKind(build, RBFOptions, points, "RBF")
 
 
 def _mesh(method: str, title: str, tolerance: float = 0.0) -> ModelKind:
