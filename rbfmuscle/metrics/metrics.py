@@ -49,9 +49,8 @@ class MuscleMeasures:
         surfaces = scene_surfaces(scene)
         guessed = guessed_muscles(scene.guesses)
         mine = [muscle for muscle in scene.muscles if muscle.name in material]
-        self.trackers = {
-            muscle.name: MuscleMeasurer(muscle, scene, *material[muscle.name]) for muscle in mine
-        }
+        trackers = each(lambda one: MuscleMeasurer(one, scene, *material[one.name]), mine)
+        self.trackers = {tracker.name: tracker for tracker in trackers}
         for muscle in mine:
             self.trackers[muscle.name].first = {
                 "articular_share": articular_share(muscle, scene, surfaces)[0],

@@ -94,13 +94,18 @@ def write_report(directory: str | Path, *, pictures: bool = True) -> None:
         page.missing = f"No pictures: {why}"
     else:
         pages: list[ReportPage] = []
-        # Plots take the interpreter's lock, and pictures leave it.
+        scenes: list[str] = []
+        # Plots take the interpreter's lock, and pictures and packing leave it.
         each(
             lambda draw: draw(),
-            [lambda: pages.append(_page(saved)), lambda: _draw_preview(saved, directory)],
+            [
+                lambda: _draw_preview(saved, directory),
+                lambda: scenes.append(packed_scene({"": saved})),
+                lambda: pages.append(_page(saved)),
+            ],
         )
         page = pages[0]
-        page.scene = packed_scene({"": saved})
+        page.scene = scenes[0]
     page.write(directory / "report.html")
 
 
