@@ -1,6 +1,7 @@
 """How a command ends when it may not go on: signals at any moment, full and closed outputs, a
 kill."""
 
+import gc
 import json
 import os
 import re
@@ -202,6 +203,21 @@ def jumping_arm(folder):
     )
     made.set_motion(ramp={"elbow.bend": {"to": 16, "step": 4}})
     return made.save(folder / "arm.toml")
+
+
+def test_a_process_ends_without_a_search_for_garbage_and_a_caller_goes_on_with_it(capsys):
+    """All that is loaded is left out of the last search."""
+    code = (
+        "import atexit, gc; "
+        "atexit.register(lambda: print(gc.get_freeze_count() > len(gc.get_objects()))); "
+        "from rbfmuscle.cli import main; main()"
+    )
+    ran = subprocess.run([sys.executable, "-c", code, "--version"], capture_output=True, text=True)
+    assert ran.returncode == 0
+    assert ran.stdout.split()[1:] == ["True"]
+    frozen = gc.get_freeze_count()
+    assert call(capsys, "--version")[0] == 0
+    assert gc.get_freeze_count() == frozen
 
 
 def test_a_jump_of_the_bones_is_named_at_once_and_the_frames_before_it_are_kept(tmp_path, capsys):
