@@ -36,7 +36,7 @@ def compare(
     Parameters
     ----------
     scenes
-        Scene files (TOML), or "phantom" for the phantom hip.
+        Scene files (TOML), or "phantom" for a hip made by formulas.
     models
         Models, separated by commas, for instance rbf,pbd; distances are measured to the first. By
         default rbf, the mesh models and pbd-converged, which takes long: it sweeps until no vertex

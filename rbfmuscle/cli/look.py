@@ -39,7 +39,7 @@ def view(
     Parameters
     ----------
     scene
-        Scene file (TOML), "phantom" for the phantom hip, or the folder of a run or of a
+        Scene file (TOML), "phantom" for a hip made by formulas, or the folder of a run or of a
         comparison.
     at
         Where to begin: COORDINATE=DEGREES, for instance hip.flexion=60; may be repeated. For a

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.objects import Muscle
     from rbfmuscle.scene.scene import Scene
 
-SceneName = Annotated[Path, Parameter(help='Scene file (TOML), or "phantom" for the phantom hip.')]
+SceneName = Annotated[
+    Path, Parameter(help='Scene file (TOML), or "phantom" for a hip made by formulas.')
+]
 RunFolder = Annotated[Path, Parameter(help="Folder of the run.")]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Folder for the results.")]
 OwnFolder = Annotated[Path | None, Parameter(name=["--output", "-o"])]

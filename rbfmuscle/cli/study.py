@@ -234,7 +234,7 @@ def sweep(
     Parameters
     ----------
     scenes
-        Scene files (TOML), or "phantom" for the phantom hip.
+        Scene files (TOML), or "phantom" for a hip made by formulas.
     """
     from rbfmuscle import interruption
     from rbfmuscle.experiments.sweep import parse_grid

@@ -21,11 +21,11 @@ from rbfmuscle.jit import compiled
 from rbfmuscle.muscle.bone_distances import ask_bones
 from rbfmuscle.muscle.surface_limits import lift
 
-# Lengths below are in mean edges of the mesh at rest. No vertex goes farther than this from where
-# the material carries it, times the square of the share that the field's slope there has of its
-# slope at rest, from none at the first; but always so far. Where sheets of a muscle meet, the slope
-# sinks within few frames: by the share itself vertices of the leg's muscles jump by up to 0.85 mm
-# in a squat, by its square 0.63.
+# Lengths below are in mean edges of the mesh at rest.
+# No vertex goes farther from where the material carries it than FARTHEST times the square of the
+# share that the field's slope there has of its slope at rest, 0 where that is UNSURE; but always
+# by ALWAYS. Where sheets of a muscle meet, the slope sinks within few frames: by the share itself
+# vertices of the leg's muscles jump by up to 0.85 mm in a squat, by its square 0.63.
 FARTHEST = 1.0
 UNSURE = 0.3
 ALWAYS = 0.05

@@ -203,7 +203,7 @@ def carry_near(near, y, margin):
     return out, reach
 
 
-class Question(NamedTuple):
+class Search(NamedTuple):
     """Where the near points are, and how far to look for obstacles from there."""
 
     here: np.ndarray  # (m, 3)
@@ -223,15 +223,15 @@ def find_touch(near, here, reach, travelled, obstacles, rounded):
     """
     touch = _no_touch(len(obstacles.poses) * len(here) + len(obstacles.planes.point))
     asked, farthest = near.free & (reach > -np.inf), reach.max() if len(reach) > 0 else -np.inf
-    question = Question(here, reach, asked, np.empty((2, 3)), farthest, travelled)
-    box_loop(here, asked, question.box)
+    search = Search(here, reach, asked, np.empty((2, 3)), farthest, travelled)
+    box_loop(here, asked, search.box)
     for i in range(len(here)):
         if reach[i] > -np.inf:
             near.spare[i] = np.inf
     count, room = 0, True
     scratch = no_scratch()
     for b in range(len(obstacles.poses)):
-        count, fits = _touch_bone(near, question, obstacles, rounded, b, touch, count, scratch)
+        count, fits = _touch_bone(near, search, obstacles, rounded, b, touch, count, scratch)
         room &= fits
     first = count
     count = _add_planes(touch, count, near, here, reach, obstacles, np.inf)
@@ -242,27 +242,27 @@ def find_touch(near, here, reach, travelled, obstacles, rounded):
 
 
 @compiled
-def _touch_bone(near, question, obstacles, rounded, b, touch, count, scratch):
+def _touch_bone(near, search, obstacles, rounded, b, touch, count, scratch):
     """Add the half-spaces of bone b to the first ``count``; how many there are then, and whether
     there was room for all of its blocks.
     """
-    here = question.here
-    reach = question.reach
+    here = search.here
+    reach = search.reach
     spare = near.spare
     allowed = near.allowed[b]
     pose = obstacles.poses[b]
     bounds = obstacles.bones.boxes[b]
     anchor = near.rounded.anchor[b]
     bound = near.rounded.bound[b]
-    apart, room = boxes_apart(question.box, pose, bounds), True
+    apart, room = boxes_apart(search.box, pose, bounds), True
     for i in range(len(here)):
-        if not question.asked[i]:
+        if not search.asked[i]:
             continue
         least = apart
-        if apart <= question.farthest:
+        if apart <= search.farthest:
             least = least_distance(here, i, pose, bounds, anchor, bound)
         if least >= reach[i]:
-            spare[i] = min(spare[i], question.travelled + least)
+            spare[i] = min(spare[i], search.travelled + least)
             continue
         distance, smooth = _ask_rounded(rounded, obstacles.bones, b, pose, here[i], scratch)
         room &= distance < np.inf
@@ -271,7 +271,7 @@ def _touch_bone(near, question, obstacles, rounded, b, touch, count, scratch):
             for a in range(3):
                 anchor[i, a] = scratch.local[a]
         there = trusted(distance) + allowed[i]
-        spare[i] = min(spare[i], question.travelled + there)
+        spare[i] = min(spare[i], search.travelled + there)
         if distance + allowed[i] < reach[i]:
             _add_touch(touch, count, i, distance + allowed[i], scratch.normal, b)
             count += 1
