@@ -19,7 +19,6 @@ def check(
     plan: Flag = False,
     time: Flag = False,
     accuracy: Flag = False,
-    upgrade: Flag = False,
     work: Work = USUAL_WORK,
 ) -> int:
     """Check a scene file and its meshes; nothing is solved but what --time and --accuracy ask for.
@@ -38,12 +37,10 @@ def check(
     accuracy
         Run the motion on lattices with the nodes given and twice as many, and tell how far RBF
         muscles are apart.
-    upgrade
-        First rewrite a scene file of format 1 in the form of today; comments stay.
     """
     if time and not plan:
         raise UsageError("--time measures what --plan lists; give check SCENE --plan --time")
-    facts: dict[str, object] = {"upgraded": _upgrade(scene)} if upgrade else {}
+    facts: dict[str, object] = {}
     with Progress(f"check {scene.name}"), work.threads():
         if picture:
             from rbfmuscle.report.render import check_picture
@@ -68,16 +65,6 @@ def check(
         last = f"usable; next: rbfmuscle run {scene} -o results" if usable else "not usable"
         print(last, file=sys.stderr)
     return 0 if usable else SceneError.exit_code
-
-
-def _upgrade(path):
-    """Rewrite an old scene file; whether it was one."""
-    from rbfmuscle.scene.upgrade import upgrade_file
-
-    changed = upgrade_file(path)
-    said = "rewritten in the form of today" if changed else "is in the form of today already"
-    print(f"{path} {said}", file=sys.stderr)
-    return changed
 
 
 def _measure_fields(scene):

@@ -23,7 +23,7 @@ from rbfmuscle.scene.options import (
 )
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
 from rbfmuscle.scene.toml_file import read_tables
-from rbfmuscle.scene.upgrade import FORMAT, MAIN, RENAMED
+from rbfmuscle.scene.toml_text import FORMAT, MAIN
 from rbfmuscle.validation import SceneError, did_you_mean
 
 
@@ -36,9 +36,7 @@ def _check_format(number):
 class SceneTable(Table):
     """``[scene]``."""
 
-    hints: ClassVar[Mapping[str, str]] = {
-        old: f"did you mean {new!r}?" for old, new in RENAMED.items()
-    }
+    hints: ClassVar[Mapping[str, str]] = {"left_out": "did you mean 'missing_bones'?"}
     format: Annotated[int, AfterValidator(_check_format)]
     name: str | None = None
     units: Literal["m", "cm", "mm"]

@@ -33,7 +33,7 @@ from rbfmuscle.scene.options import (
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
 from rbfmuscle.scene.save import SceneFiles
 from rbfmuscle.scene.settings import TABLES, change_settings
-from rbfmuscle.scene.upgrade import FORMAT
+from rbfmuscle.scene.toml_text import FORMAT
 from rbfmuscle.showing import Displayed
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 

@@ -1,16 +1,15 @@
 """The tables of a scene file as they stand, with those of the files that it includes."""
 
-import logging
 import os
 import tomllib
 from pathlib import Path
 
 from rbfmuscle.scene.guesses import Guess, find_guesses
 from rbfmuscle.scene.options import check_plain
-from rbfmuscle.scene.upgrade import FORMAT, Tables, is_old, upgraded
+from rbfmuscle.scene.toml_text import FORMAT
 from rbfmuscle.validation import SceneError, shown, shown_path
 
-log = logging.getLogger(__name__)
+Tables = dict[str, object]  # of a TOML file, unchecked
 
 # A scene file is a page or two; long lists of vertices belong into files of their own.
 LARGEST_FILE = 4_000_000
@@ -21,11 +20,7 @@ FILES = ("mesh", "fibres", "vertices", "points", "region", "file")
 
 
 def read_tables(path: Path) -> tuple[Tables, list[Guess]]:
-    """The tables of a scene file in the form of today, and its guesses; names of files are relative
-    to its folder.
-
-    A file of format 1 is taken as one of today, with a line in the log.
-    """
+    """The tables of a scene file, and its guesses; names of files are relative to its folder."""
     return _read(path, (path,))
 
 
@@ -33,14 +28,12 @@ def _read(path: Path, chain: tuple[Path, ...]) -> tuple[Tables, list[Guess]]:
     text = _read_text(path)
     data = _parse(path, text)
     check_plain(data, context=f"{path}: ")
-    if is_old(data):
-        log.warning(
-            "%s is in format 1; rbfmuscle check %s --upgrade writes it in format %d",
-            path,
-            path,
-            FORMAT,
+    about = data.get("scene")
+    if isinstance(about, dict) and about.get("format") == 1:
+        raise SceneError(
+            f"{path}: files of format 1 are read no more; write the scene anew by "
+            f"docs/scene_file.md, with format = {FORMAT}"
         )
-        data = upgraded(data)
     guesses = find_guesses(text)
     names = data.pop("include", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):

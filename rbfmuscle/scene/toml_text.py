@@ -3,6 +3,9 @@
 import json
 from collections.abc import Mapping
 
+FORMAT = 2  # of scene files
+MAIN = "main"  # the class of all muscles
+
 
 def value_text(value: object) -> str:
     """A value as TOML on one line; numbers to 13 digits."""

@@ -84,16 +84,6 @@ class TestInclude:
         loaded = Scene.load(scene)
         assert loaded.muscles[-1].model == "xpbd" and len(loaded.motion) == 3
 
-    def test_an_included_file_may_be_old(self, split):
-        scene, inner = split
-        attach = next(line for line in CLASSES.splitlines() if line.startswith("attach"))
-        inner.write_text(
-            f'[scene]\nformat = 1\nunits = "mm"\n[defaults]\nmodel = "xpbd"\n{attach}\n'
-            '[[muscle]]\nname = "first"\nmesh = "first.ply"\n'
-        )
-        (muscle,) = Scene.load(scene).muscles
-        assert muscle.model == "xpbd" and len(muscle.attachments) == 2
-
     @pytest.mark.parametrize(
         ("text", "words"),
         [

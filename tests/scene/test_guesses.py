@@ -87,7 +87,7 @@ def painted_scene(folder, colour, *, doubled=False):
     file = folder / "scene.toml"
     bones = "".join(f'[[bone]]\nname = "{n}"\nmesh = "{n}.ply"\n' for n in ("upper", "lower"))
     file.write_text(
-        f'[scene]\nformat = 1\nunits = "mm"\n{bones}[[muscle]]\nname = "m"\nmesh = "muscle.ply"\n'
+        f'[scene]\nformat = 2\nunits = "mm"\n{bones}[[muscle]]\nname = "m"\nmesh = "muscle.ply"\n'
         f'attach = [{{ bone = "upper", colour = "{colour}" }}, '
         '{ bone = "lower", colour = "#0000ff" }]\n',
         encoding="utf-8",

@@ -119,6 +119,11 @@ class TestMistakes:
                 r"'biceps' attach 1: unknown key 'sphere', write points = \[CENTRE\], radius =",
             ),
             ("[scene]\nformat = 2", "format = 2\n[scene]", r"'format', .* the table \[scene\]"),
+            (
+                "format = 2\n",
+                'format = 1\nleft_out = ["hand"]\n',
+                r"arm.toml: files of format 1 are read no more; write .* format = 2$",
+            ),
             ("format = 2\n", "", r"\[scene\]: key format is missing, write format = 2$"),
             ("[classes.main]", "[defaults]", r"'defaults', \[classes.main\] holds"),
             ("units =", "left_out = []\nunits =", r"'left_out', did you mean 'missing_bones'\?"),

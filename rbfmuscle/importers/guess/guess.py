@@ -22,8 +22,7 @@ from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.guesses import DOUBTFUL
 from rbfmuscle.scene.names import plain_name
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.scene.toml_text import attachment_file, table_text
-from rbfmuscle.scene.upgrade import FORMAT, MAIN
+from rbfmuscle.scene.toml_text import FORMAT, MAIN, attachment_file, table_text
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
 _TAIL = """[contact]
