@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.bones.build import build_cells, grid_shape
 from rbfmuscle.bones.cells import BLOCK
+from rbfmuscle.bones.distance import BoneArrays, bone_arrays
 from rbfmuscle.bones.mesh import mean_edge, points_near, prepare_bone
 from rbfmuscle.bones.query import FieldData, query_loop
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
@@ -113,6 +114,11 @@ class BoneSDF:
     def exact(self) -> ExactDistance:
         """The exact distance to the mesh (:class:`ExactDistance`), built when first asked for."""
         return ExactDistance(self.vertices, self.faces)
+
+    @cached_property
+    def arrays(self) -> BoneArrays:
+        """What loops that ask for exact distances read."""
+        return bone_arrays(self.exact, closed=self.closed)
 
     @classmethod
     def from_mesh(

@@ -4,10 +4,10 @@ their sum.
 
 import numpy as np
 
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 
-@compiled(inline="always")
+@loop
 def bspline_weights(t):
     """Weights of the four nodes about a place ``t`` in [0, 1] of a cell, and their derivatives by
     ``t``.
@@ -22,7 +22,7 @@ def bspline_weights(t):
     return weights, (-0.5 * s * s, 1.5 * t * t - 2.0 * t, 2.0 * s - 1.5 * s * s, 0.5 * t * t)
 
 
-@compiled(fastmath={"contract"})
+@loop(fastmath={"contract"})
 def bspline_sum(blocks, block, start, width, x, y, z):
     """Value and gradient, in units of a cell, at a place x, y, z of a cell.
 

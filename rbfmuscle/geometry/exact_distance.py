@@ -28,7 +28,7 @@ from rbfmuscle.geometry.triangles import (
     nearest_in_frame,
     pseudonormals,
 )
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 # Triangles in a leaf, at most.
 LEAF = 4
@@ -155,7 +155,7 @@ def faces_across(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.where(opposite < 0, opposite, opposite // 3).reshape(-1, 3)
 
 
-@compiled
+@loop
 def _order_loop(centres, order, depth, starts):
     """Order triangles so that each node of the heap holds a range, halved along its longest
     extent.
@@ -173,7 +173,7 @@ def _order_loop(centres, order, depth, starts):
             _select(centres[:, axis], order, low, high - 1, middle)
 
 
-@compiled
+@loop
 def _longest_axis(centres, order, low, high):
     longest, axis = -1.0, 0
     for k in range(3):
@@ -186,7 +186,7 @@ def _longest_axis(centres, order, low, high):
     return axis
 
 
-@compiled
+@loop
 def _select(keys, order, left, right, middle):
     """Hoare's selection: afterwards no key before ``middle`` is greater than one after it."""
     while left < right:
@@ -209,7 +209,7 @@ def _select(keys, order, left, right, middle):
             return
 
 
-@compiled
+@loop
 def _box_loop(vertices, faces, order, starts, boxes):
     """Boxes of all nodes, from the leaves up; a leaf without triangles keeps an empty box."""
     leaves = len(starts) - 1
@@ -227,7 +227,7 @@ def _box_loop(vertices, faces, order, starts, boxes):
             boxes[node, 3 + j] = max(boxes[2 * node, 3 + j], boxes[2 * node + 1, 3 + j])
 
 
-@compiled(inline="always")
+@loop
 def _box_square(boxes, node, x, y, z):
     dx = max(boxes[node, 0] - x, x - boxes[node, 3], 0.0)
     dy = max(boxes[node, 1] - y, y - boxes[node, 4], 0.0)
@@ -235,7 +235,7 @@ def _box_square(boxes, node, x, y, z):
     return dx * dx + dy * dy + dz * dz
 
 
-@compiled(inline="always")
+@loop
 def record_square(records, n, x, y, z):
     """Squared distance from a point to the triangle of record n."""
     qx = x - records[n, 0]
@@ -256,7 +256,7 @@ def record_square(records, n, x, y, z):
     return du * du + dv * dv + w * w
 
 
-@compiled
+@loop
 def record_feature(records, n, x, y, z):
     """Feature of the triangle of record n (FACE, EDGE + k, CORNER + k) that is nearest to a
     point.
@@ -272,7 +272,7 @@ def record_feature(records, n, x, y, z):
     return nearest_in_frame(bx, cx, cy, records[n, INVERSE_BC], records[n, INVERSE_CA], u, v)[2]
 
 
-@compiled
+@loop
 def nearest_triangle(tree, at, best, square, slack, stack):
     """Record of the triangle of a `Tree` nearest to a point ``at``, and the squared distance.
 
@@ -316,7 +316,7 @@ def nearest_triangle(tree, at, best, square, slack, stack):
     return best, square
 
 
-@compiled
+@loop
 def _nearest_loop(points, reach, tree, normals, out):
     records, order = tree.records, tree.order
     distance, closest, face, normal = out
@@ -345,7 +345,7 @@ def _nearest_loop(points, reach, tree, normals, out):
         distance[i] = np.sqrt(square) if side >= 0.0 else -np.sqrt(square)
 
 
-@compiled
+@loop
 def signed_side(record, face, point, normals, closest, normal):
     """Fill the nearest point of a triangle and its pseudonormal; return the offset's part along it.
 
@@ -360,7 +360,7 @@ def signed_side(record, face, point, normals, closest, normal):
     return side
 
 
-@compiled
+@loop
 def closest_in_record(record, point, closest):
     """Fill the point of one triangle that is nearest to a point; return its feature."""
     u = 0.0
@@ -378,7 +378,7 @@ def closest_in_record(record, point, closest):
     return feature
 
 
-@compiled
+@loop
 def _pseudonormal(record, feature, face, edge_normals, vertex_normals, faces, normal):
     """Fill the direction that signs the distance to one feature of a face."""
     first = int(record[FIRST])

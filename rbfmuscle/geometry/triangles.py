@@ -9,7 +9,7 @@ zero area is its longest edge. The sign comes from angle-weighted pseudonormals 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 # Columns of a record: corner A, x-axis, y-axis, normal, then x of B, x and y of C, and 1/|BC|^2,
 # 1/|CA|^2.
@@ -27,7 +27,7 @@ EDGE = 1
 CORNER = 4
 
 
-@compiled
+@loop
 def fill_records(vertices, faces, order, records):
     """Fill ``records`` (m, WIDTH) with the frames of the triangles ``faces[order]``; zero area is
     allowed.
@@ -52,7 +52,7 @@ def fill_records(vertices, faces, order, records):
         records[n, FIRST] = first
 
 
-@compiled
+@loop
 def _fill_record(corner, record):
     bx = 0.0
     along = 0.0
@@ -92,7 +92,7 @@ def _fill_record(corner, record):
     record[INVERSE_CA] = 1.0 / ca if ca > 0.0 else 0.0
 
 
-@compiled
+@loop
 def _any_normal(record):
     least = 0
     for j in range(1, 3):
@@ -104,7 +104,7 @@ def _any_normal(record):
         record[6 + j] = scale * (unit - record[3 + least] * record[3 + j])
 
 
-@compiled(inline="always")
+@loop
 def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
     """In-plane offset from the triangle to (x, y), and the feature nearest to it: ``(dx, dy,
     feature)``.
@@ -159,7 +159,7 @@ def pseudonormals(vertices: Floats, faces: Integers, across: Integers) -> tuple[
     return unit[:, None] + np.where((across >= 0)[:, :, None], unit[across], 0.0), of_vertices
 
 
-@compiled
+@loop
 def _dot(a, b, p, q):
     """(b - a) . (p - q), without temporary arrays."""
     return (
@@ -169,7 +169,7 @@ def _dot(a, b, p, q):
     )
 
 
-@compiled
+@loop
 def triangle_normal(vertices, faces, f):
     """Normal of a triangle, twice its area long."""
     a = faces[f, 0]
@@ -184,7 +184,7 @@ def triangle_normal(vertices, faces, f):
     return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
 
 
-@compiled
+@loop
 def nearest_weights(p, a, b, c, weights):
     """Barycentric weights of the point of a triangle nearest to p (Ericson 2005, section 5.1.5)."""
     d1, d2 = _dot(a, b, p, a), _dot(a, c, p, a)

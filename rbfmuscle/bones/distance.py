@@ -1,0 +1,268 @@
+"""Exact signed distance to one bone, for compiled loops: a tree of triangles asked about many
+points.
+
+The nearest triangle is found in a tree of boxes. The sign of a closed mesh comes from
+angle-weighted pseudonormals (Baerentzen & Aanaes 2005); that of an open mesh, or of one that
+intersects itself, from its winding number, summed over the same tree (Barill et al. 2018, "Fast
+winding numbers for soups and clouds").
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, nearest_triangle, record_square
+from rbfmuscle.geometry.triangles import (
+    BX,
+    CORNER,
+    CX,
+    CY,
+    EDGE,
+    FACE,
+    FIRST,
+    INVERSE_BC,
+    INVERSE_CA,
+    nearest_in_frame,
+)
+from rbfmuscle.loops import loop
+
+# Relative difference of squared distances below which triangles count as equally near: rounding in
+# large triangles, beside which the point is near. The one of the least number is taken, whatever
+# was known before.
+TIE = 1e-10
+# Nearer to the surface than this share of the bone's box, the direction from the nearest point is
+# rounding.
+ON_SURFACE = 1e-12
+# Farther from a part of the mesh than this many of its radii its solid angle is that of a dipole.
+DIPOLE_REACH = 2.0
+
+
+class BoneArrays(NamedTuple):
+    """What loops read of one bone, in bone coordinates; f faces, v vertices, l leaves."""
+
+    boxes: Floats  # (2 l, 6) of the nodes of the tree, a binary heap
+    starts: Integers  # (l + 1,) first record of each leaf
+    records: Floats  # (f, WIDTH) frames of the triangles, in the order of the tree
+    order: Integers  # (f,) face of each record
+    edge_normals: Floats  # (f, 3, 3) pseudonormals
+    vertex_normals: Floats  # (v, 3)
+    faces: Integers  # (f, 3)
+    dipoles: Floats  # (2 l, 6) middles and area vectors of the nodes, (0, 6) for a closed mesh
+
+
+class Memory(NamedTuple):
+    """What is known about one bone from the last question about each of n points."""
+
+    anchor: Floats  # (n, 3) where a point was, in bone coordinates
+    bound: Floats  # (n,) lower bound of the distance there, -infinity where nothing is known
+    triangle: Integers  # (n,) record of the nearest triangle, -1 where nothing is known
+
+    @classmethod
+    def of(cls, count: int) -> "Memory":
+        """Nothing known of so many points."""
+        return cls(
+            np.zeros((count, 3)), np.full(count, -np.inf), np.full(count, -1, dtype=np.int64)
+        )
+
+
+def bone_arrays(exact: ExactDistance, *, closed: bool) -> BoneArrays:
+    """Arrays of a mesh; ``closed`` says that it is closed and does not intersect itself."""
+    dipoles = np.empty((0 if closed else len(exact.boxes), 6))
+    if not closed:
+        _dipole_loop(exact.boxes, exact.starts, exact.records, dipoles)
+    return BoneArrays(*exact.tree, *exact.pseudonormals, exact.faces, dipoles)
+
+
+@loop
+def _dipole_loop(boxes, starts, records, dipoles):
+    """Fill middles, weighted by area, and area vectors of the nodes of a tree."""
+    leaves = len(starts) - 1
+    areas = np.zeros(len(boxes))
+    dipoles[:] = 0.0
+    for leaf in range(leaves):
+        node = leaves + leaf
+        for n in range(starts[leaf], starts[leaf + 1]):
+            area = 0.5 * records[n, BX] * records[n, CY]
+            areas[node] += area
+            for k in range(3):
+                middle = (
+                    records[n, k]
+                    + (
+                        (records[n, BX] + records[n, CX]) * records[n, 3 + k]
+                        + records[n, CY] * records[n, 6 + k]
+                    )
+                    / 3.0
+                )
+                dipoles[node, k] += area * middle
+                dipoles[node, 3 + k] += area * records[n, 9 + k]
+    for node in range(leaves - 1, 0, -1):
+        areas[node] = areas[2 * node] + areas[2 * node + 1]
+        for k in range(6):
+            dipoles[node, k] = dipoles[2 * node, k] + dipoles[2 * node + 1, k]
+    for node in range(1, len(boxes)):
+        for k in range(3):
+            dipoles[node, k] /= max(areas[node], 1e-300)
+
+
+@loop
+def _solid_angle(record, x, y, z):
+    """Half the solid angle of a triangle (Van Oosterom & Strackee 1983)."""
+    ax = record[0] - x
+    ay = record[1] - y
+    az = record[2] - z
+    bx = ax + record[BX] * record[3]
+    by = ay + record[BX] * record[4]
+    bz = az + record[BX] * record[5]
+    cx = ax + record[CX] * record[3] + record[CY] * record[6]
+    cy = ay + record[CX] * record[4] + record[CY] * record[7]
+    cz = az + record[CX] * record[5] + record[CY] * record[8]
+    a = np.sqrt(ax * ax + ay * ay + az * az)
+    b = np.sqrt(bx * bx + by * by + bz * bz)
+    c = np.sqrt(cx * cx + cy * cy + cz * cz)
+    volume = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
+    ab = ax * bx + ay * by + az * bz
+    bc = bx * cx + by * cy + bz * cz
+    ca = cx * ax + cy * ay + cz * az
+    return np.arctan2(volume, a * b * c + ab * c + bc * a + ca * b)
+
+
+@loop
+def winding_number(bone, x, y, z, stack):
+    """How often a mesh winds around a point: about 1 inside and 0 outside."""
+    boxes = bone.boxes
+    dipoles = bone.dipoles
+    leaves = len(bone.starts) - 1
+    total = 0.0
+    top = 0
+    stack[0] = 1
+    while top >= 0:
+        node = stack[top]
+        top -= 1
+        away = 0.0
+        radius = 0.0
+        flux = 0.0
+        for k in range(3):
+            at = x if k == 0 else (y if k == 1 else z)
+            offset = dipoles[node, k] - at
+            away += offset * offset
+            flux += offset * dipoles[node, 3 + k]
+            radius += (
+                max(boxes[node, 3 + k] - dipoles[node, k], dipoles[node, k] - boxes[node, k]) ** 2
+            )
+        if away > DIPOLE_REACH * DIPOLE_REACH * radius:
+            total += 0.5 * flux / (away * np.sqrt(away))
+        elif node < leaves:
+            stack[top + 1] = 2 * node
+            stack[top + 2] = 2 * node + 1
+            top += 2
+        else:
+            for n in range(bone.starts[node - leaves], bone.starts[node - leaves + 1]):
+                total += _solid_angle(bone.records[n], x, y, z)
+    return total / (2.0 * np.pi)
+
+
+@loop
+def distance_at(bone, x, y, z, triangle, stack, squares):
+    """Signed distance of one point in bone coordinates, its unit gradient, and the record of the
+    nearest triangle.
+
+    ``triangle`` is a record that may be near, or -1; it does not change the answer. ``stack`` and
+    ``squares`` (STACK,) are arrays to work in, of int64 and float64.
+    """
+    records = bone.records
+    square = np.inf if triangle < 0 else record_square(records, triangle, x, y, z)
+    tree = (bone.boxes, bone.starts, records, bone.order)
+    best = nearest_triangle(tree, (x, y, z), triangle, square, TIE, (stack, squares))[0]
+    r = records[best]
+    qx = x - r[0]
+    qy = y - r[1]
+    qz = z - r[2]
+    u = qx * r[3] + qy * r[4] + qz * r[5]
+    v = qx * r[6] + qy * r[7] + qz * r[8]
+    w = qx * r[9] + qy * r[10] + qz * r[11]
+    du, dv, feature = nearest_in_frame(r[BX], r[CX], r[CY], r[INVERSE_BC], r[INVERSE_CA], u, v)
+    distance = np.sqrt(du * du + dv * dv + w * w)
+    # From the nearest point to the point asked about.
+    ox = du * r[3] + dv * r[6] + w * r[9]
+    oy = du * r[4] + dv * r[7] + w * r[10]
+    oz = du * r[5] + dv * r[8] + w * r[11]
+    face = bone.order[best]
+    first = int(r[FIRST])
+    if feature == FACE:
+        nx, ny, nz = r[9], r[10], r[11]
+    elif feature < CORNER:
+        normal = bone.edge_normals[face, (first + feature - EDGE) % 3]
+        nx, ny, nz = normal[0], normal[1], normal[2]
+    else:
+        normal = bone.vertex_normals[bone.faces[face, (first + feature - CORNER) % 3]]
+        nx, ny, nz = normal[0], normal[1], normal[2]
+    side = 1.0 if ox * nx + oy * ny + oz * nz >= 0.0 else -1.0
+    box = bone.boxes[1]
+    size = abs(box[3] - box[0]) + abs(box[4] - box[1]) + abs(box[5] - box[2])
+    if len(bone.dipoles) > 0:
+        solid = winding_number(bone, x, y, z, stack) > 0.5
+        if feature == FACE and (side < 0.0) != solid:  # a face that looks inward
+            nx, ny, nz = -nx, -ny, -nz
+        side = -1.0 if solid else 1.0
+    if feature != FACE and distance > ON_SURFACE * size:
+        return (
+            side * distance,
+            side * ox / distance,
+            side * oy / distance,
+            side * oz / distance,
+            best,
+        )
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    if length < 1e-9:  # a pseudonormal that vanishes, as at a fold
+        nx = x - 0.5 * (box[0] + box[3])
+        ny = y - 0.5 * (box[1] + box[4])
+        nz = z - 0.5 * (box[2] + box[5]) + 1e-300
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    return side * distance, nx / length, ny / length, nz / length, best
+
+
+@loop
+def distance_loop(bone, pose, points, reach, anchor, bound, triangle, distance, gradient):
+    """Signed distances (n,) of points (n, 3) in the world to a bone in a pose (4, 4), and their
+    unit gradients (n, 3) in world axes.
+
+    Negative inside. Where the bone is farther than ``reach`` (n,), only a lower bound beyond it may
+    be given, with a gradient of zero; a reach below zero asks for depths beyond it only. On the
+    surface the gradient is the pseudonormal. ``anchor``, ``bound`` and ``triangle`` are those of a
+    `Memory`, which save time, change no answer and are brought up to date.
+    """
+    stack = np.empty(STACK, np.int64)
+    squares = np.empty(STACK)
+    box = bone.boxes[1]
+    for i in range(len(points)):
+        dx = points[i, 0] - pose[0, 3]
+        dy = points[i, 1] - pose[1, 3]
+        dz = points[i, 2] - pose[2, 3]
+        x = pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz
+        y = pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz
+        z = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
+        ex = max(box[0] - x, x - box[3], 0.0)
+        ey = max(box[1] - y, y - box[4], 0.0)
+        ez = max(box[2] - z, z - box[5], 0.0)
+        beyond = ex * ex + ey * ey + ez * ez
+        moved = (x - anchor[i, 0]) ** 2 + (y - anchor[i, 1]) ** 2 + (z - anchor[i, 2]) ** 2
+        least = bound[i] - np.sqrt(moved)
+        if beyond > 0.0:
+            least = max(least, np.sqrt(beyond))
+        if least > reach[i]:
+            distance[i] = least
+            gradient[i, 0] = 0.0
+            gradient[i, 1] = 0.0
+            gradient[i, 2] = 0.0
+            continue
+        d, gx, gy, gz, best = distance_at(bone, x, y, z, triangle[i], stack, squares)
+        distance[i] = d
+        for k in range(3):
+            gradient[i, k] = pose[k, 0] * gx + pose[k, 1] * gy + pose[k, 2] * gz
+        anchor[i, 0] = x
+        anchor[i, 1] = y
+        anchor[i, 2] = z
+        triangle[i] = best
+        # The sign of an open mesh may change without a zero between.
+        bound[i] = d if len(bone.dipoles) == 0 else -np.inf
