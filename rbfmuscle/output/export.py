@@ -8,24 +8,23 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.folders import OutputFolder
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.solids import SolidDistance
-from rbfmuscle.geometry.vectors import to_local
+from rbfmuscle.geometry.vectors import to_local, to_world
 from rbfmuscle.output.animation.gltf import animated_glb
 from rbfmuscle.output.animation.parts import AnimatedMesh, Animation, read_animation
 from rbfmuscle.output.animation.usd import check_usd, write_usd
 from rbfmuscle.output.fibre_files import write_fibres
 from rbfmuscle.output.run_data import RunData, open_run
 from rbfmuscle.output.surface_arrays import VertexArrays
-from rbfmuscle.output.vtp import NORMALS, TEXTURE, Collection, write_vtp
-from rbfmuscle.scene.meshes.input_mesh import InputMesh
-from rbfmuscle.scene.meshes.obj import obj_text
+from rbfmuscle.output.vtp import NORMALS, Collection, write_vtp
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingDependencyError, SolveError, UsageError
 
 # One file a muscle (or bone) and frame.
 MESHES = ("pvd", "vtp", "ply", "stl", "obj")
 ANIMATIONS = ("animated-glb", "usd")
+DIGITS = 12  # after the point, of lengths in OBJ files
 FORMATS = (*MESHES, "glb", *ANIMATIONS)
 
 
@@ -173,7 +172,13 @@ def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -
             files |= {p.name: f"{stems[p.name]}_{frame:04d}.{suffix}" for p in moved}
             for part in moved:
                 arrays = measure.of(part, k) if measure and group == "surfaces" else {}
-                write_mesh(folder / files[part.name], part.own(k), arrays)
+                vertices, faces, normals = part.own(k)
+                if part.given is not None:
+                    arrays = {key: values[part.given.source] for key, values in arrays.items()}
+                if part.poses is not None:
+                    vertices = to_world(vertices, part.poses[k])
+                    normals = normals @ part.poses[k][:3, :3].T
+                write_mesh(folder / files[part.name], vertices, faces, normals, arrays)
             written += [folder / files[part.name] for part in moved]
             if collection is not None:
                 collection.add(run.times[k] if run.timed else frame, list(files.items()))
@@ -220,28 +225,24 @@ def _at_rest(points: Floats, bone: AnimatedMesh, k: int) -> Floats:
     return to_local(points, pose)
 
 
-def write_mesh(path: Path, mesh: InputMesh, arrays: Mapping[str, Floats]) -> None:
-    """Write a triangle mesh as ``.vtp`` (with arrays at the vertices of the model's mesh),
-    ``.ply``, ``.stl`` or ``.obj``, by suffix; PLY and STL in single precision.
-
-    In OBJ texture coordinates and normals have numbers of their own. In VTP and PLY, which have
-    none, vertices with several come several times, after all others; STL has neither.
+def write_mesh(
+    path: Path,
+    vertices: Floats,
+    faces: Integers,
+    normals: Floats,
+    arrays: Mapping[str, Floats],
+) -> None:
+    """Write a triangle mesh as ``.vtp`` (with arrays at the vertices), ``.ply``, ``.stl`` or
+    ``.obj``, by suffix; PLY and STL in single precision, STL without normals of vertices.
     """
-    if path.suffix == ".obj":
-        path.write_text(obj_text(mesh), encoding="ascii")
-        return
-    mesh = mesh.split()
-    corners = mesh.corners
     if path.suffix == ".vtp":
-        shown = {name: values[mesh.source] for name, values in arrays.items()}
-        shown |= {TEXTURE: corners.texture} if len(corners.texture) else {}
-        shown |= {NORMALS: corners.normals} if len(corners.normals) else {}
-        write_vtp(path, mesh.vertices, mesh.faces, shown)
+        write_vtp(path, vertices, faces, {**arrays, NORMALS: normals})
         return
     import trimesh
 
-    normals = corners.normals if len(corners.normals) else None
-    made = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, process=False)
-    if len(corners.texture):
-        made.vertex_attributes.update(zip("st", corners.texture.T.astype(np.float32)))
-    made.export(path, **({"vertex_normal": normals is not None} if path.suffix == ".ply" else {}))
+    made = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
+    options: dict[str, dict[str, object]] = {
+        ".ply": {"vertex_normal": True},
+        ".obj": {"include_normals": True, "digits": DIGITS, "header": None},
+    }
+    made.export(path, **options.get(path.suffix, {}))

@@ -15,7 +15,7 @@ from rbfmuscle.output import appearance as look
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.run_folder import FolderMeshes, Mesh, read_run
 from rbfmuscle.scene.joints.tables import full_name
-from rbfmuscle.scene.meshes.input_mesh import InputMesh
+from rbfmuscle.scene.meshes.input_mesh import InputOrder
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import FibreLines, Frame
@@ -45,9 +45,10 @@ class SceneMeshes:
         mesh = self._bones[name]
         return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
-    def given(self, muscle: str) -> InputMesh | None:
-        """The mesh of a muscle's file at rest, where it differs from the one that is shown."""
-        return self._muscles[muscle].given
+    def given(self, muscle: str) -> InputOrder | None:
+        """The vertex order of a muscle's own file, where it is another one."""
+        given = self._muscles[muscle].given
+        return None if given is None else InputOrder(given.faces, given.source)
 
     def tendons(self, muscle: str, frame: Frame) -> Mesh:
         """All tendons of a muscle in a frame."""

@@ -17,7 +17,7 @@ from rbfmuscle.output.fibre_files import fibre_file, read_fibres
 from rbfmuscle.output.given_files import read_given
 from rbfmuscle.output.info import FORMAT, FrameInfo, RunInfo
 from rbfmuscle.output.vtp import read_vtp
-from rbfmuscle.scene.meshes.input_mesh import InputMesh
+from rbfmuscle.scene.meshes.input_mesh import InputOrder
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface
 from rbfmuscle.validation import SceneError, UsageError
@@ -42,8 +42,8 @@ class FolderMeshes:
             self._bones[name] = read_vtp(self._folder / "bones" / f"{name}.vtp")
         return self._bones[name]
 
-    def given(self, muscle: str) -> InputMesh | None:
-        """The mesh of a muscle's file at rest, where it differs from the one that is shown."""
+    def given(self, muscle: str) -> InputOrder | None:
+        """The vertex order of a muscle's own file, where it is another one."""
         return read_given(self._folder, muscle)
 
     def tendons(self, muscle: str, frame: Frame) -> Mesh:

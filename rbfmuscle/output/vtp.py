@@ -19,8 +19,7 @@ from rbfmuscle.geometry.arrays import Array, Floats, Integers
 from rbfmuscle.validation import MeshError
 
 _TYPES = {"Float64": "<f8", "Float32": "<f4", "Int32": "<i4"}  # of VTK, in NumPy's words
-# Names of arrays that VTK takes for texture coordinates and normals.
-TEXTURE, NORMALS = "texture_coordinates", "normals"
+NORMALS = "normals"  # name of the array that VTK takes for them
 _PARTS = ("PointData", "CellData", "Points", "Lines", "Polys")
 _HEAD = """<?xml version="1.0"?>
 <VTKFile type="PolyData" version="1.0"
@@ -84,8 +83,7 @@ def write_blocks(
 ) -> None:
     """Write a PolyData file of so many points, lines and faces."""
     names = [block.name for block in blocks if block.part == "PointData"]
-    marks = (("TCoords", TEXTURE), ("Normals", NORMALS))
-    marked = "".join(f' {mark}="{name}"' for mark, name in marks if name in names)
+    marked = f' Normals="{NORMALS}"' if NORMALS in names else ""
     elements = dict.fromkeys(_PARTS, "")
     offset = 0
     for block in blocks:

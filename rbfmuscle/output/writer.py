@@ -25,7 +25,7 @@ from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.output.appearance import tendon_mesh
 from rbfmuscle.output.fibre_files import FOLDER, TABLE, begin_table, fibre_file, write_frame
-from rbfmuscle.output.given_files import given_file, write_given
+from rbfmuscle.output.given_files import given_file
 from rbfmuscle.output.info import FORMAT, RunInfo
 from rbfmuscle.output.surface_arrays import RunArrays
 from rbfmuscle.output.vtp import Collection, write_vtp
@@ -87,17 +87,20 @@ class RunWriter:
                 begin_table(self.directory)
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
             if self.meshes:
-                self._write_given()
+                self._write_orders()
         except OSError as error:
             message = f"cannot write to {self.directory}: {error.strerror}; choose another folder"
             raise UsageError(message) from None
 
-    def _write_given(self):
-        """The meshes of the files, where surfaces are shown by other ones."""
+    def _write_orders(self):
+        """The vertex order of muscles' own files, where it is another one than that of the mesh."""
         for muscle in self.scene.muscles:
             if muscle.given is not None:
-                self.folder.add(given_file(muscle.name))
-                write_given(self.directory, muscle.name, muscle.given)
+                file = given_file(muscle.name)
+                self.folder.add(file)
+                np.savez_compressed(
+                    self.directory / file, faces=muscle.given.faces, source=muscle.given.source
+                )
 
     def write(self, frame: Frame, rows: Sequence[Sequence[object]] = ()) -> None:
         """Write one frame, and the rows of metrics that are complete; SolveError if the disk

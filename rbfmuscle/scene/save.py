@@ -15,8 +15,6 @@ from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.scene.joints.joint import Coupling, Joint
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
-from rbfmuscle.scene.meshes.input_mesh import InputMesh
-from rbfmuscle.scene.meshes.obj import obj_text
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.options import Table
 from rbfmuscle.scene.toml_text import attachment_file, table_text
@@ -67,7 +65,7 @@ class SceneFiles:
         attach: list[dict[str, object]] = []
         row: dict[str, object] = {
             "name": muscle.name,
-            "mesh": self._muscle_mesh(muscle),
+            "mesh": self._mesh("muscles", muscle.name, muscle.mesh),
             "model": {"name": muscle.model, **muscle.options},
             "attach": attach,
         }
@@ -144,19 +142,6 @@ class SceneFiles:
 
     def _relative(self, file: Path) -> str:
         return file.relative_to(self.path.parent).as_posix()
-
-    def _muscle_mesh(self, muscle: Muscle) -> str:
-        """Write the mesh of a muscle and return its name: an OBJ file where it has texture
-        coordinates or normals.
-        """
-        given = muscle.given
-        if given is None or not (len(given.corners.texture) or len(given.corners.normals)):
-            return self._mesh("muscles", muscle.name, muscle.mesh)
-        vertices = np.asarray(muscle.mesh.vertices)
-        own = InputMesh(vertices, given.source[given.faces], given.source, given.corners)
-        file = self._new(f"muscles/{muscle.name}.obj")
-        file.write_text(obj_text(own), encoding="ascii")
-        return self._relative(file)
 
     def _mesh(self, folder: str, name: str, mesh: trimesh.Trimesh) -> str:
         """Write a PLY file in double precision, which trimesh does not, and return its name."""

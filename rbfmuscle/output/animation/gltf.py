@@ -12,10 +12,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.output.animation.parts import AnimatedFibres, AnimatedMesh, Animation
 from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
-from rbfmuscle.scene.meshes.input_mesh import InputMesh, plain_input
 from rbfmuscle.validation import UsageError
 
 _FLOAT, _INT = 5126, 5125  # types of numbers
@@ -54,15 +52,24 @@ def _add_part(file: "_File", part: AnimatedMesh) -> int:
     """Number of a new node: a muscle has a morph target for each frame but the first, a bone a pose
     for each.
     """
-    first, *later = (_split(part, k) for k in range(len(part.vertices)))
-    base = first.vertices
-    normals = first.corners.normals
+    base, faces, normals = part.own(0)
+    colour = [*linear_rgb(rgb(part.colour)).tolist(), 1.0]
+    look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}
+    primitive: dict[str, object] = {
+        "attributes": {
+            "POSITION": file.add(base, "VEC3", target=_VERTICES, bounds=True),
+            "NORMAL": file.add(normals, "VEC3", target=_VERTICES),
+        },
+        "indices": file.add(faces.reshape(-1, 1), "SCALAR", target=_INDICES),
+        "material": file.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
+    }
     targets = []
-    for frame in later:
-        moved, turned = frame.vertices - base, frame.corners.normals - normals
-        position = file.add(moved, "VEC3", target=_VERTICES, bounds=True)
-        targets.append({"POSITION": position, "NORMAL": file.add(turned, "VEC3", target=_VERTICES)})
-    node = file.add_node(part.name, _primitive(file, part, first), targets)
+    for k in range(1, len(part.vertices)):
+        vertices, _, turned = part.own(k)
+        position = file.add(vertices - base, "VEC3", target=_VERTICES, bounds=True)
+        normal = file.add(turned - normals, "VEC3", target=_VERTICES)
+        targets.append({"POSITION": position, "NORMAL": normal})
+    node = file.add_node(part.name, primitive, targets)
     if part.poses is not None:
         turns, shifts = _quaternions(part.poses[:, :3, :3]), part.poses[:, :3, 3]
         place = {"rotation": turns[0].tolist(), "translation": shifts[0].tolist()}
@@ -71,42 +78,6 @@ def _add_part(file: "_File", part: AnimatedMesh) -> int:
             file.animate(node, "rotation", file.add(turns, "VEC4"))
             file.animate(node, "translation", file.add(shifts, "VEC3"))
     return node
-
-
-def _primitive(file: "_File", part: AnimatedMesh, first: InputMesh) -> dict[str, object]:
-    """The triangles of the first frame of a part, with a material of its own."""
-    colour = [*linear_rgb(rgb(part.colour)).tolist(), 1.0]
-    look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}
-    attributes = {
-        "POSITION": file.add(first.vertices, "VEC3", target=_VERTICES, bounds=True),
-        "NORMAL": file.add(first.corners.normals, "VEC3", target=_VERTICES),
-    }
-    if len(first.corners.texture):
-        # From the upper left in glTF.
-        texture = first.corners.texture * [1.0, -1.0] + [0.0, 1.0]
-        attributes["TEXCOORD_0"] = file.add(texture, "VEC2", target=_VERTICES)
-    return {
-        "attributes": attributes,
-        "indices": file.add(first.faces.reshape(-1, 1), "SCALAR", target=_INDICES),
-        "material": file.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
-    }
-
-
-def _split(part: AnimatedMesh, k: int) -> InputMesh:
-    """A frame of a part with one number for all that a corner has; its file's normals, or those of
-    the surface that is shown, on which seams of textures do not show.
-    """
-    if part.poses is not None:
-        vertices, faces = part.vertices[0], part.faces[0]
-        mesh = plain_input(vertices, faces)
-    else:
-        vertices, faces = part.mesh(k)
-        mesh = part.own(k).split()
-    if not len(mesh.corners.normals):
-        smooth = vertex_normals(vertices, faces)[mesh.source]
-        corners = mesh.corners._replace(normals=smooth, normal_faces=mesh.faces)
-        mesh = mesh._replace(corners=corners)
-    return mesh
 
 
 def _add_fibres(file: "_File", fibres: AnimatedFibres) -> int:

@@ -5,10 +5,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.output import appearance as look
 from rbfmuscle.output.run_data import RunData, frame_caption
-from rbfmuscle.scene.meshes.input_mesh import InputMesh, plain_input
+from rbfmuscle.scene.meshes.input_mesh import InputOrder
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.simulation.frame import FibreLines
 
@@ -23,8 +24,8 @@ class AnimatedMesh:
 
     Vertices (n, 3) and faces (m, 3) are those of each frame, with the same array of faces where it
     stays; of a bone there is one of each, at rest, and poses (T, 4, 4) from there to the world.
-    ``colour`` is "#rrggbb"; muscles of one ``group`` cross the same joints. ``given`` is the mesh
-    of the muscle's file at rest, where its vertices are shown.
+    ``colour`` is "#rrggbb"; muscles of one ``group`` cross the same joints. ``given`` is the
+    vertex order of the muscle's file, where its vertices are shown in another one.
     """
 
     name: str
@@ -33,7 +34,7 @@ class AnimatedMesh:
     faces: list[Integers]
     poses: Floats | None = None
     group: str = ""
-    given: InputMesh | None = None
+    given: InputOrder | None = None
 
     @property
     def keeps_vertices(self) -> bool:
@@ -51,12 +52,16 @@ class AnimatedMesh:
             return self.vertices[k], self.faces[k]
         return to_world(self.vertices[0], self.poses[k]), self.faces[0]
 
-    def own(self, k: int) -> InputMesh:
-        """The k-th frame by the vertices, triangles, texture coordinates and normals of the
-        muscle's file; of what has none the mesh that is shown.
+    def own(self, k: int) -> tuple[Floats, Integers, Floats]:
+        """Vertices (n, 3), triangles (m, 3) and unit normals (n, 3) in the k-th frame, by the order
+        of the muscle's file; of a bone at rest.
         """
-        vertices, faces = self.mesh(k)
-        return plain_input(vertices, faces) if self.given is None else self.given.moved(vertices)
+        rest = 0 if self.poses is not None else k
+        vertices, faces = self.vertices[rest], self.faces[rest]
+        normals = vertex_normals(vertices, faces)
+        if self.given is None:
+            return vertices, faces, normals
+        return vertices[self.given.source], self.given.faces, normals[self.given.source]
 
 
 @dataclass(frozen=True)
@@ -112,7 +117,11 @@ def read_animation(run: RunData, names: list[str], frames: list[int], *, unit: s
             muscle.vertices.append(points * factor)
             muscle.faces.append(muscle.faces[0] if same else faces)
         given = None if name in run.tendons else run.meshes.given(name)
-        muscles.append(replace(muscle, given=_shown_input(muscle, given, factor)))
+        if given is not None and not (
+            muscle.keeps_vertices and np.array_equal(given.source[given.faces], muscle.faces[0])
+        ):
+            given = None  # another mesh is shown
+        muscles.append(replace(muscle, given=given))
     for name in run.bones:
         vertices, faces = run.meshes.bone(name)
         poses = np.array([run.frame(frame).poses[name] for frame in frames])
@@ -138,15 +147,6 @@ def read_animation(run: RunData, names: list[str], frames: list[int], *, unit: s
         direction,
         _animated_fibres(run, names, frames, factor),
     )
-
-
-def _shown_input(muscle: AnimatedMesh, given: InputMesh | None, factor: float) -> InputMesh | None:
-    """The mesh of a muscle's file, lengths scaled, where it is what is shown in every frame."""
-    if given is None or not muscle.keeps_vertices:
-        return None
-    if not np.array_equal(given.source[given.faces], muscle.faces[0]):
-        return None
-    return given._replace(vertices=factor * given.vertices)
 
 
 def _animated_fibres(

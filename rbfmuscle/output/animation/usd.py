@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.output.animation.parts import (
     FRAMES_A_SECOND,
     AnimatedFibres,
@@ -16,7 +15,6 @@ from rbfmuscle.output.animation.parts import (
     Animation,
 )
 from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
-from rbfmuscle.scene.meshes.input_mesh import Corners, plain_input
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingDependencyError
 
@@ -96,8 +94,7 @@ def _fill(mesh: "UsdGeom.Mesh", part: AnimatedMesh, codes: list[float]) -> None:
     from pxr import Gf, UsdGeom, Vt
 
     for k in range(len(part.vertices)):
-        own = part.own(k) if part.poses is None else plain_input(part.vertices[0], part.faces[0])
-        vertices, faces = own.vertices, own.faces
+        vertices, faces, normals = part.own(k)
         at = [codes[k]] if part.poses is None else []
         if k == 0 or not part.keeps_vertices:
             topology_at = [] if part.keeps_vertices else at
@@ -110,36 +107,14 @@ def _fill(mesh: "UsdGeom.Mesh", part: AnimatedMesh, codes: list[float]) -> None:
         extent = np.stack([points.min(axis=0), points.max(axis=0)])
         _set(mesh.CreatePointsAttr(), Vt.Vec3fArray.FromNumpy(points), at, first=k == 0)
         _set(mesh.CreateExtentAttr(), Vt.Vec3fArray.FromNumpy(extent), at, first=k == 0)
-        _fill_corners(mesh, own.corners, at, first=k == 0)
-    if part.poses is not None:
         # Without normals a surface that is no subdivision surface is drawn facet by facet.
-        normals = np.ascontiguousarray(
-            vertex_normals(part.vertices[0], part.faces[0]), dtype=np.float32
-        )
-        mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
-        mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        turned = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, dtype=np.float32))
+        _set(mesh.CreateNormalsAttr(), turned, at, first=k == 0)
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    if part.poses is not None:
         place = mesh.AddTransformOp()
         for k, (code, pose) in enumerate(zip(codes, part.poses)):
             _set(place, Gf.Matrix4d(pose.T), [code] if part.moves else [], first=k == 0)
-
-
-def _fill_corners(mesh: "UsdGeom.Mesh", corners: Corners, at: list[float], *, first: bool) -> None:
-    """Texture coordinates and normals of a file, by the corners of the faces."""
-    from pxr import Sdf, UsdGeom, Vt
-
-    kinds = Sdf.ValueTypeNames
-    api, by_corner = UsdGeom.PrimvarsAPI(mesh), UsdGeom.Tokens.faceVarying
-    for name, kind, values, numbers, array, still in (
-        ("st", kinds.TexCoord2fArray, *corners[:2], Vt.Vec2fArray, True),
-        ("normals", kinds.Normal3fArray, *corners[2:], Vt.Vec3fArray, False),
-    ):
-        if not len(values) or (still and not first):
-            continue
-        found = api.CreatePrimvar(name, kind, by_corner)
-        if first:
-            found.SetIndices(Vt.IntArray.FromNumpy(numbers.astype(np.int32).ravel()))
-        rows = array.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
-        _set(found.GetAttr(), rows, [] if still else at, first=first)
 
 
 def _set(attribute: "Usd.Attribute", value: object, at: list[float], *, first: bool) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import face_normals, repeated_faces
-from rbfmuscle.geometry.vectors import unit
 
 
 class Corners(NamedTuple):
@@ -54,6 +53,15 @@ def vertex_corners(
     return found
 
 
+class InputOrder(NamedTuple):
+    """Triangles (m, 3) of a file by its own vertices, in its order; ``source`` (n,) is the vertex
+    of the model's mesh that each of these is, whose triangles are ``source[faces]``.
+    """
+
+    faces: Integers
+    source: Integers
+
+
 class InputMesh(NamedTuple):
     """Vertices (n, 3) and triangles (m, 3) of a file, in its order; ``source`` (n,) is the vertex
     of the model's mesh that each became, whose triangles are ``source[faces]``.
@@ -63,78 +71,6 @@ class InputMesh(NamedTuple):
     faces: Integers
     source: Integers
     corners: Corners = NO_CORNERS
-
-    def moved(self, shown: Floats) -> InputMesh:
-        """The mesh where the vertices of the model's mesh are ``shown`` (k, 3); normals turn with
-        their triangles.
-        """
-        vertices, corners = shown[self.source], self.corners
-        if len(corners.normals):
-            corners = corners._replace(normals=self._carried_normals(vertices))
-        return self._replace(vertices=vertices, corners=corners)
-
-    def _carried_normals(self, vertices: Floats) -> Floats:
-        """Normals (k, 3) that keep, in the frame of the triangles that have them, how they depart
-        from these triangles' mean normal by area.
-        """
-        given = self.corners.normals
-        before, after = self._frames(self.vertices), self._frames(vertices)
-        depart = np.einsum("kba,ka->kb", before, given - before[:, 0])
-        normals = after[:, 0] + np.einsum("kba,kb->ka", after, depart)
-        length = np.linalg.norm(normals, axis=1)
-        flat = length <= 0.0
-        return np.where(flat[:, None], given, normals / np.where(flat, 1.0, length)[:, None])
-
-    def _frames(self, vertices: Floats) -> Floats:
-        """Of each normal the mean normal of its triangles, and two tangents (k, 3, 3)."""
-        numbers = self.corners.normal_faces
-        area, normal = face_normals(vertices, self.faces), np.zeros_like(self.corners.normals)
-        for corner in range(3):
-            np.add.at(normal, numbers[:, corner], area)
-        first = np.unique(numbers, return_index=True)[1]
-        ends = self.faces[first // 3, first % 3], self.faces[first // 3, (first + 1) % 3]
-        normal = unit(normal)
-        side = vertices[ends[1]] - vertices[ends[0]]
-        side = unit(side - np.einsum("ka,ka->k", side, normal)[:, None] * normal)
-        return np.stack([normal, side, np.cross(normal, side)], axis=1)
-
-    def split(self) -> InputMesh:
-        """The mesh with one number for vertex, texture coordinates and normal of a corner.
-
-        A vertex keeps its number for the first of its corners; what differs at others follows the
-        vertices of the file.
-        """
-        count, corners = len(self.vertices), self.corners
-        if not len(corners.texture) and not len(corners.normals):
-            return self
-        columns = [self.faces.ravel()]
-        for values, numbers in (corners[:2], corners[2:]):
-            columns += [numbers.ravel()] if len(values) else []
-        rows, first, label = np.unique(
-            np.stack(columns, axis=1), axis=0, return_index=True, return_inverse=True
-        )
-        again = np.ones(len(rows), dtype=bool)
-        order = np.argsort(first)
-        again[order[np.unique(rows[order, 0], return_index=True)[1]]] = False
-        number = rows[:, 0].copy()
-        number[again] = count + np.argsort(np.argsort(first[again]))
-        place = np.empty(count + int(again.sum()), np.int64)
-        place[number] = np.arange(len(rows))
-        faces = number[label.ravel()].reshape(-1, 3)
-        of = rows[place]
-        texture = corners.texture[of[:, 1]] if len(corners.texture) else None
-        normals = corners.normals[of[:, -1]] if len(corners.normals) else None
-        return InputMesh(
-            self.vertices[of[:, 0]],
-            faces,
-            self.source[of[:, 0]],
-            vertex_corners(faces, texture, normals),
-        )
-
-
-def plain_input(vertices: Floats, faces: Integers) -> InputMesh:
-    """The mesh of a model as its own file would have it."""
-    return InputMesh(vertices, faces, np.arange(len(vertices)))
 
 
 def input_mesh(

@@ -3,7 +3,7 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.scene.meshes.input_mesh import NO_CORNERS, Corners, InputMesh
+from rbfmuscle.scene.meshes.input_mesh import NO_CORNERS, Corners
 from rbfmuscle.scene.meshes.polygons import cut_polygons
 
 # Elements that are no faces.
@@ -202,24 +202,3 @@ def _joined_lines(content):
             line = line[:-1] + b" " + lines[number]
         number += 1
         yield first, line
-
-
-def obj_text(mesh: InputMesh) -> str:
-    """A mesh as the text of an OBJ file, from which the same numbers are read."""
-    corners = mesh.corners
-    columns, parts = [mesh.faces], [_rows("v", mesh.vertices)]
-    for key, values, numbers in (("vt", *corners[:2]), ("vn", *corners[2:])):
-        parts += [_rows(key, values)] if len(values) else []
-        columns.append(numbers if len(values) else np.full_like(mesh.faces, -1))
-    form = {(0, 0): "%d", (1, 0): "%d/%d", (0, 1): "%d//%d", (1, 1): "%d/%d/%d"}
-    corner = form[len(corners.texture) > 0, len(corners.normals) > 0]
-    used = [c + 1 for c in columns if (c >= 0).all()]
-    line = f"f {corner} {corner} {corner}\n"
-    faces = np.stack(used, axis=2).reshape(len(mesh.faces), -1)
-    return "".join(parts) + (line * len(faces)) % tuple(faces.ravel().tolist())
-
-
-def _rows(key: str, values: Floats) -> str:
-    """Lines of an OBJ file."""
-    line = key + " %.17g" * values.shape[1] + "\n"
-    return (line * len(values)) % tuple(values.ravel().tolist())
