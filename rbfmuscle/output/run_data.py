@@ -22,7 +22,6 @@ from rbfmuscle.simulation.frame import FibreLines, Frame
 from rbfmuscle.validation import UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    import pandas
     import trimesh
 
 # Coordinates that a caption names at most.
@@ -162,15 +161,15 @@ class RunData:
         surface = frame.surfaces[name]
         return surface.vertices, surface.faces
 
-    def table(self) -> pandas.DataFrame | np.ndarray:
+    def table(self) -> np.ndarray:
         """Return the metrics as one table, with the coordinates of each frame.
 
         Returns
         -------
-        pandas.DataFrame or structured ndarray
-            The array where pandas is not installed. Columns are ``frame``, each of `coordinates`
-            by its name, ``muscle``, ``quantity``, ``coordinate`` (that of a moment arm, else
-            empty), ``value`` and ``unit``.
+        (n,) structured ndarray
+            Its fields are ``frame``, each of `coordinates` by its name, ``muscle``, ``quantity``,
+            ``coordinate`` (that of a moment arm, else empty), ``value`` and ``unit``;
+            ``pandas.DataFrame`` takes it as it is.
         """
         return _metrics_table(self.metrics, self.frame_numbers, self.coordinates)
 
@@ -325,7 +324,7 @@ def _coordinate_values(info: RunInfo) -> dict[str, Floats]:
 
 def _metrics_table(
     rows: Sequence[Row], frames: Sequence[int], coordinates: Mapping[str, Floats]
-) -> pandas.DataFrame | np.ndarray:
+) -> np.ndarray:
     """Rows of metrics as a table, see `RunData.table`; ``coordinates`` (n,) are by name, at the
     frames (n,).
     """
@@ -341,14 +340,10 @@ def _metrics_table(
         "value": np.array([row.value for row in rows], dtype=float),
         "unit": np.array([row.unit for row in rows], dtype=str),
     }
-    try:
-        import pandas
-    except ImportError:
-        table = np.empty(len(rows), dtype=[(name, x.dtype) for name, x in columns.items()])
-        for name, values in columns.items():
-            table[name] = values
-        return table
-    return pandas.DataFrame(columns)
+    table = np.empty(len(rows), dtype=[(name, x.dtype) for name, x in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
+    return table
 
 
 def _sorted_rows(metrics: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:

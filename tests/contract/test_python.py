@@ -39,16 +39,14 @@ def test_names_are_what_a_user_needs_and_types_know_them():
     assert typed == rm._HOME
 
 
-def test_user_script_is_typed_and_runs(tmp_path):
-    planted = tmp_path / "planted.py"
-    planted.write_text(
-        "import rbfmuscle as rm\nrm.simulate('phantom').mussels\nrm.Scene(units=3)\n"
-    )
-    words = ["--strict", "--config-file=", "--follow-imports=silent", f"--cache-dir={tmp_path}"]
-    command = [sys.executable, "-m", "mypy", *words, str(SCRIPT), str(planted)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    found = [line for line in done.stdout.splitlines() if ": error:" in line]
-    assert len(found) == 2 and all("planted.py" in line for line in found), done.stdout
+def test_import_loads_nothing_heavy():
+    heavy = ["numba", "pyvista", "vtk", "trimesh", "skimage", "scipy", "pydantic", "matplotlib"]
+    code = f"import sys, rbfmuscle; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_user_script_runs(tmp_path):
     done = subprocess.run([sys.executable, SCRIPT, tmp_path], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("2 ['abductor'] True ")
@@ -118,8 +116,8 @@ def test_show_takes_a_run_in_memory_and_a_loaded_one(run, loaded):
             page.close()
 
 
-def test_table_has_the_coordinates_of_each_row(run, loaded, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pandas", None)
+def test_table_has_the_coordinates_of_each_row_whatever_is_installed(run, loaded, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=dict))
     for shown in (run, loaded):
         table = shown.table()
         assert len(table) == len(run.metrics)
@@ -133,8 +131,6 @@ def test_table_has_the_coordinates_of_each_row(run, loaded, monkeypatch):
         )
         arms = table[table["quantity"] == "moment_arm"]
         assert set(arms["coordinate"]) == {moved} and set(lengths["coordinate"]) == {""}
-    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=dict))
-    assert tuple(run.table()) == table.dtype.names
 
 
 def test_values_are_of_known_names_and_moment_arms_of_one_coordinate(run, loaded):
