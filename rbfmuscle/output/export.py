@@ -18,6 +18,7 @@ from rbfmuscle.output.fibre_files import write_fibres
 from rbfmuscle.output.run_data import RunData, open_run
 from rbfmuscle.output.surface_arrays import VertexArrays
 from rbfmuscle.output.vtp import NORMALS, Collection, write_vtp
+from rbfmuscle.scene.names import DEVICES
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingDependencyError, SolveError, UsageError
 
@@ -25,6 +26,7 @@ from rbfmuscle.validation import MissingDependencyError, SolveError, UsageError
 MESHES = ("pvd", "vtp", "ply", "stl", "obj")
 ANIMATIONS = ("animated-glb", "usd")
 DIGITS = 12  # after the point, of lengths in OBJ files
+FASTEST = 1000.0  # frames per second
 FORMATS = (*MESHES, "glb", *ANIMATIONS)
 
 
@@ -132,7 +134,7 @@ def _check_words(formats: Sequence[str], units: str | None, fps: float | None) -
         raise UsageError(f"units must be m, cm or mm, got {units!r}")
     if fps is not None and not set(formats) & set(ANIMATIONS):
         raise UsageError(f"--fps is for {' and '.join(ANIMATIONS)} alone")
-    if fps is not None and not 0.0 < fps <= 1000.0:
+    if fps is not None and not 0.0 < fps <= FASTEST:
         raise UsageError(f"--fps must be a number from 0 to 1000, got {fps:g}")
 
 
@@ -152,8 +154,11 @@ def _export(run: Animation, folder: Path, name: str, frames: list[int]) -> list[
 
 
 def _file_name(name: str) -> str:
-    """The name of a run as that of a file, without what leads to other folders."""
-    return re.sub(r"[^\w .-]+", "_", name).strip(". ") or "run"
+    """The name of a run as that of a file, without what leads to other folders or names a
+    device.
+    """
+    found = re.sub(r"[^\w .-]+", "_", name).strip(". ") or "run"
+    return f"{found}_run" if found.partition(".")[0].rstrip().lower() in DEVICES else found
 
 
 def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -> list[Path]:

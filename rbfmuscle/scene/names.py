@@ -8,6 +8,10 @@ from typing import Protocol, TypeVar
 from rbfmuscle.validation import SceneError, did_you_mean, shown
 
 _CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
+# Devices on Windows, in any case and with any ending: no file can have such a name.
+DEVICES = {"con", "prn", "aux", "nul"} | {
+    f"{kind}{k}" for kind in ("com", "lpt") for k in range(10)
+}
 LONGEST_NAME = 100  # a file may be named after two of them, and systems allow 255 letters
 
 
@@ -26,9 +30,12 @@ def plain_name(name: str) -> str:
 
 
 def new_name(name: str, taken: Iterable[str], *, file: bool = True) -> str:
-    """The plain name, numbered where it is taken; of a ``file`` in letters of another case too."""
+    """The plain name, numbered where it is taken; of a ``file`` in letters of another case too, and
+    where it names a device.
+    """
     plain, number = plain_name(name)[: LONGEST_NAME - 5], 2
-    known = {one.lower() if file else one for one in taken} | {"all"}  # that is the whole scene
+    # "all" is the whole scene.
+    known = {one.lower() if file else one for one in taken} | {"all"} | DEVICES
     found = plain
     while (found.lower() if file else found) in known:
         found = f"{plain}_{number}"
@@ -65,6 +72,11 @@ def check_name(name: object, what: str) -> str:
         raise SceneError(
             f"{what} name {shown(repr(name))} has {len(name)} letters, at most {LONGEST_NAME} are "
             "allowed (it becomes a file name)"
+        )
+    if name.lower() in DEVICES:
+        raise SceneError(
+            f"{what} name {name!r} is that of a device on Windows (it becomes a file name); choose "
+            "another"
         )
     return name
 

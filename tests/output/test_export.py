@@ -232,6 +232,7 @@ class TestExport:
 
     def test_no_name_leads_out_of_the_folder(self):
         assert _file_name("../a b/c") == "_a b_c"
+        assert [_file_name(name) for name in ("CON", "aux.2")] == ["CON_run", "aux.2_run"]
 
 
 def test_json_has_no_nan_and_is_replaced_whole(tmp_path):

@@ -12,6 +12,7 @@ from conftest import ROOT
 
 from rbfmuscle.scene.check import bone_collisions, check_initial, check_scene
 from rbfmuscle.scene.frames import parse_slice
+from rbfmuscle.scene.names import new_name
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.record import record_scene
 from rbfmuscle.scene.scene import Scene, require_complete
@@ -166,6 +167,8 @@ class TestFileNames:
     @pytest.mark.parametrize(
         ("bones", "muscles", "said"),
         [
+            (["aux"], [], "bone name 'aux' is that of a device on Windows"),
+            (["b", "c"], ["COM7"], "muscle name 'COM7' is that of a device on Windows"),
             (["Femur", "femur"], [], "differs from 'Femur' in case alone"),
             (["rib", "rib_0001"], ["a"], "bone 'rib_0001' has the name of a frame of bone 'rib'"),
             (["b", "c"], ["a", "A"], "differs from 'a' in case alone"),
@@ -173,7 +176,7 @@ class TestFileNames:
             (["b", "c"], ["a_tendon", "a"], "'a_tendon' has the name of the tendons of 'a'"),
         ],
     )
-    def test_names_whose_files_would_be_one_are_refused(self, bones, muscles, said):
+    def test_names_whose_files_would_be_one_or_none_are_refused(self, bones, muscles, said):
         scene = Scene(units="mm")
         with pytest.raises(SceneError, match=said):
             for k, name in enumerate(bones):
@@ -194,10 +197,17 @@ class TestFileNames:
             require_complete(scene)
 
     def test_names_that_stay_apart_are_taken(self):
-        scene = Scene(units="mm").add_bone("rib").add_bone("rib_1").add_bone("rib_x001")
-        assert scene.meshless_bones == ["rib", "rib_1", "rib_x001"]
+        names = ["rib", "rib_1", "rib_x001", "com", "auxiliary"]
+        scene = Scene(units="mm")
+        for name in names:
+            scene.add_bone(name)
+        assert scene.meshless_bones == names
         # Of muscle and bone: a_b and c, a and b_c.
         assert attachment_file("a_b", "c") != attachment_file("a", "b_c")
+
+    @pytest.mark.parametrize("name", ["Con", "nul", "LPT1"])
+    def test_names_of_foreign_files_never_become_those_of_devices(self, name):
+        assert new_name(name, []) == f"{name}_2"
 
 
 class TestOptions:
