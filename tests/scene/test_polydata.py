@@ -139,6 +139,18 @@ sys.stdout.buffer.write({{
         assert not victim.exists()
         assert_is_ball(path)
 
+    def test_file_is_read_where_the_system_takes_no_limit_of_memory(self, tmp_path, monkeypatch):
+        """As macOS, where a limit below what is mapped is a ValueError."""
+        (tmp_path / "sitecustomize.py").write_text(
+            "import resource\ndef refuse(*given):\n    raise ValueError('limit')\n"
+            "resource.setrlimit = refuse\n"
+        )
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+        path = write_mesh(tmp_path / "a.vtp", BALL, "vtp-Appended-ZLib")
+        polydata._end(polydata._child(os.getpid()))
+        assert_is_ball(path)
+        polydata._end(polydata._child(os.getpid()))
+
     def test_file_that_unpacks_without_end_is_refused(self, tmp_path, capfd):
         size = 24 * 10**9
         block = zlib.compress(bytes(10**6), 9)
