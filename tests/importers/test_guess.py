@@ -132,6 +132,21 @@ def test_what_is_written_loads_and_has_the_phantoms_joint(tmp_path, units, optio
     assert Scene.load(tmp_path / "scene.toml").units == units
 
 
+def test_meshes_on_another_drive_are_named_by_their_whole_path(tmp_path, monkeypatch):
+    (tmp_path / "meshes").mkdir()
+    _phantom_meshes(tmp_path / "meshes")
+
+    def apart(path, start):
+        raise ValueError("path is on mount 'C:', start on mount 'D:'")
+
+    monkeypatch.setattr("os.path.relpath", apart)
+    guess = guess_scene(tmp_path / "meshes", "mm", tmp_path)
+    monkeypatch.undo()
+    scene = _write(guess, tmp_path / "scene.toml")
+    assert f'"{tmp_path.as_posix()}/meshes/femur.ply"' in (tmp_path / "scene.toml").read_text()
+    assert len(scene.bones) == 2
+
+
 def test_ends_of_a_bent_tube_are_its_tips():
     mesh = trimesh.creation.capsule(height=100.0, radius=8.0)
     mesh.vertices[:, 0] += 0.01 * (mesh.vertices[:, 2] - 50.0) ** 2

@@ -224,10 +224,27 @@ def _read_part(path, stem, mesh, base, names, facts, found, *, closed):
         vertices, faces = clustered(vertices, faces, MOST_TRIANGLES)
     read = prepare_mesh(vertices, faces, context=str(path), name=stem, may_be_open=not closed)
     read.notes[:0] = mesh.notes
-    file = os.path.relpath(path, base).replace(os.sep, "/")
-    part = Part(name, file, read, facts.bone, facts.side, facts=facts.muscle, coarse=coarse)
+    part = Part(
+        name,
+        _path_from(base, path),
+        read,
+        facts.bone,
+        facts.side,
+        facts=facts.muscle,
+        coarse=coarse,
+    )
     part.tendon_of = facts.tendon_of or ((facts.muscle.name,) if facts.muscle else ())
     return part
+
+
+def _path_from(base, path):
+    """A path as the scene file in the folder ``base`` has it; whole where there is no way from one
+    to the other, as between drives.
+    """
+    try:
+        return Path(os.path.relpath(path, base)).as_posix()
+    except ValueError:
+        return Path(path).absolute().as_posix()
 
 
 def _guess_units(found):
