@@ -8,7 +8,7 @@ DEV := $(VENV)/.installed-dev
 # are compiled when they are first imported: most never are.
 INSTALL := $(BIN)/python -m pip install --quiet --quiet --no-compile --config-settings editable_mode=compat
 
-.PHONY: demo test portability fuzz test-fast test-nojit coverage check bench figures docs release-check clean
+.PHONY: demo test test-slow test-nojit portability mutants fuzz coverage check bench figures docs release-check clean
 
 $(STAMP): pyproject.toml
 	@echo "Installing into $(VENV), about half a minute."
@@ -37,10 +37,11 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 test: $(DEV)
 	$(PYTEST)
 
-# What each list holds, and why, stands at its top.
-test-fast: $(DEV)
-	$(PYTEST) -q $$(grep -v '^#' tests/fast.txt)
+# Why each is slow stands beside it.
+test-slow: $(DEV)
+	$(PYTEST) -m slow
 
+# What the list holds, and why, stands at its top.
 test-nojit: $(DEV)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q $$(grep -v '^#' tests/nojit.txt)
 
@@ -51,8 +52,8 @@ coverage: $(DEV)
 	$(PYTEST) -q --cov --cov-append --cov-report=term:skip-covered
 	@for package in $(PACKAGES); do echo "$$package $$($(BIN)/python -m coverage report --include="$$package/*" --format=total) %"; done
 
-# The tests under other BLAS kernels, processor features, threads, versions, and with vertices moved by last digits.
-# Hours for all; a part by TESTS="tests/implicit tests/muscle" ONLY="haswell oldest".
+# The numeric tests with vertices moved in their last digits, other processor features, threads and versions, as CI runs
+# them; a part, or other variants, by TESTS="tests/implicit tests/muscle" ONLY="haswell oldest".
 TESTS ?= tests
 portability: $(DEV)
 	$(BIN)/python benchmarks/portability.py $(TESTS) $(if $(ONLY),--only $(ONLY))
@@ -64,8 +65,9 @@ fuzz: $(DEV)
 check: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -q tests/contract/test_layers.py
+	$(BIN)/python docs/check.py
 
 bench: $(DEV)
 	$(BIN)/python benchmarks/interpolation.py
@@ -76,7 +78,7 @@ figures: $(DEV)
 
 # A wheel and an sdist, installed in a clean environment each, and the phantom hip run there.
 release-check: $(DEV)
-	$(BIN)/python -m pytest -q -m slow tests/contract/test_release.py
+	$(BIN)/python benchmarks/distributions.py
 
 docs: $(DEV)
 	$(BIN)/python -c "import furo, myst_parser, sphinx" 2>/dev/null || $(INSTALL) -e ".[docs]"

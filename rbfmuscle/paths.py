@@ -31,6 +31,7 @@ STEP = 1.0  # of the central differences, to either side [degree, or mm of a shi
 # A muscle has settled where no contact point moves by more than this share of its size in a solve.
 MOST_SOLVES, SETTLED = 60, 3e-7
 SHIFT = math.degrees(1.0)  # mm of a shift that count as a radian: one mm as one degree
+STILL = 1e-6  # entries of matrices that differ by less are those of one place
 MOST_COORDINATES = 6  # OpenSim's function takes up to six coordinates
 
 Ranges = dict[str, tuple[float, float]]
@@ -226,7 +227,7 @@ def _moves(scene, bones, name):
         poses = bone_poses(scene, {name: fact.clamped_value(value)})
         back = np.linalg.inv(poses[bones[0]])
         places.append([back @ poses[bone] for bone in bones])
-    return np.ptp(np.array(places), axis=0).max() > 1e-6
+    return np.ptp(np.array(places), axis=0).max() > STILL
 
 
 def _range(scene, name, given):

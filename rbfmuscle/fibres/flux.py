@@ -117,7 +117,7 @@ class FluxField:
 
     def _joined(self, inside: Booleans, ends: Sequence[Integers]) -> bool:
         piece = self._piece(inside, ends[0])
-        return bool(piece[tuple(ends[1].T)].mean() > 0.5)
+        return bool(piece[tuple(ends[1].T)].mean() > 1 / 2)
 
     def _number_nodes(self) -> None:
         corner = self.cells[:, None, :] + _CORNERS

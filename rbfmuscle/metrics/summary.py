@@ -100,6 +100,8 @@ _APART = "move muscle or bone apart: rbfmuscle check SCENE"
 _REPAIR = "repair the muscle's mesh"
 _ATTACH = "correct the attachment: docs/new.md"
 _LINE = "give the tendon via points, or correct the attachments: docs/new.md"
+# Numbers from the first to below the second are shown without decimals or a power of ten.
+_WHOLE = (100.0, 1e5)
 LIMITS = {
     "volume_error": Limit(1e-9, "volume error", _SETTLE),
     "penetration_max": Limit(0.1, "surface in a bone", _SMALLER_STEPS),
@@ -383,5 +385,5 @@ def shown_number(value: float | None, unit: str = "") -> str:
     if 0.0 < abs(value) < least:
         text = f"< {least:g}"
     else:
-        text = f"{value:.0f}" if 100.0 <= abs(value) < 1e5 else f"{value:.3g}"
+        text = f"{value:.0f}" if _WHOLE[0] <= abs(value) < _WHOLE[1] else f"{value:.3g}"
     return text if unit in ("", "1") else f"{text} {unit}"

@@ -40,6 +40,7 @@ VIEWS: dict[str, tuple[float, float, float]] = {
     "top": (0.0, 0.0, 1.0),
     "bottom": (0.0, 0.0, -1.0),
 }
+UPRIGHT = 0.99  # cosine from which a direction counts as that of the body's axis
 # Length over which a tube tapers, in radii of the belly's end.
 TAPER = 2.5
 # No taper is longer than this share of the tendon.
@@ -124,9 +125,12 @@ def rgb(colour: str) -> Floats:
     return np.array(list(bytes.fromhex(colour[1:]))) / 255.0
 
 
+_SRGB_LINEAR = 0.04045  # below it sRGB is a line (IEC 61966-2-1)
+
+
 def linear_rgb(colour: Floats) -> Floats:
     """A colour (3,) as screens show it in the linear light that USD and glTF count in."""
-    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    return np.where(colour <= _SRGB_LINEAR, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
 
 
 def stretch_colours(stretch: Floats) -> Floats:
@@ -146,7 +150,7 @@ def view_axes(direction: Sequence[float] | Floats, body: Floats) -> Floats:
     """
     ahead = np.asarray(direction, dtype=float) @ body
     ahead /= np.linalg.norm(ahead)
-    right = np.cross(body[2] if abs(ahead @ body[2]) < 0.99 else -body[1], ahead)
+    right = np.cross(body[2] if abs(ahead @ body[2]) < UPRIGHT else -body[1], ahead)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(ahead, right), ahead])
 

@@ -17,6 +17,7 @@ _LIMIT = "#a3281f"
 _WIDE, _TALL = 302.4, 165.6
 _LEFT, _RIGHT = 36.0, 10.0
 _TOP, _BOTTOM = 18.0, 30.0
+_STILL = 1e-9  # coordinates that vary by less do not move [radian, or scene unit]
 _ROW = 11.5
 # Sides of the axes of a plot of points.
 _FRONT = (331.0, 235.0)
@@ -175,7 +176,7 @@ def motion_axis(saved: RunData) -> tuple[dict[int, float], str]:
     units = saved.info.scene.coordinate_units
     names = sorted({name for row in rows for name in row.coordinates})
     tracks = {name: np.array([row.coordinates.get(name, 0.0) for row in rows]) for name in names}
-    moving = {name: track for name, track in tracks.items() if np.ptp(track) > 1e-9}
+    moving = {name: track for name, track in tracks.items() if np.ptp(track) > _STILL}
     if len(moving) == 1:
         name, track = next(iter(moving.items()))
         unit = units.get(name, "degree").strip() or "1"

@@ -27,6 +27,7 @@ from rbfmuscle.validation import SolveError, UsageError
 # Views where none are asked for; muscles that are named, more are named by their groups; pixels of
 # a view.
 USUAL_VIEWS = ("front", "right", "back")
+_LONGEST = 3600.0  # seconds of an animation
 _MOST_CHIPS = 8
 _AREA = 220_000
 _SMALL = 900, 600  # pixels of a picture in a notebook, at most
@@ -200,7 +201,7 @@ def render_run(
     check_picture(output)
     if not run.has_surfaces:
         raise UsageError(f"{run.directory or 'the run'} has no surfaces to draw")
-    if not 0.0 < seconds <= 3600.0:
+    if not 0.0 < seconds <= _LONGEST:
         raise UsageError(f"an animation of {seconds:g} seconds; give up to 3600")
     frame = run.frame(-1 if frame is None else frame).index
     poses = [shown.poses for shown in run.frames]

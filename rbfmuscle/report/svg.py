@@ -18,6 +18,7 @@ _TICK = 3.5  # length of a tick [point]
 # Space that a tick with its number takes [point], to the right and upwards.
 _ROOM = (42.0, 16.0)
 # Decades, or a share of one, that a logarithmic axis spans before its ticks are 1, 2 and 5.
+_PLAIN = 1e6  # numbers from here on have a power of ten
 _DECADE = 10.0
 
 
@@ -48,7 +49,7 @@ class Axis(NamedTuple):
         step = _round_step((self.high - self.low) / most)
         first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
         digits = max(0, -math.floor(math.log10(step) + 1e-9))
-        plain = digits <= 4 and max(abs(self.low), abs(self.high)) < 1e6
+        plain = digits <= 4 and max(abs(self.low), abs(self.high)) < _PLAIN
         form = f".{digits}f" if plain else ".3g"
         return [(k * step, f"{k * step:{form}}") for k in range(first, last + 1)]
 

@@ -173,7 +173,7 @@ def _rest_overlaps(scene):
             continue
         share = inside / len(depth)
         level = "note" if scene.contact.initial == "resolve" else "warning"
-        if scene.contact.initial == "error" or share > 0.5:
+        if scene.contact.initial == "error" or share > 1 / 2:
             level = "error"
         message = (
             f"{inside} free vertices ({100 * share:.2g} %) start inside bone {bone.name!r}, "

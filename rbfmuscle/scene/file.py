@@ -57,13 +57,14 @@ class SceneTable(Table):
     def _check_directions(self) -> Self:
         up, front = self.superior, self.anterior
         if (up is None) != (front is None) or (
-            up and front and np.abs(np.cross(up, front)).max() < 1e-9
+            up and front and np.abs(np.cross(up, front)).max() < PARALLEL
         ):
             raise ValueError("give superior and anterior, of different directions, or neither")
         return self
 
 
 # Keys of ``[scene]`` that a `Scene` has by the same names.
+PARALLEL = 1e-9  # greatest component of the cross product of directions that are one
 ABOUT = ("units", "missing_bones", "doubts", "notes", "superior", "anterior")
 
 

@@ -93,7 +93,7 @@ class Table(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _name_unknown_keys(cls, data):
+    def _name_unknown_keys(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
         known = [field.alias or name for name, field in cls.model_fields.items()]

@@ -8,6 +8,8 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.tubes import distance_along
 
+LEAST_SLOPE = 1e-12  # of an ellipsoid's norm; only its centre has less
+
 
 @dataclass(frozen=True)
 class Tube:
@@ -173,7 +175,9 @@ def ellipsoid(points: Floats, centre: Sequence[float], radii: Sequence[float]) -
     local, radii = points - np.asarray(centre), np.asarray(radii, dtype=float)
     value = np.linalg.norm(local / radii, axis=-1)
     slope = np.linalg.norm(local / radii**2, axis=-1)
-    return np.where(slope > 1e-12, value * (value - 1) / np.maximum(slope, 1e-12), -radii.min())
+    return np.where(
+        slope > LEAST_SLOPE, value * (value - 1) / np.maximum(slope, LEAST_SLOPE), -radii.min()
+    )
 
 
 def plate(

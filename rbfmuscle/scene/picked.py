@@ -149,7 +149,7 @@ def region_vertices(
     share = (points_to_barycentric(other[corners], places) * painted[corners]).sum(axis=1)
     edge = max(_edge(np.asarray(mesh.vertices), np.asarray(mesh.faces)), _edge(other, part.faces))
     away = np.sqrt(square)
-    chosen = np.flatnonzero((share >= 0.5) & (away <= 0.5 * edge))
+    chosen = np.flatnonzero((share >= 1 / 2) & (away <= 0.5 * edge))
     if not len(chosen):
         words = f"the nearest is {away.min():.4g} away" if painted.any() else "nothing is painted"
         raise SceneError(f"{context}no vertex of the muscle lies on {shown_path(path)}, {words}")

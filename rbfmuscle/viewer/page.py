@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.output.appearance import VIEWS, view_axes
+from rbfmuscle.output.appearance import UPRIGHT, VIEWS, view_axes
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.scene import Scene
@@ -137,7 +137,7 @@ class ViewerPage:
             0.55 * max(tall, wide + both * np.linalg.norm(apart)) / math.tan(FIELD_OF_VIEW / 2)
             + deep / 2
         )
-        pole = self.source.body[2] if abs(ahead @ self.source.body[2]) < 0.99 else up
+        pole = self.source.body[2] if abs(ahead @ self.source.body[2]) < UPRIGHT else up
         with self.server.atomic():
             setattr(camera, "up_direction" if hasattr(camera, "up_direction") else "up", pole)
             camera.fov, camera.position = FIELD_OF_VIEW, middle + away * ahead

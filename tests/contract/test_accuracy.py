@@ -5,6 +5,8 @@ import pytest
 
 import rbfmuscle as rm
 
+pytestmark = pytest.mark.numeric
+
 
 @pytest.fixture
 def bent():

@@ -23,6 +23,8 @@ from rbfmuscle.models import build_model
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 
+pytestmark = pytest.mark.numeric
+
 MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume")
 SETTLED = ("rbf", "arap-volume")
 TENDON = {"length": 100.0, "strain": 0.08}

@@ -17,6 +17,8 @@ from rbfmuscle.scene.options import DetectOptions, SlidingOptions, TunnellingOpt
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 
+pytestmark = pytest.mark.numeric
+
 paper_models.register()
 MODELS = ("rbf", "pbd", "xpbd", "arap-pbd", "arap-volume", *paper_models.KINDS)
 

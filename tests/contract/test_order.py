@@ -17,6 +17,8 @@ from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.objects import Attachment, Motion
 from rbfmuscle.simulation.frame_loop import simulate_frames
 
+pytestmark = pytest.mark.numeric
+
 
 def renumbered(mesh, rng):
     """A mesh with its vertices, faces and corners in another order, and the new number of each

@@ -42,6 +42,8 @@ CAP, CAP_SHARE = 8.0, 0.12
 FEWEST, LARGEST = 8, 0.6
 # How far along the muscle a patch at one end may reach (0 at that end, 1 at the other).
 REACH = 0.75
+# Shares of a muscle's length, from an end: its tip, and what gives the tip its direction.
+TIP, TURN = 0.03, (0.1, 0.25)
 ASIDE = 60.0  # how much farther a bone counts that an end does not point to
 # An end farther than this from its site gets a tendon: [mm], and as a share of the muscle.
 FAR, FAR_SHARE = 25.0, 0.1
@@ -227,8 +229,8 @@ def _aim(points, along, bone):
     """How far an end is from a bone in the direction that it points to; what lies aside counts as
     farther.
     """
-    tip = points[along < 0.03].mean(axis=0)
-    direction = unit(tip - points[(along > 0.1) & (along < 0.25)].mean(axis=0))
+    tip = points[along < TIP].mean(axis=0)
+    direction = unit(tip - points[(along > TURN[0]) & (along < TURN[1])].mean(axis=0))
     away = bone.points - tip
     distance = np.maximum(np.linalg.norm(away, axis=1), 1e-300)
     return float((distance * (1.0 + ASIDE * (1.0 - away @ direction / distance))).min())

@@ -20,6 +20,7 @@ HEAD = (12.0, 35.0)
 CONDYLE = (11.0, 30.0)
 DOME = (11.0, 27.0)
 END, CONDYLES = 0.12, 0.16  # share of the femur's length that holds an end, and its condyles
+SHAFT, FOOT = (0.3, 0.7), 0.1  # the same of its shaft, from below, and of its lowest part
 # Normals of a condyle that count: from above (-) to below the backward direction [degree], greatest
 # cosine sideways.
 POSTERIOR, SIDEWAYS = (-30.0, 60.0), 0.5
@@ -28,6 +29,7 @@ POSTERIOR, SIDEWAYS = (-30.0, 60.0), 0.5
 ARC = 45.0
 BAND = 8.0
 RADIAL = 0.95
+ALONG = 0.8  # cosine of normals that count as those of a sphere or of a plateau
 # Greatest space between dome and plafond [mm]: 4.3 on the leg of the Visible Human Female,
 # cartilage included.
 SPACE = 6.0
@@ -103,8 +105,8 @@ def femur_frame(femur: Part, below: list[Part], above: list[Part]) -> Frame:
     points, _, areas = femur.faces
     up = long_axis(femur, below, above)
     share = (points @ up - (points @ up).min()) / np.ptp(points @ up)
-    shaft = (share > 0.3) & (share < 0.7)
-    end = share < 0.1
+    shaft = (share > SHAFT[0]) & (share < SHAFT[1])
+    end = share < FOOT
     top = share > 1.0 - END
     middle, axes = main_axes(points[shaft], areas[shaft])
     up = axes[:, 2] * np.copysign(1.0, axes[:, 2] @ up)
@@ -178,7 +180,7 @@ def _fit_condyle(points, normals, areas, millimetre):
         away = np.linalg.norm(points - centre, axis=1)
         cosine = np.einsum("ij,ij->i", normals, points - centre) / np.maximum(away, 1e-12)
         off = (away - radius) / (1.5 * millimetre)
-        weights = areas * (np.exp(-(off**2)) * (cosine > 0.8) + 1e-9)
+        weights = areas * (np.exp(-(off**2)) * (cosine > ALONG) + 1e-9)
     return centre, radius, float(np.sqrt(np.average((away - radius) ** 2, weights=weights)))
 
 
@@ -203,7 +205,7 @@ def fit_dome(
         patches.append((points[near], sign * normals[near], areas[near]))
     right = unit(across(right, up))
     points, normals, areas = patches[0]
-    top = normals @ up > 0.8
+    top = normals @ up > ALONG
     if top.sum() < 6:
         return None
     radii, before = np.array([20.0, 23.0]) * millimetre, np.empty(0)

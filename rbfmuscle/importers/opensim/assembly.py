@@ -16,6 +16,7 @@ from rbfmuscle.scene.joints.joint import Coupling, ordered
 from rbfmuscle.validation import SceneError
 
 MOST_ROUNDS = 200  # of meeting the weld constraints; a few are enough where they can be met
+LEAST_MOVE = 1e-12  # of a round that goes on [metre and radian]
 CLOSED = 1e-9  # what is left of a weld constraint that is met [metre and radian]
 NEAR = 1e-6  # a loop is closed where its ends are no farther apart [metre and radian]
 STEP = 1e-6  # of the central differences [radian or metre]
@@ -115,7 +116,7 @@ def _nearest_closed(apart, start):
         target = start + np.linalg.lstsq(slopes, wanted, rcond=1e-9)[0]
         move = target - values
         values = values + move * min(1.0, 1.0 / max(np.abs(move).max(), 1e-300))
-        if np.abs(move).max() < 1e-12:
+        if np.abs(move).max() < LEAST_MOVE:
             break
     return values
 

@@ -44,6 +44,7 @@ KINDS = {
     "free": Kind((X, Y, Z), (X, Y, Z)),
     "custom": Kind(),
 }
+STRAIGHT = 1e-8  # radian; a smaller turn has no direction of its own
 MOST_AXES = 6  # of a custom joint
 BY_TURNS = ("weld", "hinge", "universal", "ball")  # where no type is given, by the number of axes
 
@@ -157,7 +158,7 @@ class Joint:
         across = ahead - (ahead @ axes[2]) * axes[2]
         sine = float(np.linalg.norm(across))
         angle = math.atan2(sine, float(ahead @ axes[2]))
-        if angle < 1e-8:
+        if angle < STRAIGHT:
             return self.arc * axes[2]
         beside = (1.0 - math.cos(angle)) / sine * across
         return self.arc / angle * (math.sin(angle) * axes[2] + beside)

@@ -27,6 +27,7 @@ TWISTED_NOTED = 0.005  # of the area
 MOST_TWISTED = 0.3  # of the area: of more it cannot be said what is inside
 WINDING_SAMPLES = 1500  # triangles asked, before and behind them by a small share of their size:
 WINDING_STEP = 1e-3  # of the root of twice the area
+WRONG_WINDING = 0.4  # from 0 before a triangle and from 1 behind it
 MOST_WRONG = 0.01  # of the triangles of a bone, dropped where no surface can be made of them
 LEAST_KEPT = 1000  # triangles: smaller meshes are mended as fast as the cache is read
 CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are dropped
@@ -162,7 +163,7 @@ def _twisted_share(mesh):
     asked = np.ascontiguousarray(np.concatenate([middle + step, middle - step]))
     vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
     before, behind = igl.fast_winding_number(vertices, faces, asked).reshape(2, -1)
-    wrong = (np.abs(before) > 0.4) | (np.abs(behind - 1.0) > 0.4)
+    wrong = (np.abs(before) > WRONG_WINDING) | (np.abs(behind - 1.0) > WRONG_WINDING)
     return float(area[wrong].sum() / area.sum()) if len(area) else 1.0
 
 
