@@ -58,6 +58,10 @@ TESTS ?= tests
 portability: $(DEV)
 	$(BIN)/python benchmarks/portability.py $(TESTS) $(if $(ONLY),--only $(ONLY))
 
+# An hour on one core; which packages, and how many faults of each, by FAULTS="--packages fibres --count 50".
+mutants: $(DEV)
+	$(BIN)/python benchmarks/mutants.py $(FAULTS)
+
 # Damaged scenes and meshes by the thousand; ends with a table of what became of them.
 fuzz: $(DEV)
 	PYTHONPATH=tests $(BIN)/python -m fuzz --scene 10000 --mesh 2000 --frames 250

@@ -1,0 +1,318 @@
+"""One-line faults planted in formulas, and how many the tests of their own package notice.
+
+    python benchmarks/mutants.py [--packages NAME ...] [--count N] [--seed N] [-o FILE]
+
+A fault is a sign, operator, comparison, constant, index or function (minimum for maximum, sine for
+cosine) replaced in a copy of the sources. Loops run as Python (``NUMBA_DISABLE_JIT``). First the
+package's tests run once, each at most ``LONGEST`` seconds, and note the lines that they run; then a
+fault is shown to the tests that run its line, the fastest first, until one fails. A fault that no
+test notices is a missing known answer, dead code, or no fault. Names the faults that stay
+unnoticed.
+"""
+
+import argparse
+import ast
+import copy
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from evidence import write_evidence
+
+ROOT = Path(__file__).resolve().parent.parent
+COPIED = ("rbfmuscle", "pbd_baseline", "tests", "benchmarks", "docs", "examples")
+PACKAGES = ("metrics", "geometry", "fibres")
+LONGEST = 10.0  # seconds of a test, coverage included: slower ones are left out
+SHOWN = 60.0  # seconds of tests that a fault is shown to
+SLACK = 30.0  # seconds that a fault may hang on top: it counts as noticed
+TINY = 1e-6  # guards against zero and rounding: no known answer depends on them
+
+SWAPPED = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult,
+    ast.Lt: ast.Gt, ast.Gt: ast.Lt, ast.LtE: ast.GtE, ast.GtE: ast.LtE, ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq, ast.And: ast.Or, ast.Or: ast.And,
+}  # fmt: skip
+PAIRS = (
+    ("min", "max"), ("minimum", "maximum"), ("argmin", "argmax"), ("sin", "cos"),
+    ("floor", "ceil"), ("any", "all"),
+)  # fmt: skip
+OTHER = dict(PAIRS) | {b: a for a, b in PAIRS}
+TEXT = (ast.JoinedStr, ast.List, ast.ListComp, ast.Tuple)
+
+
+def changed(node):
+    """The fault that takes an expression's place, None where it has none."""
+    new = copy.deepcopy(node)
+    match node:
+        case ast.BinOp(left=left, right=right, op=op) if type(op) in SWAPPED:
+            texts = [isinstance(x, TEXT) or _is_string(x) for x in (left, right)]
+            new.op = SWAPPED[type(op)]()
+            return None if any(texts) else new
+        case ast.Compare(ops=[op]) if type(op) in SWAPPED:
+            new.ops = [SWAPPED[type(op)]()]
+            return None if _is_string(node.comparators[0]) else new
+        case ast.BoolOp(op=op):
+            new.op = SWAPPED[type(op)]()
+            return new
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return copy.deepcopy(operand)
+        case ast.Call(func=ast.Name(id=name)) if name in OTHER:
+            new.func.id = OTHER[name]
+            return new
+        case ast.Call(func=ast.Attribute(attr=name)) if name in OTHER:
+            new.func.attr = OTHER[name]
+            return new
+        case ast.Constant(value=bool() | str() | None):
+            return None
+        case ast.Constant(value=int(value)):
+            new.value = value + 1
+            return new
+        case ast.Constant(value=float(value)) if not 0.0 < abs(value) < TINY:
+            new.value = 2.0 * value if value else 1.0
+            return new
+    return None
+
+
+def _is_string(node):
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def places(tree):
+    """Expressions of formulas: what a function computes, without annotations, messages and
+    defaults, and constants of the module.
+    """
+    skipped = (ast.Raise, ast.Assert, ast.JoinedStr, ast.Import, ast.ImportFrom)
+
+    def walk(node):
+        if isinstance(node, skipped):
+            return
+        if isinstance(node, ast.expr):
+            yield node
+        for name, value in ast.iter_fields(node):
+            if name in ("annotation", "returns", "decorator_list", "args") and not isinstance(
+                node, ast.Call
+            ):
+                continue
+            for child in value if isinstance(value, list) else [value]:
+                if isinstance(child, ast.AST):
+                    yield from walk(child)
+
+    yield from walk(tree)
+
+
+def sites(path):
+    """Numbers of the expressions of a module, among `places`, that a fault can take."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return [number for number, node in enumerate(places(tree)) if changed(node) is not None]
+
+
+def plant(path, number):
+    """Line of a site, what stands there, the fault in its place, and the source with it."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    node = next(node for k, node in enumerate(places(tree)) if k == number)
+    new = changed(node)
+    parent, field, at = _parent(tree, node)
+    if at is None:
+        setattr(parent, field, new)
+    else:
+        getattr(parent, field)[at] = new
+    source = ast.unparse(ast.fix_missing_locations(tree))
+    return node.lineno, ast.unparse(node), ast.unparse(new), source
+
+
+def _parent(tree, wanted):
+    for node in ast.walk(tree):
+        for field, value in ast.iter_fields(node):
+            if value is wanted:
+                return node, field, None
+            if isinstance(value, list):
+                for at, child in enumerate(value):
+                    if child is wanted:
+                        return node, field, at
+    raise LookupError("the node is not of this tree")
+
+
+class Watch:
+    """A plugin of pytest: notes how long tests take, and ends those that take too long."""
+
+    def __init__(self):
+        self.seconds = {}
+
+    def pytest_runtest_logreport(self, report):
+        if report.when == "call" and report.passed:
+            self.seconds[report.nodeid] = report.duration
+
+    @staticmethod
+    def pytest_runtest_setup():
+        def late(*_):
+            raise TimeoutError("left out: takes too long without compiler")
+
+        signal.signal(signal.SIGALRM, late)
+        signal.setitimer(signal.ITIMER_REAL, LONGEST)
+
+    @staticmethod
+    def pytest_runtest_teardown():
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def in_child(folder, act, limit):
+    """Result of ``act`` in a forked process that works in a folder, None where it takes too long or
+    dies.
+    """
+    answer = folder / "answer.json"
+    answer.unlink(missing_ok=True)
+    child = os.fork()
+    if child == 0:
+        os.setsid()
+        os.chdir(folder)
+        sys.path[:0] = [str(folder), str(folder / "tests"), str(folder / "benchmarks")]
+        sink = os.open(folder / "printed.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(sink, 1)
+        os.dup2(sink, 2)
+        try:
+            answer.write_text(json.dumps(act()), encoding="utf-8")
+        finally:
+            os._exit(0)
+    end = time.monotonic() + limit
+    while os.waitpid(child, os.WNOHANG) == (0, 0):
+        if time.monotonic() > end:
+            os.killpg(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            break
+        time.sleep(0.02)
+    return json.loads(answer.read_text(encoding="utf-8")) if answer.exists() else None
+
+
+def first_run(folder, package):
+    """Seconds of the package's tests, and those that run each line of its modules."""
+
+    def act():
+        import coverage
+        import pytest
+
+        counted = coverage.Coverage(
+            data_file=None, source=[f"rbfmuscle/{package}"], config_file=False
+        )
+
+        class Contexts:
+            @staticmethod
+            def pytest_runtest_logstart(nodeid):
+                counted.switch_context(nodeid)
+
+        watch = Watch()
+        counted.start()
+        pytest.main(["-q", "-n0", "-p", "no:cacheprovider", f"tests/{package}"], [watch, Contexts])
+        counted.stop()
+        data = counted.get_data()
+        lines = {
+            str(Path(file).relative_to(folder)): data.contexts_by_lineno(file)
+            for file in data.measured_files()
+        }
+        return watch.seconds, lines
+
+    return in_child(folder, act, 3600.0)
+
+
+def noticed(folder, tests, limit):
+    """Whether one of the tests fails."""
+
+    def act():
+        import pytest
+
+        return int(pytest.main(["-q", "-x", "-n0", "-p", "no:cacheprovider", *tests]))
+
+    return in_child(folder, act, limit) != 0
+
+
+def spans(path):
+    """First and last line of the innermost statement of each line of a module."""
+    found = {}
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.stmt):
+            last = node.body[0].lineno - 1 if hasattr(node, "body") else node.end_lineno
+            for line in range(node.lineno, max(last, node.lineno) + 1):
+                if line not in found or node.lineno >= found[line][0]:
+                    found[line] = (node.lineno, last)
+    return found
+
+
+def measure(folder, package, asked):
+    """Plant faults in a package; how many, how many were noticed, and those that were not."""
+    seconds, lines = first_run(folder, package)
+    print(f"{package}: {len(seconds)} tests, {sum(seconds.values()):.0f} s", flush=True)
+    planted = [
+        (path.relative_to(folder), number)
+        for path in sorted((folder / "rbfmuscle" / package).rglob("*.py"))
+        if not asked.files or path.name in asked.files
+        for number in sites(path)
+    ]
+    every = len(planted)
+    random.Random(asked.seed).shuffle(planted)
+    survivors, planted = [], planted[: asked.count]
+    for path, number in planted:
+        file = folder / path
+        line, old, new, source = plant(file, number)
+        first, last = spans(file)[line]
+        contexts = lines.get(str(path), {})
+        running = {name for k in range(first, last + 1) for name in contexts.get(str(k), ())}
+        tests, budget = [], SHOWN
+        # What runs when a module is imported runs for each of its tests.
+        for name in sorted(running & set(seconds) or set(seconds), key=seconds.get):
+            budget -= seconds[name]
+            if budget < 0.0:
+                break
+            tests.append(name)
+        before = file.read_text(encoding="utf-8")
+        file.write_text(source, encoding="utf-8")
+        seen = bool(tests) and noticed(folder, tests, SHOWN + SLACK)
+        file.write_text(before, encoding="utf-8")
+        if not seen:
+            survivors.append(f"{path}:{line}: {old} -> {new}")
+            print(f"    {survivors[-1]}", flush=True)
+    found = len(planted) - len(survivors)
+    print(f"{package}: {found} of {len(planted)} faults noticed, of {every}", flush=True)
+    return [f"`{package}`", every, len(planted), found], survivors
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--packages", nargs="+", default=list(PACKAGES))
+    parser.add_argument("--files", nargs="*", help="names of modules, otherwise all")
+    parser.add_argument("--count", type=int, default=150, help="faults of each package, at random")
+    parser.add_argument("--seed", type=int, default=67)
+    parser.add_argument("-o", "--output", type=Path, help="file of evidence")
+    asked = parser.parse_args()
+    os.environ |= {"NUMBA_DISABLE_JIT": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    sys.dont_write_bytecode = True
+    # Once, before processes are forked.
+    import hypothesis  # noqa: F401
+    import numba  # noqa: F401
+    import pytest  # noqa: F401
+    import scipy.spatial  # noqa: F401
+    import trimesh  # noqa: F401
+
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place).resolve()
+        for name in COPIED:
+            ignored = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(ROOT / name, folder / name, ignore=ignored)
+        shutil.copy(ROOT / "pyproject.toml", folder)
+        measured = [measure(folder, package, asked) for package in asked.packages]
+    if asked.output:
+        heads = ["package", "formulas that can take a fault", "planted at random", "noticed"]
+        missed = [line for _, survivors in measured for line in survivors]
+        command = ["benchmarks/mutants.py", "--count", str(asked.count), "--seed", str(asked.seed)]
+        rows = [row for row, _ in measured]
+        write_evidence(asked.output, command, rows, heads, survivors=missed)
+
+
+if __name__ == "__main__":
+    main()
