@@ -15,6 +15,8 @@ from conftest import ROOT
 sys.path.insert(0, str(ROOT / "docs"))
 from gallery import EXAMPLES, find_example, read_example, run_example
 
+# What a user runs, each in a process of its own: up to a minute each.
+slow = pytest.mark.slow
 # Scripts that are no pages of the gallery.
 OTHERS = {"pictures", "contact_pictures"}
 
@@ -25,6 +27,7 @@ def test_every_script_and_notebook_is_a_page_of_the_gallery():
     assert sum(path.suffix == ".ipynb" for path in found) == 2
 
 
+@slow
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_example_has_a_title_and_passes_the_check_that_ends_it(name, tmp_path):
     text, code = read_example(find_example(ROOT, name))
@@ -48,6 +51,7 @@ def test_meshes_become_a_report_by_the_lines_of_the_readme(tmp_path, monkeypatch
     assert "gluteus_maximus" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
+@slow
 def test_python_of_the_readme_runs_as_it_stands(tmp_path):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
@@ -65,6 +69,7 @@ def test_python_of_the_readme_runs_as_it_stands(tmp_path):
     assert (tmp_path / "out" / "report.html").exists()
 
 
+@slow
 def test_the_papers_experiments_run(hip_data, monkeypatch, capsys):
     script = str(ROOT / "benchmarks" / "paper_experiments.py")
     monkeypatch.setattr(sys, "argv", [script, "--muscle", "gluteus_medius"])

@@ -14,7 +14,11 @@ from numba.core.runtime import _nrt_python, rtsys
 
 from rbfmuscle.jit import compiled
 
-pytestmark = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
+# Slow: some forty processes, each of which compiles.
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled"),
+]
 SOURCES = {
     "__init__": "",
     "constants": "SHIFT = 0.5\n",

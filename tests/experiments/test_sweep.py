@@ -210,6 +210,7 @@ def cluster(tmp_path):
             process.wait(timeout=30)
 
 
+@pytest.mark.slow  # a scheduler and two workers have to start, and one has to be missed
 def test_a_cluster_that_loses_one_of_two_workers_gives_the_same_table(finished, cluster, tmp_path):
     address, workers = cluster
 

@@ -4,9 +4,11 @@ import os
 import subprocess
 import sys
 
+import pytest
 from conftest import ROOT
 
 
+@pytest.mark.slow  # 106 cases, each a process of its own
 def test_damaged_scenes_and_meshes_end_in_one_line_or_are_fine():
     words = [sys.executable, "-m", "fuzz", "--scene", "60", "--mesh", "40", "--frames", "6"]
     env = {**os.environ, "PYTHONPATH": str(ROOT / "tests")}

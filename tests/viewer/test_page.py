@@ -4,7 +4,6 @@ import http.client
 import shutil
 import socket
 import sys
-import time
 from contextlib import nullcontext
 from unittest.mock import Mock
 from urllib.parse import urlsplit
@@ -64,12 +63,14 @@ def arrived(page):
     return figure is not None and not figure.pending and not page._resting
 
 
-def drag(tab, share):
+def drag(page, tab, share):
     """Drag the slider of flexion; the number that it comes to."""
     tab.drag(FLEXION, share)
     # -30 to 30 degrees; the handle is as wide as 2 degrees.
     wait_for(lambda: abs(tab.slider(FLEXION)[0] - (60 * share - 30)) < 3, SLOW)
-    time.sleep(1.0)  # the last events of the mouse
+    # The last number that the page shows has reached the server.
+    control = page.panel.controls["hip.flexion"]
+    wait_for(lambda: abs(control.value - tab.slider(FLEXION)[0]) < 1e-6, SLOW)
     return tab.slider(FLEXION)[0]
 
 
@@ -103,7 +104,7 @@ def test_page_shows_bones_muscles_and_numbers(tab):
 
 def test_dragging_a_slider_moves_number_muscles_and_picture_and_a_reload_keeps_the_pose(page, tab):
     before = canvas(tab)
-    value = drag(tab, 0.9)
+    value = drag(page, tab, 0.9)
     assert 21 < value < 27
     wait_for(lambda: abs(degrees(page) - value) < 1e-6, SLOW)
     assert changed(before, canvas(tab)) > 0.01
