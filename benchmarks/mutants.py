@@ -29,8 +29,8 @@ ROOT = Path(__file__).resolve().parent.parent
 COPIED = ("rbfmuscle", "pbd_baseline", "tests", "benchmarks", "docs", "examples")
 PACKAGES = ("metrics", "geometry", "fibres")
 LONGEST = 10.0  # seconds of a test, coverage included: slower ones are left out
-SHOWN = 60.0  # seconds of tests that a fault is shown to
-SLACK = 30.0  # seconds that a fault may hang on top: it counts as noticed
+SHOWN = 30.0  # seconds of tests that a fault is shown to
+HANGS = 180.0  # seconds after which a fault counts as noticed
 TINY = 1e-6  # guards against zero and rounding: no known answer depends on them
 
 SWAPPED = {
@@ -270,7 +270,7 @@ def measure(folder, package, asked):
             tests.append(name)
         before = file.read_text(encoding="utf-8")
         file.write_text(source, encoding="utf-8")
-        seen = bool(tests) and noticed(folder, tests, SHOWN + SLACK)
+        seen = bool(tests) and noticed(folder, tests, HANGS)
         file.write_text(before, encoding="utf-8")
         if not seen:
             survivors.append(f"{path}:{line}: {old} -> {new}")
