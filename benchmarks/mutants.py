@@ -21,6 +21,7 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from pathlib import Path
 
 from evidence import write_evidence
@@ -32,6 +33,9 @@ LONGEST = 10.0  # seconds of a test, coverage included: slower ones are left out
 SHOWN = 30.0  # seconds of tests that a fault is shown to
 HANGS = 180.0  # seconds after which a fault counts as noticed
 TINY = 1e-6  # guards against zero and rounding: no known answer depends on them
+
+# What is imported before processes are forked cannot be rewritten by pytest, and need not be.
+PLAIN = ["-q", "-n0", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning"]
 
 SWAPPED = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult,
@@ -177,7 +181,11 @@ def in_child(folder, act, limit):
         os.dup2(sink, 2)
         try:
             answer.write_text(json.dumps(act()), encoding="utf-8")
+        except BaseException:
+            traceback.print_exc()
+            raise
         finally:
+            sys.stderr.flush()
             os._exit(0)
     end = time.monotonic() + limit
     while os.waitpid(child, os.WNOHANG) == (0, 0):
@@ -207,7 +215,7 @@ def first_run(folder, package):
 
         watch = Watch()
         counted.start()
-        pytest.main(["-q", "-n0", "-p", "no:cacheprovider", f"tests/{package}"], [watch, Contexts])
+        pytest.main([*PLAIN, f"tests/{package}"], [watch, Contexts])
         counted.stop()
         data = counted.get_data()
         lines = {
@@ -225,7 +233,7 @@ def noticed(folder, tests, limit):
     def act():
         import pytest
 
-        return int(pytest.main(["-q", "-x", "-n0", "-p", "no:cacheprovider", *tests]))
+        return int(pytest.main([*PLAIN, "-x", *tests]))
 
     return in_child(folder, act, limit) != 0
 
@@ -246,6 +254,8 @@ def measure(folder, package, asked):
     """Plant faults in a package; how many, how many were noticed, and those that were not."""
     seconds, lines = first_run(folder, package)
     print(f"{package}: {len(seconds)} tests, {sum(seconds.values()):.0f} s", flush=True)
+    if not seconds or noticed(folder, list(seconds), 3600.0):
+        raise SystemExit(f"tests of {package} fail without a fault: see {folder}/printed.txt")
     planted = [
         (path.relative_to(folder), number)
         for path in sorted((folder / "rbfmuscle" / package).rglob("*.py"))
@@ -293,7 +303,6 @@ def main():
     os.environ |= {"NUMBA_DISABLE_JIT": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     sys.dont_write_bytecode = True
     # Once, before processes are forked.
-    import hypothesis  # noqa: F401
     import numba  # noqa: F401
     import pytest  # noqa: F401
     import scipy.spatial  # noqa: F401
