@@ -26,7 +26,7 @@ from rbfmuscle.metrics.summary import (
 )
 from rbfmuscle.models import build_models, configure_scene, kernel_names
 from rbfmuscle.output.info import RunInfo
-from rbfmuscle.output.writer import Neighbours, RunWriter, build_info, frame_facts
+from rbfmuscle.output.writer import RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
 from rbfmuscle.report.verdict import describe_verdict, require_limits
 from rbfmuscle.scene.check import (
@@ -107,7 +107,7 @@ class Recording:
         }
         self.times: dict[str, float] = {}
         self.status, self.message = "running", ""
-        self.summary, self.neighbours = Summary(), Neighbours()
+        self.summary = Summary()
         self.written: list[dict] = []
         self._path: dict[int, dict[str, float]] = {}
         self._fibres: dict[str, dict[int, Floats]] = {}  # lengths (N,) by muscle and frame
@@ -201,7 +201,6 @@ class Recording:
         frame.events.sort(key=lambda event: self._place[event.muscle])
         events, together = self._skeleton.get(frame.index, ([], {}))
         frame.events.extend(events)
-        self.neighbours.add(frame)
         before = next(reversed(self._path.values()), None)
         rows = frame_rows(self.scene, frame, before, {**measured, ALL: together})
         self.summary.add(rows)
@@ -215,7 +214,6 @@ class Recording:
         return build_info(
             self.scene,
             self.started,
-            self.neighbours,
             table,
             status=status or self.status,
             message=self.message,
@@ -227,6 +225,7 @@ class Recording:
             verdict=self._verdict(table),
             beyond=exceeded(table, limits),
             not_measured=unmeasured(table, limits),
+            neighbours=self._measures.neighbours.table(),
             frames=self.written,
         )
 

@@ -11,21 +11,28 @@ from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import EdgeLengths, label_sheets, mesh_volume
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
-from rbfmuscle.metrics.depths import bone_depth, surface_depth
+from rbfmuscle.metrics.depths import bone_depth, bones_about, surface_depth
+from rbfmuscle.metrics.neighbours import NeighbourMeasures, Shown
 from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
 from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.check import end_gap
 from rbfmuscle.scene.guesses import doubtful, guessed_muscles
-from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Event, Frame, Mesh, ModelSurface
 
 Values = dict[str, float]
 
+# What lies so near to an overlap with a bone at rest [mm] is not held to the input mesh.
+AROUND = 10.0
+OVERLAP = 0.02  # depth [mm] below which nothing overlaps
+
 _FROM_MODEL = (
     "solver_penetration_max",
+    "lifted_penetration_max",
     "solver_sweeps",
     "solver_residual",
     "solid_volume_error",
@@ -51,8 +58,10 @@ class MuscleMeasures:
         mine = [muscle for muscle in scene.muscles if muscle.name in material]
         trackers = each(lambda one: MuscleMeasurer(one, scene, *material[one.name]), mine)
         self.trackers = {tracker.name: tracker for tracker in trackers}
+        self.neighbours = NeighbourMeasures(mine, scene.units)
         for muscle in mine:
             self.trackers[muscle.name].first = {
+                "neighbour_overlap_rest": self.neighbours.at_rest(muscle.name),
                 "articular_share": articular_share(muscle, scene, surfaces)[0],
                 "end_gap": end_gap(muscle, scene)[0],
                 "guessed": muscle.name in guessed,
@@ -77,8 +86,16 @@ class MuscleMeasures:
     def measure(self, frame: Frame) -> dict[str, Values]:
         """Measure a frame: for each muscle its values by quantity, in the order of `QUANTITIES`."""
         trackers = list(self.trackers.values())
-        found = each(lambda tracker: tracker.measure(frame, self.probes), trackers)
-        return dict(zip(self.trackers, found))
+        found = dict(
+            zip(self.trackers, each(lambda tracker: tracker.measure(frame, self.probes), trackers))
+        )
+        shown = {t.name: Shown(t.distance, t.places) for t in trackers if t.name in frame.surfaces}
+        for name, values in self.neighbours.measure(frame.index, shown).items():
+            found[name].update(values)
+        return {
+            name: {q: float(values[q]) for q in QUANTITIES if q in values}
+            for name, values in found.items()
+        }
 
 
 class MuscleMeasurer:
@@ -87,6 +104,10 @@ class MuscleMeasurer:
     def __init__(self, muscle: Muscle, scene: Scene, vertices: Floats, faces: Integers) -> None:
         self.name = muscle.name
         self.mesh = muscle.mesh
+        self.held = np.concatenate(
+            [np.zeros(0, dtype=np.int64), *(held.vertices for held in muscle.attachments)]
+        )
+        self.least, self.around = from_mm(OVERLAP, scene.units), from_mm(AROUND, scene.units)
         self.rest_volume = float(muscle.mesh.volume)
         self.edges = EdgeLengths(vertices, faces)
         #: What is measured once, with the first frame.
@@ -104,6 +125,7 @@ class MuscleMeasurer:
         self.at_rest: Values = {}  # what was measured there, until the first frame takes it
         # Of the last surface.
         self.distance: MeshDistance | None = None
+        self.places: Floats | None = None  # of its vertices at rest
         self.offset: Floats | None = None
         self.near: Integers | None = None
 
@@ -138,7 +160,7 @@ class MuscleMeasurer:
         if times:
             found["time_solve"] = times.get("time_predict", 0.0) + times.get("time_solve", 0.0)
             found["time_frame"] = times["time_frame"]
-        return {quantity: float(found[quantity]) for quantity in QUANTITIES if quantity in found}
+        return found
 
     def _of_surface(self, surface, material, probes, poses):
         vertices, faces = surface.vertices, np.asarray(surface.faces)
@@ -146,6 +168,8 @@ class MuscleMeasurer:
         same = self.distance is not None and np.array_equal(self.distance.faces, faces)
         layout = self.distance.layout if same else None
         self.distance = MeshDistance(vertices, faces, layout=layout)
+        if not same:
+            self.places = self._places_at_rest(vertices, material)
         volume = mesh_volume(vertices, faces)
         depth = surface_depth(vertices, probes, poses)
         form = self.form.measure(surface, same_faces=same)
@@ -180,30 +204,32 @@ class MuscleMeasurer:
     ) -> None:
         """What is measured once, before the first frame, with all bones at rest.
 
-        Where muscle and bones overlap in the input, the surface is compared with the input mesh
-        moved as the material was, and out of the bones: that way is ``initial_shift``, not an
-        error of the shape.
+        The surface is compared with the input mesh, apart from what lies within `AROUND` of where
+        that overlaps a bone: a muscle that was moved out of a bone shows what the scan is worth,
+        not the model.
         """
         mesh = np.asarray(self.mesh.vertices, dtype=float), np.asarray(self.mesh.faces)
-        there = mesh[0] + material_shift(mesh[0], self.material, material - self.material)
-        for probe in probes:
-            inside = probe.inside(there)
-            if inside.any():
-                there[inside] = probe.nearest(there[inside])[1]
+        given = MeshDistance(*mesh)
         # Its tree is that of the first frame too.
         shown = self.distance = MeshDistance(surface.vertices, surface.faces)
-        rms, worst = distance_between(shown, MeshDistance(there, mesh[1]))
-        found = {"rest_error_rms": rms, "rest_error_max": worst}
-        found["initial_shift"] = float(np.linalg.norm(there - mesh[0], axis=1).max())
+        self.places = self._places_at_rest(shown.vertices, material)
+        places, deepest = bone_overlap(given, self.held, probes, poses, self.least)
+        found = {"input_overlap": deepest, **rest_errors(shown, given, places, self.around)}
         found["initial_overlap"] = max(
             float(surface_depth(surface.vertices, probes, poses).max()),
             bone_depth(shown, probes, poses),
-            surface.quantities.get("solver_penetration_max", 0.0),
+            surface.quantities.get(
+                "lifted_penetration_max", surface.quantities.get("solver_penetration_max", 0.0)
+            ),
         )
         if self.line is not None:
             found["thickness"] = self.line.section(*mesh, poses)["belly_thickness"]
             found["bowing_at_rest"] = self.line.measure(self.material, poses, probes)[1]
         self.at_rest = found
+
+    def _places_at_rest(self, vertices: Floats, material: Floats) -> Floats:
+        """Where vertices (n, 3) of a surface lie in the input, from the material (k, 3) there."""
+        return vertices + material_shift(vertices, material, self.material - material)
 
 
 def material_shift(points: Floats, at: Floats, shift: Floats) -> Floats:
@@ -214,6 +240,52 @@ def material_shift(points: Floats, at: Floats, shift: Floats) -> Floats:
     weights = 1.0 / np.maximum(distance, 1e-9 * np.ptp(at)) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
     return np.einsum("nk,nkd->nd", weights, shift[near])
+
+
+def bone_overlap(
+    given: MeshDistance,
+    held: Integers,
+    probes: list[BoneDistance],
+    poses: dict[str, Floats],
+    least: float,
+) -> tuple[Floats, float]:
+    """Where an input mesh and bones overlap at rest by more than ``least``: vertices (n, 3) of
+    either in the other, and the greatest depth; at its vertices that are ``held`` (k,) nothing
+    counts.
+    """
+    free = np.ones(len(given.vertices), dtype=bool)
+    free[held] = False
+    depth = np.where(free, surface_depth(given.vertices, probes, poses), 0.0)
+    places, depths = [given.vertices[depth > least]], [depth[depth > least]]
+    tree = cKDTree(given.vertices)
+    for probe in bones_about(given.vertices, probes, poses):
+        pose = poses[probe.name]
+        depth = given.depth(probe.vertices, pose=pose)
+        points = to_world(probe.vertices[depth > least], pose)
+        loose = free[tree.query(points)[1]]
+        places.append(points[loose])
+        depths.append(depth[depth > least][loose])
+    return np.concatenate(places), float(np.concatenate(depths).max(initial=0.0))
+
+
+def rest_errors(
+    shown: MeshDistance, given: MeshDistance, places: Floats, around: float
+) -> dict[str, float]:
+    """Distances between a surface and the input mesh: RMS and greatest of both directions farther
+    than ``around`` from places (n, 3), and the greatest nearer to these.
+    """
+    pairs = (given.unsigned(shown.vertices), shown.unsigned(given.vertices))
+    far = [np.ones(len(distance), dtype=bool) for distance in pairs]
+    if len(places):
+        tree = cKDTree(places)
+        far = [tree.query(mesh.vertices)[0] > around for mesh in (shown, given)]
+    near = max(float(d[~f].max(initial=0.0)) for d, f in zip(pairs, far))
+    found = {"rest_error_at_overlap": near} if len(places) else {}
+    if all(f.any() for f in far):
+        squares = [np.mean(d[f] ** 2) for d, f in zip(pairs, far)]
+        found["rest_error_rms"] = math.sqrt(sum(squares) / 2)
+        found["rest_error_max"] = max(float(d[f].max()) for d, f in zip(pairs, far))
+    return found
 
 
 def surface_distance(

@@ -30,7 +30,12 @@ QUANTITIES = {
     "bone_penetration_max": ("length", "deepest bone vertex inside the muscle"),
     "solver_penetration_max": (
         "length",
-        "deepest of the model's points inside a bone, before the cut along bones",
+        "deepest of the model's points inside a bone at the end of the solve",
+    ),
+    "lifted_penetration_max": (
+        "length",
+        "the same after RBF muscles have lifted these points out of bones, before the surface is "
+        "drawn",
     ),
     "solver_sweeps": ("1", "sweeps of the last solve of a mesh model"),
     "solver_residual": (
@@ -57,11 +62,29 @@ QUANTITIES = {
         "greatest change, from frame to frame, of distances from material mesh to surface",
     ),
     "tunnelled": ("1", "points that passed through a bone and were not brought back"),
+    "neighbour_overlap_max": (
+        "length",
+        "deepest vertex of this muscle or another in the other, beyond their overlap at rest there",
+    ),
+    "neighbour_overlap_rest": (
+        "length",
+        "deepest overlap of the input mesh with that of another muscle; first frame",
+    ),
+    "neighbour_gap": (
+        "length",
+        "how far the surface has parted from muscles that it touched at rest: 95th percentile",
+    ),
     "rest_error_rms": (
         "length",
-        "distance between surface and input mesh at rest, both ways",
+        "distance between surface and input mesh at rest, both ways, farther than 10 mm from where "
+        "that overlaps a bone",
     ),
     "rest_error_max": ("length", "the same, greatest (Hausdorff)"),
+    "rest_error_at_overlap": ("length", "the same, greatest, within 10 mm of an overlap"),
+    "input_overlap": (
+        "length",
+        "deepest overlap of the input mesh with a bone at rest, apart from attachments",
+    ),
     "thickness": (
         "length",
         "least width of the input mesh's greatest section across its line of action",
@@ -72,7 +95,6 @@ QUANTITIES = {
     ),
     "tendon_depth": ("length", "deepest point of a tendon inside a bone"),
     "initial_overlap": ("length", "deepest overlap of muscle and bones that is left at rest"),
-    "initial_shift": ("length", "greatest distance that the muscle was moved out of bones at rest"),
     "end_gap": ("length", "distance of the end that lies furthest from its bone at rest"),
     "edge_strain_rms": ("1", "relative change of edge lengths of the material mesh"),
     "condition": ("1", "condition estimate of the fit"),

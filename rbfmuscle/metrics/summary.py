@@ -132,6 +132,7 @@ LIMITS = {
         f"take all frames of the motion, or make its step smaller, or {_SMALLER_STEPS}",
     ),
     "bowing": Limit(1.03, "centreline over shortest path", _LOOK),
+    "neighbour_overlap_max": Limit(0.5, "overlap with another muscle", _LOOK),
     "tunnelled": Limit(0.0, "points beyond a bone", _SMALLER_STEPS),
     "rest_error_rms": Limit(0.6, "rest error", _MORE_CENTRES, _APART),
     "end_gap": Limit(

@@ -180,7 +180,7 @@ class SurfaceBuilder:
             surface = self._of_material(solid.lifted_nodes, centres, normals, contacts)
         spent = time.perf_counter() - started - surface.quantities["time_fit"]
         surface.quantities["time_extract"] = spent
-        surface.quantities["solver_penetration_max"] = contacts.depth(solid.points)
+        surface.quantities["lifted_penetration_max"] = contacts.depth(solid.points)
         return surface
 
     def _of_material(

@@ -180,11 +180,15 @@ class RBFMuscle:
         normals = turned_normals(nodes, columns, self._normals_at, self.rest.normals)
         drawn = self.drawer.draw(self.state, normals, contacts)
         quantities, notes = self.log.take()
+        # Before what the solve left in a bone was lifted out of it.
+        settled = carry(self.model.embedding, self.state.nodes)
+        drawn.quantities["solver_penetration_max"] = contacts.depth(settled)
         drawn.quantities.update(quantities)
         drawn.notes.extend(notes)
         if self._input is not None and self.options.surface != "marching":
             place, faces = self._input
-            drawn = replace(drawn, vertices=drawn.vertices[place], faces=faces)
+            arrays = {name: values[place] for name, values in drawn.arrays.items()}
+            drawn = replace(drawn, vertices=drawn.vertices[place], faces=faces, arrays=arrays)
         return drawn
 
 

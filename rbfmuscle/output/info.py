@@ -112,8 +112,9 @@ class RunInfo(Part):
     complete. ``times`` are those of the parts of the run [s], ``muscles`` and ``frame_time`` what
     `Summary.table` gives. ``limits`` are in the scene's unit, ``fail_on`` those that it may fail
     on (None: the default); ``beyond`` are values beyond a limit, ``not_measured`` limits without a
-    value, ``verdict`` the sentence about them. ``planned`` are the coordinates of all frames while
-    the run goes on.
+    value, ``verdict`` the sentence about them. ``neighbours`` are the pairs of muscles that touched
+    or met, with the worst of each. ``planned`` are the coordinates of all frames while the run goes
+    on.
     """
 
     format: int = 0
@@ -132,6 +133,7 @@ class RunInfo(Part):
     verdict: str = ""
     beyond: list[Exceedance] = []
     not_measured: list[Unmeasured] = []
+    neighbours: list[dict[str, object]] = []
     frames: list[FrameInfo]
     planned: list[dict[str, float]] = []
 

@@ -257,7 +257,6 @@ def json_text(data: object) -> str:
 def build_info(
     scene: Scene,
     started: datetime,
-    neighbours: "Neighbours",
     summary: dict[str, dict[str, QuantityFacts]],
     **facts: object,
 ) -> RunInfo:
@@ -265,6 +264,7 @@ def build_info(
 
     Other facts are kept as they are: ``status`` ("running", "complete", "interrupted" or "failed"),
     ``message`` (why it did not complete), ``options`` of the caller, ``kernels`` by muscle,
+    ``neighbours`` (`NeighbourMeasures.table`),
     ``times`` of the parts of the run [s], ``limits``, ``fail_on`` (those that it may fail on, None
     for the default), ``verdict``, ``beyond`` (muscle, quantity, worst value, limit, frame),
     ``not_measured`` (muscle, quantity), ``frames`` (`frame_facts`).
@@ -277,7 +277,6 @@ def build_info(
         "versions": versions(),
         "machine": machine(),
         "inputs": input_hashes(scene),
-        **({"neighbours": neighbours.table()} if neighbours.pairs else {}),
         "muscles": {name: found for name, found in summary.items() if name != ALL},
         "frame_time": summary.get(ALL, {}).get("time_frame"),
         **facts,
@@ -299,27 +298,6 @@ def frame_facts(scene: Scene, frame: Frame) -> dict:
         },
         "wall": frame.wall,
     }
-
-
-class Neighbours:
-    """Pairs of muscles that slide: worst overlap and its frame, worst gap and its frame."""
-
-    def __init__(self) -> None:
-        self.pairs: dict[tuple[str, str], tuple[float, int, float, int]] = {}
-
-    def add(self, frame: Frame) -> None:
-        """Take in what a frame holds of them."""
-        for pair, (overlap, gap) in frame.neighbours.items():
-            deepest, at, widest, there = self.pairs.get(pair, (-1.0, 0, -1.0, 0))
-            deepest, at = max((deepest, at), (overlap, frame.index), key=lambda found: found[0])
-            widest, there = max((widest, there), (gap, frame.index), key=lambda found: found[0])
-            self.pairs[pair] = deepest, at, widest, there
-
-    def table(self) -> list[dict[str, object]]:
-        """Pairs of neighbours, the deepest overlap first [scene unit]."""
-        names = ("overlap_max", "overlap_frame", "gap_rms", "gap_frame")
-        ordered = sorted(self.pairs.items(), key=lambda found: -found[1][0])
-        return [{"muscles": list(pair), **dict(zip(names, worst))} for pair, worst in ordered]
 
 
 def versions() -> dict[str, str]:

@@ -15,6 +15,7 @@ from rbfmuscle.scene.ends import attachment_ends
 from rbfmuscle.scene.extents import check_place, check_size
 from rbfmuscle.scene.guesses import doubtful, guessed_muscles
 from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.scene.neighbours import input_distances, input_overlaps
 from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.validation import RBFMuscleError, SceneError
@@ -59,6 +60,7 @@ def check_scene(scene: Scene) -> list[Finding]:
     findings += [Finding("warning", scene.name, doubt) for doubt in scene.doubts]
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
     findings += _rest_overlaps(scene)
+    findings += _neighbour_findings(scene)
     findings += _guess_findings(scene)
     if scene.meshless_bones and not scene.bones:
         words = "no bone has a mesh, so nothing can be run; give the bones meshes"
@@ -181,6 +183,20 @@ def _rest_overlaps(scene):
         )
         findings.append(Finding(level, muscle.name, message))
     return findings
+
+
+def _neighbour_findings(scene):
+    """A note for each pair of muscles whose meshes overlap."""
+    overlaps = input_overlaps(input_distances(scene.muscles))
+    return [
+        Finding(
+            "note",
+            f"{one} and {other}",
+            f"the meshes of these muscles overlap by {found.depths.max():.3g} {scene.units}: what "
+            "does so at rest counts apart",
+        )
+        for (one, other), found in sorted(overlaps.items(), key=lambda row: -row[1].depths.max())
+    ]
 
 
 def check_initial(scene: Scene) -> None:

@@ -43,6 +43,7 @@ TABLE = {
     "unfitted_fraction": (0.9, 1.0),
     "solver_residual": (1e-4, 1.1e-4),
     "solid_volume_error": (0.02, 0.021),
+    "neighbour_overlap_max": (0.5, 0.51),
     "tunnelled": (0, 1),
     "bone_overlap": (0.0, 0.06),
     "joint_gap": (5.0, 5.1),

@@ -369,13 +369,13 @@ def test_surface_at_rest_is_the_input_mesh_but_for_what_overlaps_bones():
     away = np.linalg.norm(surface.vertices - mesh.vertices, axis=1)
     # Some vertices of the ends lie up to 0.2 mm deep in the bones.
     assert np.median(away) < 1e-3 and away.max() < 0.3
-    assert run.values("extensor", "rest_error_rms")[0] < 1e-3
-    assert run.values("extensor", "initial_shift")[0] == pytest.approx(0.22, abs=0.02)
+    assert run.values("extensor", "rest_error_rms")[0] < 0.02
+    assert run.values("extensor", "input_overlap")[0] == 0.0  # apart from its attachments
     # The bare field of the centres is farther from the mesh.
     assert np.abs(field_of(model)(mesh.vertices)).max() > 0.3
     # What makes it the input mesh are level offsets; there are as many centres as keep them small.
     offsets = surface.arrays["level_offset"]
-    assert offsets.shape == (len(mesh.vertices),)
+    np.testing.assert_allclose(offsets, field_of(model)(mesh.vertices), atol=0.01)
     assert 0.05 < np.sqrt(np.mean(offsets**2)) < 0.6
 
 

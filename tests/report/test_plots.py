@@ -2,13 +2,11 @@
 axis."""
 
 import re
-from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
 
 from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.output.writer import Neighbours
 from rbfmuscle.report.plots import Point, Track, front_plot, line_plot
 from rbfmuscle.report.svg import Axis
 
@@ -112,19 +110,3 @@ def test_any_name_stands_in_a_plot_as_it_is():
     assert found.get("aria-label") == r"$\frac$ & <b>"
     assert '<"strap">' in [group.get("data-muscle") for group in found]
     assert {r"$\frac$ & <b>", '<"strap">'} <= {element.text for element in found.iter("text")}
-
-
-def test_the_worst_of_neighbours_over_the_frames_is_kept():
-    one = ("a", "b")
-    other = ("a", "c")
-    neighbours = Neighbours()
-    frames = {
-        0: {one: (0.1, 0.0)},
-        2: {one: (0.4, 0.2), other: (0.5, 0.0)},
-        4: {one: (0.3, 0.7)},
-        6: {},
-    }
-    for index, pairs in frames.items():
-        neighbours.add(SimpleNamespace(index=index, neighbours=pairs))
-    found = [[*row.pop("muscles"), *row.values()] for row in neighbours.table()]
-    assert found == [["a", "c", 0.5, 2, 0.0, 2], ["a", "b", 0.4, 2, 0.7, 4]]

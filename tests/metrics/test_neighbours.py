@@ -1,0 +1,126 @@
+"""Overlap and gaps of shown surfaces of muscles against known answers: balls and boxes."""
+
+import numpy as np
+import pytest
+import toy_scene as toy
+import trimesh
+
+from rbfmuscle.geometry.mesh_distance import MeshDistance
+from rbfmuscle.metrics.neighbours import NeighbourMeasures, Shown
+from rbfmuscle.metrics.summary import exceeded, parse_limits
+from rbfmuscle.run import simulate
+from rbfmuscle.scene.check import check_scene
+from rbfmuscle.scene.phantom import phantom_scene
+
+
+def pair(one, other, units="mm"):
+    """Measures of two muscles "one" and "other" of these meshes."""
+    muscles = [toy.muscle("one", one, []), toy.muscle("other", other, [])]
+    return NeighbourMeasures(muscles, units), {"one": one, "other": other}
+
+
+def shown(meshes, **moved):
+    """The meshes as they are shown, each where it is at rest or moved by (4, 4) or a vector."""
+    found = {}
+    for name, mesh in meshes.items():
+        motion = np.asarray(moved.get(name, np.zeros(3)), float)
+        rest = np.array(mesh.vertices)
+        vertices = trimesh.transform_points(rest, motion) if motion.ndim == 2 else rest + motion
+        found[name] = Shown(MeshDistance(vertices, mesh.faces), rest)
+    return found
+
+
+def boxes(overlap=0.0):
+    """Two boxes beside each other along x, 10 wide."""
+    return toy.box_mesh((0, 0, 0), (10, 10, 10)), toy.box_mesh(
+        (10 - overlap, 0, 0), (20 - overlap, 10, 10)
+    )
+
+
+def test_box_pushed_into_another_overlaps_by_as_much_and_pulled_off_leaves_a_gap():
+    measures, meshes = pair(*boxes())
+    at_rest = measures.measure(0, shown(meshes))
+    assert (
+        at_rest["one"] == at_rest["other"] == {"neighbour_overlap_max": 0.0, "neighbour_gap": 0.0}
+    )
+    pressed = measures.measure(1, shown(meshes, other=(-2.0, 0.7, 0.7)))
+    assert pressed["one"]["neighbour_overlap_max"] == pytest.approx(2.0)
+    apart = measures.measure(2, shown(meshes, other=(3.0, 0, 0)))
+    assert apart["one"] == pytest.approx({"neighbour_overlap_max": 0.0, "neighbour_gap": 3.0})
+    (row,) = measures.table()
+    assert (row["muscles"], row["overlap_frame"], row["gap_frame"]) == (["one", "other"], 1, 2)
+    assert (row["overlap_max"], row["gap"]) == (pytest.approx(2.0), pytest.approx(3.0))
+
+
+def test_sliding_along_a_neighbour_opens_no_gap():
+    measures, meshes = pair(*boxes())
+    # Less than a twentieth of the side is beside it no more.
+    slid = measures.measure(0, shown(meshes, other=(0, 0.4, 0)))["one"]
+    assert slid["neighbour_overlap_max"] == 0.0 and slid["neighbour_gap"] < 0.5
+
+
+@pytest.mark.parametrize("units", ["mm", "m"])
+def test_what_overlaps_at_rest_counts_apart_and_only_where_it_does(units):
+    scale = 1.0 if units == "mm" else 0.001
+    balls = [trimesh.creation.icosphere(5, 10.0) for _ in range(2)]
+    balls[1].apply_translation([19.0, 0, 0])
+    for ball in balls:
+        ball.apply_scale(scale)
+    measures, meshes = pair(*balls, units=units)
+    # Facets lie within 0.01 of a ball of radius 10.
+    near = pytest.approx(1.0 * scale, abs=0.02 * scale)
+    assert measures.at_rest("one") == near and measures.at_rest("other") == near
+    at_rest = measures.measure(0, shown(meshes))["other"]["neighbour_overlap_max"]
+    assert at_rest == pytest.approx(0.0, abs=1e-12)
+    deeper = measures.measure(0, shown(meshes, other=np.array((-2.0, 0, 0)) * scale))["one"]
+    assert deeper["neighbour_overlap_max"] == pytest.approx(2.0 * scale, abs=0.05 * scale)
+    # The other one turned about its middle: its other side did not overlap at rest.
+    turn = trimesh.transformations.rotation_matrix(np.pi, (0, 0, 1), [19.0 * scale, 0, 0])
+    turned = measures.measure(0, shown(meshes, other=turn))["other"]
+    assert turned["neighbour_overlap_max"] == near
+
+
+def test_overlap_is_that_of_a_literal_search_and_the_same_for_both_orders():
+    rng = np.random.default_rng(4)
+    balls = [trimesh.creation.icosphere(3, 10.0) for _ in range(2)]
+    for ball in balls:
+        ball.vertices *= 1.0 + 0.05 * rng.normal(size=(len(ball.vertices), 1))
+    balls[1].apply_translation([25.0, 0, 0])
+    deepest = 0.0
+    there = balls[1].copy().apply_translation([-10.0, 1.0, 0])
+    for one, other in ((balls[0], there), (there, balls[0])):
+        distance = trimesh.proximity.signed_distance(other, one.vertices)
+        deepest = max(deepest, distance.max())
+    for order in ((0, 1), (1, 0)):
+        measures, meshes = pair(*(balls[k] for k in order))
+        moved = {("one", "other")[order.index(1)]: (-10.0, 1.0, 0)}
+        found = measures.measure(0, shown(meshes, **moved))
+        assert found["one"]["neighbour_overlap_max"] == pytest.approx(deepest)
+        assert found["one"] == found["other"]
+
+
+def test_every_run_measures_neighbours_and_its_verdict_counts_them():
+    scene = phantom_scene(end=36.0, step=12.0)
+    scene.muscles = [scene.muscle(name) for name in ("extensor", "abductor")]
+    run = simulate(scene, model="pbd")
+    for name in ("extensor", "abductor"):
+        values = run.values(name, "neighbour_overlap_max")
+        assert len(values) == 4 and values[0] < 0.1 and values[-1] > 1.0
+        assert len(run.values(name, "neighbour_overlap_rest")) == 1
+        assert len(run.values(name, "neighbour_gap")) == 4
+    beyond = exceeded(run.info.muscles, parse_limits(None, run.scene))
+    assert {row.muscle for row in beyond if row.quantity == "neighbour_overlap_max"} == {
+        "extensor",
+        "abductor",
+    }
+    assert "overlap with another muscle" in run.verdict
+    (row,) = run.info.neighbours
+    assert row["overlap_max"] == pytest.approx(max(run.values("extensor", "neighbour_overlap_max")))
+
+
+def test_check_lists_muscles_whose_meshes_overlap():
+    made, _ = toy.neighbour_scene([{}], gap=-1.0, sliding=None)
+    (said,) = [f for f in check_scene(made) if f.place == "lower and upper"]
+    assert said.level == "note" and "overlap by 0.998 mm" in said.message
+    apart, _ = toy.neighbour_scene([{}], gap=1.0, sliding=None)
+    assert not [f for f in check_scene(apart) if f.place == "lower and upper"]
