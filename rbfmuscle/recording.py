@@ -17,18 +17,17 @@ from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import frame_rows, joint_gaps, moment_arm_rows
 from rbfmuscle.metrics.summary import (
     LIMITS,
+    Doubt,
     Limits,
     Summary,
     Table,
-    exceeded,
     parse_limits,
-    unmeasured,
 )
 from rbfmuscle.models import build_models, configure_scene, kernel_names
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.writer import RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
-from rbfmuscle.report.verdict import describe_verdict, require_limits
+from rbfmuscle.report.verdict import Verdict, describe_verdict, judge, require_limits
 from rbfmuscle.scene.check import (
     bone_collisions,
     bone_findings,
@@ -115,6 +114,7 @@ class Recording:
         with timed(self.times, "build"), stage("building"):
             check_substeps(self.scene)
             check_initial(self.scene)
+            self._doubts = [Doubt(name or ALL, text) for name, text in stated_doubts(self.scene)]
             self._skeleton = _check_skeleton(self.scene)
             self._models = build_models(self.scene)
             material = {model.name: model.material_mesh() for model in self._models}
@@ -210,7 +210,7 @@ class Recording:
         """The facts by now."""
         self.times["wall"] = (self._end or time.perf_counter()) - self._start
         table = self.summary.table()
-        limits = self.limits
+        limits, verdict = self.limits, self._verdict(table)
         return build_info(
             self.scene,
             self.started,
@@ -222,20 +222,20 @@ class Recording:
             times=self.times,
             limits=limits.values,
             fail_on=limits.fail_on,
-            verdict=self._verdict(table),
-            beyond=exceeded(table, limits),
-            not_measured=unmeasured(table, limits),
+            verdict=describe_verdict(verdict, table, self.scene.missing_bones),
+            **verdict._asdict(),
             neighbours=self._measures.neighbours.table(),
             frames=self.written,
         )
 
-    def _verdict(self, table: Table) -> str:
-        """What the run is worth: where it failed, of how many frames that holds."""
-        verdict = describe_verdict(table, self.limits, self.scene.missing_bones)
+    def _verdict(self, table: Table) -> Verdict:
+        """What the run is worth; where it failed, of how many frames that holds."""
+        verdict = judge(table, self.limits, self._doubts)
         if self.status == "failed" and self.written:
             count = f"{len(self.written)} of {len(self.scene.motion)} frames"
-            verdict = f"the run stopped after {count}; in these {verdict}"
-        return _with_doubts(verdict, self.scene)
+            answer = f"the run stopped after {count}; in these {verdict.answer}"
+            verdict = verdict._replace(answer=answer)
+        return verdict
 
 
 @contextmanager
@@ -246,15 +246,6 @@ def timed(times: dict[str, float], part: str) -> Iterator[None]:
         yield
     finally:
         times[part] = times.get(part, 0.0) + time.perf_counter() - start
-
-
-def _with_doubts(verdict: str, scene: Scene) -> str:
-    """A verdict, and what is doubtful about its scene."""
-    doubts = stated_doubts(scene)
-    if not doubts:
-        return verdict
-    more = f"; and {len(doubts) - 1} more" if len(doubts) > 1 else ""
-    return f"{verdict}. Doubtful: {doubts[0]}{more} (rbfmuscle check lists all)"
 
 
 Found = tuple[list[Event], dict[str, float]]

@@ -6,7 +6,13 @@ from textwrap import fill, shorten
 
 from rbfmuscle.metrics.summary import LIMITS, Summary
 from rbfmuscle.output.run_data import RunData
-from rbfmuscle.report.verdict import describe_excess, describe_unmeasured, find_remedy, worst_first
+from rbfmuscle.report.verdict import (
+    describe_doubts,
+    describe_excess,
+    describe_unmeasured,
+    find_remedy,
+    worst_first,
+)
 from rbfmuscle.scene.phantom import PHANTOM
 
 MOST = 3  # values beyond limits, and remedies, that are named
@@ -20,7 +26,7 @@ def verdict_lines(directory: Path) -> Iterator[str]:
     info, summary = saved.info, Summary()
     summary.add(saved.metrics)
     table = summary.table()
-    yield _wrapped("verdict: ", info.verdict.partition(". ")[0])
+    yield _wrapped("verdict: ", info.answer)
     named = worst_first(info.beyond)[:MOST]
     for row in named:
         yield _wrapped("  ", describe_excess(row, table, info.scene.missing_bones))
@@ -29,9 +35,8 @@ def verdict_lines(directory: Path) -> Iterator[str]:
     missing = info.not_measured
     if missing:
         yield _wrapped("not measured: ", shorten(describe_unmeasured(missing), LONGEST))
-    doubts = info.verdict.partition(". Doubtful: ")[2]
-    if doubts:
-        yield _wrapped("doubtful: ", shorten(doubts, LONGEST))
+    if info.doubts:
+        yield _wrapped("doubtful: ", shorten(describe_doubts(info.doubts, MOST), LONGEST))
     known = [row for row in named if row.quantity.partition(":")[0] in LIMITS]
     parts = [part for row in known for part in find_remedy(row, table).split("; ")]
     # Where to look is said below, for all of them.

@@ -13,6 +13,7 @@ WORST = (
     "penetration_max",
     "bone_penetration_max",
     "solver_penetration_max",
+    "neighbour_overlap_max",
     "rest_error_rms",
     "rest_error_max",
     "edge_strain_rms",

@@ -55,6 +55,13 @@ class Unmeasured(NamedTuple):
     quantity: str
 
 
+class Doubt(NamedTuple):
+    """What no limit holds and a reader should know: about a muscle, or `ALL` for the scene."""
+
+    muscle: str
+    text: str
+
+
 class Limits(NamedTuple):
     """What a run is held to: the limit of each quantity in the scene's unit.
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt
 
-from rbfmuscle.metrics.summary import Exceedance, QuantityFacts, Unmeasured
+from rbfmuscle.metrics.summary import Doubt, Exceedance, QuantityFacts, Unmeasured
 from rbfmuscle.scene.names import check_name
 from rbfmuscle.scene.tendons import tendon_name
 
@@ -112,9 +112,10 @@ class RunInfo(Part):
     complete. ``times`` are those of the parts of the run [s], ``muscles`` and ``frame_time`` what
     `Summary.table` gives. ``limits`` are in the scene's unit, ``fail_on`` those that it may fail
     on (None: the default); ``beyond`` are values beyond a limit, ``not_measured`` limits without a
-    value, ``verdict`` the sentence about them. ``neighbours`` are the pairs of muscles that touched
-    or met, with the worst of each. ``planned`` are the coordinates of all frames while the run goes
-    on.
+    value, ``answer`` which muscles are within all limits, ``doubts`` what no limit
+    holds, ``verdict`` all of these in sentences. ``neighbours`` are the pairs of muscles that
+    touched or met, with the worst of each. ``planned`` are the coordinates of all frames while the
+    run goes on.
     """
 
     format: int = 0
@@ -131,8 +132,10 @@ class RunInfo(Part):
     limits: dict[str, float] = {}
     fail_on: dict[str, float | None] = {}
     verdict: str = ""
+    answer: str = ""
     beyond: list[Exceedance] = []
     not_measured: list[Unmeasured] = []
+    doubts: list[Doubt] = []
     neighbours: list[dict[str, object]] = []
     frames: list[FrameInfo]
     planned: list[dict[str, float]] = []

@@ -7,13 +7,13 @@ from rbfmuscle.experiments.comparison_table import Comparison, ScenesComparison
 from rbfmuscle.experiments.kernel_rows import KernelFacts
 from rbfmuscle.experiments.sweep_table import SweepTable
 from rbfmuscle.folders import OutputFolder
-from rbfmuscle.metrics.summary import Limits, Summary, exceeded, parse_limits, unmeasured
+from rbfmuscle.metrics.summary import Limits, Summary, parse_limits
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import PAGES, run_folder, write_json
 from rbfmuscle.report import comparison_page, kernel_page, scenes_page, sweep_page
 from rbfmuscle.report.report import write_report
-from rbfmuscle.report.verdict import describe_verdict, require_limits
+from rbfmuscle.report.verdict import describe_verdict, judge, require_limits
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import UsageError
 
@@ -25,7 +25,6 @@ STUDIES = {
     "sweep.json": "sweep.html",
 }
 COMMANDS = {"comparison.json": "compare", "scenes.json": "compare"}
-DOUBTFUL = ". Doubtful: "  # what a verdict says after its limits
 
 
 def redraw_run(
@@ -53,14 +52,12 @@ def redraw_run(
     summary = Summary()
     summary.add(saved.metrics)
     table = summary.table()
-    # What was doubtful in the scene stays so.
-    doubts = "".join(info.verdict.partition(DOUBTFUL)[1:])
+    verdict = judge(table, limits, info.doubts)
     info = info.replaced(
         limits=dict(limits.values),
         fail_on=dict(limits.fail_on),
-        verdict=describe_verdict(table, limits, info.scene.missing_bones) + doubts,
-        beyond=exceeded(table, limits),
-        not_measured=unmeasured(table, limits),
+        verdict=describe_verdict(verdict, table, info.scene.missing_bones),
+        **verdict._asdict(),
     )
     drawn = pictures and saved.has_surfaces and len(saved.frames) > 1
     folder.add(*(PAGES if drawn else PAGES[:1]))

@@ -40,7 +40,7 @@ from rbfmuscle.report.page import (
 )
 from rbfmuscle.report.plots import Band, Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, render_run
-from rbfmuscle.report.verdict import describe_unmeasured
+from rbfmuscle.report.verdict import Verdict, describe_details, describe_unmeasured
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.simulation.frame import Event
 
@@ -53,6 +53,7 @@ LIGHTS = {
         "initial_overlap",
         "tunnelled",
     ),
+    "Stays out of other muscles": ("neighbour_overlap_max",),
     "Is the scanned shape at rest": ("rest_error_rms",),
     "Is one closed piece": (
         "components",
@@ -72,6 +73,7 @@ PANELS = (
     ("Edge strain of the material mesh (RMS)", "edge_strain_rms", 100.0, "%"),
     ("Time per frame after the first", "time_frame", 1000.0, "ms"),
 )
+MOST_DOUBTS = 6  # that a page names
 # Points of all muscles in all frames that a page holds.
 _MOST_POINTS = 2_600_000
 # Tables or plots of their own.
@@ -136,16 +138,19 @@ def packed_scene(runs: Mapping[str, RunData]) -> str:
 def _page(saved: RunData) -> ReportPage:
     info = saved.info
     complete = info.status == "complete"
-    answer, _, detail = info.verdict.partition(". ")
-    if not complete:
-        answer, detail = f"the run ended early ({info.status}): {info.message or ''}", ""
+    answer, details = info.answer, []
+    if complete:
+        verdict = Verdict(answer, info.beyond, info.not_measured, info.doubts)
+        details = describe_details(verdict, info.muscles, info.scene.missing_bones, MOST_DOUBTS)
+    else:
+        answer = f"the run ended early ({info.status}): {info.message or ''}"
     terms = [(name, text) for name, (_, text) in QUANTITIES.items()]
     return ReportPage(
         info.scene.name,
         _facts(saved),
         f"{answer[:1].upper()}{answer[1:].rstrip('.')}.",
         GOOD if complete and not (info.beyond or info.not_measured) else BAD,
-        detail=detail and f"{detail.rstrip('.')}.",
+        detail=" ".join(f"{text.rstrip('.')}." for text in details),
         lights=_lights(saved),
         sections=[
             *_plots(saved),

@@ -1,14 +1,17 @@
-"""The verdict of a run in sentences."""
+"""The verdict of a run, as data and in sentences."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.metrics.summary import (
     LIMITS,
     LOWER_BOUNDS,
+    Doubt,
     Exceedance,
     Limits,
     Table,
+    Unmeasured,
     exceeded,
     shown_number,
     unmeasured,
@@ -18,14 +21,28 @@ from rbfmuscle.validation import LimitExceededError
 MOST_NAMED = 6  # exceeded limits that a verdict names
 
 
-def describe_verdict(table: Table, limits: Limits, missing_bones: Sequence[str] = ()) -> str:
-    """Which muscles are within all limits, the worst of the others, what to do, and what was not
-    measured; bones ``missing_bones``.
+class Verdict(NamedTuple):
+    """What a run is worth: which muscles are within all limits in one sentence, what is beyond a
+    limit, the limits without a value, and doubts.
     """
-    muscles, found = [name for name in table if name != ALL], exceeded(table, limits)
-    missing = unmeasured(table, limits)
-    wrong = [name for name in dict.fromkeys(row[0] for row in found) if name != ALL]
-    unknown = [name for name in dict.fromkeys(row[0] for row in missing) if name != ALL]
+
+    answer: str
+    beyond: list[Exceedance]
+    not_measured: list[Unmeasured]
+    doubts: list[Doubt]
+
+
+def judge(table: Table, limits: Limits, doubts: Sequence[Doubt] = ()) -> Verdict:
+    """The verdict of a run's table."""
+    found, missing = exceeded(table, limits), unmeasured(table, limits)
+    return Verdict(_answer(table, found, missing), found, missing, list(doubts))
+
+
+def _answer(table: Table, found: list[Exceedance], missing: list[Unmeasured]) -> str:
+    """Which muscles are within all limits."""
+    muscles = [name for name in table if name != ALL]
+    wrong = [name for name in dict.fromkeys(row.muscle for row in found) if name != ALL]
+    unknown = [name for name in dict.fromkeys(row.muscle for row in missing) if name != ALL]
     if not muscles:
         text = "nothing was measured"
     elif not wrong:
@@ -39,10 +56,42 @@ def describe_verdict(table: Table, limits: Limits, missing_bones: Sequence[str] 
             f"{right} of {len(muscles)} muscles {'is' if right == 1 else 'are'} within all limits"
         )
         text = f"{count}; {_listed(wrong)} {'is' if len(wrong) == 1 else 'are'} not"
-    text += "; the bones are not" if any(row[0] == ALL for row in found) and not wrong else ""
-    if found:
-        text += _worst_and_remedies(found, table, missing_bones)
-    return f"{text}. Not measured: {describe_unmeasured(missing)}" if missing and muscles else text
+    bones = any(row.muscle == ALL for row in found) and not wrong
+    return f"{text}; the bones are not" if bones else text
+
+
+def describe_verdict(
+    verdict: Verdict, table: Table, missing_bones: Sequence[str] = (), *, most_doubts: int = 1
+) -> str:
+    """A verdict in sentences: its answer, the worst of what is beyond a limit, what to do, what was
+    not measured, and what is doubtful; bones ``missing_bones``.
+    """
+    return ". ".join(
+        [verdict.answer, *describe_details(verdict, table, missing_bones, most_doubts)]
+    )
+
+
+def describe_details(
+    verdict: Verdict, table: Table, missing_bones: Sequence[str], most_doubts: int
+) -> list[str]:
+    """The sentences of a verdict after its answer."""
+    texts = []
+    if verdict.beyond:
+        texts += _worst_and_remedies(verdict.beyond, table, missing_bones)
+    if verdict.not_measured and set(table) - {ALL}:
+        texts.append(f"Not measured: {describe_unmeasured(verdict.not_measured)}")
+    if verdict.doubts:
+        texts.append(f"Doubtful: {describe_doubts(verdict.doubts, most_doubts)}")
+    return texts
+
+
+def describe_doubts(doubts: Sequence[Doubt], most: int) -> str:
+    """The first of some doubts, and how many more there are."""
+    texts = [
+        doubt.text if doubt.muscle == ALL else f"{doubt.muscle}: {doubt.text}" for doubt in doubts
+    ]
+    more = [f"and {len(texts) - most} more"] if len(texts) > most else []
+    return "; ".join([*texts[:most], *more])
 
 
 def describe_unmeasured(missing: Sequence[tuple[str, str]]) -> str:
@@ -64,8 +113,8 @@ def _worst_and_remedies(found, table, missing_bones):
             remedies.setdefault(remedy, remedy.replace("FRAME", str(row[4])))
     values = "; ".join(describe_excess(row, table, missing_bones) for row in named)
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
-    to_do = f". What to do: {'; '.join(remedies.values())}" if remedies else ""
-    return f". Worst: {values}{more}{to_do}"
+    to_do = [f"What to do: {'; '.join(remedies.values())}"] if remedies else []
+    return [f"Worst: {values}{more}", *to_do]
 
 
 def worst_first(found: Sequence[Exceedance]) -> list[Exceedance]:

@@ -141,13 +141,14 @@ def open_ends(scene: Scene) -> dict[str, str]:
     return found
 
 
-def stated_doubts(scene: Scene) -> list[str]:
-    """What is doubtful about a scene though no line of it is a guess: ``doubts`` of the scene, and
-    ends of muscles that lie away from their bones, which those who wrote it stated.
+def stated_doubts(scene: Scene) -> list[tuple[str, str]]:
+    """What is doubtful about a scene though no line of it is a guess, each with its muscle: without
+    one the ``doubts`` of the scene; ends that lie away from their bones, as those who wrote it
+    stated.
     """
     guessed = guessed_muscles(scene.guesses)
-    ends = [f"{name}: {text}" for name, text in open_ends(scene).items() if name not in guessed]
-    return [*scene.doubts, *ends]
+    ends = [(name, text) for name, text in open_ends(scene).items() if name not in guessed]
+    return [*(("", doubt) for doubt in scene.doubts), *ends]
 
 
 def sort_findings(findings: Iterable[Finding]) -> list[Finding]:

@@ -69,7 +69,8 @@ def scene_marks(scene: Scene) -> Marks:
         for table in ("joint", "muscle")
         for guess in doubtful(scene.guesses, table)
     ]
-    return Marks(axes, held, [*stated_doubts(scene), *guesses])
+    stated = [f"{name}: {text}" if name else text for name, text in stated_doubts(scene)]
+    return Marks(axes, held, [*stated, *guesses])
 
 
 class MarkView:

@@ -18,6 +18,7 @@ from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.models import build_models, configure_scene, model_names
 from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh
 from rbfmuscle.output.run_data import RunData, frame_caption
+from rbfmuscle.report.verdict import describe_doubts
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
@@ -233,8 +234,7 @@ class SavedSource:
         self.muscles = {name: first.mesh(name, first.frame_numbers[0]) for name in first.muscles}
         self.colours, self.rest = first.colours, SavedFigure(first).advance()
         self.motion = [{"frame": float(frame)} for frame in first.frame_numbers]
-        doubts = first.verdict.partition("Doubtful: ")[2]
-        self.marks = Marks({}, [], [doubts] if doubts else [])
+        self.marks = Marks({}, [], [describe_doubts([doubt], 1) for doubt in first.info.doubts])
         self.controls = {
             "frame": Control("Run", "frame", *(first.frames[k].index for k in (0, -1, 0)))
         }

@@ -20,8 +20,9 @@ from rbfmuscle.metrics.summary import (
     parse_limits,
     unmeasured,
 )
+from rbfmuscle.output.run_data import RunData
 from rbfmuscle.report.report import write_report
-from rbfmuscle.report.verdict import describe_verdict
+from rbfmuscle.report.verdict import describe_verdict, judge
 from rbfmuscle.run import Run, simulate, stream_run
 from rbfmuscle.scene.check import check_scene, stated_doubts
 from rbfmuscle.scene.guesses import Guess
@@ -56,6 +57,11 @@ TABLE = {
 }
 
 
+def said_of(table, limits, missing_bones=()):
+    """The verdict on a table in sentences."""
+    return describe_verdict(judge(table, limits), table, missing_bones)
+
+
 def facts(values, *, units="mm", muscle="psoas", **others):
     """Table of a run in which a muscle has these values, frame by frame, and another none."""
     summary = Summary()
@@ -78,7 +84,7 @@ def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantit
     at_rest = {"guessed": [1.0], "bowing_at_rest": [1.0], "initial_overlap": [0.0]}
     allowed, beyond = (at_rest | {quantity: [scale * v]} for v in TABLE[quantity])
     assert set(TABLE) == set(LIMITS) and exceeded(facts(allowed, units=units), limits) == []
-    said = describe_verdict(facts(allowed, units=units), limits)
+    said = said_of(facts(allowed, units=units), limits)
     assert said.startswith("every muscle is within all limits that were measured")
     ((muscle, name, worst, limit, _),) = exceeded(facts(beyond, units=units), limits)
     assert (muscle, name.partition(":")[0], limit) == (
@@ -87,7 +93,7 @@ def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantit
         pytest.approx(scale * LIMITS[quantity].value),
     )
     assert worst == pytest.approx(scale * TABLE[quantity][1])
-    said = describe_verdict(facts(beyond, units=units), limits)
+    said = said_of(facts(beyond, units=units), limits)
     frame = said.partition("at frame ")[2].split()[0]
     limit_kind = LIMITS[quantity]
     is_mesh = quantity != "unfitted_fraction"
@@ -95,9 +101,7 @@ def test_each_row_of_the_table_is_kept_up_to_its_limit_and_broken_beyond(quantit
     assert remedy.replace("FRAME", frame) in said
     # A mesh muscle has no centres to raise; one with a level set has.
     assert not is_mesh or "centres" not in said
-    of_level_set = describe_verdict(
-        facts(beyond | {"unfitted_fraction": [0.0]}, units=units), limits
-    )
+    of_level_set = said_of(facts(beyond | {"unfitted_fraction": [0.0]}, units=units), limits)
     assert not is_mesh or limit_kind.remedy.replace("FRAME", frame) in of_level_set
 
 
@@ -156,7 +160,7 @@ def test_what_was_not_measured_is_within_no_limit():
         assert found(asked, mesh) == [] and found(asked, mesh, mesh) == [(ALL, "flicker")]
     assert found("all", mesh, mesh) == []
     assert found("moment_arm=50") == [(ALL, "moment_arm")]
-    said = describe_verdict(table(lacking), parse_limits(None, scene))
+    said = said_of(table(lacking), parse_limits(None, scene))
     assert said == (
         "every muscle is within all limits that were measured in every frame. Not measured: "
         "rest_error_rms of psoas"
@@ -166,7 +170,7 @@ def test_what_was_not_measured_is_within_no_limit():
 def test_the_worst_by_its_limit_is_named_first_and_bones_are_named_too():
     values = {"penetration_max": [0.2], "volume_error": [1e-6]}
     table = facts(values, teres={"flicker": [0.0, 3.0]}, **{ALL: {"joint_gap": [0.0, 8.0]}})
-    said = describe_verdict(table, parse_limits(None, arm_scene()))
+    said = said_of(table, parse_limits(None, arm_scene()))
     assert said.startswith(
         "0 of 3 muscles are within all limits; psoas, teres are not. Worst: psoas, volume"
     )
@@ -179,14 +183,14 @@ def test_the_worst_by_its_limit_is_named_first_and_bones_are_named_too():
 
 
 def test_a_value_beyond_its_limit_is_shown_however_small():
-    said = describe_verdict(
+    said = said_of(
         facts({"rest_error_rms": [0.0097]}), parse_limits("rest_error_rms=0.001", arm_scene())
     )
     assert "rest error 0.0097 mm at frame 0 (limit 0.001)" in said
 
 
 def test_a_value_just_beyond_its_limit_does_not_look_like_it():
-    said = describe_verdict(
+    said = said_of(
         facts({"rest_error_rms": [0.5004]}), parse_limits("rest_error_rms=0.5", arm_scene())
     )
     assert "rest error 0.5004 mm at frame 0 (limit 0.5)" in said
@@ -237,6 +241,8 @@ def test_an_end_that_is_stated_to_lie_away_from_its_bone_is_a_doubt(monkeypatch,
     assert "end_gap" not in {row.quantity for row in info.beyond}
     said = ". Doubtful: biceps: an end lies"
     assert said in info.verdict and any("doubtful: " in line for line in verdict_lines(tmp_path))
+    assert [doubt.muscle for doubt in info.doubts] == ["biceps"]
+    assert RunData.load(tmp_path).info.doubts == info.doubts
     (warning,) = [f for f in check_scene(scene) if "an end lies" in f.message]
     assert (warning.level, warning.place) == ("warning", "biceps")
     with pytest.raises(LimitExceededError, match="end_gap"):
