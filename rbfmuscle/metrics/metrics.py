@@ -89,7 +89,7 @@ class MuscleMeasures:
         found = dict(
             zip(self.trackers, each(lambda tracker: tracker.measure(frame, self.probes), trackers))
         )
-        shown = {t.name: Shown(t.distance, t.places) for t in trackers if t.name in frame.surfaces}
+        shown = {t.name: t.shown for t in trackers if t.name in frame.surfaces and t.shown}
         for name, values in self.neighbours.measure(frame.index, shown).items():
             found[name].update(values)
         return {
@@ -126,6 +126,7 @@ class MuscleMeasurer:
         # Of the last surface.
         self.distance: MeshDistance | None = None
         self.places: Floats | None = None  # of its vertices at rest
+        self.shown: Shown | None = None
         self.offset: Floats | None = None
         self.near: Integers | None = None
 
@@ -168,8 +169,9 @@ class MuscleMeasurer:
         same = self.distance is not None and np.array_equal(self.distance.faces, faces)
         layout = self.distance.layout if same else None
         self.distance = MeshDistance(vertices, faces, layout=layout)
-        if not same:
+        if not same or self.places is None:
             self.places = self._places_at_rest(vertices, material)
+        self.shown = Shown(self.distance, self.places)
         volume = mesh_volume(vertices, faces)
         depth = surface_depth(vertices, probes, poses)
         form = self.form.measure(surface, same_faces=same)

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.neighbours import InputOverlap, input_distances, input_overlaps
@@ -24,7 +24,7 @@ TOUCHING = 1.0
 # are apart, less than a muscle is wide.
 AROUND = 5.0
 # Touching places of which the gap is taken, at most, of each side of a pair.
-MOST_PLACES = 200
+MOST_PLACES = 100
 # Share of the touching places that have parted by less than the gap that is stated.
 GAP_PERCENTILE = 95.0
 
@@ -88,6 +88,8 @@ class NeighbourMeasures:
     def measure(self, index: int, shown: Mapping[str, Shown]) -> dict[str, dict[str, float]]:
         """Values of each muscle that is shown, in the frame of this number."""
         names = list(shown)
+        if not names:
+            return {}
         fresh = [name for name, surface in shown.items() if self._is_new(name, surface.at_rest)]
         each(lambda name: self._renew(name, shown[name].at_rest, names), fresh)
         low, high = np.swapaxes([surface.box for surface in shown.values()], 0, 1)
@@ -194,11 +196,11 @@ def _spread(overlap: InputOverlap, points: Floats, reach: float) -> Floats:
 
 def _deepest(vertices: Floats, other: MeshDistance, allowed: Floats | None) -> float:
     """Greatest depth of vertices (n, 3) in another surface beyond what is allowed (n,)."""
-    inside: Booleans = other.inside(vertices)
-    if not inside.any():
+    inside = np.flatnonzero(other.inside(vertices))
+    if len(inside) == 0:
         return 0.0
     depth = other.unsigned(vertices[inside])
-    return float(max(0.0, (depth if allowed is None else depth - allowed[inside]).max()))
+    return max(0.0, float((depth if allowed is None else depth - allowed[inside]).max()))
 
 
 def _parted(points: Floats, other: MeshDistance, gap: Floats) -> Floats:
