@@ -14,7 +14,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
 from rbfmuscle.metrics.quantities import ALL, Row
-from rbfmuscle.metrics.rows import frame_rows, joint_gaps, moment_arm_rows
+from rbfmuscle.metrics.rows import Lengths, frame_rows, joint_gaps, moment_arm_rows
 from rbfmuscle.metrics.summary import (
     LIMITS,
     Doubt,
@@ -150,8 +150,7 @@ class Recording:
             self.message = f"a bug: {type(error).__name__}: {error}"
             raise
         finally:
-            lengths = self.summary.series("length")
-            rows = moment_arm_rows(self.scene, self._path, lengths, self._fibres)
+            rows = moment_arm_rows(self.scene, self._path, self._lengths())
             self.summary.add(rows)
             # What ended the run says more than a disk that then refuses the rest.
             with suppress(*((SolveError,) if self.status == "failed" else ())):
@@ -227,6 +226,12 @@ class Recording:
             neighbours=self._measures.neighbours.table(),
             frames=self.written,
         )
+
+    def _lengths(self) -> Lengths:
+        """What was recorded of lengths by now."""
+        series = self.summary.series
+        muscles, paths, active = map(series, ("length", "path_length", "activation"))
+        return Lengths(muscles, paths, self._fibres, active)
 
     def _verdict(self, table: Table) -> Verdict:
         """What the run is worth; where it failed, of how many frames that holds."""

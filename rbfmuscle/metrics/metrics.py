@@ -150,7 +150,9 @@ class MuscleMeasurer:
             if self.line.unsettled:
                 count, self.line.unsettled = self.line.unsettled, 0
                 frame.events.append(Event(frame.index, self.name, "", count, "iteration_cap"))
-            found["length"] = belly + self.line.tendon_length(frame.tendons)
+            tendons = self.line.tendon_length(frame.tendons)
+            found["length"] = belly + tendons
+            found["path_length"] = belly / found["bowing"] + tendons
         if self.name in frame.fibres:
             found.update(percentiles("fibre_stretch", frame.fibres[self.name].stretch))
         if self.contracts:

@@ -99,15 +99,31 @@ QUANTITIES = {
     "edge_strain_rms": ("1", "relative change of edge lengths of the material mesh"),
     "condition": ("1", "condition estimate of the fit"),
     "length": ("length", "centreline from origin to insertion, with its tendons"),
+    "path_length": (
+        "length",
+        "shortest path over the bones between the ends of the centreline, with the tendons",
+    ),
     "bowing": (
         "1",
         "length of the centreline without tendons / that of the shortest path between its ends",
     ),
     "bowing_at_rest": ("1", "the same at rest, before the first frame"),
-    "moment_arm": ("length", "minus the change of length with the coordinate's angle"),
+    "moment_arm": (
+        "length",
+        "minus the change of length with the coordinate's angle; NaN where the activation changes",
+    ),
     "moment_arm_jump": (
         "length",
         "change of the moment arm's slope over 5 degrees, times these",
+    ),
+    "length_roughness": (
+        "length",
+        "second difference of the length over 2 degrees; motions by at most these",
+    ),
+    "path_roughness": ("length", "the same of the shortest path"),
+    "roughness_beyond_path": (
+        "length",
+        "how much length_roughness exceeds the greatest of the shortest path in the motion",
     ),
     "moment_arm_reversal": ("length", "how far the moment arm goes to either side of zero"),
     **{

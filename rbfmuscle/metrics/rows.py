@@ -5,6 +5,7 @@ along the motion.
 import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +27,9 @@ Coordinates = Mapping[str, float]
 # 0.3 mm RMS (docs/validation.md).
 REACH = 8.0
 JUMP = 5.0  # the change of a moment arm is taken within so many degrees
+ROUGH = 2.0  # steps over which lengths have second differences [degree]
+# Activations that differ by less are the same.
+_ALIKE = 1e-9
 # Coordinates that change by less [radian or scene unit] rest.
 _STILL = 1e-9
 # Bones of a joint that are nearer than this at rest [mm] meet there; others, as a tendon's end, are
@@ -58,40 +62,117 @@ def frame_rows(
     ]
 
 
-def moment_arm_rows(
-    scene: Scene,
-    path: Mapping[int, Coordinates],
-    lengths: Mapping[str, Mapping[int, float]],
-    fibres: Mapping[str, Mapping[int, Floats]],
-) -> list[Row]:
-    """Rows of the moment arms, from each frame's coordinates [radian or scene unit] and the lengths
-    of muscles, and of their fibres (N,), by frame.
+class Lengths(NamedTuple):
+    """What a run recorded along its motion, by muscle and frame: lengths, shortest paths, lengths
+    (N,) of fibres [scene unit], and activations of those that contract.
+    """
+
+    muscles: Mapping[str, Mapping[int, float]]
+    paths: Mapping[str, Mapping[int, float]]
+    fibres: Mapping[str, Mapping[int, Floats]]
+    activations: Mapping[str, Mapping[int, float]]
+
+
+def moment_arm_rows(scene: Scene, path: Mapping[int, Coordinates], lengths: Lengths) -> list[Row]:
+    """Rows of the moment arms, and of how rough lengths are, from each frame's coordinates [radian
+    or scene unit].
+
+    Where the activation of a muscle changes its moment arm is NaN: the change of length is not the
+    joint's alone.
     """
     rows = []
-    for muscle, found in lengths.items():
-        along = np.array([found.get(index, math.nan) for index in path])
-        for moments, row in _moments(scene, path, along):
-            rows.append(row._replace(muscle=muscle, value=float(moments)))
     known = all_coordinates(scene.joints)
-    turning = [row for row in rows if known[row.coordinate].motion == "rotation"]
     guessed = guessed_muscles(scene.guesses)
-    for arms in _by_muscle(turning):
-        rows += _smoothness(arms, guessed=arms[0].muscle in guessed)
-    for muscle, of_fibres in fibres.items():
+    places = {index: place for place, index in enumerate(path)}
+    for muscle, found in lengths.muscles.items():
+        along = np.array([found.get(index, math.nan) for index in path])
+        active = lengths.activations.get(muscle, {})
+        arms = [
+            row._replace(muscle=muscle, value=float(moments))
+            for moments, row in _moments(scene, path, along, active)
+        ]
+        rows += arms
+        shortest = lengths.paths.get(muscle, {})
+        for name in dict.fromkeys(row.coordinate for row in arms):
+            if known[name].motion != "rotation":
+                continue
+            mine = [row for row in arms if row.coordinate == name]
+            for part in _stretches(mine, places, active):
+                rows += _smoothness(part, guessed=muscle in guessed)
+                rows += _roughness(part, found, shortest)
+    for muscle, of_fibres in lengths.fibres.items():
         none = np.full(len(next(iter(of_fibres.values()))), math.nan)
         along = np.array([of_fibres.get(index, none) for index in path])
-        for moments, row in _moments(scene, path, along):
+        active = lengths.activations.get(muscle, {})
+        for moments, row in _moments(scene, path, along, active):
             for quantity, value in percentiles("fibre_moment_arm", moments).items():
                 rows.append(row._replace(muscle=muscle, quantity=quantity, value=value))
     return rows
 
 
-def _by_muscle(rows: Sequence[Row]) -> list[list[Row]]:
-    """Rows of each muscle and coordinate, in the order of the frames."""
-    found: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        found.setdefault((row.muscle, row.coordinate), []).append(row)
-    return list(found.values())
+def _stretches(
+    arms: Sequence[Row], places: Mapping[int, int], active: Mapping[int, float]
+) -> list[list[Row]]:
+    """Moment arms of a muscle in parts of frames that follow each other, in one direction and at
+    one activation; ``places`` are those of the frames in the motion.
+    """
+    parts: list[list[Row]] = []
+    for arm in arms:
+        if math.isnan(arm.value):
+            continue
+        if not parts or not _goes_on(parts[-1], arm, places, active):
+            parts.append([])
+        parts[-1].append(arm)
+    return parts
+
+
+def _goes_on(part, arm, places, active):
+    """Whether a moment arm continues a part of `_stretches`."""
+    last = part[-1]
+    step = arm.coordinate_value - last.coordinate_value
+    before = last.coordinate_value - part[-2].coordinate_value if len(part) > 1 else step
+    alike = abs(active.get(arm.frame, 0.0) - active.get(last.frame, 0.0)) <= _ALIKE
+    return places[arm.frame] == places[last.frame] + 1 and step * before > 0.0 and alike
+
+
+def _roughness(
+    arms: Sequence[Row], lengths: Mapping[int, float], paths: Mapping[int, float]
+) -> list[Row]:
+    """Second differences over `ROUGH` degrees of a muscle's length and of its shortest path, at the
+    places of its moment arms, and how much the length's exceeds the greatest of the path.
+
+    None where the frames, of one stretch, are farther apart or span less than twice as much.
+    """
+    angles = np.array([arm.coordinate_value for arm in arms])
+    farthest = np.abs(np.diff(angles)).max(initial=0.0)
+    if farthest > ROUGH * (1.0 + 1e-6) or np.ptp(angles) < 2.0 * ROUGH - 1e-9:
+        return []
+    order = np.argsort(angles)
+    of_length, of_path = (
+        _second_differences(angles[order], np.array([found[arm.frame] for arm in arms])[order])
+        for found in (lengths, paths)
+    )
+    allowed = np.nanmax(of_path)
+    found = []
+    for place, length, shortest in zip(order, of_length, of_path):
+        if math.isfinite(length):
+            beyond = max(0.0, length - allowed)
+            values = {
+                "length_roughness": length,
+                "path_roughness": shortest,
+                "roughness_beyond_path": beyond,
+            }
+            found += [arms[place]._replace(quantity=q, value=float(v)) for q, v in values.items()]
+    return found
+
+
+def _second_differences(angles: Floats, lengths: Floats) -> Floats:
+    """Magnitude (n,) of the second difference over `ROUGH` degrees of lengths (n,) at growing
+    angles (n,) [degree]; NaN nearer to an end.
+    """
+    inside = (angles >= angles[0] + ROUGH - 1e-9) & (angles <= angles[-1] - ROUGH + 1e-9)
+    before, after = (np.interp(angles + way, angles, lengths) for way in (-ROUGH, ROUGH))
+    return np.where(inside, np.abs(before - 2.0 * lengths + after), np.nan)
 
 
 def _smoothness(arms: Sequence[Row], *, guessed: bool) -> list[Row]:
@@ -125,17 +206,22 @@ def _before(angles: Floats, k: int) -> int:
     return int(away[-1]) if len(away) else k
 
 
-def _moments(scene, path, lengths):
-    """Moment arms along a path, each with a row that says where, as `moment_arms` finds them."""
+def _moments(scene, path, lengths, active):
+    """Moment arms along a path, each with a row that says where, as `moment_arms` finds them; NaN
+    where a coordinate moves alone while the activation changes.
+    """
     known = all_coordinates(scene.joints)
     shifts = {name for name, fact in known.items() if fact.motion == "translation"}
     names = {name for coordinates in path.values() for name in coordinates}
     reach = reaches(names, shifts, scene.units)
-    found = moment_arms(list(path.values()), lengths, reach)
-    for (index, coordinates), moments in zip(path.items(), found):
-        for name, moment_arm in moments.items():
+    frames = list(path.values())
+    found = moment_arms(frames, lengths, reach, [active.get(index, 0.0) for index in path])
+    everywhere = moment_arms(frames, lengths, reach) if active else found
+    for (index, coordinates), moments, wanted in zip(path.items(), found, everywhere):
+        for name, whole in wanted.items():
             angle = shown_value(scene, name, coordinates.get(name, 0.0))
             unit = "1" if name in shifts else scene.units
+            moment_arm = moments.get(name, np.full_like(whole, np.nan))
             yield moment_arm, Row(index, name, angle, "", "moment_arm", 0.0, unit)
 
 
@@ -165,39 +251,44 @@ def moment_arms(
     path: Sequence[Mapping[str, float]],
     lengths: ArrayLike,
     reach: Mapping[str, float] | None = None,
+    activations: Sequence[float] | None = None,
 ) -> list[dict[str, Floats]]:
     """Moment arms -dl/dq along a motion, for each frame by coordinate that moves alone before or
-    after it.
+    after it, at one activation.
 
     A parabola is fitted to the ``lengths`` [scene unit] of the frames within ``reach`` [radian or
-    scene unit, `REACH` degrees by default], and always of both neighbours, as far as the coordinate
-    goes on alone and in one direction: with two neighbours it is the central difference, at an end
-    the difference to the one. ``path`` holds the coordinates of each frame; lengths (n,), or of
-    several lines (n, m), are NaN where not known. Moment arms (), or (m,), are in scene units per
-    radian, or 1.
+    scene unit, `REACH` degrees by default], and always of the three nearest ones in the order of
+    the motion, as far as the coordinate goes on alone and in one direction and ``activations`` (n,)
+    stay: of second order at the ends too, where there are three. ``path`` holds the coordinates of
+    each frame; lengths (n,), or of several lines (n, m), are NaN where not known. Moment arms (),
+    or (m,), are in scene units per radian, or 1.
     """
     values, found = np.asarray(lengths, dtype=float), [dict[str, Floats]() for _ in path]
-    for name, first, last in _single_motions(path, values):
+    active = np.zeros(len(path)) if activations is None else np.asarray(activations)
+    for name, first, last in _single_motions(path, values, active):
         at = np.array([path[k].get(name, 0.0) for k in range(first, last + 1)])
         wide = math.radians(REACH) if reach is None else reach[name]
         for k in range(first, last + 1):
             near = np.abs(at - at[k - first]) <= wide
-            near[max(0, k - first - 1) : k - first + 2] = True
+            start = max(0, min(k - first - 1, len(at) - 3))
+            near[start : start + 3] = True
             away, long = at[near] - at[k - first], values[first : last + 1][near]
             slope = np.polyfit(away, long, min(2, len(away) - 1))[-2]
             found[k].setdefault(name, -slope)
     return found
 
 
-def _single_motions(path, lengths):
+def _single_motions(path, lengths, active):
     """Name, first and last frame of each stretch in which one coordinate moves alone and in one
-    direction.
+    direction, at one activation.
     """
     stretches = []
     for k, (before, after) in enumerate(itertools.pairwise(path)):
         moved = {n: after.get(n, 0.0) - before.get(n, 0.0) for n in {*before, *after}}
         moved = {name: change for name, change in moved.items() if abs(change) > _STILL}
         if len(moved) != 1 or not np.isfinite(lengths[k : k + 2]).all():
+            continue
+        if abs(active[k + 1] - active[k]) > _ALIKE:
             continue
         ((name, change),) = moved.items()
         if stretches and stretches[-1][:2] == (name, change > 0) and stretches[-1][3] == k:

@@ -150,6 +150,7 @@ LIMITS = {
     ),
     "articular_share": Limit(MOST_ARTICULAR, "attachment on an articular surface", _ATTACH),
     "moment_arm_jump": Limit(10.0, "moment arm that jumps within 5 degrees", _LINE),
+    "roughness_beyond_path": Limit(0.5, "length that is rough over 2 degrees", _LOOK),
     "moment_arm_reversal": Limit(5.0, "moment arm that changes its sign", _LINE),
     "doubtful_guesses": Limit(
         0.0,
@@ -175,6 +176,7 @@ NEEDS = {
     # Known by coordinate alone, and only where one moves by itself.
     "moment_arm_jump": "moment_arm_jump",
     "moment_arm_reversal": "moment_arm_reversal",
+    "roughness_beyond_path": "roughness_beyond_path",
 }
 COUNTS = ("components", "euler_characteristic", "self_crossings", "tunnelled", "doubtful_guesses")
 # A muscle thinner than this [mm] may have this rest error [mm].
@@ -196,7 +198,7 @@ class Summary:
         """Take in rows of metrics."""
         for row in rows:
             quantity = row.quantity
-            if "moment_arm" in quantity:
+            if "moment_arm" in quantity or "roughness" in quantity:
                 quantity = f"{quantity}:{row.coordinate}"
             self._values[row.muscle][quantity].append((row.frame, row.value))
             self._units[quantity] = row.unit

@@ -53,6 +53,7 @@ TABLE = {
     "articular_share": (0.5, 0.51),
     "moment_arm_jump": (10.0, 10.1),
     "moment_arm_reversal": (5.0, 5.1),
+    "roughness_beyond_path": (0.5, 0.51),
     "doubtful_guesses": (0, 1),
 }
 
