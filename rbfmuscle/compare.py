@@ -47,7 +47,8 @@ FILES = (
     "report.html",
 )
 SCENES_FILES = ("scenes.json", "scenes.csv", "scenes.tex", "report.html")
-COARSER = 5  # the motion is repeated with steps this many times as long
+COARSER = 5  # the motion is repeated with frames this many times as far apart
+FINER = 4  # and its last pose with sub-steps this many times as short, which every model solves by
 ONE_THREAD = 5  # frames that are timed on one thread, the first of which does not count
 
 
@@ -244,19 +245,25 @@ def _variants(scene, models, settings, frames):
 
 
 def _measure(name, scene, folder, progress):
-    """One model: compile its loops, run, then there and back by coarser steps."""
+    """One model: compile its loops, run, then there and back by fewer frames, and to the last pose
+    by shorter sub-steps.
+    """
     last = len(scene.motion) - 1
     _surfaces(scene, [*range(min(last, 1) + 1)])
     report = None if progress is None else (lambda done, total: progress(name, done, total))
     stream_run(scene, folder, pictures=False, progress=report)
-    with stage(f"{name}: there and back by coarser steps"):
-        coarse = [*range(0, last, COARSER)]
+    coarse = [*range(0, last, COARSER)]
+    with stage(f"{name}: there and back"):
         build, shown, _ = _surfaces(scene, [*coarse, last, *coarse[::-1]])
+    with stage(f"{name}: by shorter sub-steps"):
+        angle = scene.contact.substep_angle / FINER
+        finer = scene.with_options({"contact.substep_angle": angle})
+        turn = _surfaces(finer, [*coarse, last])[1][-1]
     with stage(f"{name}: on one thread"), threads_limited(1):
         walls = _surfaces(scene, [*range(min(last + 1, ONE_THREAD))])[2]
     again = Repeated(build, float(np.median(walls[1:] or walls)))
     if coarse:
-        again = again._replace(turn=shown[len(coarse)], end=shown[-1])
+        again = again._replace(turn=turn, end=shown[-1])
     with stage(f"{name}: measuring"):
         return measure_run(RunData.load(folder), again)
 

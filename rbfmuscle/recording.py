@@ -27,6 +27,7 @@ from rbfmuscle.models import build_models, configure_scene, kernel_names
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.writer import RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
+from rbfmuscle.report.doubts import measured_doubts
 from rbfmuscle.report.verdict import Verdict, describe_verdict, judge, require_limits
 from rbfmuscle.scene.check import (
     bone_collisions,
@@ -152,6 +153,7 @@ class Recording:
         finally:
             rows = moment_arm_rows(self.scene, self._path, self._lengths())
             self.summary.add(rows)
+            self._doubts += measured_doubts(self.scene, self.summary.table(), rows, self._path)
             # What ended the run says more than a disk that then refuses the rest.
             with suppress(*((SolveError,) if self.status == "failed" else ())):
                 sink.close(rows)
@@ -238,8 +240,8 @@ class Recording:
         verdict = judge(table, self.limits, self._doubts)
         if self.status == "failed" and self.written:
             count = f"{len(self.written)} of {len(self.scene.motion)} frames"
-            answer = f"the run stopped after {count}; in these {verdict.answer}"
-            verdict = verdict._replace(answer=answer)
+            outcome = f"the run stopped after {count}; in these {verdict.outcome}"
+            verdict = verdict._replace(outcome=outcome)
         return verdict
 
 

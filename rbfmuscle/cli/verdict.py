@@ -26,7 +26,7 @@ def verdict_lines(directory: Path) -> Iterator[str]:
     info, summary = saved.info, Summary()
     summary.add(saved.metrics)
     table = summary.table()
-    yield _wrapped("verdict: ", info.answer)
+    yield _wrapped("verdict: ", info.outcome)
     named = worst_first(info.beyond)[:MOST]
     for row in named:
         yield _wrapped("  ", describe_excess(row, table, info.scene.missing_bones))

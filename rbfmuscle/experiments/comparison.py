@@ -31,8 +31,8 @@ FORMAT = 4  # of comparison.json
 
 class Repeated(NamedTuple):
     """What a model gives beside its run: the time to build it and that of a frame on one thread
-    [s]; where the motion has more than one frame, surfaces by muscle at the last pose (``turn``)
-    and back at the first (``end``), by coarser steps.
+    [s]; where the motion has more than one frame, surfaces by muscle at the last pose by shorter
+    sub-steps (``turn``), and back at the first after the motion there and back (``end``).
     """
 
     build: float

@@ -14,7 +14,7 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
 from rbfmuscle.metrics.depths import bone_depth, bones_about, surface_depth
-from rbfmuscle.metrics.neighbours import NeighbourMeasures, Shown
+from rbfmuscle.metrics.neighbours import InputNeighbours, NeighbourMeasures, Shown
 from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
 from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.bone import BoneDistance
@@ -58,10 +58,11 @@ class MuscleMeasures:
         mine = [muscle for muscle in scene.muscles if muscle.name in material]
         trackers = each(lambda one: MuscleMeasurer(one, scene, *material[one.name]), mine)
         self.trackers = {tracker.name: tracker for tracker in trackers}
-        self.neighbours = NeighbourMeasures(mine, scene.units)
+        given = InputNeighbours(mine, scene.units)
+        self.neighbours, self._carried = NeighbourMeasures(given), NeighbourMeasures(given)
         for muscle in mine:
             self.trackers[muscle.name].first = {
-                "neighbour_overlap_rest": self.neighbours.at_rest(muscle.name),
+                "neighbour_overlap_rest": given.deepest(muscle.name),
                 "articular_share": articular_share(muscle, scene, surfaces)[0],
                 "end_gap": end_gap(muscle, scene)[0],
                 "guessed": muscle.name in guessed,
@@ -90,8 +91,14 @@ class MuscleMeasures:
             zip(self.trackers, each(lambda tracker: tracker.measure(frame, self.probes), trackers))
         )
         shown = {t.name: t.shown for t in trackers if t.name in frame.surfaces and t.shown}
-        for name, values in self.neighbours.measure(frame.index, shown).items():
+        carried = {t.name: t.carried for t in trackers if t.name in shown and t.carried}
+        apart = self.neighbours.measure(frame.index, shown)
+        within = apart
+        if any(carried[name] is not surface for name, surface in shown.items()):
+            within = self._carried.measure(frame.index, carried)
+        for name, values in apart.items():
             found[name].update(values)
+            found[name]["material_overlap_max"] = within[name]["neighbour_overlap_max"]
         return {
             name: {q: float(values[q]) for q in QUANTITIES if q in values}
             for name, values in found.items()
@@ -127,7 +134,9 @@ class MuscleMeasurer:
         self.distance: MeshDistance | None = None
         self.places: Floats | None = None  # of its vertices at rest
         self.shown: Shown | None = None
+        self.carried: Shown | None = None  # the material, which may be what is shown
         self.offset: Floats | None = None
+        self.index = 0
         self.near: Integers | None = None
 
     def measure(self, frame: Frame, probes: list[BoneDistance]) -> dict[str, float]:
@@ -140,7 +149,8 @@ class MuscleMeasurer:
         found["tendon_depth"] = float(depth.max(initial=0.0))
         material, surface = frame.material_meshes[self.name][0], frame.surfaces.get(self.name)
         if surface is not None:
-            found.update(self._of_surface(surface, material, probes, frame.poses))
+            found.update(self._of_surface(frame.index, surface, material, probes, frame.poses))
+            self._carry(*frame.material_meshes[self.name])
             found.update({q: surface.quantities[q] for q in _FROM_MODEL if q in surface.quantities})
         mine = [event for event in frame.events if event.muscle == self.name]
         found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
@@ -165,7 +175,7 @@ class MuscleMeasurer:
             found["time_frame"] = times["time_frame"]
         return found
 
-    def _of_surface(self, surface, material, probes, poses):
+    def _of_surface(self, index, surface, material, probes, poses):
         vertices, faces = surface.vertices, np.asarray(surface.faces)
         # Surfaces that keep their faces share the order of the tree.
         same = self.distance is not None and np.array_equal(self.distance.faces, faces)
@@ -184,20 +194,33 @@ class MuscleMeasurer:
             "penetration_fraction": np.mean(depth > 0.0),
             "bone_penetration_max": bone_depth(self.distance, probes, poses),
             **form,
-            **self._flicker(material, vertices, same, self.form.simple),
+            **self._flicker(index, material, vertices, same, self.form.simple),
         }
 
-    def _flicker(self, material, vertices, same, simple):
-        """Change of the signed distances of the material vertices to the surface; of a mesh that is
-        shown, none.
+    def _carry(self, material: Floats, faces: Integers) -> None:
+        """Keep the material (n, 3) as a surface of its own, unless it is shown."""
+        if self.shown is not None and np.array_equal(self.shown.distance.vertices, material):
+            self.carried = self.shown
+            return
+        layout = None if self.carried is None else self.carried.distance.layout
+        self.carried = Shown(MeshDistance(material, faces, layout=layout), self.material)
+
+    def _flicker(self, index, material, vertices, same, simple):
+        """Distances of the material to the surface, and their change since the frame before in the
+        motion, where that was measured; of a mesh that is shown, none.
         """
         if np.array_equal(material, vertices):
             return {}
         if self.near is None or not same:
             self.near = np.full(len(material), -1)
-        before = self.offset
+        before, last = self.offset, self.index
         self.offset = self.distance.signed(material, near=self.near, simple=simple)
-        return {"flicker": np.abs(self.offset - before).max() if before is not None else 0.0}
+        self.index = index
+        away = np.abs(self.offset)
+        found = {"shown_shift_rms": math.sqrt(np.mean(away**2)), "shown_shift_max": away.max()}
+        if before is not None and index == last + 1:
+            found["flicker"] = np.abs(self.offset - before).max()
+        return found
 
     def measure_rest(
         self,

@@ -62,28 +62,51 @@ class PairFacts:
     gap_frame: int = 0
 
 
-class NeighbourMeasures:
-    """Measures every pair of a scene's muscles, frame by frame."""
+class InputNeighbours:
+    """Muscles as the input has them: distances to their meshes, and which of these overlap."""
 
     def __init__(self, muscles: Sequence[Muscle], units: str) -> None:
-        self._touching, self._around = from_mm(TOUCHING, units), from_mm(AROUND, units)
-        self._input = input_distances(muscles)
-        self._bounds = {
+        self.touching, self.around = from_mm(TOUCHING, units), from_mm(AROUND, units)
+        self.distances = input_distances(muscles)
+        self.bounds = {
             name: np.array([d.vertices.min(axis=0), d.vertices.max(axis=0)])
-            for name, d in self._input.items()
+            for name, d in self.distances.items()
         }
-        self._overlaps = input_overlaps(self._input)
+        self.overlaps = input_overlaps(self.distances)
+
+    def deepest(self, name: str) -> float:
+        """Deepest overlap of a muscle's input mesh with that of another [scene unit]."""
+        deepest = [
+            float(overlap.depths.max()) for pair, overlap in self.overlaps.items() if name in pair
+        ]
+        return max(deepest, default=0.0)
+
+    def side(self, one: str, other: str, at_rest: Floats) -> Side:
+        """What vertices (n, 3) of one muscle do beside another at rest."""
+        low, high = self.bounds[other]
+        near = np.flatnonzero(
+            np.all((at_rest > low - self.touching) & (at_rest < high + self.touching), axis=1)
+        )
+        distance = self.distances[other].signed(at_rest[near])
+        touching = distance < self.touching
+        near, distance = near[touching], distance[touching]
+        thinned = slice(None, None, -(-len(near) // MOST_PLACES) or 1)
+        pair = (one, other) if (one, other) in self.overlaps else (other, one)
+        allowed = None
+        if pair in self.overlaps:
+            allowed = _spread(self.overlaps[pair], at_rest, self.around)
+        return Side(near[thinned], np.maximum(distance[thinned], 0.0), allowed)
+
+
+class NeighbourMeasures:
+    """Measures every pair of some surfaces of a scene's muscles, frame by frame."""
+
+    def __init__(self, given: InputNeighbours) -> None:
+        self.input = given
         self._places: dict[str, Floats] = {}
         self._sides: dict[tuple[str, str], Side] = {}
         self._touched: set[tuple[str, str]] = set()
         self.pairs: dict[tuple[str, str], PairFacts] = {}
-
-    def at_rest(self, name: str) -> float:
-        """Deepest overlap of a muscle's input mesh with that of another [scene unit]."""
-        deepest = [
-            float(overlap.depths.max()) for pair, overlap in self._overlaps.items() if name in pair
-        ]
-        return max(deepest, default=0.0)
 
     def measure(self, index: int, shown: Mapping[str, Shown]) -> dict[str, dict[str, float]]:
         """Values of each muscle that is shown, in the frame of this number."""
@@ -121,8 +144,8 @@ class NeighbourMeasures:
                 "muscles": list(pair),
                 "overlap_max": worst.overlap,
                 "overlap_frame": worst.overlap_frame,
-                "overlap_rest": float(self._overlaps[pair].depths.max())
-                if pair in self._overlaps
+                "overlap_rest": float(self.input.overlaps[pair].depths.max())
+                if pair in self.input.overlaps
                 else 0.0,
                 "gap": worst.gap,
                 "gap_frame": worst.gap_frame,
@@ -159,24 +182,9 @@ class NeighbourMeasures:
         self._places[one] = at_rest
         for other in names:
             if other != one:
-                self._sides[one, other] = side = self._side(one, other, at_rest)
+                self._sides[one, other] = side = self.input.side(one, other, at_rest)
                 if len(side.touching):
                     self._touched |= {(one, other), (other, one)}
-
-    def _side(self, one: str, other: str, at_rest: Floats) -> Side:
-        low, high = self._bounds[other]
-        near = np.flatnonzero(
-            np.all((at_rest > low - self._touching) & (at_rest < high + self._touching), axis=1)
-        )
-        distance = self._input[other].signed(at_rest[near])
-        touching = distance < self._touching
-        near, distance = near[touching], distance[touching]
-        thinned = slice(None, None, -(-len(near) // MOST_PLACES) or 1)
-        pair = (one, other) if (one, other) in self._overlaps else (other, one)
-        allowed = None
-        if pair in self._overlaps:
-            allowed = _spread(self._overlaps[pair], at_rest, self._around)
-        return Side(near[thinned], np.maximum(distance[thinned], 0.0), allowed)
 
 
 def _ways(row: tuple[str, str, bool]) -> tuple[tuple[str, str], tuple[str, str]]:

@@ -59,12 +59,22 @@ QUANTITIES = {
     ),
     "flicker": (
         "length",
-        "greatest change, from frame to frame, of distances from material mesh to surface",
+        "greatest change of distances from material mesh to surface since the frame before in the "
+        "motion; none in runs that leave frames out",
     ),
+    "shown_shift_rms": (
+        "length",
+        "distance of the carried material from the surface that is shown; none where it is shown",
+    ),
+    "shown_shift_max": ("length", "the same, greatest"),
     "tunnelled": ("1", "points that passed through a bone and were not brought back"),
     "neighbour_overlap_max": (
         "length",
         "deepest vertex of this muscle or another in the other, beyond their overlap at rest there",
+    ),
+    "material_overlap_max": (
+        "length",
+        "the same of the carried material, from which a model draws what it shows",
     ),
     "neighbour_overlap_rest": (
         "length",

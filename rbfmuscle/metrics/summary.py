@@ -169,7 +169,7 @@ OF_SCENE = ("bone_overlap", "joint_gap", "missing_bones")
 # Limits that not every muscle has, and the quantity without which it has none: mesh models have no
 # level set, muscles with one attachment no centreline.
 NEEDS = {
-    "flicker": "unfitted_fraction",
+    "flicker": "flicker",
     "unfitted_fraction": "unfitted_fraction",
     "solid_volume_error": "unfitted_fraction",
     "bowing": "length",

@@ -112,7 +112,7 @@ class RunInfo(Part):
     complete. ``times`` are those of the parts of the run [s], ``muscles`` and ``frame_time`` what
     `Summary.table` gives. ``limits`` are in the scene's unit, ``fail_on`` those that it may fail
     on (None: the default); ``beyond`` are values beyond a limit, ``not_measured`` limits without a
-    value, ``answer`` which muscles are within all limits, ``doubts`` what no limit
+    value, ``outcome`` which muscles are within all limits, ``doubts`` what no limit
     holds, ``verdict`` all of these in sentences. ``neighbours`` are the pairs of muscles that
     touched or met, with the worst of each. ``planned`` are the coordinates of all frames while the
     run goes on.
@@ -132,7 +132,7 @@ class RunInfo(Part):
     limits: dict[str, float] = {}
     fail_on: dict[str, float | None] = {}
     verdict: str = ""
-    answer: str = ""
+    outcome: str = ""
     beyond: list[Exceedance] = []
     not_measured: list[Unmeasured] = []
     doubts: list[Doubt] = []

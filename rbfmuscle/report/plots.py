@@ -67,17 +67,19 @@ def line_plot(
     legend: bool = False,
 ) -> str:
     """Markup of a plot of lines; one that bears a muscle's name is switched on and off with it, as
-    are ``bands``.
+    are ``bands``. Several lines have their names at their ends, beside the plot.
 
     ``labels`` are those of the axes, ``limits`` dashed lines; the axis begins at ``zero``; a
-    ``legend`` stands below.
+    ``legend`` stands below instead.
     """
+    named = [] if legend or len(tracks) < 2 else tracks
+    tall = max(_TALL, _TOP + _BOTTOM + _ROW * len(named))
     places = [*(track.x for track in tracks), *(band.x for band in bands)]
     values = [track.y for track in tracks]
     values += [edge for band in bands for edge in (band.low, band.high)]
     x = svg.axis_about(places, _LEFT, _WIDE - _RIGHT)
     known = [*values, np.array(limits, dtype=float)]
-    y = svg.axis_about(known, _TALL - _BOTTOM, _TOP, margin=0.05)
+    y = svg.axis_about(known, tall - _BOTTOM, _TOP, margin=0.05)
     if zero:
         y = y._replace(low=0.0)
     parts = [svg.frame(x, y, labels)]
@@ -90,10 +92,33 @@ def line_plot(
     for track in tracks:
         parts.append(_named(track.name, svg.line(x.place(track.x), y.place(track.y), track.colour)))
     for k, track in enumerate(tracks if legend else ()):
-        height = _TALL + _ROW * (k + 0.5)
+        height = tall + _ROW * (k + 0.5)
         parts.append(svg.line([4.0, 16.0], [height, height], track.colour))
         parts.append(svg.text(track.name, 20.0, height, colour="black"))
-    return svg.picture(parts, (_WIDE, _TALL + _ROW * len(tracks) * legend), title)
+    parts += _names_at_ends(named, x, y)
+    letters = max((len(track.name) for track in named), default=0)
+    beside = 14.0 + svg.WIDE * letters if named else 0.0
+    return svg.picture(parts, (_WIDE + beside, tall + _ROW * len(tracks) * legend), title)
+
+
+def _names_at_ends(tracks: Sequence[Track], x: svg.Axis, y: svg.Axis) -> list[str]:
+    """The names of lines below each other beside the plot, each joined to the last known place of
+    its line.
+    """
+    places = []
+    for track in tracks:
+        known = np.flatnonzero(np.isfinite(track.y))
+        if len(known):
+            last = known[np.argmax(track.x[known])]
+            places.append((track, float(x.place(track.x[last])), float(y.place(track.y[last]))))
+    top, parts = y.end, []
+    for k, (track, at, height) in enumerate(sorted(places, key=lambda place: place[2])):
+        top = min(max(height, top), y.start - _ROW * (len(places) - 1 - k))
+        join = svg.line([at, x.end + _RIGHT], [height, top], track.colour, width=0.5)
+        name = svg.text(track.name, x.end + _RIGHT + 2.0, top, colour=track.colour)
+        parts.append(_named(track.name, join + name))
+        top += _ROW
+    return parts
 
 
 def _named(name: str, markup: str) -> str:

@@ -138,7 +138,7 @@ def packed_scene(runs: Mapping[str, RunData]) -> str:
 def _page(saved: RunData) -> ReportPage:
     info = saved.info
     complete = info.status == "complete"
-    answer, details = info.answer, []
+    answer, details = info.outcome, []
     if complete:
         verdict = Verdict(answer, info.beyond, info.not_measured, info.doubts)
         details = describe_details(verdict, info.muscles, info.scene.missing_bones, MOST_DOUBTS)
@@ -253,11 +253,16 @@ def _plots(saved: RunData) -> list[Section]:
             limits = [factor * limit, -factor * limit][: 1 + signed] if limit else []
             zero = quantity != "length" and not signed
             group = mechanics if quantity in ("length", "activation", "moment_arm") else errors
-            bands = _bands(tracks, coordinate, label, saved) if coordinate else ()
+            bands = []
+            if coordinate:
+                bands = _fibre_bands(tracks, coordinate, saved)
+                bands += _bands(tracks, coordinate, label, saved)
             text = line_plot(title, tracks, (label, unit), limits=limits, zero=zero, bands=bands)
             plots[group].append(text)
-    plots[mechanics] += [_fibre_plot(saved, name, axis, label) for name in _fibre_arms(saved)]
-    hints = {mechanics: "dashed: published moment arms, where names match"}
+    hints = {
+        mechanics: "shaded: 5th to 95th percentile of the fibres, where they are followed; dashed: "
+        "published moment arms, where names match"
+    }
     return [
         Section(title, hints.get(title, ""), plots=found, opened=title == mechanics)
         for title, found in plots.items()
@@ -276,28 +281,17 @@ def _bands(tracks: Sequence[Track], coordinate: str, label: str, saved: RunData)
     return bands
 
 
-def _fibre_arms(saved: RunData) -> list[str]:
-    """The coordinates about which fibres have moment arms."""
-    names = moment_arm_coordinates(saved)
-    quantity = "fibre_moment_arm_p50"
-    return [c for c in names if any(len(saved.series(m, quantity, c)[0]) for m in saved.muscles)]
-
-
-def _fibre_plot(saved: RunData, coordinate: str, axis: Mapping[int, float], label: str) -> str:
-    """Moment arms of the fibres about a coordinate: each muscle's median and the band from the 5th
-    to the 95th percentile, and dashed the published band of a muscle that has one.
-    """
-    name = "fibre_moment_arm"
-    tracks = _tracks(saved, f"{name}_p50", 1.0, axis, coordinate)
+def _fibre_bands(tracks: Sequence[Track], coordinate: str, saved: RunData) -> list[Band]:
+    """Moment arms of the fibres of the tracks' muscles, from the 5th to the 95th percentile."""
     bands = []
     for track in tracks:
         low, high = (
-            saved.series(track.name, f"{name}_{end}", coordinate)[1] for end in ("p05", "p95")
+            saved.series(track.name, f"fibre_moment_arm_{end}", coordinate)[1]
+            for end in ("p05", "p95")
         )
-        bands.append(Band(track.name, track.colour, track.x, low, high))
-    bands += _bands(tracks, coordinate, label, saved)
-    labels = (label, arm_unit(saved, coordinate))
-    return line_plot(f"Moment arms of fibres: {coordinate}", tracks, labels, bands=bands)
+        if len(low) == len(track.x):
+            bands.append(Band(track.name, track.colour, track.x, low, high))
+    return bands
 
 
 def _tracks(

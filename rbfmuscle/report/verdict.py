@@ -26,7 +26,7 @@ class Verdict(NamedTuple):
     limit, the limits without a value, and doubts.
     """
 
-    answer: str
+    outcome: str
     beyond: list[Exceedance]
     not_measured: list[Unmeasured]
     doubts: list[Doubt]
@@ -35,10 +35,10 @@ class Verdict(NamedTuple):
 def judge(table: Table, limits: Limits, doubts: Sequence[Doubt] = ()) -> Verdict:
     """The verdict of a run's table."""
     found, missing = exceeded(table, limits), unmeasured(table, limits)
-    return Verdict(_answer(table, found, missing), found, missing, list(doubts))
+    return Verdict(_outcome(table, found, missing), found, missing, list(doubts))
 
 
-def _answer(table: Table, found: list[Exceedance], missing: list[Unmeasured]) -> str:
+def _outcome(table: Table, found: list[Exceedance], missing: list[Unmeasured]) -> str:
     """Which muscles are within all limits."""
     muscles = [name for name in table if name != ALL]
     wrong = [name for name in dict.fromkeys(row.muscle for row in found) if name != ALL]
@@ -63,18 +63,18 @@ def _answer(table: Table, found: list[Exceedance], missing: list[Unmeasured]) ->
 def describe_verdict(
     verdict: Verdict, table: Table, missing_bones: Sequence[str] = (), *, most_doubts: int = 1
 ) -> str:
-    """A verdict in sentences: its answer, the worst of what is beyond a limit, what to do, what was
+    """A verdict in sentences: its outcome, the worst of what is beyond a limit, what to do, what was
     not measured, and what is doubtful; bones ``missing_bones``.
     """
     return ". ".join(
-        [verdict.answer, *describe_details(verdict, table, missing_bones, most_doubts)]
+        [verdict.outcome, *describe_details(verdict, table, missing_bones, most_doubts)]
     )
 
 
 def describe_details(
     verdict: Verdict, table: Table, missing_bones: Sequence[str], most_doubts: int
 ) -> list[str]:
-    """The sentences of a verdict after its answer."""
+    """The sentences of a verdict after its outcome."""
     texts = []
     if verdict.beyond:
         texts += _worst_and_remedies(verdict.beyond, table, missing_bones)

@@ -6,17 +6,20 @@ import toy_scene as toy
 import trimesh
 
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.metrics.neighbours import NeighbourMeasures, Shown
+from rbfmuscle.metrics.metrics import MuscleMeasures
+from rbfmuscle.metrics.neighbours import InputNeighbours, NeighbourMeasures, Shown
 from rbfmuscle.metrics.summary import exceeded, parse_limits
 from rbfmuscle.run import simulate
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.simulation.frame import ModelSurface
+from rbfmuscle.simulation.frame_loop import simulate_frames
 
 
 def pair(one, other, units="mm"):
     """Measures of two muscles "one" and "other" of these meshes."""
     muscles = [toy.muscle("one", one, []), toy.muscle("other", other, [])]
-    return NeighbourMeasures(muscles, units), {"one": one, "other": other}
+    return NeighbourMeasures(InputNeighbours(muscles, units)), {"one": one, "other": other}
 
 
 def shown(meshes, **moved):
@@ -69,7 +72,7 @@ def test_what_overlaps_at_rest_counts_apart_and_only_where_it_does(units):
     measures, meshes = pair(*balls, units=units)
     # Facets lie within 0.01 of a ball of radius 10.
     near = pytest.approx(1.0 * scale, abs=0.02 * scale)
-    assert measures.at_rest("one") == near and measures.at_rest("other") == near
+    assert measures.input.deepest("one") == near and measures.input.deepest("other") == near
     at_rest = measures.measure(0, shown(meshes))["other"]["neighbour_overlap_max"]
     assert at_rest == pytest.approx(0.0, abs=1e-12)
     deeper = measures.measure(0, shown(meshes, other=np.array((-2.0, 0, 0)) * scale))["one"]
@@ -116,6 +119,26 @@ def test_every_run_measures_neighbours_and_its_verdict_counts_them():
     assert "overlap with another muscle" in run.verdict
     (row,) = run.info.neighbours
     assert row["overlap_max"] == pytest.approx(max(run.values("extensor", "neighbour_overlap_max")))
+
+
+def test_what_is_cut_away_in_the_drawing_stays_an_overlap_of_the_material():
+    """A model that shows its muscles smaller than they are, so that they do not meet."""
+
+    class Trimmed(toy.ToyMuscle):
+        def surface(self, contacts):
+            middle = self.x.mean(axis=0)
+            return ModelSurface(middle + 0.8 * (self.x - middle), self.faces, {})
+
+    made, fields = toy.neighbour_scene([{}, {"press": 4.0}], gap=0.2, sliding=None)
+    models = [Trimmed(muscle, made, sweeps=4, reach=2.0) for muscle in made.muscles]
+    measures = MuscleMeasures(made, {model.name: model.material_mesh() for model in models})
+    frames = simulate_frames(made, models, bone_sdfs=fields)
+    rest, pressed = (measures.measure(frame)["lower"] for frame in frames)
+    assert rest["material_overlap_max"] == pressed["neighbour_overlap_max"] == 0.0
+    assert pressed["material_overlap_max"] > 0.2
+    # The ends are farthest from the middle, 30 along it.
+    assert rest["shown_shift_max"] == pytest.approx(6.0, abs=0.3)
+    assert 0.5 < rest["shown_shift_rms"] < 2.0
 
 
 def test_check_lists_muscles_whose_meshes_overlap():
