@@ -63,8 +63,8 @@ def _outcome(table: Table, found: list[Exceedance], missing: list[Unmeasured]) -
 def describe_verdict(
     verdict: Verdict, table: Table, missing_bones: Sequence[str] = (), *, most_doubts: int = 1
 ) -> str:
-    """A verdict in sentences: its outcome, the worst of what is beyond a limit, what to do, what was
-    not measured, and what is doubtful; bones ``missing_bones``.
+    """A verdict in sentences: its outcome, the worst of what is beyond a limit, what to do, what
+    was not measured, and what is doubtful; bones ``missing_bones``.
     """
     return ". ".join(
         [verdict.outcome, *describe_details(verdict, table, missing_bones, most_doubts)]
