@@ -23,7 +23,7 @@ def shifted(height):
 
 
 def hinged(centre):
-    """The arm about another centre, with a narrow forearm whose corners can be in the other bone."""
+    """The arm about another centre; corners of its narrow forearm can be in the other bone."""
     scene = arm_scene()
     scene.bones[1].mesh.apply_scale([1.0, 0.5, 1.0])
     scene.joints.clear()
