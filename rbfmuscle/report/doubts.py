@@ -45,7 +45,7 @@ def measured_doubts(
         found += _outside_band(scene, muscle, coordinate, alone)
     turning = any(all_coordinates(scene.joints)[name].motion == "rotation" for _, name in arms)
     if turning and not any(row.quantity == "length_roughness" for row in rows):
-        text = f"whether lengths are smooth is not measured: no {2 * ROUGH:g} degrees by {ROUGH:g}"
+        text = f"roughness is not measured: no frames are {ROUGH:g} degrees apart or less"
         found.append(Doubt(ALL, text))
     return found
 
