@@ -63,7 +63,7 @@ def missing_files(page, text):
     text = without_blocks(text)
     named = re.findall(r"[\w./]*\w\.py\b", text)
     named += re.findall(rf"(?<![\w./])(?:{'|'.join(TOPS)})/[\w./]*\w", text)
-    for name in named:
+    for name in sorted(set(named)):
         if not any(file.endswith(f"/{name}") for file in there):
             yield f"no such file: {name}"
 
