@@ -174,32 +174,49 @@ def distance_at(bone, x, y, z, triangle, stack, squares):
     square = np.inf if triangle < 0 else record_square(records, triangle, x, y, z)
     tree = (bone.boxes, bone.starts, records, bone.order)
     best = nearest_triangle(tree, (x, y, z), triangle, square, TIE, (stack, squares))[0]
-    r = records[best]
-    qx = x - r[0]
-    qy = y - r[1]
-    qz = z - r[2]
-    u = qx * r[3] + qy * r[4] + qz * r[5]
-    v = qx * r[6] + qy * r[7] + qz * r[8]
-    w = qx * r[9] + qy * r[10] + qz * r[11]
-    du, dv, feature = nearest_in_frame(r[BX], r[CX], r[CY], r[INVERSE_BC], r[INVERSE_CA], u, v)
+    ux = records[best, 3]
+    uy = records[best, 4]
+    uz = records[best, 5]
+    vx = records[best, 6]
+    vy = records[best, 7]
+    vz = records[best, 8]
+    nx = records[best, 9]
+    ny = records[best, 10]
+    nz = records[best, 11]
+    qx = x - records[best, 0]
+    qy = y - records[best, 1]
+    qz = z - records[best, 2]
+    w = qx * nx + qy * ny + qz * nz
+    du, dv, feature = nearest_in_frame(
+        records[best, BX],
+        records[best, CX],
+        records[best, CY],
+        records[best, INVERSE_BC],
+        records[best, INVERSE_CA],
+        qx * ux + qy * uy + qz * uz,
+        qx * vx + qy * vy + qz * vz,
+    )
     distance = np.sqrt(du * du + dv * dv + w * w)
     # From the nearest point to the point asked about.
-    ox = du * r[3] + dv * r[6] + w * r[9]
-    oy = du * r[4] + dv * r[7] + w * r[10]
-    oz = du * r[5] + dv * r[8] + w * r[11]
-    face = bone.order[best]
-    first = int(r[FIRST])
-    if feature == FACE:
-        nx, ny, nz = r[9], r[10], r[11]
-    elif feature < CORNER:
-        normal = bone.edge_normals[face, (first + feature - EDGE) % 3]
-        nx, ny, nz = normal[0], normal[1], normal[2]
-    else:
-        normal = bone.vertex_normals[bone.faces[face, (first + feature - CORNER) % 3]]
-        nx, ny, nz = normal[0], normal[1], normal[2]
+    ox = du * ux + dv * vx + w * nx
+    oy = du * uy + dv * vy + w * ny
+    oz = du * uz + dv * vz + w * nz
+    if feature != FACE:
+        face = bone.order[best]
+        first = int(records[best, FIRST])
+        if feature < CORNER:
+            k = (first + feature - EDGE) % 3
+            nx = bone.edge_normals[face, k, 0]
+            ny = bone.edge_normals[face, k, 1]
+            nz = bone.edge_normals[face, k, 2]
+        else:
+            k = bone.faces[face, (first + feature - CORNER) % 3]
+            nx = bone.vertex_normals[k, 0]
+            ny = bone.vertex_normals[k, 1]
+            nz = bone.vertex_normals[k, 2]
     side = 1.0 if ox * nx + oy * ny + oz * nz >= 0.0 else -1.0
-    box = bone.boxes[1]
-    size = abs(box[3] - box[0]) + abs(box[4] - box[1]) + abs(box[5] - box[2])
+    boxes = bone.boxes
+    size = boxes[1, 3] - boxes[1, 0] + boxes[1, 4] - boxes[1, 1] + boxes[1, 5] - boxes[1, 2]
     if len(bone.dipoles) > 0:
         solid = winding_number(bone, x, y, z, stack) > 0.5
         if feature == FACE and (side < 0.0) != solid:  # a face that looks inward
@@ -215,9 +232,9 @@ def distance_at(bone, x, y, z, triangle, stack, squares):
         )
     length = np.sqrt(nx * nx + ny * ny + nz * nz)
     if length < 1e-9:  # a pseudonormal that vanishes, as at a fold
-        nx = x - 0.5 * (box[0] + box[3])
-        ny = y - 0.5 * (box[1] + box[4])
-        nz = z - 0.5 * (box[2] + box[5]) + 1e-300
+        nx = x - 0.5 * (boxes[1, 0] + boxes[1, 3])
+        ny = y - 0.5 * (boxes[1, 1] + boxes[1, 4])
+        nz = z - 0.5 * (boxes[1, 2] + boxes[1, 5]) + 1e-300
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
     return side * distance, nx / length, ny / length, nz / length, best
 
