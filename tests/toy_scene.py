@@ -52,7 +52,7 @@ def box(half, centre=(0, 0, 0)):
 
 def _field(mesh, centre):
     mesh.apply_translation(np.asarray(centre, dtype=float))
-    return BoneSDF.from_mesh(mesh, cache=False)
+    return BoneSDF.from_mesh(mesh)
 
 
 @compiled

@@ -163,6 +163,14 @@ def winding_number(bone, x, y, z, stack):
 
 
 @loop
+def winding_loop(bone, points, winding):
+    """Fill winding numbers (n,) of points (n, 3) in bone coordinates."""
+    stack = np.empty(STACK, np.int64)
+    for i in range(len(points)):
+        winding[i] = winding_number(bone, points[i, 0], points[i, 1], points[i, 2], stack)
+
+
+@loop
 def distance_at(bone, x, y, z, triangle, stack, squares):
     """Signed distance of one point in bone coordinates, its unit gradient, and the record of the
     nearest triangle.

@@ -10,8 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.bones.broad_phase import (
-    box_loop,
-    boxes_apart,
     direction_loop,
     may_reach,
     note_query,
@@ -95,26 +93,19 @@ NOTHING = [
 
 def stack_bones(fields: Sequence[BoneSDF]) -> Bones:
     """The fields of some bones, which may be none, as one set of arrays."""
-    data = [field.data for field in fields]
+    data = [field.cells.data for field in fields]
     parts = [NOTHING, *([one.blocks.ravel(), *one[2:]] for one in data)]
     sizes = np.array([[len(part) for part in row] for row in parts], dtype=np.int64)
     ends = np.cumsum(sizes, axis=0)
     return Bones(
         np.array([field.bounds for field in fields]).reshape(-1, 2, 3),
-        np.array([field.local_to_bone for field in fields]).reshape(-1, 4, 4),
-        np.array([field.unit for field in fields]),
+        np.array([field.cells.local_to_bone for field in fields]).reshape(-1, 4, 4),
+        np.array([field.cells.unit for field in fields]),
         np.array([one.grid for one in data]).reshape(-1, 5),
         np.array([one.blocks.shape for one in data], dtype=np.int64).reshape(-1, 3),
         np.stack([ends[:-1], ends[1:]], axis=1),
         *(np.ascontiguousarray(np.concatenate(column)) for column in zip(*parts)),
     )
-
-
-def pick_bones(bones: Bones, rows: Sequence[int]) -> Bones:
-    """Some of the bones; the large arrays are shared."""
-    some = np.array(rows, dtype=np.int64)
-    few = {name: getattr(bones, name)[some] for name in Bones._fields[:6]}
-    return bones._replace(**few)
 
 
 @compiled
@@ -179,82 +170,3 @@ def ask_near(bones, b, pose, free, known, points, reach, wanted):
     for k in range(count):
         note_query(points, near[k], pose, distance[k], anchor, bound)
     return near, distance, way
-
-
-@compiled
-def find_contacts(obstacles, points, reach):
-    """Pairs of free point (n, 3) and bone nearer than ``reach``, bone by bone.
-
-    Numbers (c,) of the points, gaps (c,) [scene unit], unit normals (c, 3) and numbers (c,) of the
-    bones in reach.
-    """
-    bones = obstacles.bones
-    free = obstacles.free
-    known = obstacles.known
-    box, limit = np.empty((2, 3)), np.full(len(points), reach)
-    box_loop(points, free, box)
-    index, source = np.empty(0, np.int64), np.empty(0, np.int64)
-    gap, normal = np.empty(0), np.empty((0, 3))
-    for b in range(len(obstacles.poses)):
-        pose = obstacles.poses[b]
-        if boxes_apart(box, pose, bones.boxes[b]) > reach:
-            continue
-        near, distance, way = ask_near(bones, b, pose, free, known, points, limit, True)
-        count = 0
-        for k in range(len(near)):
-            i = near[k]
-            near[count] = i
-            distance[count] = distance[k] + obstacles.allowed[b, i]
-            way[count] = way[k]
-            count += distance[count] < reach
-        index = np.concatenate((index, near[:count]))
-        source = np.concatenate((source, np.full(count, b)))
-        gap = np.concatenate((gap, distance[:count]))
-        normal = np.concatenate((normal, way[:count]))
-    return index, gap, normal, source
-
-
-@compiled
-def greatest_depth(obstacles, points):
-    """Greatest depth of a free point (n, 3) in a bone [scene unit], 0 where all are outside."""
-    bones = obstacles.bones
-    free = obstacles.free
-    known = obstacles.known
-    depth = 0.0
-    box, nowhere = np.empty((2, 3)), np.zeros(len(points))
-    box_loop(points, free, box)
-    for b in range(len(obstacles.poses)):
-        pose = obstacles.poses[b]
-        if boxes_apart(box, pose, bones.boxes[b]) == 0.0:
-            distance = ask_near(bones, b, pose, free, known, points, nowhere, False)[1]
-            for k in range(len(distance)):
-                depth = max(depth, -distance[k])
-    return depth
-
-
-@compiled
-def find_nearest(bones, poses, points, limit, gradient):
-    """Smallest distance (n,) of points (n, 3) from bones in poses (b, 4, 4), and its gradient (n,
-    3), or none where ``gradient`` is (0, 3); lower bounds without a gradient beyond the ``limit``
-    (n,).
-    """
-    count = len(points)
-    smallest = np.full(count, np.inf)
-    box, farthest = np.empty((2, 3)), 0.0
-    box_loop(points, np.ones(count, np.bool_), box)
-    for i in range(count):
-        farthest = max(farthest, limit[i])
-    distance, way = np.empty(count), np.empty((len(gradient), 3))
-    for b in range(len(poses)):
-        apart = boxes_apart(box, poses[b], bones.boxes[b])
-        if apart > farthest:
-            smallest = np.minimum(smallest, apart)
-            continue
-        # No farther than what was found: elsewhere a lower bound will do.
-        query_bone(bones, b, poses[b], points, np.minimum(smallest, limit), distance, way)
-        for i in range(count):
-            if distance[i] < smallest[i]:
-                smallest[i] = distance[i]
-                if len(gradient) > 0:
-                    gradient[i] = way[i]
-    return smallest

@@ -12,13 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.bones.distance import Memory, distance_loop
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.bsplines import bspline_sum
 from rbfmuscle.geometry.rest_frame import RestFrame, box_corners
-from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.loops import loop
 
 SIDE = 4  # cells along a block
@@ -86,22 +84,8 @@ def bone_thickness(bone: BoneSDF, most: float) -> float:
     way = -normal[chosen] / np.maximum(area[chosen], 1e-300)[:, None]
     depth = np.zeros(PROBES)
     for t in np.linspace(0.0, most, STEPS_IN + 1)[1:]:
-        depth = np.maximum(depth, -ask(bone, start + t * way))
+        depth = np.maximum(depth, -bone.distance(start + t * way))
     return min(2.0 * float(np.quantile(depth, 0.1)), most)
-
-
-def ask(bone: BoneSDF, points: Floats, *, reach: float = np.inf) -> Floats:
-    """Signed distances (n,) of points (n, 3) in bone coordinates, on several threads."""
-    distance, gradient = np.empty(len(points)), np.empty((len(points), 3))
-    limit, memory, pose = np.full(len(points), reach), Memory.of(len(points)), np.eye(4)
-    arrays = bone.arrays
-
-    def work(a: int, b: int) -> None:
-        known = (array[a:b] for array in memory)
-        distance_loop(arrays, pose, points[a:b], limit[a:b], *known, distance[a:b], gradient[a:b])
-
-    in_chunks(len(points), work)
-    return distance
 
 
 def _fill(
@@ -118,7 +102,7 @@ def _fill(
     shape = np.floor(corners.max(axis=0)).astype(np.int64) + 1 - first
     blocks = np.indices(shape).reshape(3, -1).T + first
     middles = frame.origin + (blocks + 0.5) * side @ frame.axes
-    near = np.abs(ask(bone, middles, reach=band)) <= band
+    near = np.abs(bone.distance(middles, reach=band)) <= band
     blocks = blocks[near]
     table = np.full(len(near), -1, dtype=np.int32)
     table[near] = np.arange(len(blocks))
@@ -129,7 +113,7 @@ def _fill(
     numbers = numbers + np.ravel_multi_index(tuple(inner.T + 1), tuple(size))
     distinct, which = np.unique(numbers, return_inverse=True)
     nodes = np.stack(np.unravel_index(distinct, tuple(size)), axis=1) - 1 + SIDE * first
-    distance = ask(bone, frame.origin + nodes * edge @ frame.axes) / edge
+    distance = bone.distance(frame.origin + nodes * edge @ frame.axes) / edge
     return {
         "low": first,
         "table": table.reshape(shape),

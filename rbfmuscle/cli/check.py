@@ -15,7 +15,6 @@ def check(
     scene: SceneName,
     *,
     picture: Flag = False,
-    sdf: Flag = False,
     plan: Flag = False,
     time: Flag = False,
     accuracy: Flag = False,
@@ -27,8 +26,6 @@ def check(
     ----------
     picture
         Draw attachments, tendons and joint axes to a PNG beside the scene file.
-    sdf
-        Measure the bones' distance fields against exact distances.
     plan
         List what a run would build: contact pairs, unknowns, sub-steps.
     time
@@ -48,8 +45,6 @@ def check(
             check_picture(scene.with_suffix(".png"))
         loaded, findings = _findings(scene)
         usable = bool(loaded.bones) and not any(f.level == "error" for f in findings)
-        if sdf:
-            facts["sdf"] = _measure_fields(loaded)
         if plan and usable:
             facts["plan"] = _plan(loaded, time)
         if accuracy and usable:
@@ -67,17 +62,6 @@ def check(
     return 0 if usable else SceneError.exit_code
 
 
-def _measure_fields(scene):
-    from rbfmuscle.bones.errors import measure_field
-    from rbfmuscle.bones.sdf import BoneSDF
-
-    with stage("errors of the bones' fields"):
-        return {
-            bone.name: measure_field(BoneSDF.from_mesh(bone.mesh, name=bone.name))
-            for bone in scene.bones
-        }
-
-
 def _draw(scene, path):
     from rbfmuscle.report.scene_picture import draw_scene
 
@@ -88,8 +72,6 @@ def _draw(scene, path):
 
 def _more_lines(facts, units):
     """Lines of what was asked for besides the check itself."""
-    for name, found in facts.get("sdf", {}).items():
-        yield _describe_field(name, found, units)
     yield from _plan_lines(facts["plan"]) if "plan" in facts else ()
     for found in facts.get("accuracy", []):
         rms, greatest = (f"{found[key]:.2g} {units}" for key in ("rms", "greatest"))
@@ -111,7 +93,7 @@ def _findings(path):
     loaded = open_scene(path, skeleton=True)
     orient_scene(loaded)
     check_models(loaded)
-    with stage("fields of the bones"):
+    with stage("meshes of the bones"):
         findings = [*check_scene(loaded), *_field_notes(loaded)]
     try:
         check_substeps(loaded)
@@ -139,16 +121,6 @@ def _field_notes(scene):
         ]
     finally:
         logger.setLevel(level)
-
-
-def _describe_field(name, found, units):
-    return (
-        f"  field of {name}: within {found['width']:.3g} {units} of the surface "
-        f"{found['error_rms']:.2g} {units} RMS, "
-        f"{found['error_max']:.2g} at most; sign wrong for {100 * found['sign_wrong']:.4f} %; "
-        "direction off by "
-        f"{found['angle_median']:.2g} degrees in the median"
-    )
 
 
 def _scene_lines(scene):

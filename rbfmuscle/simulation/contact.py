@@ -8,24 +8,23 @@ represented.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbfmuscle.bones.distance import Memory
 from rbfmuscle.bones.obstacles import (
     Bones,
     Known,
     Obstacles,
     PlaneStack,
-    find_contacts,
-    find_nearest,
-    greatest_depth,
-    query_bone,
     stack_bones,
 )
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.tendons import AT_REST
 from rbfmuscle.validation import check_finite, check_points
 
@@ -73,21 +72,22 @@ class Neighbour(Protocol):
 
 
 class BonesInReach:
-    """The bones that a muscle can reach, which never change; the poses are given.
-
-    Muscles may share the ``fields`` of the r bones, and ``arrays`` of them.
+    """The r bones that a muscle can reach, which never change; the poses are given. Muscles may
+    share the ``fields``.
     """
 
-    def __init__(
-        self, names: Sequence[str], fields: Sequence[BoneSDF], arrays: Bones | None = None
-    ) -> None:
+    def __init__(self, names: Sequence[str], fields: Sequence[BoneSDF]) -> None:
         if len(names) != len(fields):
             raise ValueError(
                 f"one field per bone is needed, got {len(fields)} for {len(names)} bones"
             )
         self.names = list(names)
         self.fields = list(fields)
-        self.arrays = stack_bones(fields) if arrays is None else arrays
+
+    @cached_property
+    def arrays(self) -> Bones:
+        """All fields by cells, for loops that read these."""
+        return stack_bones(self.fields)
 
     def place(self, poses: Mapping[str, Floats], out: Floats | None = None) -> Floats:
         """Poses (r, 4, 4) of the bones, from a dict of bone name to (4, 4) rest-to-world
@@ -106,7 +106,7 @@ class BonesInReach:
         self, points: ArrayLike, poses: Mapping[str, Floats], limit: Floats | float = np.inf
     ) -> Floats:
         """Smallest distance (n,) over the bones; parameters and result as for `nearest`."""
-        return self._nearest(points, poses, limit, gradient=False)[0]
+        return self.nearest(points, poses, limit)[0]
 
     def nearest(
         self, points: ArrayLike, poses: Mapping[str, Floats], limit: Floats | float = np.inf
@@ -117,14 +117,16 @@ class BonesInReach:
         [scene unit], negative inside a bone, infinity where none is in reach. Beyond ``limit``, a
         number or (n,), it is only a lower bound above the limit, without a direction.
         """
-        return self._nearest(points, poses, limit, gradient=True)
-
-    def _nearest(self, points, poses, limit, *, gradient):
         points = check_points(points)
-        slope = np.zeros((len(points) if gradient else 0, 3))
-        limits = np.full(len(points), limit, dtype=np.float64)
-        distance = find_nearest(self.arrays, self.place(poses), points, limits, slope)
-        return distance, slope
+        smallest, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
+        for field, pose in zip(self.fields, self.place(poses)):
+            # No farther than what was found: elsewhere a lower bound will do.
+            reach = np.minimum(smallest, limit)
+            distance, way = field.distance_and_gradient(points, pose, reach=reach)
+            closer = distance < smallest
+            smallest[closer] = distance[closer]
+            gradient[closer] = way[closer]
+        return smallest, gradient
 
 
 class BoneContacts:
@@ -143,38 +145,35 @@ class BoneContacts:
         #: Planes of sliding neighbours, and those that hold points on their side of a bone.
         self.neighbours: list[Planes] = []
         self.beside: list[Neighbour] = []
-        shape = len(bones.names), len(self.free)
-        known = Known(np.zeros((*shape, 3)), np.full(shape, -np.inf))
-        # Its arrays change in place, so that compiled loops can be given the same at each call.
-        self._alone = Obstacles(
-            bones.arrays, self.placed, self.free, np.zeros(shape), known, NO_PLANES
-        )
+        self._free = np.flatnonzero(self.free)
+        self._allowed = np.zeros((len(bones.names), len(self.free)))
+        self._memories = [Memory.of(len(self._free)) for _ in bones.names]
 
     def move(self, poses: Mapping[str, Floats]) -> None:
         """Take the bones' poses, a dict of bone name to (4, 4) rest-to-world transform."""
         self.bones.place(poses, self.placed)
         self.poses = poses
 
+    @cached_property
+    def _known(self) -> Known:
+        shape = self._allowed.shape
+        return Known(np.zeros((*shape, 3)), np.full(shape, -np.inf))
+
     def obstacles(self) -> Obstacles:
-        """What the contact points meet in the present poses, whose arrays change with these."""
-        if not self.neighbours:
-            return self._alone
-        return self._alone._replace(planes=_stacked_planes(self.neighbours))
+        """What the contact points meet in the present poses, for loops that read cells."""
+        planes = _stacked_planes(self.neighbours)
+        known = self._known
+        return Obstacles(self.bones.arrays, self.placed, self.free, self._allowed, known, planes)
 
     def allow(self, row: int, depth: Floats) -> None:
         """Let each contact point be up to ``depth`` (n,) inside a bone in reach [scene unit]."""
-        self._alone.allowed[row] = depth
+        self._allowed[row] = depth
 
     def distance_and_direction(self, points: Floats, row: int) -> tuple[Floats, Floats]:
         """Signed distance (n,) to one of the bones in reach and the unit direction (n, 3) in which
         it grows, world axes.
         """
-        points = check_points(points)
-        distance, direction = np.empty(len(points)), np.empty((len(points), 3))
-        everywhere = np.full(len(points), np.inf)
-        pose = self.placed[row]
-        query_bone(self.bones.arrays, row, pose, points, everywhere, distance, direction)
-        return distance, direction
+        return self.bones.fields[row].distance_and_gradient(points, self.placed[row])
 
     def excess(self, points: Floats) -> Floats:
         """How far (n,) points (n, 3) of the surface are to move inwards for sliding neighbours
@@ -186,28 +185,58 @@ class BoneContacts:
 
     def depth(self, points: Floats) -> float:
         """Greatest depth of a free contact point (n, 3) in a bone [scene unit]; 0 outside."""
-        return greatest_depth(self._alone, points)
+        some, depth = points[self._free], 0.0
+        for row in self._near(some, 0.0):
+            distance, _ = self._ask(row, some, 0.0)
+            depth = max(depth, -float(distance.min()))
+        return depth
 
     def half_spaces(self, points: Floats, reach: float) -> HalfSpaces:
-        """Pairs of contact point (n, 3) and obstacle nearer than ``reach`` [scene unit]."""
+        """Pairs of contact point (n, 3) and obstacle nearer than ``reach`` [scene unit], bone by
+        bone, then neighbours.
+        """
         if len(points) != len(self.free):
             raise ValueError(
                 f"half-spaces need all {len(self.free)} contact points, got {len(points)}"
             )
         check_finite(points, name="points")
-        obstacles = self.obstacles()
-        spaces = HalfSpaces(*find_contacts(obstacles, points, reach))
-        return _with_planes(spaces, obstacles.planes, points, reach) if self.neighbours else spaces
+        some = points[self._free]
+        found = [NO_SPACES]
+        for row in self._near(some, reach):
+            allowed = self._allowed[row, self._free]
+            distance, normal = self._ask(row, some, reach - allowed)
+            gap = distance + allowed
+            near = np.flatnonzero(gap < reach)
+            source = np.full(len(near), row)
+            found.append(HalfSpaces(self._free[near], gap[near], normal[near], source))
+        for kind, planes in enumerate(self.neighbours):
+            gap = planes.gap + np.einsum(
+                "ij,ij->i", planes.normal, points[planes.index] - planes.anchor
+            )
+            near = np.flatnonzero(gap < reach)
+            source = np.full(len(near), -1 - kind)
+            found.append(HalfSpaces(planes.index[near], gap[near], planes.normal[near], source))
+        return HalfSpaces(*map(np.concatenate, zip(*found)))
+
+    def _near(self, points: Floats, reach: float) -> list[int]:
+        """Rows of the bones whose boxes are within ``reach`` of the box of points (n, 3)."""
+        if len(points) == 0:
+            return []
+        low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
+        boxes = [moved_box(f.bounds, pose) for f, pose in zip(self.bones.fields, self.placed)]
+        return [
+            row for row, box in enumerate(boxes) if (box[0] <= high).all() and (box[1] >= low).all()
+        ]
+
+    def _ask(self, row: int, points: Floats, reach: ArrayLike) -> tuple[Floats, Floats]:
+        """Distances and directions of all free points; what is known of them is kept."""
+        field, memory = self.bones.fields[row], self._memories[row]
+        return field.distance_and_gradient(points, self.placed[row], reach=reach, memory=memory)
 
 
-def _with_planes(bones: HalfSpaces, planes: PlaneStack, points: Floats, reach: float) -> HalfSpaces:
-    """Half-spaces of bones and, behind them, the planes of which contact points (n, 3) are nearer
-    than ``reach``.
-    """
-    gap = planes.gap + np.einsum("ij,ij->i", planes.normal, points[planes.point] - planes.anchor)
-    near = gap < reach
-    found = planes.point[near], gap[near], planes.normal[near], -1 - planes.kind[near]
-    return HalfSpaces(*map(np.concatenate, zip(bones, found)))
+NO_SPACES = HalfSpaces(
+    np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
+)
 
 
 def _stacked_planes(kinds: Sequence[Planes]) -> PlaneStack:
@@ -221,6 +250,3 @@ def _stacked_planes(kinds: Sequence[Planes]) -> PlaneStack:
         np.repeat(np.arange(len(kinds)), [len(planes.index) for planes in kinds]),
         np.array([planes.softness for planes in kinds], dtype=np.float64),
     )
-
-
-NO_PLANES = _stacked_planes([])

@@ -79,12 +79,10 @@ def find_contact_pairs(scene: Scene) -> Regions:
 
 
 def build_fields(scene: Scene, regions: Regions) -> dict[str, BoneSDF]:
-    """Distance fields of the parts of bones that some muscle can reach: dict of bone name to
-    field.
-    """
-    parts = bone_regions(regions)
-    bones = [bone for bone in scene.bones if bone.name in parts]
-    fields = each(lambda bone: BoneSDF.from_mesh(bone.mesh, region=parts[bone.name]), bones)
+    """Distance fields of the bones that some muscle can reach: dict of bone name to field."""
+    reached = {name for _, name in regions}
+    bones = [bone for bone in scene.bones if bone.name in reached]
+    fields = each(lambda bone: BoneSDF.from_mesh(bone.mesh, name=bone.name), bones)
     return {bone.name: field for bone, field in zip(bones, fields)}
 
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 from threadpoolctl import ThreadpoolController
 
-from rbfmuscle.bones.obstacles import pick_bones, stack_bones
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.threads import each, in_stages
 from rbfmuscle.scene.activation.contraction import Activations
@@ -284,11 +283,7 @@ def simulate_frames(
 
 
 def _obstacles(scene, models, bone_sdfs):
-    """One BoneContacts for each model, with fields of the bones that it can reach.
-
-    A field covers the reach of all muscles of the scene, so that it does not depend on which are
-    simulated.
-    """
+    """One BoneContacts for each model, with fields of the bones that it can reach."""
     regions = find_contact_pairs(scene) if bone_sdfs is None else None
     here = {model.name for model in models}
     if regions is not None:
@@ -298,10 +293,7 @@ def _obstacles(scene, models, bone_sdfs):
         )
     names = [bone.name for bone in scene.bones]
     order = [name for name in names if name in bone_sdfs]
-    # One set of arrays, of which each muscle takes its bones.
-    stack = stack_bones([bone_sdfs[name] for name in order])
     for model in models:
         met = [name for name in order if regions is None or (model.name, name) in regions]
-        arrays = pick_bones(stack, [order.index(name) for name in met])
-        reached = BonesInReach(met, [bone_sdfs[name] for name in met], arrays)
+        reached = BonesInReach(met, [bone_sdfs[name] for name in met])
         yield BoneContacts(reached, model.attached_bone)

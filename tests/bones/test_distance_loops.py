@@ -23,7 +23,7 @@ SOLID = angle_iron()
 
 @pytest.fixture(scope="module")
 def field():
-    return BoneSDF.from_mesh(SOLID, cache=False)
+    return BoneSDF.from_mesh(SOLID)
 
 
 def exact(points):

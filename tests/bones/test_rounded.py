@@ -17,7 +17,7 @@ def frame_of(seed=0):
 
 
 def rounded_of(mesh, region=BOX, **options):
-    field = BoneSDF.from_mesh(mesh, cache=False)
+    field = BoneSDF.from_mesh(mesh)
     return round_bone(field, frame_of(), SPACING, region, cache=False, **options)
 
 

@@ -31,7 +31,7 @@ def test_open_bone_keeps_its_signs_away_from_the_hole(ball, caplog):
     removed = order[: len(order) // 100]
     faces = np.delete(ball.faces, removed, axis=0)
     with caplog.at_level(logging.WARNING):
-        field = BoneSDF.from_mesh((ball.vertices, faces), cache=False, name="hip")
+        field = BoneSDF.from_mesh((ball.vertices, faces), name="hip")
     assert not field.closed
     assert "hip: not closed" in caplog.text
     assert "winding numbers" in caplog.text
@@ -46,7 +46,7 @@ def test_soup_and_faces_of_mixed_orientation_are_mended(ball):
     mixed = ball.faces.copy()
     mixed[::7] = mixed[::7, ::-1]
     for mesh in ((soup, np.arange(len(soup)).reshape(-1, 3)), (ball.vertices, mixed)):
-        field = BoneSDF.from_mesh(mesh, cache=False)
+        field = BoneSDF.from_mesh(mesh)
         assert field.closed and _sides_right(field, _random()) == 1.0
 
 
@@ -74,7 +74,7 @@ def _crossed(ball, away):
 
 def test_bone_that_intersects_itself_is_signed_by_winding_numbers(ball):
     vertices, faces = _crossed(ball, 15.0)
-    field = BoneSDF.from_mesh((vertices, faces), cache=False)
+    field = BoneSDF.from_mesh((vertices, faces))
     assert not field.closed
     points = _random() + [7.5, 0.0, 0.0]
     depth = (
@@ -87,8 +87,8 @@ def test_bone_that_intersects_itself_is_signed_by_winding_numbers(ball):
 
 def test_duplicate_and_degenerate_faces_are_left_out(ball):
     faces = np.vstack([ball.faces, ball.faces[:5], [[0, 0, 1], [3, 3, 3]]])
-    field = BoneSDF.from_mesh((ball.vertices, faces), cache=False)
-    clean = BoneSDF.from_mesh(ball, cache=False)
+    field = BoneSDF.from_mesh((ball.vertices, faces))
+    clean = BoneSDF.from_mesh(ball)
     assert field.closed
     assert "5 duplicate faces left out" in field.notes
     assert "2 faces without area left out" in field.notes
@@ -104,4 +104,4 @@ def test_duplicate_and_degenerate_faces_are_left_out(ball):
 )
 def test_unusable_meshes_are_refused(vertices, faces, message):
     with pytest.raises(MeshError, match=message):
-        BoneSDF.from_mesh((vertices, faces), cache=False, name="shin")
+        BoneSDF.from_mesh((vertices, faces), name="shin")

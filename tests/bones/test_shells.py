@@ -69,7 +69,7 @@ SHELLS = {
 @pytest.mark.parametrize("kind", SHELLS)
 def test_a_bone_is_solid_to_its_outer_surface_for_all(kind):
     mesh = SHELLS[kind]
-    field = BoneSDF.from_mesh(mesh, cache=False)
+    field = BoneSDF.from_mesh(mesh)
     bone, probe = Bone("femur", mesh), BoneDistance("femur", mesh)
     for distance in (bone.distances, probe.signed, field.distance):
         np.testing.assert_allclose(distance(ASKED), RIGHT, atol=FACETING)

@@ -29,7 +29,7 @@ RADIUS, EDGE = 20.0, 2.0
 def ball():
     """A ball of flat facets, rounded over a cell, at a pose."""
     mesh = trimesh.creation.icosphere(2, RADIUS)
-    field = BoneSDF.from_mesh(mesh, cache=False)
+    field = BoneSDF.from_mesh(mesh)
     pose = rotation_about([1, 2, 3], 0.7, np.array([5.0, -2.0, 1.0]))
     arrays = stack_bones([field])
     frame = RestFrame(np.asarray(mesh.vertices))

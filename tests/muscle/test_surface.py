@@ -57,7 +57,7 @@ class Drawn:
     """The unit ball, at rest with the offsets of its vertices, drawn where its vertices are."""
 
     def __init__(self, bones=(), points=None, volume=VOLUME):
-        fields = [BoneSDF.from_mesh(bone, cache=False) for bone in bones]
+        fields = [BoneSDF.from_mesh(bone) for bone in bones]
         grids = [PointGrid.of(np.asarray(bone.vertices, dtype=float)) for bone in bones]
         if points is not None:
             grids = [PointGrid.of(points) for _ in bones]

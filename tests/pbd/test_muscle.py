@@ -31,7 +31,7 @@ class Rig:
             method = METHODS[name]._replace(tolerance=tolerance)
             self.model = PBDMuscle(muscle, self.scene, settings, method=method)
         names = [bone.name for bone in self.scene.bones]
-        fields = [BoneSDF.from_mesh(bone.mesh, cache=False) for bone in self.scene.bones]
+        fields = [BoneSDF.from_mesh(bone.mesh) for bone in self.scene.bones]
         self.contacts = BoneContacts(BonesInReach(names, fields), self.model.attached_bone)
         self.at = self.poses(0.0)
 

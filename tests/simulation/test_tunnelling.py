@@ -152,7 +152,7 @@ def test_angle_test_has_the_known_recall(shape, step, recall):
 
 @pytest.mark.parametrize("step", [1.0, 5.0])
 def test_paths_that_are_called_clear_neither_touch_nor_turn(step):
-    field = BoneSDF.from_mesh(trimesh.creation.box((3.0, 2.0, 0.5)), cache=False)
+    field = BoneSDF.from_mesh(trimesh.creation.box((3.0, 2.0, 0.5)))
     start, end = random_segments(step, count=20_000)
     sweep = sweep_paths(field, start, end, tolerance=TOLERANCE)
     cosine = np.cos(RIGHT_ANGLE_AND_HALF)
@@ -166,7 +166,7 @@ def test_paths_that_are_called_clear_neither_touch_nor_turn(step):
 def test_short_crossings_are_found_that_the_angle_test_misses():
     start = np.array([[-1.1, 0.0, 0.0], [-1.1, 0.5, 0.0], [-1.1, 1.1, 0.0]])
     end = start * [-1.0, 1.0, 1.0]
-    field = BoneSDF.from_mesh(trimesh.creation.cylinder(1.0, 4.0, sections=360), cache=False)
+    field = BoneSDF.from_mesh(trimesh.creation.cylinder(1.0, 4.0, sections=360))
     contacts = BoneContacts(BonesInReach(["bone"], [field]), np.full(3, -1))
     poses = {"bone": np.eye(4)}, {"bone": np.eye(4)}
     contacts.move(poses[1])

@@ -1,4 +1,4 @@
-"""The cache of distance fields on disk."""
+"""The cache of arrays on disk."""
 
 import os
 import pickle
@@ -9,9 +9,10 @@ import pytest
 import trimesh
 
 from rbfmuscle import cache
-from rbfmuscle.bones import sdf
+from rbfmuscle.bones import rounded
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.cache import SUFFIX, cache_path, content_key, load_arrays, store_arrays
+from rbfmuscle.geometry.rest_frame import RestFrame
 
 
 @pytest.fixture(autouse=True)
@@ -27,31 +28,35 @@ def ball():
 
 @pytest.fixture
 def builds(monkeypatch):
-    """Number of fields built from their meshes, as a list that grows."""
-    found, build = [], sdf.build_cells
-    monkeypatch.setattr(sdf, "build_cells", lambda *a, **k: found.append(1) or build(*a, **k))
+    """Number of bones rounded from their meshes, as a list that grows."""
+    found, fill = [], rounded._fill
+    monkeypatch.setattr(rounded, "_fill", lambda *given: found.append(1) or fill(*given))
     return found
 
 
-POINTS = np.random.default_rng(0).uniform(-25.0, 25.0, (2000, 3))
+BOX = np.array([[-25.0] * 3, [25.0] * 3])
+FRAME = RestFrame(np.random.default_rng(0).normal(size=(50, 3)) * [30.0, 20, 10])
 
 
-def test_second_field_comes_from_the_cache_and_is_the_same(ball, builds, folder):
-    first, second = BoneSDF.from_mesh(ball), BoneSDF.from_mesh(ball)
+def nodes(mesh, *, region=BOX, spacing=3.0):
+    return rounded.round_bone(BoneSDF.from_mesh(mesh), FRAME, spacing, region).nodes
+
+
+def test_a_bone_rounded_again_comes_from_the_cache_and_is_the_same(ball, builds, folder):
+    first, second = nodes(ball), nodes(ball)
     assert len(builds) == 1
     assert cache_path() == folder
-    np.testing.assert_array_equal(first.distance(POINTS), second.distance(POINTS))
-    for name in ("spacing", "error", "closed", "notes", "memory"):
-        assert getattr(first, name) == getattr(second, name)
+    np.testing.assert_array_equal(first, second)
     # Another mesh or other options are other entries.
-    BoneSDF.from_mesh(ball, tolerance=0.005)
-    BoneSDF.from_mesh(ball, region=[[0.0, 0, 0], [25, 25, 25]])
+    nodes(ball, spacing=4.0)
+    nodes(ball, region=BOX + 1.0)
     ball.vertices[0, 0] += 1e-9
-    BoneSDF.from_mesh(ball)
-    assert len(builds) >= 4
+    nodes(ball)
+    assert len(builds) == 4
     assert len(list(folder.glob("*" + SUFFIX))) == 4
 
 
+POINTS = np.random.default_rng(0).uniform(-25.0, 25.0, (2000, 3))
 DAMAGES = {
     "cut": lambda content: content[: len(content) // 2],
     "flipped": lambda content: content[:500] + bytes([content[500] ^ 0xFF]) + content[501:],
@@ -61,46 +66,32 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damaged_entry_is_rebuilt(ball, builds, folder, damage):
-    expected = BoneSDF.from_mesh(ball).distance(POINTS)
+    expected = nodes(ball)
     (entry,) = folder.glob("*.npz")
     entry.write_bytes(DAMAGES[damage](entry.read_bytes()))
     for _ in range(2):
-        np.testing.assert_array_equal(BoneSDF.from_mesh(ball).distance(POINTS), expected)
+        np.testing.assert_array_equal(nodes(ball), expected)
         assert len(builds) == 2
 
 
-def test_entry_of_another_mesh_is_not_believed(ball, builds, folder):
-    BoneSDF.from_mesh(ball)
+def test_entry_of_another_mesh_or_with_other_fields_is_not_believed(ball, builds, folder):
+    nodes(ball)
     (entry,) = folder.glob("*.npz")
     other = trimesh.creation.box((10.0, 10.0, 10.0))
-    BoneSDF.from_mesh(other)
+    expected = nodes(other)
     (second,) = set(folder.glob("*.npz")) - {entry}
     second.write_bytes(entry.read_bytes())
-    assert BoneSDF.from_mesh(other).distance(np.zeros((1, 3)))[0] == pytest.approx(-5.0, abs=0.1)
+    np.testing.assert_array_equal(nodes(other), expected)
     assert len(builds) == 3
+    store_arrays(second.name[: -len(SUFFIX)], {"others": np.zeros(3)})
+    np.testing.assert_array_equal(nodes(other), expected)
+    assert len(builds) == 4
 
 
 def test_cache_that_cannot_be_written_does_no_harm(ball, folder, caplog):
     folder.write_text("a file where the folder should be")
-    field = BoneSDF.from_mesh(ball)
-    assert field.distance(np.zeros((1, 3)))[0] < -19.0
+    assert len(nodes(ball)) > 0
     assert "cannot be written" in caplog.text
-
-
-def test_regions_that_are_alike_share_a_field_that_covers_both(ball, builds):
-    region = np.array([[1.0, -9.0, -30.0], [24.0, 9.5, 3.0]])
-    near = region + np.array([[0.2, 0.1, -50.0], [60.0, -0.2, 0.1]])  # and far beyond the bone
-    fields = [BoneSDF.from_mesh(ball, region=region)]
-    once = len(builds)
-    fields.append(BoneSDF.from_mesh(ball, region=near))
-    assert len(builds) == once
-    np.testing.assert_array_equal(*(field.distance(POINTS) for field in fields))
-    grown = sdf._stepped_region(sdf._region_steps(region, ball.vertices), ball.vertices)
-    inner = np.clip(region, *ball.bounds)
-    assert (grown[0] <= inner[0]).all() and (grown[1] >= inner[1]).all()
-    assert np.abs(grown - inner).max() <= 2.0 * 40.0 / sdf.REGION_PARTS + 1e-9
-    BoneSDF.from_mesh(ball, region=region + 5.0)
-    assert len(builds) > once
 
 
 def test_what_was_not_used_for_longest_is_removed_first(folder, monkeypatch):
@@ -143,4 +134,4 @@ def test_field_does_not_depend_on_the_numbering_of_its_mesh(ball):
     order = rng.permutation(len(ball.vertices))
     faces = np.argsort(order)[np.asarray(ball.faces)][rng.permutation(len(ball.faces))]
     fields = [BoneSDF.from_mesh(mesh) for mesh in (ball, (ball.vertices[order], faces))]
-    np.testing.assert_allclose(*(field.distance(POINTS) for field in fields), atol=1e-9 * 20.0)
+    np.testing.assert_allclose(*(field.distance(POINTS) for field in fields), atol=1e-12)
