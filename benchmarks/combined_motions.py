@@ -89,7 +89,7 @@ def measure(scene: rm.Scene, model: str | None) -> tuple[list[tuple], float]:
     for name in (muscle.name for muscle in scene.muscles):
         count = {
             action: sum(e.count for e in run.events if e.muscle == name and e.action == action)
-            for action in ("unresolved", "grazed", "held_back")
+            for action in ("unresolved", "held_back")
         }
         euler = run.values(name, "euler_characteristic")
         worst = {
@@ -116,16 +116,16 @@ def show(title: str, frames: int, rows: list[tuple], spent: float) -> None:
     print(
         "| muscle | frames with handles | crossing | flicker max (frames over 0.5) | unfitted | "
         "surface in bones "
-        "| bones in muscle | volume | unresolved | grazed | held back |"
+        "| bones in muscle | volume | unresolved | held back |"
     )
-    print("|---" * 11 + "|")
+    print("|---" * 10 + "|")
     for name, handles, count, over, worst, events in rows:
         print(
             f"| {name} | {handles} of {count} | {worst['self_crossings']:.0f} "
             f"| {worst.get('flicker', 0.0):.2f} ({over}) "
             f"| {worst.get('unfitted_fraction', 0.0):.3f} "
             f"| {worst['penetration_max']:.3f} | {worst['bone_penetration_max']:.3f} "
-            f"| {worst['volume_error']:.0e} | {events['unresolved']} | {events['grazed']} | "
+            f"| {worst['volume_error']:.0e} | {events['unresolved']} | "
             f"{events['held_back']} |",
             flush=True,
         )

@@ -179,13 +179,14 @@ class PBDMuscle:
         return self.material_mesh()
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
-        """The mesh as it is now."""
+        """The mesh as it is now, where it overlapped bones at rest taken out of them."""
         quantities, notes = self.log.take()
         quantities |= {
             "solver_penetration_max": self.penetration,
             "solver_sweeps": float(self.swept),
         }
-        return ModelSurface(*self.material_mesh(), quantities, notes)
+        shown = contacts.lifted(self.points)
+        return ModelSurface(np.take(shown, self._place, axis=0), self._faces, quantities, notes)
 
 
 def sweep_once(muscle: PBDMuscle, *, last: bool = False) -> float:

@@ -10,7 +10,7 @@ from rbfmuscle.jit import compiled
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.tables import JointTable
 from rbfmuscle.scene.objects import Attachment, Motion, Muscle
-from rbfmuscle.scene.options import ContactOptions, DetectOptions
+from rbfmuscle.scene.options import ContactOptions, DetectOptions, TunnellingOptions
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import ModelSurface, MuscleModel
 
@@ -201,7 +201,7 @@ def scene(fields, joints, muscles, frames, *, initial="keep", sliding=None, tunn
     """A scene of these parts, its bones from their fields by name."""
     bones = [bone(name, field) for name, field in fields.items()]
     parts = {"bones": bones, "joints": joints, "muscles": muscles}
-    detect = None if tunnelling is None else DetectOptions(tunnelling=tunnelling)
+    detect = DetectOptions(tunnelling=tunnelling or TunnellingOptions(action="off"))
     contact = ContactOptions(initial=initial)
     return Scene(
         "toy", **parts, motion=Motion(frames), contact=contact, sliding=sliding, detect=detect

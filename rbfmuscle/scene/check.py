@@ -175,9 +175,7 @@ def _rest_overlaps(scene):
         if not inside:
             continue
         share = inside / len(depth)
-        level = "note" if scene.contact.initial == "resolve" else "warning"
-        if scene.contact.initial == "error" or share > 1 / 2:
-            level = "error"
+        level = "error" if scene.contact.initial == "error" or share > 1 / 2 else "note"
         message = (
             f"{inside} free vertices ({100 * share:.2g} %) start inside bone {bone.name!r}, "
             f"up to {depth.max():.3g} {scene.units} deep"

@@ -125,7 +125,7 @@ class SceneFile(Table):
     muscle: list[MuscleTable] = Field(default_factory=list)
     contact: ContactOptions = ContactOptions()
     sliding: SlidingOptions | None = None
-    detect: DetectOptions | None = None
+    detect: DetectOptions = DetectOptions()
     output: OutputOptions = OutputOptions()
 
 

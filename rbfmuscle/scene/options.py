@@ -164,7 +164,7 @@ def _describe_error(error, name_row):
 class ContactOptions(Table):
     """``[contact]``: how muscles meet bones."""
 
-    initial: Literal["resolve", "keep", "error"] = "resolve"
+    initial: Literal["keep", "error"] = "keep"
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
 
 
@@ -179,14 +179,14 @@ class SlidingOptions(Table):
 class TunnellingOptions(Table):
     """``detect.tunnelling``: points that pass through a bone in one step."""
 
-    angle: Annotated[float, Field(gt=0, lt=180)] = 135.0
-    action: Literal["report", "substep"] = "substep"
+    angle: Annotated[float, Field(gt=0, lt=180)] | None = None
+    action: Literal["substep", "report", "off"] = "substep"
 
 
 class DetectOptions(Table):
     """``[detect]``: what is looked for while a motion runs."""
 
-    tunnelling: TunnellingOptions | None = None
+    tunnelling: TunnellingOptions = TunnellingOptions()
 
 
 def _accept_format(value: object) -> object:

@@ -10,7 +10,6 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.objects import Attachment
-from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
 from rbfmuscle.scene.phantom_shapes import (
     Tube,
     ball,
@@ -163,7 +162,6 @@ def phantom_scene(
     for name, (mesh, attach, fibres) in muscles.items():
         scene.add_muscle(name, mesh, attach=attach, model=model, fibres=fibres)
     scene.set_motion(ramp={"hip.flexion": {"from": 0.0, "to": float(end), "step": float(step)}})
-    scene.detect = DetectOptions(tunnelling=TunnellingOptions())
     return scene
 
 

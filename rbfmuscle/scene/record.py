@@ -37,7 +37,7 @@ def record_scene(scene: Scene) -> dict[str, object]:
         "muscles": [record_muscle(muscle) for muscle in scene.muscles],
         "contact": scene.contact.model_dump(),
         "sliding": scene.sliding.model_dump() if scene.sliding else None,
-        "detect": scene.detect.model_dump() if scene.detect else None,
+        "detect": scene.detect.model_dump(),
         "output": scene.output.model_dump(),
     }
 

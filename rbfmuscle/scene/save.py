@@ -23,7 +23,7 @@ from rbfmuscle.validation import UsageError
 if TYPE_CHECKING:
     import trimesh
 
-OPTIONAL = ("sliding", "detect")  # tables that change a scene even where they are empty
+OPTIONAL = ("sliding",)  # tables that change a scene even where they are empty
 TableRow: TypeAlias = tuple[str, Mapping[str, object]]  # the head of a table, and its keys
 
 

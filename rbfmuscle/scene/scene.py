@@ -62,7 +62,7 @@ class Scene(Displayed):
     motion: Motion = field(default_factory=Motion)
     contact: ContactOptions = field(default_factory=ContactOptions)
     sliding: SlidingOptions | None = None
-    detect: DetectOptions | None = None
+    detect: DetectOptions = field(default_factory=DetectOptions)
     output: OutputOptions = field(default_factory=OutputOptions)
     path: Path | None = None  # the file it was loaded from
     # These three are in the verdict of a run.

@@ -14,7 +14,6 @@ from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
 from rbfmuscle.scene.names import find_named
 from rbfmuscle.scene.objects import Muscle, split_model
 from rbfmuscle.scene.options import (
-    DetectOptions,
     MotionOptions,
     SlidingOptions,
     Table,
@@ -59,7 +58,7 @@ def change_settings(
         elif not rest:
             raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
         else:
-            tables[head] = changed_table(head, tables[head], rest, value, key, folder)
+            tables[head] = changed_table(tables[head], rest, value, key, folder)
 
 
 def split_muscle_key(key: str) -> tuple[str, str, str]:
@@ -105,7 +104,6 @@ def _set_contraction(muscle, key, rest, value):
 
 
 def changed_table(
-    head: str,
     table: Table | None,
     rest: str,
     value: object,
@@ -113,7 +111,7 @@ def changed_table(
     folder: Path | None,
 ) -> Table:
     """A table of settings with one key changed; one that the scene lacks begins with defaults."""
-    table = table or {"sliding": SlidingOptions, "detect": DetectOptions}[head]()
+    table = SlidingOptions() if table is None else table
     values = table.model_dump(by_alias=True, exclude_unset=True)
     if isinstance(table, MotionOptions):
         _change_motion(values, rest, value, context)

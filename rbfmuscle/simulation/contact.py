@@ -28,6 +28,9 @@ from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.tendons import AT_REST
 from rbfmuscle.validation import check_finite, check_points
 
+# Steps to the nearest surface in which a point that is shown leaves a bone.
+LIFTS = 3
+
 
 class HalfSpaces(NamedTuple):
     """Linearised contacts: moving ``point`` by ``dp`` is admissible where ``gap + normal . dp
@@ -147,7 +150,8 @@ class BoneContacts:
         self.beside: list[Neighbour] = []
         self._free = np.flatnonzero(self.free)
         self._allowed = np.zeros((len(bones.names), len(self.free)))
-        self._memories = [Memory.of(len(self._free)) for _ in bones.names]
+        #: What is known of the free points about each bone in reach.
+        self.memories = [Memory.of(len(self._free)) for _ in bones.names]
 
     def move(self, poses: Mapping[str, Floats]) -> None:
         """Take the bones' poses, a dict of bone name to (4, 4) rest-to-world transform."""
@@ -218,6 +222,18 @@ class BoneContacts:
             found.append(HalfSpaces(planes.index[near], gap[near], planes.normal[near], source))
         return HalfSpaces(*map(np.concatenate, zip(*found)))
 
+    def lifted(self, points: Floats) -> Floats:
+        """Contact points (n, 3) to be shown: those that stay in a bone, as they overlapped it at
+        rest, are taken to its surface.
+        """
+        points = points.copy()
+        for row in np.flatnonzero(self._allowed.any(axis=1)):
+            some = np.flatnonzero(self._allowed[row] > 0.0)
+            for _ in range(LIFTS):
+                distance, way = self.distance_and_direction(points[some], row)
+                points[some] += np.maximum(-distance, 0.0)[:, None] * way
+        return points
+
     def _near(self, points: Floats, reach: float) -> list[int]:
         """Rows of the bones whose boxes are within ``reach`` of the box of points (n, 3)."""
         if len(points) == 0:
@@ -230,7 +246,7 @@ class BoneContacts:
 
     def _ask(self, row: int, points: Floats, reach: ArrayLike) -> tuple[Floats, Floats]:
         """Distances and directions of all free points; what is known of them is kept."""
-        field, memory = self.bones.fields[row], self._memories[row]
+        field, memory = self.bones.fields[row], self.memories[row]
         return field.distance_and_gradient(points, self.placed[row], reach=reach, memory=memory)
 
 

@@ -16,12 +16,11 @@ class Event:
     """Something a user should know: ``count`` points of a muscle at a bone, and what was done.
 
     ``action`` is ``"angle_flag"`` (the angle test found a crossing), ``"reported"`` (crossed, not
-    corrected), ``"halved"`` (the step), ``"held_back"`` (kept on its side of a
-    plane), ``"grazed"`` (crossed by the bone's field, by its triangles less than 0.1 mm deep),
+    corrected), ``"halved"`` (the step), ``"held_back"`` (kept on its side of a plane),
     ``"unresolved"`` (crossed all the same), ``"carried_stretched"``, ``"carried_held_end"`` or
     ``"carried_sheets"`` (no level set could be shown, so the surface is where the material is: it
     is stretched too far, an end is held inside the bone named, or sheets have met),
-    ``"overlap_kept"`` or ``"overlap_resolved"`` (at rest, before the first frame),
+    ``"overlap_kept"`` (at rest, before the first frame),
     ``"iteration_cap"`` (``count`` times a solve, a tendon's line or the shortest path of `bowing`
     ended at a greatest number of steps, without a bone), or, with no muscle, ``"bones_overlap"``
     (the motion drives two bones into each other) or ``"joint_opens"`` (those of a joint apart).

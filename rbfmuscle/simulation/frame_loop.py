@@ -16,10 +16,9 @@ from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
-from rbfmuscle.simulation.overlap import resolve_initial_overlap
 from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.sliding import Sliding, SlidingState
-from rbfmuscle.simulation.stepper import MuscleStepper, StepperState
+from rbfmuscle.simulation.stepper import MuscleStepper, StepperState, keep_initial_overlap
 from rbfmuscle.simulation.substeps import PoseCache
 
 Path = tuple[list[dict[str, float]], list[dict[str, float]]]
@@ -61,8 +60,6 @@ class FrameLoop:
     ------
     SceneError
         If muscles overlap bones at rest and the scene's ``initial`` is ``"error"``.
-    SolveError
-        If an overlap at rest cannot be solved.
     """
 
     def __init__(
@@ -90,7 +87,7 @@ class FrameLoop:
         self._wall = 0.0
         self._blas = ThreadpoolController().select(user_api="blas").lib_controllers
         with self.working():
-            each(resolve_initial_overlap, self.steppers)
+            each(keep_initial_overlap, self.steppers)
             self._sliding = None if scene.sliding is None else Sliding(scene, self.steppers)
 
     def snapshot(self) -> LoopState:

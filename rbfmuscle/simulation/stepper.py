@@ -30,13 +30,13 @@ from rbfmuscle.simulation.tunnelling import (
     Crossing,
     find_crossings,
     one_sided_planes,
-    only_grazed,
 )
 from rbfmuscle.validation import NotFiniteError, SceneError, SolveError
 
-# Depth [mm] below which a path through a bone counts as touching it; above the error of a bone's
-# field.
+# Depth [mm] below which a path through a bone counts as touching it.
 TOUCH = 0.1
+# Depth [mm] below which a muscle does not overlap a bone at rest.
+OVERLAP = 0.02
 # Rounds in which points that still cross at the smallest step are held by planes.
 FENCES = 4
 # Sub-steps are not halved below this angle [radian].
@@ -96,7 +96,7 @@ class MuscleStepper:
         self.scene = scene
         self.name = model.name
         self.poses = poses or PoseCache(scene)
-        self.detect = scene.detect.tunnelling if scene.detect is not None else None
+        self.detect = scene.detect.tunnelling
         self.tolerance = from_mm(TOUCH, scene.units)
         self.times: dict[str, float] = defaultdict(float)
         self.cost = (0.0, 0.0)
@@ -139,7 +139,7 @@ class MuscleStepper:
                 self.step(path)
 
     def step(self, path: Path) -> None:
-        """One sub-step, with the tunnelling test where the scene has one."""
+        """One sub-step, in which no point passes through a bone."""
         self.predict(path)
         self.correct()
 
@@ -147,7 +147,7 @@ class MuscleStepper:
         """First half of a sub-step: the bones move and the model predicts."""
         self._path = path
         self._shown = None
-        if self.detect is not None:
+        if self.detect.action != "off":
             self._saved = self.model.snapshot(), self.model.contact_points().copy()
         _follow_bones(self, path)
 
@@ -156,7 +156,7 @@ class MuscleStepper:
         path = self._path
         self.solve(path.after)
         self.solves += 1
-        if self.detect is not None:
+        if self.detect.action != "off":
             crossings = _crossings(self, path, self._saved[1])
             if crossings:
                 _correct(self, path, self._saved, crossings)
@@ -255,6 +255,28 @@ class MuscleStepper:
         self.unresolved = state.unresolved
 
 
+def keep_initial_overlap(stepper: MuscleStepper) -> None:
+    """Take what overlaps bones at rest, as these come from other sources than the muscle, for the
+    zero of the contact there; SceneError where the scene's ``[contact] initial`` is ``"error"``.
+    """
+    contacts, scene = stepper.contacts, stepper.scene
+    free = contacts.free
+    points = stepper.model.contact_points()[free]
+    for row, (bone, field) in enumerate(zip(contacts.bones.names, contacts.bones.fields)):
+        depth = np.zeros(len(free))
+        depth[free] = np.maximum(-field.distance(points, contacts.placed[row], reach=0.0), 0.0)
+        deep = depth > from_mm(OVERLAP, scene.units)
+        if not deep.any():
+            continue
+        if scene.contact.initial == "error":
+            raise SceneError(
+                f"muscle {stepper.name!r} overlaps bone {bone!r} at rest: {int(deep.sum())} "
+                f"points, {depth.max():.3g} {scene.units} deep; set [contact] initial to 'keep'"
+            )
+        contacts.allow(row, depth)
+        stepper.report(bone, int(deep.sum()), "overlap_kept")
+
+
 def _follow_bones(stepper: MuscleStepper, path: Path) -> None:
     """Move the bones, and let the model predict."""
     started = perf_counter()
@@ -268,7 +290,6 @@ def _crossings(
 ) -> list[Crossing]:
     """What crossed a bone on the way from contact points (n, 3) to the present ones."""
     started, contacts = perf_counter(), stepper.contacts
-    assert stepper.detect is not None
     found = find_crossings(
         contacts,
         start,
@@ -295,12 +316,11 @@ def _correct(
     crossings: Sequence[Crossing],
 ) -> None:
     """Halve the step, down to the smallest, and then hold points on their side by planes."""
-    scene, (state, start) = stepper.scene, saved
-    assert stepper.detect is not None
+    state = saved[0]
     if stepper.detect.action == "report":
         _report_all(stepper, crossings, "reported")
         return
-    if step_angle(scene, path.before, path.after) > 2.0 * SMALLEST_STEP and (
+    if step_angle(stepper.scene, path.before, path.after) > 2.0 * SMALLEST_STEP and (
         not stepper.unresolved
     ):
         _report_all(stepper, crossings, "halved")
@@ -311,10 +331,8 @@ def _correct(
         return
     for crossing in _held_back(stepper, path, saved, crossings):
         name = stepper.contacts.bones.names[crossing.bone]
-        paths, ends = (start, stepper.model.contact_points()), (path.old[name], path.new[name])
-        touched = only_grazed(crossing, scene.bone(name).mesh, paths, *ends, stepper.tolerance)
-        stepper.report(name, len(crossing.index), "grazed" if touched else "unresolved")
-        stepper.unresolved |= not touched
+        stepper.report(name, len(crossing.index), "unresolved")
+        stepper.unresolved = True
 
 
 def _held_back(

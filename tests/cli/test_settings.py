@@ -20,7 +20,7 @@ from rbfmuscle.scene.settings import HEADS
 # A value for every key, other than its default; model settings of quick muscles.
 PAIRS = [["biceps", "brachialis"]]
 TABLES = {
-    "contact": (options.ContactOptions, {"initial": "keep", "substep_angle": 4.0}),
+    "contact": (options.ContactOptions, {"initial": "error", "substep_angle": 4.0}),
     "sliding": (options.SlidingOptions, {"threshold": 1.5, "bones": True, "pairs": PAIRS}),
     "detect.tunnelling": (
         options.TunnellingOptions,

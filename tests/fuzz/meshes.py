@@ -134,7 +134,7 @@ def base_scene() -> dict:
         ],
         "motion": {"ramp": {"hip.flexion": {"from": 0.0, "to": 6.0, "step": 3.0}}},
         "muscle": [{"name": "muscle", "mesh": "muscle-ply.ply", "model": model, "attach": attach}],
-        "contact": {"initial": "resolve", "substep_angle": 3.0},
+        "contact": {"initial": "keep", "substep_angle": 3.0},
         "detect": {"tunnelling": {"angle": 135.0, "action": "substep"}},
         "output": {"report": False},
     }

@@ -220,7 +220,7 @@ class TestOptions:
         )
         assert other.muscles[0].mesh is scene.muscles[0].mesh
         assert (other.contact.substep_angle, scene.contact.substep_angle) == (1.0, 2.0)
-        assert other.detect.tunnelling.angle == 120.0 and scene.detect is None
+        assert (other.detect.tunnelling.angle, scene.detect.tunnelling.angle) == (120.0, None)
         assert other.muscles[0].options == {"centres": 10} and scene.muscles[0].options == {}
         assert len(other.motion) == 2 and len(scene.motion) == 4
 

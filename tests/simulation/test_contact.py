@@ -11,8 +11,7 @@ from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach, Planes
 from rbfmuscle.simulation.frame_loop import simulate_frames
-from rbfmuscle.simulation.overlap import resolve_initial_overlap
-from rbfmuscle.simulation.stepper import MuscleStepper
+from rbfmuscle.simulation.stepper import MuscleStepper, keep_initial_overlap
 
 
 def _points(count=400, seed=0):
@@ -128,13 +127,16 @@ def test_kept_overlap_is_no_contact_and_deeper_is():
     contacts = BoneContacts(BonesInReach(list(fields), list(fields.values())), model.attached_bone)
     stepper = MuscleStepper(model, contacts, made)
     points = model.contact_points().copy()
-    # The field of a bone holds single-precision numbers.
-    assert contacts.depth(points) == pytest.approx(2.0, abs=1e-5)
+    assert contacts.depth(points) == pytest.approx(2.0, abs=1e-9)
     held = BoneContacts(contacts.bones, np.zeros(len(points)))
     assert held.depth(points) == 0.0  # free points alone count
-    resolve_initial_overlap(stepper)
+    keep_initial_overlap(stepper)
     assert stepper.contacts.half_spaces(points, 0.5).gap.min() >= -1e-12
     assert stepper.contacts.half_spaces(points - [0, 0, 0.1], 0.5).gap.min() == pytest.approx(-0.1)
+    shown = contacts.lifted(points)
+    assert contacts.depth(shown) < 1e-9
+    inside = fields["plate"].distance(points) < 0.0
+    np.testing.assert_array_equal((shown != points).any(axis=1), inside & contacts.free)
     (frame,) = simulate_frames(made, [model], bone_sdfs=fields)
     assert [event.action for event in frame.events] == ["overlap_kept"]
     assert np.array_equal(model.contact_points(), model.rest)

@@ -26,10 +26,7 @@ from rbfmuscle.scene.toml_text import FORMAT, MAIN, attachment_file, table_text
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
 _TAIL = """[contact]
-initial = "resolve"   # muscles that start inside a bone are pushed out; or "keep", "error"
-
-[detect]
-tunnelling = { angle = 135, action = "substep" }   # points that pass through a bone in one step
+initial = "keep"   # muscles that start inside a bone stay there; or "error"
 """
 
 
