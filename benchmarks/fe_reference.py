@@ -23,7 +23,6 @@ from scipy.spatial import cKDTree
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.metrics.metrics import surface_distance
-from rbfmuscle.models import COMPARED
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.run import simulate
@@ -39,6 +38,7 @@ END = 0.5  # share of the largest section's area that the cube's end faces take
 CELLS = (40, 12, 8)
 FIBRE_NODES = 1200  # of the model's solid whose fibres a reinforced solid takes
 DATA = Path(__file__).resolve().parents[1] / "tests" / "data" / "fe_reference.npz"
+COMPARED = ("rbf", "pbd", "pbd-converged", "xpbd", "arap-pbd", "arap-volume")
 
 
 def solid_points(tube, cube):

@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rbfmuscle.experiments.comparison import Repeated, add_distances, measure_run, write_tables
-from rbfmuscle.experiments.comparison_table import Comparison, ScenesComparison
-from rbfmuscle.experiments.scenes_table import write_scenes
+from rbfmuscle.experiments.comparison_table import Comparison
 from rbfmuscle.experiments.sweep_run import threads_limited
 from rbfmuscle.folders import OutputFolder, given_folder
-from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.models import (
-    COMPARED,
     build_models,
     configure_scene,
     model_kind,
@@ -39,14 +36,7 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
 
 
-FILES = (
-    "comparison.json",
-    "comparison.csv",
-    "statistics.csv",
-    "comparison.tex",
-    "report.html",
-)
-SCENES_FILES = ("scenes.json", "scenes.csv", "scenes.tex", "report.html")
+FILES = ("comparison.json", "comparison.csv", "statistics.csv", "report.html")
 COARSER = 5  # the motion is repeated with frames this many times as far apart
 FINER = 4  # and its last pose with sub-steps this many times as short, which every model solves by
 ONE_THREAD = 5  # frames that are timed on one thread, the first of which does not count
@@ -55,7 +45,7 @@ ONE_THREAD = 5  # frames that are timed on one thread, the first of which does n
 def compare_models(
     scene: Scene | str | Path,
     directory: str | Path | None = None,
-    models: Sequence[str] = COMPARED,
+    models: Sequence[str] = ("rbf", "pbd"),
     *,
     frames: slice | str | None = None,
     settings: Mapping[str, object] | None = None,
@@ -143,76 +133,6 @@ def _compare(
     with stage("drawing pictures" if pictures else "writing the report"):
         write_page(folder, table, pictures=pictures)
     return table
-
-
-def compare_scenes(
-    scenes: Mapping[str, Scene],
-    directory: str | Path,
-    models: Sequence[str] = COMPARED,
-    *,
-    frames: slice | str | None = None,
-    settings: Mapping[str, object] | None = None,
-    pictures: bool = True,
-    progress: Callable[[str, int, int], object] | None = None,
-) -> ScenesComparison:
-    """Compare models on several scenes, and write means and the worst over the scenes.
-
-    Parameters
-    ----------
-    scenes : mapping of str to Scene
-        By name; the comparison of each is in a folder of this name.
-    directory : path
-        Takes ``scenes.json``, tables, ``report.html`` and the folders of the scenes.
-    models, frames, settings, pictures
-        As for `compare_models`.
-    progress : callable, optional
-        Called as ``progress("SCENE: MODEL", done, total)``.
-
-    Returns
-    -------
-    ScenesComparison
-        What ``scenes.json`` holds.
-
-    Raises
-    ------
-    UsageError, SolveError
-        As for `compare_models`; SolveError if no model could be solved on any scene.
-    """
-    folder = Path(directory)
-    output = OutputFolder(folder, "compare", SCENES_FILES)
-    for scene in scenes.values():
-        _variants(scene, list(models), settings or {}, frames)
-    output.clear()
-    output.add(*SCENES_FILES)
-    found, failed = {}, {}
-    for name, scene in scenes.items():
-
-        def advance(model, done, total, name=name):
-            if progress is not None:
-                progress(f"{name}: {model}", done, total)
-
-        try:
-            table = compare_models(
-                scene,
-                folder / name,
-                models,
-                frames=frames,
-                settings=settings,
-                pictures=pictures,
-                progress=advance,
-            )
-            found[name] = table
-            failed[name] = table.failed
-        except SolveError as error:
-            failed[name] = {ALL: str(error)}
-    if not found:
-        raise SolveError("; ".join(f"{name}: {each[ALL]}" for name, each in failed.items()))
-    whole = write_scenes(folder, found, failed)
-
-    from rbfmuscle.report.scenes_page import write_page
-
-    write_page(folder, whole)
-    return whole
 
 
 def _variants(scene, models, settings, frames):

@@ -76,8 +76,6 @@ _KINDS: dict[str, Callable[[], ModelKind]] = {
     "arap-pbd-converged": lambda: _mesh("arap-pbd", "arap-pbd, converged", CONVERGED),
     "arap-volume-converged": lambda: _mesh("arap-volume", "arap-volume, converged", CONVERGED),
 }
-# The default of `compare`.
-COMPARED = ("rbf", "pbd", "pbd-converged", "xpbd", "arap-pbd", "arap-volume")
 
 
 def register_model(name: str, kind: ModelKind) -> None:

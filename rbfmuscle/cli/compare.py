@@ -1,4 +1,4 @@
-"""``rbfmuscle compare``: models on one or several scenes."""
+"""``rbfmuscle compare``: models on one scene."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from rbfmuscle.cli.options import (
     FailOn,
     Frames,
     Output,
+    SceneName,
     Settings,
     Work,
-    named_scenes,
     split_list,
 )
 from rbfmuscle.cli.printing import print_result
@@ -18,41 +18,36 @@ from rbfmuscle.validation import LimitExceededError, SolveError
 
 
 def compare(
-    *scenes: str,
+    scene: SceneName,
+    *,
     output: Output,
-    models: str | None = None,
+    models: str = "rbf,pbd",
     settings: Settings = None,
     frames: Frames = None,
     fail_on: FailOn = None,
     pictures: bool = True,
     work: Work = USUAL_WORK,
 ) -> int:
-    """Run models on one or several scenes: the same motion, contacts and measures; tables, report,
-    pictures.
+    """Run models on a scene: the same motion, contacts and measures; tables, report, pictures.
 
-    Each model's run is in a folder of its own, for several scenes in a folder for each;
-    MODEL:KEY=VALUE is a setting for one model.
+    Each model's run is in a folder of its own; MODEL:KEY=VALUE is a setting for one model.
 
     Parameters
     ----------
-    scenes
-        Scene files (TOML), or "phantom" for a hip made by formulas.
     models
-        Models, separated by commas, for instance rbf,pbd; distances are measured to the first. By
-        default rbf, the mesh models and pbd-converged, which takes long: it sweeps until no vertex
-        moves.
+        Models, separated by commas; distances are measured to the first. Of others the
+        converged ones, as pbd-converged, take long: they sweep until no vertex moves.
     pictures
         Draw pictures and the animation.
     """
     from rbfmuscle import interruption
+    from rbfmuscle.compare import compare_models
     from rbfmuscle.metrics.summary import parse_limits
-    from rbfmuscle.models import COMPARED
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
 
-    chosen, changes = split_list(models) or list(COMPARED), parse_settings(settings)
-    opened = {name: open_scene(path) for name, path in named_scenes(scenes).items()}
-    limits = {name: parse_limits(fail_on, each) for name, each in opened.items()}
+    changes, opened = parse_settings(settings), open_scene(scene)
+    limits = parse_limits(fail_on, opened)
     kept = f"finished runs are kept in {output}"
     with (
         Progress("compare") as progress,
@@ -66,52 +61,17 @@ def compare(
             progress(done, total)
             interruption.check()
 
-        table = _compare(
+        table = compare_models(
             opened,
             output,
-            chosen,
+            split_list(models),
             frames=frames,
             settings=changes,
             pictures=pictures,
             progress=advance,
         )
-    return (_print_one if len(opened) == 1 else _print_scenes)(table, output, limits, work)
-
-
-def _compare(opened, output, models, **options):
-    from rbfmuscle.compare import compare_models, compare_scenes
-
-    if len(opened) > 1:
-        return compare_scenes(opened, output, models, **options)
-    (scene,) = opened.values()
-    return compare_models(scene, output, models, **options)
-
-
-def _print_one(table, output, limits, printing):
-    """Print a comparison on one scene, and what did not finish or is beyond limits."""
-    (limit,) = limits.values()
-    error = _failure(table.failed, output) or _excess(table.models, output, limit)
-    return print_result(printing, table.model_dump(), _table_lines(table, output), error=error)
-
-
-def _print_scenes(table, output, limits, printing):
-    """Print a comparison of several scenes, and what did not finish or is beyond limits."""
-    failed = {
-        f"{scene}, {model}": reason
-        for scene, reasons in table.failed.items()
-        for model, reason in reasons.items()
-    }
-    error = _failure(failed, output)
-    for scene in table.scenes:
-        beyond = _excess(table.models, output / scene, limits[scene])
-        if beyond is not None and error is None:
-            error = LimitExceededError(f"{scene}: {beyond}")
-    lines = [
-        *(f"{scene}: {answer}" for scene, answer in table.answers.items()),
-        table.answer,
-        f"{len(table.scenes)} scenes, in {output}, open {output / 'report.html'}",
-    ]
-    return print_result(printing, table.model_dump(), lines, error=error)
+    error = _failure(table.failed, output) or _excess(table.models, output, limits)
+    return print_result(work, table.model_dump(), _table_lines(table, output), error=error)
 
 
 def _failure(failed, output):

@@ -1,7 +1,6 @@
 """Models on one scene, measured alike: what each keeps, how far apart they are, what each costs."""
 
-import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,15 +11,13 @@ from rbfmuscle.experiments.comparison_table import (
     VALUE_COLUMNS,
     Comparison,
     MeasureFacts,
-    ScenesComparison,
     Spread,
     Values,
 )
 from rbfmuscle.experiments.measures import DEEPER, FROM_METRICS, MEASURES
-from rbfmuscle.folders import write_whole
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
-from rbfmuscle.metrics.summary import QuantityFacts, shown_number
+from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.output.run_data import RunData, moment_arm_coordinates
 from rbfmuscle.output.writer import machine, versions, write_csv, write_json
 from rbfmuscle.scene.scene import Scene
@@ -137,8 +134,7 @@ def write_tables(
     poses: list[int],
 ) -> Comparison:
     """Write ``comparison.json``, which is returned, ``comparison.csv``: values by model, muscle and
-    quantity, ``statistics.csv``: their means and standard deviations over the frames, and
-    ``comparison.tex``.
+    quantity, and ``statistics.csv``: their means and standard deviations over the frames.
 
     ``unknowns`` are the points that each model solves for, in words, by model and muscle.
     """
@@ -156,7 +152,15 @@ def write_tables(
         answer=describe(results, labels, scene.units, beyond),
         within={name: len(runs[name].muscles) - len(found[ALL]) for name, found in beyond.items()},
         unknowns={name: unknowns[name] for name in results},
-        measures=measure_facts(scene.units),
+        measures={
+            name: MeasureFacts(
+                unit=unit_text(m.kind, scene.units),
+                title=m.title,
+                against=m.against,
+                meaning=m.meaning,
+            )
+            for name, m in MEASURES.items()
+        },
         results=results,
         statistics={name: statistics(run) for name, run in runs.items()},
         machine=machine(),
@@ -165,7 +169,6 @@ def write_tables(
     write_json(folder / "comparison.json", table.model_dump())
     write_csv(folder / "comparison.csv", [VALUE_COLUMNS, *table.value_rows()])
     write_csv(folder / "statistics.csv", _statistics_rows(table))
-    write_whole(folder / "comparison.tex", latex(table))
     return table
 
 
@@ -176,49 +179,6 @@ def _statistics_rows(table: Comparison) -> Iterator[tuple[object, ...]]:
             for name, spread in quantities.items():
                 unit = unit_text(QUANTITIES[name.partition(":")[0]][0], table.units)
                 yield model, muscle, name, spread.mean, spread.sd, unit
-
-
-def measure_facts(units: str) -> dict[str, MeasureFacts]:
-    """Every measure with its unit where lengths are in ``units``."""
-    return {
-        name: MeasureFacts(
-            unit=unit_text(m.kind, units), title=m.title, against=m.against, meaning=m.meaning
-        )
-        for name, m in MEASURES.items()
-    }
-
-
-def latex(table: Comparison) -> str:
-    """The table of every measure over all muscles, as LaTeX."""
-    rows = {}
-    for quantity, measure in table.measures.items():
-        values = [table.results[name][ALL].get(quantity) for name in table.models]
-        if any(value is not None for value in values):
-            rows[quantity] = [shown_number(value, measure.unit) for value in values]
-    return latex_table(table, rows, "worst of muscles and frames")
-
-
-def latex_table(
-    table: Comparison | ScenesComparison, rows: Mapping[str, list[str]], about: str
-) -> str:
-    """A LaTeX table with a column for each model and a row of texts for each measure named."""
-    lines = [
-        f"% rbfmuscle {table.versions['rbfmuscle']}: {about}",
-        rf"\begin{{tabular}}{{ll{'r' * len(table.models)}}}",
-        _latex_cells(["", "against", *(table.labels[name] for name in table.models)]),
-        r"\hline",
-    ]
-    for quantity, texts in rows.items():
-        measure = table.measures[quantity]
-        lines.append(_latex_cells([measure.title, measure.against, *texts]))
-    return "\n".join([*lines, r"\end{tabular}", ""])
-
-
-def _latex_cells(texts: Iterable[str]) -> str:
-    escaped = (
-        re.sub(r"([%_&#$])", r"\\\1", text).replace("–", "--").replace("<", "$<$") for text in texts
-    )
-    return " & ".join(escaped) + r" \\"
 
 
 def _deepened(values: Mapping[str, float]) -> float:

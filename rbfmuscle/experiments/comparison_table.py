@@ -1,10 +1,8 @@
-"""What comparisons of models found, on one scene and on several."""
+"""What a comparison of models found."""
 
 from collections.abc import Iterator
 
 from pydantic import BaseModel
-
-from rbfmuscle.metrics.summary import shown_number
 
 VALUE_COLUMNS = ("model", "muscle", "quantity", "value", "unit", "against")
 
@@ -62,42 +60,3 @@ class Comparison(BaseModel):
                 for name, measure in self.measures.items():
                     if name in values:
                         yield model, muscle, name, values[name], measure.unit, measure.against
-
-
-class OverScenes(BaseModel):
-    """A measure of a model over scenes: mean and standard deviation of the values of each scene
-    (the worst of its muscles and frames), and the worst of them, in the scene named.
-    """
-
-    mean: float
-    sd: float
-    worst: float
-    scene: str
-
-
-class ScenesComparison(BaseModel):
-    """What ``scenes.json`` holds.
-
-    ``models`` are those that were solved on every scene that any model was solved on; ``answers``
-    are by scene, ``answer`` over all of them; ``failed`` says why, by scene and model, "all" for
-    all models; ``summary`` is by model and measure.
-    """
-
-    format: int
-    scenes: list[str]
-    models: list[str]
-    labels: dict[str, str]
-    answers: dict[str, str]
-    answer: str = ""
-    failed: dict[str, dict[str, str]]
-    measures: dict[str, MeasureFacts]
-    summary: dict[str, dict[str, OverScenes]]
-    versions: dict[str, str]
-
-    def text(self, model: str, quantity: str) -> str:
-        """Mean ± standard deviation with its unit, a dash where it is not known."""
-        found = self.summary[model].get(quantity)
-        unit = self.measures[quantity].unit
-        if found is None:
-            return shown_number(None, unit)
-        return f"{shown_number(found.mean, unit)} ± {shown_number(found.sd, unit)}"

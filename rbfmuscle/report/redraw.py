@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from rbfmuscle.experiments.comparison_table import Comparison, ScenesComparison
+from rbfmuscle.experiments.comparison_table import Comparison
 from rbfmuscle.experiments.kernel_rows import KernelFacts
 from rbfmuscle.experiments.sweep_table import SweepTable
 from rbfmuscle.folders import OutputFolder
@@ -11,7 +11,7 @@ from rbfmuscle.metrics.summary import Limits, Summary, parse_limits
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import PAGES, run_folder, write_json
-from rbfmuscle.report import comparison_page, kernel_page, scenes_page, sweep_page
+from rbfmuscle.report import comparison_page, kernel_page, sweep_page
 from rbfmuscle.report.report import write_report
 from rbfmuscle.report.verdict import describe_verdict, judge, require_limits
 from rbfmuscle.scene.scene import Scene
@@ -20,11 +20,10 @@ from rbfmuscle.validation import UsageError
 # What a study keeps, and its page.
 STUDIES = {
     "comparison.json": "report.html",
-    "scenes.json": "report.html",
     "kernels.json": "kernels.html",
     "sweep.json": "sweep.html",
 }
-COMMANDS = {"comparison.json": "compare", "scenes.json": "compare"}
+COMMANDS = {"comparison.json": "compare"}
 
 
 def redraw_run(
@@ -83,8 +82,6 @@ def redraw_study(
             if file == "comparison.json":
                 table = Comparison.model_validate(found)
                 comparison_page.write_page(directory, table, pictures=pictures)
-            elif file == "scenes.json":
-                scenes_page.write_page(directory, ScenesComparison.model_validate(found))
             elif file == "kernels.json":
                 kernel_page.write_page(directory, KernelFacts.model_validate(found))
             else:

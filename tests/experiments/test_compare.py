@@ -8,14 +8,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from blend_model import BlendMuscle, arm_files, arm_scene
+from blend_model import BlendMuscle, arm_scene
 
-from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.compare import compare_models
 from rbfmuscle.experiments.comparison_answer import best_models, describe
 from rbfmuscle.experiments.comparison_table import Comparison
 from rbfmuscle.experiments.measures import DEEPER, MEASURES
-from rbfmuscle.experiments.scenes_table import write_scenes
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.models import build_model
 from rbfmuscle.report.comparison_page import _values, shown
@@ -104,10 +102,6 @@ class TestComparison:
             assert (
                 float(row["value"]) == table.results[row["model"]][row["muscle"]][row["quantity"]]
             )
-        text = (folder / "comparison.tex").read_text(encoding="utf-8")
-        assert text.count(r" \\") == 1 + len(
-            table.results["rbf"]["all"] | table.results["pbd"]["all"]
-        )
         text = (folder / "report.html").read_text(encoding="utf-8")
         answer = html.escape(table.answer, quote=False)
         kept = {name: verdict_count(Run.load(folder / name)) for name in table.models}
@@ -187,66 +181,6 @@ def test_the_first_sentences_name_what_is_beyond_limits_and_differs():
     assert "Which shape is right this cannot say" in text
     same = describe(found | {"b": found["a"]}, {"a": "A", "b": "B"}, "mm", beyond)
     assert "self-crossings" not in same.partition("Worst values")[2]
-
-
-def one_scene(units, values):
-    """A comparison that holds depths beyond rest by model."""
-    return Comparison(
-        format=4,
-        scene="s",
-        units=units,
-        frames=1,
-        poses=[0],
-        models=list(values),
-        labels={name: name.upper() for name in values},
-        failed={},
-        answer="So it is.",
-        within=dict.fromkeys(values, 0),
-        unknowns={},
-        measures={DEEPER: {"unit": units, "title": "depth", "against": "law", "meaning": "deep"}},
-        results={name: {"all": {DEEPER: value}} for name, value in values.items()},
-        statistics={},
-        machine={},
-        versions={},
-    )
-
-
-class TestScenes:
-    def test_means_are_over_scenes_of_any_unit_and_models_that_all_have(self, tmp_path):
-        found = {
-            "one": one_scene("mm", {"rbf": 1.0, "pbd": 2.0}),
-            "two": one_scene("m", {"rbf": 0.003, "xpbd": 1.0}),
-        }
-        table = write_scenes(tmp_path, found, {"one": {}, "two": {"pbd": "planted"}})
-        assert table.models == ["rbf"] and table.failed == {"two": {"pbd": "planted"}}
-        depth = table.summary["rbf"][DEEPER]
-        assert depth.model_dump() == pytest.approx(
-            {"mean": 2.0, "sd": np.sqrt(2.0), "worst": 3.0, "scene": "two"}
-        )
-        assert "2 mm ± 1.41 mm" in table.answer
-        assert "2 mm ± 1.41 mm" in (tmp_path / "scenes.tex").read_text(encoding="utf-8")
-        rows = (tmp_path / "scenes.csv").read_text(encoding="utf-8").splitlines()
-        assert len(rows) == 5 and rows[1].startswith("one,rbf,all,") and ",m," in rows[3]
-
-    def test_command_compares_scenes_in_folders_of_their_names(self, tmp_path, capsys):
-        files = [arm_files(tmp_path, name, end=10) for name in ("arm.toml", "other.toml")]
-        out = tmp_path / "out"
-        words = ["compare", *map(str, files), "-o", str(out), "--models", "pbd,xpbd"]
-        words += ["--frames", "0:2", "--no-pictures"]
-        assert command(words) == 0
-        table = json.loads((out / "scenes.json").read_text(encoding="utf-8"))
-        assert table["scenes"] == ["arm", "other"] and table["models"] == ["pbd", "xpbd"]
-        inner = json.loads((out / "other" / "comparison.json").read_text(encoding="utf-8"))
-        worst = table["summary"]["pbd"]["volume_error"]
-        assert abs(worst["worst"]) >= abs(inner["results"]["pbd"]["all"]["volume_error"])
-        said = capsys.readouterr().out
-        assert table["answer"] in said and f"arm: {table['answers']['arm']}" in said
-        page = out / "report.html"
-        before = page.read_bytes()
-        page.unlink()
-        assert command(["report", str(out)]) == 0 and page.read_bytes() == before
-        assert command([*words, "--fail-on", "edge_strain_rms=1e-9"]) == 6
-        assert command([words[0], *words[3:]]) == 2
 
 
 class TestFailure:
