@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 
+from rbfmuscle.anatomy.bones import orient_scene
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import Lengths, frame_rows, joint_gaps, moment_arm_rows

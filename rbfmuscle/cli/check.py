@@ -83,7 +83,7 @@ def _more_lines(facts, units):
 
 
 def _findings(path):
-    from rbfmuscle.importers.guess.orientation import orient_scene
+    from rbfmuscle.anatomy.bones import orient_scene
     from rbfmuscle.models import check_models
     from rbfmuscle.scene.check import Finding, check_scene, sort_findings
     from rbfmuscle.scene.phantom import open_scene

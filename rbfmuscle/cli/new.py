@@ -39,8 +39,8 @@ def new(
     output
         Folder for scene.toml; the folder of the meshes by default.
     """
+    from rbfmuscle.anatomy.bones import HEADER
     from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
-    from rbfmuscle.importers.guess.orientation import HEADER
     from rbfmuscle.importers.labels.read import read_labels
     from rbfmuscle.scene.check import check_scene
 
@@ -170,7 +170,7 @@ def _write_surfaces(volume, stage):
     """Surfaces of all labels as PLY in ``meshes`` of a folder; that folder, vertices on caps by
     file, and notes.
     """
-    from rbfmuscle.importers.guess.names import name_facts
+    from rbfmuscle.anatomy.names import name_facts
     from rbfmuscle.importers.labels.surfaces import label_surface
     from rbfmuscle.progress import Progress
     from rbfmuscle.scene.names import new_name, plain_name

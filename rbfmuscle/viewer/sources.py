@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.anatomy.bones import orient_scene
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
-from rbfmuscle.importers.guess.orientation import orient_scene
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.models import build_models, configure_scene, model_names

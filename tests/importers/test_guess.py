@@ -15,16 +15,14 @@ from command_line import call
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from rbfmuscle.anatomy.bones import CONDYLE, HEADER, Part, find_orientation, fit_condyles
+from rbfmuscle.anatomy.names import name_facts
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.tubes import line_length, points_along, tube_mesh
 from rbfmuscle.importers.guess import landmarks
 from rbfmuscle.importers.guess.attachments import Ends
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
-from rbfmuscle.importers.guess.landmarks import CONDYLE, fit_condyles
-from rbfmuscle.importers.guess.names import name_facts
-from rbfmuscle.importers.guess.orientation import HEADER, find_orientation
-from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.run import Run
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.joints.tables import JointTable

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 import rbfmuscle as rm
-from rbfmuscle.importers.guess.orientation import orient_scene
+from rbfmuscle.anatomy.bones import orient_scene
 from rbfmuscle.output.appearance import VIEWS, motion_direction, view_axes
 from rbfmuscle.report.render import Solid, aim, draw_solids, fitted_size
 from rbfmuscle.run import Run, stream_run

@@ -7,15 +7,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.geometry.vectors import across, unit
-from rbfmuscle.importers.guess.landmarks import (
+from rbfmuscle.anatomy.bones import (
     Fit,
+    Orientation,
+    Part,
     fit_condyles,
     fit_dome,
+    shank_up,
     sole_direction,
 )
-from rbfmuscle.importers.guess.orientation import Orientation, shank_up
-from rbfmuscle.importers.guess.parts import Part
+from rbfmuscle.geometry.vectors import across, unit
 
 # Class of bone: its possible parents, the likeliest first, and the kind of joint between.
 PARENTS = {

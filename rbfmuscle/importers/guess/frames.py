@@ -8,11 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.anatomy.bones import Orientation, Part, fit_condyles, shank_up
 from rbfmuscle.geometry.vectors import across, unit
 from rbfmuscle.importers.guess.anatomy import JointGuess
-from rbfmuscle.importers.guess.landmarks import fit_condyles
-from rbfmuscle.importers.guess.orientation import Orientation, shank_up
-from rbfmuscle.importers.guess.parts import Part
 
 PELVIS = ("pelvis", "ilium", "ischium", "pubis")
 FEET = ("talus", "calcaneus", "foot")

@@ -8,13 +8,13 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from rbfmuscle.anatomy.bones import Orientation, Part, find_orientation
 from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
 from rbfmuscle.importers.guess.attachments import FEWEST, MuscleGuess, guess_attachments
 from rbfmuscle.importers.guess.frames import bone_frames
 from rbfmuscle.importers.guess.joints import guess_joints
-from rbfmuscle.importers.guess.orientation import Orientation, find_orientation
-from rbfmuscle.importers.guess.parts import Part, Parts, read_parts
+from rbfmuscle.importers.guess.parts import Parts, read_parts
 from rbfmuscle.importers.guess.skeleton import Skeleton
 from rbfmuscle.importers.guess.tendons import unused_tendons
 from rbfmuscle.scene.articular import articular_points

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.anatomy.bones import HEAD, Fit, Orientation, Part, fit_coaxial, fit_sphere
 from rbfmuscle.importers.guess.anatomy import (
     JOINTS,
     PARENTS,
@@ -20,9 +21,6 @@ from rbfmuscle.importers.guess.anatomy import (
     make_anatomical,
     set_rest,
 )
-from rbfmuscle.importers.guess.landmarks import HEAD, Fit, fit_coaxial, fit_sphere
-from rbfmuscle.importers.guess.orientation import Orientation
-from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.importers.guess.patella import place_patellae
 
 BAND = 8.0  # width [mm] beyond the least gap within which faces face each other

@@ -2,15 +2,12 @@
 
 import os
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-from scipy.spatial import cKDTree
-
+from rbfmuscle.anatomy.bones import Part
+from rbfmuscle.anatomy.names import name_facts
 from rbfmuscle.geometry.coarse import clustered
-from rbfmuscle.importers.guess.names import MuscleFacts, name_facts
 from rbfmuscle.scene.extents import LARGEST_MM, SMALLEST_MM
 from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES, read_file
 from rbfmuscle.scene.meshes.read import prepare_mesh
@@ -19,7 +16,7 @@ from rbfmuscle.scene.objects import MM_PER_UNIT, from_mm
 from rbfmuscle.validation import MeshError, UsageError
 
 if TYPE_CHECKING:
-    import trimesh
+    pass
 
 # Folders below the one that is given, as people sort their meshes.
 FOLDERS = {"bones": "bone", "bone": "bone", "knochen": "bone", "os": "bone"}
@@ -29,61 +26,8 @@ FOLDERS |= {"tendons": "tendon", "tendon": "tendon", "sehnen": "tendon"}
 # large adult.
 LENGTHS = {"femur": (200, 600), "tibia": (150, 500), "humerus": (120, 420), "pelvis": (100, 450)}
 LARGEST_BONE = (90, 900)
-# Meshes of more triangles are made coarser, to about as many; fits take their points from no fewer.
-MOST_TRIANGLES, FEWEST = 400_000, 3000
-
-
-@dataclass(eq=False)
-class Part:
-    """One mesh and what it is taken for."""
-
-    name: str  # in the scene
-    file: str  # path as the scene file gives it
-    read: Any  # ReadMesh, of a bone of a scene Bone; muscles need the map of its vertices
-    kind: str = ""  # class of bone, empty where the name says none
-    side: str = ""  # "l", "r" or empty
-    doubt: str = ""  # what speaks for a bone or a muscle where the name does not
-    facts: MuscleFacts | None = None
-    tendon_of: tuple[str, ...] = ()  # muscles of which it is a tendon by its name
-    coarse: bool = False  # whether the mesh was made coarser than its file
-    # Directions of a femur, a Frame of `landmarks`, which imports this module.
-    frame: Any = None
-
-    @property
-    def mesh(self) -> "trimesh.Trimesh":
-        """The mended mesh, trimesh.Trimesh [scene unit]."""
-        return self.read.mesh
-
-    def may_be_beside(self, other: "Part") -> bool:
-        """Whether it may be of the same side of the body as another."""
-        return not self.side or not other.side or self.side == other.side
-
-    @property
-    def size(self) -> float:
-        """Diagonal of its box [scene unit]."""
-        return float(np.linalg.norm(self.mesh.extents))
-
-    @cached_property
-    def points(self) -> np.ndarray:
-        """Vertices (n, 3)."""
-        return np.asarray(self.mesh.vertices, dtype=np.float64)
-
-    @cached_property
-    def faces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Middles, normals and areas of the triangles; those of a coarse mesh are divided."""
-        mesh = self.mesh
-        while len(mesh.faces) < FEWEST:
-            mesh = mesh.subdivide()
-        return (
-            np.array(mesh.triangles_center),
-            np.array(mesh.face_normals),
-            np.array(mesh.area_faces),
-        )
-
-    @cached_property
-    def tree(self) -> cKDTree:
-        """Tree over the middles of the faces."""
-        return cKDTree(self.faces[0])
+# Meshes of more triangles are made coarser, to about as many.
+MOST_TRIANGLES = 400_000
 
 
 @dataclass

@@ -10,9 +10,9 @@ the knee's axis: forwards, and i times downwards.
 
 import numpy as np
 
+from rbfmuscle.anatomy.bones import fit_sphere
 from rbfmuscle.geometry.vectors import across, unit
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
-from rbfmuscle.importers.guess.landmarks import fit_sphere
 
 FLEXIONS = tuple(
     range(0, 131, 10)

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.anatomy.bones import Part
 from rbfmuscle.geometry.vectors import unit
 from rbfmuscle.importers.guess.frames import PELVIS, BoneFrame
-from rbfmuscle.importers.guess.parts import Part
 
 STEPS = 20  # points along a leg of a site's line
 ASIDE = 0.005  # what is nearer to an articular surface than this, in sizes of the bone, is of it

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.anatomy.bones import Part
 from rbfmuscle.importers.guess.anatomy import JointGuess
 from rbfmuscle.importers.guess.frames import BoneFrame
-from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.importers.guess.sites import Site, find_site
 from rbfmuscle.scene.bone import Bone
 

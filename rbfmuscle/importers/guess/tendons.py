@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rbfmuscle.anatomy.bones import Part
 from rbfmuscle.importers.guess.ends import edge_graph, geodesic
-from rbfmuscle.importers.guess.parts import Part
 from rbfmuscle.importers.guess.sites import Anatomy, Site, sites_on
 from rbfmuscle.importers.guess.skeleton import Skeleton
 

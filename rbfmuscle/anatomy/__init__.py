@@ -1,0 +1,1 @@
+"""What names and shapes of bones say of a body."""
