@@ -64,8 +64,7 @@ class ViewerPage:
     """A scene or saved runs in a browser; a notebook shows it where it is the value of a cell.
 
     ``at`` are controls that begin elsewhere than at rest, ``colour`` is of `COLOURINGS`, ``served``
-    is what `open_server` returned, called where not given. A browser opens the ``address``, which
-    holds a secret token.
+    is what `open_server` returned, called where not given. A browser opens the ``address``.
     """
 
     def __init__(

@@ -1,22 +1,17 @@
-"""The page in a real browser, and the gate before its server."""
+"""The page in a real browser, and the address of its server."""
 
-import http.client
 import shutil
 import socket
 import sys
-from contextlib import nullcontext
 from unittest.mock import Mock
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 from browser import Browser, wait_for
-from websockets.exceptions import InvalidStatus
-from websockets.sync.client import connect
 
 import rbfmuscle as rm
 from rbfmuscle.viewer.page import ViewerPage
-from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.sources import LiveSource
 
 FRAME, FLEXION = 0, 1  # sliders in their order
@@ -173,69 +168,6 @@ def test_unexpected_error_is_one_line_and_the_page_goes_on(page):
     wait_for(lambda: page.panel.controls["hip.flexion"].value == 0 and arrived(page), SLOW)
 
 
-def status(page, path, host=None):
-    place = urlsplit(page.address).netloc
-    client = http.client.HTTPConnection(place, timeout=20)
-    client.request("GET", path, headers={"Host": host or place})
-    try:
-        return client.getresponse().status
-    finally:
-        client.close()
-
-
-def test_page_is_given_for_the_token_and_the_own_host_name_alone(page):
-    right = urlsplit(page.address).path
-    assert status(page, right) == 200
-    for wrong in ("/", "/index.html", right[:-2] + "/", right.replace("/", "/x", 1), "/?" + right):
-        assert status(page, wrong) == 403
-    port = urlsplit(page.address).port
-    assert status(page, right, f"localhost:{port}") == 200
-    assert status(page, right, f"rebound.example:{port}") == 403
-
-
-@pytest.mark.parametrize(
-    ("origin", "path", "opens"),
-    [
-        ("own", "right", True),
-        ("own", "wrong", False),
-        ("http://evil.example", "right", False),
-        ("null", "right", False),
-        (None, "right", False),
-    ],
-)
-def test_websocket_opens_for_the_own_page_alone(page, origin, path, opens):
-    import viser
-
-    parts = urlsplit(page.address)
-    origin = f"http://{parts.netloc}" if origin == "own" else origin
-    target = f"ws://{parts.netloc}{parts.path.rstrip('/')}{'' if path == 'right' else 'x'}"
-
-    asked = {"origin": origin, "subprotocols": [f"viser-v{viser.__version__}"]}
-    refused = nullcontext() if opens else pytest.raises(InvalidStatus, match="403")
-    with refused, connect(target, **asked) as socket:
-        assert socket.recv(timeout=20)
-
-
-def test_other_websocket_servers_of_the_process_are_not_gated(page):
-    """While ours starts, too: the function that starts them is never another."""
-    import websockets.asyncio.server as module
-    from viser import infra
-
-    seen = []
-    plain = module.serve
-    start = infra.WebsockServer.start
-
-    def watched(self):
-        start(self)
-        seen.append(module.serve)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(infra.WebsockServer, "start", watched)
-        server, _ = open_server()
-        server.stop()
-    assert seen == [plain] and module.serve is plain
-
-
 @pytest.mark.skipif(
     not sys.platform.startswith("linux"), reason="other systems have one loopback address"
 )
@@ -245,7 +177,7 @@ def test_server_listens_on_one_address(page):
 
 
 def test_notebook_shows_a_scene_and_a_run():
-    shown = rm.simulate(rm.phantom_scene(end=0.0, spacing=6.0), model="pbd").show()
+    shown = rm.show(rm.simulate(rm.phantom_scene(end=0.0, spacing=6.0), model="pbd"))
     try:
         assert f'<iframe src="{shown.address}"' in shown._repr_html_()
         names = {muscle.name for muscle in rm.phantom_scene().muscles}
