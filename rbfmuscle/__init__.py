@@ -5,11 +5,8 @@ Public names are loaded when first used, so that ``import rbfmuscle`` stays ligh
 
 from __future__ import annotations
 
-import html
 import importlib
 from typing import TYPE_CHECKING
-
-from rbfmuscle import showing
 
 if TYPE_CHECKING:
     from rbfmuscle.accuracy import discretisation_error as discretisation_error
@@ -82,27 +79,3 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
-
-
-def _show(shown: Scene | Run, *, model: str | None = None) -> showing.ShownPage:
-    from rbfmuscle.viewer.page import show
-
-    return show(shown, model=model)
-
-
-def _picture(shown: Scene | Run) -> str:
-    """HTML of a picture of a scene or a run, or of its text where there is nothing to draw."""
-    from rbfmuscle.importers.guess.orientation import orient_scene
-    from rbfmuscle.report.render import figure_html, render_run
-    from rbfmuscle.report.scene_picture import draw_scene
-    from rbfmuscle.scene.scene import Scene
-
-    if isinstance(shown, Scene) and shown.bones:
-        oriented = orient_scene(shown.with_options())
-        return figure_html(lambda file: draw_scene(oriented, file), repr(shown))
-    if not isinstance(shown, Scene) and shown.has_surfaces:
-        return figure_html(lambda file: render_run(shown, file), f"{shown!r} {shown.verdict}")
-    return html.escape(repr(shown))
-
-
-showing.registered[:] = [showing.Views(_show, _picture)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -20,7 +21,6 @@ from rbfmuscle.progress import Progress
 from rbfmuscle.recording import MemorySink, Recording
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.showing import Displayed
 from rbfmuscle.simulation.frame import Frame
 from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError, did_you_mean
 
@@ -139,7 +139,7 @@ def stream_run(
     return recording.finish(writer, pictures=pictures)
 
 
-class Run(RunData, Displayed):
+class Run(RunData):
     """A run: what `simulate` returns, and what `Run.load` reads from a folder.
 
     Attributes are those of `RunData`, and:
@@ -229,6 +229,14 @@ class Run(RunData, Displayed):
         """
         names = [formats] if isinstance(formats, str) else list(formats)
         return export_run(self, names, output=directory, units=units, muscles=muscles)
+
+    def _repr_html_(self) -> str:
+        """A picture for a notebook, or text where there is nothing to draw."""
+        from rbfmuscle.report.render import figure_html, render_run
+
+        if not self.has_surfaces:
+            return html.escape(repr(self))
+        return figure_html(lambda file: render_run(self, file), f"{self!r} {self.verdict}")
 
     def _write(self, directory):
         writer = RunWriter(directory, self.scene)

@@ -34,12 +34,11 @@ from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
 from rbfmuscle.scene.save import SceneFiles
 from rbfmuscle.scene.settings import TABLES, change_settings
 from rbfmuscle.scene.toml_text import FORMAT
-from rbfmuscle.showing import Displayed
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
 
 @dataclass(eq=False, repr=False)
-class Scene(Displayed):
+class Scene:
     """Bones, joints, muscles, a motion and the settings of a simulation.
 
     Examples

@@ -174,7 +174,6 @@ def test_plot_shows_every_value(run):
 
 
 def test_notebooks_show_a_small_picture(run, loaded):
-    for shown in (run.scene, run, loaded):
+    for shown in (run, loaded):
         html = shown._repr_html_()
         assert html.startswith("<figure><img ") and len(html) < 100_000 and "abductor" in html
-    assert "no muscles" in rm.Scene("bare")._repr_html_()
