@@ -15,11 +15,18 @@ from command_line import call
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.anatomy.bones import CONDYLE, HEADER, Part, find_orientation, fit_condyles
+from rbfmuscle.anatomy.bones import (
+    CONDYLE,
+    HEADER,
+    UNSETTLED,
+    Part,
+    find_orientation,
+    fit_coaxial,
+    fit_condyles,
+)
 from rbfmuscle.anatomy.names import name_facts
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.tubes import line_length, points_along, tube_mesh
-from rbfmuscle.importers.guess import landmarks
 from rbfmuscle.importers.guess.attachments import Ends
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
@@ -250,14 +257,14 @@ def test_a_condyle_larger_than_anatomy_has_is_refused_and_named(leg, millimetre)
 def test_a_fit_that_does_not_settle_is_refused(leg, monkeypatch, cap):
     bones, _ = _leg_bones(leg, np.eye(4))
     find_orientation(bones)
-    monkeypatch.setattr(landmarks, cap, 2)
+    monkeypatch.setattr(f"rbfmuscle.anatomy.bones.{cap}", 2)
     if cap == "AXIS_ROUNDS":
         fit = fit_condyles(bones[1], bones[1].frame, 1.0)
     else:
         points, _, areas = bones[1].faces
         middle = points.mean(axis=0)
-        fit = landmarks.fit_coaxial([(points, areas)], middle, np.eye(3)[0], np.array([9.0]), 0.5)
-    assert fit.wrong == landmarks.UNSETTLED
+        fit = fit_coaxial([(points, areas)], middle, np.eye(3)[0], np.array([9.0]), 0.5)
+    assert fit.wrong == UNSETTLED
 
 
 def test_patella_follows_the_table_that_was_computed_for_the_leg(leg):
