@@ -24,9 +24,9 @@ import numpy as np
 from evidence import data_folder, write_evidence
 from leg_tendons import convert
 
-from rbfmuscle.fibres.published import published_band
 from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.metrics.centreline import NODES, shortest_path
+from rbfmuscle.metrics.published import published_band
 from rbfmuscle.run import simulate
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene

@@ -21,7 +21,7 @@ sys.path.insert(0, str(ROOT))
 
 import numpy as np  # noqa: E402
 
-from rbfmuscle.fibres.published import published_band  # noqa: E402
+from rbfmuscle.metrics.published import published_band  # noqa: E402
 from rbfmuscle.metrics.quantities import QUANTITIES  # noqa: E402
 from rbfmuscle.metrics.summary import LIMITS, LOWER_BOUNDS  # noqa: E402
 from rbfmuscle.output.appearance import MUSCLE_COLOURS  # noqa: E402

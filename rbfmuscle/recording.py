@@ -12,6 +12,7 @@ from rbfmuscle.anatomy.bones import orient_scene
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.metrics.doubts import measured_doubts
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import Lengths, frame_rows, joint_gaps, moment_arm_rows
@@ -23,12 +24,11 @@ from rbfmuscle.metrics.summary import (
     Table,
     parse_limits,
 )
+from rbfmuscle.metrics.verdict import Verdict, describe_verdict, judge, require_limits
 from rbfmuscle.models import build_models, configure_scene, kernel_names
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.writer import RunWriter, build_info, frame_facts
 from rbfmuscle.progress import stage
-from rbfmuscle.report.doubts import measured_doubts
-from rbfmuscle.report.verdict import Verdict, describe_verdict, judge, require_limits
 from rbfmuscle.scene.check import (
     bone_collisions,
     bone_findings,

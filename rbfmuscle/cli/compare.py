@@ -85,8 +85,8 @@ def _failure(failed, output):
 def _excess(models, output, limits):
     """The error that a run is beyond a limit of ``--fail-on``; None where none is."""
     from rbfmuscle.metrics.summary import Summary
+    from rbfmuscle.metrics.verdict import require_limits
     from rbfmuscle.output.run_data import RunData
-    from rbfmuscle.report.verdict import require_limits
 
     texts = []
     for name in models if limits.fail_on else ():

@@ -5,14 +5,14 @@ from pathlib import Path
 from textwrap import fill, shorten
 
 from rbfmuscle.metrics.summary import LIMITS, Summary
-from rbfmuscle.output.run_data import RunData
-from rbfmuscle.report.verdict import (
+from rbfmuscle.metrics.verdict import (
     describe_doubts,
     describe_excess,
     describe_unmeasured,
     find_remedy,
     worst_first,
 )
+from rbfmuscle.output.run_data import RunData
 from rbfmuscle.scene.phantom import PHANTOM
 
 MOST = 3  # values beyond limits, and remedies, that are named

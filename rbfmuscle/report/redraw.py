@@ -8,12 +8,12 @@ from rbfmuscle.experiments.kernel_rows import KernelFacts
 from rbfmuscle.experiments.sweep_table import SweepTable
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import Limits, Summary, parse_limits
+from rbfmuscle.metrics.verdict import describe_verdict, judge, require_limits
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import PAGES, run_folder, write_json
 from rbfmuscle.report import comparison_page, kernel_page, sweep_page
 from rbfmuscle.report.report import write_report
-from rbfmuscle.report.verdict import describe_verdict, judge, require_limits
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import UsageError
 

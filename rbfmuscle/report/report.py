@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.fibres.published import published_band
 from rbfmuscle.geometry.threads import each
+from rbfmuscle.metrics.published import published_band
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import (
     COUNTS,
@@ -24,6 +24,7 @@ from rbfmuscle.metrics.summary import (
     muscle_limit,
     shown_number,
 )
+from rbfmuscle.metrics.verdict import Verdict, describe_details, describe_unmeasured
 from rbfmuscle.output.animation.page import pack_runs
 from rbfmuscle.output.animation.parts import read_animation
 from rbfmuscle.output.run_data import RunData, moment_arm_coordinates
@@ -40,7 +41,6 @@ from rbfmuscle.report.page import (
 )
 from rbfmuscle.report.plots import Band, Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.report.render import chosen_frames, render_run
-from rbfmuscle.report.verdict import Verdict, describe_details, describe_unmeasured
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.simulation.frame import Event
 

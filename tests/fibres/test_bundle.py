@@ -10,9 +10,9 @@ import trimesh
 from toy_scene import held
 
 import rbfmuscle as rm
-from rbfmuscle.fibres.published import published_band
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.tubes import line_length
+from rbfmuscle.metrics.published import published_band
 from rbfmuscle.output.appearance import stretch_colours
 from rbfmuscle.validation import SceneError, UsageError
 from rbfmuscle.viewer.sources import SavedSource

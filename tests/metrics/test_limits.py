@@ -20,9 +20,9 @@ from rbfmuscle.metrics.summary import (
     parse_limits,
     unmeasured,
 )
+from rbfmuscle.metrics.verdict import describe_verdict, judge
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.report.report import write_report
-from rbfmuscle.report.verdict import describe_verdict, judge
 from rbfmuscle.run import Run, simulate, stream_run
 from rbfmuscle.scene.check import check_scene, stated_doubts
 from rbfmuscle.scene.guesses import Guess

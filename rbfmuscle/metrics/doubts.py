@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rbfmuscle.fibres.published import published_band
+from rbfmuscle.metrics.published import published_band
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import ROUGH
 from rbfmuscle.metrics.summary import Doubt, Table, shown_number

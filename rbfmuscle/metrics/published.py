@@ -38,7 +38,7 @@ class _Table(TypedDict):
 
 @cache
 def _table() -> "_Table":
-    text = (files("rbfmuscle.fibres") / "published.json").read_text(encoding="utf-8")
+    text = (files("rbfmuscle.metrics") / "published.json").read_text(encoding="utf-8")
     found: _Table = json.loads(text)
     return found
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from rbfmuscle.fibres.published import published_band
+from rbfmuscle.metrics.doubts import measured_doubts
+from rbfmuscle.metrics.published import published_band
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import Summary
-from rbfmuscle.report.doubts import measured_doubts
 from rbfmuscle.scene.phantom import phantom_scene
 
 FLEXION = "hip.flexion"
