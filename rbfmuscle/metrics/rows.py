@@ -152,7 +152,7 @@ def _roughness(
         _second_differences(angles[order], np.array([found[arm.frame] for arm in arms])[order])
         for found in (lengths, paths)
     )
-    allowed = np.nanmax(of_path)
+    allowed = of_path[np.isfinite(of_path)].max(initial=0.0)
     found = []
     for place, length, shortest in zip(order, of_length, of_path):
         if math.isfinite(length):

@@ -438,6 +438,10 @@ def test_roughness_is_the_second_difference_over_two_degrees_beyond_that_of_the_
     where, worst = max(by_name["roughness_beyond_path"], key=lambda row: row[1])
     assert 21.5 <= where <= 26.5 and worst == pytest.approx(0.12 + 1.0 - 0.04, abs=1e-9)
     assert min(a for a, _ in by_name["length_roughness"]) == 12.0
+    # Of a path that is not known nothing is allowed.
+    alone = _roughness(arms, lengths, dict.fromkeys(paths, np.nan))
+    beyond = [row.value for row in alone if row.quantity == "roughness_beyond_path"]
+    assert max(beyond) == pytest.approx(0.12 + 1.0)
 
 
 def test_the_sign_of_a_moment_arm_is_judged_where_attachments_are_guessed():
