@@ -29,6 +29,8 @@ BROKEN_FILE = (
 class RBFMuscleError(Exception):
     """Base of the errors meant for users: one line that names file, object, value and remedy.
 
+    ``muscle`` is the name of the muscle that cannot be used, where it is one of a scene.
+
     Examples
     --------
     >>> issubclass(SceneError, RBFMuscleError), SceneError.exit_code
@@ -36,6 +38,7 @@ class RBFMuscleError(Exception):
     """
 
     exit_code = 1
+    muscle: str = ""
 
 
 class UsageError(RBFMuscleError, ValueError):

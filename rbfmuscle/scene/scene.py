@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Self
@@ -112,7 +113,9 @@ class Scene:
             if scene.muscles or not skeleton:
                 require_complete(scene)
         except (SceneError, MeshError) as error:
-            raise type(error)(f"{path}: {error}") from None
+            found = type(error)(f"{path}: {error}")
+            found.muscle = error.muscle
+            raise found from None
         return scene
 
     def save(self, path: str | Path, *, folder: Path | None = None, comment: str = "") -> Path:
@@ -346,8 +349,19 @@ def require_complete(scene: Scene) -> Scene:
     check_file_names(scene.bones, scene.muscles)
     check_coordinates(scene.motion, scene.joints)
     for muscle in scene.muscles:
-        check_muscle(muscle, scene.motion)
+        with _naming(muscle.name):
+            check_muscle(muscle, scene.motion)
     return scene
+
+
+@contextmanager
+def _naming(muscle: str) -> Iterator[None]:
+    """Give an error that is raised inside the name of a muscle."""
+    try:
+        yield
+    except (SceneError, MeshError) as error:
+        error.muscle = muscle
+        raise
 
 
 def _made_motion(scene: Scene, options: MotionOptions) -> Motion:
@@ -367,9 +381,10 @@ def _add_rows(scene: Scene, tables: SceneFile) -> None:
     for coupling in tables.coupling:
         scene.add_coupling(make_coupling(coupling, scene.joints))
     for muscle in tables.muscle:
-        read = read_mesh(muscle.mesh, name=muscle.name, transform=muscle)
-        check_place(muscle.name, read, scene.bones, scene.units)
-        scene.add_muscle(**{**given_keys(muscle), "mesh": read})
+        with _naming(muscle.name):
+            read = read_mesh(muscle.mesh, name=muscle.name, transform=muscle)
+            check_place(muscle.name, read, scene.bones, scene.units)
+            scene.add_muscle(**{**given_keys(muscle), "mesh": read})
 
 
 def _settings(scene: Scene) -> dict[str, Table | None]:

@@ -199,16 +199,13 @@ def _check_runs(guess, path):
 
 
 def _leave_out(guess, error, final):
-    """Mark the muscle that an error names, or whose file it names, as wrong; an error that names
-    none is raised. ``final`` gives the final names of staged files in a text.
+    """Mark the muscle that an error is about as wrong; an error about none is raised. ``final``
+    gives the final names of staged files in a text.
     """
-    text, usable = str(error), [muscle for muscle in guess.muscles if not muscle.wrong]
-    found = [muscle for muscle in usable if repr(muscle.muscle.name) in text]
-    # A file's name may be the end of another's.
-    found += sorted((m for m in usable if m.muscle.file in text), key=lambda m: -len(m.muscle.file))
-    if not found:
+    found = [muscle for muscle in guess.muscles if muscle.muscle.name == error.muscle]
+    if not found or found[0].wrong:
         raise error
-    found[0].wrong, found[0].confidence = final(text), 0.0
+    found[0].wrong, found[0].confidence = final(str(error)), 0.0
 
 
 def _scene_text(guess: SceneGuess, stage: str = "") -> str:
