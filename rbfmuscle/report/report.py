@@ -18,6 +18,7 @@ from rbfmuscle.metrics.summary import (
     LOWER_BOUNDS,
     Limits,
     QuantityFacts,
+    Summary,
     exceeded,
     limit_ratio,
     meets_limit,
@@ -141,7 +142,10 @@ def _page(saved: RunData) -> ReportPage:
     answer, details = info.outcome, []
     if complete:
         verdict = Verdict(answer, info.beyond, info.not_measured, info.doubts)
-        details = describe_details(verdict, info.muscles, info.scene.missing_bones, MOST_DOUBTS)
+        summary = Summary()  # with what is measured of the bones
+        summary.add(saved.metrics)
+        table = summary.table()
+        details = describe_details(verdict, table, info.scene.missing_bones, MOST_DOUBTS)
     else:
         answer = f"the run ended early ({info.status}): {info.message or ''}"
     terms = [(name, text) for name, (_, text) in QUANTITIES.items()]

@@ -257,6 +257,16 @@ def test_an_end_that_is_stated_to_lie_away_from_its_bone_is_a_doubt(monkeypatch,
     assert stated_doubts(scene) == []  # it counts
 
 
+def test_a_report_names_what_is_wrong_with_the_bones(monkeypatch, tmp_path):
+    use_blend_model(monkeypatch)
+    scene = arm_scene(end=10)
+    scene.missing_bones = ["patella"]
+    stream_run(scene, tmp_path, pictures=False)
+    write_report(tmp_path, pictures=False)
+    page = (tmp_path / "report.html").read_text()
+    assert "bones left out (patella) 1 at frame 0 (limit 0)" in page
+
+
 def test_rest_is_measured_whatever_frames_are_asked_for(monkeypatch, tmp_path):
     use_blend_model(monkeypatch)
     rest = ("rest_error_rms", "rest_error_max", "initial_overlap", "end_gap", "bowing_at_rest")
