@@ -27,25 +27,21 @@ class _State:
     as_json = False
 
 
-def install(*, as_json: bool = False, watch: bool = False) -> None:
+def install(*, as_json: bool = False) -> None:
     """Let SIGINT and SIGTERM end the process with 130, with the error as JSON on standard output
     where ``as_json``.
 
-    With ``watch`` a thread listens too: Python's own handlers wait until compiled code of the main
-    thread returns.
+    A thread listens too: Python's own handlers wait until compiled code of the main thread returns.
     """
-    _State.asked = False
-    _State.kept = None
     _State.as_json = as_json
     _answer_by(_handle)
-    if watch:
-        reader, writer = socket.socketpair()  # a pipe cannot be made non-blocking on Windows
-        writer.setblocking(False)
-        signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
-        threading.Thread(target=_listen, args=(reader,), daemon=True).start()
-        # The first of all that is registered is the last that is called: signals are ignored while
-        # Python exits.
-        atexit.register(_answer_by, signal.SIG_IGN)
+    reader, writer = socket.socketpair()  # a pipe cannot be made non-blocking on Windows
+    writer.setblocking(False)
+    signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
+    threading.Thread(target=_listen, args=(reader,), daemon=True).start()
+    # The first of all that is registered is the last that is called: signals are ignored while
+    # Python exits.
+    atexit.register(_answer_by, signal.SIG_IGN)
 
 
 @contextlib.contextmanager

@@ -47,11 +47,17 @@ for title, commands in GROUPS.items():
         app.command(command, group=group)
 
 
-def run_command(arguments: list[str]) -> int:
-    """Run one command and return the exit code; errors are one line."""
+def report_in_lines() -> None:
+    """Let unexpected errors, warnings and records of logs be one line each, in the whole
+    process.
+    """
     sys.excepthook = _report_bug
     warnings.showwarning = _show_warning
     logging.lastResort = _LogLines(logging.WARNING)
+
+
+def run_command(arguments: list[str]) -> int:
+    """Run one command and return the exit code; errors are one line."""
     if sys.stdout is None:
         return _fail(
             "standard output is closed; send it to a file, or to /dev/null", UsageError.exit_code

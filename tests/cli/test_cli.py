@@ -206,7 +206,8 @@ class TestErrors:
             "import rbfmuscle.scene.scene as s, sys\n"
             "def load(path, **options): raise ZeroDivisionError('planted')\n"
             "s.Scene.load = load\n"
-            "from rbfmuscle.cli import main\nmain(['check', 'x.toml'])"
+            "sys.argv = ['rbfmuscle', 'check', 'x.toml']\n"
+            "from rbfmuscle.cli import main\nmain()"
         )
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         assert done.returncode == 1

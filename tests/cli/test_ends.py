@@ -3,11 +3,15 @@ kill."""
 
 import gc
 import json
+import logging
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import threading
+import warnings
 
 import numpy as np
 import pytest
@@ -96,6 +100,40 @@ cli.main()
         )
         assert done.returncode == 130 and done.stderr == "rbfmuscle: interrupted\n"
         assert json.loads(done.stdout) == {"error": "interrupted", "exit_code": 130}
+
+
+class TestCallersInPython:
+    def test_handlers_of_the_caller_stay(self, tmp_path, capsys):
+        def handlers():
+            signals = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)]
+            return [*signals, sys.excepthook, warnings.showwarning, logging.lastResort]
+
+        before = handlers()
+        code, _, err = call(capsys, "check", tmp_path / "none.toml")
+        assert code == 3 and "no such scene file" in err
+        assert handlers() == before
+
+    def test_any_thread_may_call(self, tmp_path, capsys):
+        ends = []
+        worker = threading.Thread(
+            target=lambda: ends.append(call(capsys, "check", tmp_path / "none.toml")[0])
+        )
+        worker.start()
+        worker.join()
+        assert ends == [3]
+
+    def test_an_interrupt_is_an_exit_code_and_leaves_the_caller_alive(self, tmp_path):
+        code = (
+            "import os, signal, rbfmuscle.cli as cli\n"
+            "import rbfmuscle.scene.file as m\n"
+            "m.read_scene_file = lambda path: os.kill(os.getpid(), signal.SIGINT)\n"
+            "try:\n    cli.main(['check', 'a.toml'])\n"
+            "except SystemExit as end:\n    print('alive', end.code)\n"
+            "try:\n    os.kill(os.getpid(), signal.SIGINT)\n"
+            "except KeyboardInterrupt:\n    print('mine')\n"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (0, "alive 130\nmine\n"), done.stderr
 
 
 class TestOutputs:

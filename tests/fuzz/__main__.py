@@ -111,9 +111,10 @@ def read(path: Path, *, may_be_open: bool) -> int:
 
 def run(path: Path, output: Path, model: str | None) -> int:
     """Three frames by the command line itself, and a look at what it left."""
-    from rbfmuscle.cli.app import run_command
+    from rbfmuscle.cli.app import report_in_lines, run_command
     from rbfmuscle.run import Run
 
+    report_in_lines()
     words = ["run", str(path), "-o", str(output), "--frames", "0:3", "--json"]
     shown = os.dup(1)
     with open(output.parent / "stdout.txt", "wb") as file:
