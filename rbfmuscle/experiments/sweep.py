@@ -2,22 +2,19 @@
 each.
 """
 
-import hashlib
 import itertools
-import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from rbfmuscle.output.writer import versions
-from rbfmuscle.scene.record import record_scene
+from rbfmuscle.scene.content import content_hash
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_value
 from rbfmuscle.validation import UsageError
 
 # Values of each setting that is varied.
 Grid = Mapping[str, Sequence[object]]
-_FILES = ("file", "mesh", "output")  # keys of what says where a scene lies and what it writes
 
 # Of these keys the reference takes the greatest value of the grid, or the least; of all others the
 # scene's own.
@@ -119,30 +116,9 @@ def _model_first(settings):
 
 def scene_content(scene: Scene, frames: str | None = None) -> str:
     """Hash of what a scene would simulate, wherever its files lie, and of the library's version."""
-    facts = _without_files(record_scene(scene))
-    ends = [muscle.attachments for muscle in scene.muscles]
-    held = [
-        [(a.bone, a.vertices.tolist(), a.tendon and a.tendon.model_dump()) for a in end]
-        for end in ends
-    ]
-    fibres = [[line.tolist() for line in muscle.fibres or []] for muscle in scene.muscles]
-    track = [sorted(frame.items()) for frame in scene.motion.frames]
-    version = versions()["rbfmuscle"]
-    return _hash([facts, held, fibres, track, str(frames or ""), version])
-
-
-def _without_files(facts: object) -> object:
-    """Facts of a scene without names of files, and without what it writes."""
-    if isinstance(facts, dict):
-        left = {key: value for key, value in facts.items() if key not in _FILES}
-        return {key: _without_files(value) for key, value in left.items()}
-    return [_without_files(value) for value in facts] if isinstance(facts, list) else facts
+    return content_hash(scene, str(frames or ""), versions()["rbfmuscle"])
 
 
 def point_key(content: str, settings: Mapping[str, object]) -> str:
     """Key of a point: 16 hexadecimal digits."""
-    return _hash([content, sorted(settings.items())])[:16]
-
-
-def _hash(facts):
-    return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
+    return content_hash(content, settings)[:16]

@@ -10,6 +10,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.solids import SolidDistance
+from rbfmuscle.scene.content import Compared
 from rbfmuscle.validation import check_mesh
 
 if TYPE_CHECKING:
@@ -27,9 +28,11 @@ class BoneDistance(SolidDistance):
         self.bounds = np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
 
-@dataclass
-class Bone:
+@dataclass(eq=False)
+class Bone(Compared):
     """A rigid body: its mesh (outward, rest pose), where it came from, what was mended."""
+
+    not_compared = ("source",)
 
     name: str
     mesh: trimesh.Trimesh = field(repr=False)

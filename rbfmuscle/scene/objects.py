@@ -11,6 +11,7 @@ from pydantic import Field
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.scene.activation.keys import ContractionTable
+from rbfmuscle.scene.content import Compared
 from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.scene.options import MotionOptions, Table, Vector
 from rbfmuscle.scene.tendons import TendonEnd
@@ -43,8 +44,8 @@ class LineTable(Table):
     via: list[Vector | ViaTable] = Field(default_factory=list)
 
 
-@dataclass
-class Attachment:
+@dataclass(eq=False)
+class Attachment(Compared):
     """Vertices (n,) of a muscle's mesh that move with a bone.
 
     ``tendon`` joins them to it where they end short of it. ``attachment_frame`` is the name,
@@ -68,8 +69,8 @@ class Attachment:
         return [self.bone, *(point.bone for point in via if isinstance(point, ViaTable))]
 
 
-@dataclass
-class Muscle:
+@dataclass(eq=False)
+class Muscle(Compared):
     """A closed surface (outward, rest pose) held by bones, and the model that moves it.
 
     ``contraction`` holds the keys of a muscle that contracts, None for any other; ``tendons`` are
@@ -77,6 +78,8 @@ class Muscle:
     of the origin and of the insertion, between which its fibres run. ``given`` is the mesh of the
     file, where it is another one than ``mesh`` or has texture coordinates or normals.
     """
+
+    not_compared = ("source", "tendons")  # tendons follow from the attachments and the joints
 
     name: str
     mesh: trimesh.Trimesh = field(repr=False)
@@ -93,7 +96,7 @@ class Muscle:
 
 
 @dataclass(eq=False)
-class Motion:
+class Motion(Compared):
     """The frames of a motion, each a dict of "joint.coordinate" -> value [radian or scene unit];
     absent ones rest.
     """

@@ -12,6 +12,7 @@ from typing import Self
 from numpy.typing import ArrayLike
 
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.content import Compared
 from rbfmuscle.scene.extents import check_centre, check_place, check_size
 from rbfmuscle.scene.file import ABOUT, SceneFile, given_keys, read_scene_file
 from rbfmuscle.scene.frames import check_coordinates, make_motion, slice_motion
@@ -39,8 +40,10 @@ from rbfmuscle.validation import MeshError, SceneError, UsageError
 
 
 @dataclass(eq=False, repr=False)
-class Scene:
+class Scene(Compared):
     """Bones, joints, muscles, a motion and the settings of a simulation.
+
+    Two are equal where all that they hold is, wherever their files lie.
 
     Examples
     --------
@@ -50,6 +53,8 @@ class Scene:
     >>> [bone.name for bone in scene.bones]
     ['upper']
     """
+
+    not_compared = ("path",)
 
     name: str = "scene"
     _: KW_ONLY

@@ -33,7 +33,7 @@ class Event:
     action: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ModelSurface:
     """A closed, outward surface and its quantities."""
 
@@ -78,7 +78,7 @@ class FibreLines(NamedTuple):
         return np.linalg.norm(np.diff(self.points, axis=1), axis=2).sum(axis=1)
 
 
-@dataclass
+@dataclass(eq=False)
 class Frame:
     """One written frame."""
 

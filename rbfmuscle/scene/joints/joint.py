@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple, Self, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbfmuscle.scene.content import Compared
 from rbfmuscle.scene.joints.functions import Function, Linear
 from rbfmuscle.validation import SceneError
 
@@ -93,8 +94,8 @@ class TransformAxis:
         return self.function(*(values[name] for name in self.coordinates))
 
 
-@dataclass
-class Joint:
+@dataclass(eq=False)
+class Joint(Compared):
     """Moves ``child`` (and all that hangs on it) against ``parent``; all is in the scene's
     coordinates at rest.
     """

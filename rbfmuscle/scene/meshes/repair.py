@@ -33,7 +33,7 @@ LEAST_KEPT = 1000  # triangles: smaller meshes are mended as fast as the cache i
 CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are dropped
 
 
-@dataclass
+@dataclass(eq=False)
 class ReadMesh:
     """A mesh as read and mended."""
 

@@ -1,0 +1,61 @@
+"""What a scene and its parts hold, compared and hashed: every field but where files lie."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from pydantic import BaseModel
+
+from rbfmuscle.geometry.surfaces import mesh_hash
+
+
+class Compared:
+    """Parts of a scene are equal where all their fields are, but those that are ``not_compared``:
+    where a file lies, and what follows from the other fields.
+    """
+
+    not_compared: ClassVar[tuple[str, ...]] = ()
+
+    def __eq__(self, other: object) -> bool:
+        return content(self) == content(other) if type(other) is type(self) else NotImplemented
+
+    __hash__ = None
+
+
+def content(value: object) -> object:
+    """A value as plain data that JSON can hold; arrays and meshes by their hashes, and no names of
+    files.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, str | int | float):
+        return value
+    if isinstance(value, Path):
+        return "file"
+    if isinstance(value, np.ndarray):
+        numbers = np.ascontiguousarray(value, dtype=np.float64) + 0.0  # no -0
+        return [list(value.shape), hashlib.sha256(numbers.tobytes()).hexdigest()]
+    if isinstance(value, Mapping):
+        return {key: content(item) for key, item in value.items()}
+    if isinstance(value, Sequence):
+        return [content(item) for item in value]
+    if isinstance(value, BaseModel):
+        names = type(value).model_fields
+        return {"": type(value).__name__, **{name: content(getattr(value, name)) for name in names}}
+    if is_dataclass(value):
+        left = value.not_compared if isinstance(value, Compared) else ()
+        names = [each.name for each in fields(value) if each.name not in left]
+        return {"": type(value).__name__, **{name: content(getattr(value, name)) for name in names}}
+    return mesh_hash(value.vertices, value.faces)
+
+
+def content_hash(*values: object) -> str:
+    """SHA-256 of the content of values."""
+    text = json.dumps(content(values), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
