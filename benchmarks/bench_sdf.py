@@ -14,7 +14,6 @@ import time
 from pathlib import Path
 
 import igl
-import numba
 import numpy as np
 import trimesh
 from evidence import write_evidence
@@ -24,6 +23,7 @@ from peers.spline import SplineField
 
 from rbfmuscle.bones.mesh import points_near
 from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.geometry.threads import thread_count, threads_limited
 
 PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
 # Points for accuracy, for speed, and for the slow exact tools.
@@ -47,13 +47,9 @@ def least(function, repeats=3):
 
 
 def on_one_thread(function, repeats=3):
-    """Least time of a call [s] with numba on one thread."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
+    """Least time of a call [s] on one thread."""
+    with threads_limited(1):
         return least(function, repeats)[0]
-    finally:
-        numba.set_num_threads(before)
 
 
 def judge(points, vertices, faces):
@@ -121,8 +117,7 @@ def bone_table(name, mesh):
     """All fields and detectors on one bone."""
     vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
     print(
-        f"\n{name}: {len(vertices)} vertices, {len(faces)} faces, {numba.get_num_threads()} "
-        "threads to build"
+        f"\n{name}: {len(vertices)} vertices, {len(faces)} faces, {thread_count()} threads to build"
     )
     print(
         f"{'':22s} {'build':>7s} {'memory':>7s} {'value':>7s} {'+grad':>7s} {'sorted':>7s} "

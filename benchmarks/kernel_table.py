@@ -17,7 +17,7 @@ import trimesh
 from evidence import write_evidence
 
 from rbfmuscle.experiments.kernel_study import VOLUME_BOUND, ReferenceSurface, measure_row
-from rbfmuscle.experiments.sweep_run import threads_limited
+from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.kernels.table import KERNELS
 from rbfmuscle.implicit.placement.sampling import sample_surface

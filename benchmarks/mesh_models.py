@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from evidence import write_evidence
 
-from rbfmuscle.experiments.sweep_run import threads_limited
+from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.models import build_models
 from rbfmuscle.scene.phantom import phantom_scene

@@ -11,8 +11,8 @@ import numpy as np
 
 from rbfmuscle.experiments.comparison import Repeated, add_distances, measure_run, write_tables
 from rbfmuscle.experiments.comparison_table import Comparison
-from rbfmuscle.experiments.sweep_run import threads_limited
 from rbfmuscle.folders import OutputFolder, given_folder
+from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.models import (
     build_models,
     configure_scene,

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from functools import cache
 from typing import NamedTuple
 
-from rbfmuscle.geometry.threads import each
+from rbfmuscle.geometry.threads import blas_limited, each
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.options import Table
 from rbfmuscle.scene.scene import Scene
@@ -147,9 +147,7 @@ def kernel_names(scene: Scene) -> dict[str, str]:
 
 def build_models(scene: Scene) -> list[MuscleModel]:
     """Return the models of a scene's muscles, in the scene's order, built side by side."""
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1, user_api="blas"):
+    with blas_limited(1):
         return each(lambda muscle: build_model(muscle, scene), scene.muscles)
 
 

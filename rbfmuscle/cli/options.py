@@ -86,7 +86,7 @@ class Work(Printing):
             return nullcontext()
         if self.jobs < 1:
             raise UsageError(f"--jobs must be 1 or more, got {self.jobs}")
-        from rbfmuscle.experiments.sweep_run import threads_limited
+        from rbfmuscle.geometry.threads import threads_limited
 
         return threads_limited(self.jobs)
 

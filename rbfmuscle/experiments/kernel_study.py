@@ -15,12 +15,12 @@ import numpy as np
 
 from rbfmuscle.experiments.front import pareto_front
 from rbfmuscle.experiments.kernel_rows import KernelRow, recommend
-from rbfmuscle.experiments.sweep_run import OnProgress, threads_limited
+from rbfmuscle.experiments.sweep_run import OnProgress
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.rest_frame import principal_axes
 from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, vertex_areas
-from rbfmuscle.geometry.threads import each
+from rbfmuscle.geometry.threads import blas_limited, each, threads_limited
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
 from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
@@ -236,8 +236,6 @@ def _measure_all(
     progress: OnProgress | None,
 ) -> list[Measured]:
     """What the rows of calls found, in their order, measured side by side on threads."""
-    from threadpoolctl import threadpool_limits
-
     lock, done = threading.Lock(), []
 
     def measure(call: tuple[SurfaceSample, Kernel]) -> Measured:
@@ -249,7 +247,7 @@ def _measure_all(
         return found
 
     # Filters of warnings belong to all threads: what each row sets is undone here.
-    with warnings.catch_warnings(), threadpool_limits(1, user_api="blas"):
+    with warnings.catch_warnings(), blas_limited(1):
         warnings.simplefilter("ignore", NumericalWarning)
         return each(measure, calls)
 

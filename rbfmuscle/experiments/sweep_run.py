@@ -8,7 +8,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
@@ -18,6 +18,7 @@ from rbfmuscle.experiments.front import WORST, mark_front
 from rbfmuscle.experiments.sweep import SweepPoint
 from rbfmuscle.experiments.sweep_table import SweepRow, SweepTable
 from rbfmuscle.folders import OutputFolder
+from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.metrics.summary import QuantityFacts, Table
@@ -275,21 +276,6 @@ def _errors(shown: Mapping[str, Mesh], path: Path) -> dict[str, float | None]:
         "error_rms": math.sqrt(np.mean(found[:, 0] ** 2)),
         "error_max": float(found[:, 1].max()),
     }
-
-
-@contextmanager
-def threads_limited(count: int) -> Iterator[None]:
-    """Context in which loops and BLAS use so many threads."""
-    import numba
-    from threadpoolctl import threadpool_limits
-
-    before = numba.get_num_threads()
-    numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))
-    try:
-        with threadpool_limits(count):
-            yield
-    finally:
-        numba.set_num_threads(before)
 
 
 def sweep_rows(

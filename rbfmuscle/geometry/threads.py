@@ -2,36 +2,93 @@
 the lock.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import lru_cache
 from heapq import heapify, heappop, heappush
 from itertools import pairwise
-from threading import Lock
+from threading import Lock, local
 from typing import TypeVar
 
-import numba
+from numba import config
+from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 # Fewer points than this a thread cost more to hand over than to do.
 LEAST_SHARE = 1024
+_own = local()  # of each thread: how many it may split its work over
+_blas_lock = Lock()
+_blas_limits: list[int] = []  # of all that are inside `blas_limited` now, in any thread
+_blas_before: list[int] = []  # threads of each library outside
+
+
+def thread_count() -> int:
+    """Threads that the calling thread may split its work over: as many as cores, or as
+    NUMBA_NUM_THREADS says, unless inside `threads_limited`.
+    """
+    return getattr(_own, "count", config.NUMBA_NUM_THREADS)
+
+
+@contextmanager
+def threads_limited(count: int) -> Iterator[None]:
+    """Context in which work of the calling thread, and BLAS, use at most so many threads."""
+    before = thread_count()
+    _own.count = max(1, min(count, config.NUMBA_NUM_THREADS))
+    try:
+        with blas_limited(count):
+            yield
+    finally:
+        _own.count = before
+
+
+@contextmanager
+def blas_limited(count: int) -> Iterator[None]:
+    """Context in which BLAS uses at most so many threads.
+
+    Its number belongs to the whole process: of several threads inside, the least counts, and the
+    last that leaves restores the number of before.
+    """
+    with _blas_lock:
+        if not _blas_limits:
+            _blas_before[:] = [library.num_threads for library in _blas()]
+        _blas_limits.append(count)
+        _limit_blas()
+    try:
+        yield
+    finally:
+        with _blas_lock:
+            _blas_limits.remove(count)
+            _limit_blas()
+
+
+def _limit_blas():
+    for library, before in zip(_blas(), _blas_before):
+        library.set_num_threads(min([before, *_blas_limits]))
+
+
+@lru_cache(maxsize=1)
+def _blas():
+    import scipy.linalg  # noqa: F401 - SciPy brings a BLAS of its own, found once it is loaded
+
+    return ThreadpoolController().select(user_api="blas").lib_controllers
 
 
 @lru_cache(maxsize=4)
 def _pool(workers: int) -> ThreadPoolExecutor:
     # What runs in these threads has one of them: a loop inside that splits itself stays serial.
     return ThreadPoolExecutor(
-        workers, thread_name_prefix="rbfmuscle", initializer=numba.set_num_threads, initargs=(1,)
+        workers, thread_name_prefix="rbfmuscle", initializer=setattr, initargs=(_own, "count", 1)
     )
 
 
 def each(act: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """``[act(item) for item in items]``, on at most ``numba.get_num_threads()`` threads.
+    """``[act(item) for item in items]``, on at most `thread_count` threads.
 
     An error is raised once no item is being worked on any more.
     """
-    workers = min(numba.get_num_threads(), len(items))
+    workers = min(thread_count(), len(items))
     if workers < 2:
         return [act(item) for item in items]
     futures = [_pool(workers).submit(act, item) for item in items]
@@ -80,20 +137,16 @@ def in_stages(
                 begun.add(number)
                 heappush(ready, (-costs[number][1], number))
 
-    each(work, range(min(numba.get_num_threads(), len(items))))
+    each(work, range(min(thread_count(), len(items))))
     return [results[number] for number in range(len(items))]
 
 
 def in_chunks(count: int, work: Callable[[int, int], object], *, least: int = LEAST_SHARE) -> None:
-    """Call ``work(start, stop)`` over the range of ``count``, on at most
-    ``numba.get_num_threads()`` threads.
+    """Call ``work(start, stop)`` over the range of ``count``, on at most `thread_count` threads.
 
-    The number of threads is the caller's own (numba keeps it for each thread), so what already runs
-    in parallel sets it to one and stays serial here.
+    The number of threads is the caller's own, so what already runs in parallel stays serial here.
     """
-    # Small questions are asked by the dozen in a frame, and asking for the number of threads takes
-    # longer than they do.
-    workers = min(numba.get_num_threads(), count // least) if count >= 2 * least else 1
+    workers = min(thread_count(), count // least)
     if workers < 2:
         work(0, count)
         return

@@ -19,7 +19,7 @@ from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.folders import OutputFolder, write_whole
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import simplified
-from rbfmuscle.geometry.threads import each
+from rbfmuscle.geometry.threads import each, thread_count
 from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import QuantityFacts
@@ -312,15 +312,13 @@ def versions() -> dict[str, str]:
 
 def machine() -> dict[str, object]:
     """What the times belong to."""
-    import numba
-
     return {
         "system": platform.platform(),
         "processor": platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0))
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
-        "threads": numba.get_num_threads(),
+        "threads": thread_count(),
     }
 
 

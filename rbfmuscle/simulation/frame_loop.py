@@ -5,10 +5,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from threadpoolctl import ThreadpoolController
-
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.threads import each, in_stages
+from rbfmuscle.geometry.threads import blas_limited, each, in_stages
 from rbfmuscle.scene.activation.contraction import Activations
 from rbfmuscle.scene.motion import completed, rest_coordinates
 from rbfmuscle.scene.scene import Scene
@@ -85,7 +83,6 @@ class FrameLoop:
                 stepper.rigid_transport = RigidTransport(scene.muscle(stepper.name), scene)
         self._next_index = 0
         self._wall = 0.0
-        self._blas = ThreadpoolController().select(user_api="blas").lib_controllers
         with self.working():
             each(keep_initial_overlap, self.steppers)
             self._sliding = None if scene.sliding is None else Sliding(scene, self.steppers)
@@ -170,14 +167,10 @@ class FrameLoop:
         More would spin and take the cores from the loops, and results would depend on their number.
         """
         start = time.perf_counter()
-        before = [library.num_threads for library in self._blas]
         try:
-            for library in self._blas:
-                library.set_num_threads(1)
-            yield
+            with blas_limited(1):
+                yield
         finally:
-            for library, threads in zip(self._blas, before):
-                library.set_num_threads(threads)
             self._wall += time.perf_counter() - start
 
     def _number(self, place: int) -> int:

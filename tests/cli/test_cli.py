@@ -6,7 +6,6 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-import numba
 import numpy as np
 import pytest
 import trimesh
@@ -17,6 +16,7 @@ import rbfmuscle as rm
 from rbfmuscle.cli.app import GROUPS
 from rbfmuscle.cli.check import _measure_time
 from rbfmuscle.cli.options import Work
+from rbfmuscle.geometry.threads import thread_count
 from rbfmuscle.scene.check import check_extents
 from rbfmuscle.validation import MeshError
 
@@ -268,7 +268,7 @@ class TestOtherCommands:
 
     def test_jobs_are_threads(self):
         with Work(jobs=1).threads():
-            assert numba.get_num_threads() == 1
+            assert thread_count() == 1
 
     def test_help_lists_the_commands_in_four_groups(self, capsys):
         assert call(capsys)[0] == 2

@@ -4,7 +4,6 @@ import json
 import tomllib
 import warnings
 
-import numba
 import numpy as np
 import pytest
 import trimesh
@@ -24,6 +23,7 @@ from rbfmuscle.experiments.kernel_study import ReferenceSurface
 from rbfmuscle.experiments.wanted_error import STEP, reach_error
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import mesh_hash
+from rbfmuscle.geometry.threads import thread_count, threads_limited
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN
@@ -96,13 +96,13 @@ def test_a_study_on_several_threads_is_that_of_one():
     ball = trimesh.creation.icosphere(3, 10.0).apply_scale([2.0, 1.0, 1.0])
     asked = {"kernels": ["cubic", "quintic", "gaussian"], "centres": [30, 50], "resolution": 24}
     rows = {}
-    threads = numba.get_num_threads()
+    threads = thread_count()
     filters = list(warnings.filters)
     for count in (1, threads):
-        numba.set_num_threads(count)
-        rows[count] = {
-            (row.kernel, row.centres): row for row in rm.study_kernels(ball, **asked).rows
-        }
+        with threads_limited(count):
+            rows[count] = {
+                (row.kernel, row.centres): row for row in rm.study_kernels(ball, **asked).rows
+            }
     assert warnings.filters == filters
     for key, row in rows[1].items():
         same = rows[threads][key]

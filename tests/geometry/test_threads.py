@@ -1,21 +1,27 @@
 """Work shared by a few threads."""
 
+import subprocess
+import sys
 import threading
 
-import numba
 import pytest
+from threadpoolctl import threadpool_info
 
-from rbfmuscle.geometry.threads import in_stages
+from rbfmuscle.geometry.threads import (
+    blas_limited,
+    each,
+    in_stages,
+    thread_count,
+    threads_limited,
+)
 
 
 @pytest.fixture(params=[1, 2])
 def threads(request):
-    before = numba.get_num_threads()
-    if request.param > before:
+    if request.param > thread_count():
         pytest.skip("one processor")
-    numba.set_num_threads(request.param)
-    yield request.param
-    numba.set_num_threads(before)
+    with threads_limited(request.param):
+        yield request.param
 
 
 def test_the_second_stage_of_an_item_follows_its_first(threads):
@@ -31,22 +37,18 @@ def test_the_second_stage_of_an_item_follows_its_first(threads):
 
 def test_what_has_most_left_to_do_goes_first():
     order = []
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
+    with threads_limited(1):
         in_stages(
             lambda item: order.append((1, item)),
             lambda item: order.append((2, item)),
             "abc",
             [(1.0, 2.0), (5.0, 4.0), (1.0, 4.5)],
         )
-    finally:
-        numba.set_num_threads(before)
     assert order == [(1, "b"), (1, "c"), (2, "c"), (2, "b"), (1, "a"), (2, "a")]
 
 
 def test_two_threads_draw_one_item_while_another_is_solved():
-    if numba.get_num_threads() < 2:
+    if thread_count() < 2:
         pytest.skip("one processor")
     solving, drawn = threading.Event(), threading.Event()
 
@@ -70,3 +72,56 @@ def test_an_error_is_raised_when_nothing_is_being_worked_on(threads):
 
     with pytest.raises(ValueError, match="third"):
         in_stages(lambda item: None, second, range(20), [(1.0, 1.0)] * 20)
+
+
+def _blas_threads():
+    return [one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"]
+
+
+def test_blas_has_its_threads_again_when_the_last_of_several_runs_ends():
+    before = _blas_threads()
+    first_in, second_in, first_out = (threading.Event() for _ in range(3))
+    seen = []
+
+    def first():
+        with blas_limited(1):
+            first_in.set()
+            assert second_in.wait(60.0)
+        first_out.set()
+
+    def second():
+        assert first_in.wait(60.0)
+        with blas_limited(1):
+            second_in.set()
+            assert first_out.wait(60.0)
+            seen.append(_blas_threads())
+
+    workers = [threading.Thread(target=act) for act in (first, second)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert set(seen[0]) == {1} and _blas_threads() == before
+
+
+def test_threads_are_limited_for_the_thread_that_asks_and_for_what_it_starts():
+    with threads_limited(1):
+        assert thread_count() == 1
+        counts = []
+        other = threading.Thread(target=lambda: counts.append(thread_count()))
+        other.start()
+        other.join()
+    assert counts == [thread_count()]
+    if thread_count() > 1:
+        assert set(each(lambda item: thread_count(), range(8))) == {1}
+
+
+def test_work_in_threads_starts_none_of_numbas_own():
+    code = (
+        "import threading, time\nfrom rbfmuscle.geometry.threads import each\n"
+        "each(lambda item: time.sleep(0.1), range(2))\n"
+        "import os\n"
+        "from numba.np.ufunc import parallel\nprint(parallel._is_initialized)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "False", done.stderr

@@ -4,7 +4,6 @@ import warnings
 from types import SimpleNamespace
 
 import igl
-import numba
 import numpy as np
 import pytest
 import trimesh
@@ -12,6 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import rbfmuscle as rm
+from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
 from rbfmuscle.models import build_model, build_models
 from rbfmuscle.muscle import placement
@@ -285,13 +285,10 @@ def test_muscles_on_two_threads_are_those_of_one_and_report_their_convergence():
     scene = phantom_scene()
     scene.set_motion(ramp=ramp(12, 0, 0, step=6))
     scene.muscles = scene.muscles[:2]
-    before, found = numba.get_num_threads(), []
-    try:
-        for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
-            numba.set_num_threads(threads)
+    found = []
+    for threads in (1, 2):
+        with threads_limited(threads):
             found.append(list(simulate_frames(scene, build_models(scene))))
-    finally:
-        numba.set_num_threads(before)
     for one, two in zip(*(frames[1:] for frames in found)):  # nothing is solved at rest
         for muscle in scene.muscles:
             surface, other = one.surfaces[muscle.name], two.surfaces[muscle.name]

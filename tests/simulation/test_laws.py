@@ -83,7 +83,7 @@ def test_angle_of_a_turn_is_its_angle_about_any_axis_and_way_round(axis, angle):
 
 
 def test_an_error_in_parallel_is_raised_once_nothing_goes_on_any_more(monkeypatch):
-    monkeypatch.setattr("numba.get_num_threads", lambda: 2)
+    monkeypatch.setattr("rbfmuscle.geometry.threads.thread_count", lambda: 2)
     ended = threading.Event()
 
     def act(value):
