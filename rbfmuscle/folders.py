@@ -63,7 +63,7 @@ class OutputFolder:
                 continue
             if path.relative_to(self.directory).as_posix() in self.listed:
                 raise UsageError(
-                    f"{path} exists; give another --output, or --force to replace what is there"
+                    f"{path} exists; choose another place, or replace what is there by force"
                 )
             raise UsageError(
                 f"{path} is in the way: 'rbfmuscle {self.command}' has not written it; move it, "

@@ -69,7 +69,7 @@ class SolveError(RBFMuscleError, RuntimeError):
 
 
 class LimitExceededError(RBFMuscleError, RuntimeError):
-    """A limit given with ``--fail-on`` was exceeded, or not measured (exit code 6); everything is
+    """A limit of ``fail_on`` was exceeded, or not measured (exit code 6); everything is
     written.
     """
 

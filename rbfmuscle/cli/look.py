@@ -10,7 +10,16 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from rbfmuscle.cli.options import FailOn, Model, Muscles, OwnFolder, Pairs, RunFolder, split_list
+from rbfmuscle.cli.options import (
+    FailOn,
+    Model,
+    Muscles,
+    OwnFolder,
+    Pairs,
+    RunFolder,
+    refuse,
+    split_list,
+)
 from rbfmuscle.cli.printing import USUAL, Printing, print_result
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.validation import (
@@ -26,11 +35,10 @@ def view(
     *,
     model: Model = None,
     at: Pairs = None,
-    colour: Literal[
-        "group", "fibres", "activation", "stretch", "penetration", "distance"
-    ] = "group",
-    browser: bool = True,
-    port: int = 0,
+    colour: Literal["group", "fibres", "activation", "stretch", "penetration", "distance"]
+    | None = None,
+    browser: bool | None = None,
+    port: int | None = None,
     screenshot: Path | None = None,
 ) -> None:
     """Show a scene or a run in the browser, with a slider for each joint coordinate or for the
@@ -45,7 +53,7 @@ def view(
         Where to begin: COORDINATE=DEGREES, for instance hip.flexion=60; may be repeated. For a
         saved run: frame=N, where -1 is the last.
     colour
-        What muscles are coloured by at first, in the browser.
+        What muscles are coloured by at first, in the browser; by default their group.
     browser
         Open the browser; --no-browser prints the address only.
     port
@@ -54,6 +62,10 @@ def view(
         Draw this PNG at --at, without a display, and open nothing.
     """
     stops = dict(_parse_stop(text) for text in at or [])
+    if scene.is_dir():
+        refuse(f"{scene}, the folder of a run,", {"--model": model})
+    if screenshot is not None:
+        refuse("--screenshot", {"--colour": colour, "--browser": browser, "--port": port})
     with Progress(f"view {scene.name}"):
         if screenshot is not None:
             with stage("drawing the picture"):
@@ -66,9 +78,9 @@ def view(
 
         if not scene.is_dir() and str(scene) != PHANTOM:
             read_scene_file(scene)  # its errors are shown before a browser opens
-        server, address = open_server(port)
+        server, address = open_server(port or 0)
         print(f"{address}  (Ctrl-C ends)", flush=True)
-        if browser:
+        if browser is not False:
             webbrowser.open(address)
         opened = _open(scene)
         from rbfmuscle.viewer.page import ViewerPage
@@ -80,7 +92,7 @@ def view(
             if isinstance(opened, dict) and stops.get("frame", 0.0) < 0.0:
                 shown = next(iter(opened.values())).frame(int(stops["frame"]))
                 stops["frame"] = float(shown.index)
-            ViewerPage(source, at=stops, colour=colour, served=(server, address))
+            ViewerPage(source, at=stops, colour=colour or "group", served=(server, address))
     threading.Event().wait()
 
 
@@ -132,7 +144,10 @@ def _draw(opened, model, stops, path):
     check_picture(path)
     if isinstance(opened, dict):
         _check_stops(stops, ["frame"])
-        saved = next(iter(opened.values()))
+        if len(opened) > 1:
+            names = ", ".join(opened)
+            raise UsageError(f"--screenshot draws one run, give the folder of one of {names}")
+        (saved,) = opened.values()
         frame = int(stops.get("frame", saved.frame_numbers[0]))
     else:
         saved, frame = simulate(_posed(opened, stops), model), 1
@@ -215,7 +230,7 @@ def render(
     output: Annotated[Path, Parameter(name=["--output", "-o"])],
     frame: int | None = None,
     view: str | None = None,
-    seconds: float = 5.0,
+    seconds: float | None = None,
     printing: Printing = USUAL,
 ) -> int:
     """Draw a run: a picture (.png) or an animation (.gif, .webp).
@@ -230,7 +245,7 @@ def render(
         Views, separated by commas: front, back, left, right, top, bottom or motion (in its plane);
         front, right and back by default.
     seconds
-        Length of an animation.
+        Length of an animation; 5 by default.
     """
     with Progress(f"render {directory}"):
         from rbfmuscle.report.render import render_run

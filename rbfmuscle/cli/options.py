@@ -1,6 +1,6 @@
 """Options that several commands take."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,6 +50,7 @@ FailOn = Annotated[
         "exit code 6. For instance volume_error=0.001,penetration_max, or all."
     ),
 ]
+Jobs = Annotated[int | None, Parameter(help="Cores to use; all by default.")]
 Flag = Annotated[bool, Parameter(negative="")]
 Force = Annotated[bool, Parameter(negative="", help="Replace a scene file that exists.")]
 # KEY=VALUE, once each time that the option is given.
@@ -74,11 +75,9 @@ class Changes:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Work(Printing):
-    """Options for the threads that a command uses, and for what it prints."""
+    """Options for the cores that a command uses, and for what it prints."""
 
-    jobs: Annotated[int | None, Parameter(help="Threads to use; as many as cores by default.")] = (
-        None
-    )
+    jobs: Jobs = None
 
     def threads(self) -> AbstractContextManager[None]:
         """Context in which loops use as many threads as ``--jobs`` says."""
@@ -99,6 +98,13 @@ def split_list(text: str | None) -> list[str]:
     """Words of a list, which commas separate; each once."""
     words = (word.strip() for word in (text or "").split(","))
     return list(dict.fromkeys(word for word in words if word))
+
+
+def refuse(what: str, options: Mapping[str, object]) -> None:
+    """UsageError if one of some options is given, which ``what`` leaves without effect."""
+    given = [name for name, value in options.items() if value is not None]
+    if given:
+        raise UsageError(f"{what} does not take {' and '.join(given)}; leave it out")
 
 
 def chosen_muscles(scene: "Scene", names: str | None) -> "list[Muscle]":

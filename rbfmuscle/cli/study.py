@@ -17,12 +17,14 @@ from rbfmuscle.cli.options import (
     Changes,
     FailOn,
     Frames,
+    Jobs,
     Muscles,
     Output,
     Pairs,
     Work,
     chosen_muscles,
     named_scenes,
+    refuse,
     split_list,
 )
 from rbfmuscle.cli.printing import USUAL, Printing, one_line, print_result
@@ -39,14 +41,17 @@ class Fits:
         str | None,
         Parameter(name="--kernels", help="Kernels, separated by commas; all by default."),
     ] = None
-    centres: Annotated[str, Parameter(help="Numbers of centres, separated by commas.")] = "150,300"
+    centres: Annotated[
+        str | None,
+        Parameter(help="Numbers of centres, separated by commas; 150,300 by default."),
+    ] = None
     resolution: Annotated[
-        int,
+        int | None,
         Parameter(
-            help="Cells along the longest side of extracted surfaces; 0 for 128, and more for "
+            help="Cells along the longest side of extracted surfaces; by default 128, and more for "
             "slender muscles."
         ),
-    ] = 0
+    ] = None
 
 
 @Parameter(name="*")
@@ -69,9 +74,12 @@ class Axes:
         ),
     ] = None
     error: Annotated[
-        str,
-        Parameter(help="The error on the axis of the Pareto front; the other axis is time."),
-    ] = "error_rms"
+        str | None,
+        Parameter(
+            help="The error on the axis of the Pareto front, error_rms by default; the other axis "
+            "is time."
+        ),
+    ] = None
 
 
 @Parameter(name="*")
@@ -79,13 +87,7 @@ class Axes:
 class Workers:
     """Where the points of a sweep are run."""
 
-    jobs: Annotated[
-        int | None,
-        Parameter(
-            help="Points that run at the same time; as many as cores by default. Each gets cores / "
-            "jobs threads."
-        ),
-    ] = None
+    jobs: Jobs = None
     cluster: Annotated[
         str | None,
         Parameter(
@@ -106,7 +108,7 @@ def kernels(
     output: Output,
     fits: Fits = USUAL_FITS,
     muscles: Muscles = None,
-    units: str = "",
+    units: str | None = None,
     error: float | None = None,
     work: Work = USUAL_WORK,
 ) -> int:
@@ -126,7 +128,9 @@ def kernels(
     from rbfmuscle.kernels import study_kernels
     from rbfmuscle.report.kernel_page import kernels_folder
 
-    counts = split_list(fits.centres)
+    if error is not None:
+        refuse("--error", {"--centres": fits.centres, "--resolution": fits.resolution})
+    counts = split_list("150,300" if fits.centres is None else fits.centres)
     if not counts or not all(count.isdecimal() and int(count) >= 8 for count in counts):
         raise UsageError(f"--centres must be whole numbers of 8 and more, got {fits.centres!r}")
     meshes, units = _meshes(source, muscles, units)
@@ -140,7 +144,7 @@ def kernels(
             study_kernels,
             kernels=chosen,
             centres=[int(count) for count in counts],
-            resolution=fits.resolution,
+            resolution=fits.resolution or 0,
             units=units,
         )
         return _study(meshes, output, study, work)
@@ -154,7 +158,9 @@ def _meshes(source, muscles, units):
     if source != PHANTOM and Path(source).suffix.lower() != ".toml":
         if muscles is not None:
             raise UsageError(f"--muscles names muscles of a scene, {source} is a mesh")
-        return {Path(source).stem: read_mesh(source).mesh}, units
+        return {Path(source).stem: read_mesh(source).mesh}, units or ""
+    if units is not None:
+        raise UsageError(f"--units names the unit of a mesh, {source} says its own")
     scene = open_scene(source)
     return {each.name: each.mesh for each in chosen_muscles(scene, muscles)}, scene.units
 
@@ -245,6 +251,10 @@ def sweep(
     from rbfmuscle.sweeping import sweep as run_scenes
 
     grid, settings = parse_grid(axes.grid or []), changes.parse_settings()
+    if not grid:
+        refuse("a sweep without --grid", {"--reference": axes.reference, "--error": axes.error})
+    if workers.cluster is not None:
+        refuse("--cluster", {"--jobs": workers.jobs})
     if not scenes or (len(scenes) == 1 and not grid):
         raise UsageError(
             "a sweep needs several scenes, or a grid, for instance --grid model.centres=100,200"
@@ -263,7 +273,7 @@ def sweep(
             frames=frames,
             reference=parse_settings(axes.reference),
             jobs=workers.cluster or workers.jobs,
-            error=axes.error,
+            error=axes.error or "error_rms",
             progress=progress,
         )
     return _finish(table, output, limits, printing)

@@ -113,10 +113,10 @@ def run_sweep(
     """Run the points that the folder does not hold done, references first; how many were run.
 
     ``runner(scene, settings, frames)`` gives a finished `Run`; it is module-level, so that it can
-    be sent away. ``scenes``, ``points`` and ``frames`` are those of `plan_sweep`. Of ``jobs``
-    points beside each other (as many as cores by default) each has cores / jobs threads; or it is
-    the address of a Dask scheduler whose workers see the folder. ``progress(done, total)`` is
-    called along the way.
+    be sent away. ``scenes``, ``points`` and ``frames`` are those of `plan_sweep`. ``jobs`` is the
+    number of cores to use, all by default: as many points run beside each other, and where there
+    are fewer each has several threads. Or it is the address of a Dask scheduler whose workers see
+    the folder. ``progress(done, total)`` is called along the way.
     """
     from joblib import cpu_count, parallel_config
 
@@ -126,8 +126,9 @@ def run_sweep(
     folder.output.add(*(f"references/{p.key}.npz" for p in left if p.role == "reference"))
     for point in left:
         (folder.points / f"{point.key}.json").unlink(missing_ok=True)
-    beside = -1 if isinstance(jobs, str) else jobs or cpu_count()
-    threads = max(1, cpu_count() // beside)  # one on a cluster
+    cores = 1 if isinstance(jobs, str) else jobs or cpu_count()
+    beside = -1 if isinstance(jobs, str) else min(cores, max(1, len(left)))
+    threads = max(1, cores // beside)  # one on a cluster
 
     def advance():
         if progress is not None:
@@ -154,7 +155,7 @@ def _connect_cluster(address: str) -> "Client":
         from distributed import Client
     except ImportError as error:
         message = (
-            "Dask is not installed, which --cluster needs: pip install -e '.[cluster]' in "
+            "Dask is not installed, which a cluster needs: pip install -e '.[cluster]' in "
             "rbfmuscle's folder"
         )
         raise MissingDependencyError(message) from error

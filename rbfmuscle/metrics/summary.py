@@ -254,10 +254,10 @@ def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> Limits:
         name = name.strip()
         if name not in QUANTITIES:
             raise UsageError(
-                f"--fail-on: unknown quantity {name!r}, {did_you_mean(name, QUANTITIES)}"
+                f"fail_on: unknown quantity {name!r}, {did_you_mean(name, QUANTITIES)}"
             )
         if not given and name not in LIMITS:
-            raise UsageError(f"--fail-on {name}: give a value, for instance {name}=1")
+            raise UsageError(f"fail_on {name}: give a value, for instance {name}=1")
         found[name] = _number(value, part) if given else found.get(name)
     values = {name: default_limit(name, scene) for name in LIMITS}
     return Limits(
@@ -271,7 +271,7 @@ def _number(text, part):
     except ValueError:
         value = math.nan
     if not math.isfinite(value) or value < 0:
-        raise UsageError(f"--fail-on {part}: the limit must be a number, zero or more")
+        raise UsageError(f"fail_on {part}: the limit must be a number, zero or more")
     return value
 
 

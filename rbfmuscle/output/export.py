@@ -79,7 +79,7 @@ def export_run(
     _check_words(formats, units, fps)
     names = run.muscles if muscles is None else [run[name].name for name in muscles]
     if not names:
-        raise UsageError("--muscles names no muscle; leave it out for all")
+        raise UsageError("muscles names no muscle; leave it out for all")
     chosen = run.frame_numbers[frames] if frames is not None else run.frame_numbers
     if not chosen or not run.has_surfaces:
         raise UsageError(f"{run.directory or 'the run'} has no surfaces to export")
@@ -129,13 +129,13 @@ def _check_words(formats: Sequence[str], units: str | None, fps: float | None) -
         if name not in FORMATS:
             raise UsageError(f"unknown format {name!r}; known: {', '.join(FORMATS)}")
         if "glb" in name and units not in (None, "m"):
-            raise UsageError(f"{name} is in metres by its standard; leave out --units {units}")
+            raise UsageError(f"{name} is in metres by its standard; leave out units {units}")
     if units is not None and units not in MM_PER_UNIT:
         raise UsageError(f"units must be m, cm or mm, got {units!r}")
     if fps is not None and not set(formats) & set(ANIMATIONS):
-        raise UsageError(f"--fps is for {' and '.join(ANIMATIONS)} alone")
+        raise UsageError(f"fps is for {' and '.join(ANIMATIONS)} alone")
     if fps is not None and not 0.0 < fps <= FASTEST:
-        raise UsageError(f"--fps must be a number from 0 to 1000, got {fps:g}")
+        raise UsageError(f"fps must be a number from 0 to 1000, got {fps:g}")
 
 
 def _export(run: Animation, folder: Path, name: str, frames: list[int]) -> list[Path]:

@@ -182,7 +182,7 @@ def render_run(
     views: Sequence[str] | None = None,
     area: int = _AREA,
     most: int | None = None,
-    seconds: float = 5.0,
+    seconds: float | None = None,
 ) -> None:
     """Draw a run, or the one in a folder, to a picture (``.png``, one frame) or an animation
     (``.gif`` or ``.webp``, all of them).
@@ -190,7 +190,7 @@ def render_run(
     ``frame`` is that of a picture: its number, or from the end of those that were written if it is
     negative; by default the last. ``views``, side by side, are of `VIEWS`, or
     "motion" for the plane of the motion; `USUAL_VIEWS` where not given. A view has ``area`` pixels.
-    An animation of so many ``seconds`` has at ``most`` so many frames, chosen evenly. UsageError if
+    An animation of so many ``seconds``, 5 by default, has at ``most`` so many frames, chosen evenly. UsageError if
     the folder holds nothing to draw, the suffix, frame or view is unknown, or another file is in
     the way.
     """
@@ -201,6 +201,11 @@ def render_run(
     check_picture(output)
     if not run.has_surfaces:
         raise UsageError(f"{run.directory or 'the run'} has no surfaces to draw")
+    if output.suffix == ".png" and seconds is not None:
+        raise UsageError(f"{output}: seconds are of an animation (.gif, .webp), not of a picture")
+    if output.suffix != ".png" and frame is not None:
+        raise UsageError(f"{output}: a frame is of a picture (.png), an animation shows them all")
+    seconds = 5.0 if seconds is None else seconds
     if not 0.0 < seconds <= _LONGEST:
         raise UsageError(f"an animation of {seconds:g} seconds; give up to 3600")
     frame = run.frame(-1 if frame is None else frame).index

@@ -159,7 +159,14 @@ class TestRun:
     def test_processes_give_the_same_table(self, finished, tmp_path):
         points, count = sweep(tmp_path, jobs=2)
         assert count == POINTS and rows_of(points, tmp_path) == rows_of(*finished)
-        assert os.getpid() not in {SweepFolder(tmp_path).read(p.key)["process"] for p in points}
+        results = [SweepFolder(tmp_path).read(point.key) for point in points]
+        assert os.getpid() not in {found["process"] for found in results}
+        # The cores of jobs are shared: a point each.
+        assert {found["threads"] for found in results} == {1}
+
+    def test_one_core_is_one_point_on_one_thread(self, finished):
+        points, folder = finished
+        assert {SweepFolder(folder).read(point.key)["threads"] for point in points} == {1}
 
     def test_failed_points_leave_the_others_and_are_tried_again(self, tmp_path):
         points, _ = sweep(tmp_path, ["model.centres=40,-3", "model.resolution=16,24"])

@@ -219,7 +219,7 @@ class TestAnimatedGlb:
             times = numbers(tree["animations"][0]["samplers"][0]["input"])[:, 0]
             np.testing.assert_allclose(times, np.array([0, 2, 4]) / wanted, rtol=1e-6)
         for wrong in ({"formats": "ply", "fps": 30.0}, {"formats": "usd", "fps": 0.0}):
-            with pytest.raises(UsageError, match="--fps"):
+            with pytest.raises(UsageError, match="fps"):
                 export_run(folder, output=tmp_path / "no", **wrong)
 
     def test_changing_surface_is_refused_with_a_remedy(self, changing, tmp_path):

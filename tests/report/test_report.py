@@ -53,7 +53,16 @@ def test_render_writes_what_the_suffix_says(folder, tmp_path, name):
         assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 7)
 
 
-@pytest.mark.parametrize("wrong", [{"views": ["side"]}, {"frame": 99}, {"output": "a.bmp"}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"views": ["side"]},
+        {"frame": 99},
+        {"output": "a.bmp"},
+        {"output": "a.gif", "frame": 1},
+        {"seconds": 2.0},
+    ],
+)
 def test_render_refuses_wrong_words(folder, tmp_path, wrong):
     with pytest.raises(UsageError):
         render.render_run(folder, tmp_path / wrong.pop("output", "a.png"), **wrong)

@@ -1,6 +1,7 @@
 """The command ``view``: the address it prints, and pictures without a display."""
 
 import signal
+import shutil
 import subprocess
 import sys
 import urllib.request
@@ -44,12 +45,21 @@ def test_picture_of_a_scene_is_of_the_pose_asked_for(tmp_path, capsys, graphics)
     assert (image(tmp_path / "rest.png") != image(tmp_path / "bent.png")).any(axis=2).mean() > 0.01
 
 
+def test_screenshot_of_several_runs_asks_for_one(run_folder, tmp_path, capsys):
+    for name in ("rbf", "pbd"):
+        shutil.copytree(run_folder, tmp_path / name)
+    code, _, err = call(capsys, "view", tmp_path, "--screenshot", tmp_path / "a.png")
+    assert code == 2 and "give the folder of one of pbd, rbf" in err
+    assert not (tmp_path / "a.png").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
         (["--at", "hip.flexion"], "COORDINATE=DEGREES"),
         (["--at", "hip.flexion=3"], "unknown coordinate 'hip.flexion'"),
         (["--at", "frame=7", "--screenshot", "x.png"], "was not written"),
+        (["--model", "pbd"], "does not take --model"),
     ],
 )
 def test_wrong_use_is_one_line(run_folder, capsys, arguments, says):

@@ -203,7 +203,7 @@ def _guess_units(found):
             found.notes.append(f"units are {units}: {bone.name} is {bone.size:.4g} {units} long")
             return units
     raise UsageError(
-        f"{bone.file} is {bone.size:.4g} across, which is no bone in mm, cm or m; give --units"
+        f"{bone.file} is {bone.size:.4g} across, which is no bone in mm, cm or m; give its units"
     )
 
 
@@ -218,4 +218,4 @@ def _leave_out_wrong_sizes(found):
             found.missing_bones.append(bone.name)
             found.unusable[Path(bone.file).name] = words
     if not found.bones:
-        raise UsageError(f"{bone.file} cannot be a bone: {words}; correct --units")
+        raise UsageError(f"{bone.file} cannot be a bone: {words}; correct the units")

@@ -199,7 +199,7 @@ def _placed(
     file = _find_mesh(mesh.file, folders)
     if file is None:
         where = ", ".join(str(folder) for folder in folders)
-        raise MeshError(f"it is not there (looked in {where}); give its folder with --geometry")
+        raise MeshError(f"it is not there (looked in {where}); give its folder as geometry")
     part = read_part(file.with_name(f"{file.name}#{ALL}"))
     vertices, faces = check_mesh(part.vertices, part.faces)
     transform = place @ mesh.transform
