@@ -25,5 +25,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     report_in_lines()
     code = run_command(arguments)
+    if code:
+        gc.collect()  # what an error holds: libigl complains of its objects that are never freed
     gc.freeze()  # no search for garbage among all that is loaded, only to end: 0.3 s
     raise SystemExit(code)

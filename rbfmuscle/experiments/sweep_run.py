@@ -130,9 +130,13 @@ def run_sweep(
     beside = -1 if isinstance(jobs, str) else min(cores, max(1, len(left)))
     threads = max(1, cores // beside)  # one on a cluster
 
-    def advance():
+    done = 0
+
+    def advance(*, recount: bool = False):
+        nonlocal done
+        done = sum(bool(folder.read(point.key)) for point in left) if recount else done + 1
         if progress is not None:
-            progress(sum(bool(folder.read(point.key)) for point in left), len(left))
+            progress(done, len(left))
 
     with ExitStack() as stack:
         if isinstance(jobs, str):
@@ -189,7 +193,7 @@ def _side_by_side(calls, folder, jobs, advance):
                 except BrokenProcessPool:
                     error = "the process ended without a message (out of memory, or a crash)"
                     folder.write({"key": call[2].key, "status": "failed", "error": error})
-            advance()
+            advance(recount=True)  # of some that are done the pool has not said so
         _side_by_side(left[jobs:], folder, jobs, advance)
     except RuntimeError as error:  # of Dask, where worker after worker dies of a point
         raise SolveError(f"a point ended its workers ({error}); finished points are kept") from None

@@ -2,6 +2,7 @@
 loading VTK.
 """
 
+import os
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -170,14 +171,33 @@ class Collection:
     its folder.
     """
 
+    _HEAD = b'<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
+    _TAIL = b"</Collection>\n</VTKFile>\n"
+
     def __init__(self, path: str | Path) -> None:
-        self._path, self._lines = Path(path), ""
-        self.add(0.0, [])
+        self._path = Path(path)
+        self._end = len(self._HEAD)  # where the next time step goes
+        write_whole(self._path, self._HEAD + self._TAIL)
 
     def add(self, time: float, entries: list[tuple[str, str]]) -> None:
-        """Add one time step; ``entries`` are pairs of name and file."""
+        """Add one time step; ``entries`` are pairs of name and file.
+
+        What is there is not written again. Where the disk takes no more, the file is as before.
+        """
+        lines = ""
         for part, (name, file) in enumerate(entries):
             place = f'part="{part}" name="{escape(name)}" file="{escape(file)}"'
-            self._lines += f'<DataSet timestep="{time}" group="" {place}/>\n'
-        head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
-        write_whole(self._path, f"{head}{self._lines}</Collection>\n</VTKFile>\n")
+            lines += f'<DataSet timestep="{time}" group="" {place}/>\n'
+        step = lines.encode()
+        try:
+            self._write(step + self._TAIL)
+        except OSError:
+            os.truncate(self._path, self._end)
+            self._write(self._TAIL)
+            raise
+        self._end += len(step)
+
+    def _write(self, data: bytes) -> None:
+        with self._path.open("r+b") as file:
+            file.seek(self._end)
+            file.write(data)

@@ -190,9 +190,9 @@ def render_run(
     ``frame`` is that of a picture: its number, or from the end of those that were written if it is
     negative; by default the last. ``views``, side by side, are of `VIEWS`, or
     "motion" for the plane of the motion; `USUAL_VIEWS` where not given. A view has ``area`` pixels.
-    An animation of so many ``seconds``, 5 by default, has at ``most`` so many frames, chosen evenly. UsageError if
-    the folder holds nothing to draw, the suffix, frame or view is unknown, or another file is in
-    the way.
+    An animation of so many ``seconds``, 5 by default, has at ``most`` so many frames, chosen
+    evenly. UsageError if the folder holds nothing to draw, the suffix, frame or view is unknown,
+    or another file is in the way.
     """
     run = open_run(run)
     output = Path(output)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -42,7 +43,19 @@ class SceneFiles:
         for taken in (path, self.folder)[: 1 if folder else 2]:
             if taken.exists():
                 raise UsageError(f"{taken} is there already; choose another name")
+        self._own = folder is None
         self.folder.mkdir(parents=True, exist_ok=True)
+
+    @contextmanager
+    def kept_whole(self) -> Iterator[None]:
+        """Context after whose error neither the file nor the new folder is left."""
+        try:
+            yield
+        except BaseException:
+            self.path.unlink(missing_ok=True)
+            if self._own:
+                shutil.rmtree(self.folder, ignore_errors=True)
+            raise
 
     def skeleton(
         self,

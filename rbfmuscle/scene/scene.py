@@ -145,13 +145,14 @@ class Scene(Compared):
             )
         files = SceneFiles(Path(path), folder)
         about = {key: getattr(self, key) for key in ABOUT if getattr(self, key)}
-        tables = [
-            ("[scene]", {"format": FORMAT, "name": self.name, **about}),
-            *files.skeleton(self.bones, self.meshless_bones, self.joints, self.couplings),
-            *(("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles),
-            *files.settings(_settings(self)),
-        ]
-        return files.write(tables, self.guesses, comment)
+        with files.kept_whole():
+            tables = [
+                ("[scene]", {"format": FORMAT, "name": self.name, **about}),
+                *files.skeleton(self.bones, self.meshless_bones, self.joints, self.couplings),
+                *(("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles),
+                *files.settings(_settings(self)),
+            ]
+            return files.write(tables, self.guesses, comment)
 
     def add_bone(
         self,

@@ -124,12 +124,15 @@ class TestCallersInPython:
 
     def test_an_interrupt_is_an_exit_code_and_leaves_the_caller_alive(self, tmp_path):
         code = (
-            "import os, signal, rbfmuscle.cli as cli\n"
+            "import os, signal, time, rbfmuscle.cli as cli\n"
             "import rbfmuscle.scene.file as m\n"
-            "m.read_scene_file = lambda path: os.kill(os.getpid(), signal.SIGINT)\n"
+            "def struck(*given):\n"
+            "    os.kill(os.getpid(), signal.SIGINT)\n"
+            "    while True:\n        time.sleep(0.01)\n"
+            "m.read_scene_file = struck\n"
             "try:\n    cli.main(['check', 'a.toml'])\n"
             "except SystemExit as end:\n    print('alive', end.code)\n"
-            "try:\n    os.kill(os.getpid(), signal.SIGINT)\n"
+            "try:\n    struck()\n"
             "except KeyboardInterrupt:\n    print('mine')\n"
         )
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

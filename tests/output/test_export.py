@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from rbfmuscle.cli.printing import one_line
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.output.export import _file_name, export_run
 from rbfmuscle.output.info import FORMAT
-from rbfmuscle.output.vtp import read_vtp, write_vtp
+from rbfmuscle.output.vtp import Collection, read_vtp, write_vtp
 from rbfmuscle.output.writer import write_json
 from rbfmuscle.run import Run, simulate
 from rbfmuscle.validation import MeshError, UsageError
@@ -54,6 +55,36 @@ class TestVtp:
             read_vtp(path)
         with pytest.raises(MeshError, match=r"none\.vtp is missing"):
             read_vtp(tmp_path / "none.vtp")
+
+
+class TestCollections:
+    def test_a_step_is_added_to_what_is_there(self, tmp_path):
+        path = tmp_path / "a.pvd"
+        steps = Collection(path)
+        inode = path.stat().st_ino
+        for time in range(50):
+            steps.add(float(time), [("a", f"a_{time}.vtp"), ("<b>", "b.vtp")])
+            sets = ElementTree.parse(path).getroot().findall("Collection/DataSet")
+            assert len(sets) == 2 * (time + 1) and sets[-1].get("name") == "<b>"
+            assert float(sets[-1].get("timestep")) == time
+        assert path.stat().st_ino == inode  # not written anew
+
+    def test_a_full_disk_leaves_the_steps_before(self, tmp_path):
+        resource = pytest.importorskip("resource")
+        path = tmp_path / "a.pvd"
+        steps = Collection(path)
+        steps.add(0.0, [("a", "a.vtp")])
+        whole = path.read_bytes()
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) + 10, limits[1]))
+        try:
+            with pytest.raises(OSError):
+                steps.add(1.0, [("a", "a_1.vtp")])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert path.read_bytes() == whole
+        steps.add(1.0, [("a", "a_1.vtp")])
+        assert len(ElementTree.parse(path).getroot().findall("Collection/DataSet")) == 2
 
 
 class TestSaved:

@@ -45,6 +45,27 @@ def test_a_saved_scene_reaches_the_command_line_and_replaces_nothing(tmp_path, c
     assert path.read_text() == text
 
 
+def test_a_scene_that_cannot_be_saved_leaves_nothing_and_is_saved_at_the_next_try(
+    tmp_path, monkeypatch
+):
+    scene = rich()
+    written = []
+
+    def full(file, vertices, **options):
+        written.append(file)
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savetxt", full)
+        with pytest.raises(OSError, match="No space"):
+            scene.save(tmp_path / "arm.toml")
+    assert written and not list(tmp_path.iterdir())
+    with pytest.raises(ValueError):  # an impossible value, met while the text is written
+        scene.save(tmp_path / "arm.toml", comment="\ud800")
+    assert not list(tmp_path.iterdir())
+    assert rm.Scene.load(scene.save(tmp_path / "arm.toml")).name == "arm"
+
+
 def test_a_scene_without_motion_is_saved_where_rest_is_not_zero(tmp_path):
     scene = built()
     scene.add_bone("tip")

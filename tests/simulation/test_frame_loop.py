@@ -4,12 +4,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from blend_model import arm_scene
 from tendon_scene import END, arm
 from toy_scene import ToyMuscle, bone, box, hinged_scene
 
 from rbfmuscle.scene.motion import bone_poses, turned_angle
 from rbfmuscle.scene.options import TunnellingOptions
-from rbfmuscle.simulation.contact_pairs import find_contact_pairs, sampled_poses
+from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs, sampled_poses
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 from rbfmuscle.simulation.substeps import FINER, SubSteps
 from rbfmuscle.validation import SceneError, SolveError
@@ -142,3 +143,11 @@ def test_frames_that_are_skipped_leave_the_muscle_where_shown_ones_would():
         back.surfaces["strap"].vertices, frames[0].surfaces["strap"].vertices, atol=0.05
     )
     assert loop.here == {"hinge.bend": 0.0}
+
+
+def test_a_note_about_a_bone_names_it(caplog):
+    scene = arm_scene()
+    mesh = scene.bone("fore").mesh
+    mesh.update_faces(np.arange(len(mesh.faces)) > 1)
+    build_fields(scene, find_contact_pairs(scene))
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["fore"]

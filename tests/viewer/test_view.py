@@ -1,7 +1,7 @@
 """The command ``view``: the address it prints, and pictures without a display."""
 
-import signal
 import shutil
+import signal
 import subprocess
 import sys
 import urllib.request
