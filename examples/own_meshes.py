@@ -39,7 +39,7 @@ command("new", meshes, "--units", "mm", "--force")
 
 # Every guess in the file is marked: the joint's centre, its axes, what is attached to what.
 text = (meshes / "scene.toml").read_text(encoding="utf-8")
-print("\n".join(line for line in text.splitlines() if "GUESS" in line))
+print("\n".join(line for line in text.splitlines() if "guess = " in line))
 
 # The guessed axes are those of the files. Flexion of this hip is a turn about -x.
 (meshes / "scene.toml").write_text(

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 import rbfmuscle as rm
-from rbfmuscle.scene.guesses import Guess
+from rbfmuscle.scene.guesses import GuessTable
 
 
 def built():
@@ -46,8 +46,6 @@ def rich():
     scene.set_motion(ramp={"elbow.flexion": {"from": 0, "to": 30, "step": 10}})
     scene = scene.with_options({"detect.tunnelling.angle": 120.0, "sliding.threshold": 1.5})
     scene.doubts = ["a doubt"]
-    scene.guesses = [
-        Guess("joint", "wrist", 0.5, "its axis"),
-        Guess("muscle", "second", 0.4, "its end"),
-    ]
+    scene.joints[1].guess = GuessTable(confidence=0.5, reason="its axis")
+    scene.muscles[1].attachments[2].guess = GuessTable(confidence=0.4, reason="its end")
     return scene

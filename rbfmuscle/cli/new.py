@@ -79,11 +79,11 @@ def new(
 
 
 def _new_lines(output, doubts, findings, scene):
-    yield f"{output} written; check the lines marked GUESS"
+    yield f"{output} written; check what has the key guess"
     yield from (f"doubtful: {doubt}" for doubt in doubts)
     yield from map(str, findings)
     if scene.guesses:
-        yield "how to correct guesses: docs/new.md; removing the word GUESS from a line confirms it"
+        yield "how to correct guesses: docs/new.md; removing a key guess confirms it"
     yield f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out"
 
 

@@ -153,7 +153,7 @@ QUANTITIES = {
         "length",
         "a joint's bones farther apart than at rest; muscle 'all', some frames",
     ),
-    "guessed": ("1", "1 where lines about the muscle are marked GUESS, else 0; first frame"),
+    "guessed": ("1", "1 where an attachment of the muscle is a guess, else 0; first frame"),
     "doubtful_guesses": (
         "1",
         "doubtful guesses about the muscle, under 'all' about joints; first frame",

@@ -139,7 +139,7 @@ LIMITS = {
     "doubtful_guesses": Limit(
         0.0,
         "doubtful guesses",
-        "look at them (rbfmuscle check SCENE --picture), correct them, and remove the word GUESS "
+        "look at them (rbfmuscle check SCENE --picture), correct them, and remove their key guess "
         "from their lines",
     ),
     "bone_overlap": Limit(0.0, "bones in each other", _JOINT),

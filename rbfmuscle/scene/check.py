@@ -78,7 +78,7 @@ def check_scene(scene: Scene) -> list[Finding]:
 
 def _guess_findings(scene):
     """A warning for each doubtful guess of the file."""
-    said = "look at it in a picture, correct it or remove the word GUESS from its line"
+    said = "look at it in a picture, correct it or remove its key guess"
     return [
         Finding(
             "warning",

@@ -8,7 +8,6 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from rbfmuscle.scene.activation.keys import KEYS, ContractionTable
-from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.scene.joints.tables import CouplingTable, JointTable
 from rbfmuscle.scene.meshes.transform import MeshTransform
 from rbfmuscle.scene.options import (
@@ -129,19 +128,19 @@ class SceneFile(Table):
     output: OutputOptions = OutputOptions()
 
 
-def read_scene_file(path: Path) -> tuple[SceneFile, list[Guess]]:
-    """Return the checked SceneFile of a TOML file, and its guesses; relative names of files become
-    relative to its folder.
+def read_scene_file(path: Path) -> SceneFile:
+    """Return the checked SceneFile of a TOML file; relative names of files become relative to its
+    folder.
 
     SceneError names the file, the table, the key, the value and what is right.
     """
-    data, guesses = read_tables(path)
+    data = read_tables(path)
     context, folder = f"{path}: ", path.parent
     tables = SceneFile.build(
         data, context=context, folder=folder, name_row=lambda at: _place(at, data)
     )
     muscles = [_with_class(muscle, tables.classes, context) for muscle in tables.muscle]
-    return tables.model_copy(update={"muscle": muscles}), guesses
+    return tables.model_copy(update={"muscle": muscles})
 
 
 def _with_class(muscle: MuscleTable, classes: dict[str, ClassTable], context: str) -> MuscleTable:

@@ -1,18 +1,29 @@
-"""Lines of a scene file that are guesses, until somebody removes the word GUESS from them."""
+"""Guesses of a scene: joints and attachments with the key ``guess``, until somebody removes it."""
 
 import re
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+from pydantic import Field
+
+from rbfmuscle.scene.options import Table
+from rbfmuscle.validation import SceneError
 
 DOUBTFUL = 0.6  # a guess of less confidence is reported by check and by the verdict of a run
 
-_TABLE = re.compile(r"\[\[?\s*(\w+)")
-_NAME = re.compile(r"name\s*=\s*[\"']([^\"']*)[\"']")
-_GUESS = re.compile(r"#.*?\bGUESS ([01]\.\d+): *(.*)")
+# How guesses were marked before they were keys.
+_MARK = re.compile(r"#.*\bGUESS [01]\.\d")
+
+
+class GuessTable(Table):
+    """``guess`` of a joint or an attachment: that it is one, how sure, and why."""
+
+    confidence: Annotated[float, Field(ge=0.0, le=1.0)]
+    reason: str = ""
 
 
 class Guess(NamedTuple):
-    """A guess in a scene file: the table (``"muscle"``, ``"joint"``) and the name of what it is
-    about, its confidence (0 to 1), and what it says of itself.
+    """A guess in a scene: the table (``"muscle"``, ``"joint"``) and the name of what it is about,
+    its confidence (0 to 1), and the reason.
     """
 
     table: str
@@ -21,21 +32,16 @@ class Guess(NamedTuple):
     text: str
 
 
-def find_guesses(text: str) -> list[Guess]:
-    """The guesses in the text of a scene file; lines that are comments as a whole do not count."""
-    found: list[tuple[int, float, str]] = []
-    tables: list[tuple[str, str]] = [("", "")]
-    for line in text.splitlines():
-        if line.startswith("#"):
-            continue
-        if line.startswith("["):
-            header = _TABLE.match(line)
-            tables.append((header[1] if header else "", ""))
-        elif name := _NAME.match(line):
-            tables[-1] = tables[-1][0], name[1]
-        if guess := _GUESS.search(line):
-            found.append((len(tables) - 1, float(guess[1]), guess[2].strip()))
-    return [Guess(*tables[at], confidence, said) for at, confidence, said in found]
+def refuse_marks(text: str, *, context: str) -> None:
+    """SceneError where a comment in a scene file marks a guess; lines that are comments as a whole
+    may say anything.
+    """
+    for number, line in enumerate(text.splitlines(), start=1):
+        if _MARK.search(line) and not line.lstrip().startswith("#"):
+            raise SceneError(
+                f"{context}line {number}: comments mark no guesses any more; give the joint or "
+                'attachment guess = { confidence = 0.5, reason = "..." }, or remove the word GUESS'
+            )
 
 
 def guessed_muscles(guesses: list[Guess]) -> set[str]:

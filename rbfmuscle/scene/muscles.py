@@ -99,6 +99,7 @@ def make_attachments(
             entry.tendon,
             attachment_frame,
             entry.via,
+            entry.guess,
         )
         for name in held.bones:
             find_named(bones, name, "bone", context=f"{context}tendon: ")

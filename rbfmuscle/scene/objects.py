@@ -12,6 +12,7 @@ from pydantic import Field
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.content import Compared
+from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.scene.options import MotionOptions, Table, Vector
 from rbfmuscle.scene.tendons import TendonEnd
@@ -50,7 +51,8 @@ class Attachment(Compared):
 
     ``tendon`` joins them to it where they end short of it. ``attachment_frame`` is the name,
     among the poses, of what they move with: the bone, or the end of the tendon. What is ``via`` a
-    bone passes it and is neither origin nor insertion.
+    bone passes it and is neither origin nor insertion. With ``guess``
+    nobody has confirmed it.
     """
 
     bone: str
@@ -58,6 +60,7 @@ class Attachment(Compared):
     tendon: LineTable | None = None
     attachment_frame: str = ""
     via: bool = False
+    guess: GuessTable | None = None
 
     def __post_init__(self) -> None:
         self.attachment_frame = self.attachment_frame or self.bone

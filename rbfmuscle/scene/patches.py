@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, ValidationInfo, model_validator
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.scene.meshes.formats import read_vertex_array
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.meshes.transform import MeshTransform
@@ -89,6 +90,7 @@ class AttachTable(PatchTable):
     near: NotNegative | None = None
     tendon: LineTable | None = None
     via: bool = False
+    guess: GuessTable | None = None
 
     @model_validator(mode="after")
     def _check_via(self):

@@ -13,7 +13,6 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.guesses import Guess
 from rbfmuscle.scene.joints.joint import Coupling, Joint
 from rbfmuscle.scene.joints.tables import coupling_row, joint_row
 from rbfmuscle.scene.objects import Muscle
@@ -92,6 +91,8 @@ class SceneFiles:
                 entry["tendon"] = held.tendon.model_dump(exclude_unset=True)
             if held.via:
                 entry["via"] = True
+            if held.guess is not None:
+                entry["guess"] = held.guess.model_dump(exclude_unset=True)
             attach.append(entry)
         if muscle.fibres:
             file = self._new(f"fibres/{muscle.name}.json")
@@ -123,22 +124,12 @@ class SceneFiles:
                 found.append((f"[{key}]", row))
         return found
 
-    def write(
-        self,
-        tables: Sequence[TableRow],
-        guesses: Sequence[Guess],
-        comment: str,
-    ) -> Path:
-        """Write the file itself: a comment, then the heads and rows of its tables; lines that are
-        guesses are marked. Returns its path.
+    def write(self, tables: Sequence[TableRow], comment: str) -> Path:
+        """Write the file itself: a comment, then the heads and rows of its tables. Returns its
+        path.
         """
         parts = [comment] if comment else []
-        for head, row in tables:
-            name = row.get("name")
-            about = [g for g in guesses if g.table == head.strip("[]") and g.name in ("", name)]
-            said = [f"GUESS {guess.confidence}: {guess.text}" for guess in about]
-            keys = [key for key, value in row.items() if not isinstance(value, list)]
-            parts.append(table_text(head, row, dict(zip(keys, said))))
+        parts += [table_text(head, row) for head, row in tables]
         self.path.write_text("\n".join(parts), encoding="utf-8")
         return self.path
 

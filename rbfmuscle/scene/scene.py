@@ -70,10 +70,9 @@ class Scene(Compared):
     detect: DetectOptions = field(default_factory=DetectOptions)
     output: OutputOptions = field(default_factory=OutputOptions)
     path: Path | None = None  # the file it was loaded from
-    # These three are in the verdict of a run.
+    # These two are in the verdict of a run, and so are guesses.
     missing_bones: list[str] = field(default_factory=list)  # those without a usable mesh
     doubts: list[str] = field(default_factory=list)  # what differs from the source, in sentences
-    guesses: list[Guess] = field(default_factory=list)  # lines of the file marked GUESS
     notes: list[str] = field(default_factory=list)  # what was assumed or left out, for a check
     # Anatomical directions (3,) at rest: those of the file, or found from the bones before a run.
     superior: list[float] | None = None
@@ -105,11 +104,10 @@ class Scene(Compared):
         MeshError
             If a mesh cannot be used.
         """
-        tables, guesses = read_scene_file(Path(path))
+        tables = read_scene_file(Path(path))
         scene = cls(
             tables.scene.name or Path(path).stem,
             path=Path(path),
-            guesses=guesses,
             **{key: getattr(tables.scene, key) for key in ABOUT},
         )
         try:
@@ -152,7 +150,7 @@ class Scene(Compared):
                 *(("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles),
                 *files.settings(_settings(self)),
             ]
-            return files.write(tables, self.guesses, comment)
+            return files.write(tables, comment)
 
     def add_bone(
         self,
@@ -335,6 +333,18 @@ class Scene(Compared):
         except SceneError as error:
             raise UsageError(str(error)) from None
         return changed
+
+    @property
+    def guesses(self) -> list[Guess]:
+        """Those of joints and of muscles' attachments."""
+        marked = [("joint", joint.name, joint.guess) for joint in self.joints]
+        for muscle in self.muscles:
+            marked += [("muscle", muscle.name, held.guess) for held in muscle.attachments]
+        return [
+            Guess(table, name, guess.confidence, guess.reason)
+            for table, name, guess in marked
+            if guess is not None
+        ]
 
     def bone(self, name: str) -> Bone:
         """Return the bone of that name, or raise SceneError naming the nearest."""

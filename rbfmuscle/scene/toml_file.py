@@ -4,7 +4,7 @@ import os
 import tomllib
 from pathlib import Path
 
-from rbfmuscle.scene.guesses import Guess, find_guesses
+from rbfmuscle.scene.guesses import refuse_marks
 from rbfmuscle.scene.options import check_plain
 from rbfmuscle.scene.toml_text import FORMAT
 from rbfmuscle.validation import SceneError, shown, shown_path
@@ -19,12 +19,12 @@ LISTS = ("bone", "joint", "coupling", "muscle")
 FILES = ("mesh", "fibres", "vertices", "points", "region", "file")
 
 
-def read_tables(path: Path) -> tuple[Tables, list[Guess]]:
-    """The tables of a scene file, and its guesses; names of files are relative to its folder."""
+def read_tables(path: Path) -> Tables:
+    """The tables of a scene file; names of files are relative to its folder."""
     return _read(path, (path,))
 
 
-def _read(path: Path, chain: tuple[Path, ...]) -> tuple[Tables, list[Guess]]:
+def _read(path: Path, chain: tuple[Path, ...]) -> Tables:
     text = _read_text(path)
     data = _parse(path, text)
     check_plain(data, context=f"{path}: ")
@@ -34,7 +34,7 @@ def _read(path: Path, chain: tuple[Path, ...]) -> tuple[Tables, list[Guess]]:
             f"{path}: files of format 1 are read no more; write the scene anew by "
             f"docs/scene_file.md, with format = {FORMAT}"
         )
-    guesses = find_guesses(text)
+    refuse_marks(text, context=f"{path}: ")
     names = data.pop("include", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise SceneError(f"{path}: include must be a list of names of files")
@@ -42,11 +42,10 @@ def _read(path: Path, chain: tuple[Path, ...]) -> tuple[Tables, list[Guess]]:
         file = path.parent / name
         if file.resolve() in [one.resolve() for one in chain] or len(chain) > DEEPEST_INCLUDE:
             raise SceneError(f"{path}: include {name!r}: a file would include itself")
-        inner, more = _read(file, (*chain, file))
+        inner = _read(file, (*chain, file))
         moved = {key: _moved(value, Path(name).parent) for key, value in inner.items()}
         data = _merged(moved, data, f"{path}: include {name!r}: ")
-        guesses = more + guesses
-    return data, guesses
+    return data
 
 
 def _merged(inner: Tables, own: Tables, context: str) -> Tables:

@@ -102,6 +102,21 @@ cli.main()
         assert json.loads(done.stdout) == {"error": "interrupted", "exit_code": 130}
 
 
+def test_an_error_that_holds_libigls_objects_ends_without_its_complaints():
+    code = (
+        "import sys, igl, rbfmuscle.cli as cli, rbfmuscle.cli.app as app\n"
+        "def failing(arguments):\n"
+        "    tree = igl.FastWindingNumberBVH()\n"
+        "    try:\n        raise ValueError\n"
+        "    except ValueError as error:\n        failed = error\n"  # a cycle with this frame
+        "    return 6\n"
+        "app.run_command = failing\n"
+        "sys.argv = ['rbfmuscle', 'run']\ncli.main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (6, "")
+
+
 class TestCallersInPython:
     def test_handlers_of_the_caller_stay(self, tmp_path, capsys):
         def handlers():

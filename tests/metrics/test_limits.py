@@ -25,7 +25,7 @@ from rbfmuscle.output.run_data import RunData
 from rbfmuscle.report.report import write_report
 from rbfmuscle.run import Run, simulate, stream_run
 from rbfmuscle.scene.check import check_scene, stated_doubts
-from rbfmuscle.scene.guesses import Guess
+from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.validation import LimitExceededError, UsageError
 
 # Of issue and docs, in millimetres: what is just allowed, and what is not.
@@ -224,7 +224,7 @@ def test_overlap_and_ends_away_from_bones_are_seen_in_a_run(
     scene = arm_scene(end=10)  # its muscle moved down, into the bones, or up, away from them
     scene.muscles[0].mesh.apply_translation([0.0, 0.0, shift])
     scene = scene.with_options({"contact.initial": "keep"})
-    scene.guesses = [Guess("muscle", "biceps", 0.9, "held by the nearest bones")]
+    scene.muscles[0].attachments[0].guess = GuessTable(confidence=0.9)
     assert simulate(arm_scene(end=10)).values("biceps", name)[0] < least
     info = stream_run(scene, tmp_path, pictures=False)  # a warning by default
     found = {row.quantity: row.value for row in info.beyond}
@@ -253,7 +253,7 @@ def test_an_end_that_is_stated_to_lie_away_from_its_bone_is_a_doubt(monkeypatch,
         stream_run(scene, tmp_path, fail_on="end_gap", pictures=False)
     write_report(tmp_path, pictures=False)
     assert said.strip(". ") in (tmp_path / "report.html").read_text()
-    scene.guesses = [Guess("muscle", "biceps", 0.9, "")]
+    scene.muscles[0].attachments[0].guess = GuessTable(confidence=0.9)
     assert stated_doubts(scene) == []  # it counts
 
 

@@ -104,6 +104,6 @@ class TestInclude:
     def test_guesses_of_included_files_count(self, split):
         scene, inner = split
         inner.write_text(
-            inner.read_text().replace("[[muscle]]", "[[muscle]]   # GUESS 0.3: a x", 1)
+            inner.read_text().replace("{ bone", "{ guess = { confidence = 0.3 }, bone", 1)
         )
-        assert [guess.name for guess in Scene.load(scene).guesses] == ["first"]
+        assert {guess.name for guess in Scene.load(scene).guesses} == {"first", "second", "third"}

@@ -1,36 +1,73 @@
-"""Lines marked GUESS, picked points, and attachments on articular surfaces."""
+"""Guesses of a scene, picked points, and attachments on articular surfaces."""
 
 import numpy as np
 import pytest
 import trimesh
+from blend_model import arm_files
 
 from rbfmuscle.scene.articular import articular_points
-from rbfmuscle.scene.guesses import doubtful, find_guesses
+from rbfmuscle.scene.check import check_scene
+from rbfmuscle.scene.guesses import GuessTable, doubtful
 from rbfmuscle.scene.picked import picked_vertices, read_points
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
 
-TEXT = """# Check every line marked GUESS 0.1: this line is a comment
-[[joint]]   # GUESS 0.2: a hinge
-name = "knee"
-[[muscle]]
-name = "psoas"
-attach = [
-  { bone = "pelvis" },   # GUESS 0.4: far away
-  { bone = "femur" },   # GUESS 0.9: near
-]
-"""
+
+def guessed(folder, hinge="", first=""):
+    """The scene of a file with keys in the table of its joint, and in its first attachment."""
+    path = arm_files(folder)
+    text = path.read_text(encoding="utf-8")
+    text = text.replace("[[joint]]\n", f"[[joint]]\n{hinge}", 1)
+    path.write_text(text.replace('{ bone = "upper",', f'{{ bone = "upper",{first}', 1))
+    return path
 
 
-def test_a_guess_is_doubtful_until_its_word_is_removed():
-    guesses = find_guesses(TEXT)
-    assert [(g.table, g.name, g.confidence) for g in guesses] == [
-        ("joint", "knee", 0.2),
-        ("muscle", "psoas", 0.4),
-        ("muscle", "psoas", 0.9),
+def test_a_guess_is_doubtful_until_its_key_is_removed(tmp_path):
+    hinge = "guess = { confidence = 0.2, reason = 'a hinge' }\n"
+    first = " guess = { confidence = 0.4, reason = 'far # \\u005Baway' },"
+    scene = Scene.load(guessed(tmp_path, hinge, first))
+    assert [(g.table, g.name, g.confidence) for g in scene.guesses] == [
+        ("joint", "elbow", 0.2),
+        ("muscle", "biceps", 0.4),
     ]
-    assert [g.text for g in doubtful(guesses, "muscle", "psoas")] == ["far away"]
-    assert doubtful(find_guesses(TEXT.replace("GUESS 0.4", "0.4")), "muscle") == []
+    assert [g.confidence for g in doubtful(scene.guesses, "muscle", "biceps")] == [0.4]
+    warned = [found.message for found in check_scene(scene) if "guess" in found.message]
+    assert len(warned) == 2 and "a doubtful guess (0.2): a hinge" in warned[0]
+    (muscle,), (joint,) = scene.muscles, scene.joints
+    joint.guess = None
+    muscle.attachments[0].guess = GuessTable(confidence=0.9)
+    assert doubtful(scene.guesses, "muscle") == doubtful(scene.guesses, "joint") == []
+
+
+def test_layout_of_the_file_does_not_move_a_guess(tmp_path):
+    path = arm_files(tmp_path, muscles=(("first", 0.0), ("second", 3.0)))
+    lines = path.read_text(encoding="utf-8").splitlines()
+    at = [k for k, line in enumerate(lines) if line.startswith("[[muscle]]")][1]
+    # Rows of arrays at the margin and indented keys are TOML like any other.
+    lines[at:] = [f"   {line}" for line in lines[at:]]
+    rows = ['{ bone = "upper", vertices = "upper.txt", guess = { confidence = 0.3 } },']
+    rows += ['{ bone = "fore", vertices = "fore.txt" }']
+    path.write_text("\n".join([*lines, "attach = [", *rows, "]"]) + "\n", encoding="utf-8")
+    assert [(g.table, g.name) for g in Scene.load(path).guesses] == [("muscle", "second")]
+
+
+@pytest.mark.parametrize(
+    ("hinge", "says"),
+    [
+        ("# GUESS 0.2: a whole line may say anything\n", ""),
+        ("type = 'hinge'   # GUESS 0.2: a hinge\n", "line .*: comments mark no guesses any more"),
+        ("guess = 0.7\n", "guess"),
+        ("guess = { confidence = 1.2 }\n", "confidence"),
+        ("guess = { sure = 0.2 }\n", "sure"),
+    ],
+)
+def test_other_marks_are_refused_in_words(tmp_path, hinge, says):
+    path = guessed(tmp_path, hinge)
+    if not says:
+        assert Scene.load(path).guesses == []
+        return
+    with pytest.raises(SceneError, match=says):
+        Scene.load(path)
 
 
 @pytest.mark.parametrize("head", ["", "x y z\n", '"Point ID","Points:0","Points:1","Points:2"\n'])

@@ -11,7 +11,7 @@ from blend_model import arm_scene
 import rbfmuscle as rm
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.scene.bone import BoneDistance
-from rbfmuscle.scene.guesses import Guess
+from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession, coordinate_limits
@@ -205,7 +205,8 @@ def test_marks_of_a_scene_move_with_their_bones():
 def test_doubts_of_a_scene_are_listed():
     scene = rm.phantom_scene(end=0.0)
     scene.doubts = ["the foot is one bone"]
-    scene.guesses = [Guess("muscle", "extensor", 0.3, "held by the nearest bone")]
+    held = scene.muscle("extensor").attachments[0]
+    held.guess = GuessTable(confidence=0.3, reason="held by the nearest bone")
     assert scene_marks(scene).doubts == [
         "the foot is one bone",
         "muscle extensor: held by the nearest bone",

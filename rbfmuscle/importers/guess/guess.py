@@ -209,7 +209,7 @@ def _leave_out(guess, error, final):
 
 
 def _scene_text(guess: SceneGuess, stage: str = "") -> str:
-    """The scene file of a guess: what is not sure marked GUESS, what cannot run commented out.
+    """The scene file of a guess: what is guessed has the key guess, what cannot run is a comment.
 
     ``stage`` is the folder of the attachments' folder, relative to the file.
     """
@@ -229,14 +229,14 @@ def _headed(head, part, reasons=()):
 
 
 def _doubt(part):
-    return {"name": f"GUESS: {part.doubt}"} if part.doubt else {}
+    return {"name": f"doubtful: {part.doubt}"} if part.doubt else {}
 
 
 def _head(guess):
     folder, parts = guess.folder, guess.parts
     lines = [
         f"# Scene guessed from the meshes in {folder.name or folder}. "
-        "Check every line marked GUESS; the number is its confidence, 0 to 1.",
+        "Check everything with the key guess, and remove the key of what is right.",
         "# All keys: docs/scene_file.md. Then: rbfmuscle check --picture, rbfmuscle run.",
         *(f"# NOT USED: {file}: {reason}" for file, reason in parts.unusable.items()),
     ]
@@ -262,10 +262,9 @@ def _head(guess):
 def _joint(joint: JointGuess) -> str:
     comments = {"axes": "angles follow the right-hand rule"}
     if not joint.ranges:
-        comments["axes"] += "; GUESS: rename and turn them where angles should have the other sign"
-    text = table_text(
-        f"[[joint]]   # GUESS {joint.confidence:.1f}: {joint.reason}", joint.row(), comments
-    )
+        comments["axes"] += "; rename and turn them where angles should have the other sign"
+    row = {**joint.row(), "guess": _confidence(joint.confidence, joint.reason)}
+    text = table_text("[[joint]]", row, comments)
     if joint.follows:
         row = {"coordinate": joint.coordinate, "of": [joint.follows], "linear": [1, 0]}
         text += "\n" + table_text("[[coupling]]", row)
@@ -277,7 +276,7 @@ def _motion(joint):
     _, high = joint.ranges.get(next(iter(joint.axes)), (0.0, joint.rest + 30.0))
     end = min(joint.rest + 30.0, high) if high > joint.rest else joint.rest
     ramp = {joint.coordinate: {"from": joint.rest, "to": end, "step": 2}}
-    return table_text("[motion]   # degrees", {"ramp": ramp}, {"ramp": "GUESS"})
+    return table_text("[motion]   # degrees", {"ramp": ramp}, {"ramp": "an example"})
 
 
 def _hold_file(muscle, hold):
@@ -285,14 +284,20 @@ def _hold_file(muscle, hold):
     return attachment_file(muscle.muscle.name, hold.bone.name)
 
 
-def _attachment(hold, file):
-    """A row of ``attach``, with its tendon."""
+def _confidence(confidence, reason):
+    """The key ``guess``."""
+    return {"confidence": round(confidence, 1), "reason": reason}
+
+
+def _attachment(hold, file, cap):
+    """A row of ``attach``, with its tendon; it is not surer than ``cap``."""
+    guess = _confidence(min(hold.confidence, cap), hold.reason)
     if hold.tendon is None:
-        return {"bone": hold.bone.name, "vertices": file}
+        return {"bone": hold.bone.name, "vertices": file, "guess": guess}
     line = {"to": rounded(hold.tendon.to, 6)}
     if hold.tendon.via:
         line["via"] = [{"bone": bone.name, "point": rounded(at, 6)} for bone, at in hold.tendon.via]
-    return {"bone": hold.tendon.bone.name, "vertices": file, "tendon": line}
+    return {"bone": hold.tendon.bone.name, "vertices": file, "tendon": line, "guess": guess}
 
 
 def _muscle(guess: MuscleGuess, stage: str) -> str:
@@ -300,14 +305,10 @@ def _muscle(guess: MuscleGuess, stage: str) -> str:
     # What makes the muscle doubtful, not one attachment, makes all of them so.
     cap = guess.confidence if guess.doubted else 1.0
     places = [PurePosixPath(stage, _hold_file(guess, hold)).as_posix() for hold in guess.holds]
-    attach = [_attachment(*pair) for pair in zip(guess.holds, places)]
-    said = [
-        f"GUESS {min(hold.confidence, cap):.1f}: {len(hold.vertices)} vertices, {hold.reason}"
-        for hold in guess.holds
-    ]
+    attach = [_attachment(hold, place, cap) for hold, place in zip(guess.holds, places)]
     row = {"name": part.name, "mesh": part.file, "attach": attach}
     head = _headed("[[muscle]]", part, guess.reasons)
-    text = table_text(head, row, {"attach": said, **_doubt(part)})
+    text = table_text(head, row, _doubt(part))
     if guess.wrong:
         text = "".join(f"# {line}\n" for line in [f"NOT RUN: {guess.wrong}", *text.splitlines()])
     return text

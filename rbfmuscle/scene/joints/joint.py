@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.scene.content import Compared
+from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.scene.joints.functions import Function, Linear
 from rbfmuscle.validation import SceneError
 
@@ -113,6 +114,7 @@ class Joint(Compared):
     # the three axes, where its normal is that axis; or the end of an arc of this length.
     radii: tuple[float, float, float] | None = None
     arc: float = 0.0
+    guess: GuessTable | None = None  # of a joint that nobody has confirmed
 
     def motion(self, values: dict[str, float], rest: dict[str, float]) -> np.ndarray:
         """Return the (4, 4) motion of the child against the parent, scene coordinates, the identity

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.scene.joints.functions import (
     Function,
     Linear,
@@ -154,6 +155,7 @@ class JointTable(Table):
     backward: bool = False
     radii: Vector | None = None
     arc: Finite = 0.0
+    guess: GuessTable | None = None
 
     def joint(self) -> Joint:
         """Return the joint that the table describes, or raise SceneError naming it."""
@@ -198,7 +200,7 @@ class JointTable(Table):
             radii = x, y, z
         bones = self.parent, self.child
         motions = coordinates, turns, shifts, kind, self.backward
-        return Joint(self.name, *bones, centre, *motions, radii, self.arc)
+        return Joint(self.name, *bones, centre, *motions, radii, self.arc, self.guess)
 
     def _kind_by_turns(self, context):
         """The kind where none is given: of one to three axes, each of which is turned about."""
@@ -294,6 +296,8 @@ def joint_row(joint: Joint) -> dict[str, object]:
         row["radii"] = list(joint.radii)
     if joint.arc:
         row["arc"] = joint.arc
+    if joint.guess is not None:
+        row["guess"] = joint.guess.model_dump(exclude_unset=True)
     return row
 
 
