@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from rbfmuscle.implicit.field import RBFField as RBFField
     from rbfmuscle.implicit.kernels.table import register_kernel as register_kernel
     from rbfmuscle.kernels import study_kernels as study_kernels
+    from rbfmuscle.models import ModelKind as ModelKind
+    from rbfmuscle.models import model_kind as model_kind
+    from rbfmuscle.models import register_model as register_model
     from rbfmuscle.muscle.muscle import RBFMuscle as RBFMuscle
     from rbfmuscle.run import Run as Run
     from rbfmuscle.run import simulate as simulate
@@ -49,6 +52,7 @@ _ERRORS = (
 )
 _HOME = {
     "BoneSDF": "rbfmuscle.bones.sdf",
+    "ModelKind": "rbfmuscle.models",
     "RBFField": "rbfmuscle.implicit.field",
     "RBFMuscle": "rbfmuscle.muscle.muscle",
     "Run": "rbfmuscle.run",
@@ -56,8 +60,10 @@ _HOME = {
     "check_scene": "rbfmuscle.scene.check",
     "compare_models": "rbfmuscle.compare",
     "discretisation_error": "rbfmuscle.accuracy",
+    "model_kind": "rbfmuscle.models",
     "phantom_scene": "rbfmuscle.scene.phantom",
     "register_kernel": "rbfmuscle.implicit.kernels.table",
+    "register_model": "rbfmuscle.models",
     "reach_error": "rbfmuscle.experiments.wanted_error",
     "show": "rbfmuscle.viewer.page",
     "simulate": "rbfmuscle.run",

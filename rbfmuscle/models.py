@@ -85,9 +85,9 @@ def register_model(name: str, kind: ModelKind) -> None:
 
     Examples
     --------
-    >>> from rbfmuscle.models import model_kind, register_model
-    >>> register_model("my-pbd", model_kind("pbd")._replace(title="PBD of mine"))
-    >>> model_kind("my-pbd").title
+    >>> import rbfmuscle as rm
+    >>> rm.register_model("my-pbd", rm.model_kind("pbd")._replace(title="PBD of mine"))
+    >>> rm.model_kind("my-pbd").title
     'PBD of mine'
     """
     if name in _KINDS:

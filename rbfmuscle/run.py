@@ -19,6 +19,7 @@ from rbfmuscle.output.run_folder import FolderMeshes
 from rbfmuscle.output.writer import RunWriter, run_folder
 from rbfmuscle.progress import Progress
 from rbfmuscle.recording import MemorySink, Recording
+from rbfmuscle.scene.frames import parse_slice
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame
@@ -220,15 +221,28 @@ class Run(RunData):
         *,
         units: str | None = None,
         muscles: Sequence[str] | None = None,
+        frames: slice | str | None = None,
+        fps: float | None = None,
     ) -> list[Path]:
         """Write the surfaces in other formats, into a folder for each, and return the files.
 
         Formats are ``pvd``, ``vtp``, ``ply``, ``stl``, ``obj``, ``glb``, ``usd`` and
         ``animated-glb``; ``units`` are ``"m"``, ``"cm"`` or ``"mm"``, the scene's where not given;
-        glTF is in metres. ``muscles`` are names, all where not given.
+        glTF is in metres. ``muscles`` are names, all where not given. ``frames`` are those to take
+        of the written ones, a slice or "A:B:S". ``fps`` are frames of the motion per second in
+        ``usd`` and ``animated-glb``; the times of the motion's file, or 24, where not given.
         """
         names = [formats] if isinstance(formats, str) else list(formats)
-        return export_run(self, names, output=directory, units=units, muscles=muscles)
+        chosen = parse_slice(frames) if isinstance(frames, str) else frames
+        return export_run(
+            self,
+            names,
+            output=directory,
+            units=units,
+            muscles=muscles,
+            frames=chosen,
+            fps=fps,
+        )
 
     def _repr_html_(self) -> str:
         """A picture for a notebook, or text where there is nothing to draw."""

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from rbfmuscle.cli.options import Force, Output, OwnFolder
 from rbfmuscle.cli.printing import USUAL, Printing, print_result
 from rbfmuscle.folders import OutputFolder
-from rbfmuscle.validation import MeshError, UsageError
+from rbfmuscle.validation import UsageError
 
 
 def new(
@@ -39,9 +39,9 @@ def new(
     output
         Folder for scene.toml; the folder of the meshes by default.
     """
-    from rbfmuscle.anatomy.bones import HEADER
     from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
     from rbfmuscle.importers.labels.read import read_labels
+    from rbfmuscle.importers.scenes import guess_volume
     from rbfmuscle.scene.check import check_scene
 
     volume = _is_segmentation(source)
@@ -60,13 +60,7 @@ def new(
     base = output.parent
     read = read_labels(source, names=labels) if volume else guess_scene(source, units, base)
     with out.staged(replaces=()) as stage:
-        if isinstance(read, SceneGuess):
-            guess = read
-        else:
-            folder, capped, notes = _write_surfaces(read, stage)
-            header = HEADER if read.directed else None
-            guess = guess_scene(folder, "mm", base, header=header, capped=capped)
-            guess.parts.notes[:0] = notes
+        guess = read if isinstance(read, SceneGuess) else guess_volume(read, stage, base)
         scene = write_scene(guess, output, stage)
     findings = check_scene(scene)
     facts = {
@@ -164,40 +158,3 @@ def _beside(source):
     """Folder of the scene of a segmentation, where none is given."""
     name = source.name.split(".")[0] or "scene"
     return source / "scene" if source.is_dir() else source.parent / f"{name}_scene"
-
-
-def _write_surfaces(volume, stage):
-    """Surfaces of all labels as PLY in ``meshes`` of a folder; that folder, vertices on caps by
-    file, and notes.
-    """
-    from rbfmuscle.anatomy.names import name_facts
-    from rbfmuscle.importers.labels.surfaces import label_surface
-    from rbfmuscle.progress import Progress
-    from rbfmuscle.scene.names import new_name, plain_name
-
-    meshes = stage / "meshes"
-    meshes.mkdir()
-    values = volume.values()
-    capped = {}
-    frame = "right, forward, up (RAS), mm"
-    notes = [f"surfaces of {Path(volume.source).name}, in its frame: {frame}", *volume.notes]
-    with Progress("surfaces", "label") as progress:
-        for done, label in enumerate(values, start=1):
-            tissue = name_facts(volume.name(label)).tissue
-            if tissue == "other":
-                notes.append(f"{volume.name(label)}: neither bone nor muscle, left out")
-                continue
-            try:
-                surface = label_surface(volume, int(label), pieces=tissue == "bone")
-            except MeshError as error:
-                notes.append(f"{error}; left out")
-                continue
-            plain = plain_name(surface.name)
-            file = new_name(surface.name, capped)
-            if plain.lower() in map(str.lower, capped):  # they are two parts
-                notes.append(f"several labels are named {plain}: one of them is {file} here")
-            surface.mesh.export(meshes / f"{file}.ply")
-            capped[file] = surface.capped
-            notes += [f"{surface.name}: {note}" for note in surface.notes]
-            progress(done, len(values))
-    return meshes, capped, notes

@@ -13,7 +13,6 @@ from rbfmuscle.cli.options import (
     Changes,
     FailOn,
     Frames,
-    Model,
     Output,
     SceneName,
     Work,
@@ -35,16 +34,18 @@ Simulated = Annotated[
 def demo(
     *,
     output: Output = Path("demo_output"),
-    model: Model = None,
+    changes: Changes = UNCHANGED,
+    muscles: Simulated = None,
     frames: Frames = None,
     fail_on: FailOn = None,
     work: Work = USUAL_WORK,
 ) -> int:
-    """Run the phantom hip: no data, no network. The same as `run phantom`."""
+    """Run the phantom hip: no data, no network. A word for `run phantom -o demo_output`."""
     return run(
         Path("phantom"),
         output=output,
-        changes=Changes(model),
+        changes=changes,
+        muscles=muscles,
         frames=frames,
         fail_on=fail_on,
         work=work,

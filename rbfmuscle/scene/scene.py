@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 from numpy.typing import ArrayLike
 
@@ -120,6 +120,83 @@ class Scene(Compared):
             found.muscle = error.muscle
             raise found from None
         return scene
+
+    @classmethod
+    def from_meshes(
+        cls, folder: str | Path, *, units: Literal["mm", "cm", "m"] | None = None
+    ) -> Scene:
+        """Return the scene that ``rbfmuscle new`` guesses from a folder of meshes; no file is
+        written.
+
+        Parameters
+        ----------
+        folder : path
+            One bone or muscle a file (STL, OBJ, PLY, VTK, VTP), or in folders ``bones`` and
+            ``muscles``.
+        units : {"mm", "cm", "m"}, optional
+            Unit of the meshes; by the size of the bones where not given.
+
+        Raises
+        ------
+        UsageError
+            If the folder holds no bone or no muscle, or is of no known unit.
+        MeshError
+            If a mesh cannot be used.
+        """
+        from rbfmuscle.importers.scenes import scene_from_meshes
+
+        return scene_from_meshes(Path(folder), units=units)
+
+    @classmethod
+    def from_labels(cls, path: str | Path, *, labels: str | Path | None = None) -> Scene:
+        """Return the scene that ``rbfmuscle new`` guesses from a segmentation, in mm; no file is
+        written.
+
+        Parameters
+        ----------
+        path : path
+            A volume of labels (.nii, .nii.gz, .nrrd, .nhdr), or a folder with one file a mask.
+        labels : path, optional
+            Names of the labels: a file (JSON, CSV, TSV, ITK-SNAP) or a known table, as
+            ``totalsegmentator``.
+
+        Raises
+        ------
+        MeshError
+            If the volume cannot be read or used.
+        UsageError
+            If it holds no bone or no muscle.
+        """
+        from rbfmuscle.importers.scenes import scene_from_labels
+
+        names = None if labels is None else Path(labels)
+        return scene_from_labels(Path(path), labels=names)
+
+    @classmethod
+    def from_osim(
+        cls, path: str | Path, *, geometry: Sequence[str | Path] = (), muscles: bool = True
+    ) -> Scene:
+        """Return the scene of an OpenSim model (.osim), in metres; no file is written.
+
+        Parameters
+        ----------
+        path : path
+            The model, of version 2 to 4.
+        geometry : sequence of path
+            Folders with meshes, besides the model's own and its ``Geometry``.
+        muscles : bool
+            Make a tube of each muscle of the model, along its path.
+
+        Raises
+        ------
+        SceneError
+            If the model cannot be read.
+        """
+        from rbfmuscle.importers.scenes import scene_from_osim
+
+        return scene_from_osim(
+            Path(path), geometry=[Path(one) for one in geometry], muscles=muscles
+        )
 
     def save(self, path: str | Path, *, folder: Path | None = None, comment: str = "") -> Path:
         """Write the scene as a TOML file that loads as the same scene, and return its path.

@@ -13,12 +13,13 @@ from command_line import call
 from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.cli.new import _beside, _write_surfaces
+from rbfmuscle.cli.new import _beside
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.importers.labels import surfaces
 from rbfmuscle.importers.labels.read import read_labels, read_names
 from rbfmuscle.importers.labels.surfaces import label_surface
 from rbfmuscle.importers.labels.volume import LabelVolume
+from rbfmuscle.importers.scenes import write_surfaces
 from rbfmuscle.validation import MeshError
 
 RADIUS = 20.0
@@ -232,6 +233,6 @@ def test_labels_of_one_name_are_each_a_mesh(tmp_path):
     labels[:, :13][labels[:, :13] == 2] = 3
     # File names that differ in case alone are one on some systems.
     names = {1: "soleus_3", 2: "soleus", 3: "Soleus"}
-    _write_surfaces(LabelVolume(labels, np.eye(4), names, "a.nii"), tmp_path)
+    write_surfaces(LabelVolume(labels, np.eye(4), names, "a.nii"), tmp_path)
     found = sorted(path.name for path in (tmp_path / "meshes").iterdir())
     assert found == ["Soleus_2.ply", "soleus.ply", "soleus_3.ply"]

@@ -245,6 +245,17 @@ class TestExport:
             np.testing.assert_allclose(data.points, surface.vertices, rtol=1e-6, atol=1e-5)
             np.testing.assert_array_equal(data.regular_faces, surface.faces)
 
+    def test_a_run_exports_some_frames_and_a_rate(self, arm_run, tmp_path):
+        run = arm_run[0]
+        for number, frames in enumerate(("1:6:2", slice(1, 6, 2))):
+            written = run.export(tmp_path / str(number), "vtp", frames=frames)
+            names = {path.name for path in written if path.name.startswith("biceps")}
+            assert names == {"biceps_0001.vtp", "biceps_0003.vtp", "biceps_0005.vtp"}
+        (glb,) = run.export(tmp_path / "glb", "animated-glb", fps=10.0)
+        assert glb.stat().st_size > 0
+        with pytest.raises(UsageError, match="fps is for"):
+            run.export(tmp_path / "none", "stl", fps=10.0)
+
     def test_named_muscles_alone_come_with_their_tendons_and_all_bones(self, tmp_path):
         run = simulate("phantom", "pbd", frames="0:1")
         everything = {path.name for path in run.export(tmp_path / "all", "stl")}

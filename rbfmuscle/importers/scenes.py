@@ -1,0 +1,105 @@
+"""Scenes in memory from meshes, label volumes and OpenSim models."""
+
+import os
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal, TypeAlias
+
+from rbfmuscle.anatomy.bones import HEADER
+from rbfmuscle.anatomy.names import name_facts
+from rbfmuscle.geometry.arrays import Booleans
+from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
+from rbfmuscle.importers.labels.read import read_labels
+from rbfmuscle.importers.labels.surfaces import label_surface
+from rbfmuscle.importers.labels.volume import LabelVolume
+from rbfmuscle.importers.opensim.scene import import_osim
+from rbfmuscle.progress import Progress
+from rbfmuscle.scene.names import new_name, plain_name
+from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.validation import MeshError, UsageError
+
+# Folder of the surfaces, vertices on caps by file, and notes.
+Surfaces: TypeAlias = tuple[Path, dict[str, Booleans], list[str]]
+
+
+def scene_from_meshes(folder: Path, *, units: Literal["mm", "cm", "m"] | None) -> Scene:
+    """The scene of `Scene.from_meshes`."""
+    if units is not None and units not in MM_PER_UNIT:
+        raise UsageError(f"units must be m, cm or mm, got {units!r}")
+    with TemporaryDirectory() as base:
+        guess = guess_scene(folder, units, Path(base))
+        return _in_memory(guess, Path(base))
+
+
+def scene_from_labels(path: Path, *, labels: Path | None) -> Scene:
+    """The scene of `Scene.from_labels`."""
+    volume = read_labels(path, names=labels)
+    with TemporaryDirectory() as base:
+        stage = Path(base, "surfaces")
+        stage.mkdir()
+        scene = _in_memory(guess_volume(volume, stage, Path(base)), Path(base))
+    scene.name = plain_name(path.name.split(".")[0]) or "scene"
+    return scene
+
+
+def scene_from_osim(path: Path, *, geometry: list[Path], muscles: bool) -> Scene:
+    """The scene of `Scene.from_osim`."""
+    found = import_osim(path, geometry=geometry, muscles=muscles)
+    found.scene.notes += found.notes
+    return found.scene
+
+
+def _in_memory(guess: SceneGuess, base: Path) -> Scene:
+    """The scene of a guess whose file is in a folder that is removed."""
+    stage = base / "scene"
+    stage.mkdir()
+    scene = write_scene(guess, base / "scene.toml", stage)
+    scene.path = None
+    for part in (*scene.bones, *scene.muscles):
+        source = os.path.normpath(part.source)
+        part.source = "" if source.startswith(f"{base}{os.sep}") else source
+    return scene
+
+
+def guess_volume(volume: LabelVolume, stage: Path, base: Path) -> SceneGuess:
+    """The guess of a label volume, whose surfaces are written into a folder ``stage``; the scene's
+    paths are relative to ``base``.
+    """
+    folder, capped, notes = write_surfaces(volume, stage)
+    header = HEADER if volume.directed else None
+    guess = guess_scene(folder, "mm", base, header=header, capped=capped)
+    guess.parts.notes[:0] = notes
+    return guess
+
+
+def write_surfaces(volume: LabelVolume, stage: Path) -> Surfaces:
+    """Surfaces of all labels as PLY in ``meshes`` of a folder; that folder, vertices on caps by
+    file, and notes.
+    """
+    meshes = stage / "meshes"
+    meshes.mkdir()
+    values = volume.values()
+    capped = {}
+    frame = "right, forward, up (RAS), mm"
+    notes = [f"surfaces of {Path(volume.source).name}, in its frame: {frame}", *volume.notes]
+    with Progress("surfaces", "label") as progress:
+        for done, label in enumerate(values, start=1):
+            tissue = name_facts(volume.name(label)).tissue
+            if tissue == "other":
+                notes.append(f"{volume.name(label)}: neither bone nor muscle, left out")
+                continue
+            try:
+                surface = label_surface(volume, int(label), pieces=tissue == "bone")
+            except MeshError as error:
+                notes.append(f"{error}; left out")
+                continue
+            plain = plain_name(surface.name)
+            file = new_name(surface.name, capped)
+            if plain.lower() in map(str.lower, capped):  # they are two parts
+                notes.append(f"several labels are named {plain}: one of them is {file} here")
+            surface.mesh.export(meshes / f"{file}.ply")
+            capped[file] = surface.capped
+            notes += [f"{surface.name}: {note}" for note in surface.notes]
+            progress(done, len(values))
+    return meshes, capped, notes
