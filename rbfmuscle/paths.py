@@ -2,6 +2,7 @@
 well they hold.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,15 +22,22 @@ from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Motion, from_mm
 from rbfmuscle.scene.scene import Scene, require_complete
-from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
+from rbfmuscle.simulation.contact_pairs import (
+    SAMPLED_POSES,
+    Regions,
+    build_fields,
+    find_contact_pairs,
+)
 from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.validation import SceneError, SolveError, UsageError
 
+FOR_EACH = 20  # poses for each coordinate, where no number is given
+GOOD = 1.0  # RMS of moment arms at poses held out, beyond which it is said [mm]
 HELD_OUT = 5  # every fifth sample is held out of the fit
 HIGHEST_ORDER = 7  # of the polynomials that are tried
-STEP = 1.0  # of the central differences, to either side [degree, or mm of a shift]
+STEP = 2.0  # of the central differences, to either side [degree, or mm of a shift]
 # A muscle has settled where no contact point moves by more than this share of its size in a solve.
-MOST_SOLVES, SETTLED = 60, 3e-7
+MOST_SOLVES, SETTLED = 60, 2e-6
 SHIFT = math.degrees(1.0)  # mm of a shift that count as a radian: one mm as one degree
 STILL = 1e-6  # entries of matrices that differ by less are those of one place
 MOST_COORDINATES = 6  # OpenSim's function takes up to six coordinates
@@ -56,45 +64,56 @@ def sample_muscles(
     scene: Scene,
     given: Ranges,
     *,
-    samples: int,
+    samples: int | None = None,
     fibres: int = 0,
     progress: Callable[[int, int], None] | None = None,
+    found: list[Samples] | None = None,
 ) -> list[Samples]:
     """Return lengths and moment arms of every muscle at quasi-random poses of the coordinates that
     it depends on.
 
-    Each of the ``samples`` poses is reached from rest in a straight line and the muscle settles
-    there. Where so many ``fibres`` are asked for, each of them is sampled in place of the muscle,
-    by its name and the fibre's number. A moment arm is minus the central difference of the length
-    over `STEP` to both sides, the muscle settling there too. Ranges that are ``given`` stand for
-    the coordinates' own; ``progress`` is called with the poses that are done, and of how many.
+    The ``samples`` poses, `FOR_EACH` for each of the coordinates where not given, are gone through
+    on a short tour, and the muscles settle at each. Where so many ``fibres`` are asked for, each of
+    them is sampled in place of the muscle, by its name and the fibre's number. A moment arm is
+    minus the central difference of the length over `STEP` to both sides, the muscle settling there
+    too. Ranges that are ``given`` stand for the coordinates' own; one without extent holds its
+    coordinate. ``progress`` is called with the poses that are done, and of how many. The samples
+    are added to the list ``found``, after an interrupt those of the poses that are done.
     """
     scene = require_complete(scene).with_options({"output.fibres": fibres})
     scene.sliding = None
-    groups = _groups(scene)
-    found = []
+    found = [] if found is None else found
+    held = {name: low for name, (low, high) in given.items() if low == high}
+    groups = _groups(scene, held)
+    ranges = _ranges(scene, {name: None for names in groups for name in names}, given)
+    counts = {names: samples or FOR_EACH * len(names) for names in groups}
     done = 0
-    ranges = {name: _range(scene, name, given) for names in groups for name in names}
-    for name in [name for name in given if name not in ranges]:
-        raise UsageError(
-            f"--range {name}: none of the muscles depends on it, or it is locked or follows others"
-        )
     for names, muscles in groups.items():
         part = scene.with_options()
         part.muscles = muscles
-        values = _poses([ranges[name] for name in names], samples)
-        rows = []
-        poses = [dict(zip(names, pose)) for pose in values.tolist()]
-        models = build_models(_along(part, poses))
+        values = _poses([ranges[name] for name in names], counts[names])
+        box = {name: ranges[name] for name in names}
+        order = _tour(values, _rest(scene, names), np.ptp(list(box.values()), axis=1))
+        poses = [{**held, **dict(zip(names, values[k].tolist()))} for k in order]
+        part.motion = Motion(poses)
+        models = build_models(part)
         gauges = _Gauges(part, models)
-        for row in _measured(part, models, gauges, poses):
-            rows.append(row)
-            done += 1
-            if progress is not None:
-                progress(done, samples * len(groups))
-        for name, table in zip(gauges.names, np.array(rows).transpose(1, 0, 2)):
-            capped = int(table[:, -1].sum())
-            found.append(Samples(name, names, values, table[:, 0], table[:, 1:-1], capped))
+        rows = {}
+        try:
+            fields = build_fields(part, _reached(part, poses, box))
+            for place, row in zip(order, _measured(part, models, gauges, poses, names, fields)):
+                rows[place] = row
+                done += 1
+                if progress is not None:
+                    progress(done, sum(counts.values()))
+        finally:
+            places = sorted(rows)
+            for k, name in enumerate(gauges.names if rows else ()):
+                table = np.array([rows[place][k] for place in places])
+                capped = int(table[:, -1].sum())
+                found.append(
+                    Samples(name, names, values[places], table[:, 0], table[:, 1:-1], capped)
+                )
     return found
 
 
@@ -135,34 +154,62 @@ class _Gauges:
         return np.array(found)
 
 
-def _along(scene, poses):
-    """A scene whose motion passes through poses: what bones a muscle may meet is sought along
-    it.
+def _reached(scene, poses, ranges):
+    """Regions of the bones that the muscles may reach on the way through poses and through the
+    corners of the ranges, by muscle and bone.
     """
-    scene.motion = Motion(poses[:40])
-    return scene
+    corners = [poses[0] | dict(zip(ranges, ends)) for ends in itertools.product(*ranges.values())]
+    stops = [*poses, *corners]
+    regions: Regions = {}
+    for start in range(0, len(stops), SAMPLED_POSES - 1):
+        part = scene.with_options()
+        # The next part begins where this one ends.
+        part.motion = Motion(stops[start : start + SAMPLED_POSES])
+        for key, box in find_contact_pairs(part).items():
+            known = regions.get(key, box)
+            regions[key] = np.stack([np.minimum(known[0], box[0]), np.maximum(known[1], box[1])])
+    return regions
 
 
-def _measured(scene, models, gauges, poses):
-    """For each pose and gauge: length, arm about each coordinate, whether it did not settle."""
+def _measured(scene, models, gauges, poses, names, fields):
+    """For each pose and gauge: length, arm about each coordinate of ``names``, whether it did not
+    settle.
+
+    A pose is reached from the one before. Where that fails, from rest; where that fails too, it has
+    no values.
+    """
     rest = [model.snapshot() for model in models]
-    fields = build_fields(scene, find_contact_pairs(scene))
+    loop = None
     for pose in poses:
-        for model, state in zip(models, rest):
-            model.restore(state)
-        try:
+        row = None if loop is None else _tried(loop, gauges, pose, names)
+        if row is None:
+            for model, state in zip(models, rest):
+                model.restore(state)
             loop = FrameLoop(scene, models, bone_sdfs=fields, surfaces=False)
             loop.activations.target = loop.activations.at(0)  # the same in all solves
-            yield _row(loop, gauges, pose)
-        except SolveError:
-            yield np.array([[np.nan] * (1 + len(pose)) + [0.0]] * len(gauges.names))
+            row = _tried(loop, gauges, pose, names)
+        if row is None:
+            loop = None
+            row = np.array([[np.nan] * (1 + len(names)) + [0.0]] * len(gauges.names))
+        yield row
 
 
-def _row(loop, gauges, pose):
+def _tried(loop, gauges, pose, names):
+    """The row of a pose, None where it cannot be solved."""
+    try:
+        return _row(loop, gauges, pose, names)
+    except SolveError:
+        return None
+
+
+def _row(loop, gauges, pose, names):
     """Length and arms of the gauges at a pose, and whether they did not settle, (n, 2 + d)."""
+    for stepper in loop.steppers:
+        stepper.events.clear()
     here, arms = _settled(loop, gauges, pose), []
     known = all_coordinates(loop.scene.joints)
-    for name, value in pose.items():
+    for name in names:
+        value = pose[name]
         turns = known[name].motion != "translation"
         step = math.radians(STEP) if turns else from_mm(STEP, loop.scene.units)
         ends = [known[name].clamped_value(value + side * step) for side in (-1.0, 1.0)]
@@ -201,11 +248,38 @@ def _poses(ranges, samples):
     return low + points[:samples] * (high - low)
 
 
-def _groups(scene):
-    """Muscles by the coordinates that they depend on; those of a group are sampled together."""
+def _rest(scene, names):
+    known = all_coordinates(scene.joints)
+    return np.array([known[name].rest for name in names])
+
+
+def _tour(values, start, span):
+    """The order (n,) of points (n, d) on a short way through all, from near ``start``: always to
+    the nearest that is left, in shares of a ``span`` (d,).
+    """
+    places, here = values / span, start / span
+    left = list(range(len(values)))
+    order = []
+    while left:
+        nearest = int(np.argmin(((places[left] - here) ** 2).sum(axis=1)))
+        order.append(left.pop(nearest))
+        here = places[order[-1]]
+    return order
+
+
+def _groups(scene, held):
+    """Muscles by the coordinates that they depend on, without those that are held; those of a group
+    are sampled together.
+    """
     known = all_coordinates(scene.joints)
     followers = {coupling.coordinate for coupling in scene.couplings}
     free = [name for name, fact in known.items() if name not in followers and not fact.locked]
+    for name, value in held.items():
+        if name not in free or known[name].clamped_value(value) != value:
+            raise UsageError(
+                f"{name} cannot be held there: it is locked, follows others or leaves its range"
+            )
+    free = [name for name in free if name not in held]
     groups = {}
     for muscle in scene.muscles:
         bones = sorted({bone for attachment in muscle.attachments for bone in attachment.bones})
@@ -214,7 +288,7 @@ def _groups(scene):
             raise SceneError(
                 f"muscle {muscle.name!r} depends on {len(needed)} coordinates "
                 f"({', '.join(needed)}); OpenSim takes "
-                f"1 to {MOST_COORDINATES}: lock some in the scene"
+                f"1 to {MOST_COORDINATES}: hold some, or lock them in the scene"
             )
         groups.setdefault(needed, []).append(muscle)
     return groups
@@ -230,8 +304,25 @@ def _moves(scene, bones, name):
     return np.ptp(np.array(places), axis=0).max() > STILL
 
 
+def _ranges(scene, names, given):
+    """The range of each coordinate: as given, its own, or what the motion covers; UsageError that
+    names all that have none.
+    """
+    for name in [name for name, (low, high) in given.items() if low < high and name not in names]:
+        raise UsageError(
+            f"range of {name}: none of the muscles depends on it, or it is locked or follows others"
+        )
+    found = {name: _range(scene, name, given) for name in names}
+    missing = [name for name, ends in found.items() if ends is None]
+    if missing:
+        raise UsageError(
+            f"without a range: {', '.join(missing)}; give each LOW:HIGH, or a value that it holds"
+        )
+    return found
+
+
 def _range(scene, name, given):
-    """The range of a coordinate: as given, its own, or what the motion covers."""
+    """The range of one coordinate, None where it has none."""
     moved = [frame[name] for frame in scene.motion.frames if name in frame]
     fact = all_coordinates(scene.joints)[name]
     for ends in (given.get(name), fact.range, (min(moved, default=0.0), max(moved, default=0.0))):
@@ -239,15 +330,28 @@ def _range(scene, name, given):
             low, high = (fact.clamped_value(end) for end in ends)
             if low == high:
                 raise UsageError(
-                    f"--range {name}: it lies outside the range that clamps the coordinate"
+                    f"range of {name}: it lies outside the range that clamps the coordinate"
                 )
             return low, high
-    raise UsageError(f"coordinate {name!r} has no range; give --range {name}=LOW:HIGH")
+    return None
 
 
 def paths_folder(directory: Path) -> OutputFolder:
     """The folder of fitted paths; UsageError if something in it is in the way."""
     return OutputFolder(directory, "paths", ("paths.xml", "errors.csv"))
+
+
+def fittable(found: Samples) -> bool:
+    """Whether there are poses enough to fit a path, and to tell how well it holds."""
+    use, out = _parts(found)
+    return use.sum() >= 2 * (len(found.coordinates) + 1) and bool(out.any())
+
+
+def _parts(found):
+    """Which poses (n,) are fitted, and which are held out, of those that could be solved."""
+    solved = np.isfinite(found.lengths) & np.isfinite(found.arms).all(axis=1)
+    held = np.arange(len(solved)) % HELD_OUT == HELD_OUT - 1
+    return solved & ~held, solved & held
 
 
 def report_fits(
@@ -279,6 +383,7 @@ def report_fits(
             f"{row['held_out']} poses held out: "
             f"length {row['length_rms']:.3g} {unit} RMS, {row['length_max']:.3g} at most; "
             f"arms {row['arm_rms']:.3g} {unit} RMS, {row['arm_max']:.3g} at most"
+            + (", not good: more than 1 mm" if row["arm_rms"] > from_mm(GOOD, unit) else "")
             + (f"; {row['failed']} poses could not be solved" if row["failed"] else "")
             + (f"; at {found.unsettled} poses it did not settle" if found.unsettled else "")
         )
@@ -297,18 +402,17 @@ def report_fits(
 
 def _fit(found, radian):
     """The path of a muscle, and its errors at poses not fitted, arms over a ``radian`` (d,)."""
-    solved = np.isfinite(found.lengths) & np.isfinite(found.arms).all(axis=1)
-    held = np.arange(len(solved)) % HELD_OUT == HELD_OUT - 1
-    use = solved & ~held
-    out = solved & held
-    failed = int((~solved).sum())
-    if use.sum() < 2 * (len(found.coordinates) + 1) or not out.any():
-        why = f"{failed} of {len(solved)} poses failed, too few are left to fit"
+    use, out = _parts(found)
+    count = len(found.lengths)
+    failed = count - int(use.sum() + out.sum())
+    if not fittable(found):
+        why = f"{failed} of {count} poses failed, too few are left to fit"
         raise SolveError(f"muscle {found.muscle!r}: {why}")
     parts = (found.values[use], found.lengths[use], found.arms[use])
     path = fit_path(found.muscle, found.coordinates, *parts, radian=radian, most=HIGHEST_ORDER)
     row = {"muscle": path.muscle, "order": path.order, "fitted": int(use.sum()), "failed": failed}
     row["held_out"] = int(out.sum())
+    row["unsettled"] = found.unsettled
     length = path.length(found.values[out]) - found.lengths[out]
     arm = radian * (path.arms(found.values[out]) - found.arms[out])
     for name, error in {"length": length, "arm": arm}.items():

@@ -2,7 +2,9 @@
 
 import math
 import re
+import time
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -20,11 +22,14 @@ from rbfmuscle.cli.options import (
 )
 from rbfmuscle.cli.printing import print_result
 from rbfmuscle.progress import Progress
-from rbfmuscle.validation import SceneError, UsageError
+from rbfmuscle.validation import SceneError, SolveError, UsageError
 
 if TYPE_CHECKING:
     from rbfmuscle.paths import Ranges
     from rbfmuscle.scene.scene import Scene
+
+
+FEWEST = 10  # poses from which paths are kept after an interrupt
 
 
 @Parameter(name="*")
@@ -33,8 +38,12 @@ class Sampling:
     """What is sampled."""
 
     samples: Annotated[
-        int, Parameter(help="Poses for each muscle, of which every fifth is held out of the fit.")
-    ] = 120
+        int | None,
+        Parameter(
+            help="Poses for each muscle, of which every fifth is held out of the fit; by default "
+            "20 for each coordinate."
+        ),
+    ] = None
     fibres: Annotated[
         int,
         Parameter(
@@ -47,7 +56,7 @@ class Sampling:
         Parameter(
             name="--range",
             help="COORDINATE=LOW:HIGH in degrees or scene units, else the coordinate's range, or "
-            "what the motion covers; may be repeated.",
+            "what the motion covers; COORDINATE=VALUE holds one; may be repeated.",
         ),
     ] = None
 
@@ -73,40 +82,75 @@ def paths(
         COORDINATE=JOINT/COORDINATE, what the OpenSim model calls a coordinate of the scene, for
         instance hip.flexion=hip_r/hip_flexion_r; may be repeated; else the scene's own names.
     """
+    from rbfmuscle import interruption
     from rbfmuscle.models import configure_scene
-    from rbfmuscle.paths import paths_folder, report_fits, sample_muscles
+    from rbfmuscle.paths import Samples, fittable, paths_folder, report_fits, sample_muscles
     from rbfmuscle.scene.phantom import open_scene
 
     samples = sampling.samples
-    if samples < 10:
+    if samples is not None and samples < 10:
         raise UsageError(f"--samples {samples} is too few to fit anything, give 10 or more")
     loaded = configure_scene(open_scene(scene), changes.parse_settings(), model=changes.model)
     loaded.muscles = chosen_muscles(loaded, muscles)
     ranges, targets = parse_ranges(loaded, sampling.ranges), parse_targets(loaded, names or [])
     paths_folder(output)
-    with Progress(loaded.name, "pose") as progress, work.threads():
-        sampled = sample_muscles(
-            loaded, ranges, samples=samples, fibres=sampling.fibres, progress=progress
-        )
-    rows, lines = report_fits(loaded, sampled, output, targets=targets)
+    sampled: list[Samples] = []
+    done, begun = 0, time.monotonic()
+
+    def advance(count, total):
+        nonlocal done, begun
+        done = count
+        if count == 1:  # before it models were built
+            begun = time.monotonic()
+        elif count in (2, 10):
+            left = (time.monotonic() - begun) / (count - 1) * (total - count)
+            progress.show(f"pose {count} of {total}, about {left:.0f} s to go", count, total)
+        progress(count, total)
+        interruption.check()
+
+    def kept():
+        return f"paths from {done} poses are in {output}" if done >= FEWEST else ""
+
+    sample = partial(sample_muscles, samples=samples, fibres=sampling.fibres, found=sampled)
+    with interruption.keeping(kept):
+        try:
+            with Progress(loaded.name, "pose") as progress, work.threads():
+                sample(loaded, ranges, progress=advance)
+        except KeyboardInterrupt:
+            if usable := [found for found in sampled if fittable(found)]:
+                report_fits(loaded, usable, output, targets=targets)
+            raise
+        rows, lines = report_fits(loaded, sampled, output, targets=targets)
     facts = {"file": str(output / "paths.xml"), "paths": rows}
-    return print_result(work, facts, lines)
+    return print_result(work, facts, lines, error=_failure(rows))
+
+
+def _failure(rows):
+    """The error that muscles did not settle at some poses; None where all did."""
+    loose = [f"{row['muscle']} at {row['unsettled']} poses" for row in rows if row["unsettled"]]
+    if not loose:
+        return None
+    return SolveError(f"did not settle: {', '.join(loose)}; the paths are written all the same")
 
 
 def parse_ranges(scene: "Scene", texts: Pairs) -> "Ranges":
-    """Return the ranges that --range asks for, by full name [radian or scene unit]."""
+    """Return the ranges that --range asks for, by full name [radian or scene unit]; of a
+    coordinate that it holds, both ends are the value.
+    """
     from rbfmuscle.scene.motion import inner_value
 
     found = {}
     for text in texts or ():
         name, _, ends = text.partition("=")
         try:
-            low, high = (float(end) for end in ends.split(":"))
+            low, *more = (float(end) for end in ends.split(":"))
+            (high,) = more or [low]
         except ValueError:
-            form = "COORDINATE=LOW:HIGH, for instance hip.flexion=0:60"
+            form = "COORDINATE=LOW:HIGH, for instance hip.flexion=0:60, nor COORDINATE=VALUE"
             raise UsageError(f"--range {text!r} is not {form}") from None
         full = _full_name(scene, name, "--range")
-        if not -math.inf < low < high < math.inf:
+        ordered = low < high if more else low == high
+        if not (ordered and math.isfinite(low) and math.isfinite(high)):
             raise UsageError(f"--range {text!r}: the range must go upwards between two numbers")
         found[full] = (inner_value(scene, full, low), inner_value(scene, full, high))
     return found

@@ -4,12 +4,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from command_line import call
 
 from rbfmuscle.cli.paths import parse_ranges, parse_targets
 from rbfmuscle.output.path_files import FittedPath, fit_path, write_paths
-from rbfmuscle.paths import SHIFT, Samples, report_fits, sample_muscles
+from rbfmuscle.paths import SHIFT, Samples, _reached, _tour, report_fits, sample_muscles
 from rbfmuscle.scene.joints.functions import exponents
+from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.simulation.contact_pairs import find_contact_pairs
 from rbfmuscle.validation import SolveError, UsageError
 
 
@@ -120,13 +123,104 @@ RANGES = {
 }
 
 
-def test_a_pose_is_sampled_from_rest_whatever_was_sampled_before(scene):
-    (four,) = sample_muscles(scene, RANGES, samples=4)
-    (two,) = sample_muscles(scene, RANGES, samples=2)
+def test_a_pose_has_one_length_whatever_was_sampled_before():
+    scene = phantom_scene(spacing=6.0)
+    scene.muscles = [scene.muscle("abductor")]
+    ranges = {"hip.flexion": (0.0, 0.4)}
+    ranges |= {name: (0.0, 0.0) for name in ("hip.adduction", "hip.internal_rotation")}
+    (three,) = sample_muscles(scene, ranges, samples=3)
+    (one,) = sample_muscles(scene, ranges, samples=1)
     # Sobol's sequence is scrambled for its whole length: the same points first, whatever the count.
-    np.testing.assert_allclose(two.values, four.values[:2], rtol=1e-12)
-    np.testing.assert_allclose(two.lengths, four.lengths[:2], rtol=1e-12)
-    np.testing.assert_allclose(two.arms, four.arms[:2], rtol=1e-9)
+    np.testing.assert_allclose(one.values, three.values[:1], rtol=1e-12)
+    # One pose by two ways differs by up to 0.01 mm; an arm is a difference of two over 4 degrees.
+    assert np.abs(one.lengths - three.lengths[:1]).max() < 0.02
+    assert np.abs(one.arms - three.arms[:1]).max() < 0.5
+
+
+def test_a_coordinate_is_held_at_a_value_and_no_other_is_sampled(scene):
+    flexion = {"hip.flexion": (0.0, 0.3)}
+    held = {name: (0.0, 0.0) for name in ("hip.adduction", "hip.internal_rotation")}
+    (straight,) = sample_muscles(scene, flexion | held, samples=2)
+    (apart,) = sample_muscles(scene, flexion | held | {"hip.adduction": (0.2, 0.2)}, samples=2)
+    assert straight.coordinates == apart.coordinates == ("hip.flexion",)
+    np.testing.assert_array_equal(straight.values, apart.values)
+    # The abductor is 0.2 rad times its moment arm longer.
+    assert (apart.lengths - straight.lengths > 2.0).all()
+    with pytest.raises(UsageError, match="cannot be held"):
+        sample_muscles(scene, {"hip.flexon": (0.0, 0.0)}, samples=2)
+
+
+def test_all_coordinates_without_a_range_are_named_at_once(scene):
+    with pytest.raises(UsageError, match=r"without a range: hip\.adduction, hip\.internal_rotation;"):
+        sample_muscles(scene, {}, samples=2)
+
+
+def test_bones_are_sought_along_all_poses_and_at_the_corners_of_the_ranges():
+    scene = phantom_scene(spacing=6.0)
+    poses = [{"hip.flexion": 0.0, "hip.adduction": 0.0}] * 90
+    poses += [{"hip.flexion": 1.0, "hip.adduction": 0.0}]
+    found = _reached(scene, poses, {"hip.flexion": (0.0, 1.0), "hip.adduction": (-0.3, 0.3)})
+    for pose in (poses[0], poses[-1], {"hip.flexion": 1.0, "hip.adduction": -0.3}):
+        alone = scene.with_options()
+        alone.motion = Motion([pose])
+        for key, box in find_contact_pairs(alone).items():
+            assert (found[key][0] <= box[0] + 1e-9).all() and (found[key][1] >= box[1] - 1e-9).all()
+
+
+def test_poses_are_gone_through_on_a_short_way():
+    values = np.random.default_rng(2).uniform(-1.0, 2.0, (60, 3))
+    order = _tour(values, np.zeros(3), np.full(3, 3.0))
+    assert sorted(order) == list(range(60))
+
+    def way(order):
+        return np.linalg.norm(np.diff(values[order], axis=0), axis=1).sum()
+
+    assert way(order) < 0.5 * way(range(60))
+    assert np.linalg.norm(values[order[0]]) == np.linalg.norm(values, axis=1).min()
+
+
+def test_an_interrupt_keeps_the_poses_that_are_done(scene):
+    held = {name: (0.0, 0.0) for name in ("hip.adduction", "hip.internal_rotation")}
+    found = []
+
+    def interrupt(done, total):
+        assert total == 20  # of one coordinate
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample_muscles(scene, {"hip.flexion": (0.0, 0.3), **held}, progress=interrupt, found=found)
+    (kept,) = found
+    assert kept.values.shape == (3, 1) and np.isfinite(kept.arms).all()
+
+
+@pytest.mark.parametrize(("count", "ends"), [(12, "paths from 12 poses are in"), (3, "")])
+def test_an_interrupted_command_writes_the_paths_of_these_poses(
+    tmp_path, capsys, monkeypatch, count, ends
+):
+    def sample(scene, given, *, samples, fibres, progress, found):
+        values, lengths, arms = made(count)
+        for k in range(count):
+            progress(k + 1, 20)
+        names = ("hip.flexion", "hip.adduction")
+        found.append(Samples("abductor", names, values, lengths, arms))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rbfmuscle.paths.sample_muscles", sample)
+    code, _, err = call(capsys, "paths", "phantom", "-o", tmp_path / "out")
+    assert code == 130 and "interrupted" in err and ends in err
+    assert (tmp_path / "out" / "paths.xml").exists() == bool(ends)
+
+
+def test_what_did_not_settle_is_an_error_after_the_paths_are_written(tmp_path, capsys, monkeypatch):
+    def sample(scene, given, *, found, **options):
+        found.append(Samples("abductor", ("hip.flexion", "hip.adduction"), *made(40), unsettled=2))
+        return found
+
+    monkeypatch.setattr("rbfmuscle.paths.sample_muscles", sample)
+    code, out, err = call(capsys, "paths", "phantom", "-o", tmp_path / "out")
+    assert code == 5 and "did not settle: abductor at 2 poses" in err
+    assert "abductor: order" in out and (tmp_path / "out" / "paths.xml").exists()
 
 
 def test_each_fibre_is_sampled_as_a_path_of_its_own(scene):
@@ -151,7 +245,17 @@ def test_poses_that_fail_are_left_out_and_too_many_are_refused(tmp_path, scene):
 
 def test_ranges_are_checked(scene):
     assert parse_ranges(scene, ["flexion=0:90"])["hip.flexion"] == pytest.approx((0.0, np.pi / 2))
-    for text in ("flexion", "flexion=1", "flexion=9:1", "flexion=a:b", "flexion=0:inf", "foo=0:1"):
+    assert parse_ranges(scene, ["flexion=90"])["hip.flexion"] == pytest.approx((np.pi / 2,) * 2)
+    for text in (
+        "flexion",
+        "flexion=1:",
+        "flexion=1:2:3",
+        "flexion=9:1",
+        "flexion=nan",
+        "flexion=a:b",
+        "flexion=0:inf",
+        "foo=0:1",
+    ):
         with pytest.raises(UsageError, match="--range"):
             parse_ranges(scene, [text])
 
