@@ -132,7 +132,7 @@ def run_sweep(
 
     done = 0
 
-    def advance(*, recount: bool = False):
+    def advance(*, recount: bool = False) -> None:
         nonlocal done
         done = sum(bool(folder.read(point.key)) for point in left) if recount else done + 1
         if progress is not None:

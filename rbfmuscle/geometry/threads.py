@@ -12,7 +12,7 @@ from threading import Lock, local
 from typing import TypeVar
 
 from numba import config
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import LibController, ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -63,13 +63,13 @@ def blas_limited(count: int) -> Iterator[None]:
             _limit_blas()
 
 
-def _limit_blas():
+def _limit_blas() -> None:
     for library, before in zip(_blas(), _blas_before):
         library.set_num_threads(min([before, *_blas_limits]))
 
 
 @lru_cache(maxsize=1)
-def _blas():
+def _blas() -> list[LibController]:
     import scipy.linalg  # noqa: F401 - SciPy brings a BLAS of its own, found once it is loaded
 
     return ThreadpoolController().select(user_api="blas").lib_controllers

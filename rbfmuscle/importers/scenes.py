@@ -56,10 +56,17 @@ def _in_memory(guess: SceneGuess, base: Path) -> Scene:
     stage.mkdir()
     scene = write_scene(guess, base / "scene.toml", stage)
     scene.path = None
-    for part in (*scene.bones, *scene.muscles):
-        source = os.path.normpath(part.source)
-        part.source = "" if source.startswith(f"{base}{os.sep}") else source
+    for bone in scene.bones:
+        bone.source = _lasting(bone.source, base)
+    for muscle in scene.muscles:
+        muscle.source = _lasting(muscle.source, base)
     return scene
+
+
+def _lasting(source: str, base: Path) -> str:
+    """The name of a file without a way through a folder that is removed; none for files in it."""
+    source = os.path.normpath(source)
+    return "" if source.startswith(f"{base}{os.sep}") else source
 
 
 def guess_volume(volume: LabelVolume, stage: Path, base: Path) -> SceneGuess:

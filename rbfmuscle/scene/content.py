@@ -25,8 +25,6 @@ class Compared:
     def __eq__(self, other: object) -> bool:
         return content(self) == content(other) if type(other) is type(self) else NotImplemented
 
-    __hash__ = None
-
 
 def content(value: object) -> object:
     """A value as plain data that JSON can hold; arrays and meshes by their hashes, and no names of
@@ -52,7 +50,11 @@ def content(value: object) -> object:
         left = value.not_compared if isinstance(value, Compared) else ()
         names = [each.name for each in fields(value) if each.name not in left]
         return {"": type(value).__name__, **{name: content(getattr(value, name)) for name in names}}
-    return mesh_hash(value.vertices, value.faces)
+    import trimesh
+
+    if isinstance(value, trimesh.Trimesh):
+        return mesh_hash(np.asarray(value.vertices), np.asarray(value.faces))
+    raise TypeError(f"{type(value).__name__} is no part of a scene")
 
 
 def content_hash(*values: object) -> str:

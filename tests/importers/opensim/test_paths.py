@@ -151,7 +151,8 @@ def test_a_coordinate_is_held_at_a_value_and_no_other_is_sampled(scene):
 
 
 def test_all_coordinates_without_a_range_are_named_at_once(scene):
-    with pytest.raises(UsageError, match=r"without a range: hip\.adduction, hip\.internal_rotation;"):
+    missing = r"without a range: hip\.adduction, hip\.internal_rotation;"
+    with pytest.raises(UsageError, match=missing):
         sample_muscles(scene, {}, samples=2)
 
 
