@@ -8,7 +8,7 @@ from tendon_scene import arm
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.metrics.summary import LIMITS
 from rbfmuscle.run import simulate
-from rbfmuscle.scene.guesses import Guess
+from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.scene.phantom import phantom_scene
 
 LOOK = "look at that frame"
@@ -18,7 +18,7 @@ def shifted(height):
     """The arm with its muscle moved up, held as guessed."""
     scene = arm_scene(end=10)
     scene.muscles[0].mesh.apply_translation([0.0, 0.0, height])
-    scene.guesses = [Guess("muscle", "biceps", 0.9, "")]
+    scene.muscles[0].attachments[0].guess = GuessTable(confidence=0.9)
     return scene.with_options({"contact.initial": "keep"})
 
 
@@ -33,7 +33,8 @@ def hinged(centre):
 
 def guessed(sure):
     scene = arm_scene(end=10)
-    scene.guesses = [Guess("muscle", "biceps", 0.1, "held by the nearest bones")] * (not sure)
+    doubtful = GuessTable(confidence=0.1, reason="held by the nearest bones")
+    scene.muscles[0].attachments[0].guess = None if sure else doubtful
     return scene
 
 
