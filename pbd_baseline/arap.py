@@ -13,7 +13,7 @@ from pbd_baseline.topology import Topology, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.harmonic import cotangent_laplacian, graph_laplacian
 from rbfmuscle.geometry.rotations import quaternion_matrix, rotate
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 # Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.
 # At most so many, or to this squared angle: the next sweep goes on from where these end.
@@ -87,7 +87,7 @@ class ARAPConstraint:
         )
 
 
-@compiled
+@loop
 def _rotation_loop(points, rings, rest, weights, quaternions):
     start, ring, ring_edge, edges = rings
     moment = np.empty((3, 3))
@@ -105,7 +105,7 @@ def _rotation_loop(points, rings, rest, weights, quaternions):
                 break
 
 
-@compiled
+@loop
 def _turn_towards(moment, q):
     """One Newton step of maximising tr(R^T A) over rotations R; return its squared angle.
 
@@ -151,7 +151,7 @@ def _turn_towards(moment, q):
     return square
 
 
-@compiled
+@loop
 def _turn_quaternion(q, x, y, z):
     """q <- q (1, x, y, z), normalised: right to third order, and the fixed point is unchanged."""
     a = q[0]
@@ -167,7 +167,7 @@ def _turn_quaternion(q, x, y, z):
         q[k] /= size
 
 
-@compiled
+@loop
 def _target_loop(edges, rest, weights, quaternions, out):
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
@@ -178,7 +178,7 @@ def _target_loop(edges, rest, weights, quaternions, out):
             out[j, k] -= pull
 
 
-@compiled
+@loop
 def _constraint_loop(points, inverse_mass, edges, rest, quaternions, compliance, time):
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]

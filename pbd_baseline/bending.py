@@ -7,7 +7,7 @@ import numpy as np
 from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.rotations import cross, dot
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no
 # direction.
@@ -75,7 +75,7 @@ class BendingConstraint:
         )
 
 
-@compiled
+@loop
 def _dihedral_loop(points, members, out):
     """Cosine and sine of the signed dihedral angle, positive on a convex edge."""
     for c in range(len(members)):
@@ -96,7 +96,7 @@ def _dihedral_loop(points, members, out):
         out[c, 1] = -(a * q).sum() * np.sqrt(ee) / size
 
 
-@compiled
+@loop
 def _sweep_loop(points, inverse_mass, colours, members, rest, stiffness, compliance):
     block = np.empty(ROWS * BLOCK)
     x = points.reshape(-1)
@@ -121,7 +121,7 @@ def _sweep_loop(points, inverse_mass, colours, members, rest, stiffness, complia
                     x[m + np.uint32(d)] += block[t + (9 + d) * BLOCK]
 
 
-@compiled
+@loop
 def _gather(x, inverse_mass, members, c, t, block):
     """Fill place t of a block from constraint c; x (3 n,) are coordinates, indices unsigned, so
     that none is tested for counting from the end.
@@ -136,7 +136,7 @@ def _gather(x, inverse_mass, members, c, t, block):
         block[t + (3 * k + 2) * BLOCK] = x[other + TWO] - x[first + TWO]
 
 
-@compiled(fastmath={"contract", "arcp", "nsz", "reassoc"})
+@loop(fastmath={"contract", "arcp", "nsz", "reassoc"})
 def _project_block(g, count, stiffness, compliance):
     """grad_k = -gk p, grad_m = -gm q, grad_j = aj p + bj q, grad_i = ai p + bi q; a collapsed face
     stays.
@@ -180,7 +180,7 @@ def _project_block(g, count, stiffness, compliance):
         g[t + 11 * BLOCK] = -fm * q[2]
 
 
-@compiled(inline="always")
+@loop
 def _half_turn(g, t, sine, pq, aligned):
     """Tangent, at most 1, of half the angle by which a fold is off its angle at rest."""
     turned = sine * g[t + 13 * BLOCK] - pq * g[t + 14 * BLOCK]
@@ -188,13 +188,13 @@ def _half_turn(g, t, sine, pq, aligned):
     return turned / (max(aligned, abs(turned)) + 1e-300)
 
 
-@compiled(inline="always")
+@loop
 def _taken(g, t):
     """A vector of column t of a block."""
     return g[t], g[t + BLOCK], g[t + 2 * BLOCK]
 
 
-@compiled(inline="always")
+@loop
 def _put(g, t, a, p, b, q):
     """Put a p + b q into column t of a block."""
     g[t] = a * p[0] + b * q[0]

@@ -12,7 +12,7 @@ from pbd_baseline.contact import NO_PLANES, ContactPlanes, clear_way
 from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order, spread
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import volume_cubic, volume_loop
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no
 # direction.
@@ -109,7 +109,7 @@ class VolumeConstraint:
         return _restore_loop(points, self.faces, direction, self.rest, self._least, planes)
 
 
-@compiled
+@loop
 def _restore_loop(points, faces, direction, rest, least, planes):
     """Move points along a direction to the rest volume; ``least`` is the slope that counts as none
     for a direction whose greatest component is 1.
@@ -124,7 +124,7 @@ def _restore_loop(points, faces, direction, rest, least, planes):
     return s
 
 
-@compiled
+@loop
 def _cubic_step(coefficients, wanted, least):
     """Root of c0 + c1 s + c2 s^2 + c3 s^3 = wanted that continues s = 0, by safeguarded Newton
     steps.
@@ -148,7 +148,7 @@ def _cubic_step(coefficients, wanted, least):
     return s
 
 
-@compiled
+@loop
 def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance):
     # A flat array and unsigned numbers: no index is tested for counting from the end.
     x = points.reshape(-1)
@@ -176,7 +176,7 @@ def _edge_loop(points, inverse_mass, edges, rest, limits, stiffness, compliance)
         x[j + TWO] -= fj * dz
 
 
-@compiled
+@loop
 def _volume_gradient_loop(points, faces, out):
     """Add a third of the area vector of each face at its vertices, on a closed mesh the same as b x
     c / 6.

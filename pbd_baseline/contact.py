@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.simulation.contact import BoneContacts
 
 # A half-space counts as violated below this share of the search reach.
@@ -52,7 +52,7 @@ class ContactConstraint:
         _push_loop(points, self.planes, TOUCHING * self.reach)
 
 
-@compiled
+@loop
 def plane_depths(points, planes):
     """Depth (c,) of each point in its half-space, 0 outside."""
     depth = np.empty(len(planes.point))
@@ -64,14 +64,14 @@ def plane_depths(points, planes):
     return depth
 
 
-@compiled
+@loop
 def _greatest_depth(points, planes):
     """Greatest depth of a point in its half-space, 0 where all are outside."""
     depth = plane_depths(points, planes)
     return depth.max() if len(depth) > 0 else 0.0
 
 
-@compiled
+@loop
 def _push_loop(points, planes, least):
     """Push points out of their half-spaces, all by where they are now, if one is deeper than
     ``least``.
@@ -84,7 +84,7 @@ def _push_loop(points, planes, least):
             points[planes.point[c], a] += depth[c] * planes.normal[c, a]
 
 
-@compiled
+@loop
 def clear_way(points, planes, direction, step):
     """Take out of a direction what leads into half-spaces within twice a step along it; whether
     anything did.

@@ -6,7 +6,7 @@ import numpy as np
 
 from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.scene.activation.contraction import make_contraction
 from rbfmuscle.scene.objects import Muscle
 
@@ -98,7 +98,7 @@ class MeshFibres:
         _wanted_loop(points, measured, (self.lower, self.upper, self.active), self.wanted)
 
 
-@compiled
+@loop
 def _wanted_loop(points, measured, band, wanted):
     """Target stretches (n, 2) along the fibre and across it at each vertex.
 
@@ -123,7 +123,7 @@ def _wanted_loop(points, measured, band, wanted):
         wanted[i, 1] = 1.0 / np.sqrt(along + active[i] * (now - along))
 
 
-@compiled
+@loop
 def _length_loop(chosen, edges, known, wanted, squares, lengths):
     """|T E|, from E² = (E · a)² + rest by (t E · a)² + s² · rest."""
     along, across = squares

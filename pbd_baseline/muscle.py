@@ -17,7 +17,7 @@ from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.interpolation import SurfaceInterpolation
 from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.geometry.surfaces import farthest_move
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.scene.muscles import attachment_frames
 from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
@@ -223,7 +223,7 @@ def _bone_numbers(rest, names):
     return np.where(rest.attached_bone < 0, -1, numbers[rest.attached_bone])
 
 
-@compiled
+@loop
 def _place_loop(rest, attached_bone, poses, points):
     """Put held vertices where their bones' poses (b, 4, 4) take them."""
     for i in range(len(points)):

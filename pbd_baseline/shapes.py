@@ -17,7 +17,7 @@ from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.geometry.surfaces import vertex_areas
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 # How far one global step of ARAP carries, as a share of the muscle's diagonal.
 STEP_REACH = 0.03
@@ -259,7 +259,7 @@ METHODS = {
 }
 
 
-@compiled
+@loop
 def _scale_loop(direction, length):
     """Give each row the length asked for."""
     for i in range(len(direction)):

@@ -11,7 +11,7 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.validation import MeshError, check_mesh
 
 # Offsets in a flat array of coordinates, as unsigned as the vertices of `members_in_order`.
@@ -122,7 +122,7 @@ def spread(value: Floats | float, order: Integers) -> Floats:
     return np.ascontiguousarray(value[order]) if value.ndim else np.full(len(order), float(value))
 
 
-@compiled
+@loop
 def _colour_loop(members, taken, colours):
     """Bit q of ``taken[v]`` (63 to a word) says that colour q is used at vertex v."""
     for c in range(len(members)):

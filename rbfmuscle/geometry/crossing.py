@@ -7,7 +7,7 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.rings import plain_loop, vertex_rings
 from rbfmuscle.geometry.surfaces import opposite_half_edges
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 # Triangles in a leaf of the tree, and bits of their places along each axis by which they are
 # sorted.
@@ -85,7 +85,7 @@ class FaceTree:
         return found
 
 
-@compiled
+@loop
 def no_boxes(tree):
     """Room for the boxes of a tree, none of which is made: empty ones touch nothing."""
     boxes = Boxes(np.empty((tree.leaves, 6, LEAF)), np.empty((2 * tree.leaves, 6)))
@@ -97,7 +97,7 @@ def no_boxes(tree):
     return boxes
 
 
-@compiled
+@loop
 def crossing_loop(vertices, tree, among, folds, boxes, found):
     """Mark the triangles (m,) that cross others, among pairs as `FaceTree.crossing` says; how many.
 
@@ -152,7 +152,7 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
     return FaceTree(vertices, faces).crossing(vertices)
 
 
-@compiled
+@loop
 def _boxes_loop(vertices, faces, changed, boxes):
     """Make the boxes of the nodes that ``changed`` (2 * leaves,) marks, and of their triangles."""
     box = boxes.face
@@ -181,7 +181,7 @@ def _boxes_loop(vertices, faces, changed, boxes):
                 node[k, 3 + a] = max(node[2 * k, 3 + a], node[2 * k + 1, 3 + a])
 
 
-@compiled
+@loop
 def _wanted_loop(asked, leaves, wanted):
     """Mark the nodes that hold triangles among which crossings are sought."""
     for leaf in range(leaves):
@@ -193,7 +193,7 @@ def _wanted_loop(asked, leaves, wanted):
         wanted[k] = wanted[2 * k] or wanted[2 * k + 1]
 
 
-@compiled
+@loop
 def _apart(one, i, other, j):
     """Whether two boxes do not touch."""
     # All six are compared: which of them tells cannot be foreseen, and a wrong guess costs more
@@ -208,7 +208,7 @@ def _apart(one, i, other, j):
     )
 
 
-@compiled
+@loop
 def _pairs_loop(node, wanted, pairs):
     """Pairs of leaves whose boxes touch, from the root down; how many there are, also beyond the
     room for them.
@@ -235,7 +235,7 @@ def _pairs_loop(node, wanted, pairs):
     return met
 
 
-@compiled
+@loop
 def _cross_loop(vertices, faces, leaves, asked, found):
     """The triangles of pairs of leaves: which of them touch by their boxes, then which of these
     cross.
@@ -258,7 +258,7 @@ def _cross_loop(vertices, faces, leaves, asked, found):
                 found[f], found[g] = True, True
 
 
-@compiled
+@loop
 def _near_loop(pairs, box, among, some):
     """Fill ``some`` with the triangles of pairs of leaves whose boxes touch, one of them marked;
     how many there are.
@@ -285,7 +285,7 @@ def _near_loop(pairs, box, among, some):
     return count
 
 
-@compiled
+@loop
 def _meet(faces, f, g, plain):
     """Whether two triangles can cross: not if they share an edge, or a corner around which none
     covers another.
@@ -306,7 +306,7 @@ def _meet(faces, f, g, plain):
     return (shared == 0) | ((shared == 1) & (not ringed))
 
 
-@compiled
+@loop
 def _cross(vertices, faces, f, g):
     """Whether an edge of one triangle goes through the inside of the other."""
     if not (_straddles(vertices, faces, f, g) and _straddles(vertices, faces, g, f)):
@@ -314,7 +314,7 @@ def _cross(vertices, faces, f, g):
     return _edges_cross(vertices, faces, f, g) or _edges_cross(vertices, faces, g, f)
 
 
-@compiled
+@loop
 def _straddles(vertices, faces, f, g):
     """Whether f has corners on both sides of the plane of g; those that they share lie in it."""
     a = faces[g, 0]
@@ -331,7 +331,7 @@ def _straddles(vertices, faces, f, g):
     return above and below
 
 
-@compiled
+@loop
 def _edges_cross(vertices, faces, f, g):
     """Whether an edge of f goes through the inside of g."""
     a = faces[g, 0]
@@ -351,7 +351,7 @@ def _edges_cross(vertices, faces, f, g):
     return False
 
 
-@compiled
+@loop
 def _side(vertices, a, b, c, d):
     """Six times the signed volume of a tetrahedron: which side of the triangle abc the point d lies
     on.

@@ -9,7 +9,7 @@ from scipy.sparse.linalg import splu
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
 from rbfmuscle.geometry.rotations import matrix_quaternion
 from rbfmuscle.geometry.surfaces import face_normals
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 
 def cotangent_laplacian(vertices: Floats, faces: Integers) -> sparse.csc_matrix:
@@ -108,7 +108,7 @@ def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
     return out
 
 
-@compiled
+@loop
 def exponential_loop(points, twists, out):
     """Move each point by the exponential of its twist (omega, velocity)."""
     for n in range(len(points)):
@@ -142,7 +142,7 @@ def exponential_loop(points, twists, out):
         out[n, 2] = z + w + first * pz + second * (a * py - b * px + sz) + third * (a * sy - b * sx)
 
 
-@compiled
+@loop
 def logarithm_loop(motions, twists):
     """Twists (omega, velocity) of rigid motions (b, 4, 4)."""
     for n in range(len(motions)):

@@ -19,7 +19,7 @@ from rbfmuscle.geometry.exact_distance import (
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.geometry.triangles import FACE
 from rbfmuscle.geometry.winding import inside_test
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 # Cells along the longer side, at most; below that the square root of the number of triangles.
 _MOST_CELLS = 512
@@ -79,7 +79,7 @@ class Columns:
         return out
 
 
-@compiled
+@loop
 def _count_loop(vertices, faces, grid, covered):
     """Cells that each triangle's box covers, by column and row, and in ``starts`` how many
     triangles each cell has.
@@ -111,7 +111,7 @@ def _count_loop(vertices, faces, grid, covered):
                 grid.ends[cell, 1] = max(grid.ends[cell, 1], top)
 
 
-@compiled
+@loop
 def _sort_loop(covered, width, starts, items):
     """Put the triangles into their cells, each cell's from its end on."""
     for f in range(len(covered)):
@@ -121,7 +121,7 @@ def _sort_loop(covered, width, starts, items):
                 items[starts[cell]] = f
 
 
-@compiled
+@loop
 def _inside_loop(points, pose, vertices, faces, grid, out):
     low = grid.low
     high = grid.high
@@ -149,7 +149,7 @@ def _inside_loop(points, pose, vertices, faces, grid, out):
         out[n] = count > 0
 
 
-@compiled
+@loop
 def _above(at, vertices, faces, f, axes):
     """1 where a triangle lies above a point and looks up, -1 where it looks down, else 0."""
     u, v, w = axes
@@ -181,7 +181,7 @@ def _above(at, vertices, faces, f, axes):
     return 1 if west[2] else -1
 
 
-@compiled(inline="always")
+@loop
 def _met(vertices, a, b, y, axes):
     """Where the edge from a to b meets a line along the first axis: the place on it, the height,
     and whether the edge falls, all in the order of ``axes``.
@@ -295,7 +295,7 @@ class MeshDistance:
         return out
 
 
-@compiled
+@loop
 def _distance_loop(points, tree, near, out):
     stack = np.empty(STACK, np.int64), np.empty(STACK)
     best = np.int64(-1)
@@ -310,7 +310,7 @@ def _distance_loop(points, tree, near, out):
         near[i], out[i] = best, np.sqrt(square)
 
 
-@compiled
+@loop
 def _side_loop(points, records, near, side):
     """1 before and -1 behind the triangle nearest to each point, where it projects into that
     triangle.

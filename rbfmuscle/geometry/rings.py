@@ -3,7 +3,7 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Integers
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 
 def vertex_rings(faces: Integers, opposite: Integers, count: int) -> tuple[Integers, Integers]:
@@ -36,7 +36,7 @@ def vertex_rings(faces: Integers, opposite: Integers, count: int) -> tuple[Integ
     return start, np.roll(faces, -1, axis=1).ravel()[step[order]]
 
 
-@compiled
+@loop
 def plain_loop(vertices, start, other, plain):
     """Mark (n,) the vertices whose triangles lie side by side when seen along the mean normal
     there; ``start`` and ``other`` are `vertex_rings`.
@@ -59,7 +59,7 @@ def plain_loop(vertices, start, other, plain):
         plain[v] = count > 0 and _side_by_side(sides, normals, count)
 
 
-@compiled(inline="always")
+@loop
 def _side_by_side(sides, normals, count):
     """Whether a ring of triangles between some sides, of which the last is the first again, goes
     round once, all seen from outside.

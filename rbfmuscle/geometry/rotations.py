@@ -3,7 +3,7 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 
 def turned_quaternions(quaternions: Floats, rotation: Floats) -> Floats:
@@ -13,7 +13,7 @@ def turned_quaternions(quaternions: Floats, rotation: Floats) -> Floats:
     return np.ascontiguousarray(quaternions @ left.T)
 
 
-@compiled
+@loop
 def matrix_quaternion(m):
     """Unit quaternion of a rotation matrix, as four numbers, from the greatest of them (Shepperd
     1978).
@@ -36,7 +36,7 @@ def matrix_quaternion(m):
     return q[0] / length, q[1] / length, q[2] / length, q[3] / length
 
 
-@compiled(inline="always")
+@loop
 def quaternion_matrix(q):
     """Rows of the rotation matrix of a unit quaternion, as three tuples."""
     w = q[0]
@@ -50,7 +50,7 @@ def quaternion_matrix(q):
     )
 
 
-@compiled
+@loop
 def rotate(q, v):
     """Rotate a vector by a unit quaternion; returns three numbers."""
     tx = 2.0 * (q[2] * v[2] - q[3] * v[1])
@@ -63,19 +63,19 @@ def rotate(q, v):
     )
 
 
-@compiled(inline="always")
+@loop
 def dot(u, v):
     """Product of two vectors of three numbers."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-@compiled(inline="always")
+@loop
 def cross(u, v):
     """Vector product of two vectors of three numbers."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
-@compiled(inline="always")
+@loop
 def turn_towards(m, q):
     """The unit quaternion q a step nearer to the rotational part of a matrix m, given as rows.
 
@@ -119,7 +119,7 @@ def turn_towards(m, q):
     return _turned(q, half * u, half * v, half * w)
 
 
-@compiled(inline="always")
+@loop
 def _turned(q, u, v, w):
     """Unit quaternion q followed by a small rotation, by twice the vector (u, v, w)."""
     a = q[0] - u * q[1] - v * q[2] - w * q[3]

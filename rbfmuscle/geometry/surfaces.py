@@ -8,7 +8,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 
 def face_normals(vertices: Floats, faces: Integers) -> Floats:
@@ -28,7 +28,7 @@ def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
     return normals
 
 
-@compiled
+@loop
 def _vertex_normal_loop(vertices, faces, normals):
     for f in range(len(faces)):
         a = vertices[faces[f, 0]]
@@ -186,7 +186,7 @@ def mesh_volume(vertices: Floats, faces: Integers) -> float:
     return float(volume_loop(np.asarray(vertices, dtype=np.float64), np.asarray(faces)))
 
 
-@compiled(inline="always")
+@loop
 def six_volumes(p, q, r):
     """Six times the signed volume of the tetrahedron of the origin and three points: r . (p x
     q).
@@ -198,13 +198,13 @@ def six_volumes(p, q, r):
     )
 
 
-@compiled(inline="always")
+@loop
 def corner_from(vertices, v, origin):
     """Vertex v relative to an origin, as three numbers."""
     return vertices[v, 0] - origin[0], vertices[v, 1] - origin[1], vertices[v, 2] - origin[2]
 
 
-@compiled
+@loop
 def volume_loop(vertices, faces):
     """Enclosed volume, measured from a corner of the first face; 0 without faces."""
     if len(faces) == 0:
@@ -218,7 +218,7 @@ def volume_loop(vertices, faces):
     return total / 6.0
 
 
-@compiled
+@loop
 def volume_rate(vertices, faces, direction):
     """The volume of a closed mesh, and how fast it grows along directions d (n, 3)."""
     volume, rate = 0.0, 0.0
@@ -246,7 +246,7 @@ def volume_rate(vertices, faces, direction):
     return volume / 6.0, rate / 6.0
 
 
-@compiled
+@loop
 def volume_cubic(vertices, faces, direction):
     """Coefficients c of the volume V(x + s d) = c0 + c1 s + c2 s^2 + c3 s^3 of a closed mesh along
     directions d (n, 3).
@@ -281,7 +281,7 @@ def volume_cubic(vertices, faces, direction):
     return c0 / 6.0, c1 / 6.0, c2 / 12.0, c3 / 18.0
 
 
-@compiled
+@loop
 def touching_balls(points, normals, steps, nearest):
     """Radii ``steps`` (2, n) of the empty balls that touch each point from outside and inside,
     infinite where no point limits them, and how far the nearest other point is.
@@ -348,7 +348,7 @@ class EdgeStretch:
         return np.bincount(self._ends, np.tile(change, 2), len(now)) / self._count
 
 
-@compiled
+@loop
 def farthest_move(before, after):
     """How far a point (n, 3) moved at most; infinity where one is not finite."""
     most = 0.0

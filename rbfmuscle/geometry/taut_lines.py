@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 STEEPEST = 2.0  # greatest slope of a line against the chord of its ends
 DIRECTIONS = 64  # directions in which a convex hull is begun
@@ -40,7 +40,7 @@ def taut_line(
     return start + _upper_hull(np.concatenate([[[0.0, 0.0], [size, 0.0]], *profile])) @ axes[:2]
 
 
-@compiled
+@loop
 def _profile_loop(points, turn, shift, size, width, found):
     """Fill ``found`` with points along and above a chord, counted as in `taut_line`; return how
     many there are.

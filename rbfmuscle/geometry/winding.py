@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 
 def inside_test(
@@ -25,7 +25,7 @@ def inside_test(
     return inside
 
 
-@compiled
+@loop
 def winding_loop(vertices, faces, points, out):
     """Winding numbers (n,) of a few points by the sum over all triangles' solid angles, without a
     tree.

@@ -9,7 +9,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.joints.joint import Coordinate, all_coordinates
 from rbfmuscle.scene.motion import (
@@ -258,7 +258,7 @@ class SubSteps:
         return max(moved[0], min(moved[1], FINER * moved[0]))
 
 
-@compiled
+@loop
 def step_excess(old, new, limits):
     """How far a step between poses (b, 4, 4) takes bones, and ends that tendons hold, (2,) relative
     to what is allowed.
@@ -296,7 +296,7 @@ def step_excess(old, new, limits):
     return most
 
 
-@compiled
+@loop
 def _seen_from(root, pose, out):
     """A pose as seen from another: root⁻¹ · pose, (3, 4)."""
     for a in range(3):

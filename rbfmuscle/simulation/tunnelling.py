@@ -17,7 +17,7 @@ import numpy as np
 
 from rbfmuscle.bones.distance import distance_at
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.exact_distance import STACK
 from rbfmuscle.geometry.triangles import BX, CX, CY, INVERSE_BC, INVERSE_CA, nearest_in_frame
 from rbfmuscle.geometry.vectors import to_local
@@ -69,40 +69,37 @@ def find_crossings(
     free = np.flatnonzero(contacts.free)
     start, end = start[free], end[free]
     for row, (name, field) in enumerate(zip(contacts.bones.names, contacts.bones.fields)):
-        first, last = to_local(start, before[name]), to_local(end, after[name])
-        if _apart(field, first, last):
-            continue
-        length = np.linalg.norm(last - first, axis=1)
-        memory = contacts.memories[row]
-        distance, way = field.distance_and_gradient(last, reach=length, memory=memory)
-        through = np.zeros(len(free), dtype=np.bool_)
-        places = np.empty((len(free), 2))
-        cosine = np.empty(len(free))
-        path_loop(field.arrays, first, last, distance, way, tolerance, places, cosine)
-        for k in np.flatnonzero(cosine < SLIDING_COSINE):
-            ends = first[k] + places[k, :, None] * (last[k] - first[k])
-            through[k] = (
-                cosine[k] < OPPOSITE_COSINE or _deepest(field, *ends, tolerance) > tolerance
-            )
+        found = Paths.of(len(free))
+        poses = (before[name], after[name])
+        path_loop(field.arrays, *poses, start, end, *contacts.memories[row], tolerance, *found)
+        through = []
+        for k in np.flatnonzero(found.cosine < SLIDING_COSINE):
+            first, last = to_local(start[k], poses[0]), to_local(end[k], poses[1])
+            ends = first + found.places[k, :, None] * (last - first)
+            if found.cosine[k] < OPPOSITE_COSINE or _deepest(field, *ends, tolerance) > tolerance:
+                through.append(k)
         flags = 0
         if options.angle is not None:
-            near = np.flatnonzero(distance <= length)
-            angle = math.radians(options.angle)
-            flags = count_flags(
-                field, first[near], (distance[near], way[near]), length[near], angle
-            )
-        if through.any() or flags:
-            crossings.append(Crossing(row, free[through], flags))
+            near = np.flatnonzero(found.near)
+            paths = to_local(start[near], poses[0]), to_local(end[near], poses[1])
+            flags = count_flags(field, *paths, math.radians(options.angle))
+        if through or flags:
+            crossings.append(Crossing(row, free[np.array(through, dtype=np.int64)], flags))
     return crossings
 
 
-def _apart(field: BoneSDF, start: Floats, end: Floats) -> bool:
-    """Whether the box of all paths (n, 3) and that of the bone are apart."""
-    if len(start) == 0:
-        return True
-    low = np.minimum(start.min(axis=0), end.min(axis=0))
-    high = np.maximum(start.max(axis=0), end.max(axis=0))
-    return bool((low > field.bounds[1]).any() or (high < field.bounds[0]).any())
+class Paths(NamedTuple):
+    """Paths of n points at a bone."""
+
+    near: Booleans  # (n,) whether they may touch it
+    # (n, 2) where they first go into it and last come out, as shares of each path
+    places: Floats
+    cosine: Floats  # (n,) between the outward directions there, 1 where a path does not meet it
+
+    @classmethod
+    def of(cls, count: int) -> "Paths":
+        """Of so many points, to be filled."""
+        return cls(np.empty(count, dtype=np.bool_), np.empty((count, 2)), np.empty(count))
 
 
 def _deepest(field: BoneSDF, start: Floats, end: Floats, tolerance: float) -> float:
@@ -113,16 +110,15 @@ def _deepest(field: BoneSDF, start: Floats, end: Floats, tolerance: float) -> fl
     return float(-field.distance(places).min())
 
 
-def count_flags(
-    field: BoneSDF, start: Floats, end: tuple[Floats, Floats], length: Floats, angle: float
-) -> int:
-    """How many straight paths of such lengths (n,) the angle test flags: those that may touch the
-    bone and whose directions there differ by more than the ``angle`` [radian] between ``start``
-    (n, 3), in bone coordinates, and ``end``, the distance (n,) and its gradient (n, 3).
+def count_flags(field: BoneSDF, start: Floats, end: Floats, angle: float) -> int:
+    """How many straight paths (n, 3) in bone coordinates the angle test flags: those that may touch
+    the bone and whose directions there differ by more than the ``angle`` [radian] between the ends.
     """
-    distance, way = field.distance_and_gradient(start, reach=length)
-    near = distance + end[0] <= length
-    return int((near & (np.einsum("ij,ij->i", way, end[1]) < math.cos(angle))).sum())
+    length = np.linalg.norm(end - start, axis=1)
+    first, way = field.distance_and_gradient(start, reach=length)
+    last, leave = field.distance_and_gradient(end, reach=length)
+    turned = np.einsum("ij,ij->i", way, leave) < math.cos(angle)
+    return int((turned & (first + last <= length)).sum())
 
 
 def one_sided_planes(
@@ -169,33 +165,73 @@ def _meets_box(boxes, node, x, y, z, dx, dy, dz):
 
 
 @loop
-def path_loop(bone, start, end, distance, way, tolerance, places, cosine):
-    """Where straight paths (n, 3) in bone coordinates first go into a bone and last come out of it,
-    (n, 2) as shares of each path, and the cosine (n,) between the outward directions there.
+def path_loop(
+    bone,
+    before,
+    after,
+    begin,
+    end,
+    anchor,
+    bound,
+    triangle,
+    tolerance,
+    near,
+    places,
+    cosine,
+):
+    """Fill the `Paths` of points (n, 3) in world coordinates at a bone that goes between two poses
+    (4, 4); they are straight in its coordinates.
 
-    ``distance`` (n,) is that of the ends, or a lower bound beyond the path's length, ``way`` (n, 3)
-    its gradient. A path that begins or ends inside goes in or comes out at its end, with the
-    direction of the gradient; where it meets no triangle, it counts as inside from the
-    ``tolerance`` on. The cosine is 1 where a path does not meet the bone.
+    A path that begins or ends inside goes in or comes out at its end, with the direction of the
+    distance's gradient; where it meets no triangle, it counts as inside from the ``tolerance`` on.
+    ``anchor``, ``bound`` and ``triangle`` are those of a `Memory` of the points.
     """
     boxes = bone.boxes
     records = bone.records
     leaves = len(bone.starts) - 1
     stack = np.empty(STACK, np.int64)
     squares = np.empty(STACK)
+    start = np.empty(3)
+    stop = np.empty(3)
     size = boxes[1, 3] - boxes[1, 0] + boxes[1, 4] - boxes[1, 1] + boxes[1, 5] - boxes[1, 2]
-    for i in range(len(start)):
+    for i in range(len(begin)):
+        near[i] = False
         places[i, 0] = 0.0
         places[i, 1] = 1.0
         cosine[i] = 1.0
-        x = start[i, 0]
-        y = start[i, 1]
-        z = start[i, 2]
-        dx = end[i, 0] - x
-        dy = end[i, 1] - y
-        dz = end[i, 2] - z
-        if distance[i] > np.sqrt(dx * dx + dy * dy + dz * dz):
+        moved = 0.0
+        length = 0.0
+        apart = False
+        for k in range(3):
+            start[k] = 0.0
+            stop[k] = 0.0
+            for a in range(3):
+                start[k] += before[a, k] * (begin[i, a] - before[a, 3])
+                stop[k] += after[a, k] * (end[i, a] - after[a, 3])
+            moved += (stop[k] - anchor[i, k]) ** 2
+            length += (stop[k] - start[k]) ** 2
+            apart |= (
+                min(start[k], stop[k]) > boxes[1, 3 + k] or max(start[k], stop[k]) < boxes[1, k]
+            )
+        length = np.sqrt(length)
+        if apart or bound[i] - np.sqrt(moved) > length:
             continue
+        distance, bx, by, bz, best = distance_at(
+            bone, stop[0], stop[1], stop[2], triangle[i], stack, squares
+        )
+        triangle[i] = best
+        bound[i] = distance if len(bone.dipoles) == 0 else -np.inf
+        for k in range(3):
+            anchor[i, k] = stop[k]
+        if distance > length:
+            continue
+        near[i] = True
+        x = start[0]
+        y = start[1]
+        z = start[2]
+        dx = stop[0] - x
+        dy = stop[1] - y
+        dz = stop[2] - z
         # First place and record where the path goes in, last where it comes out, and the last in
         # and first out.
         into = np.inf
@@ -249,7 +285,7 @@ def path_loop(bone, start, end, distance, way, tolerance, places, cosine):
                     if t > out:
                         out = t
                         leave = n
-        if entry < 0 and leave < 0 and distance[i] > -tolerance:
+        if entry < 0 and leave < 0 and distance > -tolerance:
             continue
         if entry < 0 or first_out < into:
             _, ax, ay, az, _ = distance_at(bone, x, y, z, -1, stack, squares)
@@ -258,11 +294,7 @@ def path_loop(bone, start, end, distance, way, tolerance, places, cosine):
             ax = records[entry, 9]
             ay = records[entry, 10]
             az = records[entry, 11]
-        if leave < 0 or last_into > out:
-            bx = way[i, 0]
-            by = way[i, 1]
-            bz = way[i, 2]
-        else:
+        if leave >= 0 and last_into < out:
             places[i, 1] = out
             bx = records[leave, 9]
             by = records[leave, 10]
