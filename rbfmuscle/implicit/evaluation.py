@@ -1,41 +1,44 @@
 """Values and gradients of an RBF field at many points.
 
-Points are handled in blocks that stay in the first-level cache; inner loops run over a block.
+A field is a blend of local fits, F(x) = sum_p w_p f_p(x). Where the weights follow the points
+(`weigh`) they have slopes, and grad F = sum_p w_p grad f_p + f_p grad w_p; where they belong to the
+material they stay as they are.
 """
 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.threads import in_chunks
-from rbfmuscle.implicit.kernels.radial import _radial_loop
 from rbfmuscle.implicit.kernels.table import Kernel
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
-# Points of a block, and pairs of points and centres below which a thread does not pay.
-_BLOCK, _SERIAL = 256, 200_000
-_CHUNK = 4096  # points that are sorted into fits at a time
+# Points of a block, which stays in the first-level cache; points below which a thread does not pay;
+# points that are weighed at a time.
+BLOCK, SERIAL, CHUNK = 256, 1500, 4096
+# Numbers of pairs of points and centres that NumPy handles at a time.
+PAIRS = 50_000
 # Beyond this share of the radius of every ball, all grow until the point lies there in the nearest.
 RIM = 0.95
 NEAR = 0.15  # how close to a centre its closeness levels off, in radii of the fit's ball
 
 
 class Terms(NamedTuple):
-    """A field of P local fits of n centres each, as the loops read it.
+    """A field of P local fits of n centres each.
 
     In the coordinates of a fit, (points - origin) / scale with ``origin`` (P, 3) and ``scale``
-    (P,): ``centres`` (P, 3, n); ``a`` (P, n) and ``b`` (P, 3, n) are the weights of the values and
-    of the derivatives, which count where ``hermite``; ``epsilon`` (P,); ``coefficients`` (P, q) and
-    ``powers`` (q, 3) are the polynomial's. A fit counts in a ball, in the caller's coordinates,
-    with ``middle`` (P, 3) and ``radius`` (P,); a single fit counts everywhere.
+    (P,): ``centres`` (P, 3, n); ``weights`` (P, 4, n) of the values and of the derivatives, which
+    are 0 unless ``hermite``; ``epsilon`` (P,); ``coefficients`` (P, q) and ``powers`` (q, 3) are
+    the polynomial's. A fit counts in a ball, in the caller's coordinates, with ``middle`` (P, 3)
+    and ``radius`` (P,); a single fit counts everywhere.
     """
 
     origin: np.ndarray
     scale: np.ndarray
     centres: np.ndarray
-    a: np.ndarray
-    b: np.ndarray
+    weights: np.ndarray
     hermite: bool
     epsilon: np.ndarray
     coefficients: np.ndarray
@@ -44,357 +47,285 @@ class Terms(NamedTuple):
     radius: np.ndarray
 
 
-class Lots(NamedTuple):
-    """Where n points lie in the balls of P fits, which grow until they are met, and sums."""
+class Blend(NamedTuple):
+    """Which points a fit counts at, in their order, and how much: those of fit p are
+    ``point[start[p] : start[p + 1]]``.
+    """
 
-    shares: np.ndarray  # (P, n) squared distances from the middles over squared radii, 0 for one
-    growth: np.ndarray  # (4, n) what the squares grew by, derivatives of half its logarithm
-    total: np.ndarray  # (8, n) sums
+    start: np.ndarray  # (P + 1,)
+    point: np.ndarray  # (m,)
+    weight: np.ndarray  # (m,)
+    slope: np.ndarray  # (m, 3) gradients of the weights; (0, 3) where they stay
+
+    def without(self, least: float, count: int) -> "Blend":
+        """The blend of ``count`` points that keeps these weights, without those below ``least``."""
+        fit = np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
+        kept = self.weight >= least
+        fit, point, weight = fit[kept], self.point[kept], self.weight[kept]
+        weight = weight / np.bincount(point, weight, minlength=count)[point]
+        start = np.searchsorted(fit, np.arange(len(self.start)))
+        return Blend(start, point, weight, np.zeros((0, 3)))
 
 
 def evaluate(
     points: Floats, terms: Terms, kernel: Kernel, with_gradient: bool
 ) -> tuple[Floats, Floats]:
-    """A field's values (n,) at points (n, 3), and its gradients (n, 3) by these, which are empty
+    """A field's values (n,) at points (n, 3), and its gradients (n, 3) by these, which mean nothing
     where not wanted.
     """
     count = len(points)
-    value, gradient = np.empty(count), np.empty((count if with_gradient else 0, 3))
-    form = None if kernel.plain_cube and bool((terms.epsilon == 1.0).all()) else kernel.form
+    value, gradient = np.zeros(count), np.zeros((count, 3))
 
     def work(start: int, stop: int) -> None:
-        _evaluate_loop(points, terms, form, start, stop, value, gradient)
+        for low in range(start, stop, CHUNK):
+            some = slice(low, min(low + CHUNK, stop))
+            blend = weigh(points[some], terms)
+            todo = np.ones(some.stop - low, dtype=np.bool_)
+            given = points[some], terms, kernel, blend, todo
+            _blend_rows(*given, (0, len(todo)), with_gradient, value[some], gradient[some])
 
-    in_chunks(count, work, least=max(_BLOCK, _SERIAL // terms.centres.shape[2]))
+    in_chunks(count, work, least=SERIAL)
     return value, gradient
 
 
-# The length of a block is a multiple of a cache line, so that all rows are contiguous and filled
-# alike. The cubic kernel has a loop of its own; without a form nothing else is compiled, so that
-# muscles need not wait for the others.
-
-
-@compiled
-def _evaluate_loop(points, terms, form, start, stop, value, gradient):
-    """Value and, where there is room for it, gradient at points[start:stop]; form None is the cube
-    with epsilon 1.
+def evaluate_blend(
+    points: Floats, terms: Terms, kernel: Kernel, blend: Blend, todo: Booleans | None = None
+) -> tuple[Floats, Floats]:
+    """Values (n,) and gradients (n, 3) of the blended fits at points (n, 3); 0 at those that
+    ``todo`` (n,) leaves out.
     """
-    wanted, rows = len(gradient) > 0, np.empty(_BLOCK, np.int64)
-    for low in range(start, stop, _CHUNK):
-        x = points[low : min(low + _CHUNK, stop)]
-        lots = _shares_loop(x, terms)
-        for fit in range(len(lots.shares)):
-            first = np.int64(0)  # the type that `_fill_block` returns, so that it is compiled once
-            while first < len(x):
-                first, p, acc, g = _fill_block(x, terms, fit, lots.shares, first, rows)
-                if p.shape[1] == 0:  # no point in this fit
-                    continue
-                if form is None:
-                    _cubic_block_loop(terms, fit, wanted, p, acc, g)
-                else:
-                    _general_block_loop(terms, fit, form, wanted, p, acc, g)
-                _blend_loop(x, terms, fit, rows, lots, wanted, (p, acc, g))
-        _give_loop(low, lots.total, value, gradient)
+    value, gradient = np.zeros(len(points)), np.zeros((len(points), 3))
+    todo = np.ones(len(points), dtype=np.bool_) if todo is None else todo
+
+    def work(start: int, stop: int) -> None:
+        rows = start, stop
+        _blend_rows(points, terms, kernel, blend, todo, rows, True, value, gradient)
+
+    in_chunks(len(points), work, least=SERIAL)
+    return value, gradient
 
 
-@compiled
-def _shares_loop(x, terms):
-    """Where points (n, 3) lie in the balls of the fits."""
-    fits, n = len(terms.middle), len(x)
-    shares, growth = np.zeros((fits, n)), np.zeros((4, n))
-    growth[0] = 1.0
-    if fits > 1:
-        for k in range(fits):
-            (a, b, c), scale = terms.middle[k], 1.0 / terms.radius[k] ** 2
-            for i in range(n):
-                square = (x[i, 0] - a) ** 2 + (x[i, 1] - b) ** 2 + (x[i, 2] - c) ** 2
-                shares[k, i] = scale * square
-        for i in range(n):
-            nearest = 0
-            for k in range(fits):
-                nearest = k if shares[k, i] < shares[nearest, i] else nearest
-            least = shares[nearest, i]
-            if least > RIM * RIM:
-                growth[0, i] = RIM * RIM / least
-                for k in range(fits):
-                    shares[k, i] *= growth[0, i]
-                for c in range(3):
-                    way = terms.middle[nearest, c] - x[i, c]
-                    growth[1 + c, i] = way / (least * terms.radius[nearest] ** 2)
-    return Lots(shares, growth, np.zeros((8, n)))
-
-
-@compiled
-def _fill_block(x, terms, fit, shares, first, rows):
-    """The next points that lie in a fit's ball, from the first on: where to go on, and these in the
-    fit's coordinates.
-
-    Their numbers are put into ``rows`` (`_BLOCK`,), -1 after the last; the points are (3, m), the
-    last repeated, and zeros (m,) and (3, m) to add to.
-    """
-    count = 0
-    while first < len(x) and count < _BLOCK:
-        if shares[fit, first] < 1.0:
-            rows[count] = first
-            count += 1
-        first += 1
-    size = (count + 7) // 8 * 8
-    p = np.empty((3, size))
-    for i in range(size):
-        row = rows[min(i, count - 1)]
-        for c in range(3):
-            p[c, i] = (x[row, c] - terms.origin[fit, c]) / terms.scale[fit]
-    if count < _BLOCK:
-        rows[count] = -1
-    return first, p, np.zeros(size), np.zeros((3, size))
-
-
-@compiled(fastmath={"contract"})
-def _closeness_loop(p, centres, soft, gradient, out):
-    """Add the sum over a fit's centres of 1 / (distance^2 + soft^2)^4 at points (3, m), and its
-    gradient, to (4, m).
-    """
-    for j in range(centres.shape[1]):
-        cx = centres[0, j]
-        cy = centres[1, j]
-        cz = centres[2, j]
-        for i in range(p.shape[1]):
-            dx = p[0, i] - cx
-            dy = p[1, i] - cy
-            dz = p[2, i] - cz
-            q = 1.0 / (dx * dx + dy * dy + dz * dz + soft * soft)
-            v = (q * q) * (q * q)
-            out[0, i] += v
-            if gradient:
-                w = -8.0 * v * q
-                out[1, i] += w * dx
-                out[2, i] += w * dy
-                out[3, i] += w * dz
-
-
-@compiled
-def _blend_loop(x, terms, fit, rows, lots, wanted, block):
-    """Add a fit's weight w, w f, and the gradients of both, to their sums; a block has points in
-    the fit's coordinates, their values and their gradients.
+def weigh(points: Floats, terms: Terms) -> Blend:
+    """The weights of the fits at points (n, 3), which add up to one, and their slopes.
 
     w is (1 - t^2)^2 at t of the ball's radius, times how close the fit's own centres are: a sheet
-    of another part of the muscle may have come into the ball, of which the fit knows nothing.
+    of another part of the muscle may have come into the ball, of which the fit knows nothing. That
+    is the sum over the centres of 1 / (distance^2 + soft^2)^4.
     """
-    p, acc, g = block
-    shares, growth, total = lots
-    size = terms.scale[fit]
-    radius = terms.radius[fit]
-    single = len(terms.middle) == 1
-    near = np.zeros((4, p.shape[1]))
-    if not single:
-        _closeness_loop(p, terms.centres[fit], NEAR * radius / size, wanted, near)
-    for n in range(len(acc)):
-        i = rows[n]
-        if i < 0:
-            break
-        share = shares[fit, i]
-        ball, close = (1.0 - share) ** 2, 1.0 if single else near[0, n] / size**8
-        steep = 0.0 if single else -4.0 * (1.0 - share) / radius**2
-        total[0, i] += ball * close
-        total[1, i] += ball * close * acc[n]
-        for c in range(3):
-            away = growth[0, i] * (x[i, c] - terms.middle[fit, c])
-            away += share * radius**2 * growth[1 + c, i]
-            slope = steep * away * close + ball * near[1 + c, n] / size**9
-            total[2 + c, i] += slope
-            total[5 + c, i] += ball * close * g[c, n] / size + slope * acc[n]
+    count = len(points)
+    if len(terms.middle) == 1:
+        return Blend(np.array([0, count]), np.arange(count), np.ones(count), np.zeros((0, 3)))
+    square = terms.radius**2
+    shares = cdist(terms.middle, points, "sqeuclidean") / square[:, None]
+    nearest = shares.argmin(axis=0)
+    least = shares[nearest, np.arange(count)]
+    least = np.maximum(least, np.finfo(float).tiny)
+    growth = np.minimum(1.0, RIM**2 / least)
+    grown = -2.0 * (points - terms.middle[nearest]) / (least * square[nearest])[:, None]
+    grown[growth == 1.0] = 0.0
+    shares *= growth
+    fit, point = np.nonzero(shares < 1.0)
+    start = np.searchsorted(fit, np.arange(len(shares) + 1))
+    close = np.zeros((len(point), 4))
+    soft = NEAR * terms.radius / terms.scale
+    _closeness_loop(points, start, point, terms.origin, terms.scale, terms.centres, soft, close)
+    share = shares[fit, point]
+    steep = (2.0 * growth[point] / square[fit])[:, None] * (points[point] - terms.middle[fit])
+    steep += share[:, None] * grown[point]
+    inside = 1.0 - share
+    weight = inside**2 * close[:, 0]
+    slope = (-2.0 * inside * close[:, 0])[:, None] * steep + (inside**2)[:, None] * close[:, 1:]
+    total = np.bincount(point, weight, minlength=count)[point]
+    weight /= total
+    for axis in range(3):
+        along = np.bincount(point, slope[:, axis], minlength=count)[point]
+        slope[:, axis] = (slope[:, axis] - weight * along) / total
+    return Blend(start, point, weight, slope)
 
 
-@compiled
-def _give_loop(low, total, value, gradient):
-    """f = sum w f / sum w, and its gradient."""
-    for i in range(total.shape[1]):
-        value[low + i] = total[1, i] / total[0, i]
-        if len(gradient) > 0:
-            for c in range(3):
-                slope = total[5 + c, i] - value[low + i] * total[2 + c, i]
-                gradient[low + i, c] = slope / total[0, i]
+@loop(fastmath={"contract"})
+def _closeness_loop(points, start, point, origin, scale, centres, soft, out):
+    """The sum over a fit's centres of 1 / (distance^2 + soft^2)^4, with ``soft`` (P,) in the
+    coordinates of the fit, and its gradient, for each pair of fit and point (m, 4).
+    """
+    for fit in range(len(start) - 1):
+        size = scale[fit]
+        for pair in range(start[fit], start[fit + 1]):
+            x = (points[point[pair], 0] - origin[fit, 0]) / size
+            y = (points[point[pair], 1] - origin[fit, 1]) / size
+            z = (points[point[pair], 2] - origin[fit, 2]) / size
+            for j in range(centres.shape[2]):
+                dx = x - centres[fit, 0, j]
+                dy = y - centres[fit, 1, j]
+                dz = z - centres[fit, 2, j]
+                q = 1.0 / (dx * dx + dy * dy + dz * dz + soft[fit] * soft[fit])
+                v = (q * q) * (q * q)
+                w = -8.0 * v * q
+                out[pair, 0] += v
+                out[pair, 1] += w * dx
+                out[pair, 2] += w * dy
+                out[pair, 3] += w * dz
+            out[pair, 0] /= size**8
+            for c in range(1, 4):
+                out[pair, c] /= size**9
 
 
-@compiled
-def _general_block_loop(terms, fit, form, gradient, p, acc, g):
-    """Any kernel: radial functions into scratch blocks, then their sums."""
-    d, u = np.empty_like(p), np.empty_like(acc)
-    work, radial = np.empty((3, u.size)), np.empty((3, u.size))
-    hermite, epsilon = terms.hermite, terms.epsilon[fit]
-    centres = terms.centres[fit]
-    weight = terms.a[fit]
-    slope = terms.b[fit]
-    wanted = (2 << (int(gradient) + int(hermite))) - 1
-    e2, ball = epsilon * epsilon, _ball(p)
-    for j in range(centres.shape[1]):
-        at = centres[0, j], centres[1, j], centres[2, j]
-        if form.compact and _out_of_reach(ball, at, epsilon):
-            continue
-        a, b = weight[j], (slope[0, j], slope[1, j], slope[2, j])
-        _offsets_loop(p, at, e2, d, u)
-        _radial_loop(form, wanted, u, work, radial)
-        _add_value_loop(a, b, e2, hermite, radial, d, acc)
-        if gradient:
-            _add_gradient_loop(a, b, e2, hermite, radial, d, g)
-    _polynomial_loop(terms.coefficients[fit], terms.powers, gradient, p, acc, g)
-
-
-@compiled
-def _ball(p):
-    """Centre and radius of a ball around the points (3, n): that of their box."""
-    middle, square = np.empty(3), 0.0
-    for c in range(3):
-        least, most = p[c, 0], p[c, 0]
-        for i in range(p.shape[1]):
-            least, most = min(least, p[c, i]), max(most, p[c, i])
-        middle[c] = 0.5 * (least + most)
-        square += (most - middle[c]) ** 2
-    return middle[0], middle[1], middle[2], np.sqrt(square)
-
-
-@compiled
-def _out_of_reach(ball, at, epsilon):
-    """Whether a kernel that ends at 1 / epsilon is zero in the whole ball."""
-    dx = ball[0] - at[0]
-    dy = ball[1] - at[1]
-    dz = ball[2] - at[2]
-    reach = ball[3] + 1.0 / epsilon
-    return dx * dx + dy * dy + dz * dz >= reach * reach
-
-
-@compiled
-def _monomial_loop(p, i, j, k, factor, term, out):
-    """out += factor x^i y^j z^k."""
-    for n in range(term.size):
-        term[n] = factor
-    for axis, power in enumerate((i, j, k)):
-        for _ in range(power):
-            for n in range(term.size):
-                term[n] *= p[axis, n]
-    for n in range(term.size):
-        out[n] += term[n]
-
-
-@compiled
-def _polynomial_loop(coefficients, powers, gradient, p, acc, g):
-    """Adds a fit's polynomial to acc, its gradient to g."""
-    term = np.empty_like(acc)
-    for q in range(len(coefficients)):
-        c = coefficients[q]
-        i = powers[q, 0]
-        j = powers[q, 1]
-        k = powers[q, 2]
-        _monomial_loop(p, i, j, k, c, term, acc)
-        if gradient and i > 0:
-            _monomial_loop(p, i - 1, j, k, c * i, term, g[0])
-        if gradient and j > 0:
-            _monomial_loop(p, i, j - 1, k, c * j, term, g[1])
-        if gradient and k > 0:
-            _monomial_loop(p, i, j, k - 1, c * k, term, g[2])
-
-
-@compiled
-def _cubic_block_loop(terms, fit, wanted, p, acc, g):
-    """The cubic kernel with epsilon 1, whose polynomial is linear."""
-    centres = terms.centres[fit]
-    a = terms.a[fit]
-    b = terms.b[fit]
-    if wanted:
-        _cubic_gradient_loop(p, centres, a, b, acc, g)
-    else:
-        for j in range(centres.shape[1]):
-            at, slope = (centres[0, j], centres[1, j], centres[2, j]), (b[0, j], b[1, j], b[2, j])
-            _cubic_value_loop(p, at, a[j], slope, acc)
-    c = terms.coefficients[fit]
-    for i in range(acc.size):
-        acc[i] += c[0] + c[1] * p[0, i] + c[2] * p[1, i] + c[3] * p[2, i]
-        if wanted:
-            for k in range(3):
-                g[k, i] += c[1 + k]
-
-
-@compiled(fastmath={"contract"})
-def _cubic_value_loop(p, at, a, b, acc):
-    """acc += a r^3 - 3 r (B . d)."""
-    bx, by, bz = b
-    for i in range(acc.size):
-        dx = p[0, i] - at[0]
-        dy = p[1, i] - at[1]
-        dz = p[2, i] - at[2]
-        u = dx * dx + dy * dy + dz * dz
-        acc[i] += np.sqrt(u) * (a * u - 3.0 * (bx * dx + by * dy + bz * dz))
-
-
-@compiled(fastmath={"contract"})
-def _cubic_gradient_loop(p, centres, weight, slope, acc, g):
-    """Adds 3 a r d - 3 r B - 3/r (B . d) d of each centre to g, the value to acc."""
-    for j in range(centres.shape[1]):
-        x = centres[0, j]
-        y = centres[1, j]
-        z = centres[2, j]
-        a = weight[j]
-        bx = slope[0, j]
-        by = slope[1, j]
-        bz = slope[2, j]
-        for i in range(acc.size):
-            dx = p[0, i] - x
-            dy = p[1, i] - y
-            dz = p[2, i] - z
-            u = dx * dx + dy * dy + dz * dz + 1e-300
-            r = np.sqrt(u)
-            bd = 3.0 * (bx * dx + by * dy + bz * dz)
-            acc[i] += r * (a * u - bd)
-            radial = 3.0 * a * r - bd / r
-            r3 = 3.0 * r
-            g[0, i] += radial * dx - r3 * bx
-            g[1, i] += radial * dy - r3 * by
-            g[2, i] += radial * dz - r3 * bz
-
-
-@compiled(fastmath={"contract"})
-def _offsets_loop(p, at, e2, d, u):
-    """d = p - centre, u = e2 |d|^2."""
-    for i in range(u.size):
-        dx = p[0, i] - at[0]
-        dy = p[1, i] - at[1]
-        dz = p[2, i] - at[2]
-        d[0, i] = dx
-        d[1, i] = dy
-        d[2, i] = dz
-        u[i] = e2 * (dx * dx + dy * dy + dz * dz)
-
-
-@compiled(fastmath={"contract"})
-def _add_value_loop(a, b, e2, hermite, radial, d, acc):
-    """acc += a phi - first (B . d)."""
-    bx, by, bz = b
-    phi, first = radial[0], radial[1]
-    if not hermite:
-        for i in range(acc.size):
-            acc[i] += a * phi[i]
+def _blend_rows(
+    points: Floats,
+    terms: Terms,
+    kernel: Kernel,
+    blend: Blend,
+    todo: Booleans,
+    rows: tuple[int, int],
+    with_gradient: bool,
+    value: Floats,
+    gradient: Floats,
+) -> None:
+    """Add the blended fits, and their gradients, of those of points[rows[0]:rows[1]] that ``todo``
+    marks.
+    """
+    low, high = rows
+    if terms.hermite and kernel.plain_cube and terms.coefficients.shape[1] == 4:
+        _cubic_loop(
+            points,
+            todo,
+            low,
+            high,
+            blend.start,
+            blend.point,
+            blend.weight,
+            blend.slope,
+            terms.origin,
+            terms.scale,
+            terms.centres,
+            terms.weights,
+            terms.coefficients,
+            value,
+            gradient,
+        )
         return
-    for i in range(acc.size):
-        acc[i] += a * phi[i] - e2 * first[i] * (bx * d[0, i] + by * d[1, i] + bz * d[2, i])
+    size = max(1, PAIRS // terms.centres.shape[2])
+    for fit in range(len(blend.start) - 1):
+        pairs = np.arange(blend.start[fit], blend.start[fit + 1])
+        near = blend.point[pairs]
+        pairs = pairs[(near >= low) & (near < high) & todo[near]]
+        for first in range(0, len(pairs), size):
+            some = pairs[first : first + size]
+            at, weight = blend.point[some], blend.weight[some]
+            found, steep = _local_fit(points[at], terms, fit, kernel, with_gradient)
+            value[at] += weight * found
+            if with_gradient:
+                gradient[at] += weight[:, None] * steep
+                if len(blend.slope):
+                    gradient[at] += blend.slope[some] * found[:, None]
 
 
-@compiled(fastmath={"contract"})
-def _add_gradient_loop(a, b, e2, hermite, radial, d, g):
-    """g += a first d - first B - second (B . d) d."""
-    bx, by, bz = b
-    first, second = radial[1], radial[2]
-    if not hermite:
-        for i in range(d.shape[1]):
-            w = a * e2 * first[i]
-            g[0, i] += w * d[0, i]
-            g[1, i] += w * d[1, i]
-            g[2, i] += w * d[2, i]
-        return
-    e4 = e2 * e2
-    for i in range(d.shape[1]):
-        bd = bx * d[0, i] + by * d[1, i] + bz * d[2, i]
-        f = e2 * first[i]
-        w = a * f - e4 * second[i] * bd
-        g[0, i] += w * d[0, i] - f * bx
-        g[1, i] += w * d[1, i] - f * by
-        g[2, i] += w * d[2, i] - f * bz
+def _local_fit(
+    points: Floats, terms: Terms, fit: int, kernel: Kernel, with_gradient: bool
+) -> tuple[Floats, Floats]:
+    """Values (m,) of one fit at points (m, 3), with any kernel, and its gradients (m, 3), 0 where
+    not wanted.
+
+    With B the weights of the derivatives and d the way from a centre the sum over the centres is
+    a phi - first (B . d), its gradient a first d - first B - second (B . d) d.
+    """
+    scale, epsilon = terms.scale[fit], terms.epsilon[fit]
+    local = (points - terms.origin[fit]) / scale
+    way = local[:, :, None] - terms.centres[fit]
+    square = epsilon**2
+    found = kernel.radial(
+        square * np.einsum("mcn,mcn->mn", way, way), 1 + int(terms.hermite) + int(with_gradient)
+    )
+    a, slopes = terms.weights[fit, 0], terms.weights[fit, 1:]
+    monomials = local[:, None, :] ** terms.powers
+    value = found[0] @ a + np.prod(monomials, axis=2) @ terms.coefficients[fit]
+    gradient = np.zeros_like(local)
+    along = np.einsum("mcn,cn->mn", way, slopes) if terms.hermite else None
+    if along is not None:
+        value -= square * np.einsum("mn,mn->m", found[1], along)
+    if not with_gradient:
+        return value, gradient
+    factor = square * found[1] * a
+    if along is not None:
+        factor -= square**2 * found[2] * along
+        gradient -= square * (found[1] @ slopes.T)
+    gradient += np.einsum("mn,mcn->mc", factor, way)
+    for axis in range(3):
+        steep = monomials.copy()
+        power = terms.powers[:, axis]
+        steep[:, :, axis] = power * local[:, None, axis] ** np.maximum(power - 1, 0)
+        gradient[:, axis] += np.prod(steep, axis=2) @ terms.coefficients[fit]
+    return value, gradient / scale
+
+
+@loop(fastmath={"contract"})
+def _cubic_loop(
+    points,
+    todo,
+    low,
+    high,
+    start,
+    point,
+    weight,
+    slope,
+    origin,
+    scale,
+    centres,
+    weights,
+    coefficients,
+    value,
+    gradient,
+):
+    """`_blend_rows` for the kernel r^3 of the coordinates of a fit, whose polynomial is linear.
+
+    The sum over the centres is r (a r^2 - 3 B . d), its gradient 3 a r d - 3 r B - 3/r (B . d) d.
+    Inner loops run over a block of points, so that they become vector code.
+    """
+    rows = np.empty(BLOCK, np.int64)
+    p = np.empty((3, BLOCK))
+    f = np.empty(BLOCK)
+    g = np.empty((3, BLOCK))
+    for fit in range(len(start) - 1):
+        at, end, size = start[fit], start[fit + 1], scale[fit]
+        while at < end:
+            count = 0
+            while at < end and count < BLOCK:
+                i = point[at]
+                if low <= i < high and todo[i]:
+                    rows[count] = at
+                    for c in range(3):
+                        p[c, count] = (points[i, c] - origin[fit, c]) / size
+                    count += 1
+                at += 1
+            for n in range(count):
+                f[n] = coefficients[fit, 0]
+                for c in range(3):
+                    f[n] += coefficients[fit, 1 + c] * p[c, n]
+                    g[c, n] = coefficients[fit, 1 + c]
+            for j in range(centres.shape[2]):
+                x = centres[fit, 0, j]
+                y = centres[fit, 1, j]
+                z = centres[fit, 2, j]
+                a = weights[fit, 0, j]
+                bx = weights[fit, 1, j]
+                by = weights[fit, 2, j]
+                bz = weights[fit, 3, j]
+                for n in range(count):
+                    dx = p[0, n] - x
+                    dy = p[1, n] - y
+                    dz = p[2, n] - z
+                    u = dx * dx + dy * dy + dz * dz + 1e-300
+                    r = np.sqrt(u)
+                    along = 3.0 * (bx * dx + by * dy + bz * dz)
+                    f[n] += r * (a * u - along)
+                    radial = 3.0 * a * r - along / r
+                    g[0, n] += radial * dx - 3.0 * r * bx
+                    g[1, n] += radial * dy - 3.0 * r * by
+                    g[2, n] += radial * dz - 3.0 * r * bz
+            for n in range(count):
+                i, share = point[rows[n]], weight[rows[n]]
+                value[i] += share * f[n]
+                for c in range(3):
+                    gradient[i, c] += share * g[c, n] / size
+                    if len(slope) > 0:
+                        gradient[i, c] += slope[rows[n], c] * f[n]

@@ -13,22 +13,22 @@ from scipy.spatial.transform import Rotation
 import rbfmuscle as rm
 from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+from rbfmuscle.implicit.placement.cached import cached_sample
 from rbfmuscle.models import build_model, build_models
 from rbfmuscle.muscle import placement
-from rbfmuscle.muscle.display_mesh import MOST_SHOWN, _unfold, display_mesh, neighbour_lists
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.muscle.options import RBFOptions
-from rbfmuscle.muscle.placement import cached_sample
 from rbfmuscle.muscle.rest import LEAST_ATTACHED
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
+from rbfmuscle.surface.display import _unfold, display_mesh, neighbour_lists
 from rbfmuscle.validation import NumericalWarning, SceneError, SolveError
 
 
 def field_of(model):
     """The RBF field through the centres at rest."""
-    return model.rest.field(model.rest.centres, model.rest.normals)
+    return model.drawer.field.through(model.rest.centres, model.rest.normals)
 
 
 def _distances(points, vertices, faces):
@@ -308,7 +308,7 @@ def test_one_iteration_is_no_clean_run():
     assert ("extensor", "iteration_cap") in {(e.muscle, e.action) for e in frames[-1].events}
 
 
-def test_shown_mesh_is_the_input_mesh_unless_it_is_large_or_another_resolution_is_asked_for():
+def test_shown_mesh_is_the_input_mesh_unless_a_resolution_is_asked_for():
     muscle = phantom_scene().muscle("abductor")
     vertices, faces = display_mesh(muscle, 0)
     np.testing.assert_allclose(vertices, muscle.mesh.vertices, atol=1e-6)
@@ -317,7 +317,7 @@ def test_shown_mesh_is_the_input_mesh_unless_it_is_large_or_another_resolution_i
     wanted = 1.15 * long.mesh.area / 2.5**2
     assert len(display_mesh(long, 100)[0]) == pytest.approx(wanted, rel=0.06)
     long.mesh = long.mesh.subdivide_to_size(1.5)
-    assert len(long.mesh.vertices) > MOST_SHOWN == len(display_mesh(long, 0)[0])
+    assert len(display_mesh(long, 0)[0]) == len(long.mesh.vertices)
 
 
 def test_a_mesh_with_as_many_vertices_as_samples_meets_the_bones_with_them():
@@ -336,7 +336,7 @@ def test_a_mesh_with_as_many_vertices_as_samples_meets_the_bones_with_them():
 def test_triangles_folded_on_a_neighbour_are_smoothed_where_that_is_little(
     most, smoothed, monkeypatch
 ):
-    monkeypatch.setattr("rbfmuscle.muscle.display_mesh.UNFOLD_WAY", most)
+    monkeypatch.setattr("rbfmuscle.surface.display.UNFOLD_WAY", most)
     box = trimesh.creation.box([20.0, 20.0, 20.0]).subdivide_to_size(3.0)
     vertices, faces = np.array(box.vertices), np.array(box.faces)
     # In the middle of a side a vertex goes a little beyond its ring, in the plane.

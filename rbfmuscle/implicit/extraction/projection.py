@@ -6,8 +6,8 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
+from rbfmuscle.geometry.point_grid import Obstacles, push_off
 from rbfmuscle.geometry.surfaces import volume_cubic
-from rbfmuscle.implicit.extraction.obstacles import Obstacles, push_off_loop
 
 
 class Projector:
@@ -96,7 +96,7 @@ class Projector:
         for _ in range(2):
             moved = np.zeros(len(self.vertices), dtype=np.bool_)
             for grid, pose in obstacles:
-                push_off_loop(self.vertices, faces, grid, pose, tolerance, moved)
+                push_off(self.vertices, faces, grid, pose, tolerance, moved)
             rows = np.flatnonzero(moved)
             self._hold(rows)
             if self._clip_distance is None or len(rows) == 0:

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fields import ClipDistance, Field
+from rbfmuscle.geometry.point_grid import Obstacles
 from rbfmuscle.geometry.surfaces import label_sheets, mesh_volume
-from rbfmuscle.implicit.extraction.obstacles import Obstacles
 from rbfmuscle.implicit.extraction.projection import Projector
 from rbfmuscle.validation import check_finite, check_points, check_positive
 

@@ -7,10 +7,8 @@ row of every block is one contiguous run.
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.implicit.evaluation import _offsets_loop
-from rbfmuscle.implicit.kernels.radial import _radial_loop
 from rbfmuscle.implicit.kernels.table import Kernel
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.validation import UsageError
 
 
@@ -64,8 +62,7 @@ class Basis:
                 f"the {count} points; degree too high: use a kernel of lower order or add points"
             )
         self.size = 4 * count if hermite else count
-        self.polynomials = np.empty((fits, len(self.powers), self.size))
-        _polynomials_loop(self.points, self.powers, self.polynomials)
+        self.polynomials = _monomials(self.points, self.powers, hermite)
 
     def scaled(self) -> Floats:
         """All centres (K, 3) in the unit ball."""
@@ -74,91 +71,57 @@ class Basis:
 
     def matrices(self, start: int, stop: int) -> Floats:
         """A of the fits from start to stop: (stop - start, size, size)."""
-        out = np.empty((stop - start, self.size, self.size))
-        if self.hermite and self.kernel.plain_cube:
-            _cubic_matrices_loop(self.points, self.epsilon, start, out)
-        else:
-            _matrices_loop(self.points, self.epsilon, self.kernel.form, self.hermite, start, out)
+        points, epsilon = self.points[start:stop], self.epsilon[start:stop]
+        fits, _, count = points.shape
+        square = np.zeros((fits, count, count))
+        for axis in range(3):
+            square += (points[:, axis, :, None] - points[:, axis, None, :]) ** 2
+        square *= epsilon[:, None, None] ** 2
+        radial = self.kernel.radial(square, 3 if self.hermite else 1)
+        if not self.hermite:
+            return radial[0]
+        out = np.empty((fits, self.size, self.size))
+        _hermite_loop(points, epsilon, *radial, out)
         return out
 
 
-@compiled
-def _polynomials_loop(points, powers, out):
-    """Monomials at points (P, 3, n), and where there is room for them their derivatives."""
+def _monomials(points: Floats, powers: Integers, derivatives: bool) -> Floats:
+    """Monomials (P, q, n) at points (P, 3, n), or with their derivatives by the three axes
+    (P, q, 4n).
+    """
+    factors = points[:, None] ** powers[None, :, :, None]
+    parts = [np.prod(factors, axis=2)]
+    for axis in range(3 if derivatives else 0):
+        power, steep = powers[:, axis, None], factors.copy()
+        steep[:, :, axis] = power * points[:, None, axis] ** np.maximum(power - 1, 0)
+        parts.append(np.prod(steep, axis=2))
+    return np.concatenate(parts, axis=2)
+
+
+@loop
+def _hermite_loop(points, epsilon, phi, first, second, out):
+    """Matrices (P, 4n, 4n) of fits to points (P, 3, n) from the radial functions (P, n, n).
+
+    With d the way from centre j to i, blocks are (value, value) phi; (value, d/dx_c) first * d_c,
+    as the other way round by the sign of d; (d/dx_e, d/dx_c) -(first * delta + second * d_c d_e).
+    """
     n = points.shape[2]
     for p in range(len(points)):
-        for q in range(len(powers)):
-            for c in range(-1, out.shape[2] // n - 1):
-                _monomial_loop(points[p], powers[q], c, out[p, q, (c + 1) * n : (c + 2) * n])
-
-
-@compiled
-def _monomial_loop(x, powers, axis, out):
-    """A monomial at points (3, n), or its derivative along an axis that is not negative."""
-    out[:] = powers[axis] if axis >= 0 else 1.0
-    for c in range(3):
-        for _ in range(powers[c] - int(c == axis)):
-            for i in range(len(out)):
-                out[i] *= x[c, i]
-
-
-@compiled
-def _matrices_loop(points, epsilon, form, hermite, start, out):
-    """Matrices of fits from start on, of points (P, 3, n), for any kernel."""
-    n = points.shape[2]
-    d = np.empty((3, n))
-    u = np.empty(n)
-    work = np.empty((3, n))
-    radial = np.empty((3, n))
-    for p in range(len(out)):
-        x, e2 = points[start + p], epsilon[start + p] ** 2
+        e2 = epsilon[p] ** 2
         for j in range(n):
-            _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), e2, d, u)
-            _radial_loop(form, 7 if hermite else 1, u, work, radial)
             for i in range(n):
-                out[p, j, i] = radial[0, i]
-            if hermite:
-                _derivatives_loop(j, e2, d, radial, out[p])
-
-
-@compiled
-def _cubic_matrices_loop(points, epsilon, start, out):
-    """As `_matrices_loop` for the kernel s^3, which muscles use and which should not wait for
-    others.
-    """
-    n = points.shape[2]
-    d = np.empty((3, n))
-    u = np.empty(n)
-    radial = np.empty((3, n))
-    for p in range(len(out)):
-        x, e2 = points[start + p], epsilon[start + p] ** 2
-        for j in range(n):
-            _offsets_loop(x, (x[0, j], x[1, j], x[2, j]), e2, d, u)
-            for i in range(n):
-                s = np.sqrt(u[i])
-                radial[1, i] = 3.0 * s
-                radial[2, i] = 3.0 / s if s > 0.0 else 0.0
-                out[p, j, i] = u[i] * s
-            _derivatives_loop(j, e2, d, radial, out[p])
-
-
-@compiled
-def _derivatives_loop(j, e2, d, radial, out):
-    """Derivatives in the four rows of centre j, from the offsets of all centres and the radial
-    functions there.
-
-    Blocks: (value, d/dx_c) first * d_c, as the other way round by the sign of d;
-    (d/dx_c, d/dx_e) -(first * delta + second * d_c d_e).
-    """
-    n = d.shape[1]
-    for c in range(3):
-        for i in range(n):
-            out[j, (c + 1) * n + i] = e2 * radial[1, i] * d[c, i]
-            out[(c + 1) * n + j, i] = -e2 * radial[1, i] * d[c, i]
-    for e in range(3):
-        row = (e + 1) * n + j
-        for c in range(3):
-            for i in range(n):
-                out[row, (c + 1) * n + i] = -e2 * e2 * radial[2, i] * d[c, i] * d[e, i]
-        for i in range(n):
-            out[row, (e + 1) * n + i] -= e2 * radial[1, i]
+                out[p, j, i] = phi[p, j, i]
+            for c in range(3):
+                at = (c + 1) * n
+                for i in range(n):
+                    along = e2 * first[p, j, i] * (points[p, c, i] - points[p, c, j])
+                    out[p, j, at + i] = along
+                    out[p, at + j, i] = -along
+                for e in range(3):
+                    row = (e + 1) * n + j
+                    for i in range(n):
+                        way = points[p, c, i] - points[p, c, j]
+                        other = points[p, e, i] - points[p, e, j]
+                        out[p, row, at + i] = -e2 * e2 * second[p, j, i] * way * other
+                for i in range(n):
+                    out[p, at + j, at + i] -= e2 * first[p, j, i]

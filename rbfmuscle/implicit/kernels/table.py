@@ -8,9 +8,9 @@ gradients and Hermite fits need are ``2**k d^k phi / du^k``::
     k = 2   second  (phi'' - phi'/r) / r**2
 
 For all kernels of the table they have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials
-A and B of degree four at most. A row lists j, A and B of phi, the others follow; the loops in
-``radial.py`` know the bases and no kernel. Kernels of another form are registered, and kept as
-polynomials of pieces (``sampled.py``).
+A and B of degree four at most. A row lists j, A and B of phi, the others follow; ``radial.py``
+knows the bases and no kernel. Kernels of another form are registered as functions of arrays
+(``given.py``).
 
 Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann
 (2000); SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: the
@@ -29,10 +29,9 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.implicit.kernels import radial
-from rbfmuscle.implicit.kernels.sampled import Radial, sample_functions
+from rbfmuscle.implicit.kernels.given import LEAST, Radial, check_functions, limits
+from rbfmuscle.implicit.kernels.radial import TERMS
 from rbfmuscle.validation import UsageError, check_finite, did_you_mean, shown
-
-_TERMS = 5  # coefficients of a polynomial: of degree 4 at most
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,8 @@ class Kernel:
     parameter: float
     base: int = field(repr=False)
     table: np.ndarray = field(repr=False, compare=False)
+    functions: tuple[Radial, ...] = field(default=(), repr=False, compare=False)
+    limits: tuple[float, ...] = field(default=(), repr=False, compare=False)
 
     @property
     def hermite(self) -> bool:
@@ -66,52 +67,73 @@ class Kernel:
         return self.order - 1
 
     @property
-    def form(self) -> radial.Form:
-        """What the loops read of this row."""
-        return radial.Form(self.base, self.parameter, self.compact, self.table)
-
-    @property
     def plain_cube(self) -> bool:
-        """Whether phi is s^3, for which the loops have a shorter way."""
-        return bool(
-            self.base == radial.ONE and self.table[0, 0] == 3.0 and self.table[0, 2 + _TERMS] == 1.0
-        )
+        """Whether phi is s^3, for which there is a loop of its own."""
+        return self.name == "cubic"
 
     @property
     def identity(self) -> str:
         """Name that stands for the formula too, in keys of what is kept on disk."""
-        sampled = self.base == radial.SAMPLED
-        return f"{self.name} {sha256(self.table.tobytes()).hexdigest()}" if sampled else self.name
+        if not self.functions:
+            return self.name
+        return f"{self.name} {sha256(self.table.tobytes()).hexdigest()}"
 
     def phi(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """Kernel at distances r (any shape), shape parameter epsilon [1/length]."""
-        return self._radial(r, epsilon, 0)
+        return self._at_distance(r, epsilon, 0)
 
     def first(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """phi'(r)/r, with its limit at r = 0 (which is infinite for kernels that are not C2)."""
-        return self._radial(r, epsilon, 1)
+        return self._at_distance(r, epsilon, 1)
 
     def second(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """(phi'' - phi'/r)/r**2, with its limit at r = 0 (infinite for kernels that are not C4)."""
-        return self._radial(r, epsilon, 2)
+        return self._at_distance(r, epsilon, 2)
 
-    def _radial(self, r: ArrayLike, epsilon: float, k: int) -> Floats:
+    def radial(self, u: Floats, count: int) -> list[Floats]:
+        """The first ``count`` radial functions at u = s**2, of any shape.
+
+        Where a function is infinite at u = 0 a finite value stands in: it is only ever multiplied
+        by zero vectors.
+        """
+        s = np.sqrt(u)
+        if self.functions:
+            return [self._given(k, s) for k in range(count)]
+        b = radial.base_values(self.base, self.parameter, u, s)
+        found = [radial.row_values(self.base, row, u, s, b) for row in self.table[:count]]
+        if self.compact:
+            for values in found:
+                values[u >= 1.0] = 0.0
+        return found
+
+    def _given(self, k: int, s: Floats) -> Floats:
+        """The k-th of the functions that were registered."""
+        values = np.zeros(s.shape)
+        inside = s < 1.0 if self.compact else np.ones(s.shape, dtype=bool)
+        with np.errstate(all="ignore"):
+            values[inside] = self.functions[k](np.maximum(s[inside], LEAST))
+        if np.isfinite(self.limits[k]):
+            values[s == 0.0] = self.limits[k]
+        return values
+
+    def _at_distance(self, r: ArrayLike, epsilon: float, k: int) -> Floats:
         r = np.asarray(r, dtype=float)
         check_finite(np.atleast_1d(r), name="r")
-        flat = np.ascontiguousarray(np.abs(r).ravel() * epsilon)
-        out = np.empty((3, flat.size))
-        radial._radial_loop(self.form, 1 << k, flat * flat, np.empty((3, flat.size)), out)
-        values = out[k]
-        values[flat == 0.0] = self._limit(k)
-        return (values * epsilon ** (2 * k)).reshape(r.shape)
+        s = np.abs(r) * epsilon
+        if self.functions and k >= len(self.functions):
+            return np.full(s.shape, np.nan)
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = self.radial(np.atleast_1d(s * s), k + 1)[k].reshape(r.shape)
+        values = np.where(s == 0.0, self._limit(k), values)
+        return np.asarray(values * epsilon ** (2 * k))
 
     def _limit(self, k: int) -> float:
         """Value of the k-th radial function at s = 0."""
-        if self.base == radial.SAMPLED:
-            return float(self.table[k, 0])
+        if self.functions:
+            return self.limits[k]
         power = self.table[k, 0]
-        inner = self.table[k, 2 : 2 + _TERMS]
-        outer = self.table[k, 2 + _TERMS :]
+        inner = self.table[k, 2 : 2 + TERMS]
+        outer = self.table[k, 2 + TERMS :]
         limit = outer[0]
         if self.base == radial.LOG:
             limit = -math.inf * inner[0] if inner[0] else limit
@@ -173,12 +195,12 @@ _ROWS = [
 
 
 def _radial_rows(base: int, parameter: float, phi: _Phi) -> Floats:
-    """Rows (3, 2 + 2 `_TERMS`): j, the base's own exponent, A, B; each (1/s) d/ds of the last, in
+    """Rows (3, 2 + 2 `TERMS`): j, the base's own exponent, A, B; each (1/s) d/ds of the last, in
     exact fractions.
     """
-    rows = np.zeros((3, 2 + 2 * _TERMS))
+    rows = np.zeros((3, 2 + 2 * TERMS))
     exponent = Fraction(parameter)
-    size = _TERMS + 2
+    size = TERMS + 2
     power, inner, outer, extra = phi
     if base == radial.ONE and any(inner):
         raise ValueError(f"a kernel with the base 1 has no A, got {inner}: write it as B")
@@ -189,8 +211,8 @@ def _radial_rows(base: int, parameter: float, phi: _Phi) -> Floats:
         a = np.roll(a, -lowest)
         b = np.roll(b, -lowest)
         row[:2] = (power, extra)
-        row[2 : 2 + _TERMS] = a[:_TERMS]
-        row[2 + _TERMS :] = b[:_TERMS]
+        row[2 : 2 + TERMS] = a[:TERMS]
+        row[2 + TERMS :] = b[:TERMS]
         slope, b = (power + np.arange(size)) * a, (power + np.arange(size)) * b
         if base == radial.EXP:
             slope = slope - np.roll(a, 1)
@@ -244,7 +266,7 @@ def register_kernel(
 ) -> Kernel:
     """Add a kernel under a name of its own, known wherever kernels are named in this process.
 
-    The functions are sampled once, to about 12 digits, for s from 1e-9 to 3e4.
+    The functions are checked against each other for s from 1e-9 to 3e4, and called as they are.
 
     Parameters
     ----------
@@ -271,8 +293,8 @@ def register_kernel(
     Raises
     ------
     UsageError
-        If the name is taken, a function is not finite or changes too fast, or ``first`` or
-        ``second`` is not the derivative of the one before.
+        If the name is taken, a function is not finite, or ``first`` or ``second`` is not the
+        derivative of the one before.
 
     Examples
     --------
@@ -294,8 +316,10 @@ def register_kernel(
         raise UsageError(f"kernel {shown(repr(name))} is known already, choose another name")
     if second is None and smoothness >= 2:
         raise UsageError(f"kernel {name!r} is C{smoothness}, so it needs its function second")
-    functions = [phi, first] if second is None else [phi, first, second]
-    table = sample_functions(functions, compact)
-    kernel = Kernel(name, order, compact, smoothness, has_epsilon, 0.0, radial.SAMPLED, table)
+    functions = (phi, first) if second is None else (phi, first, second)
+    at_zero = tuple(limits(functions))
+    compared = check_functions(functions, compact)
+    facts = name, order, compact, smoothness, has_epsilon
+    kernel = Kernel(*facts, 0.0, radial.ONE, compared, functions, at_zero)
     KERNELS[name] = kernel
     return kernel
