@@ -8,6 +8,8 @@ from rbfmuscle.importers.opensim.elements import frame_at, read_function, socket
 from rbfmuscle.importers.opensim.joints import Reading
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.importers.opensim.xml import Node
+from rbfmuscle.scene.joints.functions import Linear
+from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.names import new_name
 from rbfmuscle.validation import SceneError
 
@@ -22,6 +24,10 @@ GEOMETRY = "GeometryPath"
 PATHS = (GEOMETRY, "Scholz2015GeometryPath", "FunctionBasedPath")
 POINTS = ("PathPointSet", "MusclePointSet")
 WRAPS = ("PathWrapSet", "MuscleWrapSet")
+
+# Points that are there for some values of a coordinate, and points that move with coordinates.
+CONDITIONAL = ("ConditionalPathPoint", "MuscleViaPoint")
+MOVING = ("MovingPathPoint", "MovingMusclePoint")
 
 
 def read_muscles(reading: Reading, model: Node, forces: list[Node]) -> None:
@@ -57,7 +63,7 @@ def read_muscles(reading: Reading, model: Node, forces: list[Node]) -> None:
 
 def _read_muscle(reading, force, path, title, shapes):
     resting = reading.model.resolved()
-    points, wraps = [], []
+    points, wraps, changes = [], [], []
     if path.tag == "Scholz2015GeometryPath":
         for element in path.objects("path_elements"):
             inner = next((node for node in element.nodes() if node.tag.endswith("Point")), None)
@@ -69,9 +75,16 @@ def _read_muscle(reading, force, path, title, shapes):
     else:
         for tag in POINTS:
             points += [_path_point(point, reading, resting) for point in path.objects(tag)]
+            changes += [_change(point, reading) for point in path.objects(tag)]
         for tag in WRAPS:
             found = [shapes.wrap(wrap.word("wrap_object"), title) for wrap in path.objects(tag)]
             wraps += [shape for shape in found if shape is not None]
+    changing = [change for change in changes if change]
+    if changing:
+        reading.model.doubts.append(
+            f"{title}: {', '.join(changing)}; its tube stays as at rest, so its lengths and moment "
+            "arms are not the model's"
+        )
     force_most = force.number("max_isometric_force", FORCE)
     volume = force_most * force.number("optimal_fiber_length", FIBRE) / SPECIFIC_TENSION
     name = new_name(force.name or force.tag, [one.name for one in reading.model.muscles])
@@ -165,6 +178,36 @@ def _radii(shape):
     return None
 
 
+def _coordinate_name(point, tag):
+    """The coordinate that a point names, in any of the ways of its version."""
+    return point.word(f"socket_{tag}") or point.word(tag) or point.word(f"{tag}_name")
+
+
+def _change(point, reading):
+    """How a point comes, goes or moves with coordinates; empty where it does not."""
+    if point.tag in CONDITIONAL:
+        low, high = point.numbers("range", "-1e9 1e9", count=2)
+        name = reading.coordinate(_coordinate_name(point, "coordinate"))
+        coordinate = all_coordinates(reading.model.joints).get(name)
+        reached = None if coordinate is None else coordinate.range
+        if reached is not None and low <= min(reached) and max(reached) <= high:
+            return ""
+        return f"point {point.name!r} is on its path for {name} from {low:g} to {high:g} alone"
+    if point.tag in MOVING:
+        names = [
+            reading.coordinate(_coordinate_name(point, f"{axis}_coordinate"))
+            for axis in "xyz"
+            if not _is_constant(read_function(point.child(f"{axis}_location")))
+        ]
+        if names:
+            return f"point {point.name!r} moves with {', '.join(dict.fromkeys(names))}"
+    return ""
+
+
+def _is_constant(function):
+    return function is None or (isinstance(function, Linear) and not any(function.slopes))
+
+
 def _path_point(point, reading, resting):
     """Body and place in it of a path point where coordinates are at their defaults; None where it
     is not active.
@@ -173,15 +216,14 @@ def _path_point(point, reading, resting):
     body, frame = reading.frames.place(where, inside=point.path)
 
     def value_of(tag):
-        named = point.word(f"socket_{tag}") or point.word(tag) or point.word(f"{tag}_name")
-        return resting.get(reading.coordinate(named), 0.0)
+        return resting.get(reading.coordinate(_coordinate_name(point, tag)), 0.0)
 
-    if point.tag in ("ConditionalPathPoint", "MuscleViaPoint"):
+    if point.tag in CONDITIONAL:
         low, high = point.numbers("range", "-1e9 1e9", count=2)
         if not low <= value_of("coordinate") <= high:
             return None
     at = point.vector("location")
-    if point.tag in ("MovingPathPoint", "MovingMusclePoint"):
+    if point.tag in MOVING:
         for k, axis in enumerate("xyz"):
             function = read_function(point.child(f"{axis}_location"))
             if function is not None:

@@ -100,6 +100,11 @@ def _add_muscles(found, walk):
             ]
             mesh = tube.vertices, tube.faces
             scene.add_muscle(muscle.name, mesh, attach=attach, model=dict(TUBE_MODEL))
+            if tube.crossed:
+                scene.doubts.append(
+                    f"{muscle.title}: its path goes through {', '.join(tube.crossed)}, and so does "
+                    "its tube; give it a mesh"
+                )
             if tube.volume_error > LEAST_MISSED:
                 scene.doubts.append(
                     f"{muscle.title}: its tube misses the volume by {100 * tube.volume_error:.2g} %"

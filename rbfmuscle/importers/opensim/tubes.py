@@ -12,8 +12,8 @@ import numpy as np
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import mesh_volume, unique_edges
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along, tube_mesh
-from rbfmuscle.geometry.vectors import to_world
-from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
+from rbfmuscle.importers.opensim.model import ModelMuscle
+from rbfmuscle.importers.opensim.wraps import wrap_path
 from rbfmuscle.validation import SceneError
 
 # Sections along a tube and vertices of each; radius at the ends against the middle; share of the
@@ -30,16 +30,18 @@ FLATTENINGS = 8
 # Rounds in which the radius is fitted to the volume, at most, and the share of it left open.
 FITTINGS = 12
 FITTED = 1e-5
+MOST_MISSED = 0.1  # share of the volume that a tube beside bones may miss
 # A tube is smooth: fewer centres fit it as well, its own vertices meet the bones, and as its shape
 # is none that was measured, half the usual nodes are enough.
 TUBE_MODEL = {"name": "rbf", "centres": 100, "samples": SECTIONS * SIDES + 2, "nodes": 150}
-ROUNDS = 60  # rounds in which the middle line is drawn straight and put out of what is in its way
+ROUNDS = 60  # rounds in which the middle line is put out of bones in its way
 
 
 @dataclass
 class Tube:
     """A tube: vertices [metre], triangles, the vertices that bones hold at both ends and those that
-    bones hold on its way, and by what share its volume misses the muscle's.
+    bones hold on its way, by what share its volume misses the muscle's, and the bones that its
+    path crosses, where it could not be kept out of them.
     """
 
     vertices: np.ndarray
@@ -47,6 +49,7 @@ class Tube:
     held: dict[str, np.ndarray]
     via: dict[str, np.ndarray]
     volume_error: float
+    crossed: list[str]
 
 
 def make_tube(
@@ -71,71 +74,68 @@ def make_tube(
     points = np.array(
         [places[body][:3, :3] @ at + places[body][:3, 3] for body, at in muscle.points]
     )
-    along = distance_along(points)
-    line = points_along(points, np.linspace(0.0, along[-1], SECTIONS))
+    wraps = [(wrap, places[wrap.body] @ wrap.frame) for wrap in muscle.wraps]
+    path, own = wrap_path(points, wraps)
+    along = distance_along(path)
+    line = points_along(path, np.linspace(0.0, along[-1], SECTIONS))
     # The path's points in the line.
-    fixed = np.rint(along / max(along[-1], 1e-300) * (SECTIONS - 1)).astype(int)
+    fixed = np.rint(along[own] / max(along[-1], 1e-300) * (SECTIONS - 1)).astype(int)
     length = line_length(line)
     share = END_RADIUS + (1.0 - END_RADIUS) * np.sin(np.pi * np.linspace(0.0, 1.0, len(line)))
     radius = share * np.sqrt(muscle.volume / (np.pi * length * np.mean(share**2)))
-    wraps = [(wrap, places[wrap.body] @ wrap.frame) for wrap in muscle.wraps]
-    line = _clear_line(line, fixed, radius, wraps, list(bones.values()))
     held, via = _held(bodies, fixed, bones)
+    vertices, faces, missed = _fitted(line, fixed, radius, list(bones.values()), muscle.volume)
+    crossed: list[str] = []
+    if missed > MOST_MISSED:
+        vertices, faces, missed = _fitted(line, fixed, radius, [], muscle.volume)
+        crossed = [name for name, bone in bones.items() if (bone.signed_distance(line) < 0.0).any()]
+    if missed > MOST_MISSED:
+        raise SceneError(
+            "its path turns too sharply for a tube of its volume; give it a mesh, or fewer points"
+        )
+    return Tube(vertices, faces, held, via, missed, crossed)
+
+
+def _fitted(line, fixed, radius, bones, target):
+    """Vertices and faces of a tube of a volume about a line, beside bones, and by what share its
+    volume misses; inf where there is no such tube.
+    """
+    line = _clear_line(line, fixed, radius, bones)
     reach = FLATTENED + 2.0 * float(radius.max())
     low, high = line.min(axis=0) - reach, line.max(axis=0) + reach
     near = [
         bone
-        for bone in bones.values()
+        for bone in bones
         if (bone.vertices.min(axis=0) < high).all() and (bone.vertices.max(axis=0) > low).all()
     ]
     for _ in range(FITTINGS):
         vertices, faces = tube_mesh(line, radius, SIDES)
         vertices = _beside_bones(vertices, faces, near)
-        # As its square, but for where sections run into each other or lie flat on a bone.
         volume = mesh_volume(vertices, faces)
-        ratio = float(np.sqrt(muscle.volume / volume))
+        # Where a line passes through a bone, what comes out of it on both sides is no tube.
+        if not volume > 0.0:
+            return vertices, faces, np.inf
+        # As its square, but for where sections run into each other or lie flat on a bone.
+        ratio = float(np.sqrt(target / volume))
         if abs(ratio - 1.0) < FITTED:
             break
         radius = radius * ratio
-    return Tube(vertices, faces, held, via, abs(volume / muscle.volume - 1.0))
+    return vertices, faces, abs(volume / target - 1.0)
 
 
-def _clear_line(line, fixed, radius, wraps, bones):
-    """The line drawn straight between its points, out of wrapping shapes and, by its radius, out of
-    bones.
-    """
-    line, start = line.copy(), line.copy()
+def _clear_line(line, fixed, radius, bones):
+    """The line rounded at its points, and moved out of bones by its radius, smoothly."""
+    line = line.copy()
+    bends = fixed[(fixed > 0) & (fixed < len(line) - 1)]
+    line[bends] = 0.25 * (line[bends - 1] + 2.0 * line[bends] + line[bends + 1])
+    shift = np.zeros_like(line)
     for number in range(ROUNDS):
-        line[1:-1] = 0.25 * (line[:-2] + 2.0 * line[1:-1] + line[2:])
-        line[fixed] = 0.5 * (line[fixed] + start[fixed])
-        for wrap, frame in wraps:
-            back = np.linalg.inv(frame)
-            local = to_world(line, back)
-            line = to_world(_out_of_shape(wrap, local), frame)
+        shift[1:-1] = 0.25 * (shift[:-2] + 2.0 * shift[1:-1] + shift[2:])
+        shift[fixed] *= 0.5
         if number % 10 == 9:
             for bone in bones:
-                line = _out_of_bone(bone, line, 0.8 * radius)
-    return line
-
-
-def _out_of_shape(wrap: WrapShape, points: np.ndarray) -> np.ndarray:
-    """Points (n, 3) in a shape's frame [metre], those inside moved to its surface, in its
-    quadrant.
-    """
-    count = 2 if wrap.kind == "WrapCylinder" else 3
-    unit = points[:, :count] / wrap.radii[:count]
-    inside = np.linalg.norm(unit, axis=1) < 1.0
-    if count == 2:
-        inside &= np.abs(points[:, 2]) <= wrap.radii[2]
-    axis = "xyz".find(wrap.quadrant[-1:] or "?")
-    if 0 <= axis < count:
-        sign = -1.0 if wrap.quadrant[0] == "-" else 1.0
-        unit[:, axis] = np.where(inside & (sign * unit[:, axis] < 0.0), 0.0, unit[:, axis])
-        unit[:, axis] += sign * 1e-3 * inside
-    size = np.maximum(np.linalg.norm(unit, axis=1), 1e-9)
-    out = points.copy()
-    out[inside, :count] = (unit / size[:, None] * wrap.radii[:count])[inside]
-    return out
+                shift = _out_of_bone(bone, line + shift, 0.8 * radius) - line
+    return line + shift
 
 
 def _out_of_bone(bone, points, reach):

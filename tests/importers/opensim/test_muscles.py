@@ -5,10 +5,12 @@ import pytest
 import trimesh
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import LEAST_MISSED, import_osim, write_imported
 from rbfmuscle.importers.opensim.tubes import FITTED, SIDES, make_tube
+from rbfmuscle.importers.opensim.wraps import wrap_path
 from rbfmuscle.importers.opensim.xml import read_xml
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.scene import Scene
@@ -52,6 +54,56 @@ def test_path_goes_around_a_cylinder_on_the_side_that_it_says(quadrant, side):
     middles = tube.vertices[:-2].reshape(-1, SIDES, 3).mean(axis=1)
     away = np.hypot(middles[:, 0] + 0.002, middles[:, 2] - 0.15)
     assert away.min() > 0.0298 and side * middles[len(middles) // 2, 0] > 0.02
+
+
+RADII = {
+    "WrapCylinder": [0.03, 0.03, 0.1],
+    "WrapSphere": [0.03] * 3,
+    "WrapEllipsoid": [0.03, 0.06, 0.04],
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "quadrant", "ends", "length"),
+    [  # lengths of OpenSim 4.6
+        ("WrapCylinder", "x", ([0.03, 0.22, 0.0], [-0.05002689, -0.0701513, 0.0]), 0.33002492),
+        ("WrapCylinder", "x", ([0.03, 0.22, 0.0], [-0.00349898, -0.02601462, 0.0]), 0.24828480),
+        ("WrapCylinder", "x", ([0.03, 0.22, 0.0], [0.01620907, -0.02524413, 0.0]), 0.24563158),
+        ("WrapCylinder", "x", ([-0.01, 0.17, 0.0], [-0.08684861, -0.04982286, 0.01]), 0.31102113),
+        (
+            "WrapEllipsoid",
+            "x",
+            ([0.03, 0.22, 0.005], [-0.06685743, -0.08095730, -0.004]),
+            0.31628731,
+        ),
+    ],
+)
+def test_path_over_a_shape_is_as_long_as_opensims(kind, quadrant, ends, length):
+    wrap = WrapShape("a", np.eye(4), np.array(RADII[kind]), kind, quadrant)
+    path, own = wrap_path(np.array(ends), [(wrap, np.eye(4))])
+    assert line_length(path) == pytest.approx(length, rel=0.003)  # an arc of 24 points
+    assert own.tolist() == [0, len(path) - 1]
+
+
+def test_shortest_path_over_a_sphere_is_known():
+    """Two tangents and an arc: of points at distance d the tangents are sqrt(d^2 - r^2)."""
+    wrap = WrapShape("a", np.eye(4), np.array([0.03] * 3), "WrapSphere", "")
+    path, _ = wrap_path(np.array([[-0.1, 0.01, 0.0], [0.1, 0.01, 0.0]]), [(wrap, np.eye(4))])
+    away = np.hypot(0.1, 0.01)
+    arc = 2.0 * (np.arctan2(0.1, 0.01) - np.arccos(0.03 / away))
+    known = 2.0 * np.sqrt(away**2 - 0.03**2) + 0.03 * arc
+    assert line_length(path) == pytest.approx(known, rel=1e-4)  # an arc of 24 points
+
+
+def test_slender_tube_whose_path_crosses_a_bone_is_said_and_keeps_its_volume():
+    """What comes out of the bone on both sides has no volume of its own."""
+    rod = trimesh.creation.cylinder(radius=0.012, height=0.38, sections=16)
+    rod = rod.subdivide_to_size(0.02)
+    bones = _bones("a", "b", "c") | {"rod": ExactDistance(rod.vertices, rod.faces)}
+    points = [("a", np.array([0.03, 0.005, -0.01])), ("b", np.array([-0.067, -0.004, 0.301]))]
+    tube = make_tube(ModelMuscle("m", points, volume=3e-6), PLACES, bones, HELD_BY)
+    assert np.isfinite(tube.vertices).all() and tube.volume_error < 0.1
+    assert tube.crossed == ["rod"]
 
 
 def test_tube_lies_flat_on_a_bone_in_its_way_and_keeps_its_volume():

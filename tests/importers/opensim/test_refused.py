@@ -134,8 +134,9 @@ def test_what_is_not_taken_is_noted_once(small):
         assert text.count(words) == 1, words
     for words in ("'ball' is a Sphere", "mesh 'wedge.obj' is hidden"):
         assert text.count(words) == 1, words
-    (doubt,) = read_osim(small).doubts
-    assert doubt.startswith("PointOnLineConstraint 'rail' is not taken")
+    rail, point = read_osim(small).doubts
+    assert rail.startswith("PointOnLineConstraint 'rail' is not taken")
+    assert "point 'b' is on its path for" in point
 
 
 @pytest.mark.parametrize(
