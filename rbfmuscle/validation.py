@@ -20,6 +20,7 @@ BROKEN_FILE = (
     OSError,
     RuntimeError,
     TypeError,
+    UnboundLocalError,
     ValueError,
     struct.error,
     zlib.error,

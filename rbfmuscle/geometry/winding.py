@@ -8,21 +8,32 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.loops import loop
 
 
-def inside_test(
-    vertices: Floats, faces: Integers, *, least: float = 0.5
-) -> Callable[[Floats], Booleans]:
-    """``inside(points) -> (n,) bool`` by fast generalised winding numbers above ``least`` (Barill
-    2018), for meshes with holes too.
+def winding_numbers(vertices: Floats, faces: Integers) -> Callable[[Floats], Floats]:
+    """``winding(points) -> (n,)``: fast generalised winding numbers (Barill 2018) of a mesh, which
+    may have holes.
+
+    They are computed about the middle of the mesh, as igl's tree has single precision.
     """
     import igl
 
+    middle = vertices.mean(axis=0)
     tree = igl.FastWindingNumberBVH()
-    tree.init(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64), 2)
+    tree.init(np.ascontiguousarray(vertices - middle), np.ascontiguousarray(faces, np.int64), 2)
 
-    def inside(points: Floats) -> Booleans:
-        return tree.winding_number(np.ascontiguousarray(points)) > least
+    def winding(points: Floats) -> Floats:
+        return np.asarray(tree.winding_number(np.ascontiguousarray(points - middle)))
 
-    return inside
+    return winding
+
+
+def inside_test(
+    vertices: Floats, faces: Integers, *, least: float = 0.5
+) -> Callable[[Floats], Booleans]:
+    """``inside(points) -> (n,) bool`` by winding numbers above ``least``, for meshes with holes
+    too.
+    """
+    winding = winding_numbers(vertices, faces)
+    return lambda points: winding(points) > least
 
 
 @loop

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple
 
 from rbfmuscle.anatomy.bones import HEADER
 from rbfmuscle.anatomy.names import name_facts
@@ -20,7 +20,17 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, UsageError
 
 # Folder of the surfaces, vertices on caps by file, and notes.
-Surfaces: TypeAlias = tuple[Path, dict[str, Booleans], list[str]]
+
+
+class Surfaces(NamedTuple):
+    """The ``folder`` of a volume's surfaces, vertices (n,) on caps by file, notes, and why labels
+    have none, by their names.
+    """
+
+    folder: Path
+    capped: dict[str, Booleans]
+    notes: list[str]
+    unusable: dict[str, str]
 
 
 def scene_from_meshes(folder: Path, *, units: Literal["mm", "cm", "m"] | None) -> Scene:
@@ -73,21 +83,27 @@ def guess_volume(volume: LabelVolume, stage: Path, base: Path) -> SceneGuess:
     """The guess of a label volume, whose surfaces are written into a folder ``stage``; the scene's
     paths are relative to ``base``.
     """
-    folder, capped, notes = write_surfaces(volume, stage)
-    header = HEADER if volume.directed else None
-    guess = guess_scene(folder, "mm", base, header=header, capped=capped)
-    guess.parts.notes[:0] = notes
+    found = write_surfaces(volume, stage)
+    guess = guess_scene(
+        found.folder,
+        "mm",
+        base,
+        header=HEADER if volume.directed else None,
+        capped=found.capped,
+        source=volume.source,
+        unusable=found.unusable,
+    )
+    guess.parts.notes[:0] = found.notes
     return guess
 
 
 def write_surfaces(volume: LabelVolume, stage: Path) -> Surfaces:
-    """Surfaces of all labels as PLY in ``meshes`` of a folder; that folder, vertices on caps by
-    file, and notes.
-    """
+    """Surfaces of all labels as PLY in ``meshes`` of a folder."""
     meshes = stage / "meshes"
     meshes.mkdir()
     values = volume.values()
-    capped = {}
+    capped: dict[str, Booleans] = {}
+    unusable: dict[str, str] = {}
     frame = "right, forward, up (RAS), mm"
     notes = [f"surfaces of {Path(volume.source).name}, in its frame: {frame}", *volume.notes]
     with Progress("surfaces", "label") as progress:
@@ -99,7 +115,7 @@ def write_surfaces(volume: LabelVolume, stage: Path) -> Surfaces:
             try:
                 surface = label_surface(volume, int(label), pieces=tissue == "bone")
             except MeshError as error:
-                notes.append(f"{error}; left out")
+                unusable[volume.name(label)] = str(error).removeprefix(f"{volume.source}: ")
                 continue
             plain = plain_name(surface.name)
             file = new_name(surface.name, capped)
@@ -109,4 +125,4 @@ def write_surfaces(volume: LabelVolume, stage: Path) -> Surfaces:
             capped[file] = surface.capped
             notes += [f"{surface.name}: {note}" for note in surface.notes]
             progress(done, len(values))
-    return meshes, capped, notes
+    return Surfaces(meshes, capped, notes, unusable)

@@ -39,6 +39,7 @@ class Bone(Compared):
     source: str = ""
     closed: bool = True
     notes: list[str] = field(default_factory=list)
+    doubt: str = ""  # why it is not known what is inside
 
     def __getstate__(self) -> dict[str, object]:
         """What is computed on demand is not copied, nor sent to other processes."""

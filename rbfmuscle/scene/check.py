@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.articular import articular_share, scene_surfaces
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.ends import attachment_ends
@@ -25,6 +26,9 @@ MOST_ARTICULAR = 0.5  # share of an attachment that may lie on an articular surf
 # muscle's length.
 END_GAP_MM, END_SHARE = 25.0, 0.1
 MOTION_SAMPLES = 10  # frames in which bones are checked against each other
+# Of the size of a scene: farther from the origin, single precision shows, and the digits of double
+# precision do not suffice.
+FAR_SINGLE, FAR_DIGITS = 1e3, 1e6
 COUNTED_DEPTH_MM = 0.05  # bones that touch by less are not reported
 
 
@@ -58,6 +62,8 @@ def check_scene(scene: Scene) -> list[Finding]:
     findings += [Finding("warning", bone.name, opened) for bone in scene.bones if not bone.closed]
     findings += [Finding("warning", name, unusable) for name in scene.missing_bones]
     findings += [Finding("warning", scene.name, doubt) for doubt in scene.doubts]
+    findings += [Finding("warning", place, doubt) for place, doubt in _mesh_doubts(scene)]
+    findings += _far_findings(scene)
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
     findings += _rest_overlaps(scene)
     findings += _neighbour_findings(scene)
@@ -143,12 +149,51 @@ def open_ends(scene: Scene) -> dict[str, str]:
 
 def stated_doubts(scene: Scene) -> list[tuple[str, str]]:
     """What is doubtful about a scene though no line of it is a guess, each with its muscle: without
-    one the ``doubts`` of the scene; ends that lie away from their bones, as those who wrote it
-    stated.
+    one the ``doubts`` of the scene and of its bones' meshes; ends that lie away from their bones,
+    as those who wrote it stated.
     """
     guessed = guessed_muscles(scene.guesses)
     ends = [(name, text) for name, text in open_ends(scene).items() if name not in guessed]
-    return [*(("", doubt) for doubt in scene.doubts), *ends]
+    meshes = [f"{place}: {doubt}" for place, doubt in _mesh_doubts(scene)]
+    return [*(("", doubt) for doubt in (*scene.doubts, *meshes)), *ends]
+
+
+def _mesh_doubts(scene: Scene) -> list[tuple[str, str]]:
+    """Bones of which it is not known what is inside, and scenes so far from the origin that results
+    lose digits, as (name, doubt).
+    """
+    found = [(bone.name, bone.doubt) for bone in scene.bones if bone.doubt]
+    away, size = _far(scene)
+    if away > FAR_DIGITS * size:
+        found.append(
+            (
+                scene.name,
+                f"it lies {away:.3g} {scene.units} from the origin, {away / size:.0e} times its "
+                "size: results lose digits; move it near the origin",
+            )
+        )
+    return found
+
+
+def _far(scene: Scene) -> tuple[float, float]:
+    """The largest coordinate of the bones, and the diagonal of the box about all [scene unit]."""
+    if not scene.bones:
+        return 0.0, 0.0
+    corners = np.concatenate([bone.bounds for bone in scene.bones])
+    return float(np.abs(corners).max()), box_size(corners)
+
+
+def _far_findings(scene: Scene) -> list[Finding]:
+    """What single precision makes of places far from the origin."""
+    away, size = _far(scene)
+    if away <= FAR_SINGLE * size:
+        return []
+    error = away * float(np.finfo(np.float32).eps) / 2.0
+    said = (
+        f"it lies {away:.3g} {scene.units} from the origin: in files of single precision (STL, "
+        f"PLY, GLB) places are wrong by up to {error:.2g} {scene.units}; move it near the origin"
+    )
+    return [Finding("warning", scene.name, said)]
 
 
 def sort_findings(findings: Iterable[Finding]) -> list[Finding]:

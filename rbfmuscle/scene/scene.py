@@ -261,7 +261,9 @@ class Scene(Compared):
             self.meshless_bones.append(name)
         else:
             read = as_mesh(mesh, name, lies, may_be_open=True)
-            self.bones.append(Bone(name, read.mesh, read.source, read.closed, read.notes))
+            self.bones.append(
+                Bone(name, read.mesh, read.source, read.closed, read.notes, read.doubt)
+            )
         return self
 
     def add_joint(

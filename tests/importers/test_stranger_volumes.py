@@ -178,7 +178,7 @@ def test_what_lies_in_a_folder_of_masks_and_is_none_is_said_or_refused(tmp_path)
 def test_two_labels_of_one_name_have_two_names_and_that_is_said(tmp_path):
     folder = write_masks(tmp_path / "m", {"femur": FEMUR, "pelvis": PELVIS})
     nrrd.write(str(folder / "femur.nrrd"), FEMUR.astype(np.uint8), NRRD_HEAD)
-    meshes, _, notes = write_surfaces(read_labels(folder), tmp_path)
+    meshes, _, notes, _ = write_surfaces(read_labels(folder), tmp_path)
     assert {file.stem for file in meshes.iterdir()} == {"femur", "femur_2", "pelvis"}
     assert "several labels are named femur: one of them is femur_2 here" in notes
 
@@ -252,7 +252,7 @@ def test_nothing_is_attached_where_the_scan_ends(tmp_path):
     source = write_nifti(tmp_path / "a.nii", labels)
     (tmp_path / "n.csv").write_text("1,femur\n2,pelvis\n3,gluteus_maximus\n")
     volume = read_labels(source, names=tmp_path / "n.csv")
-    folder, capped, notes = write_surfaces(volume, tmp_path)
+    folder, capped, notes, _ = write_surfaces(volume, tmp_path)
     assert any("gluteus_maximus: cut off where the scan ends" in note for note in notes)
     on_cap = np.flatnonzero(capped["gluteus_maximus"])
     assert len(on_cap) > 8

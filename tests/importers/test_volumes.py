@@ -147,6 +147,42 @@ def test_islands_and_holes_are_left_out_and_told():
     )
 
 
+def boxes(*corners, size=(12, 12, 22)):
+    labels = np.zeros((60, 60, 60), np.uint8)
+    for x, y, z in corners:
+        labels[x : x + size[0], y : y + size[1], z : z + size[2]] = 1
+    return labels
+
+
+def test_label_that_is_thin_for_its_voxels_is_drawn_whole_or_says_its_share():
+    """One voxel of thickness, a bar of one voxel between two boxes, and boxes that touch at an edge
+    or a corner alone.
+    """
+    sheet, bridge = boxes((24, 14, 8), size=(1, 30, 40)), boxes((22, 18, 6), (22, 18, 33))
+    bridge[27, 23, 28:33] = 1
+    edge = boxes((22, 18, 6), (34, 30, 6))
+    corner = boxes((22, 18, 6), (34, 30, 28))
+    for labels, share in ((sheet, 1.0), (bridge, 1.0), (edge, 1.0), (corner, 0.5)):
+        surface = label_surface(LabelVolume(labels, np.eye(4), {}, "x.nii"), 1)
+        assert surface.mesh.is_volume and surface.mesh.body_count == 1
+        assert surface.mesh.volume == pytest.approx(share * labels.sum(), rel=0.05)
+        size = np.ptp(np.argwhere(labels), axis=0) + 1
+        assert (surface.mesh.extents < size + 2).all()
+    assert surface.notes == ["1 islands of 3168 voxels left out (50 %)"]
+
+
+def test_unusable_labels_are_named_with_their_volume_and_reason(tmp_path, capsys):
+    labels = boxes((22, 18, 6)).astype(np.int16)
+    labels[40:44, 40:44, 5:45] = 2
+    labels[5, 5, 5:20] = 3
+    path = write_nifti(tmp_path / "leg.nii.gz", labels, np.eye(4))
+    (tmp_path / "names.csv").write_text("1,femur\n2,pelvis\n3,gluteus_medius\n")
+    code, _, said = call(capsys, "new", path, "--labels", tmp_path / "names.csv")
+    assert code == 2
+    assert "leg.nii.gz holds no muscle" in said and "'gluteus_medius' has 15 voxels" in said
+    assert ".rbfmuscle" not in said
+
+
 def test_names_from_files_header_and_tables(tmp_path):
     labels = ball_labels(split=np.array([1.0, 0, 0])).astype(np.int16)
     for value, name in ((1, "soleus"), (2, "tibia")):

@@ -298,6 +298,17 @@ def test_new_takes_each_solid_of_a_file_and_writes_what_was_mended(tmp_path, cap
     assert "tibia: 2 nested shells, the inner one is ignored" in out
 
 
+def test_ply_header_without_vertex_numbers_of_faces_is_refused(tmp_path):
+    path = tmp_path / "x.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 1\nproperty list uchar int vertex_indic\nend_header\n"
+        "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    )
+    with pytest.raises(MeshError, match="declares no list of the faces' vertex numbers"):
+        read_mesh(path)
+
+
 class TestForeignContent:
     """Files under a name that is not theirs: what they are, not how their bytes fail."""
 

@@ -5,6 +5,8 @@ import pytest
 import trimesh
 from fuzz.meshes import write_mesh
 
+from rbfmuscle.geometry.winding import inside_test
+from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.meshes.read import prepare_mesh, read_mesh
 from rbfmuscle.validation import MeshError
 
@@ -191,3 +193,42 @@ def test_a_mended_mesh_is_kept_and_comes_back_alike(tmp_path, monkeypatch):
     assert prepare_mesh(np.array(mesh.vertices), faces, **given).notes == ["kept"]
     moved = prepare_mesh(np.array(mesh.vertices) + 1.0, faces, **given)
     np.testing.assert_allclose(moved.vertices, first.vertices + 1.0)
+
+
+@pytest.mark.parametrize("apart", [1e-6, 1e-5, 1e-4, 1e-3])
+def test_corners_of_a_triangle_soup_that_lie_apart_are_joined(apart):
+    """A ball of radius 14 whose triangles have corners of their own, moved by up to 1e-3."""
+    ball = trimesh.creation.icosphere(3, 14.0)
+    corners = ball.triangles.reshape(-1, 3)
+    corners = corners + apart * np.random.default_rng(1).uniform(-1, 1, corners.shape)
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    read = prepare_mesh(corners, faces, context="soup", name="soup", may_be_open=True)
+    assert read.closed and len(read.vertices) == len(ball.vertices) and not read.doubt
+    assert BoneDistance("soup", read.mesh).signed([[0.0, 0.0, 0.0]])[0] == pytest.approx(
+        -14, abs=0.1
+    )
+
+
+def test_bone_without_an_inside_is_doubted():
+    ball = trimesh.creation.icosphere(3, 14.0)
+    third = ball.faces[ball.triangles_center[:, 2] < -14 / 3]
+    flat = trimesh.creation.box([40, 20, 1e-9]).subdivide()
+    doubts = [
+        prepare_mesh(vertices, faces, context="bone", name="bone", may_be_open=True).doubt
+        for vertices, faces in (
+            (ball.vertices, ball.faces),
+            (ball.vertices, third),
+            (flat.vertices, flat.faces),
+        )
+    ]
+    assert doubts[0] == "" and "surface is missing" in doubts[1] and "it is flat" in doubts[2]
+
+
+@pytest.mark.parametrize("shift", [[250000.0, -480000.0, 1200000.0], [1e9, -1e9, 5e8]])
+def test_mesh_far_from_the_origin_has_the_inside_that_it_has_there(shift):
+    """Its tree of winding numbers has single precision."""
+    ball = trimesh.creation.icosphere(3, 14.0)
+    far = ball.vertices + shift
+    assert prepare_mesh(far, ball.faces, context="far", name="far").notes == []
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 13.0], [0.0, 0.0, 15.0]])
+    assert inside_test(far, ball.faces)(points + shift).tolist() == [True, True, False]

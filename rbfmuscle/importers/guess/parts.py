@@ -1,9 +1,9 @@
 """The meshes of a folder, sorted into bones, muscles and tendons; the unit of their lengths."""
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rbfmuscle.anatomy.bones import Part
 from rbfmuscle.anatomy.names import name_facts
@@ -14,9 +14,6 @@ from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.scene.names import new_name
 from rbfmuscle.scene.objects import MM_PER_UNIT, from_mm
 from rbfmuscle.validation import MeshError, UsageError
-
-if TYPE_CHECKING:
-    pass
 
 # Folders below the one that is given, as people sort their meshes.
 FOLDERS = {"bones": "bone", "bone": "bone", "knochen": "bone", "os": "bone"}
@@ -52,13 +49,21 @@ class Parts:
         return from_mm(1.0, self.units)
 
 
-def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
+def read_parts(
+    folder: Path,
+    units: str | None,
+    base: Path,
+    *,
+    source: str = "",
+    unusable: Mapping[str, str] | None = None,
+) -> Parts:
     """Bones, muscles and tendons of a folder, and of its folders ``bones``, ``muscles`` and
-    ``tendons``; files relative to ``base``.
+    ``tendons``; files relative to ``base``. Messages name the ``source`` of the meshes, the folder
+    by default, and what of it was ``unusable`` before, by name, and why.
 
     Where no unit is given it is the one in which the bones have the size that they have in people.
     """
-    found = Parts()
+    found = Parts(unusable=dict(unusable or {}))
     unknown = []
     names = set()
     other = []
@@ -85,14 +90,12 @@ def read_parts(folder: Path, units: str | None, base: Path) -> Parts:
     _sort_unknown(found, unknown)
     if not found.bones or not found.muscles:
         kind, rest = ("bone", "muscles") if not found.bones else ("muscle", "bones")
-        listed = ", ".join(
-            [part.file for part in found.bones or found.muscles] + list(found.unusable)
-        )
+        listed = [Path(part.file).name for part in found.bones or found.muscles]
+        listed += [f"{file} ({why})" for file, why in found.unusable.items()]
         raise UsageError(
-            f"{folder} holds no {kind} (by names or sizes all are {rest}, or cannot be used: "
-            f"{listed or 'no files'}); "
-            f"name files ({' '.join(MESH_SUFFIXES)}) after what they are, or sort them into "
-            "folders bones and muscles"
+            f"{source or folder} holds no {kind} (by names or sizes all are {rest}, or cannot be "
+            f"used: {', '.join(listed) or 'no files'}); name files ({' '.join(MESH_SUFFIXES)}) or "
+            "labels after what they are, or sort files into folders bones and muscles"
         )
     found.units = units or _guess_units(found)
     _leave_out_wrong_sizes(found)

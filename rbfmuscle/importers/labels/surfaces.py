@@ -15,6 +15,8 @@ from scipy.ndimage import binary_fill_holes, find_objects, gaussian_filter, map_
 from scipy.ndimage import label as connected
 
 from rbfmuscle.geometry.crossing import crossing_faces
+from rbfmuscle.geometry.exact_distance import faces_across
+from rbfmuscle.geometry.solids import label_shells
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normals
 from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.importers.labels.volume import LabelVolume
@@ -32,6 +34,12 @@ PIECE = 0.01  # share of the largest piece from which on a piece belongs to a bo
 # Edge of the surface's triangles [voxels], and rounds in which triangles that cross are drawn
 # apart.
 EDGE, UNTANGLE = 2.2, 20
+# Voxels of a label, at least; into how many each is divided along an axis, and at most how many
+# there are then; share by which a surface may miss their volume.
+LEAST_VOXELS = 27
+FINER = (1, 2, 4)
+MOST_VOXELS = 20_000_000
+VOLUME_ERROR = 0.05
 
 
 @dataclass
@@ -53,37 +61,25 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     With ``pieces`` (bones of several parts) every piece of a hundredth or more is kept, not the
     largest alone.
     """
-    import igl
     import trimesh
-    from skimage.measure import marching_cubes
 
     name, notes = volume.name(label), []
     mask = volume.mask(label)
     box = find_objects(mask.astype(np.int8))[0]
     cuts = _cuts(mask, box, notes)
     others = np.pad((volume.labels[(slice(None), *box)] > 0).any(axis=0) & ~mask[box], MARGIN)
-    mask = _without_islands(np.pad(mask[box], MARGIN), notes, PIECE if pieces else 1.0)
-    mask = _filled(mask, others, notes)
-    count = int(mask.sum())
-    if count < 27:
+    mask = np.pad(mask[box], MARGIN)
+    if mask.sum() < LEAST_VOXELS:
         raise MeshError(
-            f"{volume.source}: label {name!r} has {count} voxels, too few for a surface"
+            f"{volume.source}: label {name!r} has {int(mask.sum())} voxels, too few for a surface"
         )
-    smooth = smooth_mask(mask)
-    vertices, faces, _, _ = marching_cubes(-smooth, 0.0, allow_degenerate=False)
-    vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
-    # Fewer triangles by quadric edge collapse (Garland and Heckbert 1997), of about the edge that
-    # is wanted.
-    target = max(200, int(vertex_areas(vertices, faces).sum() / (np.sqrt(3.0) / 4.0 * EDGE**2)))
-    if target < len(faces):
-        vertices, faces = (np.asarray(part) for part in igl.qslim(vertices, faces, target)[:2])
-    faces = faces.astype(np.int64)
-    # Edges that collapse on either side of a thin wall fold it, or bring its sides through each
-    # other.
-    vertices, crossing = _untangled(vertices, faces, smooth)
-    if crossing:
-        notes.append(f"{crossing} triangles go through others, where the label is thin")
-    vertices = _to_volume(vertices, faces, count)
+    drawn = _draw(mask, others, notes, pieces)
+    if drawn is None:
+        raise MeshError(
+            f"{volume.source}: label {name!r} is too thin for its voxels: no closed surface has "
+            f"its volume within {100 * VOLUME_ERROR:.0f} %; resample the volume"
+        )
+    vertices, faces, count = drawn
     corner = np.array([part.start for part in box]) - MARGIN
     places = vertices + corner
     capped = np.zeros(len(places), dtype=bool)
@@ -97,6 +93,59 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     return LabelSurface(name, mesh, volume_mm3, notes, capped)
 
 
+def _draw(mask, others, notes, pieces):
+    """Vertices [voxels] and faces of a mask, and how many voxels they hold; None where no closed
+    surface holds them.
+
+    Voxels that touch along an edge or at a corner alone are first taken as one piece. Where that
+    gives none, as the label is thin there, it is drawn from finer voxels, then as its largest
+    piece.
+    """
+    for touching in (True, False):
+        for parts in FINER:
+            said: list[str] = []
+            kept = _without_islands(mask, said, PIECE if pieces else 1.0, touching=touching)
+            kept = _filled(kept, others, said)
+            count = int(kept.sum())
+            if count * parts**3 > MOST_VOXELS:
+                continue
+            fine = kept
+            for axis in range(3):
+                fine = np.repeat(fine, parts, axis=axis)
+            vertices, faces = _surface_of(fine, said)
+            vertices = (vertices + 0.5) / parts - 0.5
+            off = abs(abs(mesh_volume(vertices, faces)) / count - 1.0)
+            whole = pieces or len(np.unique(label_shells(faces)[0])) == 1
+            if off < VOLUME_ERROR and whole and (faces_across(faces) >= 0).all():
+                notes += said
+                return vertices, faces, count
+    return None
+
+
+def _surface_of(mask, notes):
+    """Vertices [voxels] and faces of a mask, of its volume where it is not too thin for that."""
+    import igl
+    from skimage.measure import marching_cubes
+
+    smooth = smooth_mask(mask)
+    if not smooth.min() < 0.0 < smooth.max():
+        return np.zeros((1, 3)), np.zeros((0, 3), np.int64)
+    vertices, faces, _, _ = marching_cubes(-smooth, 0.0, allow_degenerate=False)
+    vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
+    # Fewer triangles by quadric edge collapse (Garland and Heckbert 1997), of about the edge that
+    # is wanted.
+    target = max(200, int(vertex_areas(vertices, faces).sum() / (np.sqrt(3.0) / 4.0 * EDGE**2)))
+    if target < len(faces):
+        vertices, faces = (np.asarray(part) for part in igl.qslim(vertices, faces, target)[:2])
+    faces = faces.astype(np.int64)
+    # Edges that collapse on either side of a thin wall fold it, or bring its sides through each
+    # other.
+    vertices, crossing = _untangled(vertices, faces, smooth)
+    if crossing:
+        notes.append(f"{crossing} triangles go through others, where the label is thin")
+    return _to_volume(vertices, faces, int(mask.sum())), faces
+
+
 def smooth_mask(mask: np.ndarray) -> np.ndarray:
     """Field of a mask (i, j, k): positive inside, zero about half-way between voxels in and out."""
     rest = np.where(mask, np.float32(0.5), np.float32(-0.5))
@@ -108,13 +157,17 @@ def smooth_mask(mask: np.ndarray) -> np.ndarray:
     return smooth
 
 
-def _without_islands(mask, notes, least):
-    """The pieces of at least a share of the largest; what was left out goes to ``notes``."""
-    pieces, count = connected(mask)
+def _without_islands(mask, notes, least, *, touching):
+    """The pieces of at least a share of the largest, of 1 the first of equals; what was left out
+    goes to ``notes``. Voxels that are ``touching`` at a corner or an edge are of one piece.
+    """
+    pieces, count = connected(mask, np.ones((3, 3, 3)) if touching else None)
     if count > 1:
         sizes = np.bincount(pieces.ravel())
         sizes[0] = 0
         kept = sizes >= least * sizes.max()
+        if least == 1.0:
+            kept = np.arange(len(sizes)) == sizes.argmax()
         rest = int(sizes[~kept].sum())
         if rest:
             share = 100 * rest / sizes.sum()

@@ -274,6 +274,8 @@ def _read_ply(path, content):
         try:
             return _read_polydata(path)
         except MeshError:
+            if isinstance(error, UnboundLocalError):  # trimesh finds none
+                error = ValueError("its header declares no list of the faces' vertex numbers")
             raise error from None
     faces = np.asarray(getattr(mesh, "faces", ()), np.int64).reshape(-1, 3)
     declared = re.search(rb"element\s+face\s+(\d+)", content[:10000])

@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING
 
 import igl
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.solids import outer_surface
 from rbfmuscle.geometry.surfaces import repeated_faces
 from rbfmuscle.geometry.vectors import box_size
+from rbfmuscle.geometry.winding import winding_numbers
 from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.validation import MeshError
 
@@ -21,6 +25,11 @@ if TYPE_CHECKING:
     import trimesh
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
+# Of the diagonal: triangles whose corners lie farther apart, up to the last, are joined where that
+# closes at least so much of their border, and loses no more than so many of them.
+WIDER_TOLERANCES = (1e-6, 1e-5, 1e-4)
+BORDER_CLOSED, TRIANGLES_LOST = 0.5, 0.01
+MOST_MISSING = 0.1  # of the surface: where more is missing, the inside of a bone is a guess
 # Of the diagonal: a longer rim (of more than four edges) is not closed by guesswork.
 HOLE_LIMIT = 0.1
 TWISTED_NOTED = 0.005  # of the area
@@ -42,6 +51,7 @@ class ReadMesh:
     # The vertex (n_file,) that each vertex of the file became, -1 where it was dropped.
     vertex_map: Integers = field(repr=False)
     notes: list[str] = field(default_factory=list)  # what was mended
+    doubt: str = ""  # why it is not known what is inside a bone
     closed: bool = True
     source: str = ""  # the file
     # The mesh of the file, where it is another one or has texture coordinates or normals.
@@ -66,14 +76,15 @@ def repair(
     """
     if len(faces) < LEAST_KEPT:
         return _mend(vertices, faces, context=context, may_be_open=may_be_open)
-    key = content_key(vertices, faces, ("mended", may_be_open))
+    key = content_key(vertices, faces, ("mended, doubted", may_be_open))
     kept = load_arrays(key)
     if kept is not None:
         notes = [note for note in str(kept["notes"]).split("\n") if note]
         arrays = kept["vertices"], kept["faces"], kept["vertex_map"]
-        return ReadMesh(*arrays, notes, closed=bool(kept["closed"]))
+        return ReadMesh(*arrays, notes, str(kept["doubt"]), closed=bool(kept["closed"]))
     state = _mend(vertices, faces, context=context, may_be_open=may_be_open)
-    found = {name: getattr(state, name) for name in ("vertices", "faces", "vertex_map", "closed")}
+    names = ("vertices", "faces", "vertex_map", "closed", "doubt")
+    found = {name: getattr(state, name) for name in names}
     store_arrays(key, {**found, "notes": "\n".join(state.notes)})
     return state
 
@@ -123,7 +134,19 @@ def _check_closed(state, context, may_be_open):
         if not may_be_open:
             raise MeshError(f"{context}: {words}; close its holes")
         state.notes.append(words)
-    elif not may_be_open:
+        missing = _missing_share(state)
+        if missing > MOST_MISSING:
+            state.doubt = (
+                f"{100 * missing:.0f} % of its surface is missing: what is inside is a guess"
+            )
+    elif may_be_open:
+        wrong = _twisted_share(state.mesh)
+        if wrong > MOST_TWISTED:
+            state.doubt = (
+                f"it is flat or passes through itself, {100 * wrong:.0f} % of its surface does "
+                "not bound an inside: muscles may pass through it"
+            )
+    else:
         sizes = np.sort(np.bincount(_parts(state.faces)))[::-1]
         if len(sizes) > 1:
             raise MeshError(
@@ -132,6 +155,17 @@ def _check_closed(state, context, may_be_open):
                 "join them"
             )
         _check_inside(state, context)
+
+
+def _missing_share(state):
+    """Share of the surface that is missing, taking each rim to be closed by a fan."""
+    missing = 0.0
+    for rim in boundary_rims(state.faces):
+        points = state.vertices[rim]
+        spokes = points - points.mean(axis=0)
+        missing += 0.5 * np.linalg.norm(np.cross(spokes, np.roll(spokes, -1, axis=0)), axis=1).sum()
+    there = 0.5 * igl.doublearea(state.vertices, state.faces).sum()
+    return missing / max(missing + there, 1e-300)
 
 
 def _check_inside(state, context):
@@ -160,9 +194,8 @@ def _twisted_share(mesh):
     chosen = chosen[mesh.area_faces[chosen] > 0]
     area, middle = mesh.area_faces[chosen], mesh.triangles_center[chosen]
     step = WINDING_STEP * mesh.face_normals[chosen] * np.sqrt(2.0 * area)[:, None]
-    asked = np.ascontiguousarray(np.concatenate([middle + step, middle - step]))
-    vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
-    before, behind = igl.fast_winding_number(vertices, faces, asked).reshape(2, -1)
+    winding = winding_numbers(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    before, behind = winding(np.concatenate([middle + step, middle - step])).reshape(2, -1)
     wrong = (np.abs(before) > WRONG_WINDING) | (np.abs(behind - 1.0) > WRONG_WINDING)
     return float(area[wrong].sum() / area.sum()) if len(area) else 1.0
 
@@ -194,7 +227,7 @@ def _parts(faces: Integers) -> Integers:
 
 def _merge_equal(state):
     """Merge vertices that are one point; a closed surface only by contracting edges, so that it
-    stays closed.
+    stays closed, and an open one by a wider tolerance where that closes it.
     """
     faces, used = state.faces, np.unique(state.faces)
     vertices = state.vertices[used]
@@ -203,12 +236,22 @@ def _merge_equal(state):
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     merged = np.arange(len(state.vertices))
     merged[used] = used[first[inverse.ravel()]]
+    new = _merged_faces(faces, merged)
+    if _is_closed(faces) and not (_is_closed(new) and _euler(new) == _euler(faces)):
+        return
+    border, apart = _border(new), 0.0
+    for tolerance in WIDER_TOLERANCES if border else ():
+        wider = np.arange(len(merged))
+        wider[used] = used[_nearby(vertices, tolerance * box_size(vertices))]
+        joined = _merged_faces(faces, wider)
+        few = len(joined) >= (1.0 - TRIANGLES_LOST) * len(new)
+        left = _border(joined)
+        if few and left < border and left <= BORDER_CLOSED * border:
+            merged, new, border, apart = wider, joined, left, tolerance
+    if apart:
+        state.notes.append(f"corners up to {apart:g} of its size apart joined")
     count = int((merged != np.arange(len(merged))).sum())
     if not count:
-        return
-    new = merged[faces]
-    new = new[~repeated_faces(new)]
-    if _is_closed(faces) and not (_is_closed(new) and _euler(new) == _euler(faces)):
         return
     lost = (
         f", {len(faces) - len(new)} triangles without extent dropped"
@@ -217,6 +260,24 @@ def _merge_equal(state):
     )
     state.notes.append(f"{count} repeated vertices merged{lost}")
     state.faces, state.vertex_map = new, merged[state.vertex_map]
+
+
+def _merged_faces(faces, merged):
+    new = merged[faces]
+    return new[~repeated_faces(new)]
+
+
+def _border(faces):
+    """Number of edges of one face alone."""
+    return int((_edges(faces)[1] == 1).sum())
+
+
+def _nearby(vertices, distance):
+    """The first vertex (n,) of each group of those within a distance of another."""
+    pairs = cKDTree(vertices).query_pairs(distance, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(vertices),) * 2)
+    _, label = connected_components(links, directed=False)
+    return np.unique(label, return_index=True)[1][label]
 
 
 def _euler(faces):
@@ -261,7 +322,7 @@ def _fill_holes(state, context):
             f"{bad[0, 1]}); make the surface manifold, for instance by remeshing"
         )
     limit, filled = HOLE_LIMIT * box_size(state.vertices), 0
-    for rim in _rims(state.faces):
+    for rim in boundary_rims(state.faces):
         points = state.vertices[rim]
         if (
             len(rim) > 4
@@ -292,7 +353,7 @@ def _drop_crowded(state):
         )
 
 
-def _rims(faces: Integers) -> list[Integers]:
+def boundary_rims(faces: Integers) -> list[Integers]:
     """Closed loops of boundary edges in the direction of their faces; knotted ones are left out."""
     _, count, used = _edges(faces)
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)[count[used] == 1]
