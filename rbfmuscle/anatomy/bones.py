@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
+from rbfmuscle.anatomy.cuts import Cut, find_cut
 from rbfmuscle.anatomy.names import MuscleFacts, name_facts
 from rbfmuscle.geometry.vectors import across, unit
 from rbfmuscle.scene.scene import Scene
@@ -39,6 +40,11 @@ class Part:
     tendon_of: tuple[str, ...] = ()  # muscles of which it is a tendon by its name
     coarse: bool = False  # whether the mesh was made coarser than its file
     frame: Any = None  # Frame, of a femur
+
+    @cached_property
+    def cut(self) -> Cut | None:
+        """Where a scan ends, None where the part is whole."""
+        return find_cut(self.mesh)
 
     @property
     def mesh(self) -> "trimesh.Trimesh":
@@ -82,7 +88,14 @@ class Part:
 HEAD = (12.0, 35.0)
 CONDYLE = (11.0, 30.0)
 DOME = (11.0, 27.0)
+HEAD_SHARE = 0.12  # of the height of a femur without its lower end: the top of its head
+# How far below the head the shaft begins, over the breadth from the trochanter to the head.
+BELOW_HEAD = 1.0
+# Of its breadth: how far the middle of that lies aside of the shaft at least; a knee lies on it.
+HEAD_ASIDE = 0.5
 END, CONDYLES = 0.12, 0.16  # share of the femur's length that holds an end, and its condyles
+BREADTHS = 5.2  # length of a femur over its breadth at the condyles (of the leg: 418 and 81 mm)
+BREADTH_AT = 0.2  # share of what is left of a femur that holds its condyles
 SHAFT, FOOT = (0.3, 0.7), 0.1  # the same of its shaft, from below, and of its lowest part
 # Normals of a condyle that count: from above (-) to below the backward direction [degree], greatest
 # cosine sideways.
@@ -119,6 +132,10 @@ class Frame:
 AXIS_ROUNDS = 12
 DOME_ROUNDS = 40
 EVALUATIONS = 200
+# The triangles that are fitted are chosen anew in each round, and some may come and go for ever: a
+# fit has settled where its axis turns by less than this [degree], or less than this share of them
+# changes.
+STILL, CHANGED = 0.5, 0.02
 UNSETTLED = "the fit does not settle"
 
 
@@ -152,7 +169,7 @@ def long_axis(bone: Part, below: list[Part], above: list[Part]) -> np.ndarray:
     """
     points, _, areas = bone.faces
     middle, axes = main_axes(points, areas)
-    up = axes[:, 2]
+    up = axes[:, 2] if bone.cut is None else bone.cut.normal
     rise = sum((b.points.mean(axis=0) - middle) @ up for b in above)
     rise -= sum((b.points.mean(axis=0) - middle) @ up for b in below)
     if not rise:
@@ -165,8 +182,10 @@ def femur_frame(femur: Part, below: list[Part], above: list[Part]) -> Frame:
     """Directions of a femur by its own shape: shaft; breadth of the condyles, which lie behind it;
     head inwards.
     """
+    if femur.cut is not None and _is_below(femur, femur.cut, above, below):
+        return _stump_frame(femur, femur.cut)
     points, _, areas = femur.faces
-    up = long_axis(femur, below, above)
+    up = long_axis(femur, below, above) if femur.cut is None else femur.cut.normal
     share = (points @ up - (points @ up).min()) / np.ptp(points @ up)
     shaft = (share > SHAFT[0]) & (share < SHAFT[1])
     end = share < FOOT
@@ -179,6 +198,44 @@ def femur_frame(femur: Part, below: list[Part], above: list[Part]) -> Frame:
     head = np.average(points[top], axis=0, weights=areas[top]) - middle
     frame.side = "r" if head @ frame.right < 0 else "l"
     return frame
+
+
+def _is_below(femur: Part, cut: Cut, above: list[Part], below: list[Part]) -> bool:
+    """Whether a femur is cut off at its lower end: by the bones beside it, else as a stump is less
+    broad there than a knee.
+    """
+    near = [(np.sign((bone.points.mean(axis=0) - cut.middle) @ cut.normal), -1.0) for bone in above]
+    near += [(np.sign((bone.points.mean(axis=0) - cut.middle) @ cut.normal), 1.0) for bone in below]
+    if near:
+        return sum(side * sign for side, sign in near) > 0
+    far = (femur.points - cut.middle) @ -cut.normal
+    broad = across(femur.points[far > (1.0 - END) * far.max()] - cut.middle, cut.normal)
+    return float(np.linalg.norm(broad.mean(axis=0))) > HEAD_ASIDE * float(
+        np.linalg.norm(np.ptp(broad, axis=0))
+    )
+
+
+def _stump_frame(femur: Part, cut: Cut) -> Frame:
+    """Directions of a femur without its lower end: across its cut, and from there to its head.
+
+    Scans end across the body, so a cut shows which way is up better than what is left of the shaft.
+    Where it has no side, the head is in front of the shaft (anteversion) of what the axes of the
+    coordinates have for the breadth of the body.
+    """
+    up = -cut.normal
+    height = (femur.points - cut.middle) @ up
+    top = femur.points[height > (1.0 - HEAD_SHARE) * height.max()]
+    # Further down the shaft is bowed forwards.
+    breadth = float(np.linalg.norm(np.ptp(across(femur.points - cut.middle, up), axis=0)))
+    below = max(height.max() - BELOW_HEAD * breadth, 0.0)
+    shaft = femur.points[np.abs(height - below) < HEAD_SHARE * breadth].mean(axis=0)
+    inward = unit(across(top.mean(axis=0) - shaft, up))
+    axis = np.zeros(3)
+    axis[np.argmax(np.abs(inward))] = np.copysign(1.0, inward[np.argmax(np.abs(inward))])
+    broad = unit(across(axis, up))
+    side = femur.side or ("l" if np.cross(up, broad) @ inward > 0.0 else "r")
+    right = broad if side == "l" else -broad
+    return Frame(up, np.cross(up, right), side)
 
 
 def sole_direction(points: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -208,7 +265,10 @@ def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> Fit | None:
     """The knee's axis; None where a condyle has too few triangles."""
     points, right = femur.faces[0], frame.right
     along = points @ frame.superior
-    near = along < along.min() + CONDYLES * np.ptp(along)
+    length = np.ptp(along)
+    if femur.cut is not None:  # by its breadth at the knee
+        length = BREADTHS * np.ptp(points[along < along.min() + BREADTH_AT * length] @ right)
+    near = along < along.min() + CONDYLES * length
     points, normals, areas = (values[near] for values in femur.faces)
     for _ in range(AXIS_ROUNDS):
         anterior = unit(np.cross(frame.superior, right))
@@ -225,7 +285,7 @@ def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> Fit | None:
             return None
         fits = [_fit_condyle(points[g], normals[g], areas[g], millimetre) for g in groups]
         before, right = right, unit(fits[1][0] - fits[0][0])
-        settled = right @ before > 1.0 - 1e-9
+        settled = right @ before > np.cos(np.radians(STILL))
         if settled:
             break
     centres, radii, misfits = (np.array(values) for values in zip(*fits))
@@ -271,7 +331,7 @@ def fit_dome(
     top = normals @ up > ALONG
     if top.sum() < 6:
         return None
-    radii, before = np.array([20.0, 23.0]) * millimetre, np.empty(0)
+    radii, before = np.array([20.0, 23.0]) * millimetre, np.empty(0, dtype=bool)
     centre = np.average(points[top], axis=0, weights=areas[top]) - radii[0] * up
     for _ in range(DOME_ROUNDS):
         chosen = [
@@ -283,7 +343,9 @@ def fit_dome(
             chosen = chosen[:1]
         if chosen[0].sum() < 8:
             return None
-        settled = np.array_equal(before, before := np.concatenate(chosen))
+        now = np.concatenate(chosen)
+        settled = len(now) == len(before) and (now != before).sum() <= CHANGED * now.sum()
+        before = now
         if settled:
             break
         used = [(patch[0][c], patch[2][c]) for patch, c in zip(patches, chosen)]
@@ -382,7 +444,12 @@ def find_orientation(bones: list[Part], header: Orientation | None = None) -> Or
     Directions of a ``header`` count; the bones are held against them.
     """
     femora = [bone for bone in bones if bone.kind == "femur"]
-    doubts = []
+    doubts = [
+        f"{bone.name}: it is cut off where the scan ends; its directions are those of the cut and "
+        "of what is left: check superior and anterior, and the axes of its joints"
+        for bone in bones
+        if bone.kind in ("femur", "tibia") and bone.cut is not None
+    ]
     for bone in femora:
         bone.frame = femur_frame(
             bone, neighbours(bone, bones, _BELOW), neighbours(bone, bones, _ABOVE)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import pyvista
 import trimesh
 from command_line import call
 from scipy.spatial import cKDTree
@@ -253,11 +254,45 @@ def test_a_condyle_larger_than_anatomy_has_is_refused_and_named(leg, millimetre)
         assert fit.wrong == ("" if scale == 1.0 else f"a condyle of {said}")
 
 
-@pytest.mark.parametrize("cap", ["AXIS_ROUNDS", "EVALUATIONS"])
-def test_a_fit_that_does_not_settle_is_refused(leg, monkeypatch, cap):
+@pytest.mark.parametrize(("share", "closed"), [(0.5, True), (0.3, True), (0.3, False), (0.2, True)])
+def test_femur_cut_by_the_scan_keeps_up_and_front_and_is_doubted(leg, share, closed):
+    bones, _ = _leg_bones(leg, np.eye(4))
+    whole = find_orientation(bones[:2])
+    low, high = bones[1].mesh.bounds[:, 2]
+    plane = {"normal": (0, 0, 1), "origin": (0, 0, high - share * (high - low))}
+    whole_mesh = pyvista.read(leg[0] / "bones" / "femur.ply")
+    found = (
+        whole_mesh.clip_closed_surface(**plane)
+        if closed
+        else whole_mesh.clip(**plane, invert=False)
+    )
+    found = found.extract_surface(algorithm="dataset_surface").triangulate().clean()
+    cut = trimesh.Trimesh(found.points, found.faces.reshape(-1, 4)[:, 1:])
+    stump = Part("femur", "femur", SimpleNamespace(mesh=cut), kind="femur")
+    found = find_orientation([bones[0], stump])
+    assert found.superior @ whole.superior > np.cos(np.radians(5))
+    assert found.anterior @ whole.anterior > np.cos(np.radians(5))
+    assert any("femur: it is cut off" in doubt for doubt in found.doubts)
+    assert not whole.doubts
+
+
+@pytest.mark.parametrize("scale", [0.92, 0.8])
+def test_small_leg_keeps_the_axis_of_its_knee(leg, scale):
+    axes = []
+    for size in (1.0, scale):
+        bones, _ = _leg_bones(leg, np.diag([size, size, size, 1.0]))
+        find_orientation(bones)
+        fit = fit_condyles(bones[1], bones[1].frame, 1.0)
+        assert fit.wrong == ""
+        axes.append(fit.axis)
+    assert axes[0] @ axes[1] > np.cos(np.radians(1.0))
+
+
+@pytest.mark.parametrize(("cap", "rounds"), [("AXIS_ROUNDS", 1), ("EVALUATIONS", 2)])
+def test_a_fit_that_does_not_settle_is_refused(leg, monkeypatch, cap, rounds):
     bones, _ = _leg_bones(leg, np.eye(4))
     find_orientation(bones)
-    monkeypatch.setattr(f"rbfmuscle.anatomy.bones.{cap}", 2)
+    monkeypatch.setattr(f"rbfmuscle.anatomy.bones.{cap}", rounds)
     if cap == "AXIS_ROUNDS":
         fit = fit_condyles(bones[1], bones[1].frame, 1.0)
     else:

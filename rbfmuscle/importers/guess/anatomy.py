@@ -53,6 +53,7 @@ COORDINATES = {
     "knee": {"flexion": (-10.0, 135.0)},
     "ankle": {"dorsiflexion": (-50.0, 20.0)},
 }
+CUT = 0.4  # confidence in axes of a bone that is cut off where a scan ends
 MISFIT = 0.05  # greatest misfit of a condyle or a dome against its radius
 
 
@@ -130,6 +131,10 @@ def make_anatomical(
     if pair[1] == "femur" and joint.kind == "ball":
         lowest = joint.child.points[np.argmin(joint.child.points @ orientation.superior)]
         up = unit(across(joint.centre - lowest, right))
+        if joint.child.cut is not None:
+            up = unit(across(joint.child.frame.superior, right))
+            joint.confidence = min(joint.confidence, CUT)
+            joint.reason += f"; {joint.child.name} is cut off: its axes are those of its cut"
         inward = 1.0 if joint.child.frame.side == "r" else -1.0
         axes = (right, inward * np.cross(up, right), inward * up)
         joint.axes, joint.ranges = dict(zip(COORDINATES["hip"], axes)), COORDINATES["hip"]

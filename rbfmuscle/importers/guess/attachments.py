@@ -242,6 +242,8 @@ def _hold(place, distance, ends, muscle, skeleton):
     by_tendon = _hold_by_tendon(place, ends, muscle, skeleton)
     if by_tendon is not None:
         return by_tendon
+    if place.stands_in:
+        return _hold_whole_end(place, distance, ends)
     points = muscle.points
     sites = place.sites or (whole_bone(bone, skeleton.articular[bone]),)
     near = cKDTree(np.concatenate([site.points for site in sites])).query(points)[0] / millimetre
@@ -260,16 +262,23 @@ def _hold(place, distance, ends, muscle, skeleton):
         gap, confidence = float(near[chosen].min()), BESIDE
         reason = f"at the end that points to the {where}, {gap:.3g} mm from it"
     hold = AttachmentGuess(bone, chosen, gap, reason, confidence)
-    if confidence == BESIDE:
-        if place.stands_in:
-            hold.vertices = np.flatnonzero(ends.along(place.end) <= UPPER)
-        elif gap > far:
-            end = muscle.points[hold.vertices].mean(axis=0)
-            hold.tendon = tendon_to_site(bone, place.sites, place.via, end, muscle, skeleton)
-            hold.confidence = TENDON if hold.gap < LONG else LONG_TENDON
+    if confidence == BESIDE and gap > far:
+        end = muscle.points[hold.vertices].mean(axis=0)
+        hold.tendon = tendon_to_site(bone, place.sites, place.via, end, muscle, skeleton)
+        hold.confidence = TENDON if hold.gap < LONG else LONG_TENDON
     if not place.sites:
         hold.confidence = min(hold.confidence, NO_SITE)
     return hold
+
+
+def _hold_whole_end(place, distance, ends):
+    """What a bone holds of an end whose own bone is not here: the end, which moves with it,
+    wherever it lies; not what passes it on the way.
+    """
+    chosen = np.flatnonzero(ends.along(place.end) <= UPPER)
+    gap = max(float(distance[chosen].min()), 0.0)
+    reason = f"its end, {gap:.3g} mm from the {place.bone.name}, which it moves with"
+    return AttachmentGuess(place.bone, chosen, gap, reason, NO_SITE)
 
 
 def _hold_by_tendon(place, ends, muscle, skeleton):

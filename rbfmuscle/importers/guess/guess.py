@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from rbfmuscle.anatomy.bones import Orientation, Part, find_orientation
+from rbfmuscle.anatomy.cuts import EXACT, find_cut
 from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
 from rbfmuscle.importers.guess.attachments import FEWEST, MuscleGuess, guess_attachments
@@ -66,15 +67,19 @@ def guess_scene(
     *,
     header: Orientation | None = None,
     capped: Mapping[str, Booleans] | None = None,
+    source: str = "",
+    unusable: Mapping[str, str] | None = None,
 ) -> SceneGuess:
     """Guess a scene from the meshes of a folder, or of folders ``bones`` and ``muscles`` in it.
 
     ``units`` are ``"mm"``, ``"cm"`` or ``"m"``, by the size of the bones where None; the scene's
     paths are relative to ``base``; a ``header`` holds anatomical directions where they are known;
-    ``capped`` marks vertices (n,) of files, by their stems, to which nothing is attached.
-    UsageError if the folder is missing, holds no bone or no muscle, or is of no known unit.
+    ``capped`` marks vertices (n,) of files, by their stems, to which nothing is attached;
+    messages name the ``source`` of the meshes where it is not the folder, and what of it is
+    ``unusable``, by name, and why. UsageError if the folder is missing, holds no bone or no muscle,
+    or is of no known unit.
     """
-    parts = read_parts(folder, units, base)
+    parts = read_parts(folder, units, base, source=source, unusable=unusable)
     bones, millimetre = parts.bones, parts.millimetre
     orientation = find_orientation(bones, header)
     root, joints = guess_joints(bones, millimetre, orientation)
@@ -92,7 +97,7 @@ def guess_scene(
         ]
     _say_unused(guess, skeleton)
     for muscle in guess.muscles:
-        _leave_caps(muscle, (capped or {}).get(Path(muscle.muscle.file).stem))
+        _leave_caps(muscle, _capped_vertices(muscle.muscle, capped))
     order = [root, *(joint.child for joint in joints)]
     for muscle in guess.muscles:  # from the bone that stands still outwards
         muscle.holds.sort(key=lambda hold: order.index(hold.bone) if hold.bone in order else 0)
@@ -127,11 +132,21 @@ def _say_unused(guess, skeleton):
     parts.notes += [f"{file} is not used: {reason}" for file, reason in unused.items()]
 
 
-def _leave_caps(muscle, capped):
+def _capped_vertices(part, capped):
+    """Vertices of a muscle where a scan ends: those that are ``capped``, by file, where that is
+    known.
+    """
+    if capped is None:
+        cut = find_cut(part.mesh, depth=EXACT)
+        return np.empty(0, dtype=int) if cut is None else np.flatnonzero(cut.on)
+    marked = capped.get(Path(part.file).stem, np.empty(0, dtype=bool))
+    return part.read.vertex_map[np.flatnonzero(marked)]
+
+
+def _leave_caps(muscle, on_cap):
     """Take the vertices on the cap at the scan's end from what holds a muscle."""
-    if capped is None or not capped.any():
+    if not len(on_cap):
         return
-    on_cap = muscle.muscle.read.vertex_map[np.flatnonzero(capped)]
     for hold in list(muscle.holds):
         hold.vertices = np.setdiff1d(hold.vertices, on_cap)
         if len(hold.vertices) < FEWEST:
