@@ -1,7 +1,5 @@
 """Triangles of a surface that go through others of the same surface."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
@@ -30,29 +28,15 @@ def morton_order(points: Floats) -> Integers:
     return np.argsort(code, kind="stable")
 
 
-class TreeArrays(NamedTuple):
-    """What a search for crossings reads of a `FaceTree`."""
-
-    order: np.ndarray  # (m,) triangles in the order of the leaves
-    corners: np.ndarray  # (m, 3) their vertices
-    leaves: int
-    closed: bool  # whether every edge has two triangles that agree on their outside
-    start: np.ndarray  # (n + 1,) of a closed surface the `vertex_rings`
-    other: np.ndarray
-
-
-class Boxes(NamedTuple):
-    """Boxes, lower corner and upper corner, as they were when crossings were last sought; the
-    first node's begins at infinity before that.
-    """
-
-    face: np.ndarray  # (leaves, 6, LEAF) of the triangles, leaf by leaf
-    node: np.ndarray  # (2 * leaves, 6) of the tree's nodes: node k holds those of 2k and 2k + 1
-
-
 class FaceTree:
     """Boxes around the triangles of a mesh, by nearness at one moment; good for later ones with the
     same faces.
+
+    Attributes
+    ----------
+    faces : (m, 3) ndarray
+    closed : bool
+        Whether every edge has two triangles that agree on their outside.
     """
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
@@ -60,82 +44,56 @@ class FaceTree:
         middle = (
             vertices[self.faces[:, 0]] + vertices[self.faces[:, 1]] + vertices[self.faces[:, 2]]
         ) / 3.0
-        order, opposite = morton_order(middle), opposite_half_edges(self.faces)
-        closed = bool((opposite >= 0).all())
-        ringed = (self.faces, opposite) if closed else (self.faces[:0], opposite[:0])
-        self.arrays = TreeArrays(
-            order,
-            self.faces[order],
-            1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length(),
-            closed,
-            *vertex_rings(*ringed, len(vertices)),
-        )
+        self._order = morton_order(middle)
+        self._corners = self.faces[self._order]
+        self._leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
+        opposite = opposite_half_edges(self.faces)
+        self.closed = bool((opposite >= 0).all())
+        ringed = (self.faces, opposite) if self.closed else (self.faces[:0], opposite[:0])
+        self._rings = vertex_rings(*ringed, len(vertices))
 
     def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
         """Which triangles cross others, as `crossing_faces` says, for places of the vertices (n, 3)
-        now.
-
-        With ``among`` (m,) only pairs with one of these, or with one at a corner whose triangles do
-        not lie side by side.
+        now; ``among`` as in `pairs`.
         """
-        vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-        asked = np.ones(len(self.faces), dtype=np.bool_) if among is None else among
         found = np.zeros(len(self.faces), dtype=np.bool_)
-        crossing_loop(vertices, self.arrays, asked, True, no_boxes(self.arrays), found)
+        found[self.pairs(vertices, among)] = True
         return found
 
+    def pairs(
+        self, vertices: Floats, among: Booleans | None = None, *, folds: bool = True
+    ) -> Integers:
+        """Pairs of triangles (k, 2) that cross.
 
-@loop
-def no_boxes(tree):
-    """Room for the boxes of a tree, none of which is made: empty ones touch nothing."""
-    boxes = Boxes(np.empty((tree.leaves, 6, LEAF)), np.empty((2 * tree.leaves, 6)))
-    boxes.node[1, 0] = np.inf
-    # Of leaves without triangles, and of one that has some.
-    full = len(tree.corners) // LEAF
-    boxes.face[full:, :3], boxes.face[full:, 3:] = np.inf, -np.inf
-    boxes.node[tree.leaves + full :, :3], boxes.node[tree.leaves + full :, 3:] = np.inf, -np.inf
-    return boxes
-
-
-@loop
-def crossing_loop(vertices, tree, among, folds, boxes, found):
-    """Mark the triangles (m,) that cross others, among pairs as `FaceTree.crossing` says; how many.
-
-    Without ``folds`` pairs at folded corners are not sought elsewhere, and ``boxes`` of the other
-    triangles that were made before are still right. Without a folded corner and without triangles
-    that are asked for no box is made.
-    """
-    faces, count = tree.corners, len(tree.corners)
-    plain = np.zeros(len(vertices), np.bool_)
-    asked = np.zeros(LEAF * tree.leaves, np.bool_)
-    for f in range(count):
-        asked[f] = among[tree.order[f]]
-    if folds:
-        if tree.closed:
-            plain_loop(vertices, tree.start, tree.other, plain)
-        for f in range(count):
-            asked[f] |= not (plain[faces[f, 0]] and plain[faces[f, 1]] and plain[faces[f, 2]])
-    found[:] = False
-    wanted = np.zeros(2 * tree.leaves, np.bool_)
-    _wanted_loop(asked, tree.leaves, wanted)
-    if not wanted[1]:
-        return 0
-    fresh = folds or boxes.node[1, 0] == np.inf
-    _boxes_loop(vertices, faces, np.ones_like(wanted) if fresh else wanted, boxes)
-    room = 16 * tree.leaves
-    pairs = np.empty((room, 2), np.int64)
-    met = _pairs_loop(boxes.node, wanted, pairs)
-    if met > room:
-        pairs = np.empty((met, 2), np.int64)
-        _pairs_loop(boxes.node, wanted, pairs)
-    crossed = np.zeros(count, np.bool_)
-    _cross_loop(vertices, faces, (pairs[:met], boxes.face), (asked, plain), crossed)
-    total = 0
-    for f in range(count):
-        if crossed[f]:
-            found[tree.order[f]] = True
-            total += 1
-    return total
+        With ``among`` (m,) only those with one of these or, with ``folds``, with one at a corner
+        whose triangles do not lie side by side.
+        """
+        vertices = np.ascontiguousarray(vertices, dtype=np.float64)
+        asked = np.zeros(LEAF * self._leaves, dtype=np.bool_)
+        asked[: len(self.faces)] = True if among is None else among[self._order]
+        plain = np.zeros(len(vertices), dtype=np.bool_)
+        if folds and self.closed:
+            plain_loop(vertices, *self._rings, plain)
+            asked[: len(self.faces)] |= ~plain[self._corners].all(axis=1)
+        # Without a folded corner and without triangles that are asked for no box is made.
+        if not asked.any():
+            return np.zeros((0, 2), dtype=np.int64)
+        wanted = np.zeros(2 * self._leaves, dtype=np.bool_)
+        wanted[self._leaves :] = asked.reshape(-1, LEAF).any(axis=1)
+        face = np.empty((self._leaves, 6, LEAF))
+        node = np.empty((2 * self._leaves, 6))
+        _boxes_loop(vertices, self._corners, face, node, wanted)
+        near = np.empty((16 * self._leaves, 2), dtype=np.int64)
+        met = _pairs_loop(node, wanted, near)
+        if met > len(near):
+            near = np.empty((met, 2), dtype=np.int64)
+            _pairs_loop(node, wanted, near)
+        crossed = np.empty((len(self.faces), 2), dtype=np.int64)
+        count = _cross_loop(vertices, self._corners, near[:met], face, asked, plain, crossed)
+        if count > len(crossed):
+            crossed = np.empty((count, 2), dtype=np.int64)
+            _cross_loop(vertices, self._corners, near[:met], face, asked, plain, crossed)
+        return self._order[crossed[:count]]
 
 
 def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
@@ -153,44 +111,36 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
 
 
 @loop
-def _boxes_loop(vertices, faces, changed, boxes):
-    """Make the boxes of the nodes that ``changed`` (2 * leaves,) marks, and of their triangles."""
-    box = boxes.face
-    node = boxes.node
-    leaves = len(box)
-    for leaf in range((len(faces) + LEAF - 1) // LEAF):
-        k = leaves + leaf
-        if not changed[k]:
-            continue
-        first = LEAF * leaf
+def _boxes_loop(vertices, faces, face, node, wanted):
+    """Make the boxes of the triangles, leaf by leaf, (leaves, 6, LEAF), and of the tree's nodes
+    (2 * leaves, 6): node k holds those of 2k and 2k + 1. Lower corner, then upper corner.
+
+    Marks the nodes (2 * leaves,) that hold a leaf that is ``wanted``.
+    """
+    leaves = len(face)
+    for leaf in range(leaves):
         for a in range(3):
             least = np.inf
             most = -np.inf
-            for place in range(min(LEAF, len(faces) - first)):
-                x = vertices[faces[first + place, 0], a]
-                y = vertices[faces[first + place, 1], a]
-                z = vertices[faces[first + place, 2], a]
-                low, high = min(x, y, z), max(x, y, z)
-                box[leaf, a, place], box[leaf, 3 + a, place] = low, high
+            for place in range(LEAF):
+                f = LEAF * leaf + place
+                low = np.inf
+                high = -np.inf
+                if f < len(faces):
+                    x = vertices[faces[f, 0], a]
+                    y = vertices[faces[f, 1], a]
+                    z = vertices[faces[f, 2], a]
+                    low, high = min(x, y, z), max(x, y, z)
+                face[leaf, a, place] = low
+                face[leaf, 3 + a, place] = high
                 least, most = min(least, low), max(most, high)
-            node[k, a], node[k, 3 + a] = least, most
-    for k in range(leaves - 1, 0, -1):
-        if changed[k]:
-            for a in range(3):
-                node[k, a] = min(node[2 * k, a], node[2 * k + 1, a])
-                node[k, 3 + a] = max(node[2 * k, 3 + a], node[2 * k + 1, 3 + a])
-
-
-@loop
-def _wanted_loop(asked, leaves, wanted):
-    """Mark the nodes that hold triangles among which crossings are sought."""
-    for leaf in range(leaves):
-        some = False
-        for place in range(LEAF):
-            some |= asked[LEAF * leaf + place]
-        wanted[leaves + leaf] = some
+            node[leaves + leaf, a] = least
+            node[leaves + leaf, 3 + a] = most
     for k in range(leaves - 1, 0, -1):
         wanted[k] = wanted[2 * k] or wanted[2 * k + 1]
+        for a in range(3):
+            node[k, a] = min(node[2 * k, a], node[2 * k + 1, a])
+            node[k, 3 + a] = max(node[2 * k, 3 + a], node[2 * k + 1, 3 + a])
 
 
 @loop
@@ -236,13 +186,12 @@ def _pairs_loop(node, wanted, pairs):
 
 
 @loop
-def _cross_loop(vertices, faces, leaves, asked, found):
+def _cross_loop(vertices, faces, pairs, box, among, plain, crossed):
     """The triangles of pairs of leaves: which of them touch by their boxes, then which of these
-    cross.
+    cross. How many pairs do, also beyond what ``crossed`` (k, 2) holds.
     """
-    pairs, box = leaves
-    among, plain = asked
     some = np.empty((STAGE * LEAF * LEAF, 2), np.int64)
+    found = 0
     for start in range(0, len(pairs), STAGE):
         near = _near_loop(pairs[start : start + STAGE], box, among, some)
         # Nearly all that touch share a corner: those that do not are put in front.
@@ -254,8 +203,12 @@ def _cross_loop(vertices, faces, leaves, asked, found):
             count += _meet(faces, f, g, plain)
         for k in range(count):
             f, g = some[k, 0], some[k, 1]
-            if not (found[f] and found[g]) and _cross(vertices, faces, f, g):
-                found[f], found[g] = True, True
+            if cross(vertices, faces, f, g):
+                if found < len(crossed):
+                    crossed[found, 0] = f
+                    crossed[found, 1] = g
+                found += 1
+    return found
 
 
 @loop
@@ -307,7 +260,7 @@ def _meet(faces, f, g, plain):
 
 
 @loop
-def _cross(vertices, faces, f, g):
+def cross(vertices, faces, f, g):
     """Whether an edge of one triangle goes through the inside of the other."""
     if not (_straddles(vertices, faces, f, g) and _straddles(vertices, faces, g, f)):
         return False

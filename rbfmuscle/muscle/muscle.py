@@ -10,7 +10,6 @@ from rbfmuscle.geometry.fibres import fibre_directions
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.muscle.activation import contracting_fibres
-from rbfmuscle.muscle.drawing import SurfaceBuilder
 from rbfmuscle.muscle.fibres import along_fibres, held_at_insertion
 from rbfmuscle.muscle.model import (
     SolidModel,
@@ -27,7 +26,6 @@ from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
 from rbfmuscle.muscle.rounded_bones import RoundedBones, grown, round_bones
 from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, settle
 from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform
-from rbfmuscle.muscle.surface_limits import SurfaceState
 from rbfmuscle.scene.ends import ordered_muscle
 from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.muscles import attachment_frames
@@ -35,6 +33,7 @@ from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
+from rbfmuscle.surface.drawing import Carry, SurfaceBuilder
 
 # Neighbours meet a muscle at contact points so far apart, of the side of a lattice cell, which has
 # three nodes on it.
@@ -87,11 +86,17 @@ class RBFMuscle:
         self.state = rest_state(self.model)
         self._stiffness = stiffness(self.model, 0.0)
         self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
-        embedding = partial(embed, self._lattice, self.frame)
-        self.drawer = SurfaceBuilder(muscle, scene, self.rest, self.options, embedding)
+        self.drawer = SurfaceBuilder(
+            muscle,
+            scene,
+            self.rest.surface(),
+            self._carry,
+            shape=self.options.surface,
+            resolution=self.options.resolution,
+        )
         # Where the shown mesh is the input mesh, its vertices as numbered there, and its faces.
         self._input: Mesh | None = None
-        if not self.options.resolution and len(self.drawer.model.offset) == len(order):
+        if not self.options.resolution:
             faces = np.ascontiguousarray(given.mesh.faces, dtype=np.int64)
             self._input = np.argsort(order), faces
         names = attachment_frames(scene.bones, muscle)
@@ -154,31 +159,34 @@ class RBFMuscle:
         """Go along with a rigid motion (4, 4), as the muscle is."""
         self.state = transform(self.state, motion)
 
-    def snapshot(self) -> tuple[SolidState, SurfaceState, LogState]:
+    def snapshot(self) -> tuple[SolidState, float, LogState]:
         """Everything that :meth:`restore` needs."""
-        return self.state, self.drawer.state, self.log.state
+        return self.state, self.drawer.level, self.log.state
 
-    def restore(self, state: tuple[SolidState, SurfaceState, LogState]) -> None:
+    def restore(self, state: tuple[SolidState, float, LogState]) -> None:
         """Go back to a snapshot."""
-        solid, surface, self.log.state = state
-        self.drawer.restore(surface)
+        solid, self.drawer.level, self.log.state = state
         self.activate(float(solid.activation[0]))
         self.state = solid
 
     def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
         """What gives the present places (n, 3) of points (n, 3) of the muscle at rest."""
-        embedding = embed(self._lattice, self.frame, points)
-        return lambda: carry(embedding, self.state.lifted_nodes)
+        placed = self._carry(points)
+        return lambda: placed(self.state.lifted_nodes)
+
+    def _carry(self, points: np.ndarray) -> Carry:
+        """What gives the places (n, 3) of points (n, 3) of the muscle at rest from the nodes."""
+        return partial(carry, embed(self._lattice, self.frame, points))
 
     def embedded_mesh(self) -> Mesh:
         """The shown mesh where the solid carries it."""
-        return carry(self.drawer.model.embedding, self.state.lifted_nodes), self.drawer.model.faces
+        return self.drawer.carry(self.state.lifted_nodes), self.drawer.shown.faces
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lies in the way."""
         columns, nodes = self.model.embedding.columns, self.state.lifted_nodes
         normals = turned_normals(nodes, columns, self._normals_at, self.rest.normals)
-        drawn = self.drawer.draw(self.state, normals, contacts)
+        drawn = self.drawer.draw(self.state.points, nodes, normals, contacts)
         quantities, notes = self.log.take()
         # Before what the solve left in a bone was lifted out of it.
         settled = carry(self.model.embedding, self.state.nodes)

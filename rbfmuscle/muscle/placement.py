@@ -1,21 +1,21 @@
 """Where the centres and samples of an RBF muscle lie, and the fit that its field is made by."""
 
 import warnings
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Integers
-from rbfmuscle.geometry.crossing import morton_order
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
+from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.implicit.kernels.table import get_kernel
-from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample, sample_surface
+from rbfmuscle.implicit.placement.cached import cached_sample
+from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample
 from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing, surface_error
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene.objects import Muscle, from_mm
@@ -39,9 +39,9 @@ TRIALS = 5
 MOST_CENTRES = 4.0
 # What is aimed at, in what is wanted: the shown mesh adds its own.
 AIM = 0.97
-# Parts of the names under which samples and numbers of centres are cached: raise one when the way
-# to find them changes.
-SAMPLING, SEARCH = 5, 4
+# Part of the names under which numbers of centres are kept: raise it when the way to find them
+# changes.
+SEARCH = 4
 SEED = 0
 
 
@@ -223,29 +223,3 @@ def _refuse_broken(
             f"{said} breaks at rest: {found.components} sheets, {100 * off:+.3g} % of volume; "
             f"{remedy}"
         )
-
-
-def cached_sample(
-    vertices: np.ndarray, faces: np.ndarray, count: int, placement: str
-) -> SurfaceSample:
-    """`sample_surface` of a muscle's mesh, from the cache on disk by content: greedy placement
-    takes a second.
-
-    Points are in an order in which near ones are mostly near each other, except for greedy
-    placement. A mesh of ``count`` vertices is its own even sample.
-    """
-    if placement == "even" and len(vertices) == count:
-        normals = vertex_normals(vertices, faces)
-        return SurfaceSample(vertices, normals, np.ascontiguousarray(faces, dtype=np.int64))
-    key = content_key(vertices, faces, ("surface sample", SAMPLING, count, SEED, placement))
-    arrays = load_arrays(key)
-    if arrays is None:
-        arrays = asdict(sample_surface(vertices, faces, count, seed=SEED, placement=placement))
-        if placement != "greedy":
-            order = morton_order(arrays["points"])
-            corners = np.argsort(order)[arrays.pop("control_faces")]
-            arrays = {name: part[order] for name, part in arrays.items()} | {
-                "control_faces": corners
-            }
-        store_arrays(key, arrays)
-    return SurfaceSample(**arrays)

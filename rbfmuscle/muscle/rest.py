@@ -9,13 +9,14 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, principal_axes
-from rbfmuscle.implicit.field import FieldFit, RBFField
+from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import choose_centres, place_points
 from rbfmuscle.scene.ends import ordered_muscle
 from rbfmuscle.scene.muscles import attachment_frames
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
+from rbfmuscle.surface.drawing import RestSurface
 from rbfmuscle.validation import SceneError
 
 # A patch smaller than the spacing of the centres still has to hold the muscle against turning.
@@ -70,11 +71,19 @@ class RestState:
             frame.directions(principal_axes(samples.points)),
         )
 
-    def field(self, centres: Floats, normals: Floats) -> RBFField:
-        """The field through the centres (K, 3) where they are now, with their unit normals
-        (K, 3).
-        """
-        return self.fit.fit(centres, normals, self.parts)
+    def surface(self) -> RestSurface:
+        """What the surface is drawn from."""
+        return RestSurface(
+            self.fit,
+            self.parts,
+            self.centres,
+            self.normals,
+            self.contact_points(),
+            self.attached_bone,
+            self.mesh_volume,
+            self.axes,
+            self.bones,
+        )
 
     def contact_points(self) -> np.ndarray:
         """Centres, then samples, (K + S, 3)."""

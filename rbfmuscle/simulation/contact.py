@@ -23,7 +23,7 @@ from rbfmuscle.bones.obstacles import (
     stack_bones,
 )
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.tendons import AT_REST
 from rbfmuscle.validation import check_finite, check_points
@@ -172,6 +172,11 @@ class BoneContacts:
     def allow(self, row: int, depth: Floats) -> None:
         """Let each contact point be up to ``depth`` (n,) inside a bone in reach [scene unit]."""
         self._allowed[row] = depth
+
+    @property
+    def keeps_overlap(self) -> Booleans:
+        """Which contact points (n,) are allowed in a bone."""
+        return np.asarray((self._allowed > 0.0).any(axis=0))
 
     def distance_and_direction(self, points: Floats, row: int) -> tuple[Floats, Floats]:
         """Signed distance (n,) to one of the bones in reach and the unit direction (n, 3) in which

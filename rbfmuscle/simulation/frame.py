@@ -20,6 +20,7 @@ class Event:
     ``"unresolved"`` (crossed all the same), ``"carried_stretched"``, ``"carried_held_end"`` or
     ``"carried_sheets"`` (no level set could be shown, so the surface is where the material is: it
     is stretched too far, an end is held inside the bone named, or sheets have met),
+    ``"surface_crosses"`` (``count`` triangles of the shown surface cross others of it),
     ``"overlap_kept"`` (at rest, before the first frame),
     ``"iteration_cap"`` (``count`` times a solve, a tendon's line or the shortest path of `bowing`
     ended at a greatest number of steps, without a bone), or, with no muscle, ``"bones_overlap"``

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.geometry.crossing import FaceTree, crossing_faces, crossing_loop, no_boxes
+from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 
 BALL = trimesh.creation.icosphere(3)
 
@@ -25,25 +25,24 @@ def test_a_tree_made_at_rest_finds_crossings_later_and_rings_that_lie_plain_spar
     tree = FaceTree(points, faces)
     moved = points + (noise or 0.0) * np.random.default_rng(3).normal(size=points.shape)
     quick = tree.crossing(moved)
-    assert tree.arrays.closed and quick.any() == (noise != 0.0)
+    assert tree.closed and quick.any() == (noise != 0.0)
     np.testing.assert_array_equal(quick, crossing_faces(moved, faces))
     some = quick & (np.cumsum(quick) == 1)
     assert tree.crossing(moved, some)[some].all()
-    tree.arrays = tree.arrays._replace(closed=False)  # every pair that shares a corner is tested
+    tree.closed = False  # every pair that shares a corner is tested
     np.testing.assert_array_equal(quick, tree.crossing(moved))
     for other in (faces[1:], np.vstack([faces, faces[:1]])):
-        assert not FaceTree(points, other).arrays.closed
+        assert not FaceTree(points, other).closed
 
 
-def test_boxes_are_made_anew_where_triangles_moved():
+def test_pairs_are_sought_among_some_triangles():
     points, faces = np.array(BALL.vertices), np.asarray(BALL.faces)
-    tree = FaceTree(points, faces).arrays
-    boxes, found = no_boxes(tree), np.zeros(len(faces), bool)
-    assert crossing_loop(points, tree, np.ones(len(faces), bool), True, boxes, found) == 0
+    tree = FaceTree(points, faces)
+    assert len(tree.pairs(points)) == 0
     dented = points[:, 2] > 0.95
     points[dented, 2] -= 2.1  # out at the other side
     among = dented[faces].any(axis=1)
-    assert crossing_loop(points, tree, among, False, boxes, found) > 0
-    np.testing.assert_array_equal(found, crossing_faces(points, faces))
-    points[dented, 2] += 2.1
-    assert crossing_loop(points, tree, among, False, boxes, found) == 0
+    pairs = tree.pairs(points, among, folds=False)
+    assert (among[pairs].any(axis=1)).all() and (pairs[:, 0] != pairs[:, 1]).all()
+    np.testing.assert_array_equal(np.unique(pairs), np.flatnonzero(crossing_faces(points, faces)))
+    assert len(tree.pairs(points, np.zeros(len(faces), bool), folds=False)) == 0

@@ -8,9 +8,9 @@ import pytest
 import trimesh
 from toy_scene import Formula
 
+from rbfmuscle.geometry.point_grid import PointGrid
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction import surface as extraction
-from rbfmuscle.implicit.extraction.obstacles import PointGrid
 from rbfmuscle.implicit.extraction.surface import Grid, LevelSet
 
 CENTRE = np.array([1.0, 2.0, 3.0])

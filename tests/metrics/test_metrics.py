@@ -272,6 +272,25 @@ class TestMomentArm:
         # of one fitted over a reach a tenth of that squared.
         assert worst(step) < 1.1 * 40.0 * max(np.radians(step) ** 2 / 3, np.radians(8.0) ** 2 / 10)
 
+    def test_over_a_joint_that_another_follows_is_the_total_derivative_in_every_frame(self):
+        """A straight muscle over a hip and a patella that tilts by half the flexion, by 5 degrees
+        (case 42 of the reference cases).
+        """
+
+        def turned(point, centre, angle):
+            c, s = np.cos(angle), np.sin(angle)
+            return centre + np.array([[c, -s], [s, c]]) @ (point - centre)
+
+        def distance(angle):
+            end = turned(np.array([28.0, 15.0]), np.array([0.0, 40.0]), 0.5 * angle)
+            end = turned(end, np.array([0.0, 100.0]), angle)
+            return float(np.linalg.norm(end - [30.0, 160.0]))
+
+        angles = np.radians(np.arange(-20.0, 31.0, 5.0))
+        found = np.array(self.arms(angles, [distance(a) for a in angles]))
+        wanted = [-(distance(a + 1e-5) - distance(a - 1e-5)) / 2e-5 for a in angles]
+        np.testing.assert_allclose(found, wanted, rtol=0.05)
+
     def test_is_the_slope_at_one_activation_and_none_while_it_changes(self):
         angles = np.radians(np.arange(0.0, 50.0, 5.0))
         active = np.array([0.0] * 4 + [0.3] + [0.6] * 5)

@@ -1,4 +1,4 @@
-"""The mesh that shows a muscle: its input mesh, or a coarser one, with the field's value at rest.
+"""The mesh that shows a muscle, with the field's value at rest.
 
 The level set of some hundred centres departs from the scan by some tenths of a millimetre. So each
 vertex X_i of the shown mesh keeps its place at rest and carries the value of the field there, its
@@ -12,12 +12,10 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.rest_frame import RestFrame, principal_axes
 from rbfmuscle.geometry.surfaces import face_normals, opposite_half_edges, vertex_normals
-from rbfmuscle.muscle.placement import cached_sample
-from rbfmuscle.muscle.surface_limits import smooth_loop
+from rbfmuscle.implicit.placement.cached import cached_sample
+from rbfmuscle.loops import loop
 from rbfmuscle.scene.objects import Muscle
 
-# The input mesh itself is shown up to so many vertices; what has more is covered with so many.
-MOST_SHOWN = 6000
 # Sweeps of smoothing for triangles that cross others at rest.
 UNTANGLED = 24
 # Cosine between the normals of two neighbours that lie on each other, which cross when they move;
@@ -33,9 +31,10 @@ VERTICES_AN_EDGE = 1.15
 
 
 def display_mesh(muscle: Muscle, resolution: int) -> tuple[Floats, Integers]:
-    """Vertices (n, 3) and faces (m, 3) that show a muscle: its input mesh, or a coarser one on it.
+    """Vertices (n, 3) and faces (m, 3) that show a muscle: its input mesh, or, with a
+    ``resolution`` above 0, one on it with so many edges along the longest side.
 
-    With a ``resolution`` above 0, with so many edges along the longest side. Triangles of a scan
+    Triangles of a scan
     that lie on a neighbour are smoothed where that is a small change, and those that cross others
     until they do not, `UNTANGLED` times at most: what then crosses counts as ``self_crossings`` of
     every frame.
@@ -53,7 +52,7 @@ def display_mesh(muscle: Muscle, resolution: int) -> tuple[Floats, Integers]:
             marked = np.unique(
                 np.concatenate([marked, faces[np.isin(faces, marked).any(axis=1)].ravel()])
             )
-        smooth_loop(points, marked, start, other)
+        _smooth_loop(points, marked, start, other)
     return points, faces
 
 
@@ -64,7 +63,7 @@ def _unfold(points: Floats, faces: Integers, start: Integers, other: Integers) -
         folded = _folded(smooth, faces, beside)
         if not folded.any():
             break
-        smooth_loop(smooth, np.unique(faces[folded]), start, other)
+        _smooth_loop(smooth, np.unique(faces[folded]), start, other)
     way = np.linalg.norm(smooth - points, axis=1).max()
     if way < UNFOLD_WAY * np.linalg.norm(points[faces[:, 0]] - points[faces[:, 1]], axis=1).mean():
         points[:] = smooth
@@ -85,18 +84,16 @@ def _folded(points: Floats, faces: Integers, beside: Integers) -> Booleans:
 
 
 def _covering(muscle: Muscle, resolution: int) -> tuple[Floats, Integers]:
-    """The input mesh, or a coarser one on it."""
+    """The input mesh, or with a resolution another one on it."""
     points = np.asarray(muscle.mesh.vertices, dtype=float)
     faces = np.ascontiguousarray(muscle.mesh.faces, dtype=np.int64)
-    count = MOST_SHOWN
-    if resolution:
-        axes = principal_axes(points)
-        edge = float(np.ptp(points @ axes.T, axis=0).max()) / resolution
-        count = int(np.clip(VERTICES_AN_EDGE * float(muscle.mesh.area) / edge**2, *WANTED))
     frame = RestFrame(points)
-    if not resolution and len(points) <= MOST_SHOWN:
+    if not resolution:
         # As the frame holds them, so that a scene that was moved is drawn alike to the last digit.
         return frame.points(frame.local), faces
+    axes = principal_axes(points)
+    edge = float(np.ptp(points @ axes.T, axis=0).max()) / resolution
+    count = int(np.clip(VERTICES_AN_EDGE * float(muscle.mesh.area) / edge**2, *WANTED))
     sample = cached_sample(frame.local, faces, count, "adaptive")
     return frame.points(sample.points), np.ascontiguousarray(sample.control_faces, dtype=np.int64)
 
@@ -108,3 +105,15 @@ def neighbour_lists(faces: Integers, count: int) -> tuple[Integers, Integers]:
     ends = np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]])
     pairs = np.unique(np.concatenate([ends @ (count, 1), ends @ (1, count)]))
     return np.searchsorted(pairs, count * np.arange(count + 1)), pairs % count
+
+
+@loop
+def _smooth_loop(vertices, rows, start, other):
+    """Half the way to the mean of the neighbours, one vertex after the other."""
+    for v in rows:
+        count = start[v + 1] - start[v]
+        for a in range(3):
+            total = 0.0
+            for n in range(start[v], start[v + 1]):
+                total += vertices[other[n], a]
+            vertices[v, a] = 0.5 * (vertices[v, a] + total / count)

@@ -1,14 +1,13 @@
-"""Chords that cut through a convex bone: vertices of the surface moved until no bone vertex is
-inside it.
+"""Points in the cells of a grid, and vertices of a surface moved until no such point is inside:
+chords that cut through a convex bone.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.jit import compiled
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.loops import loop
 
 # A chord is never farther from its surface than this share of a cell. As vertices move while points
 # are pushed off, points are looked for so far above and below triangles, and so far beside them in
@@ -16,10 +15,10 @@ from rbfmuscle.jit import compiled
 CHORD = 0.35
 MARGIN = 0.4
 BESIDE = 0.15
+# Last part of the way to the greatest depth on which the motion of a point's triangle fades.
+FADE = 0.3
 # Points deeper than the tolerance by less than this share are there but for rounding.
 ASKED = 1.0 + 1e-6
-# Room for pairs of a point and a triangle near it, at first, for each triangle.
-PAIRS = 2
 # Cells of a grid for each point; passes over the points that are pushed off.
 CELLS, ROUNDS = 5, 4
 
@@ -55,120 +54,53 @@ class PointGrid(NamedTuple):
         return cls(np.ascontiguousarray(points[order]), start, low, edge, shape, order)
 
 
-class PointGrids(NamedTuple):
-    """Several `PointGrid`, one behind the other; ``first`` (b + 1, 2) says where the points and the
-    starts of each begin.
-    """
-
-    points: np.ndarray
-    start: np.ndarray
-    low: np.ndarray  # (b, 3)
-    edge: np.ndarray  # (b,)
-    shape: np.ndarray  # (b, 3)
-    number: np.ndarray
-    first: np.ndarray
-
-
-def stack_grids(grids: Sequence[PointGrid]) -> PointGrids:
-    """Grids as one set of arrays."""
-    sizes = np.array([[len(grid.points), len(grid.start)] for grid in grids]).reshape(-1, 2)
-    first = np.vstack([np.zeros((1, 2), np.int64), np.cumsum(sizes, axis=0)])
-    return PointGrids(
-        np.concatenate([np.zeros((0, 3)), *(grid.points for grid in grids)]),
-        np.concatenate([np.zeros(0, np.int64), *(grid.start for grid in grids)]),
-        np.array([grid.low for grid in grids]).reshape(-1, 3),
-        np.array([grid.edge for grid in grids], dtype=np.float64),
-        np.array([grid.shape for grid in grids], dtype=np.int64).reshape(-1, 3),
-        np.concatenate([np.zeros(0, np.int64), *(grid.number for grid in grids)]),
-        first.astype(np.int64),
-    )
-
-
-@compiled
-def grid_of(grids, b):
-    """Grid b: views into the arrays of all."""
-    low, high = grids.first[b], grids.first[b + 1]
-    return PointGrid(
-        grids.points[low[0] : high[0]],
-        grids.start[low[1] : high[1]],
-        grids.low[b],
-        grids.edge[b],
-        grids.shape[b],
-        grids.number[low[0] : high[0]],
-    )
-
-
 # Points with their pose (4, 4) to the world.
 Obstacles = list[tuple[PointGrid, Floats]]
 
 
-@compiled
-def push_off_loop(vertices, faces, grid, pose, tolerance, moved):
-    """Move the vertices (n, 3) of triangles (m, 3) that obstacle points have come through, into the
-    surface, and mark them.
+def push_off(
+    vertices: Floats,
+    faces: Integers,
+    grid: PointGrid,
+    pose: Floats,
+    tolerance: float,
+    moved: Booleans,
+    among: Booleans | None = None,
+) -> None:
+    """Move the vertices (n, 3) of triangles (m, 3) that points in a pose (4, 4) have come
+    through, into the surface, and mark them.
 
     A point behind a triangle (inside the mesh) by more than ``tolerance`` [scene unit] moves its
-    three corners along the normal, by barycentric weights, until it is not. Points deeper than
-    ``CHORD`` of the length of the triangle's edges are left alone: they are behind another part of
-    the muscle.
+    three corners along the normal, by barycentric weights, until it is not. The way fades to zero
+    where a point is at first as deep as ``CHORD`` of the length of the triangle's edges: what is
+    deeper is behind another part of the muscle. With ``among`` (n,) only triangles with a corner in
+    it.
     """
-    local, known = np.empty_like(vertices), np.zeros(len(vertices), np.bool_)
-    for f in range(len(faces)):
-        for k in range(3):
-            v = faces[f, k]
-            if known[v]:
-                continue
-            known[v] = True
-            for a in range(3):
-                local[v, a] = 0.0
-                for b in range(3):
-                    local[v, a] += (vertices[v, b] - pose[b, 3]) * pose[b, a]
-    room = PAIRS * len(faces)
-    pairs = np.empty((2, room), np.int64)
-    met = _near_loop(local, faces, grid, pairs)
-    if met > room:
-        pairs = np.empty((2, met), np.int64)
-        met = _near_loop(local, faces, grid, pairs)
+    if among is None:
+        among = np.ones(len(vertices), dtype=np.bool_)
+    cells = grid.points, grid.start, grid.low, grid.edge, grid.shape
+    given = vertices, faces, among, pose, *cells
+    pairs = np.empty((len(faces), 2), dtype=np.int64)
+    met = _near_loop(*given, pairs)
+    if met > len(pairs):
+        pairs = np.empty((met, 2), dtype=np.int64)
+        met = _near_loop(*given, pairs)
     if met == 0:
         return
-    point, first, near = _sort_loop(pairs[:, :met], grid.number, len(faces))
-    places = np.empty((len(point), 3))
-    for p in range(len(point)):
-        for a in range(3):
-            places[p, a] = pose[a, 3]
-            for b in range(3):
-                places[p, a] += pose[a, b] * grid.points[point[p], b]
+    # In the order of the points' numbers, so that a scene that is turned is drawn alike.
+    point, face = pairs[:met].T
+    order = np.argsort(grid.number[point] * len(faces) + face)
+    point, near = point[order], np.ascontiguousarray(face[order])
+    first = np.flatnonzero(np.diff(point, prepend=-1))
+    places = grid.points[point[first]] @ pose[:3, :3].T + pose[:3, 3]
+    first = np.append(first, met)
+    allowed = np.full(len(places), np.nan)
     for _ in range(ROUNDS):
-        if not _push_loop(vertices, faces, (places, first, near), tolerance, moved):
+        if not _push_loop(vertices, faces, places, first, near, tolerance, allowed, moved):
             break
 
 
-@compiled
-def _sort_loop(pairs, number, faces):
-    """Points that triangles are near, and the triangles of point k: ``near[first[k] : first[k +
-    1]]``.
-
-    In the order of the points' ``number``, so that a scene that is turned is drawn alike.
-    """
-    met = pairs.shape[1]
-    key = np.empty(met, np.int64)
-    for m in range(met):
-        key[m] = number[pairs[0, m]] * faces + pairs[1, m]
-    point = np.empty(met, np.int64)
-    first = np.empty(met + 1, np.int64)
-    near = np.empty(met, np.int64)
-    used = 0
-    for place, m in enumerate(np.argsort(key)):
-        if used == 0 or point[used - 1] != pairs[0, m]:
-            point[used] = pairs[0, m]
-            first[used] = place
-            used += 1
-        near[place] = pairs[1, m]
-    first[used] = met
-    return point[:used], first[: used + 1], near
-
-
-@compiled(inline="always")
+@loop
 def _length(vertices, faces, f):
     """Length of the longest edge of a triangle."""
     square = 0.0
@@ -181,52 +113,52 @@ def _length(vertices, faces, f):
     return np.sqrt(square)
 
 
-@compiled
-def _near_loop(vertices, faces, grid, pairs):
-    """Pairs of a point and a triangle near it; how many there are, also beyond the room for
-    them.
+@loop
+def _near_loop(vertices, faces, among, pose, points, start, low, edge, shape, pairs):
+    """Pairs of a point and a triangle with a corner in ``among`` (n,) near it; how many there are,
+    also beyond what ``pairs`` (k, 2) holds.
     """
-    points, start, low, edge, shape, _ = grid
+    corners, corner = np.empty((3, 3)), np.arange(3).reshape(1, 3)
     least, most = np.empty(3), np.empty(3)
     begin = np.empty(3, np.int64)
     end = np.empty(3, np.int64)
     met = 0
     for f in range(len(faces)):
-        margin = MARGIN * _length(vertices, faces, f)
-        if not _box_of(vertices, faces, f, margin, grid, least, most):
+        if not (among[faces[f, 0]] or among[faces[f, 1]] or among[faces[f, 2]]):
             continue
+        for k in range(3):
+            v = faces[f, k]
+            x = vertices[v, 0] - pose[0, 3]
+            y = vertices[v, 1] - pose[1, 3]
+            z = vertices[v, 2] - pose[2, 3]
+            for a in range(3):
+                corners[k, a] = x * pose[0, a] + y * pose[1, a] + z * pose[2, a]
+        margin = MARGIN * _length(corners, corner, 0)
+        inside = True
         for a in range(3):
+            x = corners[0, a]
+            y = corners[1, a]
+            z = corners[2, a]
+            least[a], most[a] = min(x, y, z) - margin, max(x, y, z) + margin
+            inside &= most[a] >= low[a] and least[a] <= low[a] + edge * shape[a]
             begin[a] = np.int64(max(np.floor((least[a] - low[a]) / edge), 0.0))
             end[a] = min(np.int64(np.floor((most[a] - low[a]) / edge)), shape[a] - 1)
-        plane = _plane(vertices, faces, f)
+        if not inside:
+            continue
+        plane = _plane(corners, corner, 0)
         square = _square(plane)
         for i in range(begin[0], end[0] + 1):
             for j in range(begin[1], end[1] + 1):
                 row = (i * shape[1] + j) * shape[2]
                 for p in range(start[row + begin[2]], start[row + end[2] + 1]):
                     if _is_near(plane, square, margin, points[p], least, most):
-                        if met < pairs.shape[1]:
-                            pairs[0, met], pairs[1, met] = p, f
+                        if met < len(pairs):
+                            pairs[met, 0], pairs[met, 1] = p, f
                         met += 1
     return met
 
 
-@compiled(inline="always")
-def _box_of(vertices, faces, f, margin, grid, least, most):
-    """Fill the corners (3,) of a triangle's box, larger by a margin; False where it is outside of
-    the grid.
-    """
-    inside = True
-    for a in range(3):
-        x = vertices[faces[f, 0], a]
-        y = vertices[faces[f, 1], a]
-        z = vertices[faces[f, 2], a]
-        least[a], most[a] = min(x, y, z) - margin, max(x, y, z) + margin
-        inside &= most[a] >= grid[2][a] and least[a] <= grid[2][a] + grid[3] * grid[4][a]
-    return inside
-
-
-@compiled(inline="always")
+@loop
 def _is_near(plane, square, margin, point, least, most):
     """Whether a point is within a margin of a triangle: of its plane, not beside it, in its box."""
     x = point[0]
@@ -246,14 +178,22 @@ def _is_near(plane, square, margin, point, least, most):
     )
 
 
-@compiled
-def _push_loop(vertices, faces, near_points, tolerance, moved):
-    """One pass over the points; returns whether any had to be pushed off."""
-    points, first, near = near_points
+@loop
+def _push_loop(vertices, faces, points, first, near, tolerance, allowed, moved):
+    """One pass over the points; whether any had to be pushed off.
+
+    How deep each may stay is ``allowed`` (k,), NaN until a triangle is first found over it.
+    """
     pushed = False
     for p in range(len(points)):
         best, depth = _triangle_over(vertices, faces, points[p], near[first[p] : first[p + 1]])
-        if best < 0 or depth <= ASKED * tolerance or depth > CHORD * _length(vertices, faces, best):
+        if best < 0:
+            continue
+        if np.isnan(allowed[p]):
+            deepest = CHORD * _length(vertices, faces, best)
+            share = min(max((deepest - depth) / (FADE * deepest), 0.0), 1.0)
+            allowed[p] = max(share * tolerance + (1.0 - share) * depth, tolerance)
+        if depth <= ASKED * allowed[p]:
             continue
         pushed = True
         plane = _plane(vertices, faces, best)
@@ -261,8 +201,8 @@ def _push_loop(vertices, faces, near_points, tolerance, moved):
         at_b, at_c = _areas(plane, points[p, 0], points[p, 1], points[p, 2])
         (nx, ny, nz) = plane[3]
         weight = 1.0 - (at_b + at_c) / square, at_b / square, at_c / square
-        # The tolerance is left: what is a little deeper does not leap.
-        way = (depth - tolerance) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2)
+        # What is allowed is left: what is a little deeper does not leap.
+        way = (depth - allowed[p]) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2)
         way /= np.sqrt(square)
         for k in range(3):
             v = faces[best, k]
@@ -273,7 +213,7 @@ def _push_loop(vertices, faces, near_points, tolerance, moved):
     return pushed
 
 
-@compiled(inline="always")
+@loop
 def _triangle_over(vertices, faces, point, near):
     """Of the triangles ``near`` a point the one whose plane is nearest, of those that it is not
     beside, -1 for none, and the point's depth below that.
@@ -298,7 +238,7 @@ def _triangle_over(vertices, faces, point, near):
     return best, signed
 
 
-@compiled(inline="always")
+@loop
 def _plane(vertices, faces, f):
     """Corner A of a triangle, its sides to B and C, and its normal, as long as twice its area."""
     a = faces[f, 0]
@@ -321,21 +261,21 @@ def _plane(vertices, faces, f):
     )
 
 
-@compiled(inline="always")
+@loop
 def _square(plane):
     """Square of the normal's length."""
     nx, ny, nz = plane[3]
     return nx * nx + ny * ny + nz * nz
 
 
-@compiled(inline="always")
+@loop
 def _height(plane, x, y, z):
     """Height of a point above a triangle, times the normal's length."""
     (ax, ay, az), (nx, ny, nz) = plane[0], plane[3]
     return nx * (x - ax) + ny * (y - ay) + nz * (z - az)
 
 
-@compiled(inline="always")
+@loop
 def _areas(plane, x, y, z):
     """Areas at B and C of a point's foot on a triangle's plane, times twice the normal's length."""
     (ax, ay, az), (ux, uy, uz), (vx, vy, vz), (nx, ny, nz) = plane
