@@ -47,6 +47,7 @@ class FaceTree:
         self._order = morton_order(middle)
         self._corners = self.faces[self._order]
         self._leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
+        self._boxes: tuple[Floats, Floats] | None = None
         opposite = opposite_half_edges(self.faces)
         self.closed = bool((opposite >= 0).all())
         ringed = (self.faces, opposite) if self.closed else (self.faces[:0], opposite[:0])
@@ -61,12 +62,18 @@ class FaceTree:
         return found
 
     def pairs(
-        self, vertices: Floats, among: Booleans | None = None, *, folds: bool = True
+        self,
+        vertices: Floats,
+        among: Booleans | None = None,
+        *,
+        folds: bool = True,
+        again: bool = False,
     ) -> Integers:
         """Pairs of triangles (k, 2) that cross.
 
         With ``among`` (m,) only those with one of these or, with ``folds``, with one at a corner
-        whose triangles do not lie side by side.
+        whose triangles do not lie side by side. ``again`` says that none but these moved since the
+        last call, whose other boxes are still right.
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         asked = np.zeros(LEAF * self._leaves, dtype=np.bool_)
@@ -80,9 +87,11 @@ class FaceTree:
             return np.zeros((0, 2), dtype=np.int64)
         wanted = np.zeros(2 * self._leaves, dtype=np.bool_)
         wanted[self._leaves :] = asked.reshape(-1, LEAF).any(axis=1)
-        face = np.empty((self._leaves, 6, LEAF))
-        node = np.empty((2 * self._leaves, 6))
-        _boxes_loop(vertices, self._corners, face, node, wanted)
+        whole = self._boxes is None or not again
+        if self._boxes is None:
+            self._boxes = np.empty((self._leaves, 6, LEAF)), np.empty((2 * self._leaves, 6))
+        face, node = self._boxes
+        _boxes_loop(vertices, self._corners, face, node, wanted, whole)
         near = np.empty((16 * self._leaves, 2), dtype=np.int64)
         met = _pairs_loop(node, wanted, near)
         if met > len(near):
@@ -111,14 +120,17 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
 
 
 @loop
-def _boxes_loop(vertices, faces, face, node, wanted):
+def _boxes_loop(vertices, faces, face, node, wanted, whole):
     """Make the boxes of the triangles, leaf by leaf, (leaves, 6, LEAF), and of the tree's nodes
     (2 * leaves, 6): node k holds those of 2k and 2k + 1. Lower corner, then upper corner.
 
-    Marks the nodes (2 * leaves,) that hold a leaf that is ``wanted``.
+    Marks the nodes (2 * leaves,) that hold a leaf that is ``wanted``; boxes of other leaves stay
+    unless ``whole``.
     """
     leaves = len(face)
     for leaf in range(leaves):
+        if not (whole or wanted[leaves + leaf]):
+            continue
         for a in range(3):
             least = np.inf
             most = -np.inf

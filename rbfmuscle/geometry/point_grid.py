@@ -164,11 +164,7 @@ def _is_near(plane, square, margin, point, least, most):
     x = point[0]
     y = point[1]
     z = point[2]
-    height = _height(plane, x, y, z)
-    at_b, at_c = _areas(plane, x, y, z)
-    over = height * height <= margin * margin * square
-    over = over and min(at_b, at_c, square - at_b - at_c) >= -BESIDE * square
-    return over and (
+    boxed = (
         (least[0] <= x)
         & (x <= most[0])
         & (least[1] <= y)
@@ -176,6 +172,12 @@ def _is_near(plane, square, margin, point, least, most):
         & (least[2] <= z)
         & (z <= most[2])
     )
+    if not boxed:
+        return False
+    height = _height(plane, x, y, z)
+    at_b, at_c = _areas(plane, x, y, z)
+    over = height * height <= margin * margin * square
+    return over and min(at_b, at_c, square - at_b - at_c) >= -BESIDE * square
 
 
 @loop

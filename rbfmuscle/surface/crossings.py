@@ -47,7 +47,7 @@ def part_crossings(
     moved = np.zeros(len(before), dtype=np.bool_)
     among, pairs = shown.touching(sheet.suspect), np.zeros((0, 2), dtype=np.int64)
     for turn in range(ROUNDS + 1):
-        pairs = shown.tree.pairs(sheet.vertices, among, folds=folds and turn == 0)
+        pairs = shown.tree.pairs(sheet.vertices, among, folds=folds and turn == 0, again=turn > 0)
         if len(pairs) == 0 or turn == ROUNDS:
             break
         if turn < PARTED:

@@ -46,3 +46,10 @@ def test_pairs_are_sought_among_some_triangles():
     assert (among[pairs].any(axis=1)).all() and (pairs[:, 0] != pairs[:, 1]).all()
     np.testing.assert_array_equal(np.unique(pairs), np.flatnonzero(crossing_faces(points, faces)))
     assert len(tree.pairs(points, np.zeros(len(faces), bool), folds=False)) == 0
+    # Boxes of triangles that did not move are kept.
+    tree.pairs(points, among)
+    points[dented, 2] += 2.1
+    assert len(tree.pairs(points, among, folds=False, again=True)) == 0
+    points[dented, 2] -= 2.1
+    same = tree.pairs(points, among, folds=False, again=True)
+    np.testing.assert_array_equal(np.sort(same, axis=0), np.sort(pairs, axis=0))
