@@ -15,6 +15,8 @@ from rbfmuscle.loops import loop
 CHORD = 0.35
 MARGIN = 0.4
 BESIDE = 0.15
+# How deep a point may stay, in mean edges.
+TOLERANCE = 0.01
 # Last part of the way to the greatest depth on which the motion of a point's triangle fades.
 FADE = 0.3
 # Points deeper than the tolerance by less than this share are there but for rounding.
@@ -63,18 +65,18 @@ def push_off(
     faces: Integers,
     grid: PointGrid,
     pose: Floats,
-    tolerance: float,
+    edge: float,
     moved: Booleans,
     among: Booleans | None = None,
 ) -> None:
     """Move the vertices (n, 3) of triangles (m, 3) that points in a pose (4, 4) have come
     through, into the surface, and mark them.
 
-    A point behind a triangle (inside the mesh) by more than ``tolerance`` [scene unit] moves its
-    three corners along the normal, by barycentric weights, until it is not. The way fades to zero
-    where a point is at first as deep as ``CHORD`` of the length of the triangle's edges: what is
-    deeper is behind another part of the muscle. With ``among`` (n,) only triangles with a corner in
-    it.
+    A point behind a triangle (inside the mesh) by more than ``TOLERANCE`` of ``edge``, the mean
+    length of an edge [scene unit], moves its three corners along the normal, by barycentric
+    weights, until it is not. The way fades to zero where a point is at first as deep as ``CHORD``
+    of that, or of the triangle's longest edge where that is shorter: what is deeper is behind
+    another part of the muscle. With ``among`` (n,) only triangles with a corner in it.
     """
     if among is None:
         among = np.ones(len(vertices), dtype=np.bool_)
@@ -96,7 +98,7 @@ def push_off(
     first = np.append(first, met)
     allowed = np.full(len(places), np.nan)
     for _ in range(ROUNDS):
-        if not _push_loop(vertices, faces, places, first, near, tolerance, allowed, moved):
+        if not _push_loop(vertices, faces, places, first, near, edge, allowed, moved):
             break
 
 
@@ -181,7 +183,7 @@ def _is_near(plane, square, margin, point, least, most):
 
 
 @loop
-def _push_loop(vertices, faces, points, first, near, tolerance, allowed, moved):
+def _push_loop(vertices, faces, points, first, near, edge, allowed, moved):
     """One pass over the points; whether any had to be pushed off.
 
     How deep each may stay is ``allowed`` (k,), NaN until a triangle is first found over it.
@@ -191,11 +193,12 @@ def _push_loop(vertices, faces, points, first, near, tolerance, allowed, moved):
         best, depth = _triangle_over(vertices, faces, points[p], near[first[p] : first[p + 1]])
         if best < 0:
             continue
+        deepest = CHORD * min(_length(vertices, faces, best), edge)
         if np.isnan(allowed[p]):
-            deepest = CHORD * _length(vertices, faces, best)
             share = min(max((deepest - depth) / (FADE * deepest), 0.0), 1.0)
-            allowed[p] = max(share * tolerance + (1.0 - share) * depth, tolerance)
-        if depth <= ASKED * allowed[p]:
+            least = TOLERANCE * edge
+            allowed[p] = max(share * least + (1.0 - share) * depth, least)
+        if depth <= ASKED * allowed[p] or depth >= deepest:
             continue
         pushed = True
         plane = _plane(vertices, faces, best)

@@ -20,7 +20,6 @@ from rbfmuscle.surface.sheet import Sheet, Shown
 NEAR_FACE = 1.2 * 0.8
 # Lengths below are in mean edges of the mesh at rest.
 OUT = 1e-5  # what is no deeper in a bone counts as out of it
-PUSHED = 0.01  # a bone's vertex may lie within the surface by so much
 SUNK = 1.0  # deeper in a bone the material is sunk
 LAMELLA = 0.02  # where both sides of a muscle sink into a bone, the far one stays above it by this
 LIFTS = 2  # rounds of moving what lies in a bone onto it, at most
@@ -128,7 +127,7 @@ class ShownBones:
                 return
             moved = np.zeros(len(near), dtype=np.bool_)
             for grid, pose in zip(self._grids, self._poses):
-                push_off(sheet.vertices, shown.faces, grid, pose, PUSHED * shown.edge, moved, near)
+                push_off(sheet.vertices, shown.faces, grid, pose, shown.edge, moved, near)
             rows = np.flatnonzero(moved)
             sheet.suspect[rows] = True
             sheet.hold(rows)

@@ -24,8 +24,7 @@ from rbfmuscle.surface.sheet import Sheet, Shown
 ROUNDS, PARTED, WIDER = 64, 12, 6
 # Both sides go this much farther apart than they must: triangles beside them cross then.
 BEYOND = 1.5
-# Rings of vertices on which a displacement fades, by so much on each; sweeps of smoothing then.
-RINGS, FADE, SWEEPS = 3, 0.6, 2
+SWEEPS = 2  # of smoothing for a displacement that was spread
 # Rings around a crossing by which it is seen how the material turned.
 TURNED = 4
 # Halvings of the way by which two triangles part, at most an edge.
@@ -81,15 +80,8 @@ def _displacements(shown: Shown, sheet: Sheet, pairs: Integers) -> tuple[Integer
     given = sheet.vertices, shown.faces, pairs, directions, inwards, shown.edge
     _part_loop(*given, parted, smoothed)
     parted *= BEYOND
-    rows = np.flatnonzero(parted.any(axis=1))
+    rows = shown.spread(parted)
     if len(rows):
-        for _ in range(RINGS):
-            marked = np.zeros(len(parted))
-            marked[rows] = 1.0
-            ring = np.setdiff1d(links[rows].indices, rows)
-            near = links[ring]
-            parted[ring] = FADE * (near @ parted) / (near @ marked)[:, None]
-            rows = np.concatenate([rows, ring])
         near, degree = links[rows], shown.degree[rows, None]
         for _ in range(SWEEPS):
             parted[rows] = 0.5 * (parted[rows] + near @ parted / degree)

@@ -12,6 +12,8 @@ from rbfmuscle.implicit.evaluation import Blend
 
 # Newton steps of the cubic polynomial of the volume.
 CUBIC = 4
+# Rings of vertices on which a displacement fades, by so much on each.
+RINGS, FADE = 3, 0.6
 
 
 class Shown(NamedTuple):
@@ -38,6 +40,20 @@ class Shown(NamedTuple):
     def grown(self, rows: Integers) -> Integers:
         """Some vertices and their neighbours."""
         return np.union1d(rows, self.links[rows].indices)
+
+    def spread(self, displacement: Floats) -> Integers:
+        """Let a displacement (n, 3) of some vertices fade away over rings around them; the vertices
+        that it has then.
+        """
+        rows = np.flatnonzero(displacement.any(axis=1))
+        for _ in range(RINGS if len(rows) else 0):
+            marked = np.zeros(len(displacement))
+            marked[rows] = 1.0
+            ring = np.setdiff1d(self.links[rows].indices, rows)
+            near = self.links[ring]
+            displacement[ring] = FADE * (near @ displacement) / (near @ marked)[:, None]
+            rows = np.concatenate([rows, ring])
+        return rows
 
 
 class Sheet(NamedTuple):

@@ -56,7 +56,7 @@ def test_points_that_came_through_end_on_the_surface_and_the_way_fades_where_the
     for depth in np.linspace(0.0, 0.4, 81) * edge:
         vertices, moved = np.array(ball.vertices), np.zeros(len(ball.vertices), dtype=bool)
         grid = PointGrid.of((middle - depth * normal)[None])
-        push_off(vertices, faces, grid, np.eye(4), 0.01 * edge, moved)
+        push_off(vertices, faces, grid, np.eye(4), edge, moved)
         left = trimesh.proximity.signed_distance(
             trimesh.Trimesh(vertices, faces), middle[None] - depth * normal
         )[0]

@@ -91,12 +91,12 @@ class Projector:
             change += lack / rate
         return change
 
-    def push_off(self, faces: Integers, obstacles: Obstacles, tolerance: float) -> None:
+    def push_off(self, faces: Integers, obstacles: Obstacles) -> None:
         """Move vertices around points that came through faces (m, 3), which leave the level."""
         for _ in range(2):
             moved = np.zeros(len(self.vertices), dtype=np.bool_)
             for grid, pose in obstacles:
-                push_off(self.vertices, faces, grid, pose, tolerance, moved)
+                push_off(self.vertices, faces, grid, pose, self.spacing, moved)
             rows = np.flatnonzero(moved)
             self._hold(rows)
             if self._clip_distance is None or len(rows) == 0:

@@ -295,7 +295,7 @@ def _finish(
     bones: Obstacles,
 ) -> ExtractedSurface:
     spacing = projector.spacing
-    projector.push_off(faces, bones, 0.01 * spacing)
+    projector.push_off(faces, bones)
     if target is not None:
         step = projector.volume_step(faces, target, steps=3)
         level += step
