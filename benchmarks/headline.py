@@ -18,9 +18,9 @@ import numpy as np
 from evidence import write_evidence
 
 import rbfmuscle as rm
-from rbfmuscle.experiments.front import WORST
 from rbfmuscle.models import build_models
 from rbfmuscle.simulation.frame_loop import simulate_frames
+from rbfmuscle.studies.sweep import WORST
 
 ROOT = Path(__file__).resolve().parent.parent
 # pbd-converged takes half an hour; embedded is the RBF muscle's solid shown without its field.

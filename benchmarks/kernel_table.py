@@ -16,7 +16,6 @@ import numpy as np
 import trimesh
 from evidence import write_evidence
 
-from rbfmuscle.experiments.kernel_study import VOLUME_BOUND, ReferenceSurface, measure_row
 from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.kernels.table import KERNELS
@@ -24,6 +23,7 @@ from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN, spacing, surface_error
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.studies.kernels import VOLUME_BOUND, ReferenceSurface, measure_row
 
 SCANNED, LIMIT = 40, 1.05
 

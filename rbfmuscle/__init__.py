@@ -9,13 +9,9 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rbfmuscle.accuracy import discretisation_error as discretisation_error
     from rbfmuscle.bones.sdf import BoneSDF as BoneSDF
-    from rbfmuscle.compare import compare_models as compare_models
-    from rbfmuscle.experiments.wanted_error import reach_error as reach_error
     from rbfmuscle.implicit.field import RBFField as RBFField
     from rbfmuscle.implicit.kernels.table import register_kernel as register_kernel
-    from rbfmuscle.kernels import study_kernels as study_kernels
     from rbfmuscle.models import ModelKind as ModelKind
     from rbfmuscle.models import model_kind as model_kind
     from rbfmuscle.models import register_model as register_model
@@ -25,7 +21,11 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.check import check_scene as check_scene
     from rbfmuscle.scene.phantom import phantom_scene as phantom_scene
     from rbfmuscle.scene.scene import Scene as Scene
-    from rbfmuscle.sweeping import sweep as sweep
+    from rbfmuscle.studies.accuracy import discretisation_error as discretisation_error
+    from rbfmuscle.studies.compare import compare_models as compare_models
+    from rbfmuscle.studies.kernels import reach_error as reach_error
+    from rbfmuscle.studies.kernels import study_kernels as study_kernels
+    from rbfmuscle.studies.sweep import sweep as sweep
     from rbfmuscle.validation import LimitExceededError as LimitExceededError
     from rbfmuscle.validation import MeshError as MeshError
     from rbfmuscle.validation import MissingDependencyError as MissingDependencyError
@@ -58,17 +58,17 @@ _HOME = {
     "Run": "rbfmuscle.run",
     "Scene": "rbfmuscle.scene.scene",
     "check_scene": "rbfmuscle.scene.check",
-    "compare_models": "rbfmuscle.compare",
-    "discretisation_error": "rbfmuscle.accuracy",
+    "compare_models": "rbfmuscle.studies.compare",
+    "discretisation_error": "rbfmuscle.studies.accuracy",
     "model_kind": "rbfmuscle.models",
     "phantom_scene": "rbfmuscle.scene.phantom",
     "register_kernel": "rbfmuscle.implicit.kernels.table",
     "register_model": "rbfmuscle.models",
-    "reach_error": "rbfmuscle.experiments.wanted_error",
+    "reach_error": "rbfmuscle.studies.kernels",
     "show": "rbfmuscle.viewer.page",
     "simulate": "rbfmuscle.run",
-    "study_kernels": "rbfmuscle.kernels",
-    "sweep": "rbfmuscle.sweeping",
+    "study_kernels": "rbfmuscle.studies.kernels",
+    "sweep": "rbfmuscle.studies.sweep",
     **dict.fromkeys(_ERRORS, "rbfmuscle.validation"),
 }
 __all__ = [*_HOME, "__version__"]

@@ -159,7 +159,7 @@ def _held_how(held):
 def _accuracy(scene):
     from dataclasses import asdict
 
-    from rbfmuscle.accuracy import discretisation_error
+    from rbfmuscle.studies.accuracy import discretisation_error
 
     with stage("two lattices"):
         return [asdict(found) for found in discretisation_error(scene)]

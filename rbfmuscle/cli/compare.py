@@ -41,10 +41,10 @@ def compare(
         Draw pictures and the animation.
     """
     from rbfmuscle import interruption
-    from rbfmuscle.compare import compare_models
     from rbfmuscle.metrics.summary import parse_limits
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
+    from rbfmuscle.studies.compare import compare_models
 
     changes, opened = parse_settings(settings), open_scene(scene)
     limits = parse_limits(fail_on, opened)
@@ -100,7 +100,7 @@ def _excess(models, output, limits):
 
 
 def _table_lines(table, output):
-    from rbfmuscle.report.comparison_page import LIGHTS, shown
+    from rbfmuscle.studies.compare import LIGHTS, shown
 
     # As many columns as a terminal holds stand beside each other.
     for k in range(0, len(table.models), 3):

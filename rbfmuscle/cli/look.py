@@ -2,6 +2,7 @@
 pictures, on its page and in other formats.
 """
 
+import json
 import math
 import threading
 import webbrowser
@@ -27,6 +28,13 @@ from rbfmuscle.validation import (
     MissingDependencyError,
     UsageError,
     did_you_mean,
+)
+
+# What a study keeps, and its page.
+STUDIES = (
+    ("compare", "comparison.json", "report.html"),
+    ("kernels", "kernels.json", "kernels.html"),
+    ("sweep", "sweep.json", "sweep.html"),
 )
 
 
@@ -274,10 +282,10 @@ def report(
     """
     with Progress(f"report {directory}"), stage("drawing pictures" if pictures else "writing"):
         from rbfmuscle.output.run_data import RunData
-        from rbfmuscle.report.redraw import redraw_run, redraw_study
+        from rbfmuscle.report.redraw import redraw_run
 
         failed, page = None, directory / "report.html"
-        study = redraw_study(directory, pictures=pictures)
+        study = _redraw_study(directory, pictures=pictures)
         if study is not None:
             if fail_on is not None:
                 raise UsageError(f"--fail-on is for the folder of a run, {directory} holds several")
@@ -288,6 +296,34 @@ def report(
             except LimitExceededError as error:
                 facts, failed = RunData.load(directory).info.to_dict(), error
     return print_result(printing, facts, _report_lines(directory, facts, page), error=failed)
+
+
+def _redraw_study(directory, *, pictures):
+    """Write the page of a comparison, a study of kernels or a sweep again; the page, and what the
+    JSON file beside it holds, or None where the folder holds none of these.
+    """
+    from rbfmuscle.folders import OutputFolder
+    from rbfmuscle.studies import compare, kernels, sweep
+
+    for command, name, page in STUDIES:
+        path = directory / name
+        if not path.exists():
+            continue
+        OutputFolder(directory, command, [page])
+        try:
+            facts = json.loads(path.read_text(encoding="utf-8"))
+            if command == "compare":
+                table = compare.Comparison.model_validate(facts)
+                compare.write_page(directory, table, pictures=pictures)
+            elif command == "kernels":
+                kernels.write_page(directory, kernels.KernelFacts.model_validate(facts))
+            else:
+                sweep.write_page(directory, sweep.SweepTable.model_validate(facts))
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            message = f"{path} is not as it was written ({error!r}); run the command again"
+            raise UsageError(message) from None
+        return directory / page, facts
+    return None
 
 
 def _report_lines(directory, facts, page):

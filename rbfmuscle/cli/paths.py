@@ -25,8 +25,8 @@ from rbfmuscle.progress import Progress
 from rbfmuscle.validation import SceneError, SolveError, UsageError
 
 if TYPE_CHECKING:
-    from rbfmuscle.paths import Ranges
     from rbfmuscle.scene.scene import Scene
+    from rbfmuscle.studies.paths import Ranges
 
 
 FEWEST = 10  # poses from which paths are kept after an interrupt
@@ -84,8 +84,8 @@ def paths(
     """
     from rbfmuscle import interruption
     from rbfmuscle.models import configure_scene
-    from rbfmuscle.paths import Samples, fittable, paths_folder, report_fits, sample_muscles
     from rbfmuscle.scene.phantom import open_scene
+    from rbfmuscle.studies.paths import Samples, fittable, paths_folder, report_fits, sample_muscles
 
     samples = sampling.samples
     if samples is not None and samples < 10:

@@ -124,9 +124,7 @@ def kernels(
         Find the fewest centres, and the kernel, that reach this RMS distance (in the mesh's unit),
         in place of a table.
     """
-    from rbfmuscle.experiments.wanted_error import reach_error
-    from rbfmuscle.kernels import study_kernels
-    from rbfmuscle.report.kernel_page import kernels_folder
+    from rbfmuscle.studies.kernels import kernels_folder, reach_error, study_kernels
 
     if error is not None:
         refuse("--error", {"--centres": fits.centres, "--resolution": fits.resolution})
@@ -166,7 +164,7 @@ def _meshes(source, muscles, units):
 
 
 def _study(meshes, output, study, printing):
-    from rbfmuscle.report.kernel_page import write_studies
+    from rbfmuscle.studies.kernels import write_studies
 
     studies = {}
     for name, mesh in meshes.items():
@@ -178,8 +176,7 @@ def _study(meshes, output, study, printing):
 
 
 def _study_lines(studies, output):
-    from rbfmuscle.experiments.kernel_rows import describe
-    from rbfmuscle.report.kernel_page import answer
+    from rbfmuscle.studies.kernels import answer, describe
 
     for name, study in studies.items():
         if study.recommended is not None:
@@ -193,7 +190,7 @@ def _study_lines(studies, output):
 def _find_wanted(meshes, output, find, units, printing):
     """Find, print and write what reaches an error; where it is not reached, that is said."""
     from rbfmuscle.output.writer import json_text
-    from rbfmuscle.report.kernel_page import kernels_folder
+    from rbfmuscle.studies.kernels import kernels_folder
 
     facts = {}
     for name, mesh in meshes.items():
@@ -243,12 +240,12 @@ def sweep(
         Scene files (TOML), or "phantom" for a hip made by formulas.
     """
     from rbfmuscle import interruption
-    from rbfmuscle.experiments.sweep import parse_grid
     from rbfmuscle.metrics.summary import parse_limits
     from rbfmuscle.models import configure_scene
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
-    from rbfmuscle.sweeping import sweep as run_scenes
+    from rbfmuscle.studies.sweep import parse_grid
+    from rbfmuscle.studies.sweep import sweep as run_scenes
 
     grid, settings = parse_grid(axes.grid or []), changes.parse_settings()
     if not grid:
@@ -283,8 +280,8 @@ def _beyond(table, output, limits):
     """What the points hold beyond the limits of their scenes, and what they did not measure, in
     words.
     """
-    from rbfmuscle.experiments.sweep_run import SweepFolder
     from rbfmuscle.metrics.summary import exceeded, shown_number, unmeasured
+    from rbfmuscle.studies.sweep import SweepFolder
 
     folder = SweepFolder(output)
     for row in table.rows:

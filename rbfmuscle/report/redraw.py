@@ -1,29 +1,15 @@
-"""Write the page of a saved run or study again, after a change of limits or texts."""
+"""Write the page of a saved run again, after a change of limits or texts."""
 
-import json
 from pathlib import Path
 
-from rbfmuscle.experiments.comparison_table import Comparison
-from rbfmuscle.experiments.kernel_rows import KernelFacts
-from rbfmuscle.experiments.sweep_table import SweepTable
-from rbfmuscle.folders import OutputFolder
 from rbfmuscle.metrics.summary import Limits, Summary, parse_limits
 from rbfmuscle.metrics.verdict import describe_verdict, judge, require_limits
 from rbfmuscle.output.info import RunInfo
 from rbfmuscle.output.run_data import RunData
 from rbfmuscle.output.writer import PAGES, run_folder, write_json
-from rbfmuscle.report import comparison_page, kernel_page, sweep_page
 from rbfmuscle.report.report import write_report
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import UsageError
-
-# What a study keeps, and its page.
-STUDIES = {
-    "comparison.json": "report.html",
-    "kernels.json": "kernels.html",
-    "sweep.json": "sweep.html",
-}
-COMMANDS = {"comparison.json": "compare"}
 
 
 def redraw_run(
@@ -64,33 +50,6 @@ def redraw_run(
     write_report(directory, pictures=pictures)
     require_limits(table, limits)
     return info
-
-
-def redraw_study(
-    directory: Path, *, pictures: bool = True
-) -> tuple[Path, dict[str, object]] | None:
-    """Write the page of a comparison, a study of kernels or a sweep again; the page, and what the
-    JSON file beside it holds, or None where the folder holds none of these.
-    """
-    for file, page in STUDIES.items():
-        path = directory / file
-        if not path.exists():
-            continue
-        OutputFolder(directory, COMMANDS.get(file, Path(file).stem), [page])
-        try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-            if file == "comparison.json":
-                table = Comparison.model_validate(found)
-                comparison_page.write_page(directory, table, pictures=pictures)
-            elif file == "kernels.json":
-                kernel_page.write_page(directory, KernelFacts.model_validate(found))
-            else:
-                sweep_page.write_page(SweepTable.model_validate(found), directory)
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            message = f"{path} is not as it was written ({error!r}); run the command again"
-            raise UsageError(message) from None
-        return directory / page, found
-    return None
 
 
 def _limits(saved: RunData, fail_on: str | None) -> Limits:

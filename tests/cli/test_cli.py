@@ -119,10 +119,10 @@ class TestRun:
         ("words", "work"),
         [
             (("run",), "rbfmuscle.run.Recording"),
-            (("compare",), "rbfmuscle.compare._measure"),
-            (("kernels", "--centres", "8"), "rbfmuscle.kernels.study_kernels"),
-            (("kernels", "--error", "1"), "rbfmuscle.experiments.wanted_error.reach_error"),
-            (("paths", "--samples", "10"), "rbfmuscle.paths.sample_muscles"),
+            (("compare",), "rbfmuscle.studies.compare._measure"),
+            (("kernels", "--centres", "8"), "rbfmuscle.studies.kernels.study_kernels"),
+            (("kernels", "--error", "1"), "rbfmuscle.studies.kernels.reach_error"),
+            (("paths", "--samples", "10"), "rbfmuscle.studies.paths.sample_muscles"),
         ],
     )
     def test_unwritable_output_is_told_before_any_work(

@@ -9,7 +9,7 @@ from scipy.spatial.distance import cdist
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.fit.assembly import exponents
 from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel, register_kernel
-from rbfmuscle.kernels import study_kernels
+from rbfmuscle.studies.kernels import study_kernels
 from rbfmuscle.validation import UsageError
 
 mp.mp.dps = 50

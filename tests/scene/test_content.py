@@ -10,9 +10,9 @@ from pydantic import BaseModel
 from rich_scene import rich
 
 import rbfmuscle as rm
-from rbfmuscle.experiments.sweep import scene_content
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.meshes.input_mesh import InputMesh
+from rbfmuscle.studies.sweep import scene_content
 
 # Where files lie, and what follows from attachments and joints.
 LEFT_OUT = {("Scene", "path"), ("Bone", "source"), ("Muscle", "source"), ("Muscle", "tendons")}

@@ -7,12 +7,21 @@ import pytest
 from command_line import call
 
 from rbfmuscle.cli.paths import parse_ranges, parse_targets
-from rbfmuscle.output.path_files import FittedPath, fit_path, write_paths
-from rbfmuscle.paths import SHIFT, Samples, _reached, _tour, report_fits, sample_muscles
 from rbfmuscle.scene.joints.functions import exponents
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.contact_pairs import find_contact_pairs
+from rbfmuscle.studies.paths import (
+    SHIFT,
+    FittedPath,
+    Samples,
+    _reached,
+    _tour,
+    fit_path,
+    report_fits,
+    sample_muscles,
+    write_paths,
+)
 from rbfmuscle.validation import SolveError, UsageError
 
 
@@ -207,7 +216,7 @@ def test_an_interrupted_command_writes_the_paths_of_these_poses(
         found.append(Samples("abductor", names, values, lengths, arms))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rbfmuscle.paths.sample_muscles", sample)
+    monkeypatch.setattr("rbfmuscle.studies.paths.sample_muscles", sample)
     code, _, err = call(capsys, "paths", "phantom", "-o", tmp_path / "out")
     assert code == 130 and "interrupted" in err and ends in err
     assert (tmp_path / "out" / "paths.xml").exists() == bool(ends)
@@ -218,7 +227,7 @@ def test_what_did_not_settle_is_an_error_after_the_paths_are_written(tmp_path, c
         found.append(Samples("abductor", ("hip.flexion", "hip.adduction"), *made(40), unsettled=2))
         return found
 
-    monkeypatch.setattr("rbfmuscle.paths.sample_muscles", sample)
+    monkeypatch.setattr("rbfmuscle.studies.paths.sample_muscles", sample)
     code, out, err = call(capsys, "paths", "phantom", "-o", tmp_path / "out")
     assert code == 5 and "did not settle: abductor at 2 poses" in err
     assert "abductor: order" in out and (tmp_path / "out" / "paths.xml").exists()

@@ -10,15 +10,20 @@ import numpy as np
 import pytest
 from blend_model import BlendMuscle, arm_scene
 
-from rbfmuscle.compare import compare_models
-from rbfmuscle.experiments.comparison_answer import best_models, describe
-from rbfmuscle.experiments.comparison_table import Comparison
-from rbfmuscle.experiments.measures import DEEPER, MEASURES
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.models import build_model
-from rbfmuscle.report.comparison_page import _values, shown
 from rbfmuscle.run import Run
 from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.studies.compare import (
+    DEEPER,
+    MEASURES,
+    Comparison,
+    _values,
+    best_models,
+    compare_models,
+    describe,
+    shown,
+)
 from rbfmuscle.validation import UsageError
 
 

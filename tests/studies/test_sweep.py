@@ -17,12 +17,21 @@ from blend_model import arm_files, arm_scene, use_blend_model
 import rbfmuscle as rm
 from rbfmuscle.cli.app import run_command as command
 from rbfmuscle.cli.options import named_scenes
-from rbfmuscle.experiments.front import mark_front, pareto_front
-from rbfmuscle.experiments.sweep import SweepPoint, parse_grid, plan_sweep, scene_content
-from rbfmuscle.experiments.sweep_run import SweepFolder, run_sweep, sweep_rows, write_table
-from rbfmuscle.experiments.sweep_table import SweepRow
-from rbfmuscle.report.sweep_page import write_page
-from rbfmuscle.sweeping import run_point
+from rbfmuscle.studies.sweep import (
+    SweepFolder,
+    SweepPoint,
+    SweepRow,
+    mark_front,
+    pareto_front,
+    parse_grid,
+    plan_sweep,
+    run_point,
+    run_sweep,
+    scene_content,
+    sweep_rows,
+    write_page,
+    write_table,
+)
 from rbfmuscle.validation import UsageError
 
 GRID = ["model.centres=40,60", "model.resolution=16,24"]
@@ -139,7 +148,7 @@ class TestRun:
     def test_error_falls_with_refinement_and_the_reference_has_none(self, finished):
         points, folder = finished
         table = write_table(points, folder, {"arm": "mm"})
-        write_page(table, folder)
+        write_page(folder, table)
         page = (folder / "sweep.html").read_text(encoding="utf-8")
         assert "<svg" in page and "http" not in page and "the default lies" in page
         rows = {r.label: r for r in table.rows}

@@ -10,24 +10,25 @@ import trimesh
 from command_line import call
 
 import rbfmuscle as rm
-from rbfmuscle.experiments import kernel_study, wanted_error
-from rbfmuscle.experiments.kernel_rows import (
-    ENDS,
-    KernelFacts,
-    KernelRow,
-    at_end,
-    describe,
-    recommend,
-)
-from rbfmuscle.experiments.kernel_study import ReferenceSurface
-from rbfmuscle.experiments.wanted_error import STEP, reach_error
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import mesh_hash
 from rbfmuscle.geometry.threads import thread_count, threads_limited
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.sampling import sample_surface
 from rbfmuscle.implicit.selection import SPAN
-from rbfmuscle.report.kernel_page import write_page
+from rbfmuscle.studies import kernels
+from rbfmuscle.studies.kernels import (
+    ENDS,
+    STEP,
+    KernelFacts,
+    KernelRow,
+    ReferenceSurface,
+    at_end,
+    describe,
+    reach_error,
+    recommend,
+    write_page,
+)
 from rbfmuscle.validation import MeshError, UsageError
 
 
@@ -198,7 +199,7 @@ def _muscle(name):
 
 def test_rows_that_err_more_than_the_coarsest_kernel_are_unfit():
     rows = [row("linear", 0.4, 1.0), row("buhmann", 0.9, 1.0), row("cubic", 0.1, 1.0)]
-    kernel_study._refuse_coarse(rows)
+    kernels._refuse_coarse(rows)
     assert [one.unfit for one in rows] == ["", "an error of 0.9, beyond that of linear, 0.4", ""]
 
 
@@ -251,7 +252,7 @@ def test_command_with_an_error_says_what_to_paste(tmp_path, ellipsoid, capsys, m
     assert facts["reached"] and facts["error"] <= 0.4
     table = tomllib.loads(facts["toml"])["muscle"]["model"]
     assert table["kernel"] == "cubic" and table["centres"] == facts["row"]["centres"]
-    monkeypatch.setattr(wanted_error, "MOST", 24)
+    monkeypatch.setattr(kernels, "MOST", 24)
     code, said, _ = call(capsys, "kernels", *words, "--error", "1e-5")
     assert code == 0 and "is not reached; the best, cubic, 24 centres" in said
 

@@ -1,1 +1,0 @@
-"""Kernel studies, comparisons and sweeps."""

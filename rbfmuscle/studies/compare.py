@@ -1,0 +1,818 @@
+"""Models compared on one scene: the same motion, contacts and measures for each; tables, a page."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel
+
+from rbfmuscle.folders import OutputFolder, given_folder
+from rbfmuscle.geometry.threads import threads_limited
+from rbfmuscle.metrics.metrics import surface_distance
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
+from rbfmuscle.metrics.summary import LIMITS, QuantityFacts, shown_number
+from rbfmuscle.models import (
+    build_models,
+    configure_scene,
+    model_kind,
+    model_title,
+    solved_points,
+)
+from rbfmuscle.output.appearance import MUSCLE_COLOURS
+from rbfmuscle.output.run_data import RunData, moment_arm_coordinates
+from rbfmuscle.output.writer import machine, run_folder, versions, write_csv, write_json
+from rbfmuscle.progress import stage
+from rbfmuscle.report.page import (
+    BAD,
+    GOOD,
+    PLAIN,
+    Cell,
+    CheckRow,
+    ReportPage,
+    Section,
+    Table,
+    limit_state,
+)
+from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
+from rbfmuscle.report.report import packed_scene
+from rbfmuscle.run import stream_run
+from rbfmuscle.scene.frames import pick_frames
+from rbfmuscle.scene.objects import from_mm
+from rbfmuscle.scene.options import OutputOptions
+from rbfmuscle.scene.phantom import open_scene
+from rbfmuscle.scene.scene import Scene, require_complete
+from rbfmuscle.scene.settings import chooses_model
+from rbfmuscle.simulation.frame import Mesh
+from rbfmuscle.simulation.frame_loop import simulate_frames
+from rbfmuscle.validation import SolveError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.scene.scene import Scene
+
+
+FILES = ("comparison.json", "comparison.csv", "statistics.csv", "report.html")
+COARSER = 5  # the motion is repeated with frames this many times as far apart
+FINER = 4  # and its last pose with sub-steps this many times as short, which every model solves by
+ONE_THREAD = 5  # frames that are timed on one thread, the first of which does not count
+
+
+def compare_models(
+    scene: Scene | str | Path,
+    directory: str | Path | None = None,
+    models: Sequence[str] = ("rbf", "pbd"),
+    *,
+    frames: slice | str | None = None,
+    settings: Mapping[str, object] | None = None,
+    pictures: bool = True,
+    progress: Callable[[str, int, int], object] | None = None,
+) -> Comparison:
+    """Run every model on a scene, measure all alike, and write tables, a report and pictures.
+
+    Parameters
+    ----------
+    scene : Scene, path or "phantom"
+    directory : path, optional
+        Takes ``comparison.json``, tables, ``report.html`` and the run of each model; without one
+        nothing is kept but what is returned.
+    models : list of str
+        Distances are to the first. One that cannot be solved is left out, and named in the tables.
+    frames : slice or str, optional
+        Frames of the motion, a slice or "A:B:S".
+    settings : dict, optional
+        Dotted keys with their values, for all models, or as "MODEL:KEY" for one.
+    pictures : bool
+    progress : callable, optional
+        Called as ``progress(model, done, total)``.
+
+    Returns
+    -------
+    Comparison
+        What ``comparison.json`` holds.
+
+    Raises
+    ------
+    UsageError
+        On an unknown model or setting, or a folder that holds something else.
+    SolveError
+        If no model could be solved.
+
+    Examples
+    --------
+    >>> from rbfmuscle import phantom_scene
+    >>> table = compare_models(phantom_scene(end=2.0), models=["pbd", "xpbd"])
+    >>> sorted(table.models)
+    ['pbd', 'xpbd']
+    """
+    variants = _variants(open_scene(scene), list(models), settings or {}, frames)
+    with given_folder(directory) as folder:
+        return _compare(variants, folder, pictures and directory is not None, progress)
+
+
+def _compare(
+    variants: Mapping[str, Scene],
+    folder: Path,
+    pictures: bool,
+    progress: Callable[[str, int, int], object] | None,
+) -> Comparison:
+    """Run the scene of each model in a folder of its name, and write tables and a report."""
+    output = OutputFolder(folder, "compare", FILES)
+    for name in variants:
+        run_folder(folder / name)
+    output.clear()
+    output.add(*FILES)
+    first = next(iter(variants.values()))
+    last = len(first.motion) - 1
+    poses = [int(first.motion.numbers[k]) for k in sorted({0, last // 2, last})]
+    results, failed = {}, {}
+    for name, variant in variants.items():
+        try:
+            results[name] = _measure(name, variant, folder / name, progress)
+        except SolveError as error:
+            failed[name] = str(error)
+    if not results:
+        raise SolveError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
+    with stage("distances between models"):
+        add_distances(results, folder, poses)
+    labels = {name: model_title(variant.muscles[0]) for name, variant in variants.items()}
+    unknowns = {
+        name: {muscle.name: solved_points(muscle, variant) for muscle in variant.muscles}
+        for name, variant in variants.items()
+    }
+    table = write_tables(
+        folder, first, results, failed, labels=labels, unknowns=unknowns, poses=poses
+    )
+
+    from rbfmuscle.studies.compare import write_page
+
+    with stage("drawing pictures" if pictures else "writing the report"):
+        write_page(folder, table, pictures=pictures)
+    return table
+
+
+def _variants(scene, models, settings, frames):
+    """The scene for each model; every name and setting is checked before anything is run."""
+    if len(models) < 2 or len(set(models)) < len(models):
+        raise UsageError(f"give two or more different models, got {', '.join(models) or 'none'}")
+    for name in models:
+        model_kind(name)
+    for key in settings:
+        model = key.rpartition(":")[0]
+        if model and model not in models:
+            raise UsageError(f"{key}: model {model!r} is not compared; models: {', '.join(models)}")
+        if model and key.removeprefix(f"{model}:").startswith("motion."):
+            raise UsageError(f"{key}: all models have the same motion; leave out {model}:")
+    variants = {}
+    for name in models:
+        mine = {
+            k.rpartition(":")[2]: v
+            for k, v in settings.items()
+            if k.rpartition(":")[0] in ("", name)
+        }
+        # As in the scene file, a model given for all is the model whose settings these are; each
+        # then takes its turn.
+        whole = {key: value for key, value in mine.items() if chooses_model(key)}
+        own = {key: value for key, value in mine.items() if not chooses_model(key)}
+        variant = configure_scene(scene, whole).with_options(model=name)
+        variants[name] = require_complete(configure_scene(variant, own, frames=frames))
+        variants[name].output = OutputOptions(report=False)
+    return variants
+
+
+def _measure(name, scene, folder, progress):
+    """One model: compile its loops, run, then there and back by fewer frames, and to the last pose
+    by shorter sub-steps.
+    """
+    last = len(scene.motion) - 1
+    _surfaces(scene, [*range(min(last, 1) + 1)])
+    report = None if progress is None else (lambda done, total: progress(name, done, total))
+    stream_run(scene, folder, pictures=False, progress=report)
+    coarse = [*range(0, last, COARSER)]
+    with stage(f"{name}: there and back"):
+        build, shown, _ = _surfaces(scene, [*coarse, last, *coarse[::-1]])
+    with stage(f"{name}: by shorter sub-steps"):
+        angle = scene.contact.substep_angle / FINER
+        finer = scene.with_options({"contact.substep_angle": angle})
+        turn = _surfaces(finer, [*coarse, last])[1][-1]
+    with stage(f"{name}: on one thread"), threads_limited(1):
+        walls = _surfaces(scene, [*range(min(last + 1, ONE_THREAD))])[2]
+    again = Repeated(build, float(np.median(walls[1:] or walls)))
+    if coarse:
+        again = again._replace(turn=turn, end=shown[-1])
+    with stage(f"{name}: measuring"):
+        return measure_run(RunData.load(folder), again)
+
+
+def _surfaces(scene, chosen):
+    """Time to build the models, the surfaces of all muscles in frames of these numbers, in this
+    order, and the wall time of each frame.
+    """
+    changed = scene.with_options()
+    changed.motion = pick_frames(scene.motion, chosen)
+    start = time.perf_counter()
+    models = build_models(changed)
+    build = time.perf_counter() - start
+    frames = list(simulate_frames(changed, models))
+    surfaces = [
+        {name: (s.vertices, s.faces) for name, s in frame.surfaces.items()} for frame in frames
+    ]
+    return build, surfaces, [frame.wall for frame in frames]
+
+
+LAW = "law"
+MESH = "input mesh"
+FIRST = "first model"
+COST = "cost"
+
+
+class Measure(NamedTuple):
+    """A row of the table.
+
+    ``kind`` is that of a unit: ``"1"``, ``"length"`` or ``"s"``; ``against`` says what a value is
+    an error of or against; a value is better the smaller its distance from ``ideal``, and
+    differences of less than ``floor`` (millimetres for lengths) do not count.
+    """
+
+    title: str
+    kind: str
+    against: str
+    floor: float
+    meaning: str
+    ideal: float = 0.0
+
+
+DEEPER = "depth_beyond_rest"
+_ROWS: dict[str, tuple[str, str, str, float, str]] = {
+    "volume_error": ("volume error", "1", LAW, 1e-5, "relative to the input mesh"),
+    DEEPER: ("depth beyond rest", "length", LAW, 0.02, "of muscle and bones, less that at rest"),
+    "penetration_max": ("surface in a bone", "length", LAW, 0.02, "deepest vertex, as at rest"),
+    "bone_penetration_max": ("bone in the muscle", "length", LAW, 0.02, "the same of bones"),
+    "solver_penetration_max": ("left by the solver", "length", LAW, 0.02, "its points in a bone"),
+    "neighbour_overlap_max": ("muscles overlap", "length", LAW, 0.02, "deepest, beyond rest"),
+    "neighbour_gap": ("muscles part", "length", LAW, 0.1, "where they touched at rest, 95 %"),
+    "initial_overlap": ("overlap left at rest", "length", LAW, 0.02, "of muscle and bones"),
+    "bowing": ("bowing", "1", LAW, 0.005, "centreline over shortest path"),
+    "components": ("pieces", "1", LAW, 0.0, "connected pieces, most in any frame"),
+    "euler_characteristic": ("Euler characteristic", "1", LAW, 0.0, "two less for a handle"),
+    "self_crossings": ("self-crossings", "1", LAW, 0.0, "triangles that cross others"),
+    "unfitted_fraction": ("surface not fitted", "1", LAW, 1e-4, "share of vertices off the field"),
+    "flicker": ("flicker", "length", LAW, 0.05, "surface against material mesh, by frames"),
+    "tunnelled": ("tunnelled points", "1", LAW, 0.0, "points beyond a bone"),
+    "return_rms": ("return error (RMS)", "length", LAW, 0.02, "first pose, there and back"),
+    "return_max": ("return error (greatest)", "length", LAW, 0.1, "greatest distance"),
+    "step_rms": (
+        "step dependence (RMS)",
+        "length",
+        LAW,
+        0.02,
+        "last pose by shorter sub-steps",
+    ),
+    "step_max": ("step dependence (greatest)", "length", LAW, 0.1, "greatest distance"),
+    "rest_error_rms": ("rest error (RMS)", "length", MESH, 0.02, "surface to mesh at rest"),
+    "rest_error_max": ("rest error (greatest)", "length", MESH, 0.1, "greatest distance"),
+    "rest_error_at_overlap": ("rest beside overlaps", "length", MESH, 0.1, "within 10 mm of them"),
+    "distance_rms": ("distance (RMS)", "length", FIRST, 0.0, "to the first's, worst pose"),
+    "distance_max": ("distance (greatest)", "length", FIRST, 0.0, "greatest distance"),
+    "length_rms": ("length (RMS)", "length", FIRST, 0.0, "difference over the frames"),
+    "moment_arm_rms": ("moment arm (RMS)", "length", FIRST, 0.0, "difference over the frames"),
+    "time_frame": ("time per frame", "s", COST, 0.0, "median of all muscles, with surfaces"),
+    "time_frame_p95": ("time per frame (95 %)", "s", COST, 0.0, "exceeded by one in 20"),
+    "time_one_thread": ("time on one thread", "s", COST, 0.0, "median of the first frames"),
+    "time_build": ("build", "s", COST, 0.0, "all models, once, with filled caches"),
+}
+_IDEAL = {"bowing": 1.0, "euler_characteristic": 2.0}  # 0 of all others
+MEASURES = {name: Measure(*row, _IDEAL.get(name, 0.0)) for name, row in _ROWS.items()}
+FROM_METRICS = [name for name, m in MEASURES.items() if m.against in (LAW, MESH) and name != DEEPER]
+
+
+VALUE_COLUMNS = ("model", "muscle", "quantity", "value", "unit", "against")
+
+# Values by muscle, "all" included, and quantity.
+Values = dict[str, dict[str, float]]
+
+
+class MeasureFacts(BaseModel):
+    """A measure: its unit, and the words of its row of `MEASURES`."""
+
+    unit: str
+    title: str
+    against: str
+    meaning: str
+
+
+class Spread(BaseModel):
+    """Mean and standard deviation over the frames."""
+
+    mean: float
+    sd: float
+
+
+class Comparison(BaseModel):
+    """What ``comparison.json`` holds.
+
+    ``poses`` are the numbers of the frames at which distances were measured, ``labels`` models as
+    tables name them, ``failed`` why models were not solved, ``answer`` all of it in sentences,
+    ``within`` how many muscles of each model are within all limits, ``unknowns`` the points that
+    each model solves for, in words, by model and muscle. ``results`` are by model; ``statistics``
+    by model, muscle and quantity, of moment arms ``"moment_arm:COORDINATE"``.
+    """
+
+    format: int
+    scene: str
+    units: str
+    frames: int
+    poses: list[int]
+    models: list[str]
+    labels: dict[str, str]
+    failed: dict[str, str]
+    answer: str
+    within: dict[str, int] = {}
+    unknowns: dict[str, dict[str, str]]
+    measures: dict[str, MeasureFacts]
+    results: dict[str, Values]
+    statistics: dict[str, dict[str, dict[str, Spread]]]
+    machine: dict[str, str | int | None]
+    versions: dict[str, str]
+
+    def value_rows(self) -> Iterator[tuple[str, str, str, float, str, str]]:
+        """Every value, in rows of `VALUE_COLUMNS`."""
+        for model, muscles in self.results.items():
+            for muscle, values in muscles.items():
+                for name, measure in self.measures.items():
+                    if name in values:
+                        yield model, muscle, name, values[name], measure.unit, measure.against
+
+
+FORMAT = 4  # of comparison.json
+
+
+class Repeated(NamedTuple):
+    """What a model gives beside its run: the time to build it and that of a frame on one thread
+    [s]; where the motion has more than one frame, surfaces by muscle at the last pose by shorter
+    sub-steps (``turn``), and back at the first after the motion there and back (``end``).
+    """
+
+    build: float
+    one_thread: float
+    turn: dict[str, Mesh] | None = None
+    end: dict[str, Mesh] | None = None
+
+
+def measure_run(saved: RunData, again: Repeated) -> Values:
+    """Values of every measure but the distances for one model: muscle -> quantity -> value.
+
+    Under ``"all"`` the worst over muscles, or the wall time.
+    """
+    found: Values = {}
+    for muscle in saved.muscles:
+        facts = saved.info.muscles.get(muscle, {})
+        worst = {q: facts.get(q, QuantityFacts()).get("worst") for q in FROM_METRICS}
+        values = {q: value for q, value in worst.items() if value is not None}
+        values[DEEPER] = _deepened(values)
+        times = saved.series(muscle, "time_frame")[1][1:]  # the first loads and compiles
+        if len(times):
+            values["time_frame"] = float(np.median(times))
+        for name, frame, meshes in (("return", 0, again.end), ("step", -1, again.turn)):
+            if meshes is not None:
+                mine = saved.mesh(muscle, saved.frame_numbers[frame])
+                pair = surface_distance(*mine, *meshes[muscle])
+                values[f"{name}_rms"], values[f"{name}_max"] = pair
+        found[muscle] = values
+    together: dict[str, float] = {}
+    for name, measure in MEASURES.items():
+        known = [values[name] for values in found.values() if name in values]
+        if known:
+            together[name] = max(known, key=lambda value: abs(value - measure.ideal))
+    wall = saved.series(ALL, "time_frame")[1][1:]
+    if len(wall):
+        together["time_frame"] = float(np.median(wall))
+        together["time_frame_p95"] = float(np.percentile(wall, 95))
+    together["time_build"] = again.build
+    together["time_one_thread"] = again.one_thread
+    found[ALL] = together
+    return found
+
+
+def statistics(saved: RunData) -> dict[str, dict[str, Spread]]:
+    """Mean and standard deviation over the frames, by muscle and quantity; of moment arms the
+    quantity is ``"moment_arm:COORDINATE"``.
+    """
+    found = {}
+    for muscle in saved.muscles:
+        whole = (*FROM_METRICS, "length", "time_frame")
+        series = {name: saved.series(muscle, name)[1] for name in whole}
+        for about in moment_arm_coordinates(saved, muscle):
+            series[f"moment_arm:{about}"] = saved.series(muscle, "moment_arm", about)[1]
+        series["time_frame"] = series["time_frame"][1:]  # the first loads and compiles
+        found[muscle] = {
+            name: Spread(mean=float(values.mean()), sd=float(values.std()))
+            for name, values in series.items()
+            if len(values) and np.isfinite(values).all()
+        }
+    return found
+
+
+def add_distances(results: dict[str, Values], folder: Path, poses: list[int]) -> None:
+    """Add the distances of each model's surfaces to those of the first, the worst of some poses of
+    a folder's runs, and the differences of lengths and moment arms.
+    """
+    first, *others = (RunData.load(folder / name) for name in results)
+    for found, run in zip(list(results.values())[1:], others):
+        for muscle in first.muscles:
+            pairs = [surface_distance(*first.mesh(muscle, k), *run.mesh(muscle, k)) for k in poses]
+            apart = dict(zip(("distance_rms", "distance_max"), map(max, zip(*pairs))))
+            apart["length_rms"] = _apart(first, run, muscle, "length", None)
+            arms = [
+                _apart(first, run, muscle, "moment_arm", about)
+                for about in moment_arm_coordinates(first, muscle)
+            ]
+            apart |= {"moment_arm_rms": max(arms)} if arms else {}
+            for name, value in apart.items():
+                if np.isfinite(value):
+                    found[muscle][name] = value
+                    found[ALL][name] = max(found[ALL].get(name, 0.0), value)
+
+
+def _apart(first: RunData, other: RunData, muscle: str, quantity: str, about: str | None) -> float:
+    """Root mean square over the frames of the difference of a quantity; NaN where frames differ."""
+    (frames, mine), (others, values) = (
+        run.series(muscle, quantity, about) for run in (first, other)
+    )
+    if not len(frames) or not np.array_equal(frames, others):
+        return float("nan")
+    return float(np.sqrt(np.mean((mine - values) ** 2)))
+
+
+def write_tables(
+    folder: Path,
+    scene: Scene,
+    results: dict[str, Values],
+    failed: dict[str, str],
+    *,
+    labels: dict[str, str],
+    unknowns: dict[str, dict[str, str]],
+    poses: list[int],
+) -> Comparison:
+    """Write ``comparison.json``, which is returned, ``comparison.csv``: values by model, muscle and
+    quantity, and ``statistics.csv``: their means and standard deviations over the frames.
+
+    ``unknowns`` are the points that each model solves for, in words, by model and muscle.
+    """
+    runs = {name: RunData.load(folder / name) for name in results}
+    beyond = {name: muscles_beyond(run) for name, run in runs.items()}
+    table = Comparison(
+        format=FORMAT,
+        scene=scene.name,
+        units=scene.units,
+        frames=len(scene.motion),
+        poses=poses,
+        models=list(results),
+        labels={name: labels[name] for name in results},
+        failed=failed,
+        answer=describe(results, labels, scene.units, beyond),
+        within={name: len(runs[name].muscles) - len(found[ALL]) for name, found in beyond.items()},
+        unknowns={name: unknowns[name] for name in results},
+        measures={
+            name: MeasureFacts(
+                unit=unit_text(m.kind, scene.units),
+                title=m.title,
+                against=m.against,
+                meaning=m.meaning,
+            )
+            for name, m in MEASURES.items()
+        },
+        results=results,
+        statistics={name: statistics(run) for name, run in runs.items()},
+        machine=machine(),
+        versions=versions(),
+    )
+    write_json(folder / "comparison.json", table.model_dump())
+    write_csv(folder / "comparison.csv", [VALUE_COLUMNS, *table.value_rows()])
+    write_csv(folder / "statistics.csv", _statistics_rows(table))
+    return table
+
+
+def _statistics_rows(table: Comparison) -> Iterator[tuple[object, ...]]:
+    yield "model", "muscle", "quantity", "mean", "sd", "unit"
+    for model, muscles in table.statistics.items():
+        for muscle, quantities in muscles.items():
+            for name, spread in quantities.items():
+                unit = unit_text(QUANTITIES[name.partition(":")[0]][0], table.units)
+                yield model, muscle, name, spread.mean, spread.sd, unit
+
+
+def _deepened(values: Mapping[str, float]) -> float:
+    """How deep a muscle is in a bone, or a bone in it, beyond what is left at rest."""
+    deepest = max(values.get(name, 0.0) for name in ("penetration_max", "bone_penetration_max"))
+    return max(0.0, deepest - values.get("initial_overlap", 0.0))
+
+
+# A model keeps out of bones that is no deeper in one [mm].
+KEPT_OUT = 0.3
+# How many quantities beyond limits are named; of depths the sentences say what is beyond rest.
+MOST_TOLD = 4
+_DEPTHS = ("penetration_max", "bone_penetration_max", "initial_overlap")
+_TIE = 1.05  # models whose values differ by less are equally good
+
+Beyond = Mapping[str, Mapping[str, set[str]]]
+
+
+def best_models(results: dict[str, Values], quantity: str, units: str) -> list[str]:
+    """Models that are as good as the best in a measure: within 5 %, or within what does not
+    count.
+    """
+    measure = MEASURES[quantity]
+    known = {
+        name: found[ALL][quantity] for name, found in results.items() if quantity in found[ALL]
+    }
+    values = {name: abs(value - measure.ideal) for name, value in known.items()}
+    if measure.against == FIRST or len(values) < 2:
+        return []
+    scale = from_mm(1.0, units) if measure.kind == "length" else 1.0
+    limit = _TIE * min(values.values()) + measure.floor * scale
+    return [name for name, value in values.items() if value <= limit]
+
+
+def muscles_beyond(saved: RunData) -> dict[str, set[str]]:
+    """The muscles of a run that are not within a limit, by quantity; under ``"all"`` those that are
+    not within all limits, or not measured for one.
+    """
+    found: dict[str, set[str]] = {ALL: set()}
+    pairs = [(row.muscle, row.quantity) for row in saved.info.beyond]
+    pairs += [(row.muscle, row.quantity) for row in saved.info.not_measured]
+    for muscle, quantity in pairs:
+        if muscle in saved.muscles:
+            found[ALL].add(muscle)
+            found.setdefault(quantity, set()).add(muscle)
+    return found
+
+
+def _failures(beyond: Beyond, labels: dict[str, str]) -> list[str]:
+    """For each model what its muscles are not within the limits of, most muscles first."""
+    texts = []
+    for model, found in beyond.items():
+        named = {quantity: sorted(muscles) for quantity, muscles in found.items() if muscles}
+        named.pop(ALL, None)
+        most = sorted(named, key=lambda quantity: len(named[quantity]), reverse=True)[:MOST_TOLD]
+        told = [f"{LIMITS[quantity].title} ({_some(named[quantity])})" for quantity in most]
+        if told:
+            texts.append(f"Beyond limits, {labels[model]}: {', '.join(told)}")
+    return texts
+
+
+def _some(names: list[str]) -> str:
+    """A few of some names."""
+    more = f" and {len(names) - MOST_TOLD} more" if len(names) > MOST_TOLD else ""
+    return ", ".join(names[:MOST_TOLD]) + more
+
+
+def _differences(
+    results: dict[str, Values],
+    labels: dict[str, str],
+    units: str,
+    beyond: Beyond,
+) -> list[str]:
+    """Worst values of what most muscles are beyond a limit of, and of the return error, where the
+    models differ in it.
+    """
+    counts = {
+        name: [len(beyond.get(model, {}).get(name, ())) for model in results] for name in MEASURES
+    }
+    told = [name for name, count in counts.items() if any(count) and name not in _DEPTHS]
+    told.sort(key=lambda name: max(counts[name]) - min(counts[name]), reverse=True)
+    texts = []
+    for name in (*told[:MOST_TOLD], "return_rms"):
+        known = [model for model in results if name in results[model][ALL]]
+        best = best_models(results, name, units)
+        if len(best) < len(known) and len(known) > 1:
+            unit = unit_text(MEASURES[name].kind, units)
+            values = [
+                f"{shown_number(results[model][ALL][name], unit)} ({labels[model]})"
+                for model in known
+            ]
+            texts.append(f"{MEASURES[name].title} {', '.join(values)}")
+    return texts
+
+
+def describe(results: dict[str, Values], labels: dict[str, str], units: str, beyond: Beyond) -> str:
+    """How many muscles of each model are within all limits, what the others are beyond, and where
+    the models differ; then whether the first keeps out of bones, its time against the quickest
+    other one, which is nearest in shape.
+
+    Arguments are those of `write_tables`, ``beyond`` is `muscles_beyond` of each model; distances
+    are to the first model.
+    """
+    muscles = len(next(iter(results.values()))) - 1
+    kept = [
+        f"{muscles - len(found[ALL])} of {muscles} ({labels[name]})"
+        for name, found in beyond.items()
+    ]
+    texts = [f"Muscles within all limits: {', '.join(kept)}"] if kept else []
+    texts += _failures(beyond, labels)
+    if differ := _differences(results, labels, units, beyond):
+        texts.append(f"Worst values: {'; '.join(differ)}")
+    whole = {name: found[ALL] for name, found in results.items()}
+    texts += [*_depths(whole, labels, units), *_times_and_shapes(whole, labels, units)]
+    if len(results) > 1:
+        texts.append(
+            "Which shape is right this cannot say; docs/validation.md compares with finite elements"
+        )
+    return f"{'. '.join(texts)}."
+
+
+def _depths(whole: Values, labels: dict[str, str], units: str) -> list[str]:
+    """Whether the first model keeps out of bones, and how deep the others are; ``whole`` are values
+    of all muscles by model.
+    """
+    first, *others = whole
+    depth = whole[first].get(DEEPER, 0.0)
+    verb = "keeps out of" if depth <= from_mm(KEPT_OUT, units) else "enters"
+    there = [
+        f"{labels[name]}: {shown_number(whole[name].get(DEEPER, 0.0), units)}" for name in others
+    ]
+    texts = [
+        f"{labels[first]} {verb} bones: {shown_number(depth, units)} deep at most beyond "
+        "the overlap at rest" + (f" ({'; '.join(there)})" if there else "")
+    ]
+    before = whole[first].get("solver_penetration_max", 0.0)
+    if before > whole[first].get("penetration_max", 0.0) + from_mm(0.02, units):
+        texts.append(
+            f"Before it is clipped along bones its points are {shown_number(before, units)} deep"
+        )
+    return texts
+
+
+def _times_and_shapes(whole: Values, labels: dict[str, str], units: str) -> list[str]:
+    """The first model's time against the quickest other one, and which is nearest in shape."""
+    first, *others = whole
+    texts = []
+    timed = [
+        name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]
+    ]
+    quick = min(timed, key=lambda name: whole[name]["time_frame"], default=None)
+    if quick:
+        ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
+        name = f"{labels[quick]}{', the quickest of the others' if len(others) > 1 else ''}"
+        texts.append(f"{labels[first]} takes {ratio:.2g} times the time of {name}")
+    apart = {name: whole[name]["distance_rms"] for name in others if "distance_rms" in whole[name]}
+    if apart:
+        near = min(apart, key=apart.__getitem__)
+        away = f"{apart[near]:.2g} {units} RMS"
+        if len(others) == 1:
+            texts.append(f"The two surfaces are {away} apart")
+        else:
+            texts.append(f"Nearest to it in shape is {labels[near]} ({away})")
+            if near in timed and near != quick:
+                ratio = whole[near]["time_frame"] / whole[first]["time_frame"]
+                texts[-1] += f", which takes {ratio:.2g} times the time of {labels[first]}"
+    return texts
+
+
+LIGHTS = (DEEPER, "volume_error", "bowing", "return_rms", "time_frame")
+_DRAWN = ("penetration_max", "bone_penetration_max", "bowing")
+_READING = """All models ran through the same frames and sub-steps, with the same bone fields and
+number of threads. The time per frame leaves out the first, which loads and compiles. The
+distance to the first model is no error. A mesh model keeps the overlap with bones that its mesh
+has at rest; depth beyond rest leaves that out. A law is what every muscle keeps, whatever its
+shape: volume, one piece, no bone inside, the same pose there and back."""
+
+
+def write_page(folder: Path, found: Comparison, *, pictures: bool = True) -> None:
+    """Write ``report.html`` of what `write_tables` found to the folder of its runs; raises
+    SolveError.
+    """
+    runs = {found.labels[name]: RunData.load(folder / name) for name in found.models}
+    page = _page(found, runs)
+    if pictures:
+        page.scene = packed_scene(runs)
+    else:
+        page.missing = "No pictures: they were switched off."
+    page.write(folder / "report.html")
+
+
+def _page(found: Comparison, runs: Mapping[str, RunData]) -> ReportPage:
+    first = next(iter(runs.values()))
+    failed = [f"{name} did not finish: {reason}" for name, reason in found.failed.items()]
+    counts = {"muscles": len(first.muscles), "frames": found.frames, **found.machine}
+    # Of the bowing each muscle has a limit of its own.
+    limits = first.info.limits | {"bowing": None, DEEPER: first.info.limits.get("penetration_max")}
+    terms = [(m.title, m.meaning) for m in MEASURES.values()]
+    return ReportPage(
+        f"{found.scene}: models compared",
+        [f"{counts[what]} {what}" for what in ("muscles", "frames", "threads")],
+        " ".join([found.answer, *failed]),
+        BAD if failed else PLAIN,
+        lights=[_light(found, name, limits.get(name)) for name in LIGHTS if _values(found, name)],
+        heads=list(runs),
+        sections=[
+            Section(
+                "Every measure",
+                "worst of muscles and frames, best in green",
+                table=_measures(found),
+            ),
+            Section("Mean and standard deviation over the frames", table=_statistics(found)),
+            Section("What each model solves for", table=_unknowns(found)),
+            Section("Over the motion", plots=_plots(runs)),
+            Section("How to read this", text=_READING, terms=terms),
+        ],
+        footer=", ".join(f"{name} {value}" for name, value in found.versions.items()),
+    )
+
+
+def _values(found: Comparison, quantity: str) -> list[float | None]:
+    """A measure of each model over all muscles; empty where none has it."""
+    values = [found.results[name][ALL].get(quantity) for name in found.models]
+    return values if any(value is not None for value in values) else []
+
+
+def _light(found: Comparison, quantity: str, limit: float | None) -> CheckRow:
+    values = _values(found, quantity)
+    cells = [Cell(shown(found, quantity, x), limit_state(quantity, x, limit)) for x in values]
+    # A column of limits would be off a phone's screen.
+    note = MEASURES[quantity].meaning if limit is None else f"limit {shown(found, quantity, limit)}"
+    return CheckRow(MEASURES[quantity].title, cells, note=note)
+
+
+def shown(found: Comparison, quantity: str, value: float | None) -> str:
+    """A value of a measure with its unit; lengths that do not count as zero."""
+    measure, unit = MEASURES[quantity], found.measures[quantity].unit
+    if value is not None and unit == "mm" and abs(value) < 0.5 * measure.floor:
+        value = 0.0
+    return shown_number(value, unit)
+
+
+def _measures(found: Comparison) -> Table:
+    rows = []
+    for quantity, measure in MEASURES.items():
+        if values := _values(found, quantity):
+            best, models = best_models(found.results, quantity, found.units), found.models
+            states = [
+                GOOD if name in best and len(best) < len(models) else PLAIN for name in models
+            ]
+            texts = [shown(found, quantity, value) for value in values]
+            rows.append([Cell(measure.title), Cell(measure.against), *map(Cell, texts, states)])
+    return Table(["", "against", *(found.labels[name] for name in found.models)], rows)
+
+
+def _statistics(found: Comparison) -> Table:
+    """Length, moment arms, volume and time of each muscle, mean ± standard deviation."""
+    models, rows = found.models, []
+    first = found.statistics[models[0]]
+    for muscle, quantities in first.items():
+        names = ["length", *(name for name in quantities if name.startswith("moment_arm:"))]
+        for name in [*names, "volume_error", "time_frame"]:
+            quantity, _, about = name.partition(":")
+            unit = unit_text(QUANTITIES[quantity][0], found.units)
+            texts = []
+            for model in models:
+                spread = found.statistics[model].get(muscle, {}).get(name)
+                pair = [shown_number(x, unit) for x in (spread.mean, spread.sd)] if spread else []
+                texts.append(" ± ".join(pair) or "–")
+            title = f"{quantity.replace('_', ' ')} {about}".strip()
+            rows.append([Cell(muscle), Cell(title), *map(Cell, texts)])
+    return Table(["", "", *(found.labels[name] for name in models)], rows)
+
+
+def _unknowns(found: Comparison) -> Table:
+    models = found.models
+    rows = [
+        [Cell(muscle), *(Cell(found.unknowns[name][muscle]) for name in models)]
+        for muscle in found.unknowns[models[0]]
+    ]
+    return Table(["", *(found.labels[name] for name in models)], rows)
+
+
+def _plots(runs: Mapping[str, RunData]) -> list[str]:
+    """Moment arms, length and depths of each muscle, then the time; a line for each model, no plot
+    of constants.
+    """
+    first, pictures = next(iter(runs.values())), []
+    axis, label = motion_axis(first)
+    panels: list[tuple[str, str, str, str, str | None]] = [
+        (f"Moment arm: {muscle}, {about}", arm_unit(first, about), muscle, "moment_arm", about)
+        for muscle in first.muscles
+        for about in moment_arm_coordinates(first, muscle)
+    ]
+    shapes = {"length": ("Length", first.units)} | {
+        name: (MEASURES[name].title.capitalize(), "" if MEASURES[name].kind == "1" else first.units)
+        for name in _DRAWN
+    }
+    for quantity, (title, unit) in shapes.items():
+        panels += [(f"{title}: {muscle}", unit, muscle, quantity, None) for muscle in first.muscles]
+    panels.append(("Time per frame after the first", "s", ALL, "time_frame", None))
+    for title, unit, muscle, quantity, about in panels:
+        tracks = []
+        for (name, run), colour in zip(runs.items(), cycle(MUSCLE_COLOURS)):
+            frames, values = run.series(muscle, quantity, about)
+            kept = slice(quantity == "time_frame", None)
+            if np.isfinite(values[kept]).any():
+                tracks.append(
+                    Track(name, colour, np.array([axis[k] for k in frames])[kept], values[kept])
+                )
+        if any(np.ptp(track.y) != 0 for track in tracks):
+            pictures.append(line_plot(title, tracks, (label, unit), legend=True))
+    return pictures

@@ -1,0 +1,817 @@
+"""Which kernel, which shape parameter, how many centres: a surface fitted by all of them; tables
+and a page.
+
+Accuracy, conditioning and time are measured together, since each can be bought with the others.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import threading
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from itertools import cycle
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import BaseModel
+
+from rbfmuscle.folders import OutputFolder
+from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
+from rbfmuscle.geometry.mesh_distance import MeshDistance
+from rbfmuscle.geometry.rest_frame import principal_axes
+from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, vertex_areas
+from rbfmuscle.geometry.threads import blas_limited, each, threads_limited
+from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
+from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
+from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
+from rbfmuscle.implicit.placement.sampling import (
+    GREEDY_LARGEST,
+    SurfaceSample,
+    sample_surface,
+    spread_points,
+)
+from rbfmuscle.implicit.selection import BOUND, SCAN, SPAN, choose_epsilon, spacing
+from rbfmuscle.metrics.summary import shown_number
+from rbfmuscle.output.appearance import MUSCLE_COLOURS
+from rbfmuscle.output.writer import json_text, versions, write_csv
+from rbfmuscle.report.page import (
+    BAD,
+    GOOD,
+    PLAIN,
+    Cell,
+    CheckRow,
+    ReportPage,
+    Section,
+    Table,
+    number_cell,
+)
+from rbfmuscle.report.plots import Point, Track, front_plot, line_plot
+from rbfmuscle.studies.sweep import OnProgress, pareto_front
+from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
+
+
+def study_kernels(
+    mesh: MeshLike,
+    directory: str | Path | None = None,
+    *,
+    kernels: Sequence[str] | None = None,
+    centres: Sequence[int] = (150, 300),
+    resolution: int = 0,
+    units: str = "",
+    progress: OnProgress | None = None,
+) -> KernelStudy:
+    """Fit a surface with many kernels and numbers of centres, and measure each fit.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
+        Closed, outward.
+    directory : path, optional
+        Takes ``kernels.csv``, ``kernels.json`` and the page ``kernels.html``.
+    kernels : list of str, optional
+        All by default.
+    centres : sequence of int
+    resolution : int
+        Cells along the longest side of the extracted surfaces; as many as a muscle so slender needs
+        by default.
+    units, progress : str, callable, optional
+        Name of the mesh's unit, for the page. ``progress(done, total)`` is called along the way.
+
+    Raises
+    ------
+    UsageError, MeshError
+        On an unknown kernel, a number of centres below 8, or a folder that holds something else; on
+        an unusable mesh.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> ball = trimesh.creation.icosphere(3, 10.0)
+    >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], resolution=16)
+    >>> study.rows[0].kernel
+    'cubic'
+    """
+    if directory is not None:
+        kernels_folder(directory)  # what is in the way is reported now, not after the study
+    vertices, faces, chosen = check_request(mesh, kernels or KERNELS)
+    if min(centres, default=0) < 8:
+        raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
+    judge = ReferenceSurface(vertices, faces, resolution)
+    study = measure_fits(judge, chosen, centres, progress)
+    study.units = units
+    if directory is not None:
+        write_studies({"mesh": study}, directory)
+    return study
+
+
+# Errors this much apart are alike: points of another seed move them as far.
+ALIKE = 1.05
+# Rows beyond this condition are taken only where none that is as accurate is below it.
+SOUND = 1e10
+ENDS = "epsilon lies at an end of its search"
+
+
+class KernelRow(BaseModel):
+    """A kernel with a number of centres: what its field and that field's surface miss.
+
+    ``shape`` is epsilon times the spacing, ``bound`` that of the condition, 0 for none. Errors are
+    in the mesh's unit, of normals in degrees, of the volume relative; ``fit_time`` and
+    ``evaluation_time`` (of 20,000 values) in seconds of processor time. ``trials`` are pairs of a
+    shape and its error, ``unfit`` says why the row cannot be used; ``front`` rows are beaten by no
+    other both in error and in time. What was not measured is None.
+    """
+
+    surface: str = ""
+    kernel: str
+    centres: int
+    epsilon: float = 0.0
+    shape: float | None = None
+    condition: float | None = None
+    bound: float = 0.0
+    rms: float | None = None
+    hausdorff: float | None = None
+    normal_error: float | None = None
+    volume_error: float | None = None
+    fit_time: float | None = None
+    evaluation_time: float | None = None
+    trials: list[tuple[float, float]] = []
+    unfit: str = ""
+    note: str = ""
+    front: bool = False
+
+    @property
+    def error(self) -> float:
+        """The RMS error, infinite where there is none or the row is unfit."""
+        return math.inf if self.unfit or self.rms is None else self.rms
+
+    @property
+    def cost(self) -> float:
+        """What a frame pays for the field: a fit and the values at 20,000 points [s of processor
+        time]; NaN where they were not timed.
+        """
+        return math.nan if self.fit_time is None else self.fit_time + (self.evaluation_time or 0.0)
+
+    @property
+    def title(self) -> str:
+        """The row in words."""
+        return f"{self.kernel}, {self.centres} centres"
+
+    def toml(self) -> str:
+        """The lines of a scene file's model table that give the row."""
+        lines = ["[muscle.model]", 'name = "rbf"', f'kernel = "{self.kernel}"']
+        lines.append(f"centres = {self.centres}")
+        if self.epsilon:
+            lines.append(f"epsilon = {self.epsilon:.6g}")
+        if self.bound:
+            lines.append(f"condition = {self.bound:g}")
+        return "\n".join(lines)
+
+
+class KernelFacts(BaseModel):
+    """What ``kernels.json`` holds: the unit, the library's version, the date, the hash of each mesh
+    by its name, and the rows of all.
+    """
+
+    units: str
+    version: str
+    date: str
+    meshes: dict[str, str]
+    rows: list[KernelRow]
+
+
+def at_end(shape: float) -> bool:
+    """Whether epsilon times the spacing lies at an end of its search, within a scan's step."""
+    low, high = SPAN
+    step = (high / low) ** (1.0 / (SCAN - 1))
+    return shape <= low * step or shape >= high / step
+
+
+def describe(rows: list[KernelRow]) -> str:
+    """What to use of the rows of a study, and why."""
+    best = recommend(rows)
+    if best is None:
+        return "Every field is unfit; take more centres."
+    good = [row for row in rows if not row.unfit and row.centres == best.centres]
+    least = min(row.error for row in good)
+    tied = [row for row in good if row.error <= ALIKE * least]
+    use = f"Use {best.kernel} with {best.centres} centres"
+    counts = {row.centres for row in rows}
+    nearest = min((row for row in rows if not row.unfit), key=lambda row: row.error)
+    most = len(counts) > 1 and nearest.centres == max(counts)
+    more = " The most centres that were tried err least; more may err less still." if most else ""
+    if len(tied) == 1:
+        less = 100 * (
+            1 - best.error / min((row.error for row in good if row is not best), default=math.inf)
+        )
+        behind = (
+            f": its error is {less:.0f} % less than that of the next kernel"
+            if len(good) > 1
+            else ""
+        )
+        return f"{use}{behind}.{more}"
+    names = ", ".join(row.kernel for row in tied)
+    near = f"the errors of {names} are within {100 * (ALIKE - 1):.0f} % of the least"
+    shape = "" if best.epsilon else " and needs no shape parameter"
+    return f"{use}: {near}, and of these {best.kernel} is among the quickest{shape}.{more}"
+
+
+def recommend(rows: list[KernelRow]) -> KernelRow | None:
+    """The quickest of the rows that err at most 5 % more than the best, None where every one is
+    unfit.
+
+    Sound conditions come first; of rows alike in time, within 15 %, those without a parameter to
+    choose.
+    """
+    good = [row for row in rows if not row.unfit]
+    if not good:
+        return None
+    least = min(row.error for row in good)
+    alike = [row for row in good if row.error <= ALIKE * least]
+    sound = [row for row in alike if (row.condition or math.inf) <= SOUND] or alike
+    quick = min(row.cost for row in sound)
+    alike = [row for row in sound if row.cost <= 1.15 * quick]
+    return min(alike, key=lambda row: (bool(row.epsilon), row.condition or math.inf))
+
+
+# Points of the mesh at which errors are measured, and others that choose epsilon.
+JUDGES, HELD_OUT = 20_000, 2000
+# Cells along the longest side (so many a mean radius, between two bounds). With too few thin rims
+# fall between the nodes: iliacus seems to miss 1.7 mm with 64, sartorius 7.3 with 128, where they
+# miss 0.9 and 1.2.
+CELLS, RANGE = 5.0, (128, 320)
+# Points of one timed evaluation, and the processor time after which enough of them, or of fits, are
+# made [s].
+TIMED, MEASURED = 20_000, 0.05
+# A level zero that encloses so much more or less than the mesh has lost or gained a part of it.
+VOLUME_BOUND = 0.1
+
+
+class ReferenceSurface:
+    """The surface (vertices (n, 3), faces (m, 3)) that is to be met, and how far another one is
+    from it.
+
+    ``resolution`` counts cells along the longest side of extracted surfaces; as many as one so
+    slender needs where 0.
+    """
+
+    def __init__(self, vertices: Floats, faces: Integers, resolution: int = 0) -> None:
+        self.vertices = vertices
+        self.faces = faces
+        self.volume = mesh_volume(vertices, faces)
+        radius = 2.0 * self.volume / vertex_areas(vertices, faces).sum()
+        self.axes = principal_axes(vertices)
+        if resolution and resolution < 4:
+            raise UsageError(f"resolution must be at least 4 cells, got {resolution}")
+        self.resolution = resolution or int(
+            np.clip(CELLS * np.ptp(vertices @ self.axes[0]) / radius, *RANGE)
+        )
+        self.distance = MeshDistance(vertices, faces)
+        self.points, which = spread_points(vertices, faces, JUDGES)
+        normal = face_normals(vertices, faces)[which]
+        self.normals = normal / np.linalg.norm(normal, axis=1)[:, None]
+        self.held_out = spread_points(vertices, faces, HELD_OUT, seed=1)[0]
+
+    def apart(self, vertices: Floats, faces: Integers) -> tuple[float, float]:
+        """RMS and greatest distance of a surface, both ways [length]."""
+        there = MeshDistance(vertices, faces, closed=False).unsigned(self.points)
+        back = self.distance.unsigned(vertices)
+        rms = float(np.sqrt(0.5 * ((there**2).mean() + (back**2).mean())))
+        return rms, float(max(there.max(), back.max()))
+
+
+def check_request(mesh: MeshLike, kernels: Iterable[str]) -> tuple[Floats, Integers, list[Kernel]]:
+    """Vertices and faces of a mesh, and kernels by name; MeshError and UsageError for what cannot
+    be studied.
+    """
+    named = [get_kernel(name) for name in kernels]
+    return *check_mesh(*(mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces))), named
+
+
+class Measured(NamedTuple):
+    """What one row found: a row of `KernelStudy.rows` without times, the fitted centres, how, and
+    the surface.
+    """
+
+    row: KernelRow
+    sample: SurfaceSample
+    fit: FieldFit
+    surface: tuple[Floats, Integers] | None
+
+
+def measure_row(judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel) -> Measured:
+    """One row of the table, its times left open, and its surface."""
+    fit = FieldFit(kernel, 1.0, BOUND if kernel.has_epsilon else np.inf)
+    note = "" if kernel.hermite else "values on and off the surface, the kernel is not C2"
+    row = KernelRow(kernel=kernel.name, centres=len(sample.points), note=note)
+    surface = None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NumericalWarning)
+        try:
+            fit = _chosen_fit(row, judge, sample, fit)
+            surface = _measure(row, judge, sample, fit.fit(sample.points, sample.normals))
+        except (ValueError, np.linalg.LinAlgError) as error:
+            row.unfit = " ".join(str(error).split())
+    return Measured(row, sample, fit, surface)
+
+
+def _chosen_fit(
+    row: KernelRow, judge: ReferenceSurface, sample: SurfaceSample, fit: FieldFit
+) -> FieldFit:
+    """The fit with the epsilon of the least error, or with a bounded condition where it needs one;
+    both are written into the row.
+    """
+    points, normals = sample.points, sample.normals
+    if fit.kernel.has_epsilon:
+        choice = choose_epsilon(
+            points, normals, fit, held_out=judge.held_out, distance=judge.distance.unsigned
+        )
+        row.trials = [(shape, error) for shape, error in choice.trials.tolist()]
+        row.epsilon = choice.epsilon
+        row.shape = choice.epsilon * float(spacing(points).mean())
+        if choice.broken:
+            raise ValueError(choice.broken)
+        return replace(fit, epsilon=choice.epsilon)
+    if fit.fit(points, normals).condition > BOUND:
+        row.bound = BOUND
+        return replace(fit, condition=BOUND)
+    return fit
+
+
+def _measure(
+    row: KernelRow, judge: ReferenceSurface, sample: SurfaceSample, field: RBFField
+) -> tuple[Floats, Integers]:
+    """Write what is measured of a field into the row; its surface."""
+    row.condition = float(field.condition)
+    gradient = field.gradient(judge.points[::5])
+    cosine = np.einsum("ij,ij->i", gradient, judge.normals[::5])
+    cosine /= np.maximum(np.linalg.norm(gradient, axis=1), np.finfo(float).tiny)
+    row.normal_error = float(
+        np.degrees(np.sqrt((np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2).mean()))
+    )
+    sheets = find_sheets(field, sample.points, judge.distance.unsigned)
+    if sheets.is_open:
+        raise ValueError(
+            "the level set is open: it leaves the box of the muscle; take more centres"
+        )
+    if sheets.stray:
+        raise ValueError(f"{sheets.stray} sheets beside those of the mesh; take more centres")
+    found = extract_surface(
+        field, points=sample.points, resolution=judge.resolution, axes=judge.axes
+    )
+    row.volume_error = found.volume / judge.volume - 1.0
+    if abs(row.volume_error) > VOLUME_BOUND:
+        row.unfit = f"{100 * row.volume_error:+.3g} % of volume, beyond {100 * VOLUME_BOUND:g}"
+    row.rms, row.hausdorff = judge.apart(found.vertices, found.faces)
+    return found.vertices, found.faces
+
+
+def time_row(found: Measured, points: Floats) -> None:
+    """Write into a row what a fit, and values at 20,000 points (n, 3), cost [s of processor time,
+    one thread].
+    """
+    row = found.row
+    sample = found.sample
+    parts = overlapping_parts(found.sample.points)
+    with warnings.catch_warnings(), threads_limited(1):
+        warnings.simplefilter("ignore", NumericalWarning)  # it stands in the row's condition
+        field = found.fit.fit(sample.points, sample.normals, parts)
+        row.fit_time = _spent(lambda: found.fit.fit(sample.points, sample.normals, parts))
+        field(points[:TIMED])
+        row.evaluation_time = _spent(lambda: field(points[:TIMED]))
+
+
+def _spent(work: Callable[[], object]) -> float:
+    """Processor time of some work, done as often as a coarse clock needs [s]."""
+    start, runs = time.process_time(), 0
+    while runs == 0 or time.process_time() - start < MEASURED:
+        work()
+        runs += 1
+    return (time.process_time() - start) / runs
+
+
+@dataclass
+class KernelStudy:
+    """What `rbfmuscle.study_kernels` found.
+
+    ``rows`` are `KernelRow` for each kernel and number of centres, the smallest error first, unfit
+    ones last. ``surfaces`` (vertices, faces) are those of the rows, None where there is none.
+    ``recommended`` is the quickest row that errs at most 5 % more than the best, None where every
+    one is unfit. ``sha256`` is that of the mesh.
+    """
+
+    rows: list[KernelRow] = field(repr=False)
+    surfaces: list[tuple[Floats, Integers] | None] = field(default_factory=list, repr=False)
+    units: str = ""
+    recommended: KernelRow | None = None
+    sha256: str = ""
+
+
+def measure_fits(
+    judge: ReferenceSurface,
+    kernels: Sequence[Kernel],
+    counts: Sequence[int],
+    progress: OnProgress | None,
+) -> KernelStudy:
+    """Fit a surface with each kernel and number of centres, and measure each fit."""
+    calls = []
+    for count in counts:
+        sample = sample_surface(judge.vertices, judge.faces, int(count), placement="greedy")
+        calls += [(sample, kernel) for kernel in kernels]
+    found = _measure_all(judge, calls, progress)
+    _refuse_coarse([one.row for one in found])
+    for one in found:  # when nothing else runs
+        if not one.row.unfit:
+            time_row(one, judge.points)
+    found.sort(
+        key=lambda one: (bool(one.row.unfit), np.inf if one.row.rms is None else one.row.rms)
+    )
+    rows = [one.row for one in found]
+    good = [row for row in rows if not row.unfit]
+    front = pareto_front([row.error for row in good], [row.cost for row in good])
+    for row in rows:  # no other row beats those of the front both in error and in time
+        row.front = any(row is good[index] for index in front)
+    surfaces = [one.surface for one in found]
+    sha256 = mesh_hash(judge.vertices, judge.faces)
+    return KernelStudy(rows, surfaces, recommended=recommend(rows), sha256=sha256)
+
+
+def _measure_all(
+    judge: ReferenceSurface,
+    calls: list[tuple[SurfaceSample, Kernel]],
+    progress: OnProgress | None,
+) -> list[Measured]:
+    """What the rows of calls found, in their order, measured side by side on threads."""
+    lock, done = threading.Lock(), []
+
+    def measure(call: tuple[SurfaceSample, Kernel]) -> Measured:
+        found = measure_row(judge, *call)
+        with lock:
+            done.append(found)
+            if progress is not None:
+                progress(len(done), len(calls))
+        return found
+
+    # Filters of warnings belong to all threads: what each row sets is undone here.
+    with warnings.catch_warnings(), blas_limited(1):
+        warnings.simplefilter("ignore", NumericalWarning)
+        return each(measure, calls)
+
+
+def _refuse_coarse(rows: list[KernelRow]) -> None:
+    """Name rows unfit that err more than `linear`, the coarsest sensible kernel, with as many
+    centres.
+    """
+    bounds = {row.centres: row.error for row in rows if row.kernel == "linear" and not row.unfit}
+    for row in rows:
+        bound = bounds.get(row.centres)
+        if not row.unfit and bound is not None and row.error > bound:
+            row.unfit = f"an error of {row.error:.3g}, beyond that of linear, {bound:.3g}"
+
+
+# Kernels that take part by default, the quickest first.
+CANDIDATES = ("cubic", "quintic", "skala_cervenka", "matern_52")
+FEWEST, MOST = 20, GREEDY_LARGEST
+# Numbers of centres closer than this share are alike; power of the number by which the error falls.
+STEP, POWER = 0.04, 1.4
+
+
+class TriedFit(NamedTuple):
+    """A kernel with a number of centres, and its error [length], infinite where it is unfit."""
+
+    kernel: str
+    centres: int
+    error: float
+
+
+@dataclass
+class CentreSearchResult:
+    """What `reach_error` found.
+
+    ``row`` is as in `KernelStudy.rows`: the one that reached the ``wanted`` error, else that of the
+    smallest error; ``error`` is its [length]; ``tried`` is all that was measured, in order.
+    """
+
+    reached: bool
+    row: KernelRow
+    error: float
+    wanted: float
+    tried: list[TriedFit] = field(default_factory=list)
+
+    def describe(self, name: str, units: str = "") -> str:
+        """One line on the surface of this name: what reaches the wanted error, or what the best
+        reached.
+        """
+        unit, said = f" {units}" if units else "", self.row.title
+        if self.row.unfit:
+            return f"{name}: no field is fit; take more centres or another kernel"
+        if self.reached:
+            return f"{name}: {said} reaches {self.error:.3g}{unit} RMS, wanted {self.wanted:g}"
+        return (
+            f"{name}: {self.wanted:g}{unit} RMS is not reached; the best, {said}, reaches "
+            f"{self.error:.3g}; "
+            "take other kernels, or a larger error"
+        )
+
+
+def reach_error(
+    mesh: MeshLike,
+    error: float,
+    *,
+    kernels: Sequence[str] | None = None,
+    progress: OnProgress | None = None,
+) -> CentreSearchResult:
+    """Find the fewest centres, 20 to 1000, the kernel and its setting that meet a surface to a
+    wanted error.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
+        Closed, outward.
+    error : float
+        Root mean square distance both ways between mesh and extracted surface [length].
+    kernels : list of str, optional
+        By default cubic, quintic, skala_cervenka and matern_52.
+    progress : callable, optional
+        Called as ``progress(done, total)``; the total grows with what is found.
+
+    Raises
+    ------
+    UsageError, MeshError
+        On an error that is not positive, or an unknown kernel; on an unusable mesh.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> ball = trimesh.creation.icosphere(3, 10.0)
+    >>> found = reach_error(ball, 0.1, kernels=["cubic"])
+    >>> found.reached, found.row.kernel, found.error <= 0.1
+    (True, 'cubic', True)
+    """
+    if not 0.0 < error < np.inf:
+        raise UsageError(f"error must be a positive length, got {error}")
+    vertices, faces, named = check_request(mesh, kernels or CANDIDATES)
+    search = _Search(ReferenceSurface(vertices, faces), float(error), progress)
+    for kernel in named:
+        search.try_kernel(kernel)
+    return search.result()
+
+
+class _Search:
+    """Rows by kernel and number of centres, and the best so far."""
+
+    def __init__(
+        self,
+        judge: ReferenceSurface,
+        error: float,
+        progress: OnProgress | None,
+    ) -> None:
+        self.judge = judge
+        self.error = error
+        self.progress = progress
+        self.sample = cache(
+            partial(sample_surface, judge.vertices, judge.faces, placement="greedy")
+        )
+        self.found: dict[tuple[str, int], Measured] = {}
+        self.best: tuple[str, int] | None = None
+
+    def measure(self, kernel: Kernel, count: int) -> float:
+        """Error of a kernel with so many centres [length], infinite where it broke."""
+        key = kernel.name, count
+        if key not in self.found:
+            self.found[key] = measure_row(self.judge, self.sample(count), kernel)
+            if self.progress is not None:
+                self.progress(len(self.found), max(len(self.found) + 1, 8))
+        error = self.found[key].row.error
+        if error <= self.error and (self.best is None or count < self.best[1]):
+            self.best = key
+        return error
+
+    def try_kernel(self, kernel: Kernel) -> None:
+        """The fewest centres of a kernel, where it may need fewer than the best so far."""
+        low, high = FEWEST - 1, MOST + 1
+        if self.best is not None:  # only what serves with fewer than the best is worth more fits
+            high = int((1.0 - STEP) * self.best[1])
+            if high < FEWEST or self.measure(kernel, high) > self.error:
+                return
+        count = min(120, high - 1)
+        while high > low + max(1, STEP * low):
+            missed = self.measure(kernel, count)
+            low, high = (low, count) if missed <= self.error else (count, high)
+            if low >= FEWEST and high <= MOST:
+                count = round(math.sqrt(low * high))
+            else:  # by the power law, while one end is open
+                factor = (missed / self.error) ** (1.0 / POWER) if math.isfinite(missed) else 2.0
+                beyond = 0.9 if missed <= self.error else 1.1
+                count = round(count * float(np.clip(factor, 0.4, 2.5)) * beyond)
+            count = int(np.clip(count, low + 1, high - 1)) if high > low + 1 else high
+
+    def result(self) -> CentreSearchResult:
+        """The row of fewest centres that reaches the error, or that of the smallest error."""
+        least = min(self.found, key=lambda key: self.found[key].row.error)
+        found = self.found[self.best or least]
+        if not found.row.unfit:
+            time_row(found, self.judge.points)
+        tried = [TriedFit(*key, one.row.error) for key, one in self.found.items()]
+        return CentreSearchResult(
+            self.best is not None, found.row, found.row.error, self.error, tried
+        )
+
+
+# Quantity: heading, factor.
+COLUMNS = {
+    "centres": ("centres", 1.0),
+    "shape": ("epsilon times spacing", 1.0),
+    "rms": ("RMS error", 1.0),
+    "hausdorff": ("greatest error", 1.0),
+    "normal_error": ("normals [°]", 1.0),
+    "volume_error": ("volume [%]", 100.0),
+    "condition": ("condition", 1.0),
+    "fit_time": ("fit [ms]", 1e3),
+    "evaluation_time": ("20,000 values [ms]", 1e3),
+}
+FILES = ("kernels.csv", "kernels.json", "kernels.html")
+_MOST_LIGHTS = 5  # rows at the top of the page
+_READING = """A kernel's shape parameter is chosen by the error at other points of the mesh.
+Distances are measured both ways between mesh and extracted surface, root mean square and
+greatest. Recommended is the quickest row (a fit and 20,000 values) whose error is at most 5 %
+more than the least one; of rows with the same time, one without a shape parameter, then the
+best-conditioned one. No other row has both a smaller error and a shorter time than a row on the
+front. A kernel that is not C2 cannot be fitted to normals: it is fitted to values on and off the
+surface."""
+
+
+def kernels_folder(directory: str | Path) -> OutputFolder:
+    """The folder of a kernel study; UsageError if something in it is in the way."""
+    return OutputFolder(directory, "kernels", (*FILES, "error.json"))
+
+
+def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> None:
+    """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html`` of studies by the names of their
+    surfaces.
+    """
+    facts = KernelFacts(
+        units=next(iter(studies.values())).units,
+        version=versions()["rbfmuscle"],
+        date=datetime.date.today().isoformat(),
+        meshes={name: study.sha256 for name, study in studies.items()},
+        rows=[
+            row.model_copy(update={"surface": name})
+            for name, study in studies.items()
+            for row in study.rows
+        ],
+    )
+    with kernels_folder(directory).staged() as stage:
+        names = [name for name in KernelRow.model_fields if name != "trials"]
+        rows = [[getattr(row, name) for name in names] for row in facts.rows]
+        write_csv(stage / "kernels.csv", [names, *rows])
+        (stage / "kernels.json").write_text(json_text(facts.model_dump()), encoding="utf-8")
+        write_page(stage, facts)
+
+
+def write_page(directory: Path, facts: KernelFacts) -> None:
+    """Write ``kernels.html`` of what ``kernels.json`` holds."""
+    studies = {}
+    for name, digest in facts.meshes.items():
+        rows = [row for row in facts.rows if row.surface == name]
+        studies[name] = KernelStudy(rows, [], facts.units, recommend(rows), digest)
+    made = f"rbfmuscle {facts.version}, {facts.date}"
+    _page(studies, made).write(directory / "kernels.html")
+
+
+def answer(studies: Mapping[str, KernelStudy]) -> str:
+    """What to use and why: of one surface its own sentence, of several the kernel that is near the
+    best on most.
+    """
+    if len(studies) == 1:
+        return describe(next(iter(studies.values())).rows)
+    tied: Counter[str] = Counter()
+    for study in studies.values():
+        good = [row for row in study.rows if not row.unfit]
+        tied.update({row.kernel for row in good if row.error <= ALIKE * good[0].error})
+    if not tied:
+        return "Every field is unfit on every surface; take more centres."
+    chosen = Counter(study.recommended.kernel for study in studies.values() if study.recommended)
+    kernel = max(chosen, key=lambda name: (tied[name], chosen[name]))
+    return (
+        f"Use {kernel}: within 5 % of the least error on {tied[kernel]} of {len(studies)} muscles, "
+        f"and the quickest such kernel on {chosen[kernel]}."
+    )
+
+
+def _page(studies: Mapping[str, KernelStudy], made: str) -> ReportPage:
+    several, rows = len(studies) > 1, [row for study in studies.values() for row in study.rows]
+    units = next(iter(studies.values())).units
+    surfaces = f"all {len(studies)} muscles" if several else next(iter(studies)).replace("_", " ")
+    kernels = len({row.kernel for row in rows})
+    counts = ", ".join(map(str, sorted({row.centres for row in rows})))
+    found = {name: study.recommended for name, study in studies.items() if study.recommended}
+    code = "\n\n".join(f"# {name}\n{row.toml()}" for name, row in found.items())
+    hint = f"distances in {units or 'mesh units'}"
+    return ReportPage(
+        f"Kernels for {surfaces}",
+        [
+            f"{kernels} kernels",
+            f"{counts} centres",
+            *["every muscle; --muscles for some"][:several],
+            made,
+        ],
+        answer(studies),
+        GOOD if found else BAD,
+        plot=_plot(studies, units),
+        lights=_lights(studies, units),
+        heads=["RMS error", "fit and 20,000 values"],
+        sections=[
+            *(
+                Section(f"Fitted rows of {name}", f"{hint}; mesh {s.sha256[:12]}", table=_rows(s))
+                for name, s in studies.items()
+            ),
+            *(
+                Section(f"Unfit rows of {name}", hint, table=_rows(s, unfit=True))
+                for name, s in studies.items()
+                if any(row.unfit for row in s.rows)
+            ),
+            *(
+                Section(f"Error against epsilon: {name}", plots=_curves(s))
+                for name, s in studies.items()
+                if any(row.trials for row in s.rows)
+            ),
+            Section("To paste at the end of a [[muscle]]", code=code),
+            Section("How to read this", text=_READING),
+        ],
+    )
+
+
+def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[CheckRow]:
+    """Of one surface its best rows, each with whether it ties; of several what is recommended for
+    each.
+    """
+    chosen = [
+        (name, study.recommended, GOOD) for name, study in studies.items() if study.recommended
+    ]
+    if len(studies) == 1:
+        (study,) = studies.values()
+        good = [row for row in study.rows if not row.unfit]
+        others = [row for row in good if row is not study.recommended]
+        chosen = [("recommended", row, GOOD) for _, row, _ in chosen]
+        chosen += [
+            ("", row, GOOD if row.error <= ALIKE * good[0].error else PLAIN) for row in others
+        ]
+        chosen = chosen[:_MOST_LIGHTS]
+    cells = [[number_cell(row.rms, units, s), number_cell(row.cost, "s")] for _, row, s in chosen]
+    return [CheckRow(row.title, pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
+
+
+def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
+    """Error against the time of a fit and 20,000 values: a colour a surface, or of one a number of
+    centres.
+    """
+    points = []
+    for name, study in studies.items():
+        for row in study.rows:
+            if not row.unfit:
+                group = name if len(studies) > 1 else f"{row.centres} centres"
+                place = 1e3 * row.cost, row.error, row.kernel, group
+                points.append(Point(*place, row is study.recommended, row.front))
+    labels = ("a fit and 20,000 values [ms of one thread]", f"RMS error [{units or 'mesh units'}]")
+    return front_plot(points, labels)
+
+
+def _curves(study: KernelStudy) -> list[str]:
+    """For each number of centres the error at the held-out points against epsilon, by kernel."""
+    pictures = []
+    unit = study.units or "mesh units"
+    for count in dict.fromkeys(row.centres for row in study.rows):
+        rows = [row for row in study.rows if row.centres == count and row.trials]
+        tracks = []
+        for row, colour in zip(rows, cycle(MUSCLE_COLOURS)):
+            shapes, errors = np.array(row.trials).T
+            tracks.append(Track(row.kernel, colour, np.log10(shapes), np.log10(errors)))
+        labels = "log10 of epsilon times spacing", f"log10 of the RMS error [{unit}]"
+        if tracks:
+            pictures.append(line_plot(f"{count} centres", tracks, labels, legend=True))
+    return pictures
+
+
+def _rows(study: KernelStudy, *, unfit: bool = False) -> Table:
+    rows = []
+    for row in (row for row in study.rows if bool(row.unfit) == unfit):
+        state = GOOD if row is study.recommended else BAD if row.unfit else PLAIN
+        front = "on the front" if row.front else ""
+        verdict = row.unfit or ("recommended" if row is study.recommended else front)
+        verdict = "; ".join(
+            filter(None, [verdict, ENDS if row.shape and at_end(row.shape) else ""])
+        )
+        values = [(getattr(row, name), factor) for name, (_, factor) in COLUMNS.items()]
+        texts = [
+            shown_number(x * factor) if isinstance(x, float) else str(x or "")
+            for x, factor in values
+        ]
+        rows.append([Cell(row.kernel), Cell(verdict, state), *map(Cell, texts)])
+    return Table(["kernel", "verdict", *(head for head, _ in COLUMNS.values())], rows)
