@@ -27,7 +27,7 @@ from leg_tendons import convert
 from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.metrics.centreline import NODES, shortest_path
 from rbfmuscle.metrics.published import published_band
-from rbfmuscle.run import simulate
+from rbfmuscle.recording import simulate
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_settings

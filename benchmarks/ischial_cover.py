@@ -16,7 +16,7 @@ import numpy as np
 from evidence import data_folder, write_evidence
 
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.run import simulate
+from rbfmuscle.recording import simulate
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene

@@ -20,7 +20,7 @@ import numpy as np
 from evidence import data_folder, write_evidence
 from leg_tendons import convert
 
-from rbfmuscle.run import simulate
+from rbfmuscle.recording import simulate
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene
 

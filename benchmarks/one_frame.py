@@ -17,7 +17,7 @@ from pathlib import Path
 os.environ["NUMBA_NUM_THREADS"] = "1"
 
 import rbfmuscle as rm
-from rbfmuscle.run import stream_run
+from rbfmuscle.recording import stream_run
 
 OURS = str(Path(rm.__file__).parent) + os.sep
 THREADS = OURS + "geometry/threads.py"

@@ -26,7 +26,7 @@ from peers.load_steps import follow, nearest_bone
 from scipy.spatial import cKDTree
 
 from rbfmuscle.metrics.metrics import surface_distance
-from rbfmuscle.run import simulate
+from rbfmuscle.recording import simulate
 from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.scene import Scene

@@ -8,7 +8,7 @@ import numpy as np
 from pictures import draw, folder
 
 import rbfmuscle as rm
-from rbfmuscle.output.export import export_run
+from rbfmuscle.display.export import export_run
 
 out = folder("exporting")
 scene = rm.phantom_scene()

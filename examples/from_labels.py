@@ -21,7 +21,7 @@ from pictures import folder
 
 import rbfmuscle as rm
 from rbfmuscle.cli import main
-from rbfmuscle.run import Run
+from rbfmuscle.recording import Run
 
 out = folder("from_labels")
 VOXEL = 1.5

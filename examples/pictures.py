@@ -6,7 +6,7 @@ Not an example itself.
 import sys
 from pathlib import Path
 
-from rbfmuscle.report.render import render_run
+from rbfmuscle.display.pictures import render_run
 
 
 def folder(name):

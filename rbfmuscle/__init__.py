@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from rbfmuscle.models import model_kind as model_kind
     from rbfmuscle.models import register_model as register_model
     from rbfmuscle.muscle.muscle import RBFMuscle as RBFMuscle
-    from rbfmuscle.run import Run as Run
-    from rbfmuscle.run import simulate as simulate
+    from rbfmuscle.recording import Run as Run
+    from rbfmuscle.recording import simulate as simulate
     from rbfmuscle.scene.check import check_scene as check_scene
     from rbfmuscle.scene.phantom import phantom_scene as phantom_scene
     from rbfmuscle.scene.scene import Scene as Scene
@@ -55,7 +55,7 @@ _HOME = {
     "ModelKind": "rbfmuscle.models",
     "RBFField": "rbfmuscle.implicit.field",
     "RBFMuscle": "rbfmuscle.muscle.muscle",
-    "Run": "rbfmuscle.run",
+    "Run": "rbfmuscle.recording",
     "Scene": "rbfmuscle.scene.scene",
     "check_scene": "rbfmuscle.scene.check",
     "compare_models": "rbfmuscle.studies.compare",
@@ -66,7 +66,7 @@ _HOME = {
     "register_model": "rbfmuscle.models",
     "reach_error": "rbfmuscle.studies.kernels",
     "show": "rbfmuscle.viewer.page",
-    "simulate": "rbfmuscle.run",
+    "simulate": "rbfmuscle.recording",
     "study_kernels": "rbfmuscle.studies.kernels",
     "sweep": "rbfmuscle.studies.sweep",
     **dict.fromkeys(_ERRORS, "rbfmuscle.validation"),

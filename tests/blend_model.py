@@ -85,7 +85,7 @@ def arm_files(folder, name="arm.toml", *, end=10, step=5, muscles=(("biceps", 0.
 
 
 def use_blend_model(monkeypatch, fail_at=None):
-    """Let `rbfmuscle.run` build BlendMuscle for every muscle."""
+    """Let `rbfmuscle.recording` build BlendMuscle for every muscle."""
     monkeypatch.setattr(BlendMuscle, "fail_at", fail_at)
     monkeypatch.setattr("rbfmuscle.models.build_model", BlendMuscle)
 

@@ -109,7 +109,7 @@ def arm_run(tmp_path_factory):
     """
     from blend_model import arm_scene, use_blend_model
 
-    from rbfmuscle.run import simulate
+    from rbfmuscle.recording import simulate
 
     folder = tmp_path_factory.mktemp("arm")
     with pytest.MonkeyPatch.context() as patch:

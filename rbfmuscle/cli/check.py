@@ -40,7 +40,7 @@ def check(
     facts: dict[str, object] = {}
     with Progress(f"check {scene.name}"), work.threads():
         if picture:
-            from rbfmuscle.report.render import check_picture
+            from rbfmuscle.display.pictures import check_picture
 
             check_picture(scene.with_suffix(".png"))
         loaded, findings = _findings(scene)
@@ -63,7 +63,7 @@ def check(
 
 
 def _draw(scene, path):
-    from rbfmuscle.report.scene_picture import draw_scene
+    from rbfmuscle.display.pictures import draw_scene
 
     with stage("drawing the picture"):
         draw_scene(scene, path)
@@ -182,7 +182,7 @@ def _measure_time(scene):
     """Wall time of a run without report, pictures and files [s], extrapolated from its first three
     frames.
     """
-    from rbfmuscle.run import simulate
+    from rbfmuscle.recording import simulate
 
     start = perf_counter()
     frames = simulate(scene, frames=slice(0, 3)).frames

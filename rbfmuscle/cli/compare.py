@@ -86,7 +86,7 @@ def _excess(models, output, limits):
     """The error that a run is beyond a limit of ``--fail-on``; None where none is."""
     from rbfmuscle.metrics.summary import Summary
     from rbfmuscle.metrics.verdict import require_limits
-    from rbfmuscle.output.run_data import RunData
+    from rbfmuscle.run.data import RunData
 
     texts = []
     for name in models if limits.fail_on else ():

@@ -134,7 +134,7 @@ def _open(path):
 
 def _open_runs(folder):
     """The run in a folder, or those of the models of a comparison, by name."""
-    from rbfmuscle.output.run_data import RunData
+    from rbfmuscle.run.data import RunData
 
     inside = sorted(path.parent for path in folder.glob("*/run.json"))
     if (folder / "run.json").exists() or not inside:
@@ -146,8 +146,8 @@ def _draw(opened, model, stops, path):
     """Draw a run's frame, or a scene's pose after a run to it, in the way `rbfmuscle render`
     does.
     """
-    from rbfmuscle.report.render import check_picture, render_run
-    from rbfmuscle.run import simulate
+    from rbfmuscle.display.pictures import check_picture, render_run
+    from rbfmuscle.recording import simulate
 
     check_picture(path)
     if isinstance(opened, dict):
@@ -206,7 +206,7 @@ def export(
         Frames per second of animated-glb and usd; by default the times of the motion's file, or 24.
     """
     with Progress(f"export {directory}"):
-        from rbfmuscle.output.export import export_run
+        from rbfmuscle.display.export import export_run
         from rbfmuscle.scene.frames import parse_slice
 
         chosen = parse_slice(frames) if frames is not None else None
@@ -256,7 +256,7 @@ def render(
         Length of an animation; 5 by default.
     """
     with Progress(f"render {directory}"):
-        from rbfmuscle.report.render import render_run
+        from rbfmuscle.display.pictures import render_run
 
         views = split_list(view) or None
         with stage("drawing pictures"):
@@ -281,8 +281,8 @@ def report(
         Draw pictures and the animation.
     """
     with Progress(f"report {directory}"), stage("drawing pictures" if pictures else "writing"):
-        from rbfmuscle.output.run_data import RunData
-        from rbfmuscle.report.redraw import redraw_run
+        from rbfmuscle.display.report import redraw_run
+        from rbfmuscle.run.data import RunData
 
         failed, page = None, directory / "report.html"
         study = _redraw_study(directory, pictures=pictures)

@@ -37,7 +37,7 @@ def print_result(
     code.
     """
     if printing.as_json:
-        from rbfmuscle.output.writer import json_text
+        from rbfmuscle.run.writer import json_text
 
         failed = {} if error is None else {"error": str(error), "exit_code": error.exit_code}
         print(json_text({**facts, **failed}))

@@ -78,8 +78,8 @@ def run(
 
     failed: RBFMuscleError | None = None
     with Progress(scene.stem) as progress, interruption.keeping(kept), work.threads():
-        from rbfmuscle.output.run_data import RunData
-        from rbfmuscle.run import stream_run
+        from rbfmuscle.recording import stream_run
+        from rbfmuscle.run.data import RunData
         from rbfmuscle.scene.phantom import open_scene
 
         settings, loaded = changes.parse_settings(), open_scene(scene)

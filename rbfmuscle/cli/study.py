@@ -189,7 +189,7 @@ def _study_lines(studies, output):
 
 def _find_wanted(meshes, output, find, units, printing):
     """Find, print and write what reaches an error; where it is not reached, that is said."""
-    from rbfmuscle.output.writer import json_text
+    from rbfmuscle.run.writer import json_text
     from rbfmuscle.studies.kernels import kernels_folder
 
     facts = {}

@@ -12,7 +12,7 @@ from rbfmuscle.metrics.verdict import (
     find_remedy,
     worst_first,
 )
-from rbfmuscle.output.run_data import RunData
+from rbfmuscle.run.data import RunData
 from rbfmuscle.scene.phantom import PHANTOM
 
 MOST = 3  # values beyond limits, and remedies, that are named

@@ -11,6 +11,19 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from pydantic import BaseModel
 
+from rbfmuscle.display.page import (
+    BAD,
+    GOOD,
+    PLAIN,
+    Cell,
+    CheckRow,
+    ReportPage,
+    Section,
+    Table,
+    limit_state,
+)
+from rbfmuscle.display.plots import Track, arm_unit, line_plot, motion_axis
+from rbfmuscle.display.report import packed_scene
 from rbfmuscle.folders import OutputFolder, given_folder
 from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
@@ -23,24 +36,11 @@ from rbfmuscle.models import (
     model_title,
     solved_points,
 )
-from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.output.run_data import RunData, moment_arm_coordinates
-from rbfmuscle.output.writer import machine, run_folder, versions, write_csv, write_json
 from rbfmuscle.progress import stage
-from rbfmuscle.report.page import (
-    BAD,
-    GOOD,
-    PLAIN,
-    Cell,
-    CheckRow,
-    ReportPage,
-    Section,
-    Table,
-    limit_state,
-)
-from rbfmuscle.report.plots import Track, arm_unit, line_plot, motion_axis
-from rbfmuscle.report.report import packed_scene
-from rbfmuscle.run import stream_run
+from rbfmuscle.recording import stream_run
+from rbfmuscle.run.appearance import MUSCLE_COLOURS
+from rbfmuscle.run.data import RunData, moment_arm_coordinates
+from rbfmuscle.run.writer import machine, run_folder, versions, write_csv, write_json
 from rbfmuscle.scene.frames import pick_frames
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.options import OutputOptions

@@ -22,6 +22,18 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import BaseModel
 
+from rbfmuscle.display.page import (
+    BAD,
+    GOOD,
+    PLAIN,
+    Cell,
+    CheckRow,
+    ReportPage,
+    Section,
+    Table,
+    number_cell,
+)
+from rbfmuscle.display.plots import Point, Track, front_plot, line_plot
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.mesh_distance import MeshDistance
@@ -39,20 +51,8 @@ from rbfmuscle.implicit.placement.sampling import (
 )
 from rbfmuscle.implicit.selection import BOUND, SCAN, SPAN, choose_epsilon, spacing
 from rbfmuscle.metrics.summary import shown_number
-from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.output.writer import json_text, versions, write_csv
-from rbfmuscle.report.page import (
-    BAD,
-    GOOD,
-    PLAIN,
-    Cell,
-    CheckRow,
-    ReportPage,
-    Section,
-    Table,
-    number_cell,
-)
-from rbfmuscle.report.plots import Point, Track, front_plot, line_plot
+from rbfmuscle.run.appearance import MUSCLE_COLOURS
+from rbfmuscle.run.writer import json_text, versions, write_csv
 from rbfmuscle.studies.sweep import OnProgress, pareto_front
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
 

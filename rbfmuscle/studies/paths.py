@@ -17,7 +17,7 @@ from rbfmuscle.geometry.threads import each
 from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
-from rbfmuscle.output.writer import write_csv
+from rbfmuscle.run.writer import write_csv
 from rbfmuscle.scene.joints.functions import exponents
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses

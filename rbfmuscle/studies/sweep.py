@@ -20,15 +20,7 @@ from typing import TYPE_CHECKING, TypedDict
 import numpy as np
 from pydantic import BaseModel
 
-from rbfmuscle.folders import OutputFolder, given_folder
-from rbfmuscle.geometry.threads import threads_limited
-from rbfmuscle.metrics.metrics import surface_distance
-from rbfmuscle.metrics.quantities import ALL, QUANTITIES
-from rbfmuscle.metrics.summary import QuantityFacts, shown_number
-from rbfmuscle.models import configure_scene
-from rbfmuscle.output.run_data import RunData
-from rbfmuscle.output.writer import versions, write_csv, write_json
-from rbfmuscle.report.page import (
+from rbfmuscle.display.page import (
     GOOD,
     NEAR,
     PLAIN,
@@ -39,8 +31,16 @@ from rbfmuscle.report.page import (
     Table,
     number_cell,
 )
-from rbfmuscle.report.plots import Point, front_plot
-from rbfmuscle.run import Run, simulate
+from rbfmuscle.display.plots import Point, front_plot
+from rbfmuscle.folders import OutputFolder, given_folder
+from rbfmuscle.geometry.threads import threads_limited
+from rbfmuscle.metrics.metrics import surface_distance
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES
+from rbfmuscle.metrics.summary import QuantityFacts, shown_number
+from rbfmuscle.models import configure_scene
+from rbfmuscle.recording import Run, simulate
+from rbfmuscle.run.data import RunData
+from rbfmuscle.run.writer import versions, write_csv, write_json
 from rbfmuscle.scene.content import content_hash
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_value

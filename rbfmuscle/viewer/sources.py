@@ -17,8 +17,8 @@ from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.metrics.verdict import describe_doubts
 from rbfmuscle.models import build_models, configure_scene, model_names
-from rbfmuscle.output.appearance import muscle_colours, muscle_groups, tendon_mesh
-from rbfmuscle.output.run_data import RunData, frame_caption
+from rbfmuscle.run.appearance import muscle_colours, muscle_groups, tendon_mesh
+from rbfmuscle.run.data import RunData, frame_caption
 from rbfmuscle.scene.activation.contraction import STEP
 from rbfmuscle.scene.joints.joint import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.run import simulate
+from rbfmuscle.recording import simulate
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import UsageError
 

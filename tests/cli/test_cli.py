@@ -118,7 +118,7 @@ class TestRun:
     @pytest.mark.parametrize(
         ("words", "work"),
         [
-            (("run",), "rbfmuscle.run.Recording"),
+            (("run",), "rbfmuscle.recording.Recording"),
             (("compare",), "rbfmuscle.studies.compare._measure"),
             (("kernels", "--centres", "8"), "rbfmuscle.studies.kernels.study_kernels"),
             (("kernels", "--error", "1"), "rbfmuscle.studies.kernels.reach_error"),
@@ -253,7 +253,7 @@ class TestOtherCommands:
         frames = [SimpleNamespace(wall=wall) for wall in (9.0, 0.002, 0.006)]
         for count, frame in ((3, 0.004), (1, 1 / 64 / 11)):
             run = SimpleNamespace(frames=frames[:count])
-            monkeypatch.setattr("rbfmuscle.run.simulate", lambda *_, run=run, **__: run)
+            monkeypatch.setattr("rbfmuscle.recording.simulate", lambda *_, run=run, **__: run)
             build = 1 / 64 - frame * (count - 1)
             found = _measure_time(SimpleNamespace(motion=range(11)))
             assert found == pytest.approx(

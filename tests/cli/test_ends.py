@@ -19,8 +19,8 @@ from blend_model import arm_files, arm_scene, use_blend_model
 from command_line import call
 from tendon_scene import arm
 
-from rbfmuscle.output.export import export_run
-from rbfmuscle.run import Run, stream_run
+from rbfmuscle.display.export import export_run
+from rbfmuscle.recording import Run, stream_run
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.substeps import SubSteps
@@ -51,10 +51,10 @@ class TestInterrupts:
         [
             ("SIGINT", "builtins.__import__", "given[0] == 'cyclopts'", ""),
             ("SIGTERM", "pbd_baseline.muscle._bone_numbers", "True", ""),
-            ("SIGINT", "rbfmuscle.output.writer.write_vtp", "len(calls) == 8", ""),
-            ("SIGTERM", "rbfmuscle.output.writer.write_vtp", "len(calls) == 8", ""),
+            ("SIGINT", "rbfmuscle.run.writer.write_vtp", "len(calls) == 8", ""),
+            ("SIGTERM", "rbfmuscle.run.writer.write_vtp", "len(calls) == 8", ""),
             # As ctypes does in a callback.
-            ("SIGINT", "rbfmuscle.output.writer.write_vtp", "len(calls) == 8", "KeyboardInterrupt"),
+            ("SIGINT", "rbfmuscle.run.writer.write_vtp", "len(calls) == 8", "KeyboardInterrupt"),
         ],
     )
     def test_signal_ends_with_130_wherever_it_comes(self, tmp_path, number, moment, due, lost):

@@ -7,8 +7,8 @@ import sys
 import pytest
 from command_line import call
 
-from rbfmuscle.output.export import export_run
-from rbfmuscle.run import Run
+from rbfmuscle.display.export import export_run
+from rbfmuscle.recording import Run
 
 SCREEN = 80, 24
 

@@ -12,7 +12,7 @@ from conftest import ROOT
 
 import rbfmuscle as rm
 from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.output.run_data import SceneMeshes, frame_caption
+from rbfmuscle.run.data import SceneMeshes, frame_caption
 
 SCRIPT = ROOT / "tests" / "data" / "user_script.py"
 

@@ -13,7 +13,7 @@ import rbfmuscle as rm
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.metrics.published import published_band
-from rbfmuscle.output.appearance import stretch_colours
+from rbfmuscle.run.appearance import stretch_colours
 from rbfmuscle.validation import SceneError, UsageError
 from rbfmuscle.viewer.sources import SavedSource
 

@@ -112,7 +112,7 @@ def read(path: Path, *, may_be_open: bool) -> int:
 def run(path: Path, output: Path, model: str | None) -> int:
     """Three frames by the command line itself, and a look at what it left."""
     from rbfmuscle.cli.app import report_in_lines, run_command
-    from rbfmuscle.run import Run
+    from rbfmuscle.recording import Run
 
     report_in_lines()
     words = ["run", str(path), "-o", str(output), "--frames", "0:3", "--json"]

@@ -31,7 +31,7 @@ from rbfmuscle.geometry.tubes import line_length, points_along, tube_mesh
 from rbfmuscle.importers.guess.attachments import Ends
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
-from rbfmuscle.run import Run
+from rbfmuscle.recording import Run
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.joints.tables import JointTable
 from rbfmuscle.scene.phantom import phantom_scene

@@ -8,6 +8,7 @@ import trimesh
 from blend_model import arm_scene, use_blend_model
 
 from rbfmuscle.cli.verdict import verdict_lines
+from rbfmuscle.display.report import write_report
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
 from rbfmuscle.metrics.rows import joint_gaps
 from rbfmuscle.metrics.summary import (
@@ -21,9 +22,8 @@ from rbfmuscle.metrics.summary import (
     unmeasured,
 )
 from rbfmuscle.metrics.verdict import describe_verdict, judge
-from rbfmuscle.output.run_data import RunData
-from rbfmuscle.report.report import write_report
-from rbfmuscle.run import Run, simulate, stream_run
+from rbfmuscle.recording import Run, simulate, stream_run
+from rbfmuscle.run.data import RunData
 from rbfmuscle.scene.check import check_scene, stated_doubts
 from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.validation import LimitExceededError, UsageError

@@ -14,7 +14,7 @@ from rbfmuscle.metrics.depths import bone_depth, surface_depth
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
 from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.metrics.rows import _roughness, _smoothness, moment_arms
-from rbfmuscle.run import simulate
+from rbfmuscle.recording import simulate
 from rbfmuscle.scene.bone import Bone, BoneDistance
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.scene.objects import Attachment, Motion

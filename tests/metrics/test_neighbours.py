@@ -9,7 +9,7 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.metrics.metrics import MuscleMeasures
 from rbfmuscle.metrics.neighbours import InputNeighbours, NeighbourMeasures, Shown
 from rbfmuscle.metrics.summary import exceeded, parse_limits
-from rbfmuscle.run import simulate
+from rbfmuscle.recording import simulate
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.frame import ModelSurface

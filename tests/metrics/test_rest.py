@@ -7,7 +7,7 @@ from blend_model import BlendMuscle, arm_scene, use_blend_model
 
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.metrics.metrics import bone_overlap, distance_between, rest_errors
-from rbfmuscle.run import simulate
+from rbfmuscle.recording import simulate
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.simulation.frame import ModelSurface
 

@@ -13,8 +13,8 @@ from toy_scene import held
 import rbfmuscle as rm
 from rbfmuscle.geometry.taut_lines import taut_line
 from rbfmuscle.geometry.tubes import line_length
-from rbfmuscle.output.appearance import LONGEST_TAPER, TAPER, tendon_mesh
-from rbfmuscle.run import Run
+from rbfmuscle.recording import Run
+from rbfmuscle.run.appearance import LONGEST_TAPER, TAPER, tendon_mesh
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.tendons import AT_REST, STIFFNESS_RATIO, TendonEnd, TendonLine

@@ -12,7 +12,7 @@ from blend_model import BlendMuscle, arm_scene
 
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.models import build_model
-from rbfmuscle.run import Run
+from rbfmuscle.recording import Run
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.studies.compare import (
     DEEPER,

@@ -9,14 +9,14 @@ import trimesh
 from blend_model import arm_scene
 
 import rbfmuscle as rm
-from rbfmuscle.output.run_data import RunData
+from rbfmuscle.run.data import RunData
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.scene.joints.joint import Coordinate
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession, coordinate_limits
 from rbfmuscle.viewer.marks import KINDS, MarkView, scene_marks
-from rbfmuscle.viewer.panel import Panel
+from rbfmuscle.viewer.page import Panel
 from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.side import vertex_values
 from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource

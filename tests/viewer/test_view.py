@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from command_line import call
 
-from rbfmuscle.report.render import render_run
+from rbfmuscle.display.pictures import render_run
 
 
 def image(path):

@@ -1,6 +1,4 @@
-"""The report of a run: its verdict, the moving scene, five rows with limits; plots and tables
-folded.
-"""
+"""The report of a run."""
 
 import math
 from collections import Counter
@@ -9,6 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.display.animation import pack_runs, read_animation
+from rbfmuscle.display.page import (
+    BAD,
+    GOOD,
+    Cell,
+    CheckRow,
+    ReportPage,
+    Section,
+    Table,
+    limit_state,
+    number_cell,
+)
+from rbfmuscle.display.pictures import chosen_frames, render_run
+from rbfmuscle.display.plots import Band, Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.published import published_band
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
@@ -23,27 +35,24 @@ from rbfmuscle.metrics.summary import (
     limit_ratio,
     meets_limit,
     muscle_limit,
+    parse_limits,
     shown_number,
 )
-from rbfmuscle.metrics.verdict import Verdict, describe_details, describe_unmeasured
-from rbfmuscle.output.animation.page import pack_runs
-from rbfmuscle.output.animation.parts import read_animation
-from rbfmuscle.output.run_data import RunData, moment_arm_coordinates
-from rbfmuscle.report.page import (
-    BAD,
-    GOOD,
-    Cell,
-    CheckRow,
-    ReportPage,
-    Section,
-    Table,
-    limit_state,
-    number_cell,
+from rbfmuscle.metrics.verdict import (
+    Verdict,
+    describe_details,
+    describe_unmeasured,
+    describe_verdict,
+    judge,
+    require_limits,
 )
-from rbfmuscle.report.plots import Band, Track, arm_unit, line_plot, motion_axis
-from rbfmuscle.report.render import chosen_frames, render_run
+from rbfmuscle.run.data import RunData, moment_arm_coordinates
+from rbfmuscle.run.info import RunInfo
+from rbfmuscle.run.writer import PAGES, run_folder, write_json
 from rbfmuscle.scene.objects import from_mm
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Event
+from rbfmuscle.validation import UsageError
 
 # What the rows beside the picture say, and the quantities that each holds to a limit.
 LIGHTS = {
@@ -368,3 +377,49 @@ def _events(events: Sequence[Event]) -> str:
         most = ", ".join(f"{name} {count}" for name, count in found.most_common(6))
         texts.append(f"{kind}: {found.total()} ({most}).")
     return " ".join(texts)
+
+
+def redraw_run(
+    directory: str | Path, *, fail_on: str | None = None, pictures: bool = True
+) -> RunInfo:
+    """Hold a saved run to limits again and write its pages; what ``run.json`` then holds.
+
+    ``fail_on`` are limits as for `parse_limits`, those that the run had where not given;
+    ``pictures`` are those of the report and the preview.
+
+    Raises
+    ------
+    UsageError
+        If the folder holds no run that has ended, or a file that is not the run's is in the way.
+    LimitExceededError
+        If a limit of ``fail_on`` is exceeded, or was not measured; everything is written.
+    """
+    directory = Path(directory)
+    saved = RunData.load(directory)
+    info = saved.info
+    if info.status == "running":
+        raise UsageError(f"{directory} holds a run that has not ended; run the scene again")
+    folder = run_folder(directory)
+    limits = _saved_limits(saved, fail_on)
+    summary = Summary()
+    summary.add(saved.metrics)
+    table = summary.table()
+    verdict = judge(table, limits, info.doubts)
+    info = info.replaced(
+        limits=dict(limits.values),
+        fail_on=dict(limits.fail_on),
+        verdict=describe_verdict(verdict, table, info.scene.missing_bones),
+        **verdict._asdict(),
+    )
+    drawn = pictures and saved.has_surfaces and len(saved.frames) > 1
+    folder.add(*(PAGES if drawn else PAGES[:1]))
+    write_json(directory / "run.json", info.to_dict())
+    write_report(directory, pictures=pictures)
+    require_limits(table, limits)
+    return info
+
+
+def _saved_limits(saved: RunData, fail_on: str | None) -> Limits:
+    given = saved.info.fail_on
+    texts = [name if value is None else f"{name}={value!r}" for name, value in given.items()]
+    return parse_limits(texts if fail_on is None else fail_on, Scene(units=saved.units))

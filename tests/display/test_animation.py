@@ -12,14 +12,14 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.output.animation import page
-from rbfmuscle.output.animation.gltf import _key_name
-from rbfmuscle.output.animation.parts import AnimatedMesh, Animation
-from rbfmuscle.output.export import export_run
-from rbfmuscle.output.run_data import frame_caption
-from rbfmuscle.output.vtp import write_vtp
-from rbfmuscle.report.page import ReportPage
-from rbfmuscle.run import Run
+from rbfmuscle.display import animation as page
+from rbfmuscle.display.animation import AnimatedMesh, Animation
+from rbfmuscle.display.export import export_run
+from rbfmuscle.display.gltf import _key_name
+from rbfmuscle.display.page import ReportPage
+from rbfmuscle.recording import Run
+from rbfmuscle.run.data import frame_caption
+from rbfmuscle.run.vtk_files import write_vtp
 from rbfmuscle.validation import MissingDependencyError, UsageError
 
 TOLERANCE = 1e-6  # [m]: what single precision holds at a metre, with room
@@ -260,7 +260,7 @@ def test_times_of_a_motion_are_those_of_the_files(folder, tmp_path):
 
 
 def test_names_that_usd_does_not_know_stay_apart():
-    from rbfmuscle.output.animation.usd import identifier
+    from rbfmuscle.display.usd import identifier
 
     used = set()
     assert [identifier(name, used) for name in ("a-b", "a_b", "1x")] == ["a_b", "a_b_2", "_x"]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rbfmuscle.display import pictures as render
+from rbfmuscle.display.page import Cell, ReportPage, Section, Table, limit_state
+from rbfmuscle.display.report import write_report
 from rbfmuscle.metrics.summary import shown_number
-from rbfmuscle.output.appearance import muscle_groups
-from rbfmuscle.output.info import JointInfo
-from rbfmuscle.report import render
-from rbfmuscle.report.page import Cell, ReportPage, Section, Table, limit_state
-from rbfmuscle.report.report import write_report
+from rbfmuscle.run.appearance import muscle_groups
+from rbfmuscle.run.info import JointInfo
 from rbfmuscle.validation import UsageError
 
 

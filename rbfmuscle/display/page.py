@@ -88,9 +88,9 @@ class ReportPage:
         """Write the page, which needs no other file; raises SolveError where that fails."""
         from jinja2 import Environment, PackageLoader
 
-        from rbfmuscle.output.animation.page import scene_file
+        from rbfmuscle.display.animation import scene_file
 
-        pages = Environment(loader=PackageLoader("rbfmuscle.report"), autoescape=True)
+        pages = Environment(loader=PackageLoader("rbfmuscle.display"), autoescape=True)
         text = pages.get_template("page.html").render(page=self, scene_file=scene_file)
         try:
             write_whole(path, text)

@@ -11,12 +11,12 @@ import trimesh
 from blend_model import arm_files
 
 from rbfmuscle.cli.printing import one_line
+from rbfmuscle.display.export import _file_name, export_run
 from rbfmuscle.geometry.coarse import simplified
-from rbfmuscle.output.export import _file_name, export_run
-from rbfmuscle.output.info import FORMAT
-from rbfmuscle.output.vtp import Collection, read_vtp, write_vtp
-from rbfmuscle.output.writer import write_json
-from rbfmuscle.run import Run, simulate
+from rbfmuscle.recording import Run, simulate
+from rbfmuscle.run.info import FORMAT
+from rbfmuscle.run.vtk_files import Collection, read_vtp, write_vtp
+from rbfmuscle.run.writer import write_json
 from rbfmuscle.validation import MeshError, UsageError
 
 

@@ -6,9 +6,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.report.plots import Point, Track, front_plot, line_plot
-from rbfmuscle.report.svg import Axis
+from rbfmuscle.display.plots import Point, Track, front_plot, line_plot
+from rbfmuscle.display.svg import Axis
+from rbfmuscle.run.appearance import MUSCLE_COLOURS
 
 
 def ticks(svg, anchor):

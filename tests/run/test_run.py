@@ -11,11 +11,11 @@ import trimesh
 from blend_model import arm_scene, files_in, use_blend_model
 from run_folders import timeless
 
-from rbfmuscle.output import writer
-from rbfmuscle.output.export import export_run
-from rbfmuscle.output.run_data import frame_caption
-from rbfmuscle.report.redraw import redraw_run
-from rbfmuscle.run import Run, simulate, stream_run
+from rbfmuscle.display.export import export_run
+from rbfmuscle.display.report import redraw_run
+from rbfmuscle.recording import Run, simulate, stream_run
+from rbfmuscle.run import writer
+from rbfmuscle.run.data import frame_caption
 from rbfmuscle.validation import LimitExceededError, SceneWarning, SolveError, UsageError
 
 
@@ -112,7 +112,7 @@ class TestStream:
         assert info.muscles["biceps"]["volume_error"]["worst"] < 1e-9
 
     def test_disk_that_fills_up_keeps_the_frames(self, tmp_path, monkeypatch):
-        import rbfmuscle.output.writer as writer
+        import rbfmuscle.run.writer as writer
 
         real, count = writer.write_vtp, []
 

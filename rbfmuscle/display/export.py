@@ -7,17 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
+from rbfmuscle.display.animation import AnimatedMesh, Animation, read_animation
+from rbfmuscle.display.gltf import animated_glb
+from rbfmuscle.display.usd import check_usd, write_usd
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.solids import SolidDistance
 from rbfmuscle.geometry.vectors import to_local, to_world
-from rbfmuscle.output.animation.gltf import animated_glb
-from rbfmuscle.output.animation.parts import AnimatedMesh, Animation, read_animation
-from rbfmuscle.output.animation.usd import check_usd, write_usd
-from rbfmuscle.output.fibre_files import write_fibres
-from rbfmuscle.output.run_data import RunData, open_run
-from rbfmuscle.output.surface_arrays import VertexArrays
-from rbfmuscle.output.vtp import NORMALS, Collection, write_vtp
+from rbfmuscle.run.data import RunData, open_run
+from rbfmuscle.run.vtk_files import NORMALS, Collection, write_fibres, write_vtp
+from rbfmuscle.run.writer import VertexArrays
 from rbfmuscle.scene.names import DEVICES
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingDependencyError, SolveError, UsageError

@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rbfmuscle.display.animation import AnimatedFibres, AnimatedMesh, Animation
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.output.animation.parts import AnimatedFibres, AnimatedMesh, Animation
-from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
+from rbfmuscle.run.appearance import linear_rgb, rgb, stretch_colours
 from rbfmuscle.validation import UsageError
 
 _FLOAT, _INT = 5126, 5125  # types of numbers

@@ -12,9 +12,9 @@ from blend_model import arm_scene, use_blend_model
 from scipy.spatial import cKDTree
 from toy_scene import ellipsoid
 
+from rbfmuscle.display.export import export_run
 from rbfmuscle.geometry.surfaces import face_normals, vertex_normals
-from rbfmuscle.output.export import export_run
-from rbfmuscle.run import Run, simulate
+from rbfmuscle.recording import Run, simulate
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.validation import UsageError
 

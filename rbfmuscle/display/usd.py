@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rbfmuscle.output.animation.parts import (
+from rbfmuscle.display.animation import (
     FRAMES_A_SECOND,
     AnimatedFibres,
     AnimatedMesh,
     Animation,
 )
-from rbfmuscle.output.appearance import linear_rgb, rgb, stretch_colours
+from rbfmuscle.run.appearance import linear_rgb, rgb, stretch_colours
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingDependencyError
 

@@ -8,9 +8,9 @@ import trimesh
 
 import rbfmuscle as rm
 from rbfmuscle.anatomy.bones import orient_scene
-from rbfmuscle.output.appearance import VIEWS, motion_direction, view_axes
-from rbfmuscle.report.render import Solid, aim, draw_solids, fitted_size
-from rbfmuscle.run import Run, stream_run
+from rbfmuscle.display.pictures import Solid, aim, draw_solids, fitted_size
+from rbfmuscle.recording import Run, stream_run
+from rbfmuscle.run.appearance import VIEWS, motion_direction, view_axes
 from rbfmuscle.scene.objects import body_axes
 from rbfmuscle.scene.phantom import phantom_scene
 

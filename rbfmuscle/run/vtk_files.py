@@ -1,7 +1,8 @@
-"""VTK files written and read directly: PolyData (.vtp) and collections over time (.pvd), without
-loading VTK.
+"""VTK files written and read directly: PolyData (.vtp) of surfaces and fibres, and collections over
+time (.pvd), without loading VTK.
 """
 
+import csv
 import os
 import re
 import zlib
@@ -17,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.folders import write_whole
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
+from rbfmuscle.simulation.frame import FibreLines
 from rbfmuscle.validation import MeshError
 
 _TYPES = {"Float64": "<f8", "Float32": "<f4", "Int32": "<i4"}  # of VTK, in NumPy's words
@@ -201,3 +203,57 @@ class Collection:
         with self._path.open("r+b") as file:
             file.seek(self._end)
             file.write(data)
+
+
+FOLDER, TABLE = "fibres", "fibres.csv"
+COLUMNS = ("frame", "muscle", "fibre", "length", "stretch")
+
+
+def fibre_file(muscle: str, frame: int) -> str:
+    """Name of the file of a muscle's fibres in a frame, in the run's folder."""
+    return f"{FOLDER}/{muscle}_{frame:04d}.vtp"
+
+
+def write_fibres(path: Path, fibres: FibreLines) -> None:
+    """Write fibres as polylines (VTK PolyData): for each its ``length`` and ``stretch``, for each
+    point the ``local_stretch``.
+    """
+    lines, points = fibres.points.shape[:2]
+    count = lines * points
+    blocks = [
+        made_block("PointData", "local_stretch", fibres.local_stretch.ravel(), "Float64"),
+        made_block("CellData", "length", fibres.lengths, "Float64"),
+        made_block("CellData", "stretch", fibres.stretch, "Float64"),
+        made_block("Points", "Points", fibres.points.reshape(-1, 3), "Float64"),
+        made_block("Lines", "connectivity", np.arange(count), "Int32"),
+        made_block("Lines", "offsets", points * np.arange(1, lines + 1), "Int32"),
+    ]
+    write_blocks(path, blocks, points=count, lines=lines)
+
+
+def read_fibres(path: Path) -> FibreLines:
+    """Fibres of a file that `write_fibres` has written; MeshError if missing or damaged."""
+    with refusing_damage(path):
+        blocks = read_blocks(path)
+        points, stretch, local = (
+            numbers_of(*blocks[name]).copy() for name in ("Points", "stretch", "local_stretch")
+        )
+        lines = len(stretch)
+        return FibreLines(points.reshape(lines, -1, 3), stretch, local.reshape(lines, -1))
+
+
+def begin_table(directory: Path) -> None:
+    """Write the table's head."""
+    with (directory / TABLE).open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerow(COLUMNS)
+
+
+def write_frame(directory: Path, frame: int, fibres: Mapping[str, FibreLines]) -> None:
+    """Write the fibres of a frame, by muscle: the files and the rows of the table."""
+    for muscle, lines in fibres.items():
+        write_fibres(directory / fibre_file(muscle, frame), lines)
+    with (directory / TABLE).open("a", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        for muscle, lines in fibres.items():
+            for number, row in enumerate(zip(lines.lengths.tolist(), lines.stretch.tolist())):
+                writer.writerow((frame, muscle, number, *row))

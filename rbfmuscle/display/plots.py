@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbfmuscle.display import svg
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.output.appearance import MUSCLE_COLOURS
-from rbfmuscle.output.run_data import RunData
-from rbfmuscle.report import svg
+from rbfmuscle.run.appearance import MUSCLE_COLOURS
+from rbfmuscle.run.data import RunData
 
 _LIMIT = "#a3281f"
 # Width and height of a plot of lines, what lies beside its axes, and height of a row of labels

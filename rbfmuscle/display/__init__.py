@@ -1,0 +1,1 @@
+"""How runs and studies are shown: pages, pictures, exports."""

@@ -1,1 +1,0 @@
-"""Output files of a run."""

@@ -1,0 +1,1 @@
+"""A run as data, its folder and the files in it."""
