@@ -17,12 +17,17 @@ from cyclopts import App, CycloptsError, Group, UnusedCliTokensError
 from rbfmuscle import __version__
 from rbfmuscle.cli.check import check
 from rbfmuscle.cli.compare import compare
-from rbfmuscle.cli.look import export, render, report, view
-from rbfmuscle.cli.new import import_, new
+from rbfmuscle.cli.export import export
+from rbfmuscle.cli.import_osim import import_
+from rbfmuscle.cli.kernels import kernels
+from rbfmuscle.cli.new import new
+from rbfmuscle.cli.options import USUAL, Printing, one_line
 from rbfmuscle.cli.paths import paths
-from rbfmuscle.cli.printing import USUAL, Printing, one_line
+from rbfmuscle.cli.render import render
+from rbfmuscle.cli.report import report
 from rbfmuscle.cli.run import demo, run
-from rbfmuscle.cli.study import kernels, sweep
+from rbfmuscle.cli.sweep import sweep
+from rbfmuscle.cli.view import view
 from rbfmuscle.interruption import INTERRUPTED
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import RBFMuscleError, SolveError, UsageError

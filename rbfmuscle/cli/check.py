@@ -4,8 +4,7 @@ import logging
 import sys
 from time import perf_counter
 
-from rbfmuscle.cli.options import USUAL_WORK, Flag, SceneName, Work
-from rbfmuscle.cli.printing import print_result
+from rbfmuscle.cli.options import USUAL_WORK, Flag, SceneName, Work, print_result
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.validation import SceneError, UsageError

@@ -10,9 +10,9 @@ from rbfmuscle.cli.options import (
     SceneName,
     Settings,
     Work,
+    print_result,
     split_list,
 )
-from rbfmuscle.cli.printing import print_result
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import LimitExceededError, SolveError
 

@@ -17,8 +17,8 @@ from rbfmuscle.cli.options import (
     SceneName,
     Work,
     chosen_muscles,
+    print_result,
 )
-from rbfmuscle.cli.printing import print_result
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError
 

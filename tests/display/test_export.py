@@ -10,7 +10,7 @@ import pyvista
 import trimesh
 from blend_model import arm_files
 
-from rbfmuscle.cli.printing import one_line
+from rbfmuscle.cli.options import one_line
 from rbfmuscle.display.export import _file_name, export_run
 from rbfmuscle.geometry.coarse import simplified
 from rbfmuscle.recording import Run, simulate

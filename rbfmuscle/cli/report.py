@@ -1,0 +1,96 @@
+"""``rbfmuscle report``: the page of a run or a study, written again."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from rbfmuscle.cli.options import (
+    USUAL,
+    FailOn,
+    Printing,
+    print_result,
+)
+from rbfmuscle.progress import Progress, stage
+from rbfmuscle.validation import (
+    LimitExceededError,
+    UsageError,
+)
+
+# What a study keeps, and its page.
+STUDIES = (
+    ("compare", "comparison.json", "report.html"),
+    ("kernels", "kernels.json", "kernels.html"),
+    ("sweep", "sweep.json", "sweep.html"),
+)
+
+
+def report(
+    directory: Annotated[
+        Path, Parameter(help="Folder of a run, a comparison, a study of kernels or a sweep.")
+    ],
+    *,
+    fail_on: FailOn = None,
+    pictures: bool = True,
+    printing: Printing = USUAL,
+) -> int:
+    """Write the page of a run or a study again, for instance after a change of limits.
+
+    Parameters
+    ----------
+    pictures
+        Draw pictures and the animation.
+    """
+    with Progress(f"report {directory}"), stage("drawing pictures" if pictures else "writing"):
+        from rbfmuscle.display.report import redraw_run
+        from rbfmuscle.run.data import RunData
+
+        failed, page = None, directory / "report.html"
+        study = _redraw_study(directory, pictures=pictures)
+        if study is not None:
+            if fail_on is not None:
+                raise UsageError(f"--fail-on is for the folder of a run, {directory} holds several")
+            page, facts = study
+        else:
+            try:
+                facts = redraw_run(directory, fail_on=fail_on, pictures=pictures).to_dict()
+            except LimitExceededError as error:
+                facts, failed = RunData.load(directory).info.to_dict(), error
+    return print_result(printing, facts, _report_lines(directory, facts, page), error=failed)
+
+
+def _redraw_study(directory, *, pictures):
+    """Write the page of a comparison, a study of kernels or a sweep again; the page, and what the
+    JSON file beside it holds, or None where the folder holds none of these.
+    """
+    from rbfmuscle.folders import OutputFolder
+    from rbfmuscle.studies import compare, kernels, sweep
+
+    for command, name, page in STUDIES:
+        path = directory / name
+        if not path.exists():
+            continue
+        OutputFolder(directory, command, [page])
+        try:
+            facts = json.loads(path.read_text(encoding="utf-8"))
+            if command == "compare":
+                table = compare.Comparison.model_validate(facts)
+                compare.write_page(directory, table, pictures=pictures)
+            elif command == "kernels":
+                kernels.write_page(directory, kernels.KernelFacts.model_validate(facts))
+            else:
+                sweep.write_page(directory, sweep.SweepTable.model_validate(facts))
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            message = f"{path} is not as it was written ({error!r}); run the command again"
+            raise UsageError(message) from None
+        return directory / page, facts
+    return None
+
+
+def _report_lines(directory, facts, page):
+    from rbfmuscle.cli.verdict import verdict_lines
+
+    if page.name == "report.html":
+        yield from [facts["answer"]] if "answer" in facts else verdict_lines(directory)
+    yield f"open {page}"
