@@ -30,7 +30,7 @@ from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError,
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Axes:
-    """What a sweep varies, and the error that it measures."""
+    """What a sweep varies, and the quantity that it weighs against time."""
 
     grid: Annotated[
         Pairs,
@@ -46,7 +46,7 @@ class Axes:
             "default the finest values of the grid."
         ),
     ] = None
-    error: Annotated[
+    quantity: Annotated[
         str | None,
         Parameter(
             help="The error on the axis of the Pareto front, error_rms by default; the other axis "
@@ -105,7 +105,9 @@ def sweep(
 
     grid, settings = parse_grid(axes.grid or []), changes.parse_settings()
     if not grid:
-        refuse("a sweep without --grid", {"--reference": axes.reference, "--error": axes.error})
+        refuse(
+            "a sweep without --grid", {"--reference": axes.reference, "--quantity": axes.quantity}
+        )
     if workers.cluster is not None:
         refuse("--cluster", {"--jobs": workers.jobs})
     if not scenes or (len(scenes) == 1 and not grid):
@@ -126,7 +128,7 @@ def sweep(
             frames=frames,
             reference=parse_settings(axes.reference),
             jobs=workers.cluster or workers.jobs,
-            error=axes.error or "error_rms",
+            quantity=axes.quantity or "error_rms",
             progress=progress,
         )
     return _finish(table, output, limits, printing)
@@ -155,7 +157,7 @@ def _beyond(table, output, limits):
 def _finish(table, output, limits, printing):
     bad = [row for row in table.rows if row.status != "done"]
     for row in bad[:5]:
-        reason = one_line(row.error or row.status)
+        reason = one_line(row.message or row.status)
         print(f"rbfmuscle: {row.scene} {row.label}: {reason}", file=sys.stderr)
     remedy = "the others are kept, the same command runs these again"
     failed: RBFMuscleError | None = None

@@ -42,6 +42,7 @@ from rbfmuscle.recording import Run, simulate
 from rbfmuscle.run.data import RunData
 from rbfmuscle.run.writer import versions, write_csv, write_json
 from rbfmuscle.scene.content import content_hash
+from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_value
 from rbfmuscle.simulation.frame import Mesh
@@ -58,14 +59,14 @@ if TYPE_CHECKING:
 
 
 def sweep(
-    scenes: Mapping[str, Scene],
+    scenes: Scene | str | Path | Mapping[str, Scene | str | Path],
     grid: Mapping[str, Sequence[object]],
     directory: str | Path | None = None,
     *,
     frames: str | None = None,
     reference: Mapping[str, object] | None = None,
     jobs: int | str | None = None,
-    error: str = "error_rms",
+    quantity: str = "error_rms",
     progress: OnProgress | None = None,
 ) -> SweepTable:
     """Run scenes under every combination of some settings, and write tables and a page.
@@ -74,8 +75,8 @@ def sweep(
 
     Parameters
     ----------
-    scenes : mapping of str to Scene
-        Scenes by name.
+    scenes : Scene, path or "phantom", or mapping of str to these
+        One scene, or several by name.
     grid : mapping of str to sequence
         Values of each dotted key, as ``{"model.centres": [100, 200]}``; empty, the scenes are
         compared as they are.
@@ -88,7 +89,7 @@ def sweep(
     jobs : int or str, optional
         Points that run at the same time, as many as cores by default; or the address of a Dask
         scheduler whose workers see the folder.
-    error : str
+    quantity : str
         The error on the axis of the Pareto front.
     progress : callable, optional
         Called with the number of points that are done, and of all.
@@ -102,24 +103,29 @@ def sweep(
     --------
     >>> from rbfmuscle import phantom_scene, sweep
     >>> scene = phantom_scene(end=0.0, spacing=6.0).with_options(model="pbd")
-    >>> table = sweep({"hip": scene}, {}, jobs=1)
+    >>> table = sweep(scene, {}, jobs=1)
     >>> table.done, len(table.rows)
     (1, 1)
     """
-    if error not in VALUES:
-        raise UsageError(f"unknown quantity {error!r}, {did_you_mean(error, VALUES)}")
+    if quantity not in VALUES:
+        raise UsageError(f"unknown quantity {quantity!r}, {did_you_mean(quantity, VALUES)}")
     if isinstance(jobs, int) and jobs < 1:
         raise UsageError(f"jobs must be 1 or more, got {jobs}")
     if isinstance(jobs, str) and directory is None:
         raise UsageError("a cluster needs a folder that its workers see")
-    values = {key: list(several) for key, several in grid.items()}
-    points = plan_sweep(scenes, values, frames=frames, reference=reference)
+    if isinstance(scenes, Mapping):
+        opened = {name: open_scene(scene) for name, scene in scenes.items()}
+    else:
+        scene = open_scene(scenes)
+        opened = {scene.name: scene}
+    values = {key: list(chosen) for key, chosen in grid.items()}
+    points = plan_sweep(opened, values, frames=frames, reference=reference)
     for point in points:  # a mistyped key is reported now, not after the first point
-        configure_scene(scenes[point.scene], point.settings, frames=frames)
-    units = {name: scene.units for name, scene in scenes.items()}
+        configure_scene(opened[point.scene], point.settings, frames=frames)
+    units = {name: scene.units for name, scene in opened.items()}
     with given_folder(directory) as folder:
-        run_sweep(run_point, scenes, points, folder, frames=frames, jobs=jobs, progress=progress)
-        table = write_table(points, folder, units, quantity=error)
+        run_sweep(run_point, opened, points, folder, frames=frames, jobs=jobs, progress=progress)
+        table = write_table(points, folder, units, quantity=quantity)
         write_page(folder, table)
     return table
 
@@ -258,7 +264,7 @@ class SweepRow(BaseModel):
     seconds: float | None = None
     threads: int | None = None
     machine: str = ""
-    error: str = ""
+    message: str = ""
     label: str
     reference: str
     key: str
@@ -422,7 +428,7 @@ class PointResult(TypedDict, total=False):
     reference: str
     settings: dict[str, object]
     status: str
-    error: str
+    message: str
     values: dict[str, float | None]
     summary: Mapping[str, Mapping[str, QuantityFacts]]  # of the run, as limits read it
     threads: int
@@ -557,8 +563,8 @@ def _side_by_side(calls, folder, jobs, advance):
                 try:
                     pool.submit(measure_point, *call).result()
                 except BrokenProcessPool:
-                    error = "the process ended without a message (out of memory, or a crash)"
-                    folder.write({"key": call[2].key, "status": "failed", "error": error})
+                    message = "the process ended without a message (out of memory, or a crash)"
+                    folder.write({"key": call[2].key, "status": "failed", "message": message})
             advance(recount=True)  # of some that are done the pool has not said so
         _side_by_side(left[jobs:], folder, jobs, advance)
     except RuntimeError as error:  # of Dask, where worker after worker dies of a point
@@ -582,7 +588,7 @@ def measure_point(
         "reference": point.reference,
         "settings": point.settings,
         "status": "done",
-        "error": "",
+        "message": "",
         "threads": threads,
         "machine": platform.node(),
         "process": os.getpid(),
@@ -604,7 +610,7 @@ def measure_point(
             result["summary"] = run.summary
     except POINT_ERRORS as error:
         result["status"] = "failed"
-        result["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        result["message"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
     result["seconds"] = time.perf_counter() - start
     folder.write(result)
 
@@ -667,7 +673,7 @@ def sweep_rows(
             seconds=result.get("seconds"),
             threads=result.get("threads"),
             machine=result.get("machine", ""),
-            error=result.get("error", ""),
+            message=result.get("message", ""),
             label=point.label,
             reference=point.reference,
             key=point.key,
@@ -705,7 +711,7 @@ def _lines(rows: Sequence[SweepRow]) -> Iterator[list[object]]:
     """Lines of ``sweep.csv``: settings, then facts and values of each point."""
     keys = list(dict.fromkeys(key for row in rows for key in row.settings))
     first = ("scene", "units", "role", "status", "front")
-    last = ("seconds", "threads", "machine", "error", "reference", "key")
+    last = ("seconds", "threads", "machine", "message", "reference", "key")
     yield [*keys, *first, *VALUES, *last]
     for row in rows:
         cells = [row.settings.get(key, "") for key in keys]
@@ -837,5 +843,5 @@ def _point_table(rows: list[SweepRow]) -> Table:
             number_cell(row.value(name), "s" if name.startswith("time_") else "") for name in SHOWN
         )
         texts = row.scene, *values, row.role, "yes" if row.front else ""
-        lines.append([*map(Cell, texts), *numbers, Cell(row.error or row.status)])
+        lines.append([*map(Cell, texts), *numbers, Cell(row.message or row.status)])
     return Table(head, lines)

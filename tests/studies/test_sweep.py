@@ -182,7 +182,7 @@ class TestRun:
         rows = write_table(points, tmp_path, {"arm": "mm"}).rows
         failed = [r for r in rows if r.status == "failed"]
         assert {r.settings["model.centres"] for r in failed} == {-3} and all(
-            r.error for r in failed
+            r.message for r in failed
         )
         assert sweep(tmp_path, ["model.centres=40,-3", "model.resolution=16,24"])[1] == len(failed)
 
@@ -199,7 +199,7 @@ def test_a_process_that_dies_takes_only_its_own_point(tmp_path):
     points, _ = sweep(tmp_path, ["model.centres=40,60,80"], crash_or_run, jobs=2)
     rows = {r.label: r for r in write_table(points, tmp_path, {"arm": "mm"}).rows}
     assert {label for label, r in rows.items() if r.status != "done"} == {"model.centres=60"}
-    assert "process ended" in rows["model.centres=60"].error
+    assert "process ended" in rows["model.centres=60"].message
 
 
 @pytest.fixture
@@ -275,7 +275,8 @@ class TestCommand:
         assert "flicker was not measured" in capsys.readouterr().err
 
     @pytest.mark.parametrize(
-        "words", ["", "--error rms", "--jobs 0", "--grid contact.substep_angel=1,2", "--frames a:b"]
+        "words",
+        ["", "--quantity rms", "--jobs 0", "--grid contact.substep_angel=1,2", "--frames a:b"],
     )
     def test_wrong_usage(self, tmp_path, words):
         grid = ["--grid", "model.iterations=1,2"] if words else []
@@ -291,11 +292,11 @@ def test_rows_are_those_of_their_points_in_order():
     ]
     done, failed = (
         {"status": "done", "values": {"error_rms": 0.25}},
-        {"status": "failed", "error": "no"},
+        {"status": "failed", "message": "no"},
     )
     folder = SimpleNamespace(read=lambda key: {"k0": done, "k1": failed}.get(key, {}))
     rows = sweep_rows(points, folder, {"s": "cm"})
     assert [r.status for r in rows] == ["done", "failed", "missing"]
     assert [r.label for r in rows] == ["default", "a=1", "a=2"]
-    assert [r.error for r in rows] == ["", "no", ""] and rows[0].units == "cm"
+    assert [r.message for r in rows] == ["", "no", ""] and rows[0].units == "cm"
     np.testing.assert_array_equal([r.value("error_rms") for r in rows], [0.25, np.nan, np.nan])
