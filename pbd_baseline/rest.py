@@ -16,7 +16,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.fibres import fibre_directions
 from rbfmuscle.geometry.harmonic import harmonic_weights, surface_gradient
 from rbfmuscle.geometry.surfaces import edge_lengths, vertex_normals
-from rbfmuscle.scene.ends import attachment_ends, ordered_muscle
+from rbfmuscle.scene.muscles import attachment_ends, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, NotFiniteError, check_finite

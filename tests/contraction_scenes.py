@@ -14,7 +14,7 @@ from toy_scene import held
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.metrics.centreline import belly_measures
 from rbfmuscle.scene.objects import Motion
-from rbfmuscle.scene.phantom_shapes import stitch
+from rbfmuscle.scene.phantom import stitch
 from rbfmuscle.scene.scene import Scene
 
 MUSCLE = "muscle"

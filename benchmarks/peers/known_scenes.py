@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.scene.objects import Attachment
-from rbfmuscle.scene.phantom_shapes import stitch
+from rbfmuscle.scene.phantom import stitch
 from rbfmuscle.scene.scene import Scene
 
 # The centre of the joint that pulls lies this many bar lengths away: the path of the end is

@@ -35,8 +35,8 @@ def new(
         Folder for scene.toml; the folder of the meshes by default.
     """
     from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
-    from rbfmuscle.importers.labels.read import read_labels
     from rbfmuscle.importers.scenes import guess_volume
+    from rbfmuscle.importers.volumes import read_labels
     from rbfmuscle.scene.check import check_scene
 
     volume = _is_segmentation(source)
@@ -86,7 +86,7 @@ def _new_folder(file, force):
 
 
 def _is_segmentation(source):
-    from rbfmuscle.importers.labels.read import VOLUME_SUFFIXES, is_volume
+    from rbfmuscle.importers.volumes import VOLUME_SUFFIXES, is_volume
     from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES
 
     if source.is_file() and not is_volume(source):

@@ -11,7 +11,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import moving_joints, split_ends
-from rbfmuscle.metrics.depths import bones_about
+from rbfmuscle.metrics.rows import bones_about
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import NODES, TendonLine

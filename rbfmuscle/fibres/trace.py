@@ -4,13 +4,219 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import cg
+from scipy.spatial import cKDTree
 
-from rbfmuscle.fibres.flux import FluxField
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.fibres import nearest_pieces
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.tubes import distance_along, points_along
 from rbfmuscle.geometry.vectors import box_size, unit
 from rbfmuscle.scene.bone import BoneDistance
+
+CELLS = 30_000  # of a muscle, about
+GRIP = 30.0  # conductance of an end where u is given, over that of a cube of the muscle's volume
+ACROSS = 0.02  # conductivity across polylines, over that along them
+NEAREST = 4  # pieces of polylines that speak for one place
+TOLERANCE = 1e-8  # relative residual of the potential
+MOST_ITERATIONS = 5_000  # of conjugate gradients; some hundreds serve
+_CORNERS = np.indices((2, 2, 2)).reshape(3, -1).T  # of a cell, (8, 3)
+
+
+class FluxField:
+    """The flux in a closed muscle mesh between points of its origin and of its insertion.
+
+    Parameters
+    ----------
+    mesh : MeshDistance
+        The muscle at rest.
+    ends : pair of (n, 3) ndarray
+        Points spread evenly over the area of the origin's patches, and of the insertion's.
+    polylines : sequence of (k, 3) ndarray, optional
+        That the flux follows.
+
+    Attributes
+    ----------
+    side : float
+        Of a cell [scene unit].
+    middles : (m, 3) ndarray
+        Of the cells in the muscle.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If origin and insertion lie in separate pieces, or the potential does not converge.
+    """
+
+    def __init__(
+        self,
+        mesh: MeshDistance,
+        ends: tuple[Floats, Floats],
+        polylines: Sequence[Floats] | None = None,
+    ) -> None:
+        low = mesh.vertices.min(axis=0)
+        extent = np.ptp(mesh.vertices, axis=0)
+        self.side = _side(mesh, extent)
+        self.low = low - 1.5 * self.side
+        self.shape = np.ceil(extent / self.side).astype(int) + 3
+        self.cells = self._cells(mesh, ends)
+        self.middles = self.low + (self.cells + 0.5) * self.side
+        self._number_nodes()
+        conductivity = _conductivity(self.middles, polylines)
+        matrix = self._assemble(conductivity)
+        source = self._source(ends)
+        if polylines:
+            grip = GRIP * self.side * len(self.cells) ** (1 / 3)
+            matrix += sparse.diags(grip * np.abs(source))
+            source = grip * source
+        potential = _solve(matrix, source)
+        self._spread(conductivity, potential)
+
+    def __call__(self, points: Floats) -> Floats:
+        """Flux (n, 3) at points (n, 3); beyond the cells, that of the nearest node."""
+        place = np.clip((points - self.low) / self.side, 0.0, self.shape - 1e-9)
+        cell = place.astype(int)
+        share = place - cell
+        out = np.zeros((len(points), 3))
+        for corner in _CORNERS:
+            weight = np.prod(np.where(corner, share, 1.0 - share), axis=1)
+            out += weight[:, None] * self._flux[tuple((cell + corner).T)]
+        return out
+
+    def _cells(self, mesh: MeshDistance, ends: tuple[Floats, Floats]) -> Integers:
+        """Cells (m, 3) of which the middle lies inside, those of the ends, and, where these are not
+        joined, those that the surface passes through.
+        """
+        every = np.indices(self.shape).reshape(3, -1).T
+        inside = mesh.inside(self.low + (every + 0.5) * self.side).reshape(self.shape)
+        at_ends = [self._cell_of(end) for end in ends]
+        for cell in at_ends:
+            inside[tuple(cell.T)] = True
+        if not self._joined(inside, at_ends):
+            inside[tuple(self._cell_of(_surface_points(mesh, 0.4 * self.side)).T)] = True
+            if not self._joined(inside, at_ends):
+                raise np.linalg.LinAlgError("origin and insertion lie in separate pieces")
+        return np.argwhere(self._piece(inside, at_ends[0]))
+
+    def _cell_of(self, points: Floats) -> Integers:
+        return np.asarray(((points - self.low) / self.side).astype(int))
+
+    def _piece(self, inside: Booleans, start: Integers) -> Booleans:
+        """The cells joined to the one that most of the cells ``start`` (n, 3) are joined to."""
+        from scipy.ndimage import label
+
+        labels = label(inside)[0]
+        at = labels[tuple(start.T)]
+        return np.asarray(labels == np.bincount(at).argmax())
+
+    def _joined(self, inside: Booleans, ends: Sequence[Integers]) -> bool:
+        piece = self._piece(inside, ends[0])
+        return bool(piece[tuple(ends[1].T)].mean() > 1 / 2)
+
+    def _number_nodes(self) -> None:
+        corner = self.cells[:, None, :] + _CORNERS
+        flat = np.ravel_multi_index(tuple(np.moveaxis(corner, -1, 0)), tuple(self.shape + 1))
+        self._known, nodes = np.unique(flat, return_inverse=True)
+        self.nodes = nodes.reshape(flat.shape)
+
+    def _assemble(self, conductivity: Floats) -> sparse.csr_matrix:
+        """Matrix of the potential's energy, trilinear in each cell."""
+        element = self.side * np.einsum("cij,ijkl->ckl", conductivity, _element_matrices())
+        rows = np.repeat(self.nodes, 8, axis=1).ravel()
+        columns = np.tile(self.nodes, (1, 8)).ravel()
+        size = len(self._known)
+        return sparse.csr_matrix((element.ravel(), (rows, columns)), shape=(size, size))
+
+    def _source(self, ends: tuple[Floats, Floats]) -> Floats:
+        """Flux (n,) into each node: one in all through the origin, as much out of the insertion."""
+        out = np.zeros(len(self._known))
+        tree = cKDTree(self.middles)
+        for sign, end in zip((1.0, -1.0), ends):
+            cell = tree.query(end)[1]
+            share = np.clip((end - self.middles[cell]) / self.side + 0.5, 0.0, 1.0)
+            for k, corner in enumerate(_CORNERS):
+                weight = np.prod(np.where(corner, share, 1.0 - share), axis=1)
+                np.add.at(out, self.nodes[cell, k], sign * weight / len(end))
+        return out
+
+    def _spread(self, conductivity: Floats, potential: Floats) -> None:
+        """Mean flux of the cells around each node, and beyond the muscle that of the nearest."""
+        from scipy.ndimage import distance_transform_edt
+
+        slope = (_CORNERS - 0.5) * 2.0 / (4.0 * self.side)  # at the middle of a cell
+        gradient = np.einsum("ck,ka->ca", potential[self.nodes], slope)
+        flux = -np.einsum("cab,cb->ca", conductivity, gradient)
+        total = np.zeros((len(self._known), 3))
+        count = np.bincount(self.nodes.ravel(), minlength=len(self._known))
+        np.add.at(total, self.nodes.ravel(), np.repeat(flux, 8, axis=0))
+        grid = np.zeros((*(self.shape + 1), 3))
+        known = np.zeros(self.shape + 1, dtype=bool)
+        where = np.unravel_index(self._known, tuple(self.shape + 1))
+        grid[where] = total / count[:, None]
+        known[where] = True
+        nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+        self._flux = grid[tuple(nearest)]
+
+
+def _side(mesh: MeshDistance, extent: Floats) -> float:
+    """Side of a cell [scene unit] with which the muscle has about `CELLS`."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] - mesh.vertices[0] for k in range(3))
+    volume = abs(float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum())) / 6.0
+    return float(max((volume / CELLS) ** (1 / 3), extent.max() / 1000.0))
+
+
+def _surface_points(mesh: MeshDistance, apart: float) -> Floats:
+    """Points on a surface that are not farther apart than a distance, about."""
+    corners = mesh.vertices[mesh.faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+    count = int(min(np.ceil(longest / apart), 20))
+    shares = np.array(
+        [(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)], dtype=float
+    )
+    return np.asarray(np.einsum("sk,fka->sfa", shares / count, corners).reshape(-1, 3))
+
+
+def _conductivity(points: Floats, polylines: Sequence[Floats] | None) -> Floats:
+    """D (n, 3, 3) at points (n, 3)."""
+    if not polylines:
+        return np.tile(np.eye(3), (len(points), 1, 1))
+    unit, share = nearest_pieces(points, polylines, NEAREST)
+    share /= share.sum(axis=1, keepdims=True)
+    # Dyads have no sense of direction, as fibres have none.
+    dyads = np.einsum("nk,nka,nkb->nab", share, unit, unit)
+    direction = np.linalg.eigh(dyads)[1][:, :, 2]
+    along = np.einsum("na,nb->nab", direction, direction)
+    return ACROSS * np.eye(3) + (1.0 - ACROSS) * along
+
+
+def _element_matrices() -> Floats:
+    """∫ ∂_i N_k ∂_j N_l over a unit cell, (3, 3, 8, 8), by two Gauss points along each axis."""
+    gauss = 0.5 + (_CORNERS - 0.5) / np.sqrt(3.0)
+    out = np.zeros((3, 3, 8, 8))
+    for point in gauss:
+        factor = np.where(_CORNERS, point, 1.0 - point)
+        slope = np.empty((3, 8))
+        for axis in range(3):
+            others = [k for k in range(3) if k != axis]
+            slope[axis] = (2 * _CORNERS[:, axis] - 1) * factor[:, others].prod(axis=1)
+        out += np.einsum("ik,jl->ijkl", slope, slope) / 8.0
+    return out
+
+
+def _solve(matrix: sparse.csr_matrix, source: Floats) -> Floats:
+    """Potential (n,) by conjugate gradients; where fluxes are given up to a constant."""
+    if connected_components(matrix, directed=False)[0] > 1:
+        raise np.linalg.LinAlgError("the muscle's cells lie in separate pieces")
+    scale = 1.0 / matrix.diagonal()
+    found, status = cg(
+        matrix, source, rtol=TOLERANCE, maxiter=MOST_ITERATIONS, M=sparse.diags(scale)
+    )
+    if status != 0:
+        raise np.linalg.LinAlgError("the potential of the fibres does not converge")
+    return np.asarray(found)
+
 
 POINTS = 25  # of a fibre, at even distances along it
 STEP = 0.5  # of a line that is traced, in cells

@@ -9,10 +9,8 @@ from rbfmuscle.anatomy.bones import HEADER
 from rbfmuscle.anatomy.names import name_facts
 from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
-from rbfmuscle.importers.labels.read import read_labels
-from rbfmuscle.importers.labels.surfaces import label_surface
-from rbfmuscle.importers.labels.volume import LabelVolume
 from rbfmuscle.importers.opensim.scene import import_osim
+from rbfmuscle.importers.volumes import LabelVolume, label_surface, read_labels
 from rbfmuscle.progress import Progress
 from rbfmuscle.scene.names import new_name, plain_name
 from rbfmuscle.scene.objects import MM_PER_UNIT

@@ -21,7 +21,7 @@ from rbfmuscle.geometry.surfaces import connected_vertices, vertex_areas
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.geometry.vectors import to_local
 from rbfmuscle.jit import compiled
-from rbfmuscle.metrics.depths import bones_about
+from rbfmuscle.metrics.rows import bones_about
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.joints.joint import Joint, all_coordinates, rigid_body
 from rbfmuscle.scene.objects import Attachment, Muscle

@@ -13,12 +13,11 @@ from rbfmuscle.geometry.surfaces import EdgeLengths, label_sheets, mesh_volume
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
-from rbfmuscle.metrics.depths import bone_depth, bones_about, surface_depth
 from rbfmuscle.metrics.neighbours import InputNeighbours, NeighbourMeasures, Shown
 from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
-from rbfmuscle.scene.articular import articular_share, scene_surfaces
+from rbfmuscle.metrics.rows import bone_depth, bones_about, surface_depth
 from rbfmuscle.scene.bone import BoneDistance
-from rbfmuscle.scene.check import end_gap
+from rbfmuscle.scene.check import articular_share, end_gap, scene_surfaces
 from rbfmuscle.scene.guesses import doubtful, guessed_muscles
 from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene

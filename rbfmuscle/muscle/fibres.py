@@ -7,8 +7,8 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.muscle.model import SolidModel, hung_matrix
-from rbfmuscle.scene.ends import attachment_ends
 from rbfmuscle.scene.joints.joint import Joint
+from rbfmuscle.scene.muscles import attachment_ends
 from rbfmuscle.scene.objects import Muscle
 
 

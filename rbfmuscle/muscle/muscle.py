@@ -26,9 +26,8 @@ from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
 from rbfmuscle.muscle.rounded_bones import RoundedBones, grown, round_bones
 from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, settle
 from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform
-from rbfmuscle.scene.ends import ordered_muscle
 from rbfmuscle.scene.joints.joint import Joint
-from rbfmuscle.scene.muscles import attachment_frames
+from rbfmuscle.scene.muscles import attachment_frames, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts

@@ -12,8 +12,7 @@ from rbfmuscle.geometry.rest_frame import RestFrame, principal_axes
 from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import choose_centres, place_points
-from rbfmuscle.scene.ends import ordered_muscle
-from rbfmuscle.scene.muscles import attachment_frames
+from rbfmuscle.scene.muscles import attachment_frames, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.surface.drawing import RestSurface

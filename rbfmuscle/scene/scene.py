@@ -33,9 +33,8 @@ from rbfmuscle.scene.options import (
     Table,
 )
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
-from rbfmuscle.scene.save import SceneFiles
+from rbfmuscle.scene.save import FORMAT, SceneFiles
 from rbfmuscle.scene.settings import TABLES, change_settings
-from rbfmuscle.scene.toml_text import FORMAT
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
 

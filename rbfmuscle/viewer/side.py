@@ -12,7 +12,7 @@ from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import EdgeStretch, joined_meshes, mesh_volume
 from rbfmuscle.geometry.vectors import to_world
-from rbfmuscle.metrics.depths import surface_depth
+from rbfmuscle.metrics.rows import surface_depth
 from rbfmuscle.run.appearance import (
     BONE_COLOUR,
     LONG,

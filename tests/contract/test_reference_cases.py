@@ -16,10 +16,9 @@ from conftest import find_data
 import rbfmuscle as rm
 from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.importers.guess.guess import guess_scene
-from rbfmuscle.importers.labels.read import read_labels
-from rbfmuscle.importers.labels.surfaces import label_surface
 from rbfmuscle.importers.opensim import tubes
 from rbfmuscle.importers.opensim.scene import import_osim
+from rbfmuscle.importers.volumes import label_surface, read_labels
 from rbfmuscle.metrics.rows import moment_arms
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.meshes.read import read_mesh

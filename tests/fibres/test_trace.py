@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.fibres.flux import FluxField
-from rbfmuscle.fibres.trace import trace_fibres
+from rbfmuscle.fibres.trace import FluxField, trace_fibres
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.scene.bone import BoneDistance
 

@@ -7,10 +7,8 @@ import pytest
 from command_line import call
 
 from rbfmuscle.importers.guess.guess import guess_scene
-from rbfmuscle.importers.labels.read import read_labels, read_names
-from rbfmuscle.importers.labels.surfaces import label_surface
-from rbfmuscle.importers.labels.volume import LAYER, LabelVolume
 from rbfmuscle.importers.scenes import write_surfaces
+from rbfmuscle.importers.volumes import LAYER, LabelVolume, label_surface, read_labels, read_names
 from rbfmuscle.validation import MeshError, UsageError
 
 SHAPE = (30, 26, 40)

@@ -10,10 +10,9 @@ import trimesh
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.mesh_distance import Columns, MeshDistance
 from rbfmuscle.metrics.centreline import Centreline, split_ends
-from rbfmuscle.metrics.depths import bone_depth, surface_depth
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
 from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.metrics.rows import _roughness, _smoothness, moment_arms
+from rbfmuscle.metrics.rows import _roughness, _smoothness, bone_depth, moment_arms, surface_depth
 from rbfmuscle.recording import simulate
 from rbfmuscle.scene.bone import Bone, BoneDistance
 from rbfmuscle.scene.joints.joint import Coordinate

@@ -5,10 +5,9 @@ import pytest
 import trimesh
 from blend_model import arm_files
 
-from rbfmuscle.scene.articular import articular_points
-from rbfmuscle.scene.check import check_scene
+from rbfmuscle.scene.check import articular_points, check_scene
 from rbfmuscle.scene.guesses import GuessTable, doubtful
-from rbfmuscle.scene.picked import picked_vertices, read_points
+from rbfmuscle.scene.patches import picked_vertices, read_points
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
 

@@ -12,8 +12,15 @@ from scipy.spatial.transform import Rotation
 from toy_scene import held
 
 from rbfmuscle.scene.check import check_scene
-from rbfmuscle.scene.joints.functions import Linear, PiecewiseLinear, Polynomial, Spline
-from rbfmuscle.scene.joints.joint import KINDS, all_coordinates, coordinate_values
+from rbfmuscle.scene.joints.joint import (
+    KINDS,
+    Linear,
+    PiecewiseLinear,
+    Polynomial,
+    Spline,
+    all_coordinates,
+    coordinate_values,
+)
 from rbfmuscle.scene.joints.tables import JointTable, joint_row
 from rbfmuscle.scene.motion import bone_poses, step_angle, turned_angle
 from rbfmuscle.scene.objects import Motion

@@ -8,8 +8,7 @@ import trimesh
 
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.phantom import MUSCLES
-from rbfmuscle.scene.phantom_shapes import Tube
+from rbfmuscle.scene.phantom import MUSCLES, Tube
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError, UsageError
 

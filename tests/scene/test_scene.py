@@ -15,9 +15,9 @@ from rbfmuscle.scene.frames import parse_slice
 from rbfmuscle.scene.names import new_name
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.record import record_scene
+from rbfmuscle.scene.save import attachment_file
 from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.scene.settings import parse_settings
-from rbfmuscle.scene.toml_text import attachment_file
 from rbfmuscle.validation import SceneError, UsageError
 
 TEXT = (ROOT / "tests" / "data" / "biceps.toml").read_text(encoding="utf-8")

@@ -17,13 +17,13 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.anatomy.bones import Part
 from rbfmuscle.geometry.vectors import unit
-from rbfmuscle.importers.guess.ends import Ends
 from rbfmuscle.importers.guess.frames import PELVIS
+from rbfmuscle.importers.guess.joints import Skeleton
 from rbfmuscle.importers.guess.sites import Site, anatomy_of, sites_on, whole_bone
-from rbfmuscle.importers.guess.skeleton import Skeleton
 from rbfmuscle.importers.guess.tendons import (
     REACHES,
     BonePlace,
+    Ends,
     TendonGuess,
     see_tendon,
     tendon_by_mesh,

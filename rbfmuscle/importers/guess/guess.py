@@ -14,16 +14,15 @@ from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
 from rbfmuscle.importers.guess.attachments import FEWEST, MuscleGuess, guess_attachments
 from rbfmuscle.importers.guess.frames import bone_frames
-from rbfmuscle.importers.guess.joints import guess_joints
+from rbfmuscle.importers.guess.joints import Skeleton, guess_joints
 from rbfmuscle.importers.guess.parts import Parts, read_parts
-from rbfmuscle.importers.guess.skeleton import Skeleton
 from rbfmuscle.importers.guess.tendons import unused_tendons
-from rbfmuscle.scene.articular import articular_points
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.check import articular_points
 from rbfmuscle.scene.guesses import DOUBTFUL
 from rbfmuscle.scene.names import plain_name
+from rbfmuscle.scene.save import FORMAT, MAIN, attachment_file, table_text
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.scene.toml_text import FORMAT, MAIN, attachment_file, table_text
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
 _TAIL = """[contact]

@@ -5,19 +5,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rbfmuscle.importers.opensim.elements import Frames, frame_at, read_function
+from rbfmuscle.importers.opensim.elements import Frames, Node, frame_at, read_function
 from rbfmuscle.importers.opensim.model import ModelConstraint, ModelJoint, OsimModel
-from rbfmuscle.importers.opensim.xml import Node
-from rbfmuscle.scene.joints.functions import Function, Linear, Multivariate, scaled
 from rbfmuscle.scene.joints.joint import (
     KINDS,
     Coordinate,
     Coupling,
+    Function,
+    Linear,
+    Multivariate,
     TransformAxis,
     X,
     Y,
     Z,
     motion_of,
+    scaled,
 )
 from rbfmuscle.scene.names import new_name
 from rbfmuscle.validation import SceneError

@@ -7,8 +7,8 @@ from typing import Annotated, NamedTuple, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from rbfmuscle.geometry.arrays import Booleans
+from rbfmuscle.scene.motion_file import read_storage
 from rbfmuscle.scene.options import FileName, Finite, Positive, Table
-from rbfmuscle.scene.storage import read_storage
 from rbfmuscle.validation import SceneError, did_you_mean
 
 KEYS = ("activation", "fibre_stretch_at_rest", "tendon_region")

@@ -11,14 +11,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from rbfmuscle.scene.guesses import GuessTable
-from rbfmuscle.scene.joints.functions import (
-    Function,
-    Linear,
-    Multivariate,
-    PiecewiseLinear,
-    Polynomial,
-    Spline,
-)
 from rbfmuscle.scene.joints.joint import (
     BY_TURNS,
     IDENTITY,
@@ -26,8 +18,14 @@ from rbfmuscle.scene.joints.joint import (
     MOST_AXES,
     Coordinate,
     Coupling,
+    Function,
     Joint,
+    Linear,
     MotionKind,
+    Multivariate,
+    PiecewiseLinear,
+    Polynomial,
+    Spline,
     TransformAxis,
     all_coordinates,
     motion_of,

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from rbfmuscle.importers.opensim.xml import read_xml
+from rbfmuscle.importers.opensim.elements import read_xml
 from rbfmuscle.validation import SceneError
 
 NESTED = "".join(
@@ -44,7 +44,7 @@ def test_outside_entities_are_refused(tmp_path):
 
 def test_a_gigabyte_from_a_pipe_is_refused_in_bounded_memory():
     code = (
-        "import sys; from pathlib import Path; from rbfmuscle.importers.opensim.xml import "
+        "import sys; from pathlib import Path; from rbfmuscle.importers.opensim.elements import "
         "read_xml\n"
         "from rbfmuscle.validation import SceneError\n"
         "try: read_xml(Path('/dev/stdin'))\n"
