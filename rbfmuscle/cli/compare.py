@@ -70,16 +70,11 @@ def compare(
             pictures=pictures,
             progress=advance,
         )
-    error = _failure(table.failed, output) or _excess(table.models, output, limits)
+    error = _excess(table.models, output, limits)
+    if table.failed:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in table.failed.items())
+        error = SolveError(f"{reasons}; the other models are in {output}")
     return print_result(work, table.model_dump(), _table_lines(table, output), error=error)
-
-
-def _failure(failed, output):
-    """The error that some models could not be solved; None where all were."""
-    if not failed:
-        return None
-    reasons = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
-    return SolveError(f"{reasons}; the other models are in {output}")
 
 
 def _excess(models, output, limits):

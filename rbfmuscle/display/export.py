@@ -217,16 +217,13 @@ class SurfaceArrays:
         if part.name not in self._first:
             self._first[part.name] = VertexArrays(part.mesh(0), self._groups.index(part.group))
         found = self._first[part.name].of(mesh)
-        distances = [field.signed(_at_rest(mesh[0], bone, k)) for field, bone in self._bones]
+        distances = [
+            field.signed(mesh[0] if bone.poses is None else to_local(mesh[0], bone.poses[k]))
+            for field, bone in self._bones
+        ]
         if distances:
             found["bone_distance"] = np.min(distances, axis=0)
         return found
-
-
-def _at_rest(points: Floats, bone: AnimatedMesh, k: int) -> Floats:
-    """Points (n, 3) in the frame of a bone at rest."""
-    pose = np.eye(4) if bone.poses is None else bone.poses[k]
-    return to_local(points, pose)
 
 
 def write_mesh(

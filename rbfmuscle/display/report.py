@@ -237,16 +237,11 @@ def _light(saved: RunData, title: str, quantities: Sequence[str]) -> CheckRow | 
     allowed = (
         f"{'≥' if name in LOWER_BOUNDS else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}"
     )
-    cells, note = [number_cell(worst, unit, limit_state(name, worst, limit))], _title(name)
+    cells = [number_cell(worst, unit, limit_state(name, worst, limit))]
+    note = LIMITS[name].title if name in LIMITS else name
+    if note.replace(" ", "_") != name:
+        note = f"{note} ({name})"  # its name in ``metrics.csv``
     return CheckRow(title, cells, allowed, note + place if worst else note)
-
-
-def _title(name: str) -> str:
-    """A quantity in the words of the verdict, with its name in ``metrics.csv`` where that is
-    another.
-    """
-    title = LIMITS[name].title if name in LIMITS else name
-    return title if title.replace(" ", "_") == name else f"{title} ({name})"
 
 
 def _plots(saved: RunData) -> list[Section]:
@@ -400,7 +395,8 @@ def redraw_run(
     if info.status == "running":
         raise UsageError(f"{directory} holds a run that has not ended; run the scene again")
     folder = run_folder(directory)
-    limits = _saved_limits(saved, fail_on)
+    texts = [name if value is None else f"{name}={value!r}" for name, value in info.fail_on.items()]
+    limits = parse_limits(texts if fail_on is None else fail_on, Scene(units=saved.units))
     summary = Summary()
     summary.add(saved.metrics)
     table = summary.table()
@@ -417,9 +413,3 @@ def redraw_run(
     write_report(directory, pictures=pictures)
     require_limits(table, limits)
     return info
-
-
-def _saved_limits(saved: RunData, fail_on: str | None) -> Limits:
-    given = saved.info.fail_on
-    texts = [name if value is None else f"{name}={value!r}" for name, value in given.items()]
-    return parse_limits(texts if fail_on is None else fail_on, Scene(units=saved.units))

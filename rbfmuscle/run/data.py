@@ -121,7 +121,11 @@ class RunData:
         self.info = info
         self.frames = frames
         self.frame_numbers = [frame.index for frame in frames]
-        self.coordinates = _coordinate_values(info)
+        rows = [row.coordinates for row in info.frames]
+        self.coordinates = {
+            name: np.array([row.get(name, np.nan) for row in rows])
+            for name in sorted({name for row in rows for name in row})
+        }
         self.metrics = metrics
         self.quantities = list(dict.fromkeys(row.quantity for row in metrics))
         self.summary = info.muscles
@@ -140,7 +144,10 @@ class RunData:
         )
         self.colours = look.muscle_colours(self.muscles, self.groups)
         self._by_number = {frame.index: frame for frame in frames}
-        self._rows = _sorted_rows(metrics)
+        # By muscle and quantity: of dozens of muscles there are tens of thousands.
+        self._rows: dict[str, dict[str, list[Row]]] = {}
+        for one in metrics:
+            self._rows.setdefault(one.muscle, {}).setdefault(one.quantity, []).append(one)
 
     @classmethod
     def load(cls, directory: str | Path) -> Self:
@@ -326,13 +333,6 @@ def frame_caption(run: RunData, number: int) -> str:
     return ", ".join([f"frame {number}", *clock, *texts])
 
 
-def _coordinate_values(info: RunInfo) -> dict[str, Floats]:
-    """Values (frames,) of each coordinate, by name; NaN where unknown."""
-    rows = [row.coordinates for row in info.frames]
-    names = sorted({name for row in rows for name in row})
-    return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-
-
 def _metrics_table(
     rows: Sequence[Row], frames: Sequence[int], coordinates: Mapping[str, Floats]
 ) -> np.ndarray:
@@ -355,14 +355,6 @@ def _metrics_table(
     for name, values in columns.items():
         table[name] = values
     return table
-
-
-def _sorted_rows(metrics: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
-    """Rows by muscle and quantity: of dozens of muscles there are tens of thousands."""
-    found: dict[str, dict[str, list[Row]]] = {}
-    for row in metrics:
-        found.setdefault(row.muscle, {}).setdefault(row.quantity, []).append(row)
-    return found
 
 
 def named_coordinates(quantity: str, rows: Sequence[Row], coordinate: str | None) -> list[str]:
@@ -501,7 +493,12 @@ def read_run(directory: Path) -> tuple[RunInfo, list[Frame], list[Row], FolderMe
     if info.status == "running":
         info = info.replaced(frames=_whole_frames(info, directory, poses))
     frames = _read_frames(info, directory, poses)
-    return info, frames, _read_metrics(directory), FolderMeshes(directory)
+    metrics = _read_table(
+        directory,
+        "metrics.csv",
+        lambda r: Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6]),
+    )
+    return info, frames, metrics, FolderMeshes(directory)
 
 
 def _read_table(directory: Path, name: str, read: Callable[[list[str]], _Row]) -> list[_Row]:
@@ -520,20 +517,6 @@ def _read_table(directory: Path, name: str, read: Callable[[list[str]], _Row]) -
     except (ValueError, IndexError, csv.Error) as error:
         message = f"{path} is not as it was written ({error}); run the scene again"
         raise UsageError(message) from None
-
-
-def _read_metrics(directory: Path) -> list[Row]:
-    def row(r: list[str]) -> Row:
-        return Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6])
-
-    return _read_table(directory, "metrics.csv", row)
-
-
-def _read_events(directory: Path) -> list[Event]:
-    def event(r: list[str]) -> Event:
-        return Event(int(r[0]), r[1], r[2], int(r[3]), r[4])
-
-    return _read_table(directory, "events.csv", event)
 
 
 def _read_poses(directory: Path) -> Poses:
@@ -570,7 +553,9 @@ def _read_frames(info: RunInfo, directory: Path, poses: Poses) -> list[Frame]:
     units = scene.coordinate_units
     muscles = [muscle.name for muscle in scene.muscles]
     events: dict[int, list[Event]] = {}
-    for event in _read_events(directory):
+    for event in _read_table(
+        directory, "events.csv", lambda r: Event(int(r[0]), r[1], r[2], int(r[3]), r[4])
+    ):
         events.setdefault(event.frame, []).append(event)
     found = []
     for entry in info.frames:

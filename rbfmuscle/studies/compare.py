@@ -372,7 +372,9 @@ def measure_run(saved: RunData, again: Repeated) -> Values:
         facts = saved.info.muscles.get(muscle, {})
         worst = {q: facts.get(q, QuantityFacts()).get("worst") for q in FROM_METRICS}
         values = {q: value for q, value in worst.items() if value is not None}
-        values[DEEPER] = _deepened(values)
+        # How deep it is in a bone, or a bone in it, beyond what is left at rest.
+        depths = [values.get(name, 0.0) for name in ("penetration_max", "bone_penetration_max")]
+        values[DEEPER] = max(0.0, max(depths) - values.get("initial_overlap", 0.0))
         times = saved.series(muscle, "time_frame")[1][1:]  # the first loads and compiles
         if len(times):
             values["time_frame"] = float(np.median(times))
@@ -503,12 +505,6 @@ def _statistics_rows(table: Comparison) -> Iterator[tuple[object, ...]]:
             for name, spread in quantities.items():
                 unit = unit_text(QUANTITIES[name.partition(":")[0]][0], table.units)
                 yield model, muscle, name, spread.mean, spread.sd, unit
-
-
-def _deepened(values: Mapping[str, float]) -> float:
-    """How deep a muscle is in a bone, or a bone in it, beyond what is left at rest."""
-    deepest = max(values.get(name, 0.0) for name in ("penetration_max", "bone_penetration_max"))
-    return max(0.0, deepest - values.get("initial_overlap", 0.0))
 
 
 # A model keeps out of bones that is no deeper in one [mm].

@@ -598,7 +598,11 @@ def measure_point(
             run = runner(scene, point.settings, frames)
             values = _values(run)
             every = [(frame, *named) for frame in run.frames for named in frame.surfaces.items()]
-            shown = {f"{_pose(frame)}|{name}": (s.vertices, s.faces) for frame, name, s in every}
+            shown = {}
+            for frame, name, surface in every:
+                at = sorted(frame.coordinates.items())
+                pose = " ".join(f"{key}={round(value, 9) + 0.0:.9f}" for key, value in at) or "rest"
+                shown[f"{pose}|{name}"] = surface.vertices, surface.faces
             if point.role == "reference":
                 arrays = {f"{place}|{k}": mesh[k] for place, mesh in shown.items() for k in (0, 1)}
                 fresh = folder.references / f".{point.key}.{os.getpid()}.npz"
@@ -630,11 +634,6 @@ def _values(run: RunData) -> dict[str, float | None]:
     ]
     times = np.median(walls), np.percentile(walls, 95), np.median(extract)
     return {**worst, **{name: float(value) for name, value in zip(TIMES, times)}}
-
-
-def _pose(frame):
-    values = sorted(frame.coordinates.items())
-    return " ".join(f"{name}={round(value, 9) + 0.0:.9f}" for name, value in values) or "rest"
 
 
 def _errors(shown: Mapping[str, Mesh], path: Path) -> dict[str, float | None]:
