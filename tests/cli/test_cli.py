@@ -166,7 +166,7 @@ class TestErrors:
             ("kernels arm.toml -o o --units mm", 2, "--units names the unit of a mesh"),
             ("kernels biceps.ply -o o --error 1 --centres 9", 2, "--error does not take --centres"),
             ("kernels a.ply -o o --error 1 --resolution 64", 2, "does not take --resolution"),
-            ("sweep arm.toml phantom -o o --error error_max", 2, "without --grid does not take"),
+            ("sweep arm.toml phantom -o o --quantity error_max", 2, "without --grid does not take"),
             ("sweep phantom arm.toml -o o --reference a=1", 2, "does not take --reference"),
             (
                 "sweep arm.toml -o o --grid model.centres=60,70 --cluster tcp://a:1 --jobs 2",

@@ -2,6 +2,7 @@
 notebooks."""
 
 import ast
+import importlib.util
 import subprocess
 import sys
 import types
@@ -171,6 +172,11 @@ def test_plot_shows_every_value(run):
         run.plot("moment_arm", coordinate="hip.twist")
     with pytest.raises(rm.UsageError, match="did you mean 'length'"):
         run.plot("lenght")
+
+
+def test_no_public_name_is_that_of_a_module():
+    """Importing the module would put it in the place of what is exported."""
+    assert not [name for name in rm.__all__ if importlib.util.find_spec(f"rbfmuscle.{name}")]
 
 
 def test_notebooks_show_a_small_picture(run, loaded):
