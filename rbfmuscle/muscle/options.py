@@ -10,11 +10,19 @@ from rbfmuscle.implicit.kernels.table import get_kernel
 from rbfmuscle.scene.options import NotNegative, Table
 from rbfmuscle.validation import UsageError
 
+FEWEST_CENTRES = 4  # a linear polynomial in space has four coefficients
+
 
 def _known_bound(condition: float) -> float:
     if 0.0 < condition < 1.0:
         raise ValueError("condition must be at least 1, or 0 for no bound")
     return condition
+
+
+def _enough_centres(count: int) -> int:
+    if 0 < count < FEWEST_CENTRES:
+        raise ValueError(f"centres must be at least {FEWEST_CENTRES}, or 0 for as many as it needs")
+    return count
 
 
 def _known_kernel(name: str) -> str:
@@ -46,7 +54,7 @@ class RBFOptions(Table):
     hints: ClassVar[Mapping[str, str]] = {
         "placement": "remove it: centres lie where a fit misses the surface"
     }
-    centres: Annotated[int, Field(ge=0, le=20_000)] = 0
+    centres: Annotated[int, Field(ge=0, le=20_000), AfterValidator(_enough_centres)] = 0
     rest_error: NotNegative = 0.0
     samples: Annotated[int, Field(ge=50, le=200_000)] = 6000
     nodes: Annotated[int, Field(ge=30, le=3000)] = 300

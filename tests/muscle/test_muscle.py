@@ -165,6 +165,12 @@ def test_surface_makes_room_for_neighbours_and_keeps_its_volume(side):
     assert np.abs(shown[2].vertices - shown[0].vertices).max() < 1.0
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_fewer_centres_than_a_linear_polynomial_needs_are_refused(count):
+    with pytest.raises(SceneError, match="centres must be at least 4"):
+        RBFOptions.build({"centres": count}, context="muscle 'm': ")
+
+
 def test_a_chosen_epsilon_never_gives_a_broken_field():
     narrow = {
         "kernel": "gaussian",

@@ -12,6 +12,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.implicit.placement import lattice as lattices
 from rbfmuscle.implicit.placement.lattice import LEAST_REGION, Lattice
 from rbfmuscle.models import build_models
 from rbfmuscle.muscle.global_step import BULK
@@ -139,6 +140,24 @@ def test_quadrature_gives_volume_middle_and_moments():
     assert np.abs(w @ p / w.sum()).max() < 0.01
     wanted = np.array([3.0, 1.0, 0.6]) ** 2 / 5
     assert np.einsum("q,qa,qa->a", w, p, p) / w.sum() == pytest.approx(wanted, rel=0.03)
+
+
+def test_thin_sheet_takes_no_more_points_than_a_thick_one(monkeypatch):
+    """Its cells' least side is its thickness."""
+    counts = []
+    points_on = lattices._points_on
+
+    def count(*given):
+        found = points_on(*given)
+        counts.append(len(found))
+        return found
+
+    monkeypatch.setattr(lattices, "_points_on", count)
+    monkeypatch.setattr(lattices, "load_arrays", lambda key: {"count": np.array([20, 10, 1])})
+    for thickness in (2.0, 0.02):
+        sheet = trimesh.creation.box([100.0, 40.0, thickness]).subdivide_to_size(4.0)
+        Lattice(np.asarray(sheet.vertices), np.asarray(sheet.faces), 150)
+    assert counts[1] < 2 * counts[0]
 
 
 def test_cells_that_were_kept_give_the_same_lattice(tmp_path, monkeypatch):

@@ -88,10 +88,9 @@ class Lattice:
         depth = self.distance(middle @ self.axes)
         half = 0.5 * float(np.linalg.norm(self.spacing))
         used = depth < 0.0
-        surface = _points_on(triangles, DENSITY * float(self.spacing.min()))
-        touched = self._key(
-            np.clip(((surface - self.low) / self.spacing).astype(int), 0, self.count - 1)
-        )
+        # In units of the cells' sides, so that a thin sheet takes no more points than a thick one.
+        surface = _points_on((triangles - self.low) / self.spacing, DENSITY)
+        touched = self._key(np.clip(surface.astype(int), 0, self.count - 1))
         used[np.unique(touched)] = True
         self.full = (depth < -half)[used]
         self.cells = every[used]
