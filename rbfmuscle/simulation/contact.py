@@ -232,7 +232,7 @@ class BoneContacts:
         rest, are taken to its surface.
         """
         points = points.copy()
-        for row in np.flatnonzero(self._allowed.any(axis=1)):
+        for row in np.flatnonzero(self._allowed.any(axis=1)).tolist():
             some = np.flatnonzero(self._allowed[row] > 0.0)
             for _ in range(LIFTS):
                 distance, way = self.distance_and_direction(points[some], row)

@@ -44,7 +44,7 @@ class Crossing(NamedTuple):
     """
 
     bone: int
-    index: Integers
+    index: Integers  # type: ignore[assignment]  # a tuple has a method of this name
     flagged: int
 
 
@@ -75,8 +75,9 @@ def find_crossings(
         through = []
         for k in np.flatnonzero(found.cosine < SLIDING_COSINE):
             first, last = to_local(start[k], poses[0]), to_local(end[k], poses[1])
-            ends = first + found.places[k, :, None] * (last - first)
-            if found.cosine[k] < OPPOSITE_COSINE or _deepest(field, *ends, tolerance) > tolerance:
+            entry, leave = first + found.places[k, :, None] * (last - first)
+            opposite = found.cosine[k] < OPPOSITE_COSINE
+            if opposite or _deepest(field, entry, leave, tolerance) > tolerance:
                 through.append(k)
         flags = 0
         if options.angle is not None:

@@ -18,7 +18,9 @@ PLANES = 48  # planes through both points that are tried around a sphere or an e
 ON_SURFACE = 1e-6
 
 
-def wrap_path(points: np.ndarray, wraps: list[tuple[WrapShape, np.ndarray]]) -> np.ndarray:
+def wrap_path(
+    points: np.ndarray, wraps: list[tuple[WrapShape, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray]:
     """A path (n, 3) with points between its own where it goes around shapes, and which of the
     result (m, 3) are its own, (n,).
 
