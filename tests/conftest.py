@@ -1,5 +1,6 @@
 """What several test files share."""
 
+import hashlib
 import itertools
 import os
 import re
@@ -16,6 +17,14 @@ ROOT = Path(__file__).resolve().parent.parent
 # what runs side by side is tested as such.
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+# Numba sees edits of a loop in its own file alone, not in those of the loops that it calls: tests
+# keep the code of each state of the sources apart.
+_sources = hashlib.sha256()
+for _file in sorted([*ROOT.glob("rbfmuscle/**/*.py"), *ROOT.glob("pbd_baseline/*.py")]):
+    _sources.update(_file.read_bytes())
+_loops = ROOT / ".pytest_cache" / "loops" / _sources.hexdigest()[:16]
+os.environ.setdefault("NUMBA_CACHE_DIR", str(_loops))
 
 # Seed of moves at random of the vertices of every scene, and of the shapes that tests make; 0 is
 # none. They are moved by this share of their size, more than what another processor rounds

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints.tables import JointTable
 from rbfmuscle.scene.objects import Attachment, Motion, Muscle
@@ -55,7 +55,7 @@ def _field(mesh, centre):
     return BoneSDF.from_mesh(mesh)
 
 
-@compiled
+@loop
 def press(target, now, inverse, index, gap, normal):
     """Least energy under half-spaces, by projected Gauss-Seidel on their pressures."""
     x, pressure = target.copy(), np.zeros(len(index))

@@ -27,6 +27,9 @@ WIDE = SIDE + 3  # nodes along it, those of the splines that reach into it too
 ROUNDING = 1.7
 LEAST_ROUNDING = 0.1  # of that
 PROBES, STEPS_IN = 300, 12  # paths into a bone that tell how thick it is, and places along each
+# In place of the row of a block: farther from the bone than the reach it was rounded for, and deep
+# inside it.
+FAR, UNKNOWN = -1, -2
 LEAST_SLOPE = 0.3  # where the distance's slope is less, inside a thin bone, the spline is flat
 
 
@@ -37,7 +40,7 @@ class RoundedBone(NamedTuple):
     origin: Floats  # (3,) of the lattice, in bone coordinates
     axes: Floats  # (3, 3) rows
     low: Integers  # (3,) first block along each axis
-    table: Integers  # (i, j, k) int32, row of each block in ``nodes``, -1 where there is none
+    table: Integers  # (i, j, k) int32, row of each block in ``nodes``, `FAR` or `UNKNOWN`
     nodes: Floats  # (blocks, WIDE³) distances [cells]
 
 
@@ -59,7 +62,7 @@ def round_bone(
     edge = ROUNDING * spacing
     edge = max(bone_thickness(bone, edge), LEAST_ROUNDING * edge)
     place = (frame.origin.tolist(), frame.axes.tolist())
-    options = ("rounded", edge, reach, np.asarray(region).tolist(), *place)
+    options = ("rounded", 2, edge, reach, np.asarray(region).tolist(), *place)
     key = content_key(bone.vertices, bone.faces, options) if cache else None
     arrays = None if key is None else load_arrays(key)
     if arrays is None or arrays.keys() != {"low", "table", "nodes"}:
@@ -102,9 +105,10 @@ def _fill(
     shape = np.floor(corners.max(axis=0)).astype(np.int64) + 1 - first
     blocks = np.indices(shape).reshape(3, -1).T + first
     middles = frame.origin + (blocks + 0.5) * side @ frame.axes
-    near = np.abs(bone.distance(middles, reach=band)) <= band
+    middle = bone.distance(middles, reach=band)
+    near = np.abs(middle) <= band
     blocks = blocks[near]
-    table = np.full(len(near), -1, dtype=np.int32)
+    table = np.where(middle > 0.0, FAR, UNKNOWN).astype(np.int32)
     table[near] = np.arange(len(blocks))
     # A block shares most of its nodes with its neighbours.
     inner = np.indices((WIDE, WIDE, WIDE)).reshape(3, -1).T - 1
@@ -127,7 +131,8 @@ def rounded_at(rounded, x, y, z):
     more than the point moves; the same over its slope, which is near the distance to the smoothed
     surface; and its unit gradient.
 
-    All are NaN where there is no block, or where the spline is flat.
+    All are NaN where the point is beyond all blocks or deep inside the bone, and where the spline
+    is flat; the distances are infinite farther from the bone than it is rounded.
     """
     axes = rounded.axes
     table = rounded.table
@@ -145,8 +150,10 @@ def rounded_at(rounded, x, y, z):
     b = j // SIDE - low[1]
     c = k // SIDE - low[2]
     inside = 0 <= a < table.shape[0] and 0 <= b < table.shape[1] and 0 <= c < table.shape[2]
-    if not inside or table[a, b, c] < 0:
+    if not inside or table[a, b, c] == UNKNOWN:
         return np.nan, np.nan, np.nan, np.nan, np.nan
+    if table[a, b, c] == FAR:
+        return np.inf, np.inf, np.nan, np.nan, np.nan
     start = ((i % SIDE) * WIDE + j % SIDE) * WIDE + k % SIDE
     value, sx, sy, sz = bspline_sum(
         rounded.nodes, np.int64(table[a, b, c]), start, WIDE, u - i, v - j, w - k

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import logging
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.bones.cell_field import CellField
 from rbfmuscle.bones.distance import BoneArrays, Memory, bone_arrays, distance_loop, winding_loop
 from rbfmuscle.bones.mesh import prepare_bone
 from rbfmuscle.geometry.arrays import Floats, MeshLike
@@ -67,11 +65,6 @@ class BoneSDF:
     def closed(self) -> bool:
         """Whether the sign comes from the mesh itself (else from winding numbers)."""
         return len(self.arrays.dipoles) == 0
-
-    @cached_property
-    def cells(self) -> CellField:
-        """The same by cells, for loops that read these."""
-        return CellField.from_mesh((self.vertices, self.faces))
 
     @classmethod
     def from_mesh(cls, mesh: MeshLike, *, name: str = "bone") -> BoneSDF:

@@ -16,7 +16,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.geometry.vectors import to_world
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.appearance import rgb, tendon_mesh
 from rbfmuscle.run.data import RunData, frame_caption, open_run
@@ -147,7 +147,7 @@ def labelled(
     return sheet
 
 
-@compiled
+@loop
 def _raster_loop(points, faces, shades, opacity, depth, image):
     height, width = depth.shape
     for f in range(len(faces)):

@@ -20,7 +20,7 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import connected_vertices, vertex_areas
 from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.geometry.vectors import to_local
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.metrics.rows import bones_about
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.joints.joint import Joint, all_coordinates, rigid_body
@@ -379,7 +379,7 @@ def _planes(
     return gap, normal
 
 
-@compiled
+@loop
 def _tighten_loop(string, held, normal, offset, sweeps, relaxation):
     """Move nodes that are not held (n,) to where the squared segments are least with normal · node
     >= offset, by projected SOR.

@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.muscle.fibres import flux
-from rbfmuscle.muscle.model import Fibres, SolidModel
 from rbfmuscle.scene.activation.contraction import make_contraction
 from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.solid.model import Fibres, SolidModel
 
 PEAK = 30.0  # greatest isometric tension of active fibres, in shear moduli
 WIDEST = 0.2  # share of the belly that counts as its widest part

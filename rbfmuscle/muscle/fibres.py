@@ -6,10 +6,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
-from rbfmuscle.muscle.model import SolidModel, hung_matrix
 from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.muscles import attachment_ends
 from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.solid.model import SolidModel, hung_matrix
 
 
 def held_at_insertion(model: SolidModel, muscle: Muscle, joints: Sequence[Joint]) -> Booleans:

@@ -6,37 +6,44 @@ from functools import partial
 
 import numpy as np
 
+from rbfmuscle.bones.rounded import round_bone
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.fibres import fibre_directions
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.implicit.placement.lattice import Lattice
 from rbfmuscle.muscle.activation import contracting_fibres
 from rbfmuscle.muscle.fibres import along_fibres, held_at_insertion
-from rbfmuscle.muscle.model import (
-    SolidModel,
-    attached_owner,
-    build_solid,
-    carry,
-    embed,
-    lattice_slopes,
-    stiffness,
-    turned_normals,
-)
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
-from rbfmuscle.muscle.rounded_bones import RoundedBones, grown, round_bones
-from rbfmuscle.muscle.settle import DIVERGED, NO_ROOM, settle
-from rbfmuscle.muscle.state import SolidState, predict, rest_state, transform
 from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.muscles import attachment_frames, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import EVERYWHERE, BoneContacts
 from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
+from rbfmuscle.solid.contact import NO_FENCES, Fences, Mobility, Obstacles
+from rbfmuscle.solid.kernels import turned_normals
+from rbfmuscle.solid.lattice import Lattice
+from rbfmuscle.solid.model import (
+    SolidModel,
+    attached_owner,
+    build_solid,
+    embed,
+    lattice_slopes,
+    stiffness,
+)
+from rbfmuscle.solid.solve import NEAR, Settling, find_slowness, settle
+from rbfmuscle.solid.state import SolidState, predict, rest_state, transform
+from rbfmuscle.solid.touching import SEARCHED, Body, Material, carried, even_points
 from rbfmuscle.surface.drawing import Carry, SurfaceBuilder
 
 # Neighbours meet a muscle at contact points so far apart, of the side of a lattice cell, which has
 # three nodes on it.
 CONTACT_SPACING = 0.3
+
+
+# A muscle whose activation changes while the bones stand still ends nearer to its equilibrium: what
+# is left of each step adds up.
+ERROR_ACTIVE = 2e-6
 
 
 class RBFMuscle:
@@ -75,6 +82,7 @@ class RBFMuscle:
     def __init__(self, muscle: Muscle, scene: Scene, options: RBFOptions | None = None) -> None:
         given, (muscle, order) = muscle, ordered_muscle(muscle)
         self.name = muscle.name
+        self._rest_mesh = muscle.mesh
         self.options = options or RBFOptions()
         self.rest = RestState.from_muscle(muscle, scene, self.options)
         self.frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
@@ -83,7 +91,7 @@ class RBFMuscle:
             muscle, scene.joints, self._lattice, self.frame, self.rest, self.options
         )
         self.state = rest_state(self.model)
-        self._stiffness = stiffness(self.model, 0.0)
+        self._stiffen(0.0)
         self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
         self.drawer = SurfaceBuilder(
             muscle,
@@ -103,11 +111,7 @@ class RBFMuscle:
         owner = attached_owner(self.model)
         self.contact_spacing = CONTACT_SPACING * self.model.side
         self.attached_bone = np.where(owner < 0, -1, numbers[owner])
-        self._meshes = {
-            bone.name: (np.asarray(bone.mesh.vertices), np.asarray(bone.mesh.faces))
-            for bone in scene.bones
-        }
-        self._rounded: tuple[BoneContacts, RoundedBones] | None = None
+        self._met: tuple[BoneContacts, Obstacles] | None = None
         self.log = SolveLog(solver_residual=0.0, solid_volume_error=0.0)
 
     def contact_points(self) -> np.ndarray:
@@ -126,33 +130,87 @@ class RBFMuscle:
 
     def solve(self, contacts: BoneContacts, *, room: bool = False) -> None:
         """Solve for the equilibrium under elasticity, volume and contact at the bones' present
-        poses; with ``room`` only move what is shown out of the planes of neighbours.
+        poses.
         """
-        if self._rounded is None or self._rounded[0] is not contacts:
-            spacing, count = float(np.sqrt(self.model.area)), len(self.state.points)
-            fields = dict(zip(contacts.bones.names, contacts.bones.fields))
-            rounded = round_bones(fields, self.frame, spacing, self._meshes, count)
-            self._rounded = contacts, rounded
-        given = self.model, self._stiffness, self.state, contacts.obstacles()
-        state, report = settle(*given, self._rounded[1], room=room)
-        while report.status == NO_ROOM:
-            self._rounded = contacts, grown(self._rounded[1])
-            state, report = settle(*given, self._rounded[1], room=room)
-        if report.status == DIVERGED:
-            raise FloatingPointError("the solid does not settle")
-        self.state = state
-        if not room:
-            self.log.add(
-                caps=report.caps,
-                solver_residual=report.residual,
-                solid_volume_error=report.volume_error,
-            )
+        if room:
+            return
+        solid = self.settling(contacts)
+        settle([solid])
+        self.take(solid)
+
+    def settling(self, contacts: BoneContacts) -> Settling:
+        """The solid on its way to equilibrium."""
+        if self._met is None or self._met[0] is not contacts:
+            self._met = contacts, self._obstacles(contacts)
+        obstacles = self._met[1]
+        fences = [Fences(p.index, p.gap, p.normal, p.anchor) for p in contacts.neighbours]
+        obstacles.fences = Fences(*map(np.concatenate, zip(*fences))) if fences else NO_FENCES
+        return Settling(
+            self.model,
+            self._stiffness,
+            self._mobility,
+            self.state,
+            obstacles,
+            slowness=self._slowness,
+            error=ERROR_ACTIVE if self.state.activation or not self.state.step.any() else None,
+        )
+
+    def take(self, solid: Settling) -> None:
+        """Take the state where a solve ended."""
+        self.state = solid.finish()
+        report = solid.report()
+        self.log.add(
+            caps=len(report.caps),
+            solver_residual=report.error,
+            solid_volume_error=report.volume_error,
+        )
+
+    def _obstacles(self, contacts: BoneContacts) -> Obstacles:
+        """What the contact points meet, with the bones rounded for their spacing."""
+        spacing, reach = float(np.sqrt(self.model.area)), NEAR * self.model.size
+        bones = contacts.bones
+        rounded = [
+            round_bone(field, self.frame, spacing, region, reach=reach)
+            for field, region in zip(bones.fields, bones.regions)
+        ]
+        boxes = np.array([field.bounds for field in bones.fields]).reshape(-1, 2, 3)
+        exact = [field.arrays for field in bones.fields]
+        return Obstacles(exact, boxes, rounded, contacts.placed, contacts.free, contacts.allowed)
+
+    def body(self) -> Body:
+        """What this muscle is to others that it touches."""
+        model, lattice, frame = self.model, self._lattice, self.frame
+        points = even_points(model.points, model.owner, model.size)
+        spacing = float(np.sqrt(model.area))
+        rest = BoneSDF.from_mesh(self._rest_mesh, name=self.name)
+        reach = SEARCHED * model.size
+        turn = lattice.axes @ frame.axes / frame.size / lattice.spacing[:, None]
+        origin = frame.origin + np.linalg.solve(turn, lattice.low / lattice.spacing)
+        every = np.indices(tuple(lattice.count)).reshape(3, -1).T
+        nearest = lattice.tree.query(every + 0.5)[1].astype(np.int64)
+        material = Material(
+            origin,
+            turn,
+            np.linalg.inv(turn),
+            nearest.reshape(tuple(lattice.count)),
+            np.ascontiguousarray(lattice.cells),
+            lattice.nodes,
+            round_bone(rest, frame, spacing, rest.bounds + EVERYWHERE, reach=reach),
+        )
+        places = (model.points[points] - origin) @ turn.T
+        area = float(self._rest_mesh.area) / len(points)
+        return Body(self.name, material, points, places, area, model.size)
+
+    def _stiffen(self, activation: float) -> None:
+        self._stiffness = stiffness(self.model, activation)
+        self._mobility = Mobility(*self.model.embedding, self._stiffness.inverse)
+        self._slowness = find_slowness(self.model, self._stiffness, self._mobility)
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
-        if activation != self.state.activation[0]:
-            self._stiffness = stiffness(self.model, activation)
-            self.state = self.state._replace(activation=np.array([activation]))
+        if activation != self.state.activation:
+            self._stiffen(activation)
+            self.state = self.state._replace(activation=activation, metric=None)
 
     def transform(self, motion: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4), as the muscle is."""
@@ -165,7 +223,7 @@ class RBFMuscle:
     def restore(self, state: tuple[SolidState, float, LogState]) -> None:
         """Go back to a snapshot."""
         solid, self.drawer.level, self.log.state = state
-        self.activate(float(solid.activation[0]))
+        self.activate(solid.activation)
         self.state = solid
 
     def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
@@ -175,7 +233,7 @@ class RBFMuscle:
 
     def _carry(self, points: np.ndarray) -> Carry:
         """What gives the places (n, 3) of points (n, 3) of the muscle at rest from the nodes."""
-        return partial(carry, embed(self._lattice, self.frame, points))
+        return partial(carried, *embed(self._lattice, self.frame, points))
 
     def embedded_mesh(self) -> Mesh:
         """The shown mesh where the solid carries it."""
@@ -183,12 +241,14 @@ class RBFMuscle:
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lies in the way."""
-        columns, nodes = self.model.embedding.columns, self.state.lifted_nodes
-        normals = turned_normals(nodes, columns, self._normals_at, self.rest.normals)
+        nodes = self.state.lifted_nodes
+        normals = np.empty_like(self.rest.normals)
+        columns = self.model.embedding.columns
+        turned_normals(nodes, columns, self._normals_at, self.rest.normals, normals)
         drawn = self.drawer.draw(self.state.points, nodes, normals, contacts)
         quantities, notes = self.log.take()
         # Before what the solve left in a bone was lifted out of it.
-        settled = carry(self.model.embedding, self.state.nodes)
+        settled = carried(*self.model.embedding, self.state.nodes)
         drawn.quantities["solver_penetration_max"] = contacts.depth(settled)
         drawn.quantities.update(quantities)
         drawn.notes.extend(notes)

@@ -8,20 +8,12 @@ represented.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.bones.distance import Memory
-from rbfmuscle.bones.obstacles import (
-    Bones,
-    Known,
-    Obstacles,
-    PlaneStack,
-    stack_bones,
-)
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.rest_frame import moved_box
@@ -74,23 +66,30 @@ class Neighbour(Protocol):
         """How far (n,) points (n, 3) are to move inwards for it [scene unit]."""
 
 
+# Grows a box so far that it holds all that can be near the bone in it.
+EVERYWHERE = np.array([[-np.inf], [np.inf]])
+
+
 class BonesInReach:
     """The r bones that a muscle can reach, which never change; the poses are given. Muscles may
-    share the ``fields``.
+    share the ``fields``; ``regions`` are the boxes (2, 3) of each bone that this one can reach, in
+    bone coordinates, all of it where they are not given.
     """
 
-    def __init__(self, names: Sequence[str], fields: Sequence[BoneSDF]) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        fields: Sequence[BoneSDF],
+        regions: Sequence[Floats] | None = None,
+    ) -> None:
         if len(names) != len(fields):
             raise ValueError(
                 f"one field per bone is needed, got {len(fields)} for {len(names)} bones"
             )
         self.names = list(names)
         self.fields = list(fields)
-
-    @cached_property
-    def arrays(self) -> Bones:
-        """All fields by cells, for loops that read these."""
-        return stack_bones(self.fields)
+        everywhere = [field.bounds + EVERYWHERE for field in fields]
+        self.regions = everywhere if regions is None else list(regions)
 
     def place(self, poses: Mapping[str, Floats], out: Floats | None = None) -> Floats:
         """Poses (r, 4, 4) of the bones, from a dict of bone name to (4, 4) rest-to-world
@@ -149,7 +148,7 @@ class BoneContacts:
         self.neighbours: list[Planes] = []
         self.beside: list[Neighbour] = []
         self._free = np.flatnonzero(self.free)
-        self._allowed = np.zeros((len(bones.names), len(self.free)))
+        self.allowed = np.zeros((len(bones.names), len(self.free)))
         #: What is known of the free points about each bone in reach.
         self.memories = [Memory.of(len(self._free)) for _ in bones.names]
 
@@ -158,25 +157,14 @@ class BoneContacts:
         self.bones.place(poses, self.placed)
         self.poses = poses
 
-    @cached_property
-    def _known(self) -> Known:
-        shape = self._allowed.shape
-        return Known(np.zeros((*shape, 3)), np.full(shape, -np.inf))
-
-    def obstacles(self) -> Obstacles:
-        """What the contact points meet in the present poses, for loops that read cells."""
-        planes = _stacked_planes(self.neighbours)
-        known = self._known
-        return Obstacles(self.bones.arrays, self.placed, self.free, self._allowed, known, planes)
-
     def allow(self, row: int, depth: Floats) -> None:
         """Let each contact point be up to ``depth`` (n,) inside a bone in reach [scene unit]."""
-        self._allowed[row] = depth
+        self.allowed[row] = depth
 
     @property
     def keeps_overlap(self) -> Booleans:
         """Which contact points (n,) are allowed in a bone."""
-        return np.asarray((self._allowed > 0.0).any(axis=0))
+        return np.asarray((self.allowed > 0.0).any(axis=0))
 
     def distance_and_direction(self, points: Floats, row: int) -> tuple[Floats, Floats]:
         """Signed distance (n,) to one of the bones in reach and the unit direction (n, 3) in which
@@ -212,7 +200,7 @@ class BoneContacts:
         some = points[self._free]
         found = [NO_SPACES]
         for row in self._near(some, reach):
-            allowed = self._allowed[row, self._free]
+            allowed = self.allowed[row, self._free]
             distance, normal = self._ask(row, some, reach - allowed)
             gap = distance + allowed
             near = np.flatnonzero(gap < reach)
@@ -232,8 +220,8 @@ class BoneContacts:
         rest, are taken to its surface.
         """
         points = points.copy()
-        for row in np.flatnonzero(self._allowed.any(axis=1)).tolist():
-            some = np.flatnonzero(self._allowed[row] > 0.0)
+        for row in np.flatnonzero(self.allowed.any(axis=1)).tolist():
+            some = np.flatnonzero(self.allowed[row] > 0.0)
             for _ in range(LIFTS):
                 distance, way = self.distance_and_direction(points[some], row)
                 points[some] += np.maximum(-distance, 0.0)[:, None] * way
@@ -258,16 +246,3 @@ class BoneContacts:
 NO_SPACES = HalfSpaces(
     np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
 )
-
-
-def _stacked_planes(kinds: Sequence[Planes]) -> PlaneStack:
-    """The planes of some kinds, which may be none."""
-    some = [Planes(), *kinds]
-    return PlaneStack(
-        np.concatenate([planes.index for planes in some]),
-        np.concatenate([planes.gap for planes in some]),
-        np.concatenate([planes.normal for planes in some]),
-        np.concatenate([planes.anchor for planes in some]),
-        np.repeat(np.arange(len(kinds)), [len(planes.index) for planes in kinds]),
-        np.array([planes.softness for planes in kinds], dtype=np.float64),
-    )

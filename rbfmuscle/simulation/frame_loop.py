@@ -285,5 +285,6 @@ def _obstacles(scene, models, bone_sdfs):
     order = [name for name in names if name in bone_sdfs]
     for model in models:
         met = [name for name in order if regions is None or (model.name, name) in regions]
-        reached = BonesInReach(met, [bone_sdfs[name] for name in met])
+        parts = None if regions is None else [regions[model.name, name] for name in met]
+        reached = BonesInReach(met, [bone_sdfs[name] for name in met], parts)
         yield BoneContacts(reached, model.attached_bone)

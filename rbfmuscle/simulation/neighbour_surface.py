@@ -12,7 +12,7 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.surfaces import touching_balls, vertex_normals
 from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
 from rbfmuscle.geometry.winding import winding_loop
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 
 if TYPE_CHECKING:
     from rbfmuscle.simulation.frame import Mesh, MuscleModel
@@ -279,7 +279,7 @@ def _change(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str
     return {name: value - before.get(name, 0.0) for name, value in after.items()}
 
 
-@compiled
+@loop
 def _walk_loop(points, index, skin, nearest, away):
     """From vertices over edges to the nearest ones, and how far away these are."""
     vertices, _, faces, start, ring = skin
@@ -307,7 +307,7 @@ class _Foot(NamedTuple):
     true: np.ndarray  # (3,) sum of the unit normals of the triangles that meet there
 
 
-@compiled
+@loop
 def _distance_loop(points, index, nearest, skin, distance, normal):
     foot = _Foot(np.empty(3), np.empty(3), np.empty(3))
     at, weights = np.empty(3), np.empty(3)
@@ -333,7 +333,7 @@ def _distance_loop(points, index, nearest, skin, distance, normal):
         distance[q] = sign * length
 
 
-@compiled()
+@loop()
 def _find_foot(point, vertex, skin, weights, at, foot):
     """Squared distance of a point from the triangles about a vertex, and the nearest of these;
     fills the foot. ``weights`` and ``at`` (3,) are room for those of one triangle.
@@ -364,7 +364,7 @@ def _find_foot(point, vertex, skin, weights, at, foot):
     return least, face
 
 
-@compiled
+@loop
 def _add_unit_normal(vertices, faces, f, total):
     """Add the unit normal of a triangle."""
     x, y, z = triangle_normal(vertices, faces, f)

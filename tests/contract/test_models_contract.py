@@ -194,7 +194,7 @@ def test_a_solve_at_its_cap_is_an_event_and_beyond_its_limit():
     assert "iteration_cap" not in actions[0] and "iteration_cap" in actions[1]
     residuals = [run.values("strap0", "solver_residual").max() for run in (settled, capped)]
     assert residuals[0] < LIMITS["solver_residual"].value < residuals[1]
-    assert "last motion of the solver" in capped.verdict
+    assert "strap0 is not within all limits" in capped.verdict
     assert settled.values("strap0", "solid_volume_error").max() < LIMITS["solid_volume_error"].value
 
 

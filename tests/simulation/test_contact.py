@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from toy_scene import ToyMuscle, attach, box, ellipsoid, muscle, scene, sphere
 
-from rbfmuscle.bones.broad_phase import boxes_apart, direction_loop
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach, Planes
@@ -88,31 +87,13 @@ def test_nearest_is_the_smallest_over_bones_and_infinite_without():
     assert np.all(found[~below] >= limit[~below]) and np.all(found <= distance + 1e-9)
 
 
-def test_boxes_are_apart_by_no_more_than_what_is_in_them():
+def test_moved_box_holds_what_is_in_the_box():
     rng = np.random.default_rng(3)
-    apart = []
-    for _ in range(200):
-        fixed, bounds = np.sort(rng.uniform(-3, 3, (2, 2, 3)), axis=1) + rng.uniform(
-            -8, 8, (2, 1, 3)
-        )
+    for _ in range(50):
+        bounds = np.sort(rng.uniform(-3, 3, (2, 3)), axis=0)
         pose = rotation_about(rng.normal(size=3), rng.uniform(0, 3), rng.uniform(-2, 2, 3))
         corners = np.array(list(product(*bounds.T))) @ pose[:3, :3].T + pose[:3, 3]
         assert np.allclose(moved_box(bounds, pose), [corners.min(axis=0), corners.max(axis=0)])
-        # Of a corner the nearest place of the other box is the corner itself, kept within its
-        # sides.
-        least = np.linalg.norm(corners - np.clip(corners, *fixed), axis=1).min()
-        apart.append(boxes_apart(fixed, pose, bounds))
-        assert apart[-1] <= least + 1e-9
-    assert np.mean(np.array(apart) > 0.0) > 0.3
-    # Side by side along the axes they are as far apart as they look.
-    two = np.array([[0.0, 0, 0], [1, 1, 1]])
-    assert boxes_apart(two, np.eye(4), two + [3.0, 0, 5.0]) == pytest.approx(np.hypot(2.0, 4.0))
-
-
-def test_point_with_no_direction_still_gets_one():
-    gradient, corners = np.zeros((1, 3)), np.array([[-2.0, -2, -2], [2, 2, 2]])
-    direction_loop(np.array([[0.5, 0, 0]]), gradient, np.eye(4), corners)
-    assert np.allclose(gradient, [[1, 0, 0]])
 
 
 def test_kept_overlap_is_no_contact_and_deeper_is():

@@ -21,7 +21,7 @@ from rbfmuscle.geometry.surfaces import (
     unique_edges,
     vertex_areas,
 )
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.validation import MeshError
 
 # Least ratio of cell size to edge length: about ten mesh vertices a cell, or cells get ragged.
@@ -122,7 +122,7 @@ def cluster_mesh(
     return contract_clusters(fine.faces, labels, weight, count)
 
 
-@compiled
+@loop
 def _farthest_loop(start, other, length, first, count, labels):
     """Farthest points by distance along edges; labels become the nearest of them."""
     distance = np.full(len(start) - 1, np.inf)
@@ -147,7 +147,7 @@ def _farthest_loop(start, other, length, first, count, labels):
         chosen = np.argmax(distance)
 
 
-@compiled
+@loop
 def _cell_energy(moment, mass, k, sign, x, w):
     """Inertia of cell k but for a constant, with a vertex added (sign 1), taken away (-1) or
     neither.
@@ -161,7 +161,7 @@ def _cell_energy(moment, mass, k, sign, x, w):
     return -total / m
 
 
-@compiled
+@loop
 def _equalise_loop(vertices, weight, edges, labels, count):
     """Move vertices between neighbouring cells while that lowers the sum of the cells' inertias."""
     moment = np.zeros((count, 3))
@@ -219,7 +219,7 @@ def _mark_loose(
     labels[(labels >= 0) & (piece != heaviest[labels])] = -2
 
 
-@compiled
+@loop
 def _join_loop(start, other, labels):
     """Vertices of label -2 join a cell beside them."""
     loose = (labels == -2).sum()
@@ -270,12 +270,12 @@ def contract_clusters(
     return order[parent], order[control[control[:, 0] >= 0]]
 
 
-@compiled
+@loop
 def _preceding(h):
     return h + 2 if h % 3 == 0 else h - 1
 
 
-@compiled
+@loop
 def _is_contractible(h, tail, twin, mark):
     """Whether the ends of half-edge h share exactly two neighbours (link condition)."""
     a, b = tail[h], tail[twin[h]]
@@ -303,7 +303,7 @@ def _is_contractible(h, tail, twin, mark):
     return common == 2 and a != b
 
 
-@compiled
+@loop
 def _contract(h, tail, twin, out, parent, weight):
     """Contract half-edge h = (a -> b): b is merged into a, two faces vanish."""
     a, b = tail[h], tail[twin[h]]
@@ -327,7 +327,7 @@ def _contract(h, tail, twin, out, parent, weight):
     weight[a] += weight[b]
 
 
-@compiled
+@loop
 def _contract_one(tail, twin, out, parent, label, weight, mark, main):
     """Contract the lightest left-over piece into a neighbour; any light pair where no such piece
     can be.
@@ -345,7 +345,7 @@ def _contract_one(tail, twin, out, parent, label, weight, mark, main):
     return best >= 0
 
 
-@compiled
+@loop
 def _contract_loop(tail, twin, out, parent, label, weight, live, count):
     """Contract edges inside clusters, then left-over pieces one by one; return the number of
     vertices left.

@@ -10,7 +10,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.triangles import nearest_weights
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.clustering import FineMesh, cluster_mesh, refine_mesh
-from rbfmuscle.jit import compiled
+from rbfmuscle.loops import loop
 from rbfmuscle.validation import MeshError, check_mesh
 
 # Densities stay within this ratio, so that no part of the surface is left without centres that
@@ -188,7 +188,7 @@ def _normals_at(fine: FineMesh, points: Floats, piece: Integers, corner: Integer
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
-@compiled
+@loop
 def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distance):
     """Point nearest to target[k] of the triangles wholly in cell k: at a thin rim two would else
     take the same.

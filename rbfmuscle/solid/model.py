@@ -23,12 +23,15 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
-from rbfmuscle.implicit.placement.lattice import Embedding as LatticePoints
-from rbfmuscle.implicit.placement.lattice import Lattice
-from rbfmuscle.jit import compiled
+from rbfmuscle.solid.kernels import add_rows
+from rbfmuscle.solid.lattice import Embedding as LatticePoints
+from rbfmuscle.solid.lattice import Lattice
 
 # A bone holds its points, and with ten times the stiffness their mean. A spring at a point that
 # stands for such a part of the surface is as stiff as a cell: springs are spread evenly over an
@@ -51,6 +54,10 @@ MOBILE = 0.02
 # that shortens fibres by more than the ends approach, as any above 1.5 (1 - d / d₀) does, would
 # straighten the muscle at the first motion.
 ANTI_BUCKLING_TENSION, GREATEST_TENSION = 30.0, 0.9
+# Modes in which a solid is softer than its matrix, the error of these, and the share of the
+# softening that is taken: a stretched or pressed solid is stiffer than at rest.
+SOFT, SOFT_ERROR, SOFTENED = 10, 0.01, 0.5
+BLOCK = 1024  # points whose mobility is found at once
 # Greatest pressure that a contact takes, over 2 μ. With 5 the gluteus maximus is pressed 6.6 mm
 # into the femur in 90 degrees of flexion.
 MOST_CONTACT_PRESSURE = 40.0
@@ -81,25 +88,14 @@ class Cells(NamedTuple):
     weights: np.ndarray  # (Q,) volume of a point [scene unit cubed]
     points: np.ndarray  # (Q, 3) at rest
     region: np.ndarray  # (C,) its region
-    slot: np.ndarray  # (C, 27) row of its nodes in a gradient of the regions' volumes
-    start: np.ndarray  # (M + 1,) first row of each region
-    node: np.ndarray  # (S,) node of each row
     volumes: np.ndarray  # (M,) of the regions at rest [scene unit cubed]
 
 
 class Embedding(NamedTuple):
-    """Points of the muscle as sums of its nodes; those of a lattice cell have the same 27.
-
-    ``order`` lists them cell by cell, cell c from ``start[c]`` on; ``by_cell`` (27, n) has the
-    shape functions in that order, so that loops over them read memory in its order.
-    """
+    """Points of the muscle as sums of 27 of its nodes."""
 
     columns: np.ndarray  # (n, 27)
     shares: np.ndarray  # (n, 27) shape functions
-    nodes: np.ndarray  # (cells, 27)
-    start: np.ndarray  # (cells + 1,)
-    order: np.ndarray  # (n,)
-    by_cell: np.ndarray  # (27, n)
 
 
 class SolidModel(NamedTuple):
@@ -120,6 +116,7 @@ class SolidModel(NamedTuple):
     matrix: np.ndarray  # (N, N) second derivative of E / 2 μ without springs and fibres
     motion_weights: np.ndarray  # (N, b) how much of each bone's motion a node takes
     reach: np.ndarray  # (N,) how much of a node's motion material takes, about
+    axes: np.ndarray  # (3, 3) rows: of the rest frame, which turn with the scene
     size: float  # diameter of the muscle [scene unit]
     side: float  # of a lattice cell [scene unit]
     area: float  # of the surface, for each contact point [scene unit squared]
@@ -129,7 +126,9 @@ class SolidModel(NamedTuple):
 class Stiffness(NamedTuple):
     """What follows from the model and an activation."""
 
-    inverse: np.ndarray  # (N, N) of the second derivative of E / 2 μ
+    matrix: np.ndarray  # (N, N) A, the second derivative of E / 2 μ for rotations that stay
+    inverse: np.ndarray  # (N, N)
+    soft: np.ndarray  # (N, 3, m) modes that the solid yields more in, at rest: see `soft_modes`
     most: np.ndarray  # (n,) greatest contact force, over 2 μ
 
 
@@ -153,7 +152,7 @@ def build_solid(
     """
     side = float(np.prod(lattice.spacing)) ** (1 / 3) * frame.size
     rest = frame.points(lattice.rest)
-    cells = _number_regions(lattice, frame)
+    cells = _cut_regions(lattice, frame)
     embedding = embed(lattice, frame, points)
     spring = side * HELD_OF * area / surface
     hangs = np.zeros((len(rest), len(held)))
@@ -178,6 +177,7 @@ def build_solid(
         matrix=GHOST * side * lattice.second_differences() + _gram(cells, len(rest)),
         motion_weights=np.empty((0, 0)),
         reach=_reach(len(rest), embedding, embed(lattice, frame, cells.points)),
+        axes=frame.axes,
         size=diameter(points),
         side=side,
         area=area,
@@ -208,12 +208,7 @@ def _springs(hangs: Floats, bone: Integers, spring: float) -> Floats:
 def embed(lattice: Lattice, frame: RestFrame, points: Floats) -> Embedding:
     """Points (n, 3) of the muscle at rest as sums of the lattice's nodes."""
     found = _embedded(lattice, frame, points)
-    nodes, cell = np.unique(found.indices, axis=0, return_inverse=True)
-    cell = cell.ravel()
-    order = np.argsort(cell, kind="stable")
-    start = np.searchsorted(cell[order], np.arange(len(nodes) + 1))
-    by_cell = np.ascontiguousarray(found.weights[order].T)
-    return Embedding(found.indices, found.weights, nodes, start, order, by_cell)
+    return Embedding(found.indices, found.weights)
 
 
 def lattice_slopes(lattice: Lattice, frame: RestFrame, points: Floats) -> Floats:
@@ -225,13 +220,11 @@ def _embedded(lattice: Lattice, frame: RestFrame, points: Floats) -> LatticePoin
     return lattice.embed((points - frame.origin) @ frame.axes.T / frame.size)
 
 
-def _number_regions(lattice: Lattice, frame: RestFrame) -> Cells:
+def _cut_regions(lattice: Lattice, frame: RestFrame) -> Cells:
     """The quadrature, and regions of about `NODES_PER_REGION` nodes."""
-    size, cells = len(lattice.rest), len(lattice.cells)
-    region = lattice.regions(max(1, size // NODES_PER_REGION))
+    cells = len(lattice.cells)
+    region = lattice.regions(max(1, len(lattice.rest) // NODES_PER_REGION))
     weights = lattice.weights * frame.size**3
-    known, slot = np.unique(region[:, None] * size + lattice.nodes, return_inverse=True)
-    count = int(region.max()) + 1
     slopes = lattice.quadrature.slopes @ frame.axes / frame.size
     by_cell = slopes.reshape(cells, -1, lattice.nodes.shape[1], 3).transpose(0, 2, 3, 1)
     return Cells(
@@ -240,10 +233,7 @@ def _number_regions(lattice: Lattice, frame: RestFrame) -> Cells:
         weights,
         frame.points(lattice.points),
         region,
-        slot.reshape(lattice.nodes.shape).astype(np.int64),
-        np.searchsorted(known // size, np.arange(count + 1)).astype(np.int64),
-        (known % size).astype(np.int64),
-        np.bincount(region, weights.reshape(cells, -1).sum(axis=1), minlength=count),
+        np.bincount(region, weights.reshape(cells, -1).sum(axis=1)),
     )
 
 
@@ -301,16 +291,73 @@ def stiffness(model: SolidModel, activation: float) -> Stiffness:
         along = _derivatives(cells, fibres.direction, len(model.rest))
         matrix = matrix + (along * (stiff * cells.weights)[:, None]).T @ along
     inverse = _inverted(matrix)
-    move = mobility(model.embedding.columns, model.embedding.shares, inverse)
+    move = mobility(model.embedding, inverse)
     share = np.minimum(1.0, move / np.median(move[model.owner < 0]))
-    return Stiffness(inverse, MOST_CONTACT_PRESSURE * model.area * share)
+    soft = np.zeros((len(inverse), 3, 0))
+    if activation == 0.0:
+        soft = soft_modes(model, matrix)
+    return Stiffness(matrix, inverse, soft, MOST_CONTACT_PRESSURE * model.area * share)
+
+
+def soft_modes(model: SolidModel, matrix: Floats) -> Floats:
+    """Modes W (N, 3, m) for which A⁻¹ + W Wᵀ comes nearer to the inverse of the solid's stiffness.
+
+    The matrix A holds what a motion costs whose rotations stay. A slender solid that bends turns,
+    which costs next to nothing: its stiffness H at rest, of ½ |sym ∇u|² in place of ½ |∇u|², is
+    less than A by up to a factor of 60 in its softest modes, and an iteration would contract
+    accordingly slowly. With H v = λ A v and |v|_A = 1, the volumes kept, W holds sqrt(1/λ - 1) v of
+    the `SOFT` softest.
+    """
+    nodes = len(matrix)
+    cells = model.cells
+    slopes = cells.slopes.reshape(*cells.nodes.shape, 3, -1).transpose(0, 3, 2, 1)
+    count = slopes.shape[0] * slopes.shape[1]
+    root = np.sqrt(cells.weights)[:, None, None]
+    spots = np.repeat(cells.nodes, slopes.shape[1], axis=0)
+    # Derivatives along each axis at the quadrature points, times the root of the weight.
+    row = np.broadcast_to(np.arange(3 * count).reshape(count, 3, 1), (count, 3, 27))
+    column = np.broadcast_to(spots[:, None, :], row.shape)
+    values = root * slopes.reshape(count, 3, -1)
+    gradient = csr_array((values.ravel(), (row.ravel(), column.ravel())), (3 * count, nodes))
+    factor = np.linalg.cholesky(matrix)
+    inverse = solve_triangular(factor, np.eye(nodes), lower=True)
+    kept = _volume_gradients(model, nodes)
+    kept = np.linalg.qr((inverse @ kept).reshape(3 * nodes, -1))[0]
+
+    def turned(x: Floats) -> Floats:
+        """What a motion x (3 N,), in the metric of A, costs less because it may turn."""
+        x = x - kept @ (kept.T @ x)
+        change = (gradient @ (inverse.T @ x.reshape(nodes, 3))).reshape(count, 3, 3)
+        skew = 0.5 * (change - change.swapaxes(1, 2))
+        back = inverse @ (gradient.T @ skew.reshape(3 * count, 3))
+        out = back.ravel()
+        return np.asarray(out - kept @ (kept.T @ out))
+
+    operator = LinearOperator((3 * nodes, 3 * nodes), matvec=turned, dtype=np.float64)
+    start = (np.random.default_rng(0).normal(size=(nodes, 3)) @ model.axes).ravel()
+    less, modes = eigsh(operator, k=SOFT, which="LA", v0=start, tol=SOFT_ERROR)
+    softness = np.sqrt(SOFTENED * less / np.maximum(1.0 - less, 1e-3))
+    found = inverse.T @ (modes * softness).reshape(nodes, -1)
+    return np.ascontiguousarray(found.reshape(nodes, 3, SOFT))
+
+
+def _volume_gradients(model: SolidModel, nodes: int) -> Floats:
+    """Gradients (N, 3 M) of the regions' volumes at rest, axis by axis."""
+    cells = model.cells
+    count, corners = cells.nodes.shape
+    weights = cells.weights.reshape(count, 1, 1, -1)
+    slopes = (cells.slopes.reshape(count, corners, 3, -1) * weights).sum(axis=3)
+    out = np.zeros((nodes, 3, len(cells.volumes)))
+    spots = cells.nodes[:, :, None], np.arange(3), cells.region[:, None, None]
+    np.add.at(out, spots, slopes)
+    return out.reshape(nodes, -1)
 
 
 def attached_owner(model: SolidModel) -> Integers:
     """Row (n,) of the bone that holds each contact point, -1 where none does; free points that a
     force hardly moves count to the bone of the nearest held one.
     """
-    move = mobility(model.embedding.columns, model.embedding.shares, stiffness(model, 0.0).inverse)
+    move = mobility(model.embedding, stiffness(model, 0.0).inverse)
     owner = model.owner.copy()
     free, attached = owner < 0, np.flatnonzero(owner >= 0)
     for point in np.flatnonzero(free & (move < MOBILE * np.median(move[free]))):
@@ -331,65 +378,18 @@ def _farthest_ends(held: Floats, own: Integers) -> tuple[Integers, float]:
     return end.astype(np.int64), most
 
 
-@compiled
-def mobility(columns, shares, inverse):
-    """Motion (n,) of each embedded point for a unit force at it: w A⁻¹ w."""
-    out = np.zeros(len(columns))
-    for s in range(len(columns)):
-        for k in range(columns.shape[1]):
-            for m in range(columns.shape[1]):
-                out[s] += shares[s, k] * shares[s, m] * inverse[columns[s, k], columns[s, m]]
-    return out
-
-
-@compiled(fastmath={"contract"})
-def carry(embedding, y):
-    """Places (n, 3) of embedded points, Σ_k share_k y_k, for nodes y (N, 3); cell by cell."""
-    nodes = embedding.nodes
-    start = embedding.start
-    order = embedding.order
-    shares = embedding.by_cell
-    most = 0
-    for c in range(len(nodes)):
-        most = max(most, start[c + 1] - start[c])
-    out, sums = np.empty((len(order), 3)), np.empty((3, most))
-    for c in range(len(nodes)):
-        first, count = start[c], start[c + 1] - start[c]
-        sums[:, :count] = 0.0
-        for k in range(nodes.shape[1]):
-            some, j = shares[k, first : first + count], nodes[c, k]
-            for a in range(3):
-                total, node = sums[a], y[j, a]
-                for s in range(count):
-                    total[s] += some[s] * node
-        for s in range(count):
-            for a in range(3):
-                out[order[first + s], a] = sums[a, s]
-    return out
-
-
-@compiled
-def turned_normals(y, columns, slopes, normals):
-    """Unit normals of the deformed surface at embedded points: the cofactor of the deformation
-    gradient times those at rest.
-    """
-    out, f = np.empty_like(normals), np.empty((3, 3))
-    for s in range(len(normals)):
-        f[:] = 0.0
-        for k in range(columns.shape[1]):
-            j = columns[s, k]
-            for a in range(3):
-                for b in range(3):
-                    f[a, b] += y[j, a] * slopes[s, k, b]
-        square = 0.0
-        for a in range(3):
-            p, q = (a + 1) % 3, (a + 2) % 3
-            value = 0.0
-            for b in range(3):
-                u, v = (b + 1) % 3, (b + 2) % 3
-                value += (f[p, u] * f[q, v] - f[p, v] * f[q, u]) * normals[s, b]
-            out[s, a] = value
-            square += value * value
-        for a in range(3):
-            out[s, a] /= np.sqrt(square)
+def mobility(embedding: Embedding, inverse: Floats) -> Floats:
+    """Motion (n,) of each embedded point for a unit force at it: s A⁻¹ s."""
+    out = np.empty(len(embedding.columns))
+    rows = np.empty((min(len(out), BLOCK), len(inverse)))
+    for first in range(0, len(out), BLOCK):
+        columns, shares = (part[first : first + BLOCK] for part in embedding)
+        some = rows[: len(columns)]
+        add_rows(columns, shares, inverse, some)
+        np.einsum(
+            "nk,nk->n",
+            shares,
+            np.take_along_axis(some, columns, axis=1),
+            out=out[first : first + BLOCK],
+        )
     return out

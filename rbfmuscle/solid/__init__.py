@@ -1,0 +1,1 @@
+"""The elastic solid that carries an RBF muscle: lattice, energy, contact, equilibrium."""

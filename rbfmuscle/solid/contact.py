@@ -1,0 +1,362 @@
+"""Contact of a solid with bones: which points are near, the half-spaces they meet, the forces.
+
+A unit force at contact i along n_i moves contact j along n_j, with the volumes of the regions kept,
+by
+
+    G_ij = (n_i · n_j) s_i A⁻¹ s_j - ρ_i · ρ_j,    ρ_i = Σ_k s_ik n_i · U_k,
+
+the Delassus matrix of the contacts after the Schur complement of the volumes; s_i are the shape
+functions of the point, U the whitened responses to the regions' pressures (`solve.py`). Forces λ
+give every contact the motion z that it needs,
+
+    0 <= λ_i <= λ_max,    (G λ)_i + ε λ_i >= z_i where λ_i < λ_max,    λ_i = 0 where it is greater,
+
+and ε is what a contact yields for a unit force. A contact between two muscles has a row in the
+matrix of each.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.bones.distance import BoneArrays, Memory, distance_loop
+from rbfmuscle.bones.rounded import RoundedBone, rounded_at
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.loops import loop
+from rbfmuscle.solid.kernels import add_rows
+
+SWEEPS = 200  # of the Gauss-Seidel method, at most
+MOST_ROWS = 800  # contact points whose rows are kept: more are found anew
+
+
+class Touch(NamedTuple):
+    """Half-spaces: a motion d of a point is admissible where gap + normal · d >= 0."""
+
+    near: Integers  # (c,) place of the point among those that were asked about
+    source: Integers  # (c,) the bones in reach in order, then the fences
+    gap: Floats  # (c,) [scene unit]
+    normal: Floats  # (c, 3) unit
+
+
+NO_TOUCH = Touch(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)))
+
+
+class Wanted(NamedTuple):
+    """What is asked of the forces of c contacts."""
+
+    point: Integers  # (c,) contact point of the solid
+    source: Integers  # (c,) as in `Touch`
+    normal: Floats  # (c, 3)
+    motion: Floats  # (c,) along the normal that it needs
+    yields: Floats  # (c,) motion for a unit force
+    most: Floats  # (c,) greatest force
+    force: Floats  # (c,) first guess
+
+
+class Rows(NamedTuple):
+    """What unit forces at w contacts do to a solid."""
+
+    normal: Floats  # (w, 3) of the forces
+    motion: Floats  # (w, N) of the nodes, along the force, by A⁻¹
+    soft: Floats  # (w, m) share of the soft modes in it
+    rho: Floats  # (w, M) taken from the whitened pressures
+    delassus: Floats  # (w, w) for the share of a step that is taken
+
+
+class Fences(NamedTuple):
+    """Half-spaces that hold contact points on their side of a bone they would pass through."""
+
+    point: Integers  # (f,)
+    gap: Floats  # (f,) distance of the anchor [scene unit]
+    normal: Floats  # (f, 3) unit
+    anchor: Floats  # (f, 3)
+
+
+NO_FENCES = Fences(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+class Obstacles:
+    """What the n contact points of a solid meet: bones in reach, rounded, and fences.
+
+    Parameters
+    ----------
+    exact : sequence of BoneArrays
+        The b bones in reach.
+    boxes : (b, 2, 3) ndarray
+        In bone coordinates.
+    rounded : sequence of RoundedBone
+        The same bones as this muscle meets them.
+    poses : (b, 4, 4) ndarray
+        Of the bones; changed in place by whoever moves them.
+    free : (n,) ndarray of bool
+        Which contact points no bone holds; the others take no contact.
+    allowed : (b, n) ndarray
+        How deep each may be in a bone [scene unit]; changed in place.
+    """
+
+    def __init__(
+        self,
+        exact: Sequence[BoneArrays],
+        boxes: Floats,
+        rounded: Sequence[RoundedBone],
+        poses: Floats,
+        free: Booleans,
+        allowed: Floats,
+    ) -> None:
+        self.exact = exact
+        self.boxes = boxes
+        self.rounded = rounded
+        self.poses = poses
+        self.free = np.flatnonzero(free)
+        self.allowed = allowed
+        self.fences = NO_FENCES
+        self.count = len(exact) + 1
+        # Where each point was last asked about, in bone coordinates, and its distance there.
+        self._smooth = [(np.zeros((len(free), 3)), np.full(len(free), -np.inf)) for _ in exact]
+        self._exact = [Memory.of(len(free)) for _ in exact]
+
+    def find_near(self, points: Floats, reach: float) -> Integers:
+        """Which of the free points (n, 3) are nearer to an obstacle than ``reach``."""
+        here = points[self.free]
+        found = np.zeros(len(points), dtype=np.bool_)
+        touch = self.meet(self.free, here, np.full(len(here), reach))
+        found[self.free[touch.near]] = True
+        return np.flatnonzero(found)
+
+    def meet(self, which: Integers, here: Floats, reach: Floats) -> Touch:
+        """The half-spaces that points ``which`` (m,), now ``here`` (m, 3), meet within ``reach``
+        (m,).
+        """
+        parts = [self._meet_fences(which, here)]
+        for b in range(len(self.exact)):
+            gap, normal = np.empty(len(which)), np.empty((len(which), 3))
+            anchor, bound = self._smooth[b]
+            meet_bone(
+                self.rounded[b],
+                self.poses[b],
+                self.boxes[b],
+                which,
+                here,
+                reach,
+                self.allowed[b],
+                anchor,
+                bound,
+                gap,
+                normal,
+            )
+            lost = np.flatnonzero(np.isnan(gap))
+            if len(lost):
+                gap[lost], normal[lost] = self.ask(b, which[lost], here[lost], reach[lost])
+            near = np.flatnonzero(gap < reach)
+            parts.append(Touch(near, np.full(len(near), b), gap[near], normal[near]))
+        return Touch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def meet_exactly(self, which: Integers, here: Floats, reach: float) -> Touch:
+        """The same with the bones as they are."""
+        parts = [self._meet_fences(which, here)]
+        for b in range(len(self.exact)):
+            gap, normal = self.ask(b, which, here, np.full(len(which), reach))
+            near = np.flatnonzero(gap < reach)
+            parts.append(Touch(near, np.full(len(near), b), gap[near], normal[near]))
+        return Touch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def ask(self, b: int, which: Integers, here: Floats, reach: Floats) -> tuple[Floats, Floats]:
+        """Gaps (m,) to bone b as it is, at least ``reach`` (m,) where they are more, and its
+        normals (m, 3).
+        """
+        known = self._exact[b]
+        some = Memory(known.anchor[which], known.bound[which], known.triangle[which])
+        gap, normal = np.empty(len(which)), np.empty((len(which), 3))
+        allowed = self.allowed[b, which]
+        distance_loop(self.exact[b], self.poses[b], here, reach - allowed, *some, gap, normal)
+        for part, found in zip(known, some, strict=True):
+            part[which] = found
+        return gap + allowed, normal
+
+    def _meet_fences(self, which: Integers, here: Floats) -> Touch:
+        fences = self.fences
+        if len(fences.point) == 0 or len(which) == 0:
+            return NO_TOUCH
+        near = np.minimum(np.searchsorted(which, fences.point), len(which) - 1)
+        chosen = np.flatnonzero(which[near] == fences.point)
+        near, normal = near[chosen], fences.normal[chosen]
+        away = here[near] - fences.anchor[chosen]
+        gap = fences.gap[chosen] + np.einsum("fa,fa->f", normal, away)
+        return Touch(near, np.full(len(near), len(self.exact)), gap, normal)
+
+
+@loop
+def meet_bone(rounded, pose, box, which, here, reach, allowed, anchor, bound, gap, normal):
+    """Fill the gaps (m,) and unit normals (m, 3) of points ``here`` (m, 3) at one rounded bone.
+
+    ``which`` (m,) are their numbers in ``allowed`` (n,), how deep each may be in the bone, and in
+    what is known of each: its distance was ``bound`` (n,) at ``anchor`` (n, 3) in bone coordinates,
+    and changes by no more than the point moves. A gap beyond ``reach`` (m,) is infinite, one where
+    the rounded bone has no answer NaN. ``box`` (2, 3) is that of the bone.
+    """
+    local = np.empty(3)
+    for k in range(len(which)):
+        i = which[k]
+        outside = 0.0
+        moved = 0.0
+        for a in range(3):
+            at = 0.0
+            for b in range(3):
+                at += pose[b, a] * (here[k, b] - pose[b, 3])
+            local[a] = at
+            beyond = max(box[0, a] - at, at - box[1, a], 0.0)
+            outside += beyond * beyond
+            moved += (at - anchor[i, a]) ** 2
+        gap[k] = np.inf
+        wanted = reach[k] - allowed[i]
+        if bound[i] - np.sqrt(moved) >= wanted or (outside > 0.0 and np.sqrt(outside) >= wanted):
+            continue
+        smooth, distance, x, y, z = rounded_at(rounded, local[0], local[1], local[2])
+        if np.isnan(distance):
+            gap[k] = np.nan
+            continue
+        if distance == np.inf:
+            continue
+        bound[i] = smooth
+        for a in range(3):
+            anchor[i, a] = local[a]
+        if distance < wanted:
+            gap[k] = distance + allowed[i]
+            for a in range(3):
+                normal[k, a] = pose[a, 0] * x + pose[a, 1] * y + pose[a, 2] * z
+
+
+@loop(fastmath={"contract"})
+def fill_mobilities(columns, shares, rows, first, out):
+    """Fill s_i A⁻¹ s_j for points i from ``first`` on and all before them, both ways.
+
+    ``columns`` and ``shares`` (w, 27) are those of the points, ``rows`` (w, N) their s_i A⁻¹.
+    """
+    for i in range(first, len(columns)):
+        row = rows[i]
+        for j in range(i + 1):
+            value = 0.0
+            for k in range(columns.shape[1]):
+                value += shares[j, k] * row[columns[j, k]]
+            out[i, j] = value
+            out[j, i] = value
+
+
+class Mobility:
+    """Responses s_i A⁻¹ of the points that have been in contact; they depend on the matrix alone.
+
+    Parameters
+    ----------
+    columns, shares : (n, 27) ndarray
+        Nodes and shape functions of all contact points.
+    inverse : (N, N) ndarray
+        A⁻¹.
+    """
+
+    def __init__(self, columns: Integers, shares: Floats, inverse: Floats) -> None:
+        self.columns = columns
+        self.shares = shares
+        self.inverse = inverse
+        self._clear()
+
+    def _clear(self) -> None:
+        self.slot = np.full(len(self.columns), -1)
+        self.points = np.empty(0, dtype=np.int64)
+        self.rows = np.empty((64, len(self.inverse)))
+        self.pairs = np.empty((64, 64))
+
+    def find(self, points: Integers) -> Integers:
+        """Rows of some points in ``rows`` (w, N) and ``pairs`` (w, w); unknown ones are found."""
+        new = points[self.slot[points] < 0]
+        if len(new):
+            new = np.unique(new)
+            if len(self.points) + len(new) > MOST_ROWS:
+                self._clear()
+                new = np.unique(points)
+            self._add(new)
+        return self.slot[points]
+
+    def _add(self, new: Integers) -> None:
+        first = len(self.points)
+        self.points = np.concatenate([self.points, new])
+        count = len(self.points)
+        self.slot[new] = np.arange(first, count)
+        if count > len(self.rows):
+            room = 2 * count
+            rows, pairs = self.rows, self.pairs
+            self.rows = np.empty((room, rows.shape[1]))
+            self.pairs = np.empty((room, room))
+            self.rows[:first] = rows[:first]
+            self.pairs[:first, :first] = pairs[:first, :first]
+        columns, shares = self.columns[self.points], self.shares[self.points]
+        add_rows(columns[first:], shares[first:], self.inverse, self.rows[first:count])
+        fill_mobilities(columns, shares, self.rows[:count], first, self.pairs)
+
+
+@loop
+def solve_forces(
+    delassus, start, width, one, row, other, across, wants, yields, most, force, moved, tolerance
+):
+    """Contact forces (c,) of a group of solids, by projected Gauss-Seidel from a first guess.
+
+    ``delassus`` holds the matrices of the solids behind each other: that of solid m, ``width[m]``
+    wide, from ``start[m]`` on. Contact c is row ``row[c]`` of solid ``one[c]``, and row
+    ``across[c]`` of solid ``other[c]`` where that is not -1. It ``wants`` a motion, ``yields`` one
+    for a unit force, and bears ``most``. ``moved`` holds the motions of the rows behind each other,
+    solid m's from Σ width before it on. Returns whether no contact moved by more than the
+    ``tolerance`` in the last sweep.
+    """
+    count = len(wants)
+    moved[:] = 0.0
+    first = np.empty(len(width), np.int64)
+    total = 0
+    for m in range(len(width)):
+        first[m] = total
+        total += width[m]
+    for c in range(count):
+        if force[c] != 0.0:
+            _move_rows(
+                delassus, start[one[c]], width[one[c]], row[c], force[c], moved, first[one[c]]
+            )
+            if other[c] >= 0:
+                _move_rows(
+                    delassus,
+                    start[other[c]],
+                    width[other[c]],
+                    across[c],
+                    force[c],
+                    moved,
+                    first[other[c]],
+                )
+    for _ in range(SWEEPS):
+        largest = 0.0
+        for c in range(count):
+            m = one[c]
+            own = delassus[start[m] + row[c] * width[m] + row[c]]
+            here = moved[first[m] + row[c]]
+            if other[c] >= 0:
+                o = other[c]
+                own += delassus[start[o] + across[c] * width[o] + across[c]]
+                here += moved[first[o] + across[c]]
+            own = own * (1.0 + 1e-7) + yields[c]
+            change = (wants[c] - here - yields[c] * force[c]) / own
+            change = min(max(force[c] + change, 0.0), most[c]) - force[c]
+            if change != 0.0:
+                force[c] += change
+                largest = max(largest, abs(change) * own)
+                _move_rows(delassus, start[m], width[m], row[c], change, moved, first[m])
+                if other[c] >= 0:
+                    o = other[c]
+                    _move_rows(delassus, start[o], width[o], across[c], change, moved, first[o])
+        if largest < tolerance:
+            return True
+    return False
+
+
+@loop
+def _move_rows(delassus, start, width, row, force, moved, first):
+    """Add what a force at one row does to all rows of its solid."""
+    at = start + row * width
+    for k in range(width):
+        moved[first + k] += delassus[at + k] * force

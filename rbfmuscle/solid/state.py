@@ -1,0 +1,134 @@
+"""What changes of an RBF muscle's solid, and the steps that move it with the bones.
+
+A state is never changed in place: each step returns another one. So a state is its own snapshot.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.harmonic import exponential_loop, logarithm_loop
+from rbfmuscle.geometry.rotations import turned_quaternions
+from rbfmuscle.solid.model import ANTI_BUCKLING_TENSION, GREATEST_TENSION, SolidModel
+
+# Greatest multiple of the last sub-step's correction that the next one starts with, and the least
+# motion of an attachment, of the muscle's size, in a step whose correction counts.
+MOST_TREND, LEAST_STEP = 1.5, 2e-5
+
+
+class Metric(NamedTuple):
+    """What corrections of the volumes are made by; it only decides how fast a solve converges."""
+
+    gradient: np.ndarray  # (M, 3, N) of the volumes, where the metric was found
+    matrix: np.ndarray  # (N, N) A, with the stiffness of squeezed points
+    inverse: np.ndarray  # (N, N)
+    soft: np.ndarray  # (N, 3, m) W, turned with the material: nodes yield by A⁻¹ + W Wᵀ
+    response: np.ndarray  # (N, 3, M) motions of the nodes for unit whitened pressures, U
+    whiten: np.ndarray  # (M, M) L⁻¹ of G + K = L Lᵀ
+
+
+class SolidState(NamedTuple):
+    """A solid of N nodes, Q quadrature points, M regions, n contact points and h held ones."""
+
+    nodes: np.ndarray  # (N, 3) in equilibrium with contacts that yield a little
+    lifted_nodes: np.ndarray  # (N, 3) the same with what is left in a bone moved out of it
+    points: np.ndarray  # (n, 3) contact points, carried by the lifted nodes
+    rotations: np.ndarray  # (Q, 4) unit quaternions
+    stretches: np.ndarray  # (Q,) of slack fibres
+    pressures: np.ndarray  # (M,) over 2 μ
+    forces: np.ndarray  # (n, b) of contacts with the bones in reach, over 2 μ
+    anchors: np.ndarray  # (h, 3) where the bones hold the held points
+    # The last step of the anchors (h, 3), and nodes (N, 3) and pressures (M,) as first predicted;
+    # what a solve added to these is the correction that the next step starts with.
+    step: np.ndarray
+    start: np.ndarray
+    start_pressures: np.ndarray
+    activation: float
+    metric: Metric | None  # of the last solve
+
+
+def rest_state(model: SolidModel) -> SolidState:
+    """The solid at rest."""
+    nodes, held = model.rest.copy(), model.points[model.held]
+    regions, count = len(model.cells.volumes), len(model.cells.weights)
+    return SolidState(
+        nodes,
+        nodes,
+        model.points.copy(),
+        np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        np.ones(count),
+        np.zeros(regions),
+        np.zeros((len(model.points), 0)),
+        held,
+        np.zeros_like(held),
+        nodes,
+        np.zeros(regions),
+        0.0,
+        None,
+    )
+
+
+def tension(model: SolidModel, anchors: Floats) -> float:
+    """Tension τ of slack fibres over 2 μ: it grows as the muscle's ends, those of the anchors
+    (h, 3) that `SolidModel.end` marks, approach from their distance at rest.
+    """
+    first, last = anchors[model.end == 0], anchors[model.end == 1]
+    if len(first) == 0:
+        return 0.0
+    distance = float(np.linalg.norm(first.mean(axis=0) - last.mean(axis=0)))
+    nearer = max(0.0, 1.0 - distance / model.end_distance)
+    return min(ANTI_BUCKLING_TENSION * nearer * nearer, GREATEST_TENSION)
+
+
+def predict(model: SolidModel, state: SolidState, before: Floats, after: Floats) -> SolidState:
+    """The state after the bones moved between two sets of poses (b, 4, 4).
+
+    Nodes take a mean of the bones' motions: the twists are averaged with the nodes' weights.
+    Where the motion goes on as before, so does the last correction. Contact points are those of
+    the mean motion alone, from which a solve tells what passed through a bone.
+    """
+    twists = np.empty((len(before), 6))
+    logarithm_loop(np.ascontiguousarray(after @ np.linalg.inv(before)), twists)
+    start = np.empty_like(state.nodes)
+    exponential_loop(state.nodes, model.motion_weights @ twists, start)
+    pose = after[model.held_bone]
+    held = model.points[model.held]
+    anchors = np.einsum("hab,hb->ha", pose[:, :3, :3], held) + pose[:, :3, 3]
+    step = anchors - state.anchors
+    share = 0.0
+    if np.abs(state.step).max(initial=0.0) > LEAST_STEP * model.size:
+        along = float(np.vdot(step, state.step) / np.vdot(state.step, state.step))
+        share = min(max(along, -MOST_TREND), MOST_TREND)
+    return state._replace(
+        nodes=start + share * (state.nodes - state.start),
+        pressures=state.pressures + share * (state.pressures - state.start_pressures),
+        anchors=anchors,
+        step=step,
+        start=start,
+        start_pressures=state.pressures,
+    )
+
+
+def transform(state: SolidState, motion: Floats) -> SolidState:
+    """The state after a rigid motion (4, 4) of the whole muscle."""
+    turned, shift = np.ascontiguousarray(motion[:3, :3].T), motion[:3, 3]
+    return state._replace(
+        nodes=state.nodes @ turned + shift,
+        lifted_nodes=state.lifted_nodes @ turned + shift,
+        points=state.points @ turned + shift,
+        rotations=turned_quaternions(state.rotations, motion[:3, :3]),
+        anchors=state.anchors @ turned + shift,
+        step=state.step @ turned,
+        start=state.start @ turned + shift,
+        metric=None if state.metric is None else _turned(state.metric, motion[:3, :3]),
+    )
+
+
+def _turned(metric: Metric, rotation: Floats) -> Metric:
+    """The metric of a solid that was turned by a rotation (3, 3)."""
+    return metric._replace(
+        gradient=np.einsum("ab,mbn->man", rotation, metric.gradient),
+        soft=np.ascontiguousarray(rotation @ metric.soft),
+        response=np.ascontiguousarray(rotation @ metric.response),
+    )
