@@ -24,7 +24,7 @@ from rbfmuscle.geometry.arrays import Array, Floats, Integers
 
 log = logging.getLogger(__name__)
 
-VERSION = 14  # part of every name: raise it when the arrays or the way they are built change
+VERSION = 15  # part of every name: raise it when the arrays or the way they are built change
 SUFFIX = ".sdf.npz"
 PART = SUFFIX + ".part"  # of an entry that is being written
 # Bytes that the cache may take; what was not used for longest is removed first. A file that a
@@ -102,7 +102,7 @@ def store_arrays(key: str, arrays: Mapping[str, ArrayLike]) -> None:
         handle, name = tempfile.mkstemp(prefix=key, suffix=PART, dir=folder)
         try:
             with os.fdopen(handle, "wb") as file:
-                np.savez(file, allow_pickle=False, **entry)
+                np.savez(file, **entry)
             Path(name).replace(folder / (key + SUFFIX))
         except BaseException:
             Path(name).unlink(missing_ok=True)

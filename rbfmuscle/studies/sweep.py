@@ -606,7 +606,7 @@ def measure_point(
             if point.role == "reference":
                 arrays = {f"{place}|{k}": mesh[k] for place, mesh in shown.items() for k in (0, 1)}
                 fresh = folder.references / f".{point.key}.{os.getpid()}.npz"
-                np.savez_compressed(fresh, allow_pickle=False, **arrays)
+                np.savez_compressed(fresh, **arrays)
                 os.replace(fresh, folder.surfaces(point.key))
             elif point.reference:
                 values |= _errors(shown, folder.surfaces(point.reference))

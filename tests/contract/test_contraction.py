@@ -144,7 +144,7 @@ def test_pennate_panel_turns_its_fibres_as_its_volume_says(model):
         np.abs(rest[:, 2] - 0.5 * HEIGHT) < 0.3 * HEIGHT
     )  # away from the plates, which are rigid
     away = rest[between] - rest[between].mean(axis=0)
-    gradient = np.linalg.lstsq(away, now[between] - now[between].mean(axis=0))[0]
+    gradient = np.linalg.lstsq(away, now[between] - now[between].mean(axis=0), rcond=None)[0]
     fibre = np.array([LEAN, 0.0, HEIGHT]) @ gradient
     angle = np.degrees(np.arccos(fibre[0] / np.linalg.norm(fibre)))
     # Fibres bend beside the plates, and are steeper between.

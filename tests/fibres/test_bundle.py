@@ -134,8 +134,8 @@ def test_moment_arms_of_fibres_are_their_distances_from_the_axis(run):
     # Fibres lie within 9 mm of the strap's middle, the axis 30 mm behind that; their tendon is one.
     assert np.abs(arms).min() > 20.0
     assert np.abs(arms).max() < 40.0
-    # The median of twelve is within half of these 9 mm of the centreline.
-    assert np.median(arms, axis=1) == pytest.approx(run.values("strap", "moment_arm"), abs=4.5)
+    # How far inside these 9 mm the middle fibre lies hangs on the mesh: the strap bends.
+    assert np.median(arms, axis=1) == pytest.approx(run.values("strap", "moment_arm"), abs=9.0)
     found = np.percentile(arms, [5, 50, 95], axis=1)
     for name, values in zip(("p05", "p50", "p95"), found):
         np.testing.assert_allclose(run.values("strap", f"fibre_moment_arm_{name}"), values)
