@@ -92,6 +92,7 @@ class RBFMuscle:
         )
         self.state = rest_state(self.model)
         self._stiffen(0.0)
+        self._slowness = find_slowness(self.model, self._stiffness, self._mobility)
         self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
         self.drawer = SurfaceBuilder(
             muscle,
@@ -204,7 +205,6 @@ class RBFMuscle:
     def _stiffen(self, activation: float) -> None:
         self._stiffness = stiffness(self.model, activation)
         self._mobility = Mobility(*self.model.embedding, self._stiffness.inverse)
-        self._slowness = find_slowness(self.model, self._stiffness, self._mobility)
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""

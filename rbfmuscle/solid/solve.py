@@ -86,7 +86,7 @@ BULK, MOST_PRESSURE = 200.0, 3.0
 # steps are shortened.
 CALM_PRESSURE = 0.5
 # Random motion of nodes at rest, of the size, and iterations, that tell how slowly a solid settles.
-SHAKEN, SHAKES = 1e-5, 30
+SHAKEN, SHAKES = 1e-5, 120
 # The metric is found anew where the gradients of the volumes have changed by this share.
 TURNED = 0.15
 # Within a solve, where nodes have moved by this, of the size.
@@ -279,7 +279,10 @@ class Settling:
         force -= metric.matrix @ self.y
         free = self.part * yielded(metric, force)
         rest = model.cells.volumes
-        lacking = rest * (1.0 - self.pressure / BULK) - self.volumes - flat @ free.T.ravel()
+        # What contacts take from the pressures is found with the metric's gradients: with others
+        # here the two would not cancel, and where the iteration ends would depend on the metric.
+        adds = metric.gradient.reshape(len(rest), -1) @ free.T.ravel()
+        lacking = rest * (1.0 - self.pressure / BULK) - self.volumes - adds
         self.change = metric.whiten @ lacking
         self.step = free + metric.response @ self.change
 
