@@ -16,6 +16,7 @@ from fuzz.meshes import FORMS, suffix_of, write_mesh
 
 from rbfmuscle.scene.meshes import polydata
 from rbfmuscle.scene.meshes.formats import read_part
+from rbfmuscle.scene.meshes.polydata import MOST_ARRAYS
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.validation import MeshError
 
@@ -150,6 +151,22 @@ sys.stdout.buffer.write({{
         polydata._end(polydata._child(os.getpid()))
         assert_is_ball(path)
         polydata._end(polydata._child(os.getpid()))
+
+    def test_file_of_more_arrays_than_are_read_in_seconds_is_refused(self, tmp_path, capfd):
+        array = '<DataArray type="Float32" Name="a%d" format="ascii">0 0 0 0</DataArray>'
+        arrays = {
+            "a.vtp": '<VTKFile type="PolyData"><PolyData><Piece NumberOfPoints="4" '
+            f'NumberOfPolys="0"><PointData>{"".join(array % k for k in range(MOST_ARRAYS))}'
+            f"</PointData><Points>{array % 0}</Points></Piece></PolyData></VTKFile>",
+            "a.vtk": "# vtk DataFile Version 3.0\na\nASCII\nDATASET POLYDATA\nPOINTS 1 float\n0 0 0"
+            f"\nPOINT_DATA 1\nFIELD FieldData {MOST_ARRAYS + 1}\n",
+        }
+        for name, text in arrays.items():
+            path = tmp_path / name
+            path.write_text(text)
+            with pytest.raises(MeshError, match="1001 arrays, at most 1000 are read"):
+                read_mesh(path)
+            assert_refused(path, capfd)
 
     def test_file_that_unpacks_without_end_is_refused(self, tmp_path, capfd):
         size = 24 * 10**9

@@ -4,8 +4,10 @@ import atexit
 import contextlib
 import io
 import json
+import mmap
 import os
 import queue
+import re
 import subprocess
 import sys
 import threading
@@ -22,6 +24,10 @@ PATIENCE = 120.0  # Time after which a file that is not read is refused [s].
 MEMORY = (
     2 << 30
 )  # Address space of the process that reads [bytes]: a small file may unpack to anything.
+# Arrays of a file: VTK compares the name of each with all others, 20 s for 50,000.
+MOST_ARRAYS = 1000
+# Where an array begins, or how many follow.
+_ARRAY = re.compile(rb"<DataArray\s|^(?:SCALARS|VECTORS|TENSORS)\s|^FIELD\s+\S+\s+(\d+)", re.M)
 _LOCK = threading.Lock()
 _SIZE = 8  # bytes of the size that stands before an answer
 
@@ -201,6 +207,9 @@ def _read(path: str, array: str) -> tuple[Array, ...]:
     import pyvista
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
+    count = _count_arrays(path)
+    if count > MOST_ARRAYS:
+        raise ValueError(f"{count} arrays, at most {MOST_ARRAYS} are read")
     with pyvista.VtkErrorCatcher(raise_errors=True, send_to_logging=False):
         data = pyvista.read(path)
         said = vtkOutputWindow.GetInstance()
@@ -227,6 +236,17 @@ def _read(path: str, array: str) -> tuple[Array, ...]:
         )
     points = np.array(data.points, dtype=np.float64)
     return points, ends, numbers, *lines, single, values, *look
+
+
+def _count_arrays(path):
+    """Number of arrays that a file declares, no more than needed to refuse it."""
+    if not os.path.getsize(path):
+        return 0
+    count = 0
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        for found in _ARRAY.finditer(content):
+            count += int(found[1] or 1)
+    return count
 
 
 def _rows(array, width):
