@@ -4,6 +4,7 @@ import hashlib
 import itertools
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,10 @@ ROOT = Path(__file__).resolve().parent.parent
 # what runs side by side is tested as such.
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+# A job that a script starts in the background ignores interrupts, as would all that tests start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Numba sees edits of a loop in its own file alone, not in those of the loops that it calls: tests
 # keep the code of each state of the sources apart.
