@@ -19,18 +19,23 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-# What CI runs, the longest first: those that compile anew.
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+TWO_THREADS = {"OPENBLAS_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2"}
+# What CI runs, the longest first: those that compile anew. Numbers of threads go with moved
+# vertices, for time; each alone tells which of the two makes a test fail.
 USUAL = {
     "oldest": {},
     "numba-generic": {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
-    "one-thread": {"OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
-    "two-threads": {"OPENBLAS_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2"},
-    "moved-1": {"RBFMUSCLE_MOVED_VERTICES": "1"},
-    "moved-2": {"RBFMUSCLE_MOVED_VERTICES": "2"},
+    "moved-1-one-thread": {"RBFMUSCLE_MOVED_VERTICES": "1", **ONE_THREAD},
+    "moved-2-two-threads": {"RBFMUSCLE_MOVED_VERTICES": "2", **TWO_THREADS},
     "moved-3": {"RBFMUSCLE_MOVED_VERTICES": "3"},
 }
 VARIANTS = USUAL | {
     "newest": {},
+    "one-thread": ONE_THREAD,
+    "two-threads": TWO_THREADS,
+    "moved-1": {"RBFMUSCLE_MOVED_VERTICES": "1"},
+    "moved-2": {"RBFMUSCLE_MOVED_VERTICES": "2"},
     "haswell": {"OPENBLAS_CORETYPE": "Haswell"},
     "zen": {"OPENBLAS_CORETYPE": "Zen"},
     "skylakex": {"OPENBLAS_CORETYPE": "SkylakeX"},
