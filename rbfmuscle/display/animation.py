@@ -16,7 +16,7 @@ from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.appearance import VIEWS
 from rbfmuscle.run.data import RunData, frame_caption
-from rbfmuscle.scene.meshes.input_mesh import InputOrder
+from rbfmuscle.scene.meshes.repair import InputOrder
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.simulation.frame import FibreLines
 

@@ -24,7 +24,7 @@ from rbfmuscle.run import appearance as look
 from rbfmuscle.run.info import FORMAT, FrameInfo, RunInfo
 from rbfmuscle.run.vtk_files import fibre_file, read_fibres, read_vtp
 from rbfmuscle.scene.joints.tables import full_name
-from rbfmuscle.scene.meshes.input_mesh import InputOrder
+from rbfmuscle.scene.meshes.repair import InputOrder
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
@@ -57,8 +57,7 @@ class SceneMeshes:
 
     def given(self, muscle: str) -> InputOrder | None:
         """The vertex order of a muscle's own file, where it is another one."""
-        given = self._muscles[muscle].given
-        return None if given is None else InputOrder(given.faces, given.source)
+        return self._muscles[muscle].given
 
     def tendons(self, muscle: str, frame: Frame) -> Mesh:
         """All tendons of a muscle in a frame."""

@@ -13,7 +13,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.content import Compared
 from rbfmuscle.scene.guesses import GuessTable
-from rbfmuscle.scene.meshes.input_mesh import InputMesh
+from rbfmuscle.scene.meshes.repair import InputOrder
 from rbfmuscle.scene.options import MotionOptions, Table, Vector
 from rbfmuscle.scene.tendons import TendonEnd
 from rbfmuscle.validation import SceneError, shown
@@ -79,7 +79,7 @@ class Muscle(Compared):
     ``contraction`` holds the keys of a muscle that contracts, None for any other; ``tendons`` are
     the ends that tendons hold. ``aponeuroses`` are the vertices of a pennate muscle's patches,
     of the origin and of the insertion, between which its fibres run. ``given`` is the mesh of the
-    file, where it is another one than ``mesh`` or has texture coordinates or normals.
+    file, where it is another one than ``mesh``.
     """
 
     not_compared = ("source", "tendons")  # tendons follow from the attachments and the joints
@@ -94,7 +94,7 @@ class Muscle(Compared):
     notes: list[str] = field(default_factory=list)
     contraction: ContractionTable | None = None
     tendons: list[TendonEnd] = field(default_factory=list)
-    given: InputMesh | None = field(default=None, repr=False)
+    given: InputOrder | None = field(default=None, repr=False)
     aponeuroses: list[Integers] = field(default_factory=list, repr=False)
 
 

@@ -11,7 +11,7 @@ from rich_scene import rich
 
 import rbfmuscle as rm
 from rbfmuscle.scene.activation.keys import ContractionTable
-from rbfmuscle.scene.meshes.input_mesh import InputMesh
+from rbfmuscle.scene.meshes.repair import InputOrder
 from rbfmuscle.studies.sweep import scene_content
 
 # Where files lie, and what follows from attachments and joints.
@@ -35,7 +35,7 @@ def full():
         muscle.aponeuroses = [np.arange(5), np.arange(5, 9)]
         mesh = muscle.mesh
         order = np.arange(len(mesh.vertices))
-        muscle.given = InputMesh(np.array(mesh.vertices), mesh.faces, order)
+        muscle.given = InputOrder(mesh.faces, order)
         muscle.contraction = ContractionTable(activation=[0.0, 0.5], fibre_stretch_at_rest=1.1)
     return scene
 

@@ -11,8 +11,6 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import joined_meshes
-from rbfmuscle.scene.meshes.input_mesh import NO_CORNERS, Corners, vertex_corners
-from rbfmuscle.scene.meshes.obj import read_obj
 from rbfmuscle.scene.meshes.polydata import read_polydata
 from rbfmuscle.scene.meshes.polygons import cut_polygons
 from rbfmuscle.validation import BROKEN_FILE, MeshError, did_you_mean, shown, shown_path
@@ -21,11 +19,11 @@ MESH_SUFFIXES = (".stl", ".obj", ".ply", ".vtk", ".vtp")
 # Part of a file's path that names one of its meshes, and what names all of them.
 _PART = re.compile(r"(.+\.(?:stl|obj|ply|vtk|vtp))#(.+)", re.IGNORECASE)
 ALL = "*"
-# A binary STL file: header, number of triangles, and normal, corners and two bytes of each.
-_HEAD = 84
-_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
-_VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+# A binary STL file: bytes of its header with the number of triangles, and of each triangle.
+_HEAD, _TRIANGLE = 84, 50
 _SOLID = re.compile(rb"^[ \t]*(end)?solid\b([^\r\n]*)", re.IGNORECASE | re.MULTILINE)
+# Elements of an OBJ file that are no faces.
+_NO_FACES = (b"l", b"p", b"curv", b"curv2", b"surf")
 # First bytes of what is saved under a wrong name, and what to do about it.
 _NO_MESH = (
     (rb"version https://git-lfs", "a pointer of Git LFS: fetch the file itself (git lfs pull)"),
@@ -45,15 +43,12 @@ _MESHES = (
 
 
 class FilePart(NamedTuple):
-    """One mesh of a file: vertices (n, 3), triangles (m, 3), what was left out or assumed, and
-    texture coordinates and normals.
-    """
+    """One mesh of a file: vertices (n, 3), triangles (m, 3), and what was left out or assumed."""
 
     name: str  # empty where the file gives none
     vertices: Floats
     faces: Integers
     notes: list[str]
-    corners: Corners = NO_CORNERS
 
 
 def split_path(path: Path) -> tuple[Path, str]:
@@ -117,7 +112,7 @@ def read_file(path: Path) -> list[FilePart]:
         if suffix == ".stl":
             return _named(_read_stl(content))
         if suffix == ".obj":
-            return _named([FilePart(*part) for part in read_obj(content)])
+            return _named(_read_obj(content))
         return [_read_ply(path, content) if suffix == ".ply" else _read_polydata(path)]
     except MeshError:
         raise
@@ -175,21 +170,22 @@ def _named(parts):
 
 
 def _read_stl(content):
-    """The solids of an STL file; triangles have their own vertices there, equal ones are merged."""
+    """The solids of an STL file, each read by trimesh after a check of what it passes over: bytes
+    that are missing or left over, corners that make no triangle, solids without any.
+    """
     if not _is_binary(content):
         return _read_stl_text(content)
     parts, start = [], 0
     while len(content) - start >= _HEAD:
         count = int.from_bytes(content[start + 80 : start + _HEAD], "little")
-        whole = start + _HEAD + 50 * count
+        whole = start + _HEAD + _TRIANGLE * count
         if whole > len(content):
             if parts:  # not another solid, but other bytes
                 break
             raise ValueError(
                 f"it is cut off: {len(content):,} bytes, {count:,} triangles need {whole:,}"
             )
-        rows = np.frombuffer(content, _TRIANGLE, count, start + _HEAD)
-        parts.append(_soup("", rows["corners"].astype(np.float64)))
+        parts.append(_read_solid("", content[start:whole]))
         start = whole
         if count == 0:
             if len(parts) == 1 and len(content) > start:
@@ -204,7 +200,7 @@ def _read_stl(content):
 def _has_stl_length(content):
     """Whether content is as long as a binary STL file of its triangles, of which it has some."""
     count = int.from_bytes(content[80:_HEAD], "little")
-    return count > 0 and len(content) == _HEAD + 50 * count
+    return count > 0 and len(content) == _HEAD + _TRIANGLE * count
 
 
 def _is_binary(content):
@@ -217,59 +213,167 @@ def _is_binary(content):
 
 def _read_stl_text(content):
     parts = []
-    name = b""
-    start = None
+    begun = None
     content = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r", b"\n")
     if re.search(rb"vertex\s+\S*\d,\d", content, re.IGNORECASE):
         raise ValueError("its numbers have a decimal comma; write them with a point")
     for match in [*_SOLID.finditer(content), None]:
-        if start is not None and (match is None or match[1] is None):
-            raise ValueError(f"it is cut off: solid {name.decode('utf-8', 'replace')!r} has no end")
-        if match is None:
-            break
-        if match[1] is None:
-            name, start = match[2].strip(), match.end()
-            continue
-        if start is None:
+        ends = match is not None and match[1] is not None
+        if begun is not None and not ends:
+            name = begun[2].strip().decode("utf-8", "replace")
+            raise ValueError(f"it is cut off: solid {name!r} has no end")
+        if begun is None and ends:
             raise ValueError("a solid ends that has not begun")
-        inside = content[start : match.start()]
-        corners = np.array(_VERTEX.findall(inside)).astype(np.float64)
-        facets = len(re.findall(rb"\bendfacet\b", inside, re.IGNORECASE))
-        if len(corners) != 3 * facets:
-            raise ValueError(f"{len(corners)} corners of {facets} triangles")
-        parts.append(_soup(name.decode("utf-8", "replace"), corners.reshape(-1, 3, 3)))
-        start = None
+        if ends:
+            name = begun[2].strip().decode("utf-8", "replace")
+            # A name may hold the words by which trimesh finds numbers.
+            inside = b"solid\n" + content[begun.end() : match.start()] + b"\nendsolid\n"
+            part = _read_solid(name, inside)
+            facets = len(re.findall(rb"\bendfacet\b", inside, re.IGNORECASE))
+            corners = len(re.findall(rb"\bvertex\b", inside, re.IGNORECASE))
+            if not corners == 3 * facets == 3 * len(part.faces):
+                raise ValueError(f"{corners} corners of {facets} triangles")
+            parts.append(part)
+        begun = None if ends else match
     if not parts:
         raise ValueError("neither text from 'solid' to 'endsolid' nor binary")
     return parts
 
 
-def _soup(name, corners):
-    """Triangles (m, 3, 3) as a mesh whose equal corners are one vertex, in order of first use."""
+def _read_solid(name, content):
+    """One solid of an STL file; its triangles have their own corners there, equal ones become one
+    vertex, in order of first use.
+    """
+    mesh = _load("stl", content)
     # Bytes sort faster than rows; 0.0 is -0.0.
-    rows = np.ascontiguousarray(corners.reshape(-1, 3) + 0.0)
-    _, first, inverse = np.unique(rows.view("V24").ravel(), return_index=True, return_inverse=True)
+    corners = np.asarray(mesh.triangles, np.float64).reshape(-1, 3) + 0.0
+    rows = np.ascontiguousarray(corners).view("V24").ravel()
+    _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
     order = np.argsort(first)
-    return FilePart(name, rows[first[order]], np.argsort(order)[inverse].reshape(-1, 3), [])
+    return FilePart(name, corners[first[order]], np.argsort(order)[inverse].reshape(-1, 3), [])
+
+
+def _load(kind, content):
+    """What trimesh reads, as it stands; text that is no number is an error."""
+    import trimesh
+
+    with warnings.catch_warnings():
+        # NumPy warns and goes on.
+        warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
+        return trimesh.load(
+            io.BytesIO(content),
+            file_type=kind,
+            process=False,
+            force="mesh",
+            fix_texture=False,  # vertices are not split where textures meet
+            skip_materials=True,
+        )
+
+
+def _read_obj(content):
+    """The meshes of an OBJ file: its objects, or groups that have no vertex in common.
+
+    trimesh cuts polygons into fans, which leave a concave one, and VTK has single precision and
+    splits vertices where textures meet, so that the lines are read here. Where there are several
+    meshes, the vertices of each are its own, in the order of the file.
+    """
+    points, numbers, ends, labels, objects, other = _obj_lines(content)
+    vertices = np.array(points, dtype=np.float64).reshape(-1, 3)
+    numbers, ends = np.array(numbers, dtype=np.int64), np.array(ends)
+    places, notes = cut_polygons(vertices, ends, numbers)
+    polygon = np.searchsorted(ends, places[:, 0], side="right") - 1
+    faces, used = numbers[places], np.repeat(np.arange(len(labels)), np.diff(ends))
+    if other:
+        notes.append(f"{other} lines, points and curves left out")
+    full = {name for _, name, _ in labels}
+    if empty := [name for name in objects if name not in full]:
+        notes.append(f"{len(empty)} objects without faces ({', '.join(empty[:8])})")
+    # By the places of objects, by their names, by groups.
+    for column, apart in ((0, True), (1, False), (2, True)):
+        first: dict[object, int] = {}
+        label = np.array([first.setdefault(row[column], k) for k, row in enumerate(labels)], int)
+        if len(first) > 1 and not (apart and _share_vertices(numbers, label[used])):
+            break
+    else:
+        return [FilePart("", vertices, faces, notes)]
+    parts = []
+    for k in first.values():
+        own, mine = np.unique(faces[label[polygon] == k], return_inverse=True)
+        name = labels[k][2 if column == 2 else 1]
+        parts.append(FilePart(name, vertices[own], mine.reshape(-1, 3), list(notes)))
+    return parts
+
+
+def _share_vertices(numbers, label):
+    """Whether a vertex of ``numbers`` (n,) belongs to two parts, which ``label`` (n,) tells."""
+    pairs = np.unique(np.column_stack([numbers, label]), axis=0)
+    return len(np.unique(pairs[:, 0])) < len(pairs)
+
+
+def _obj_lines(content):
+    """Vertices, the vertices of all polygons and where each polygon ends, the object of each by
+    place and name and its group, the names of objects, and the number of lines that are no faces.
+    """
+    points: list[tuple[float, float, float]] = []
+    numbers: list[int] = []
+    ends, lines = [0], []
+    labels: list[tuple[int, str, str]] = []
+    objects: list[str] = []
+    group, other = "", 0
+    for number, line in _joined_lines(content.removeprefix(b"\xef\xbb\xbf")):
+        key, *words = line.partition(b"#")[0].split() or [b""]
+        try:
+            if key == b"v":
+                if len(words) < 3:
+                    raise ValueError(f"{len(words)} coordinates, a vertex has three")
+                points.append((float(words[0]), float(words[1]), float(words[2])))
+            elif key == b"f":
+                numbers += [_obj_vertex(word, len(points)) for word in words]
+                ends.append(len(numbers))
+                lines.append(number)
+                labels.append((len(objects), objects[-1] if objects else "", group))
+        except (ValueError, OverflowError) as error:
+            said = line.decode("utf-8", "replace").strip()[:60]
+            raise ValueError(f"line {number}, {said!r}: {error}") from None
+        if key == b"o":
+            objects.append(b" ".join(words).decode("utf-8", "replace"))
+        elif key == b"g":
+            group = b" ".join(words).decode("utf-8", "replace")
+        elif key in _NO_FACES:
+            other += 1
+    if numbers and max(numbers) >= len(points):
+        wrong = next(k for k, vertex in enumerate(numbers) if vertex >= len(points))
+        line = lines[int(np.searchsorted(ends, wrong, side="right")) - 1]
+        words = f"a face names vertex {numbers[wrong] + 1}, there are {len(points)}"
+        raise ValueError(f"line {line}: {words}")
+    return points, numbers, ends, labels, objects, other
+
+
+def _obj_vertex(word, count):
+    """The vertex, from 0 on, of a corner ``a/b/c`` behind ``count`` vertices."""
+    number = int(word.partition(b"/")[0])
+    if number == 0 or number < -count:
+        raise ValueError(f"vertex {number}; numbers begin at 1, or count back from -1 to {-count}")
+    return number - 1 if number > 0 else count + number
+
+
+def _joined_lines(content):
+    """Number and text of each line, those that a backslash continues as one."""
+    lines = content.splitlines()
+    number = 0
+    while number < len(lines):
+        first, line = number + 1, lines[number]
+        while line.endswith(b"\\") and number + 1 < len(lines):
+            number += 1
+            line = line[:-1] + b" " + lines[number]
+        number += 1
+        yield first, line
 
 
 def _read_ply(path, content):
     """The mesh of a PLY file: triangles by trimesh; polygons, which it cuts into fans, by VTK."""
-    import trimesh
-
     try:
-        with warnings.catch_warnings():
-            # Older NumPy warns of text that is no number and goes on.
-            warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
-            # Vertices are not split where textures meet.
-            mesh = trimesh.load(
-                io.BytesIO(content),
-                file_type="ply",
-                process=False,
-                force="mesh",
-                fix_texture=False,
-                skip_materials=True,
-            )
+        mesh = _load("ply", content)
     except (*BROKEN_FILE, DeprecationWarning) as error:  # VTK may read it
         try:
             return _read_polydata(path)
@@ -286,28 +390,7 @@ def _read_ply(path, content):
         raise ValueError(f"it has {count} points and no faces{strips}; export its triangles")
     if declared and int(declared[1]) != len(faces):
         return _read_polydata(path, declared=int(declared[1]))
-    vertices = np.asarray(mesh.vertices, np.float64)
-    return FilePart("", vertices, faces, [], _ply_corners(mesh, faces))
-
-
-def _ply_corners(mesh, faces):
-    """Texture coordinates, by vertex or by corner, and normals of a PLY file."""
-    raw = mesh.metadata.get("_ply_raw", {})
-    vertex, face = (raw.get(name, {}).get("data") for name in ("vertex", "face"))
-    columns = vertex.dtype.names if isinstance(vertex, np.ndarray) else (vertex or ())
-    normals = None
-    if {"nx", "ny", "nz"} <= set(columns):
-        normals = np.stack([vertex[name] for name in ("nx", "ny", "nz")], axis=1)
-    found = vertex_corners(faces, getattr(mesh.visual, "uv", None), normals)
-    fields = face.dtype.names if isinstance(face, np.ndarray) else (face or ())
-    if "texcoord" in fields:
-        pairs = face["texcoord"]
-        pairs = np.asarray(pairs["f1"] if isinstance(face, np.ndarray) else pairs)
-        found = found._replace(texture=NO_CORNERS.texture, texture_faces=NO_CORNERS.texture_faces)
-        if pairs.shape == (len(faces), 6) and np.isfinite(pairs).all():
-            pairs, own = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
-            found = found._replace(texture=pairs.astype(float), texture_faces=own.reshape(-1, 3))
-    return found
+    return FilePart("", np.asarray(mesh.vertices, np.float64), faces, [])
 
 
 def _read_polydata(path, declared=0):
@@ -316,13 +399,10 @@ def _read_polydata(path, declared=0):
     if whole < declared:
         raise ValueError(f"it is cut off: it declares {declared} faces and holds {whole}")
     places, notes = cut_polygons(found.points, found.ends, found.numbers)
-    faces = found.numbers[places]
     other = max(len(found.line_ends) - 1, 0) + found.single
     if other:
         notes.append(f"{other} lines and points left out")
-    return FilePart(
-        "", found.points, faces, notes, vertex_corners(faces, found.texture, found.normals)
-    )
+    return FilePart("", found.points, found.numbers[places], notes)
 
 
 def read_vertex_array(path: Path, name: str) -> Floats:

@@ -36,8 +36,7 @@ class PolyData(NamedTuple):
     """Points (n, 3), and polygons: of polygon k the points ``numbers[ends[k] : ends[k + 1]]``.
 
     Lines stand in the same way; ``single`` is the number of single points in the file, ``values``
-    (n,) are of the vertex array that was asked for, (0,) where none was. Texture coordinates
-    (n, 2) and normals (n, 3) are those that VTK takes for them, none where there are none.
+    (n,) are of the vertex array that was asked for, (0,) where none was.
     """
 
     points: Floats
@@ -47,8 +46,6 @@ class PolyData(NamedTuple):
     line_numbers: Integers
     single: int
     values: Floats
-    texture: Floats
-    normals: Floats
 
 
 def read_polydata(path: str | Path, *, array: str = "") -> PolyData:
@@ -99,25 +96,18 @@ def _receive(pipe: IO[bytes]) -> PolyData | str:
     points = np.load(content, allow_pickle=False)
     if points.dtype.kind == "U":
         return str(points)
-    *cells, single, values, texture, normals = (
-        np.load(content, allow_pickle=False) for _ in range(8)
-    )
+    *cells, single, values = (np.load(content, allow_pickle=False) for _ in range(6))
     for array, kind, shape in (
         (points, "f8", (*points.shape[:1], 3)),
         *((array, "i8", (array.size,)) for array in cells),
         (single, "i8", (1,)),
         (values, "f8", (len(points) if values.size else 0,)),
-        (texture, "f8", (len(points) if texture.size else 0, 2)),
-        (normals, "f8", (len(points) if normals.size else 0, 3)),
     ):
         if array.dtype != kind or array.shape != shape:
             raise ValueError("the answer is no mesh")
     for ends, numbers in (cells[:2], cells[2:]):
         _check_cells(ends, numbers, len(points))
-    ends, numbers, line_ends, line_numbers = cells
-    return PolyData(
-        points, ends, numbers, line_ends, line_numbers, int(single[0]), values, texture, normals
-    )
+    return PolyData(points, *cells, int(single[0]), values)
 
 
 def _read_whole(pipe: IO[bytes], size: int) -> bytes:
@@ -230,12 +220,8 @@ def _read(path: str, array: str) -> tuple[Array, ...]:
         lines = _cells(data.GetLines(), data.n_points)
         single = np.array([data.n_verts if len(numbers) else 0])
         values = _values(data, array)
-        look = (
-            _rows(data.GetPointData().GetTCoords(), 2),
-            _rows(data.GetPointData().GetNormals(), 3),
-        )
     points = np.array(data.points, dtype=np.float64)
-    return points, ends, numbers, *lines, single, values, *look
+    return points, ends, numbers, *lines, single, values
 
 
 def _count_arrays(path):
@@ -247,15 +233,6 @@ def _count_arrays(path):
         for found in _ARRAY.finditer(content):
             count += int(found[1] or 1)
     return count
-
-
-def _rows(array, width):
-    """An array of VTK as rows (n, width); (0, width) where there is none such."""
-    from pyvista import convert_array
-
-    if array is None or array.GetNumberOfComponents() != width:
-        return np.empty((0, width))
-    return np.array(convert_array(array), dtype=np.float64).reshape(-1, width)
 
 
 def _values(data, array):

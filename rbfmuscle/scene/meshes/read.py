@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.scene.meshes.formats import read_part
-from rbfmuscle.scene.meshes.input_mesh import NO_CORNERS, Corners, input_mesh, vertex_corners
 from rbfmuscle.scene.meshes.polydata import read_polydata
-from rbfmuscle.scene.meshes.repair import ReadMesh, repair
+from rbfmuscle.scene.meshes.repair import ReadMesh, input_order, repair
 from rbfmuscle.scene.meshes.transform import MeshTransform
 from rbfmuscle.validation import (
     MeshError,
@@ -51,11 +50,8 @@ def read_mesh(
     """
     path = Path(path)
     part = read_part(path)
-    vertices, faces, corners = _placed(part.vertices, part.faces, part.corners, transform)
     read = prepare_mesh(
-        vertices,
-        faces,
-        corners,
+        *_placed(part.vertices, part.faces, transform),
         context=str(path),
         name=name or path.stem,
         may_be_open=may_be_open,
@@ -65,17 +61,11 @@ def read_mesh(
     return read
 
 
-def _placed(vertices, faces, corners, transform):
-    """Vertices, triangles and their corners of a file in the scene."""
+def _placed(vertices, faces, transform):
+    """Vertices and triangles of a file in the scene."""
     with np.errstate(over="ignore", invalid="ignore"):
         vertices = transform.points(vertices)
-        corners = corners._replace(normals=transform.normals(corners.normals))
-    if not transform.turns_inside_out:
-        return vertices, faces, corners
-    corners = corners._replace(
-        texture_faces=corners.texture_faces[:, ::-1], normal_faces=corners.normal_faces[:, ::-1]
-    )
-    return vertices, faces[:, ::-1], corners
+    return vertices, faces[:, ::-1] if transform.turns_inside_out else faces
 
 
 def as_mesh(
@@ -94,29 +84,23 @@ def as_mesh(
         return read_mesh(mesh, name=name, transform=transform, may_be_open=may_be_open)
     vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
     vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
-    uv = getattr(getattr(mesh, "visual", None), "uv", None)
-    if uv is not None and np.shape(uv) != (len(vertices), 2):
-        uv = None
-    corners = vertex_corners(faces, uv)
-    vertices, faces, corners = _placed(vertices, faces, corners, transform)
     return prepare_mesh(
-        vertices, faces, corners, context=f"mesh {name!r}", name=name, may_be_open=may_be_open
+        *_placed(vertices, faces, transform),
+        context=f"mesh {name!r}",
+        name=name,
+        may_be_open=may_be_open,
     )
 
 
 def prepare_mesh(
     vertices: Floats,
     faces: Integers,
-    corners: Corners = NO_CORNERS,
     *,
     context: str,
     name: str,
     may_be_open: bool = False,
 ) -> ReadMesh:
-    """Return the ReadMesh of given arrays, mended like a file's; ``context`` begins messages.
-
-    What may be open is shown as it is mended, without ``corners``.
-    """
+    """Return the ReadMesh of given arrays, mended like a file's; ``context`` begins messages."""
     vertices, faces = np.asarray(vertices), np.asarray(faces)
     if not len(vertices) or not len(faces):
         raise MeshError(
@@ -140,19 +124,9 @@ def prepare_mesh(
     except MeshError as error:
         raise MeshError(f"{context}: {error}") from None
     read = repair(vertices, faces, context=context, may_be_open=may_be_open)
-    if not may_be_open:
-        _keep_given(read, faces, corners)
+    if not may_be_open:  # what may be open is shown as it is mended
+        read.given = input_order(read, faces)
     return read
-
-
-def _keep_given(read: ReadMesh, faces: Integers, corners: Corners) -> None:
-    """Keep the mesh of the file, with triangles (m, 3) and their corners, beside the mended one."""
-    looks = len(corners.texture) or len(corners.normals)
-    if not looks and np.array_equal(read.vertex_map, np.arange(len(read.vertices))):
-        return
-    read.given = input_mesh(read.vertices, read.faces, read.vertex_map, faces, corners)
-    if read.given is None and looks:
-        read.notes.append("texture coordinates and normals left out, as triangles were added")
 
 
 def read_fibres(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import igl
 import numpy as np
@@ -18,7 +18,6 @@ from rbfmuscle.geometry.solids import outer_surface
 from rbfmuscle.geometry.surfaces import repeated_faces
 from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.geometry.winding import winding_numbers
-from rbfmuscle.scene.meshes.input_mesh import InputMesh
 from rbfmuscle.validation import MeshError
 
 if TYPE_CHECKING:
@@ -42,6 +41,19 @@ LEAST_KEPT = 1000  # triangles: smaller meshes are mended as fast as the cache i
 CRUMB_LIMIT = 0.01  # of the largest part's area: smaller loose parts are dropped
 
 
+class InputOrder(NamedTuple):
+    """Triangles (m, 3) of a file by its own vertices, in its order; ``source`` (n,) is the vertex
+    of the model's mesh that each of these is, whose triangles are ``source[faces]``.
+
+    A model needs each point of a surface once, and files repeat vertices along the seams of their
+    textures. This leads back from the mesh of the model, wherever its vertices have gone, to that
+    of the file.
+    """
+
+    faces: Integers
+    source: Integers
+
+
 @dataclass(eq=False)
 class ReadMesh:
     """A mesh as read and mended."""
@@ -54,8 +66,8 @@ class ReadMesh:
     doubt: str = ""  # why it is not known what is inside a bone
     closed: bool = True
     source: str = ""  # the file
-    # The mesh of the file, where it is another one or has texture coordinates or normals.
-    given: InputMesh | None = field(default=None, repr=False)
+    # The mesh of the file, where it is another one.
+    given: InputOrder | None = field(default=None, repr=False)
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
@@ -63,6 +75,30 @@ class ReadMesh:
         import trimesh
 
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+
+def input_order(read: ReadMesh, given: Integers) -> InputOrder | None:
+    """The mesh of a file, with triangles ``given`` (m, 3), that became what was read; None where
+    that has the vertices of the file, or triangles that the file has not.
+    """
+    faces, vertex_map = read.faces, read.vertex_map
+    if np.array_equal(vertex_map, np.arange(len(read.vertices))):
+        return None
+    there = vertex_map[given]
+    kept = np.flatnonzero((there >= 0).all(axis=1) & ~repeated_faces(there))
+    there = there[kept]
+    _, label = np.unique(
+        np.sort(np.concatenate([faces, there]), axis=1), axis=0, return_inverse=True
+    )
+    place = np.full(len(faces) + len(there), -1)
+    place[label.ravel()[len(faces) :]] = np.arange(len(there))
+    chosen = place[label.ravel()[: len(faces)]]
+    if (chosen < 0).any():
+        return None
+    order = (faces[:, :, None] == there[chosen][:, None, :]).argmax(axis=2)
+    own = np.take_along_axis(given[kept][chosen], order, axis=1)
+    used = np.unique(own)
+    return InputOrder(np.searchsorted(used, own), vertex_map[used])
 
 
 def repair(

@@ -85,14 +85,6 @@ class MeshTransform(Table):
         scaled, matrix = np.asarray(points, dtype=float) * self.scale, self.matrix
         return scaled if matrix is None else to_world(scaled, matrix)
 
-    def normals(self, normals: Floats) -> Floats:
-        """Unit normals (n, 3) of a file, in the scene."""
-        matrix = self.matrix
-        if matrix is not None:
-            normals = normals @ np.linalg.inv(matrix[:3, :3])
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return normals / np.maximum(length, np.finfo(float).tiny)
-
 
 def mesh_transform(
     scale: float, mirror: str | None, transform: TransformInput, *, context: str
