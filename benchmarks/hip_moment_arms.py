@@ -24,7 +24,7 @@ import numpy as np
 from evidence import data_folder, write_evidence
 from leg_tendons import convert
 
-from rbfmuscle.geometry.tubes import line_length
+from rbfmuscle.geometry.lines import line_length
 from rbfmuscle.metrics.centreline import NODES, shortest_path
 from rbfmuscle.metrics.published import published_band
 from rbfmuscle.recording import simulate

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from textwrap import fill, shorten
 
-from rbfmuscle.metrics.summary import LIMITS, Summary
+from rbfmuscle.metrics.quantities import quantity_of
+from rbfmuscle.metrics.summary import LIMITS, LOOK, Summary
 from rbfmuscle.metrics.verdict import (
     describe_doubts,
     describe_excess,
@@ -15,7 +16,7 @@ from rbfmuscle.metrics.verdict import (
 from rbfmuscle.run.data import RunData
 from rbfmuscle.scene.phantom import PHANTOM
 
-MOST = 3  # values beyond limits, and remedies, that are named
+MOST = 3  # values beyond limits that are named
 WIDTH = 80  # characters of a line
 LONGEST = 140  # characters about what was not measured or is doubtful: two lines
 
@@ -37,12 +38,11 @@ def verdict_lines(directory: Path) -> Iterator[str]:
         yield _wrapped("not measured: ", shorten(describe_unmeasured(missing), LONGEST))
     if info.doubts:
         yield _wrapped("doubtful: ", shorten(describe_doubts(info.doubts, MOST), LONGEST))
-    known = [row for row in named if row.quantity.partition(":")[0] in LIMITS]
-    parts = [part for row in known for part in find_remedy(row, table).split("; ")]
-    # Where to look is said below, for all of them.
-    own = [part for part in dict.fromkeys(parts) if "rbfmuscle render" not in part]
-    for part in own[:MOST]:
-        yield _wrapped("what to do: ", part.replace("SCENE", info.scene.file or PHANTOM))
+    known = [row for row in named if quantity_of(row.quantity) in LIMITS]
+    remedies = dict.fromkeys(find_remedy(row, table) for row in known)
+    remedies.pop(LOOK, None)  # said below, for all of them
+    for remedy in remedies:
+        yield _wrapped("what to do: ", remedy.replace("SCENE", info.scene.file or PHANTOM))
     if named and saved.has_surfaces and named[0].frame is not None:
         frame = named[0].frame
         yield f"where to look: rbfmuscle render {directory} --frame {frame} -o frame.png"

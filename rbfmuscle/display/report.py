@@ -23,7 +23,7 @@ from rbfmuscle.display.pictures import chosen_frames, render_run
 from rbfmuscle.display.plots import Band, Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.published import published_band
-from rbfmuscle.metrics.quantities import ALL, QUANTITIES
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, quantity_of
 from rbfmuscle.metrics.summary import (
     COUNTS,
     LIMITS,
@@ -196,7 +196,7 @@ def _lights(saved: RunData) -> list[CheckRow]:
     """A row for each of `LIGHTS`, then one for whatever else is beyond a limit."""
     known = {quantity for quantities in LIGHTS.values() for quantity in quantities}
     limits, missing = _limits(saved), saved.info.not_measured
-    beyond = {name.partition(":")[0] for _, name, *_ in exceeded(saved.info.muscles, limits)}
+    beyond = {quantity_of(row.quantity) for row in exceeded(saved.info.muscles, limits)}
     other = sorted((beyond | set(limits.fail_on)) - known)
     rows = [_light(saved, *row) for row in (*LIGHTS.items(), *((name, (name,)) for name in other))]
     found = [row for row in rows if row]

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.fibres import nearest_pieces
+from rbfmuscle.geometry.lines import distance_along, points_along
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.tubes import distance_along, points_along
 from rbfmuscle.geometry.vectors import box_size, unit
 from rbfmuscle.scene.bone import BoneDistance
 

@@ -2,13 +2,18 @@
 
 import hashlib
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.loops import loop
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 def face_normals(vertices: Floats, faces: Integers) -> Floats:
@@ -359,3 +364,23 @@ def farthest_move(before, after):
         if not square <= most:
             most = square if np.isfinite(square) else np.inf
     return np.sqrt(most)
+
+
+def surface_graph(mesh: "trimesh.Trimesh") -> csr_matrix:
+    """Lengths of the edges of a mesh, and of the ways across them to the corner on the other side:
+    paths along edges alone are up to 15 % too long, these some per cent.
+    """
+    ends = np.concatenate([mesh.edges_unique, mesh.face_adjacency_unshared])
+    ends = np.unique(np.sort(ends, axis=1), axis=0)
+    lengths = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
+    count = len(mesh.vertices)
+    return coo_matrix((np.maximum(lengths, 1e-300), ends.T), shape=(count, count)).tocsr()
+
+
+def geodesic(graph: csr_matrix, vertices: ArrayLike) -> Floats:
+    """Length (n,) of the shortest path over a surface from the nearest of some vertices, infinite
+    where there is none.
+    """
+    start = np.atleast_1d(vertices)
+    found: Floats = dijkstra(graph, directed=False, indices=start, min_only=True)
+    return found

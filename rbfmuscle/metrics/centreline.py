@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.harmonic import harmonic_weights
+from rbfmuscle.geometry.lines import distance_along, line_length, points_along
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import connected_vertices, vertex_areas
-from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
 from rbfmuscle.geometry.vectors import to_local
 from rbfmuscle.loops import loop
 from rbfmuscle.metrics.rows import bones_about

@@ -182,6 +182,22 @@ class Row(NamedTuple):
     unit: str
 
 
+def of_coordinate(quantity: str, coordinate: str) -> str:
+    """Name of a quantity that is known by coordinate, where many stand in one table."""
+    return f"{quantity}:{coordinate}"
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """The quantity and the coordinate of a name in such a table; no coordinate for most."""
+    quantity, _, coordinate = name.partition(":")
+    return quantity, coordinate
+
+
+def quantity_of(name: str) -> str:
+    """The quantity of a name in such a table."""
+    return split_name(name)[0]
+
+
 def percentiles(quantity: str, values: Floats) -> dict[str, float]:
     """`PERCENTILES` of a quantity's values (n,), by the names of `QUANTITIES`."""
     found = np.percentile(values, list(PERCENTILES.values())).tolist()

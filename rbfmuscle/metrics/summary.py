@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from typing_extensions import TypedDict
 
-from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, of_coordinate, quantity_of
 from rbfmuscle.scene.check import END_GAP_MM, END_SHARE, MOST_ARTICULAR
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
@@ -86,6 +86,10 @@ class Limits(NamedTuple):
         return Limits({name: self.values[name] for name in self.fail_on}, self.fail_on)
 
 
+# The remedy where none is known to help.
+LOOK = "look at that frame: rbfmuscle render RUN --frame FRAME -o frame.png"
+
+
 class Limit(NamedTuple):
     """Greatest allowed magnitude of a quantity (of those in `LOWER_BOUNDS` the least), lengths in
     millimetres; ``mesh_remedy`` is that of mesh models, where it is another.
@@ -96,7 +100,7 @@ class Limit(NamedTuple):
 
     value: float
     title: str
-    remedy: str = "look at that frame: rbfmuscle render RUN --frame FRAME -o frame.png"
+    remedy: str = LOOK
     mesh_remedy: str = ""
 
 
@@ -183,7 +187,7 @@ class Summary:
         for row in rows:
             quantity = row.quantity
             if "moment_arm" in quantity or "roughness" in quantity:
-                quantity = f"{quantity}:{row.coordinate}"
+                quantity = of_coordinate(quantity, row.coordinate)
             self._values[row.muscle][quantity].append((row.frame, row.value))
             self._units[quantity] = row.unit
 
@@ -320,7 +324,7 @@ def exceeded(table: Table, limits: Limits) -> list[Exceedance]:
     found = []
     for muscle, quantities in table.items():
         for name, facts in quantities.items():
-            quantity = name.partition(":")[0]
+            quantity = quantity_of(name)
             if quantity not in limits.values:
                 continue
             limit = muscle_limit(quantity, limits, quantities)
@@ -343,7 +347,7 @@ def unmeasured(table: Table, limits: Limits) -> list[Unmeasured]:
         having = {
             muscle
             for muscle, quantities in table.items()
-            if any(name.partition(":")[0] == quantity for name in quantities)
+            if any(quantity_of(name) == quantity for name in quantities)
         }
         if quantity in OF_SCENE or not muscles:
             wanted = [ALL]

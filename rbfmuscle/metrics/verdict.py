@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from rbfmuscle.metrics.quantities import ALL
+from rbfmuscle.metrics.quantities import ALL, quantity_of, split_name
 from rbfmuscle.metrics.summary import (
     LIMITS,
     LOWER_BOUNDS,
@@ -108,9 +108,9 @@ def _worst_and_remedies(found, table, missing_bones):
     named = worst_first(found)[:MOST_NAMED]
     remedies: dict[str, str] = {}
     for row in named:
-        if row[1].partition(":")[0] in LIMITS:
+        if quantity_of(row.quantity) in LIMITS:
             remedy = find_remedy(row, table)
-            remedies.setdefault(remedy, remedy.replace("FRAME", str(row[4])))
+            remedies.setdefault(remedy, remedy.replace("FRAME", str(row.frame)))
     values = "; ".join(describe_excess(row, table, missing_bones) for row in named)
     more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
     to_do = [f"What to do: {'; '.join(remedies.values())}"] if remedies else []
@@ -131,7 +131,7 @@ def find_remedy(row: Exceedance, table: Table) -> str:
     overlap = table[muscle].get("initial_overlap", {}).get("worst")
     depth = quantity in ("penetration_max", "bone_penetration_max")
     at_rest = depth and overlap is not None and overlap > limit
-    limit_kind = LIMITS["initial_overlap" if at_rest else quantity.partition(":")[0]]
+    limit_kind = LIMITS["initial_overlap" if at_rest else quantity_of(quantity)]
     is_mesh = "unfitted_fraction" not in table[muscle]
     return (is_mesh and limit_kind.mesh_remedy) or limit_kind.remedy
 
@@ -148,11 +148,11 @@ def describe_excess(row: Exceedance, table: Table, missing_bones: Sequence[str] 
     value = shown_number(worst, unit)
     shown_limit = f"{limit:.3g}"
     # Less than is shown elsewhere, or so near to the limit that it would look the same.
-    if value.startswith("<") or value.split()[0] == shown_limit:
+    if value.startswith("<") or shown_number(worst) == shown_limit:
         value = f"{worst:.5g} {unit}".removesuffix(" 1")
         shown_limit = f"{limit:.5g}"
     place = "the bones" if muscle == ALL else muscle
-    quantity, _, coordinate = quantity.partition(":")
+    quantity, coordinate = split_name(quantity)
     title = LIMITS[quantity].title if quantity in LIMITS else quantity
     title += f" ({coordinate})" if coordinate else ""
     title += f" ({_listed(missing_bones)})" if quantity == "missing_bones" else ""

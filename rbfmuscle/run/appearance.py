@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.lines import distance_along, tube_mesh
 from rbfmuscle.geometry.surfaces import joined_meshes
-from rbfmuscle.geometry.tubes import distance_along, tube_mesh
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.tendons import TendonLine
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.tubes import distance_along
+from rbfmuscle.geometry.lines import distance_along
 from rbfmuscle.scene.objects import Attachment
 from rbfmuscle.scene.scene import Scene
 

@@ -19,8 +19,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.taut_lines import taut_line
-from rbfmuscle.geometry.tubes import distance_along, line_length, points_along
+from rbfmuscle.geometry.lines import distance_along, line_length, points_along, taut_line
 from rbfmuscle.geometry.vectors import across, to_local, to_world, unit
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.bone import Bone

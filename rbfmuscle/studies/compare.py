@@ -27,7 +27,7 @@ from rbfmuscle.display.report import packed_scene
 from rbfmuscle.folders import OutputFolder, given_folder
 from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
-from rbfmuscle.metrics.quantities import ALL, QUANTITIES, unit_text
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, quantity_of, split_name, unit_text
 from rbfmuscle.metrics.summary import LIMITS, QuantityFacts, shown_number
 from rbfmuscle.models import (
     build_models,
@@ -503,7 +503,7 @@ def _statistics_rows(table: Comparison) -> Iterator[tuple[object, ...]]:
     for model, muscles in table.statistics.items():
         for muscle, quantities in muscles.items():
             for name, spread in quantities.items():
-                unit = unit_text(QUANTITIES[name.partition(":")[0]][0], table.units)
+                unit = unit_text(QUANTITIES[quantity_of(name)][0], table.units)
                 yield model, muscle, name, spread.mean, spread.sd, unit
 
 
@@ -761,7 +761,7 @@ def _statistics(found: Comparison) -> Table:
     for muscle, quantities in first.items():
         names = ["length", *(name for name in quantities if name.startswith("moment_arm:"))]
         for name in [*names, "volume_error", "time_frame"]:
-            quantity, _, about = name.partition(":")
+            quantity, about = split_name(name)
             unit = unit_text(QUANTITIES[quantity][0], found.units)
             texts = []
             for model in models:

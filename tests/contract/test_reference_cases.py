@@ -14,7 +14,7 @@ from command_line import call
 from conftest import find_data
 
 import rbfmuscle as rm
-from rbfmuscle.geometry.tubes import line_length
+from rbfmuscle.geometry.lines import line_length
 from rbfmuscle.importers.guess.guess import guess_scene
 from rbfmuscle.importers.opensim import tubes
 from rbfmuscle.importers.opensim.scene import import_osim

@@ -10,8 +10,8 @@ import trimesh
 from toy_scene import held
 
 import rbfmuscle as rm
+from rbfmuscle.geometry.lines import line_length
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.tubes import line_length
 from rbfmuscle.metrics.published import published_band
 from rbfmuscle.run.appearance import stretch_colours
 from rbfmuscle.validation import SceneError, UsageError

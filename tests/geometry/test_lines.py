@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.geometry.lines import (
+    STEEPEST,
+    distance_along,
+    line_length,
+    points_along,
+    taut_line,
+    tube_mesh,
+)
 from rbfmuscle.geometry.rest_frame import diameter
-from rbfmuscle.geometry.taut_lines import STEEPEST, taut_line
-from rbfmuscle.geometry.tubes import distance_along, line_length, points_along, tube_mesh
 
 CORNER = np.array([[0.0, 0, 0], [3.0, 0, 0], [3.0, 4.0, 0]])
 UP = np.array([0.0, 1.0, 0.0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.geometry.rings import plain_loop, vertex_rings
+from rbfmuscle.geometry.crossing import plain_loop, vertex_rings
 from rbfmuscle.geometry.surfaces import opposite_half_edges
 
 BALL = trimesh.creation.icosphere(2)

@@ -27,7 +27,7 @@ from rbfmuscle.anatomy.bones import (
 )
 from rbfmuscle.anatomy.names import name_facts
 from rbfmuscle.folders import OutputFolder
-from rbfmuscle.geometry.tubes import line_length, points_along, tube_mesh
+from rbfmuscle.geometry.lines import line_length, points_along, tube_mesh
 from rbfmuscle.importers.guess.attachments import Ends
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints

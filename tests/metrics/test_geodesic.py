@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.geometry.tubes import line_length, tube_mesh
+from rbfmuscle.geometry.lines import line_length, tube_mesh
 from rbfmuscle.metrics.centreline import NODES, Centreline, shortest_path
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.objects import Attachment

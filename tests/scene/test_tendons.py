@@ -11,8 +11,7 @@ from tendon_scene import END, arm
 from toy_scene import held
 
 import rbfmuscle as rm
-from rbfmuscle.geometry.taut_lines import taut_line
-from rbfmuscle.geometry.tubes import line_length
+from rbfmuscle.geometry.lines import line_length, taut_line
 from rbfmuscle.recording import Run
 from rbfmuscle.run.appearance import LONGEST_TAPER, TAPER, tendon_mesh
 from rbfmuscle.scene.activation.keys import TENDON_STRAIN

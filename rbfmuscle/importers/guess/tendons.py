@@ -7,12 +7,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.sparse import coo_matrix, csr_matrix
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from rbfmuscle.anatomy.bones import Part
+from rbfmuscle.geometry.surfaces import geodesic, surface_graph
 from rbfmuscle.importers.guess.joints import Skeleton
 from rbfmuscle.importers.guess.sites import Anatomy, Site, sites_on
 
@@ -20,22 +18,11 @@ if TYPE_CHECKING:
     import trimesh
 
 
-def edge_graph(mesh: trimesh.Trimesh) -> csr_matrix:
-    """The edges of a mesh and their lengths."""
-    count = len(mesh.vertices)
-    return coo_matrix((mesh.edges_unique_length, mesh.edges_unique.T), shape=(count, count)).tocsr()
-
-
-def geodesic(graph: csr_matrix, vertices: ArrayLike) -> np.ndarray:
-    """Distance along edges (n,) to the nearest of some vertices, infinite where there is no way."""
-    return dijkstra(graph, directed=False, indices=np.atleast_1d(vertices), min_only=True)
-
-
 class Ends:
     """The two ends of a closed surface: the points farthest apart along it."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        graph = edge_graph(mesh)
+        graph = surface_graph(mesh)
 
         def away_from(vertex):
             distance = geodesic(graph, vertex)
@@ -181,7 +168,7 @@ def see_tendon(tendon: Part, muscle: Part) -> TendonMesh:
     points = tendon.points
     away_from_muscle = cKDTree(muscle.points).query(points)[0]
     near = np.flatnonzero(away_from_muscle <= away_from_muscle.min() + JOINS * tendon.size)
-    graph = edge_graph(tendon.mesh)
+    graph = surface_graph(tendon.mesh)
     along = geodesic(graph, near)
     along[~np.isfinite(along)] = 0.0
     last = np.flatnonzero(along >= LAST * along.max())

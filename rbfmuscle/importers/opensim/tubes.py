@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.lines import distance_along, line_length, points_along, tube_mesh
 from rbfmuscle.geometry.surfaces import mesh_volume, unique_edges
-from rbfmuscle.geometry.tubes import distance_along, line_length, points_along, tube_mesh
 from rbfmuscle.importers.opensim.model import ModelMuscle
 from rbfmuscle.importers.opensim.wraps import wrap_path
 from rbfmuscle.validation import SceneError

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rbfmuscle.geometry.tubes import line_length
+from rbfmuscle.geometry.lines import line_length
 from rbfmuscle.geometry.vectors import to_world, unit
 from rbfmuscle.importers.opensim.model import WrapShape
 

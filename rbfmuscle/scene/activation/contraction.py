@@ -6,11 +6,10 @@ import itertools
 import math
 
 import numpy as np
-import scipy.sparse as sparse
-from scipy.sparse.csgraph import dijkstra
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.surfaces import geodesic, surface_graph
 from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.activation.keys import (
     TENDON_STRAIN,
@@ -71,27 +70,13 @@ def _tendon(muscle: Muscle, given: TendonRegionTable | None) -> Booleans:
             f"{context}: not attached to {given.at!r}, {did_you_mean(given.at, bones)}"
         )
     start = np.concatenate([a.vertices for a in muscle.attachments if given.at in (None, a.bone)])
-    tendon = _along_surface(muscle.mesh, start) <= given.length
+    tendon = geodesic(surface_graph(muscle.mesh), start) <= given.length
     free[np.concatenate([a.vertices for a in muscle.attachments])] = False
     if not (free & ~tendon).any():
         raise SceneError(f"{context}: covers all of the muscle, leave a belly that can contract")
     if not (free & tendon).any():
         raise SceneError(f"{context}: holds no vertex beyond the attachments, make it longer")
     return tendon
-
-
-def _along_surface(mesh, start):
-    """Length (n,) of the shortest path over the surface from the vertices ``start``, some per cent
-    too long.
-    """
-    # Along edges, and across them to the corner on the other side: along edges alone up to 15 % too
-    # long.
-    ends = np.concatenate([mesh.edges_unique, mesh.face_adjacency_unshared])
-    ends = np.unique(np.sort(ends, axis=1), axis=0)
-    lengths = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1)
-    count = len(mesh.vertices)
-    graph = sparse.coo_matrix((np.maximum(lengths, 1e-300), ends.T), shape=(count, count)).tocsr()
-    return dijkstra(graph, directed=False, indices=start, min_only=True)
 
 
 def check_activation(muscle: Muscle, motion: Motion) -> None:

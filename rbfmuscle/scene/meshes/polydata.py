@@ -107,7 +107,8 @@ def _receive(pipe: IO[bytes]) -> PolyData | str:
             raise ValueError("the answer is no mesh")
     for ends, numbers in (cells[:2], cells[2:]):
         _check_cells(ends, numbers, len(points))
-    return PolyData(points, *cells, int(single[0]), values)
+    ends, numbers, line_ends, line_numbers = cells
+    return PolyData(points, ends, numbers, line_ends, line_numbers, int(single[0]), values)
 
 
 def _read_whole(pipe: IO[bytes], size: int) -> bytes:

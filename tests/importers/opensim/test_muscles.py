@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.tubes import line_length
+from rbfmuscle.geometry.lines import line_length
 from rbfmuscle.importers.opensim.elements import read_xml
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.importers.opensim.read import read_osim
