@@ -25,7 +25,7 @@ EXAMPLES = (
 # The Python reference: public names by topic.
 TOPICS = {
     "Scenes": ("Scene", "phantom_scene"),
-    "Running and comparing": ("simulate", "Run", "compare_models", "show"),
+    "Running and comparing": ("simulate", "Run", "compare", "show"),
     "Fields and kernels": ("RBFField", "study_kernels", "reach_error", "register_kernel"),
     "Muscles and bones": ("RBFMuscle", "BoneSDF"),
     "Errors and warnings": (

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rbfmuscle.scene.phantom import phantom_scene as phantom_scene
     from rbfmuscle.scene.scene import Scene as Scene
     from rbfmuscle.studies.accuracy import discretisation_error as discretisation_error
-    from rbfmuscle.studies.compare import compare_models as compare_models
+    from rbfmuscle.studies.compare import compare as compare
     from rbfmuscle.studies.kernels import reach_error as reach_error
     from rbfmuscle.studies.kernels import study_kernels as study_kernels
     from rbfmuscle.studies.sweep import sweep as sweep
@@ -58,7 +58,7 @@ _HOME = {
     "Run": "rbfmuscle.recording",
     "Scene": "rbfmuscle.scene.scene",
     "check_scene": "rbfmuscle.scene.check",
-    "compare_models": "rbfmuscle.studies.compare",
+    "compare": "rbfmuscle.studies.compare",
     "discretisation_error": "rbfmuscle.studies.accuracy",
     "model_kind": "rbfmuscle.models",
     "phantom_scene": "rbfmuscle.scene.phantom",
@@ -76,6 +76,8 @@ __all__ = [*_HOME, "__version__"]
 
 def __getattr__(name: str) -> object:
     home = _HOME.get(name)
+    if name == "compare_models":
+        raise AttributeError("rbfmuscle.compare_models is rbfmuscle.compare now")
     if home is None:
         raise AttributeError(f"module 'rbfmuscle' has no attribute {name!r}")
     value = getattr(importlib.import_module(home), name)

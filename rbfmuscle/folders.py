@@ -226,11 +226,14 @@ def _check_writable(directory: Path) -> None:
         ) from None
 
 
-@contextmanager
-def given_folder(directory: str | Path | None) -> Iterator[Path]:
-    """Context with a folder, or where none is given with a new one that is removed at the end."""
-    if directory is not None:
-        yield Path(directory)
-        return
-    with tempfile.TemporaryDirectory() as kept:
-        yield Path(kept, "results")
+def copy_listed(source: Path, target: Path, command: str) -> None:
+    """Copy the files that a command wrote to a folder, and nothing else that lies there."""
+    names = read_list(source, command)
+    if names is None:
+        raise UsageError(
+            f"{source} has no {LIST}, which names the files of 'rbfmuscle {command}'; run it again"
+        )
+    for name in names:
+        if (source / name).is_file():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(source / name, target / name)

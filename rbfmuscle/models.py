@@ -79,7 +79,7 @@ _KINDS: dict[str, Callable[[], ModelKind]] = {
 
 
 def register_model(name: str, kind: ModelKind) -> None:
-    """Add a model under a name of its own, for scenes, `simulate` and `compare_models`.
+    """Add a model under a name of its own, for scenes, `simulate` and `compare`.
 
     Raises UsageError if the name is taken.
 

@@ -5,7 +5,6 @@ and clocked frame by frame.
 from __future__ import annotations
 
 import html
-import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,7 +17,7 @@ from rbfmuscle.anatomy.bones import orient_scene
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.display.export import export_run
 from rbfmuscle.fibres.bundle import build_bundles
-from rbfmuscle.folders import LIST, read_list
+from rbfmuscle.folders import copy_listed
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.metrics.doubts import measured_doubts
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
@@ -248,7 +247,7 @@ class Run(RunData):
             self._recording.finish(self._write(directory), pictures=pictures)
         elif self.directory and Path(directory).resolve() != self.directory.resolve():
             with folder.staged() as stage:
-                _copy_run(self.directory, stage)
+                copy_listed(self.directory, stage, "run")
 
     def export(
         self,
@@ -295,17 +294,6 @@ class Run(RunData):
         writer.close(self.metrics)
         writer.write_info(self.info)
         return writer
-
-
-def _copy_run(source: Path, target: Path) -> None:
-    """Copy the files of a run, and nothing else that lies in its folder."""
-    names = read_list(source, "run")
-    if names is None:
-        raise UsageError(f"{source} has no {LIST}, which names the files of a run; run it again")
-    for name in names:
-        if (source / name).is_file():
-            (target / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(source / name, target / name)
 
 
 class MemorySink:

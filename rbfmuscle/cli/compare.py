@@ -44,7 +44,7 @@ def compare(
     from rbfmuscle.metrics.summary import parse_limits
     from rbfmuscle.scene.phantom import open_scene
     from rbfmuscle.scene.settings import parse_settings
-    from rbfmuscle.studies.compare import compare_models
+    from rbfmuscle.studies.compare import compare as run_models
 
     changes, opened = parse_settings(settings), open_scene(scene)
     limits = parse_limits(fail_on, opened)
@@ -52,21 +52,19 @@ def compare(
     with (
         Progress("compare") as progress,
         interruption.keeping(lambda: kept if output.exists() else ""),
-        work.threads(),
     ):
 
-        def advance(model, done, total):
-            if done == 0:
-                progress.show(model, done, total)
+        def advance(done, total):
             progress(done, total)
             interruption.check()
 
-        table = compare_models(
+        table = run_models(
             opened,
             output,
-            split_list(models),
-            frames=frames,
+            models=split_list(models),
             settings=changes,
+            frames=frames,
+            jobs=work.jobs,
             pictures=pictures,
             progress=advance,
         )

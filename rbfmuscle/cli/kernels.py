@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +14,7 @@ from rbfmuscle.cli.options import (
     Muscles,
     Output,
     Work,
-    chosen_muscles,
+    named_muscles,
     print_result,
     refuse,
     split_list,
@@ -71,78 +70,56 @@ def kernels(
         Find the fewest centres, and the kernel, that reach this RMS distance (in the mesh's unit),
         in place of a table.
     """
-    from rbfmuscle.studies.kernels import kernels_folder, reach_error, study_kernels
+    from rbfmuscle.studies.kernels import kernels_folder, open_surfaces, study_kernels
 
     if error is not None:
         refuse("--error", {"--centres": fits.centres, "--resolution": fits.resolution})
     counts = split_list("150,300" if fits.centres is None else fits.centres)
     if not counts or not all(count.isdecimal() and int(count) >= 8 for count in counts):
         raise UsageError(f"--centres must be whole numbers of 8 and more, got {fits.centres!r}")
-    meshes, units = _meshes(source, muscles, units)
     kernels_folder(output)
-    chosen = split_list(fits.names) or None
-    with work.threads():
-        if error is not None:
-            find = partial(reach_error, error=error, kernels=chosen)
-            return _find_wanted(meshes, output, find, units, work)
-        study = partial(
-            study_kernels,
+    chosen, named = split_list(fits.names) or None, named_muscles(muscles)
+    if error is not None:
+        meshes, unit = open_surfaces(source, named, units)
+        with work.threads():
+            return _find_wanted(meshes, output, error, chosen, unit, work)
+    with Progress(f"kernels of {Path(source).stem}", what="fit") as bar:
+        study = study_kernels(
+            source,
+            output,
+            muscles=named,
             kernels=chosen,
             centres=[int(count) for count in counts],
             resolution=fits.resolution or 0,
             units=units,
+            jobs=work.jobs,
+            progress=bar,
         )
-        return _study(meshes, output, study, work)
-
-
-def _meshes(source, muscles, units):
-    """Meshes by name, and their unit: of a scene the named muscles, or every one."""
-    from rbfmuscle.scene.meshes.read import read_mesh
-    from rbfmuscle.scene.phantom import PHANTOM, open_scene
-
-    if source != PHANTOM and Path(source).suffix.lower() != ".toml":
-        if muscles is not None:
-            raise UsageError(f"--muscles names muscles of a scene, {source} is a mesh")
-        return {Path(source).stem: read_mesh(source).mesh}, units or ""
-    if units is not None:
-        raise UsageError(f"--units names the unit of a mesh, {source} says its own")
-    scene = open_scene(source)
-    return {each.name: each.mesh for each in chosen_muscles(scene, muscles)}, scene.units
-
-
-def _study(meshes, output, study, printing):
-    from rbfmuscle.studies.kernels import write_studies
-
-    studies = {}
-    for name, mesh in meshes.items():
-        with Progress(f"kernels of {name}", what="fit") as bar:
-            studies[name] = study(mesh, progress=bar)
-    write_studies(studies, output)
     facts = json.loads((output / "kernels.json").read_text(encoding="utf-8"))
-    return print_result(printing, facts, _study_lines(studies, output))
+    return print_result(work, facts, _study_lines(study, output))
 
 
-def _study_lines(studies, output):
-    from rbfmuscle.studies.kernels import answer, describe
+def _study_lines(study, output):
+    from rbfmuscle.studies.kernels import describe
 
-    for name, study in studies.items():
-        if study.recommended is not None:
-            yield f"{name}: {describe(study.rows)}"
-            yield f"to paste at the end of its [[muscle]]:\n\n{study.recommended.toml()}\n"
-    if len(studies) > 1 or not next(iter(studies.values())).recommended:
-        yield answer(studies)
+    for name, each in study.studies.items():
+        if each.recommended is not None:
+            yield f"{name}: {describe(each.rows)}"
+            yield f"to paste at the end of its [[muscle]]:\n\n{each.recommended.toml()}\n"
+    if len(study.studies) > 1 or not study.recommended:
+        yield study.answer()
     yield f"all rows: open {output / 'kernels.html'}"
 
 
-def _find_wanted(meshes, output, find, units, printing):
+def _find_wanted(meshes, output, error, kernels, units, printing):
     """Find, print and write what reaches an error; where it is not reached, that is said."""
     from rbfmuscle.run.writer import json_text
-    from rbfmuscle.studies.kernels import kernels_folder
+    from rbfmuscle.studies.kernels import kernels_folder, reach_error
 
     facts = {}
     for name, mesh in meshes.items():
         with Progress(f"kernels of {name}", what="fit") as bar:
-            found = find(mesh, progress=bar)
+            found = reach_error(mesh, error, kernels=kernels, progress=bar)
         facts[name] = {
             "reached": found.reached,
             "error": found.error,

@@ -4,7 +4,7 @@ errors on standard error.
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -131,13 +131,9 @@ class Work(Printing):
 
     def threads(self) -> AbstractContextManager[None]:
         """Context in which loops use as many threads as ``--jobs`` says."""
-        if self.jobs is None:
-            return nullcontext()
-        if self.jobs < 1:
-            raise UsageError(f"--jobs must be 1 or more, got {self.jobs}")
-        from rbfmuscle.geometry.threads import threads_limited
+        from rbfmuscle.geometry.threads import cores_limited
 
-        return threads_limited(self.jobs)
+        return cores_limited(self.jobs)
 
 
 UNCHANGED = Changes()
@@ -161,15 +157,18 @@ def chosen_muscles(scene: "Scene", names: str | None) -> "list[Muscle]":
     """The muscles that ``--muscles`` names, all where it is not given; UsageError if there is no
     such muscle.
     """
-    if names is None:
-        return scene.muscles
+    named = named_muscles(names)
     try:
-        found = [scene.muscle(name) for name in split_list(names)]
+        return scene.muscles if named is None else [scene.muscle(name) for name in named]
     except SceneError as error:
         raise UsageError(f"--muscles: {error}") from None
-    if not found:
+
+
+def named_muscles(names: str | None) -> list[str] | None:
+    """The names of ``--muscles``, None for all; UsageError if there are none in it."""
+    if names is not None and not split_list(names):
         raise UsageError("--muscles names no muscle; leave it out for all")
-    return found
+    return None if names is None else split_list(names)
 
 
 def named_scenes(scenes: Sequence[str]) -> dict[str, str]:

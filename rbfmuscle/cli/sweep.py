@@ -123,8 +123,8 @@ def sweep(
     with progress, interruption.keeping(lambda: f"finished points are kept in {output}"):
         table = run_scenes(
             loaded,
-            grid,
             output,
+            grid=grid,
             frames=frames,
             reference=parse_settings(axes.reference),
             jobs=workers.cluster or workers.jobs,

@@ -4,7 +4,7 @@ the lock.
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import lru_cache
 from heapq import heapify, heappop, heappush
 from itertools import pairwise
@@ -13,6 +13,8 @@ from typing import TypeVar
 
 from numba import config
 from threadpoolctl import LibController, ThreadpoolController
+
+from rbfmuscle.validation import UsageError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -41,6 +43,15 @@ def threads_limited(count: int) -> Iterator[None]:
             yield
     finally:
         _own.count = before
+
+
+def cores_limited(jobs: int | None) -> AbstractContextManager[None]:
+    """Context in which work of the calling thread uses so many cores; all for None."""
+    if jobs is None:
+        return nullcontext()
+    if jobs < 1:
+        raise UsageError(f"jobs must be 1 or more, got {jobs}")
+    return threads_limited(jobs)
 
 
 @contextmanager

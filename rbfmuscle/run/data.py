@@ -350,7 +350,13 @@ def _metrics_table(
         "value": np.array([row.value for row in rows], dtype=float),
         "unit": np.array([row.unit for row in rows], dtype=str),
     }
-    table = np.empty(len(rows), dtype=[(name, x.dtype) for name, x in columns.items()])
+    return as_table(columns)
+
+
+def as_table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Columns (n,) by name as a structured ndarray (n,)."""
+    count = len(next(iter(columns.values())))
+    table = np.empty(count, dtype=[(name, x.dtype) for name, x in columns.items()])
     for name, values in columns.items():
         table[name] = values
     return table

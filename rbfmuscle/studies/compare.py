@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel
@@ -24,8 +24,8 @@ from rbfmuscle.display.page import (
 )
 from rbfmuscle.display.plots import Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.display.report import packed_scene
-from rbfmuscle.folders import OutputFolder, given_folder
-from rbfmuscle.geometry.threads import threads_limited
+from rbfmuscle.folders import OutputFolder
+from rbfmuscle.geometry.threads import cores_limited, threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, quantity_of, split_name, unit_text
 from rbfmuscle.metrics.summary import LIMITS, QuantityFacts, shown_number
@@ -37,9 +37,9 @@ from rbfmuscle.models import (
     solved_points,
 )
 from rbfmuscle.progress import stage
-from rbfmuscle.recording import stream_run
+from rbfmuscle.recording import Run, stream_run
 from rbfmuscle.run.appearance import MUSCLE_COLOURS
-from rbfmuscle.run.data import RunData, moment_arm_coordinates
+from rbfmuscle.run.data import RunData, as_table, moment_arm_coordinates
 from rbfmuscle.run.writer import machine, run_folder, versions, write_csv, write_json
 from rbfmuscle.scene.frames import pick_frames
 from rbfmuscle.scene.objects import from_mm
@@ -49,6 +49,7 @@ from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.scene.settings import chooses_model
 from rbfmuscle.simulation.frame import Mesh
 from rbfmuscle.simulation.frame_loop import simulate_frames
+from rbfmuscle.studies.result import OnProgress, Study, part_progress, study_folder
 from rbfmuscle.validation import SolveError, UsageError
 
 if TYPE_CHECKING:
@@ -61,15 +62,16 @@ FINER = 4  # and its last pose with sub-steps this many times as short, which ev
 ONE_THREAD = 5  # frames that are timed on one thread, the first of which does not count
 
 
-def compare_models(
+def compare(
     scene: Scene | str | Path,
     directory: str | Path | None = None,
-    models: Sequence[str] = ("rbf", "pbd"),
     *,
-    frames: slice | str | None = None,
+    models: Sequence[str] = ("rbf", "pbd"),
     settings: Mapping[str, object] | None = None,
+    frames: slice | str | None = None,
+    jobs: int | None = None,
     pictures: bool = True,
-    progress: Callable[[str, int, int], object] | None = None,
+    progress: OnProgress | None = None,
 ) -> Comparison:
     """Run every model on a scene, measure all alike, and write tables, a report and pictures.
 
@@ -77,22 +79,24 @@ def compare_models(
     ----------
     scene : Scene, path or "phantom"
     directory : path, optional
-        Takes ``comparison.json``, tables, ``report.html`` and the run of each model; without one
-        nothing is kept but what is returned.
+        Takes ``comparison.json``, tables, ``report.html`` and the run of each model.
     models : list of str
         Distances are to the first. One that cannot be solved is left out, and named in the tables.
+    settings : mapping, optional
+        Dotted keys with their values, for all models, or as "MODEL:KEY" for one.
     frames : slice or str, optional
         Frames of the motion, a slice or "A:B:S".
-    settings : dict, optional
-        Dotted keys with their values, for all models, or as "MODEL:KEY" for one.
+    jobs : int, optional
+        Cores to use, all by default.
     pictures : bool
+        Whether the report has them.
     progress : callable, optional
-        Called as ``progress(model, done, total)``.
+        Called as ``progress(done, total)`` after each frame of each model.
 
     Returns
     -------
     Comparison
-        What ``comparison.json`` holds.
+        What ``comparison.json`` holds, with ``table()``, ``save(directory)`` and ``show()``.
 
     Raises
     ------
@@ -104,20 +108,20 @@ def compare_models(
     Examples
     --------
     >>> from rbfmuscle import phantom_scene
-    >>> table = compare_models(phantom_scene(end=2.0), models=["pbd", "xpbd"])
-    >>> sorted(table.models)
-    ['pbd', 'xpbd']
+    >>> found = compare(phantom_scene(end=2.0), models=["pbd", "xpbd"], pictures=False)
+    >>> found.models, found.table()["value"].dtype
+    (['pbd', 'xpbd'], dtype('float64'))
     """
     variants = _variants(open_scene(scene), list(models), settings or {}, frames)
-    with given_folder(directory) as folder:
-        return _compare(variants, folder, pictures and directory is not None, progress)
+    with cores_limited(jobs), study_folder(directory) as folder:
+        return _compare(variants, folder, pictures, progress).kept_in(folder, own=directory is None)
 
 
 def _compare(
     variants: Mapping[str, Scene],
     folder: Path,
     pictures: bool,
-    progress: Callable[[str, int, int], object] | None,
+    progress: OnProgress | None,
 ) -> Comparison:
     """Run the scene of each model in a folder of its name, and write tables and a report."""
     output = OutputFolder(folder, "compare", FILES)
@@ -128,10 +132,13 @@ def _compare(
     first = next(iter(variants.values()))
     last = len(first.motion) - 1
     poses = [int(first.motion.numbers[k]) for k in sorted({0, last // 2, last})]
-    results, failed = {}, {}
+    results, failed, done, total = {}, {}, 0, len(variants) * len(first.motion)
     for name, variant in variants.items():
+        count = part_progress(progress, done, total)
+        done += len(first.motion)
         try:
-            results[name] = _measure(name, variant, folder / name, progress)
+            with stage(name):
+                results[name] = _measure(name, variant, folder / name, count)
         except SolveError as error:
             failed[name] = str(error)
     if not results:
@@ -146,9 +153,6 @@ def _compare(
     table = write_tables(
         folder, first, results, failed, labels=labels, unknowns=unknowns, poses=poses
     )
-
-    from rbfmuscle.studies.compare import write_page
-
     with stage("drawing pictures" if pictures else "writing the report"):
         write_page(folder, table, pictures=pictures)
     return table
@@ -189,8 +193,7 @@ def _measure(name, scene, folder, progress):
     """
     last = len(scene.motion) - 1
     _surfaces(scene, [*range(min(last, 1) + 1)])
-    report = None if progress is None else (lambda done, total: progress(name, done, total))
-    stream_run(scene, folder, pictures=False, progress=report)
+    stream_run(scene, folder, pictures=False, progress=progress)
     coarse = [*range(0, last, COARSER)]
     with stage(f"{name}: there and back"):
         build, shown, _ = _surfaces(scene, [*coarse, last, *coarse[::-1]])
@@ -311,7 +314,7 @@ class Spread(BaseModel):
     sd: float
 
 
-class Comparison(BaseModel):
+class Comparison(BaseModel, Study):
     """What ``comparison.json`` holds.
 
     ``poses`` are the numbers of the frames at which distances were measured, ``labels`` models as
@@ -320,6 +323,9 @@ class Comparison(BaseModel):
     each model solves for, in words, by model and muscle. ``results`` are by model; ``statistics``
     by model, muscle and quantity, of moment arms ``"moment_arm:COORDINATE"``.
     """
+
+    command: ClassVar[str] = "compare"
+    page: ClassVar[str] = "report.html"
 
     format: int
     scene: str
@@ -337,6 +343,22 @@ class Comparison(BaseModel):
     statistics: dict[str, dict[str, dict[str, Spread]]]
     machine: dict[str, str | int | None]
     versions: dict[str, str]
+
+    def table(self) -> np.ndarray:
+        """Every value as a structured ndarray, with the columns of ``comparison.csv``."""
+        columns = zip(VALUE_COLUMNS, zip(*self.value_rows()))
+        return as_table({name: np.array(values) for name, values in columns})
+
+    def save(self, directory: str | Path) -> None:
+        """Write what the command writes, the run of each model among it.
+
+        UsageError if the folder cannot be written to, or holds anything but an earlier result.
+        """
+        for name in self.models:
+            run_folder(Path(directory) / name)
+        super().save(directory)
+        for name in self.models:
+            Run.load(self._folder / name).save(Path(directory) / name)
 
     def value_rows(self) -> Iterator[tuple[str, str, str, float, str, str]]:
         """Every value, in rows of `VALUE_COLUMNS`."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import cycle
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel
@@ -39,7 +39,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.rest_frame import principal_axes
 from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, vertex_areas
-from rbfmuscle.geometry.threads import blas_limited, each, threads_limited
+from rbfmuscle.geometry.threads import blas_limited, cores_limited, each, threads_limited
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
 from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
@@ -51,38 +51,58 @@ from rbfmuscle.implicit.placement.sampling import (
 )
 from rbfmuscle.implicit.selection import BOUND, SCAN, SPAN, choose_epsilon, spacing
 from rbfmuscle.metrics.summary import shown_number
+from rbfmuscle.progress import stage
 from rbfmuscle.run.appearance import MUSCLE_COLOURS
+from rbfmuscle.run.data import as_table
 from rbfmuscle.run.writer import json_text, versions, write_csv
-from rbfmuscle.studies.sweep import OnProgress, pareto_front
+from rbfmuscle.scene.meshes.read import read_mesh
+from rbfmuscle.scene.phantom import PHANTOM, open_scene
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.studies.result import OnProgress, Study, part_progress, study_folder
+from rbfmuscle.studies.sweep import pareto_front
 from rbfmuscle.validation import NumericalWarning, UsageError, check_mesh
 
 
 def study_kernels(
-    mesh: MeshLike,
+    scene: Scene | MeshLike | str | Path,
     directory: str | Path | None = None,
     *,
+    muscles: Sequence[str] | None = None,
     kernels: Sequence[str] | None = None,
     centres: Sequence[int] = (150, 300),
     resolution: int = 0,
-    units: str = "",
+    units: str | None = None,
+    jobs: int | None = None,
     progress: OnProgress | None = None,
 ) -> KernelStudy:
-    """Fit a surface with many kernels and numbers of centres, and measure each fit.
+    """Fit a surface, or the muscles of a scene, with many kernels and numbers of centres, and
+    measure each fit.
 
     Parameters
     ----------
-    mesh : trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
-        Closed, outward.
+    scene : Scene, path, "phantom", trimesh.Trimesh or pair of (n, 3) vertices and (m, 3) faces
+        A scene or a closed, outward mesh, or the file of either.
     directory : path, optional
         Takes ``kernels.csv``, ``kernels.json`` and the page ``kernels.html``.
+    muscles : list of str, optional
+        Of a scene, all by default.
     kernels : list of str, optional
         All by default.
     centres : sequence of int
     resolution : int
         Cells along the longest side of the extracted surfaces; as many as a muscle so slender needs
         by default.
-    units, progress : str, callable, optional
-        Name of the mesh's unit, for the page. ``progress(done, total)`` is called along the way.
+    units : str, optional
+        Name of a mesh's unit, for the page.
+    jobs : int, optional
+        Cores to use, all by default.
+    progress : callable, optional
+        Called as ``progress(done, total)`` after each fit.
+
+    Returns
+    -------
+    KernelStudy
+        ``rows`` and ``recommended``, with ``table()``, ``save(directory)`` and ``show()``.
 
     Raises
     ------
@@ -95,20 +115,48 @@ def study_kernels(
     >>> import trimesh
     >>> ball = trimesh.creation.icosphere(3, 10.0)
     >>> study = study_kernels(ball, kernels=["cubic"], centres=[40], resolution=16)
-    >>> study.rows[0].kernel
-    'cubic'
+    >>> study.rows[0].kernel, len(study.table())
+    ('cubic', 1)
     """
     if directory is not None:
         kernels_folder(directory)  # what is in the way is reported now, not after the study
-    vertices, faces, chosen = check_request(mesh, kernels or KERNELS)
     if min(centres, default=0) < 8:
         raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
-    judge = ReferenceSurface(vertices, faces, resolution)
-    study = measure_fits(judge, chosen, centres, progress)
-    study.units = units
-    if directory is not None:
-        write_studies({"mesh": study}, directory)
-    return study
+    meshes, units = open_surfaces(scene, muscles, units)
+    checked = {name: check_request(mesh, kernels or KERNELS) for name, mesh in meshes.items()}
+    found, done = {}, 0
+    with cores_limited(jobs), study_folder(directory) as folder:
+        for name, (vertices, faces, chosen) in checked.items():
+            fits = len(chosen) * len(centres)
+            count = part_progress(progress, done, len(meshes) * fits)
+            judge = ReferenceSurface(vertices, faces, resolution)
+            with stage(name):
+                found[name] = measure_fits(judge, chosen, centres, count)
+            done += fits
+        study = KernelStudy(found, units)
+        write_study(study, folder)
+        return study.kept_in(folder, own=directory is None)
+
+
+def open_surfaces(
+    scene: Scene | MeshLike | str | Path, muscles: Sequence[str] | None, units: str | None
+) -> tuple[dict[str, MeshLike], str]:
+    """Meshes by name, and their unit: one mesh or its file, or of a scene the muscles of some
+    names, or all.
+    """
+    if not isinstance(scene, (Scene, str, Path)):
+        named, source = {"mesh": scene}, "what was given"
+    elif not isinstance(scene, Scene) and scene != PHANTOM and Path(scene).suffix != ".toml":
+        named, source = {Path(scene).stem: read_mesh(scene).mesh}, str(scene)
+    else:
+        opened = open_scene(scene)
+        if units is not None:
+            raise UsageError(f"units names the unit of a mesh, {opened.name} says its own")
+        chosen = opened.muscles if muscles is None else [opened.muscle(m) for m in muscles]
+        return {muscle.name: muscle.mesh for muscle in chosen}, opened.units
+    if muscles is not None:
+        raise UsageError(f"muscles names muscles of a scene, {source} is a mesh")
+    return named, units or ""
 
 
 # Errors this much apart are alike: points of another seed move them as far.
@@ -397,8 +445,8 @@ def _spent(work: Callable[[], object]) -> float:
 
 
 @dataclass
-class KernelStudy:
-    """What `rbfmuscle.study_kernels` found.
+class SurfaceStudy:
+    """What a study found of one surface.
 
     ``rows`` are `KernelRow` for each kernel and number of centres, the smallest error first, unfit
     ones last. ``surfaces`` (vertices, faces) are those of the rows, None where there is none.
@@ -406,11 +454,85 @@ class KernelStudy:
     one is unfit. ``sha256`` is that of the mesh.
     """
 
-    rows: list[KernelRow] = field(repr=False)
-    surfaces: list[tuple[Floats, Integers] | None] = field(default_factory=list, repr=False)
+    rows: list[KernelRow]
+    surfaces: list[tuple[Floats, Integers] | None]
+    recommended: KernelRow | None
+    sha256: str
+
+
+@dataclass(eq=False)
+class KernelStudy(Study):
+    """What `rbfmuscle.study_kernels` found: a `SurfaceStudy` of each surface by its name, whose
+    lengths are in ``units``.
+    """
+
+    command: ClassVar[str] = "kernels"
+    page: ClassVar[str] = "kernels.html"
+
+    studies: dict[str, SurfaceStudy] = field(repr=False)
     units: str = ""
-    recommended: KernelRow | None = None
-    sha256: str = ""
+
+    @property
+    def rows(self) -> list[KernelRow]:
+        """A row for each kernel and number of centres of each surface, of each the smallest error
+        first and unfit ones last.
+        """
+        return [
+            row.model_copy(update={"surface": name})
+            for name, study in self.studies.items()
+            for row in study.rows
+        ]
+
+    @property
+    def surfaces(self) -> list[tuple[Floats, Integers] | None]:
+        """Vertices and faces of each row's surface, None where there is none."""
+        return [surface for study in self.studies.values() for surface in study.surfaces]
+
+    @property
+    def recommended(self) -> KernelRow | None:
+        """The quickest row that errs at most 5 % more than the best, None where every one is unfit;
+        of several surfaces that of the first for which it is the kernel that serves most.
+        """
+        kernel = self._kernel()[0]
+        rows = [study.recommended for study in self.studies.values() if study.recommended]
+        return next((row for row in rows if row.kernel == kernel), None)
+
+    def table(self) -> np.ndarray:
+        """The rows as a structured ndarray, with the columns of ``kernels.csv``."""
+        columns = {name: [getattr(row, name) for row in self.rows] for name in _columns()}
+        return as_table(
+            {
+                name: np.array([np.nan if value is None else value for value in values])
+                for name, values in columns.items()
+            }
+        )
+
+    def answer(self) -> str:
+        """What to use and why: of one surface its own sentence, of several the kernel that is near
+        the best on most.
+        """
+        if len(self.studies) == 1:
+            return describe(self.rows)
+        kernel, tied, chosen = self._kernel()
+        if not kernel:
+            return "Every field is unfit on every surface; take more centres."
+        return (
+            f"Use {kernel}: within 5 % of the least error on {tied} of {len(self.studies)} "
+            f"muscles, and the quickest such kernel on {chosen}."
+        )
+
+    def _kernel(self) -> tuple[str, int, int]:
+        """The kernel that is near the best on most surfaces, on how many, and on how many it is
+        recommended; "" where every field is unfit.
+        """
+        tied: Counter[str] = Counter()
+        for study in self.studies.values():
+            good = [row for row in study.rows if not row.unfit]
+            tied.update({row.kernel for row in good if row.error <= ALIKE * good[0].error})
+        found = (study.recommended for study in self.studies.values())
+        chosen = Counter(row.kernel for row in found if row)
+        kernel = max(chosen, key=lambda name: (tied[name], chosen[name]), default="")
+        return kernel, tied[kernel], chosen[kernel]
 
 
 def measure_fits(
@@ -418,7 +540,7 @@ def measure_fits(
     kernels: Sequence[Kernel],
     counts: Sequence[int],
     progress: OnProgress | None,
-) -> KernelStudy:
+) -> SurfaceStudy:
     """Fit a surface with each kernel and number of centres, and measure each fit."""
     calls = []
     for count in counts:
@@ -439,7 +561,7 @@ def measure_fits(
         row.front = any(row is good[index] for index in front)
     surfaces = [one.surface for one in found]
     sha256 = mesh_hash(judge.vertices, judge.faces)
-    return KernelStudy(rows, surfaces, recommended=recommend(rows), sha256=sha256)
+    return SurfaceStudy(rows, surfaces, recommend(rows), sha256)
 
 
 def _measure_all(
@@ -652,27 +774,25 @@ def kernels_folder(directory: str | Path) -> OutputFolder:
     return OutputFolder(directory, "kernels", (*FILES, "error.json"))
 
 
-def write_studies(studies: Mapping[str, KernelStudy], directory: str | Path) -> None:
-    """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html`` of studies by the names of their
-    surfaces.
-    """
+def write_study(study: KernelStudy, directory: str | Path) -> None:
+    """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html`` of a study."""
     facts = KernelFacts(
-        units=next(iter(studies.values())).units,
+        units=study.units,
         version=versions()["rbfmuscle"],
         date=datetime.date.today().isoformat(),
-        meshes={name: study.sha256 for name, study in studies.items()},
-        rows=[
-            row.model_copy(update={"surface": name})
-            for name, study in studies.items()
-            for row in study.rows
-        ],
+        meshes={name: each.sha256 for name, each in study.studies.items()},
+        rows=study.rows,
     )
     with kernels_folder(directory).staged() as stage:
-        names = [name for name in KernelRow.model_fields if name != "trials"]
-        rows = [[getattr(row, name) for name in names] for row in facts.rows]
-        write_csv(stage / "kernels.csv", [names, *rows])
+        rows = [[getattr(row, name) for name in _columns()] for row in facts.rows]
+        write_csv(stage / "kernels.csv", [_columns(), *rows])
         (stage / "kernels.json").write_text(json_text(facts.model_dump()), encoding="utf-8")
         write_page(stage, facts)
+
+
+def _columns() -> list[str]:
+    """Columns of ``kernels.csv``."""
+    return [name for name in KernelRow.model_fields if name != "trials"]
 
 
 def write_page(directory: Path, facts: KernelFacts) -> None:
@@ -680,34 +800,14 @@ def write_page(directory: Path, facts: KernelFacts) -> None:
     studies = {}
     for name, digest in facts.meshes.items():
         rows = [row for row in facts.rows if row.surface == name]
-        studies[name] = KernelStudy(rows, [], facts.units, recommend(rows), digest)
+        studies[name] = SurfaceStudy(rows, [], recommend(rows), digest)
     made = f"rbfmuscle {facts.version}, {facts.date}"
-    _page(studies, made).write(directory / "kernels.html")
+    _page(KernelStudy(studies, facts.units), made).write(directory / "kernels.html")
 
 
-def answer(studies: Mapping[str, KernelStudy]) -> str:
-    """What to use and why: of one surface its own sentence, of several the kernel that is near the
-    best on most.
-    """
-    if len(studies) == 1:
-        return describe(next(iter(studies.values())).rows)
-    tied: Counter[str] = Counter()
-    for study in studies.values():
-        good = [row for row in study.rows if not row.unfit]
-        tied.update({row.kernel for row in good if row.error <= ALIKE * good[0].error})
-    if not tied:
-        return "Every field is unfit on every surface; take more centres."
-    chosen = Counter(study.recommended.kernel for study in studies.values() if study.recommended)
-    kernel = max(chosen, key=lambda name: (tied[name], chosen[name]))
-    return (
-        f"Use {kernel}: within 5 % of the least error on {tied[kernel]} of {len(studies)} muscles, "
-        f"and the quickest such kernel on {chosen[kernel]}."
-    )
-
-
-def _page(studies: Mapping[str, KernelStudy], made: str) -> ReportPage:
-    several, rows = len(studies) > 1, [row for study in studies.values() for row in study.rows]
-    units = next(iter(studies.values())).units
+def _page(study: KernelStudy, made: str) -> ReportPage:
+    studies, units, rows = study.studies, study.units, study.rows
+    several = len(studies) > 1
     surfaces = f"all {len(studies)} muscles" if several else next(iter(studies)).replace("_", " ")
     kernels = len({row.kernel for row in rows})
     counts = ", ".join(map(str, sorted({row.centres for row in rows})))
@@ -722,7 +822,7 @@ def _page(studies: Mapping[str, KernelStudy], made: str) -> ReportPage:
             *["every muscle; --muscles for some"][:several],
             made,
         ],
-        answer(studies),
+        study.answer(),
         GOOD if found else BAD,
         plot=_plot(studies, units),
         lights=_lights(studies, units),
@@ -738,7 +838,7 @@ def _page(studies: Mapping[str, KernelStudy], made: str) -> ReportPage:
                 if any(row.unfit for row in s.rows)
             ),
             *(
-                Section(f"Error against epsilon: {name}", plots=_curves(s))
+                Section(f"Error against epsilon: {name}", plots=_curves(s, units))
                 for name, s in studies.items()
                 if any(row.trials for row in s.rows)
             ),
@@ -748,7 +848,7 @@ def _page(studies: Mapping[str, KernelStudy], made: str) -> ReportPage:
     )
 
 
-def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[CheckRow]:
+def _lights(studies: Mapping[str, SurfaceStudy], units: str) -> list[CheckRow]:
     """Of one surface its best rows, each with whether it ties; of several what is recommended for
     each.
     """
@@ -768,7 +868,7 @@ def _lights(studies: Mapping[str, KernelStudy], units: str) -> list[CheckRow]:
     return [CheckRow(row.title, pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
 
 
-def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
+def _plot(studies: Mapping[str, SurfaceStudy], units: str) -> str:
     """Error against the time of a fit and 20,000 values: a colour a surface, or of one a number of
     centres.
     """
@@ -783,10 +883,10 @@ def _plot(studies: Mapping[str, KernelStudy], units: str) -> str:
     return front_plot(points, labels)
 
 
-def _curves(study: KernelStudy) -> list[str]:
+def _curves(study: SurfaceStudy, units: str) -> list[str]:
     """For each number of centres the error at the held-out points against epsilon, by kernel."""
     pictures = []
-    unit = study.units or "mesh units"
+    unit = units or "mesh units"
     for count in dict.fromkeys(row.centres for row in study.rows):
         rows = [row for row in study.rows if row.centres == count and row.trials]
         tracks = []
@@ -799,7 +899,7 @@ def _curves(study: KernelStudy) -> list[str]:
     return pictures
 
 
-def _rows(study: KernelStudy, *, unfit: bool = False) -> Table:
+def _rows(study: SurfaceStudy, *, unfit: bool = False) -> Table:
     rows = []
     for row in (row for row in study.rows if bool(row.unfit) == unfit):
         state = GOOD if row is study.recommended else BAD if row.unfit else PLAIN

@@ -15,7 +15,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from types import MappingProxyType
+from typing import TYPE_CHECKING, ClassVar, TypedDict
 
 import numpy as np
 from pydantic import BaseModel
@@ -32,20 +33,21 @@ from rbfmuscle.display.page import (
     number_cell,
 )
 from rbfmuscle.display.plots import Point, front_plot
-from rbfmuscle.folders import OutputFolder, given_folder
+from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import QuantityFacts, shown_number
 from rbfmuscle.models import configure_scene
 from rbfmuscle.recording import Run, simulate
-from rbfmuscle.run.data import RunData
+from rbfmuscle.run.data import RunData, as_table
 from rbfmuscle.run.writer import versions, write_csv, write_json
 from rbfmuscle.scene.content import content_hash
 from rbfmuscle.scene.phantom import open_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_value
 from rbfmuscle.simulation.frame import Mesh
+from rbfmuscle.studies.result import OnProgress, Study, study_folder
 from rbfmuscle.validation import (
     MissingDependencyError,
     RBFMuscleError,
@@ -59,11 +61,12 @@ if TYPE_CHECKING:
 
 
 def sweep(
-    scenes: Scene | str | Path | Mapping[str, Scene | str | Path],
-    grid: Mapping[str, Sequence[object]],
+    scene: Scene | str | Path | Mapping[str, Scene | str | Path],
     directory: str | Path | None = None,
     *,
-    frames: str | None = None,
+    grid: Mapping[str, Sequence[object]] = MappingProxyType({}),
+    settings: Mapping[str, object] | None = None,
+    frames: slice | str | None = None,
     reference: Mapping[str, object] | None = None,
     jobs: int | str | None = None,
     quantity: str = "error_rms",
@@ -75,62 +78,66 @@ def sweep(
 
     Parameters
     ----------
-    scenes : Scene, path or "phantom", or mapping of str to these
+    scene : Scene, path or "phantom", or mapping of str to these
         One scene, or several by name.
+    directory : path, optional
+        New, empty, or that of an earlier sweep.
     grid : mapping of str to sequence
         Values of each dotted key, as ``{"model.centres": [100, 200]}``; empty, the scenes are
         compared as they are.
-    directory : path, optional
-        New, empty, or that of an earlier sweep; without one nothing is kept but what is returned.
-    frames : str, optional
-        Frames of the motion, "A:B:S".
+    settings : mapping, optional
+        Dotted keys with their values, of every point.
+    frames : slice or str, optional
+        Frames of the motion, a slice or "A:B:S".
     reference : mapping, optional
         Settings of the run that errors are measured against, over the finest values of the grid.
     jobs : int or str, optional
-        Points that run at the same time, as many as cores by default; or the address of a Dask
+        Cores to use, all by default: points run at the same time; or the address of a Dask
         scheduler whose workers see the folder.
     quantity : str
         The error on the axis of the Pareto front.
     progress : callable, optional
-        Called with the number of points that are done, and of all.
+        Called as ``progress(done, total)`` after each point.
 
     Returns
     -------
     SweepTable
-        ``done``, ``failed``, ``verdicts`` and ``rows``, one per point, as in ``sweep.json``.
+        What ``sweep.json`` holds (``done``, ``failed``, ``verdicts`` and ``rows``, one per
+        point), with ``table()``, ``save(directory)`` and ``show()``.
 
     Examples
     --------
     >>> from rbfmuscle import phantom_scene, sweep
     >>> scene = phantom_scene(end=0.0, spacing=6.0).with_options(model="pbd")
-    >>> table = sweep(scene, {}, jobs=1)
-    >>> table.done, len(table.rows)
-    (1, 1)
+    >>> found = sweep(scene, grid={"contact.substep_angle": [1.0, 2.0]}, jobs=1)
+    >>> found.done, len(found.table())
+    (3, 3)
     """
+    if isinstance(directory, Mapping):
+        raise UsageError("give the grid by its name: sweep(scene, grid={...})")
     if quantity not in VALUES:
         raise UsageError(f"unknown quantity {quantity!r}, {did_you_mean(quantity, VALUES)}")
     if isinstance(jobs, int) and jobs < 1:
         raise UsageError(f"jobs must be 1 or more, got {jobs}")
     if isinstance(jobs, str) and directory is None:
         raise UsageError("a cluster needs a folder that its workers see")
-    if isinstance(scenes, Mapping):
-        opened = {name: open_scene(scene) for name, scene in scenes.items()}
-    else:
-        scene = open_scene(scenes)
-        opened = {scene.name: scene}
+    if not isinstance(scene, Mapping):
+        scene = open_scene(scene)
+        scene = {scene.name: scene}
+    opened = {name: configure_scene(open_scene(one), settings) for name, one in scene.items()}
     values = {key: list(chosen) for key, chosen in grid.items()}
     points = plan_sweep(opened, values, frames=frames, reference=reference)
     for point in points:  # a mistyped key is reported now, not after the first point
         configure_scene(opened[point.scene], point.settings, frames=frames)
     units = {name: scene.units for name, scene in opened.items()}
-    with given_folder(directory) as folder:
+    with study_folder(directory) as folder:
         run_sweep(run_point, opened, points, folder, frames=frames, jobs=jobs, progress=progress)
         table = write_table(points, folder, units, quantity=quantity)
         write_page(folder, table)
-    return table
+        return table.kept_in(folder, own=directory is None)
 
 
-def run_point(scene: Scene, settings: dict[str, object], frames: str | None) -> Run:
+def run_point(scene: Scene, settings: dict[str, object], frames: slice | str | None) -> Run:
     """One run of a sweep, in memory; module-level, so that it can be sent to other processes."""
     return simulate(scene, settings=settings, frames=frames)
 
@@ -196,7 +203,7 @@ def plan_sweep(
     scenes: Mapping[str, Scene],
     grid: Grid,
     *,
-    frames: str | None = None,
+    frames: slice | str | None = None,
     reference: Mapping[str, object] | None = None,
 ) -> list[SweepPoint]:
     """Lay out a sweep scene by scene: reference, the scene's own settings, the grid; nothing is
@@ -236,7 +243,7 @@ def _model_first(settings):
     return dict(sorted(settings.items(), key=lambda item: item[0] != "model"))
 
 
-def scene_content(scene: Scene, frames: str | None = None) -> str:
+def scene_content(scene: Scene, frames: slice | str | None = None) -> str:
     """Hash of what a scene would simulate, wherever its files lie, and of the library's version."""
     return content_hash(scene, str(frames or ""), versions()["rbfmuscle"])
 
@@ -292,10 +299,13 @@ class FrontVerdict(BaseModel):
     text: str
 
 
-class SweepTable(BaseModel):
+class SweepTable(BaseModel, Study):
     """What ``sweep.json`` holds; ``quantity`` is the error on the axis of the Pareto front, then
     follow counts of points.
     """
+
+    command: ClassVar[str] = "sweep"
+    page: ClassVar[str] = "sweep.html"
 
     quantity: str
     done: int
@@ -303,6 +313,16 @@ class SweepTable(BaseModel):
     missing: int
     verdicts: list[FrontVerdict]
     rows: list[SweepRow]
+
+    def table(self) -> np.ndarray:
+        """The points as a structured ndarray: settings (as text), then facts and values."""
+        keys = list(dict.fromkeys(key for row in self.rows for key in row.settings))
+        facts = ("scene", "role", "status", "front")
+        return as_table(
+            {key: np.array([str(row.settings.get(key, "")) for row in self.rows]) for key in keys}
+            | {name: np.array([getattr(row, name) for row in self.rows]) for name in facts}
+            | {name: np.array([row.value(name) for row in self.rows]) for name in VALUES}
+        )
 
 
 # Worst over muscles and frames, by magnitude: of a point of a sweep, and of the README's table.
@@ -404,8 +424,7 @@ def _figures(row: SweepRow, quantity: str) -> str:
 
 
 CONNECT_WITHIN = 20  # seconds for a scheduler and its first two workers
-Runner = Callable[[Scene, dict[str, object], str | None], RunData]
-OnProgress = Callable[[int, int], None]  # of what is done and the total
+Runner = Callable[[Scene, dict[str, object], slice | str | None], RunData]
 # What a point may fail with and leave the others standing.
 POINT_ERRORS = (
     RBFMuscleError,
@@ -478,7 +497,7 @@ def run_sweep(
     points: Sequence[SweepPoint],
     directory: str | Path,
     *,
-    frames: str | None = None,
+    frames: slice | str | None = None,
     jobs: int | str | None = None,
     progress: OnProgress | None = None,
 ) -> int:
@@ -576,7 +595,7 @@ def measure_point(
     scene: Scene,
     point: SweepPoint,
     folder: SweepFolder,
-    frames: str | None,
+    frames: slice | str | None,
     threads: int,
 ) -> None:
     """Run one point, measure it and keep the result; an error becomes the result of a failed

@@ -2,6 +2,7 @@
 notebooks."""
 
 import ast
+import gc
 import importlib.util
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import types
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import ROOT
 
 import rbfmuscle as rm
@@ -172,6 +174,62 @@ def test_plot_shows_every_value(run):
         run.plot("moment_arm", coordinate="hip.twist")
     with pytest.raises(rm.UsageError, match="did you mean 'length'"):
         run.plot("lenght")
+
+
+@pytest.fixture(scope="module")
+def studies():
+    """What each study finds of a small scene, without a folder."""
+    scene = rm.phantom_scene(end=2.0, step=2.0, spacing=6.0)
+    scene.muscles = [scene.muscle("abductor")]
+    return [
+        rm.compare(scene, models=["pbd", "xpbd"], jobs=1, pictures=False),
+        rm.sweep(scene.with_options(model="pbd"), settings={"contact.substep_angle": 1.0}, jobs=1),
+        rm.study_kernels(scene, kernels=["cubic"], centres=[40], resolution=24, jobs=1),
+    ]
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_what_a_study_returns_is_a_table_that_is_saved_and_shown(
+    studies, place, tmp_path, monkeypatch
+):
+    found = studies[place]
+    table = found.table()
+    assert len(table) and set(table.dtype.names) & {"value", "error_rms", "rms"}
+    found.save(tmp_path / "out")
+    found.save(tmp_path / "out")  # an earlier result is replaced
+    page = tmp_path / "out" / found.page
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    assert opened == [] and found.show().read_bytes() == page.read_bytes()
+    assert opened[0].startswith("file://") and page.is_file()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    with pytest.raises(rm.UsageError, match=r"notes\.txt"):
+        found.save(tmp_path / "mine")
+
+
+def test_runs_of_a_comparison_are_saved_with_it(studies, tmp_path):
+    studies[0].save(tmp_path / "out")
+    assert len(rm.Run.load(tmp_path / "out" / "xpbd")) == 2
+
+
+def test_files_of_a_study_without_a_folder_go_with_it():
+    ball = trimesh.creation.icosphere(2, 10.0)
+    found = rm.study_kernels(ball, kernels=["cubic"], centres=[30], resolution=16)
+    kept = found._folder
+    assert kept.is_dir()
+    del found
+    gc.collect()
+    assert not kept.parent.exists()
+
+
+def test_a_grid_in_the_place_of_the_folder_and_an_old_name_are_named():
+    with pytest.raises(rm.UsageError, match="grid by its name"):
+        rm.sweep("phantom", {"model.nodes": [100]})
+    with pytest.raises(AttributeError, match=r"rbfmuscle\.compare now"):
+        _ = rm.compare_models
+    with pytest.raises(rm.UsageError, match="jobs must be 1 or more"):
+        rm.compare("phantom", jobs=0)
 
 
 def test_no_public_name_is_that_of_a_module():

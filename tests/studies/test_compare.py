@@ -20,7 +20,7 @@ from rbfmuscle.studies.compare import (
     Comparison,
     _values,
     best_models,
-    compare_models,
+    compare,
     describe,
     shown,
 )
@@ -61,8 +61,8 @@ def compared(tmp_path_factory):
     """Two models on the phantom, four poses to 18 degrees."""
     folder = tmp_path_factory.mktemp("compare")
     scene = phantom_scene(step=6.0).with_options(frames="0:4")
-    table = compare_models(
-        scene, folder, ["rbf", "pbd"], settings={"rbf:model.centres": 100}, pictures=False
+    table = compare(
+        scene, folder, models=["rbf", "pbd"], settings={"rbf:model.centres": 100}, pictures=False
     )
     return folder, table
 
@@ -199,7 +199,7 @@ class TestFailure:
             (["rbf", "pbd"], {"pbd:motion.step": 1}, "same motion"),
         ):
             with pytest.raises(UsageError, match=words):
-                compare_models(arm_scene(), tmp_path, models, settings=settings)
+                compare(arm_scene(), tmp_path, models=models, settings=settings)
         assert not list(tmp_path.iterdir())
 
     def test_a_model_that_fails_leaves_the_others(self, tmp_path, monkeypatch):
@@ -208,7 +208,7 @@ class TestFailure:
 
         monkeypatch.setattr(BlendMuscle, "fail_at", 1)
         monkeypatch.setattr("rbfmuscle.models.build_model", build)
-        table = compare_models(arm_scene(), tmp_path, ["pbd", "arap-pbd", "xpbd"], pictures=False)
+        table = compare(arm_scene(), tmp_path, models=["pbd", "arap-pbd", "xpbd"], pictures=False)
         assert table.models == ["pbd", "arap-pbd"] and "planted" in table.failed["xpbd"]
         assert "xpbd did not finish" in (tmp_path / "report.html").read_text(encoding="utf-8")
         assert not math.isnan(table.results["pbd"]["all"]["volume_error"])
