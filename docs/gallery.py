@@ -24,10 +24,17 @@ EXAMPLES = (
 )
 # The Python reference: public names by topic.
 TOPICS = {
-    "Scenes": ("Scene", "phantom_scene"),
-    "Running and comparing": ("simulate", "Run", "compare", "show"),
+    "Scenes": ("Scene", "phantom_scene", "check_scene"),
+    "Running and comparing": (
+        "simulate",
+        "Run",
+        "compare",
+        "sweep",
+        "show",
+        "discretisation_error",
+    ),
     "Fields and kernels": ("RBFField", "study_kernels", "reach_error", "register_kernel"),
-    "Muscles and bones": ("RBFMuscle", "BoneSDF"),
+    "Muscles and bones": ("RBFMuscle", "BoneSDF", "ModelKind", "model_kind", "register_model"),
     "Errors and warnings": (
         "RBFMuscleError",
         "UsageError",

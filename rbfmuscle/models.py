@@ -24,6 +24,12 @@ class ModelKind(NamedTuple):
     ``options`` is that table's class, ``points`` says in words what the model solves for, building
     nothing. ``title`` is its name in tables and pictures, with ``{}`` for its number of sweeps,
     ``solver_sweeps``.
+
+    Examples
+    --------
+    >>> import rbfmuscle as rm
+    >>> isinstance(rm.model_kind("pbd"), rm.ModelKind)
+    True
     """
 
     # Both take the options' own class, which a type of a function cannot say.
@@ -81,7 +87,11 @@ _KINDS: dict[str, Callable[[], ModelKind]] = {
 def register_model(name: str, kind: ModelKind) -> None:
     """Add a model under a name of its own, for scenes, `simulate` and `compare`.
 
-    Raises UsageError if the name is taken.
+    Parameters
+    ----------
+    name : str
+        UsageError if it is taken.
+    kind : ModelKind
 
     Examples
     --------
@@ -106,7 +116,18 @@ def _loaded(load: Callable[[], ModelKind]) -> ModelKind:
 
 
 def model_kind(name: str) -> ModelKind:
-    """What a model's name stands for; UsageError with the nearest right name on an unknown one."""
+    """What a model's name stands for.
+
+    Parameters
+    ----------
+    name : str
+        UsageError with the nearest right name on an unknown one.
+
+    Examples
+    --------
+    >>> model_kind("rbf").title
+    'RBF'
+    """
     if name not in _KINDS:
         hint = did_you_mean(str(name).lower()[:100].replace("_", "-"), model_names())
         raise UsageError(f"unknown model {shown(repr(name))}, {hint}")

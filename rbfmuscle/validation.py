@@ -43,19 +43,43 @@ class RBFMuscleError(Exception):
 
 
 class UsageError(RBFMuscleError, ValueError):
-    """The call itself is wrong (exit code 2)."""
+    """The call itself is wrong (exit code 2).
+
+    Examples
+    --------
+    >>> import rbfmuscle as rm
+    >>> rm.model_kind("rbff")
+    Traceback (most recent call last):
+    rbfmuscle.validation.UsageError: unknown model 'rbff', did you mean 'rbf'?
+    """
 
     exit_code = 2
 
 
 class SceneError(RBFMuscleError, ValueError):
-    """The scene file, or a name or number in it, is wrong (exit code 3)."""
+    """The scene file, or a name or number in it, is wrong (exit code 3).
+
+    Examples
+    --------
+    >>> import rbfmuscle as rm
+    >>> rm.phantom_scene().muscle("extenser")
+    Traceback (most recent call last):
+    rbfmuscle.validation.SceneError: unknown muscle 'extenser', did you mean 'extensor'?
+    """
 
     exit_code = 3
 
 
 class MeshError(RBFMuscleError, ValueError):
-    """A mesh cannot be used (exit code 4)."""
+    """A mesh cannot be used (exit code 4).
+
+    Examples
+    --------
+    >>> import rbfmuscle as rm
+    >>> rm.study_kernels("femur.off")
+    Traceback (most recent call last):
+    rbfmuscle.validation.MeshError: femur.off: .off is not a mesh format, use .stl, .obj, .ply, ...
+    """
 
     exit_code = 4
 
@@ -63,6 +87,11 @@ class MeshError(RBFMuscleError, ValueError):
 class SolveError(RBFMuscleError, RuntimeError):
     """A frame could not be solved; frames so far are kept (exit code 5), in memory as ``run``, a
     `Run`.
+
+    Examples
+    --------
+    >>> SolveError("muscle 'biceps': frame 3 did not converge").exit_code
+    5
     """
 
     exit_code = 5
@@ -72,6 +101,11 @@ class SolveError(RBFMuscleError, RuntimeError):
 class LimitExceededError(RBFMuscleError, RuntimeError):
     """A limit of ``fail_on`` was exceeded, or not measured (exit code 6); everything is
     written.
+
+    Examples
+    --------
+    >>> LimitExceededError("biceps: volume_error = 0.2 > 0.001 at frame 3").exit_code
+    6
     """
 
     exit_code = 6
@@ -81,6 +115,11 @@ class MissingDependencyError(RBFMuscleError, ImportError):
     """An optional part (graphics, an extra) is missing (exit code 7).
 
     ``written`` are files that did not need it.
+
+    Examples
+    --------
+    >>> MissingDependencyError("USD needs usd-core").exit_code, MissingDependencyError.written
+    (7, ())
     """
 
     exit_code = 7
@@ -94,12 +133,23 @@ class NotFiniteError(ValueError):
 
 
 class SceneWarning(UserWarning):
-    """A scene asks for something impossible, for instance bones moved into each other."""
+    """A scene asks for something impossible, for instance bones moved into each other.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> warnings.simplefilter("error", SceneWarning)  # such a scene is not run
+    """
 
 
 class NumericalWarning(UserWarning):
     """A result is usable but less accurate than asked; the message names the cause and the
     remedy.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> warnings.simplefilter("error", NumericalWarning)
     """
 
 

@@ -167,6 +167,10 @@ def check_scene(scene: Scene) -> list[Finding]:
     """Return all findings about a scene, the first error among them, the worst first; nothing is
     solved or changed.
 
+    Parameters
+    ----------
+    scene : Scene
+
     Examples
     --------
     >>> from rbfmuscle import check_scene, phantom_scene

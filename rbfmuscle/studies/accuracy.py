@@ -33,12 +33,23 @@ def discretisation_error(scene: Scene) -> list[LatticeError]:
     six tenths from doubling to doubling, so a very fine lattice is two to three times as far away
     as the next one. Muscles of other models are left out.
 
+    Parameters
+    ----------
+    scene : Scene
+
     Raises
     ------
     UsageError
         If the scene has no RBF muscle.
     RBFMuscleError
         As `simulate` does.
+
+    Examples
+    --------
+    >>> from rbfmuscle import phantom_scene
+    >>> scene = phantom_scene(end=0.0, spacing=6.0).with_options({"model.nodes": 60})
+    >>> [found.muscle for found in discretisation_error(scene)]
+    ['extensor', 'abductor', ...]
     """
     coarse = configure_scene(scene)
     coarse.muscles = [muscle for muscle in coarse.muscles if muscle.model == "rbf"]
