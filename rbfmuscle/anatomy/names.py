@@ -109,7 +109,7 @@ def name_facts(name: str) -> NameFacts:
     """What a name says, of a file (without suffix) or of a label."""
     table = _table()
     words, side, spelling = _read_words(name)
-    bone, muscle = _longest(words, table.bones), _longest(words, table.muscles)
+    bone, muscle = _longest(words, table.bones), _longest(words, _without_groups(words, table))
     if any(word in table.other and word not in (muscle or ()) for word in words):
         return NameFacts("other", side=side)
     shared = _longest(words, table.shared)
@@ -129,6 +129,24 @@ def name_facts(name: str) -> NameFacts:
     )
     side = "" if kind in MIDLINE else side
     return NameFacts(tissue, kind, table.muscles[muscle] if muscle else None, side, shown)
+
+
+def _without_groups(words, table):
+    """The muscles that the words may name, without those of which a part is named too, as the
+    quadriceps femoris in "quadriceps, rectus femoris".
+    """
+    fitting = {key: facts for key, facts in table.muscles.items() if set(words).issuperset(key)}
+    named = {facts.name for facts in fitting.values()}
+    whole = [
+        set(key)
+        for key, facts in fitting.items()
+        if named.intersection(table.groups.get(facts.name, ()))
+    ]
+    return {
+        key: facts
+        for key, facts in fitting.items()
+        if not any(group.issuperset(key) for group in whole)
+    }
 
 
 def _longest(words, table):

@@ -50,10 +50,12 @@ def check(
             facts["accuracy"] = _accuracy(loaded)
         if picture:
             facts["picture"] = _draw(loaded, scene.with_suffix(".png"))
+    from rbfmuscle.scene.check import attachment_facts
     from rbfmuscle.scene.record import record_scene
 
     lines = [*_scene_lines(loaded), *map(str, findings), *_more_lines(facts, loaded.units)]
     facts |= {"scene": record_scene(loaded), "findings": [vars(finding) for finding in findings]}
+    facts["attachments"] = [held._asdict() for held in attachment_facts(loaded)]
     print_result(work, facts, lines)
     if not work.as_json:
         last = f"usable; next: rbfmuscle run {scene} -o results" if usable else "not usable"
@@ -123,6 +125,7 @@ def _field_notes(scene):
 
 
 def _scene_lines(scene):
+    from rbfmuscle.scene.check import attachment_facts
     from rbfmuscle.scene.objects import body_axes
 
     yield f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}"
@@ -140,19 +143,18 @@ def _scene_lines(scene):
             f"  joint {joint.name}: {joint.parent} to {joint.child}, "
             f"{', '.join(joint.coordinates) or joint.kind}"
         )
+    attached = attachment_facts(scene)
     for muscle in scene.muscles:
-        held = ", ".join(f"{len(a.vertices)} {_held_how(a)} {a.bone}" for a in muscle.attachments)
         volume = muscle.mesh.volume / from_mm(10.0, scene.units) ** 3
         yield (
             f"  muscle {muscle.name}: model {muscle.model}, {len(muscle.mesh.vertices)} vertices, "
-            f"{volume:.4g} cm3, attached: {held}"
+            f"{volume:.4g} cm3"
         )
-
-
-def _held_how(held):
-    if held.via:
-        return "via"
-    return "on" if held.tendon is None else "by a tendon to"
+        for held in (one for one in attached if one.muscle == muscle.name):
+            yield (
+                f"    {held.end}: {held.vertices} vertices {held.how} {held.bone}, "
+                f"{held.area:.3g} cm2, {100 * held.share:.2g} % of the surface"
+            )
 
 
 def _accuracy(scene):

@@ -5,13 +5,14 @@ motion.
 import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.extents import check_place, check_size
@@ -99,6 +100,40 @@ def articular_share(
             share = float(lies.sum()) / len(points)
             worst = max(worst, (share, held.bone))
     return worst
+
+
+class AttachmentFacts(NamedTuple):
+    """What an attachment holds: which end of the muscle ("origin" where its first attachment is,
+    "insertion", or "way" between them), how (on, via or by a tendon to) which bone, the number of
+    vertices, their area [cm^2] and its share of the muscle's surface.
+    """
+
+    muscle: str
+    end: str
+    how: str
+    bone: str
+    vertices: int
+    area: float
+    share: float
+
+
+def attachment_facts(scene: Scene) -> list[AttachmentFacts]:
+    """What the attachments of a scene hold, muscle by muscle."""
+    found = []
+    for muscle in scene.muscles:
+        areas = vertex_areas(np.asarray(muscle.mesh.vertices), np.asarray(muscle.mesh.faces))
+        first, last = attachment_ends(muscle, scene.joints) or (muscle.attachments, [])
+        begins = next((a for a in muscle.attachments if not a.via), None)
+        origin = last if any(held is begins for held in last) else first
+        for held in muscle.attachments:
+            end = "origin" if any(held is one for one in origin) else "insertion"
+            how = "on" if held.tendon is None else "by a tendon to"
+            if held.via:
+                end, how = "way", "via"
+            area = float(areas[held.vertices].sum())
+            row = (end, how, held.bone, len(held.vertices), area / from_mm(10.0, scene.units) ** 2)
+            found.append(AttachmentFacts(muscle.name, *row, area / float(areas.sum())))
+    return found
 
 
 def _head_radius(mesh, centre):

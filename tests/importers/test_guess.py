@@ -67,6 +67,25 @@ def test_names_as_they_are_published(name, tissue, known, side):
     assert (facts.tissue, found, facts.side) == (tissue, known, side)
 
 
+@pytest.mark.parametrize(
+    ("name", "muscle"),
+    [
+        ("quadriceps_rectus_femoris", "rectus femoris"),
+        ("Quadriceps femoris, rectus", "rectus femoris"),
+        ("QuadricepsFemoris_VastusLateralis_r", "vastus lateral"),
+        ("triceps_surae_soleus", "soleus"),
+        ("triceps surae gastrocnemius medialis", "gastrocnemius medial"),
+        ("hamstrings_semitendinosus", "semitendinosus"),
+        ("iliopsoas_iliacus", "iliacus"),
+        ("quadriceps_femoris", "quadriceps femoris"),
+        ("triceps_surae", "triceps surae"),
+    ],
+)
+def test_a_muscle_of_a_group_is_that_muscle(name, muscle):
+    """Its bones are others: the vasti begin on the femur, the rectus femoris on the pelvis."""
+    assert name_facts(name).muscle.name == muscle
+
+
 def test_misspelt_names_are_named_and_known_words_are_never_taken_for_others():
     assert "'illiacus' read as 'iliacus'" in name_facts("Illiacus").spelling
     assert not name_facts("obturator_externus").spelling
