@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import logging
 import os
+import sys
 import tempfile
 import time
 import zipfile
@@ -45,14 +46,14 @@ _DAMAGE = (
 
 def cache_path() -> Path:
     """Folder of the cache: ``RBFMUSCLE_CACHE``, or the user's cache folder of the platform."""
-    import platformdirs
-
-    place = os.environ.get("RBFMUSCLE_CACHE")
-    return (
-        Path(place)
-        if place
-        else Path(platformdirs.user_cache_dir("rbfmuscle", appauthor=False)) / "sdf"
-    )
+    if place := os.environ.get("RBFMUSCLE_CACHE"):
+        return Path(place)
+    if sys.platform == "win32":
+        local = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+        return Path(local) / "rbfmuscle" / "Cache" / "sdf"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "rbfmuscle" / "sdf"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rbfmuscle" / "sdf"
 
 
 def content_key(vertices: Floats, faces: Integers, options: tuple[object, ...]) -> str:

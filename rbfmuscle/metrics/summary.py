@@ -5,10 +5,9 @@ its verdict.
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
-from typing_extensions import TypedDict
 
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, of_coordinate, quantity_of
 from rbfmuscle.scene.check import END_GAP_MM, END_SHARE, MOST_ARTICULAR

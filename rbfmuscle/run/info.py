@@ -3,7 +3,7 @@ read.
 """
 
 from functools import partial
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt
 
@@ -18,6 +18,12 @@ FORMAT = 2
 # Names become those of files.
 BoneName = Annotated[str, AfterValidator(partial(check_name, what="bone"))]
 MuscleName = Annotated[str, AfterValidator(partial(check_name, what="muscle"))]
+
+
+if TYPE_CHECKING:
+    Facts: TypeAlias = dict[str, dict[str, QuantityFacts]]
+else:  # on Python 3.11 pydantic takes no TypedDict of the standard library
+    Facts = dict[str, dict[str, dict[str, str | int | float | None]]]
 
 
 class Part(BaseModel):
@@ -127,7 +133,7 @@ class RunInfo(Part):
     machine: dict[str, str | int | None] = {}
     kernels: dict[str, str] = {}
     times: dict[str, float] = {}
-    muscles: dict[str, dict[str, QuantityFacts]] = {}
+    muscles: Facts = {}
     frame_time: QuantityFacts | None = None
     limits: dict[str, float] = {}
     fail_on: dict[str, float | None] = {}

@@ -56,6 +56,23 @@ def test_a_bone_rounded_again_comes_from_the_cache_and_is_the_same(ball, builds,
     assert len(list(folder.glob("*" + SUFFIX))) == 4
 
 
+@pytest.mark.parametrize(
+    ("platform", "variable", "place"),
+    [
+        ("linux", "XDG_CACHE_HOME", "rbfmuscle/sdf"),
+        ("win32", "LOCALAPPDATA", "rbfmuscle/Cache/sdf"),
+        ("darwin", "HOME", "Library/Caches/rbfmuscle/sdf"),
+    ],
+)
+def test_cache_lies_where_the_platform_keeps_caches(
+    monkeypatch, tmp_path, platform, variable, place
+):
+    monkeypatch.delenv("RBFMUSCLE_CACHE", raising=False)
+    monkeypatch.setenv(variable, str(tmp_path))
+    monkeypatch.setattr("sys.platform", platform)
+    assert cache_path() == tmp_path / place
+
+
 POINTS = np.random.default_rng(0).uniform(-25.0, 25.0, (2000, 3))
 DAMAGES = {
     "cut": lambda content: content[: len(content) // 2],

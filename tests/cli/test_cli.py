@@ -236,13 +236,26 @@ class TestOtherCommands:
         assert not (folder / "arm.png").exists()
         text = (folder / "arm.toml").read_text(encoding="utf-8")
         (folder / "bones.toml").write_text(text[: text.index("[[muscle]]")])
-        code, out, _ = call(capsys, "check", folder / "bones.toml")  # before there are muscles
-        assert code == 3 and "joint elbow" in out and "add a [[muscle]]" in out
+        code, said, _ = call(capsys, "check", folder / "bones.toml")  # before there are muscles
+        assert code == 3 and "joint elbow" in said and "add a [[muscle]]" in said
         assert err.splitlines()[-1].startswith("usable; next: rbfmuscle run ")
-        assert (
-            json.loads(call(capsys, "check", folder / "arm.toml", "--json")[1])["scene"]["units"]
-            == "mm"
-        )
+        found = json.loads(call(capsys, "check", folder / "arm.toml", "--json")[1])
+        assert found["scene"]["units"] == "mm"
+        muscle = rm.Scene.load(folder / "arm.toml").muscle("biceps")
+        held = found["attachments"]
+        assert [row["bone"] for row in held] == [a.bone for a in muscle.attachments]
+        assert {row["end"] for row in held} == {"origin", "insertion"}
+        faces = np.asarray(muscle.mesh.faces)
+        for row, attachment in zip(held, muscle.attachments, strict=True):
+            # A third of the triangles around each vertex is its own.
+            corners = np.isin(faces, attachment.vertices).sum(axis=1)
+            area = float((muscle.mesh.area_faces * corners).sum()) / 3.0
+            assert row["area"] == pytest.approx(area / 100.0, rel=1e-9)
+            assert row["share"] == pytest.approx(area / muscle.mesh.area, rel=1e-9)
+            line = (
+                f"{row['end']}: {row['vertices']} vertices on {row['bone']}, {row['area']:.3g} cm2"
+            )
+            assert line in out
         code, out, err = call(capsys, "check", folder / "none.toml", "--json")
         assert json.loads(out) == {
             "error": one_line(err).removeprefix("rbfmuscle: "),
