@@ -21,9 +21,9 @@ MuscleName = Annotated[str, AfterValidator(partial(check_name, what="muscle"))]
 
 
 if TYPE_CHECKING:
-    Facts: TypeAlias = dict[str, dict[str, QuantityFacts]]
+    Facts: TypeAlias = QuantityFacts
 else:  # on Python 3.11 pydantic takes no TypedDict of the standard library
-    Facts = dict[str, dict[str, dict[str, str | int | float | None]]]
+    Facts = dict[str, str | int | float | None]
 
 
 class Part(BaseModel):
@@ -133,8 +133,8 @@ class RunInfo(Part):
     machine: dict[str, str | int | None] = {}
     kernels: dict[str, str] = {}
     times: dict[str, float] = {}
-    muscles: Facts = {}
-    frame_time: QuantityFacts | None = None
+    muscles: dict[str, dict[str, Facts]] = {}
+    frame_time: Facts | None = None
     limits: dict[str, float] = {}
     fail_on: dict[str, float | None] = {}
     verdict: str = ""
