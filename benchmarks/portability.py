@@ -4,8 +4,9 @@ processor features, threads and versions.
     python benchmarks/portability.py [--only NAME ...] [--jobs N] [--folder DIR] [TESTS ...]
 
 Without ``--only``, what CI runs. Each variant is one process; bone fields are not taken from the
-cache. ``oldest`` and ``newest`` have an environment of their own each (``.ci/oldest.txt``,
-``.ci/newest.txt``), kept in the folder. Names each variant in which a test fails; exit code 1 then.
+cache. Those of the oldest and the newest versions have an environment of their own each
+(``.ci/oldest.txt``, ``.ci/newest.txt``), kept in the folder. Names each variant in which a test
+fails; exit code 1 then.
 """
 
 import argparse
@@ -19,30 +20,32 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 TWO_THREADS = {"OPENBLAS_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2"}
-# What CI runs, the longest first: those that compile anew. Numbers of threads go with moved
-# vertices, for time; each alone tells which of the two makes a test fail.
+MOVED = {f"moved-{seed}": {"RBFMUSCLE_MOVED_VERTICES": str(seed)} for seed in (1, 2, 3)}
+# What CI runs, the longest first: those that compile anew. Each is two or three changes at once,
+# for time; the variants of one change tell which of them makes a test fail.
 USUAL = {
-    "oldest": {},
-    "numba-generic": {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
-    "moved-1-one-thread": {"RBFMUSCLE_MOVED_VERTICES": "1", **ONE_THREAD},
-    "moved-2-two-threads": {"RBFMUSCLE_MOVED_VERTICES": "2", **TWO_THREADS},
-    "moved-3": {"RBFMUSCLE_MOVED_VERTICES": "3"},
+    "oldest-moved-1": MOVED["moved-1"],
+    "generic-one-thread-moved-2": GENERIC | ONE_THREAD | MOVED["moved-2"],
+    "two-threads-moved-3": TWO_THREADS | MOVED["moved-3"],
 }
-VARIANTS = USUAL | {
+VARIANTS = {
+    **USUAL,
+    "oldest": {},
     "newest": {},
+    "generic": GENERIC,
     "one-thread": ONE_THREAD,
     "two-threads": TWO_THREADS,
-    "moved-1": {"RBFMUSCLE_MOVED_VERTICES": "1"},
-    "moved-2": {"RBFMUSCLE_MOVED_VERTICES": "2"},
+    **MOVED,
     "haswell": {"OPENBLAS_CORETYPE": "Haswell"},
     "zen": {"OPENBLAS_CORETYPE": "Zen"},
     "skylakex": {"OPENBLAS_CORETYPE": "SkylakeX"},
     "numpy-without-avx512": {"NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL"},
 }
 # Their machine code is kept apart: files of other versions or processors would replace each other.
-COMPILED_ANEW = {"oldest", "newest", "numba-generic"}
+COMPILED_ANEW = ("oldest", "newest", "generic")
 # Enough of NumPy and SciPy to meet an instruction that a processor has not.
 TRIAL = (
     "import numpy as np, scipy.linalg as s; a = np.eye(300) + np.random.rand(300, 300); "
@@ -53,12 +56,13 @@ CHOSEN = "numeric and not slow and not benchmark"
 
 def interpreter(name: str, folder: Path) -> Path:
     """The Python of a variant; an environment is made where it has versions of its own."""
-    constraints = ROOT / ".ci" / f"{name}.txt"
+    versions = name.split("-")[0]
+    constraints = ROOT / ".ci" / f"{versions}.txt"
     if not constraints.exists():
         return Path(sys.executable)
-    python = folder / name / "bin" / "python"
+    python = folder / versions / "bin" / "python"
     if not python.exists():
-        subprocess.run([sys.executable, "-m", "venv", folder / name], check=True)
+        subprocess.run([sys.executable, "-m", "venv", folder / versions], check=True)
     pip = [python, "-m", "pip", "install", "--quiet", "--constraint", constraints]
     subprocess.run([*pip, "--editable", f"{ROOT}[dev]"], check=True)
     return python
@@ -75,7 +79,7 @@ def run_variant(name: str, tests: list[str], folder: Path) -> tuple[bool, list[s
         return False, [f"no environment: {error}"]
     with tempfile.TemporaryDirectory() as cache, log.open("w") as printed:
         environment = {**os.environ, **VARIANTS[name], "RBFMUSCLE_CACHE": cache}
-        if name in COMPILED_ANEW:
+        if name.startswith(COMPILED_ANEW):
             environment["NUMBA_CACHE_DIR"] = str(folder / f"{name}-loops")
         trial = subprocess.run(
             [python, "-c", TRIAL], env=environment, capture_output=True, check=False

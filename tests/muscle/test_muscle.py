@@ -319,10 +319,10 @@ def test_shown_mesh_is_the_input_mesh_unless_a_resolution_is_asked_for():
     vertices, faces = display_mesh(muscle, 0)
     np.testing.assert_allclose(vertices, muscle.mesh.vertices, atol=1e-6)
     np.testing.assert_array_equal(faces, muscle.mesh.faces)
-    long = SimpleNamespace(mesh=trimesh.creation.cylinder(5.0, 250.0, sections=64))
+    long = SimpleNamespace(mesh=trimesh.creation.cylinder(5.0, 100.0, sections=24))
     wanted = 1.15 * long.mesh.area / 2.5**2
-    assert len(display_mesh(long, 100)[0]) == pytest.approx(wanted, rel=0.06)
-    long.mesh = long.mesh.subdivide_to_size(1.5)
+    assert len(display_mesh(long, 40)[0]) == pytest.approx(wanted, rel=0.06)
+    long.mesh = trimesh.creation.icosphere(5).apply_scale([5.0, 5.0, 50.0])
     assert len(display_mesh(long, 0)[0]) == len(long.mesh.vertices)
 
 

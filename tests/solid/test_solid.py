@@ -362,6 +362,7 @@ def test_a_solve_of_the_phantom_ends_within_its_stated_error_of_the_equilibrium(
     check_ways(ways_after_the_end(scene, monkeypatch), ["extensor", "adductor_posterior"])
 
 
+@pytest.mark.slow  # forty solves and each anew, to a thousandth of its error
 def test_a_solve_of_the_hip_ends_within_its_stated_error_of_the_equilibrium(hip_data, monkeypatch):
     scene = Scene.load(hip_data / "flexion.toml")
     scene.set_motion(waypoints=[{}, {"hip.flexion": 90.0}], step=9.0)
