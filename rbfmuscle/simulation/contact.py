@@ -231,7 +231,9 @@ class BoneContacts:
         """Rows of the bones whose boxes are within ``reach`` of the box of points (n, 3)."""
         if len(points) == 0:
             return []
-        low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
+        # One axis after the other: NumPy takes ten times as long along rows of three.
+        axes = np.ascontiguousarray(points.T)
+        low, high = axes.min(axis=1) - reach, axes.max(axis=1) + reach
         boxes = [moved_box(f.bounds, pose) for f, pose in zip(self.bones.fields, self.placed)]
         return [
             row for row, box in enumerate(boxes) if (box[0] <= high).all() and (box[1] >= low).all()

@@ -40,6 +40,8 @@ class ShownBones:
         self._grids = [grids[name] for name in bones.names]
         self._memories = [Memory.of(len(shown.rest)) for _ in bones.names]
         self._reach = NEAR_FACE * shown.side
+        # Which vertices a bone may be within reach of, for each bone and for any.
+        self._near_each = [np.zeros(len(shown.rest), dtype=np.bool_) for _ in bones.names]
         self._near = np.zeros(0, dtype=np.int64)
 
     def at_rest(self) -> "ShownBones":
@@ -50,55 +52,76 @@ class ShownBones:
         other._memories = [Memory.of(len(self._shown.rest)) for _ in self._bones]
         return other
 
-    def nearest(self, points: Floats, rows: Integers, reach: Floats) -> tuple[Floats, Floats]:
-        """Distances (k,) of some vertices, of points (n, 3), to the nearest bone, and the
-        directions (k, 3) in which they grow, for those within ``reach`` (k,); elsewhere a lower
-        bound beyond it, without a direction.
+    def find_near(self, points: Floats) -> None:
+        """Find the vertices that a bone may be within reach of, where these are at points (n, 3).
+
+        A bound of the distance is kept for each, which shrinks as the vertex moves. The bone is
+        asked only where it falls below the reach, or below what it was when it was found.
         """
-        count = len(rows)
-        smallest, outward = np.full(count, np.inf), np.zeros((count, 3))
-        whole = count == len(points)
-        where = points if whole else points[rows]
+        nearer = np.zeros(len(points), dtype=np.bool_)
+        least, unbounded = np.empty(len(points)), np.full(len(points), -np.inf)
+        for bone, near in enumerate(self._near_each):
+            self._ask(bone, points, None, unbounded, least)
+            memory = self._memories[bone]
+            stale = np.flatnonzero((least < self._reach) & (memory.bound >= self._reach))
+            found = np.empty(len(stale))
+            self._ask(bone, points, stale, self._reach[stale], found)
+            least[stale] = found
+            np.less(least, self._reach, out=near)
+            nearer |= near
+        self._near = np.flatnonzero(nearer)
+
+    def _ask(
+        self,
+        bone: int,
+        points: Floats,
+        rows: Integers | None,
+        reach: Floats,
+        distance: Floats,
+    ) -> Floats:
+        """Fill distances (k,) of some vertices, of points (n, 3), to one bone; the directions
+        (k, 3) in which they grow.
+        """
+        memory, direction = self._memories[bone], np.empty((len(distance), 3))
+        if rows is not None:
+            points, memory = points[rows], Memory(*(part[rows] for part in memory))
 
         def work(start: int, stop: int) -> None:
-            some = slice(start, stop)
-            distance, way = np.empty(stop - start), np.empty((stop - start, 3))
-            for bone, pose, memory in zip(self._bones, self._poses, self._memories):
-                known = [part[some] if whole else part[rows[some]] for part in memory]
-                limit = np.minimum(reach[some], smallest[some])
-                distance_loop(bone, pose, where[some], limit, *known, distance, way)
-                if not whole:
-                    for part, values in zip(memory, known):
-                        part[rows[some]] = values
-                near = np.flatnonzero((distance < smallest[some]) & (distance <= limit))
-                np.minimum(smallest[some], distance, out=smallest[some])
-                outward[start + near] = way[near]
+            given = self._bones[bone], self._poses[bone], points[start:stop], reach[start:stop]
+            known = [part[start:stop] for part in memory]
+            distance_loop(*given, *known, distance[start:stop], direction[start:stop])
 
-        if self._bones:
-            in_chunks(count, work)
+        in_chunks(len(distance), work)
+        if rows is not None:
+            for part, values in zip(self._memories[bone], memory):
+                part[rows] = values
+        return direction
+
+    def _depth(self, points: Floats, rows: Integers) -> tuple[Floats, Floats]:
+        """Distances (k,) of some vertices, of points (n, 3), to the nearest bone, where they are in
+        one, else a number above zero, and the directions (k, 3) in which they grow.
+        """
+        smallest, outward = np.full(len(rows), np.inf), np.zeros((len(rows), 3))
+        for bone in range(len(self._bones)):
+            distance = np.empty(len(rows))
+            direction = self._ask(bone, points, rows, np.minimum(smallest, 0.0), distance)
+            nearer = np.flatnonzero((distance < smallest) & (distance <= 0.0))
+            np.minimum(smallest, distance, out=smallest)
+            outward[nearer] = direction[nearer]
         return smallest, outward
 
-    def lift(self, sheet: Sheet, rows: Integers | None = None, *, again: bool = False) -> Integers:
+    def lift(self, sheet: Sheet, rows: Integers | None = None) -> Integers:
         """Move vertices that lie in a bone onto it, where they stay: these.
 
-        Where ``rows`` are given only these; with ``again`` only those that were near a bone when
-        all were last asked for. What looks away from the bone keeps off it, so that both sides of a
-        muscle that sinks into it stay apart.
+        Without ``rows`` those that are asked about are what `find_near` found. What looks away from
+        the bone keeps off it, so that both sides of a muscle that sinks into it stay apart.
         """
-        if not self._bones:
-            return np.zeros(0, dtype=np.int64)
-        edge, reach = self._shown.edge, None
-        if rows is None and not again:
-            rows, reach = np.arange(len(sheet.vertices)), self._reach
-        elif rows is None:
-            rows = self._near
+        edge, rows = self._shown.edge, self._near if rows is None else rows
         moved = np.zeros(0, dtype=np.int64)
         for turn in range(LIFTS):
-            limit = np.zeros(len(rows)) if reach is None else reach
-            distance, outward = self.nearest(sheet.vertices, rows, limit)
-            if reach is not None:
-                self._near = np.flatnonzero(distance < reach)
-                reach = None
+            if not self._bones or len(rows) == 0:
+                break
+            distance, outward = self._depth(sheet.vertices, rows)
             inside = np.flatnonzero(distance < -OUT * edge)
             rows, distance, outward = rows[inside], distance[inside], outward[inside]
             if len(rows) == 0:
@@ -117,21 +140,17 @@ class ShownBones:
         """Move the corners of triangles that a bone's vertices came through, of those with a corner
         in ``among`` (n,), and out of the bones again what that drove into another.
         """
-        shown = self._shown
-        near = np.zeros(len(sheet.vertices), dtype=np.bool_)
-        near[self._near] = True
-        if among is not None:
-            near &= among
+        shown, count = self._shown, len(sheet.vertices)
         for _ in range(2):
-            if not near.any():
-                return
-            moved = np.zeros(len(near), dtype=np.bool_)
-            for grid, pose in zip(self._grids, self._poses):
-                push_off(sheet.vertices, shown.faces, grid, pose, shown.edge, moved, near)
+            moved = np.zeros(count, dtype=np.bool_)
+            for grid, pose, near in zip(self._grids, self._poses, self._near_each):
+                some = near if among is None else near & among
+                if some.any():
+                    push_off(sheet.vertices, shown.faces, grid, pose, shown.edge, moved, some)
             rows = np.flatnonzero(moved)
             sheet.suspect[rows] = True
             sheet.hold(rows)
-            if len(rows) == 0 or len(self.lift(sheet, rows)) == 0:
+            if len(self.lift(sheet, rows)) == 0:
                 return
-            near[:] = False
-            near[shown.grown(rows)] = True
+            among = np.zeros(count, dtype=np.bool_)
+            among[shown.grown(rows)] = True

@@ -55,13 +55,13 @@ def fill(shown: Shown, bones: ShownBones, sheet: Sheet) -> float:
         change = level_change(shown, sheet)
         if np.isnan(change):
             sheet.direction[:] = vertex_normals(sheet.vertices, shown.faces)
-            bones.lift(sheet, again=True)
+            bones.lift(sheet)
             change = level_change(shown, sheet)
         if np.isnan(change):
             return change
         total += change
         sheet.shift(change)
-        if turn == MEET or len(bones.lift(sheet, again=True)) == 0:
+        if turn == MEET or len(bones.lift(sheet)) == 0:
             break
     return total
 
@@ -73,6 +73,7 @@ def fill_material(shown: Shown, bones: ShownBones, sheet: Sheet) -> None:
     sheet.bounded[:] = True
     sheet.suspect[:] = True
     for _ in range(STEPS):
+        bones.find_near(sheet.vertices)
         bones.lift(sheet)
         sheet.direction[:] = vertex_normals(sheet.vertices, shown.faces)
         volume, rate = volume_rate(sheet.vertices, shown.faces, sheet.direction)

@@ -53,7 +53,9 @@ def reach_level(
         given = sheet.carried, value, gradient, shown.offset, shown.slope, allowed
         moved = [sheet.vertices, sheet.direction, sheet.bounded, sheet.suspect]
         _step_loop(*given, level, edge, todo, *moved)
-        todo[bones.lift(sheet, again=turn > 0)] = False
+        if turn == 0:
+            bones.find_near(sheet.vertices)
+        todo[bones.lift(sheet)] = False
         volume, rate = volume_rate(sheet.vertices, shown.faces, sheet.direction)
         if not rate > 0.0:
             return np.nan
