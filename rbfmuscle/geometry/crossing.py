@@ -80,12 +80,10 @@ class FaceTree:
         plain = np.zeros(len(vertices), dtype=np.bool_)
         if folds and self.closed:
             plain_loop(vertices, *self._rings, plain)
-            asked[: len(self.faces)] |= ~plain[self._corners].all(axis=1)
-        # Without a folded corner and without triangles that are asked for no box is made.
-        if not asked.any():
-            return np.zeros((0, 2), dtype=np.int64)
         wanted = np.zeros(2 * self._leaves, dtype=np.bool_)
-        wanted[self._leaves :] = asked.reshape(-1, LEAF).any(axis=1)
+        # Without a folded corner and without triangles that are asked for no box is made.
+        if not _asked_loop(self._corners, plain, folds and self.closed, asked, wanted):
+            return np.zeros((0, 2), dtype=np.int64)
         whole = self._boxes is None or not again
         if self._boxes is None:
             self._boxes = np.empty((self._leaves, 6, LEAF)), np.empty((2 * self._leaves, 6))
@@ -116,6 +114,21 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
         return np.zeros(0, dtype=bool)
     vertices = np.asarray(vertices, dtype=np.float64)
     return FaceTree(vertices, faces).crossing(vertices)
+
+
+@loop
+def _asked_loop(faces, plain, folds, asked, wanted):
+    """Mark, with ``folds``, also the triangles that have a corner which is not plain (n,); mark the
+    leaves of a tree that hold one which is ``asked`` for, and say whether there is one.
+    """
+    leaves = len(wanted) // 2
+    some = False
+    for f in range(len(faces)):
+        if folds:
+            asked[f] |= not (plain[faces[f, 0]] & plain[faces[f, 1]] & plain[faces[f, 2]])
+        wanted[leaves + f // LEAF] |= asked[f]
+        some |= asked[f]
+    return some
 
 
 @loop

@@ -40,9 +40,8 @@ class ShownBones:
         self._grids = [grids[name] for name in bones.names]
         self._memories = [Memory.of(len(shown.rest)) for _ in bones.names]
         self._reach = NEAR_FACE * shown.side
-        # Which vertices a bone may be within reach of, for each bone and for any.
-        self._near_each = [np.zeros(len(shown.rest), dtype=np.bool_) for _ in bones.names]
-        self._near = np.zeros(0, dtype=np.int64)
+        # Which vertices each bone may be within reach of.
+        self._near = np.zeros((len(bones.names), len(shown.rest)), dtype=np.bool_)
 
     def at_rest(self) -> "ShownBones":
         """The same bones where they are at rest, with nothing known."""
@@ -50,6 +49,7 @@ class ShownBones:
         other.__dict__.update(self.__dict__)
         other._poses = np.tile(np.eye(4), (len(self._poses), 1, 1))
         other._memories = [Memory.of(len(self._shown.rest)) for _ in self._bones]
+        other._near = np.zeros_like(self._near)
         return other
 
     def find_near(self, points: Floats) -> None:
@@ -58,18 +58,15 @@ class ShownBones:
         A bound of the distance is kept for each, which shrinks as the vertex moves. The bone is
         asked only where it falls below the reach, or below what it was when it was found.
         """
-        nearer = np.zeros(len(points), dtype=np.bool_)
         least, unbounded = np.empty(len(points)), np.full(len(points), -np.inf)
-        for bone, near in enumerate(self._near_each):
+        for bone, near in enumerate(self._near):
             self._ask(bone, points, None, unbounded, least)
             memory = self._memories[bone]
             stale = np.flatnonzero((least < self._reach) & (memory.bound >= self._reach))
             found = np.empty(len(stale))
             self._ask(bone, points, stale, self._reach[stale], found)
             least[stale] = found
-            np.less(least, self._reach, out=near)
-            nearer |= near
-        self._near = np.flatnonzero(nearer)
+            near[:] = least < self._reach
 
     def _ask(
         self,
@@ -98,29 +95,33 @@ class ShownBones:
         return direction
 
     def _depth(self, points: Floats, rows: Integers) -> tuple[Floats, Floats]:
-        """Distances (k,) of some vertices, of points (n, 3), to the nearest bone, where they are in
-        one, else a number above zero, and the directions (k, 3) in which they grow.
+        """Distances (k,) of some vertices, of points (n, 3), to the nearest bone where they are in
+        one, else 0, and the directions (k, 3) in which they grow.
         """
-        smallest, outward = np.full(len(rows), np.inf), np.zeros((len(rows), 3))
-        for bone in range(len(self._bones)):
-            distance = np.empty(len(rows))
-            direction = self._ask(bone, points, rows, np.minimum(smallest, 0.0), distance)
-            nearer = np.flatnonzero((distance < smallest) & (distance <= 0.0))
-            np.minimum(smallest, distance, out=smallest)
-            outward[nearer] = direction[nearer]
+        smallest, outward = np.zeros(len(rows)), np.zeros((len(rows), 3))
+        for bone, near in enumerate(self._near):
+            some = np.flatnonzero(near[rows])
+            distance = np.empty(len(some))
+            direction = self._ask(bone, points, rows[some], smallest[some], distance)
+            deeper = distance < smallest[some]
+            smallest[some[deeper]] = distance[deeper]
+            outward[some[deeper]] = direction[deeper]
         return smallest, outward
 
     def lift(self, sheet: Sheet, rows: Integers | None = None) -> Integers:
         """Move vertices that lie in a bone onto it, where they stay: these.
 
-        Without ``rows`` those that are asked about are what `find_near` found. What looks away from
-        the bone keeps off it, so that both sides of a muscle that sinks into it stay apart.
+        Of ``rows``, which count as near all bones from then on; without them, of all that are near
+        one. What looks away from the bone keeps off it, so that both sides of a muscle that sinks
+        into it stay apart.
         """
-        edge, rows = self._shown.edge, self._near if rows is None else rows
+        edge = self._shown.edge
+        if rows is None:
+            rows = np.flatnonzero(self._near.any(axis=0))
+        else:
+            self._near[:, rows] = True
         moved = np.zeros(0, dtype=np.int64)
         for turn in range(LIFTS):
-            if not self._bones or len(rows) == 0:
-                break
             distance, outward = self._depth(sheet.vertices, rows)
             inside = np.flatnonzero(distance < -OUT * edge)
             rows, distance, outward = rows[inside], distance[inside], outward[inside]
@@ -143,7 +144,7 @@ class ShownBones:
         shown, count = self._shown, len(sheet.vertices)
         for _ in range(2):
             moved = np.zeros(count, dtype=np.bool_)
-            for grid, pose, near in zip(self._grids, self._poses, self._near_each):
+            for grid, pose, near in zip(self._grids, self._poses, self._near):
                 some = near if among is None else near & among
                 if some.any():
                     push_off(sheet.vertices, shown.faces, grid, pose, shown.edge, moved, some)

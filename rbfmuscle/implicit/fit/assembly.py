@@ -89,12 +89,19 @@ def _monomials(points: Floats, powers: Integers, derivatives: bool) -> Floats:
     """Monomials (P, q, n) at points (P, 3, n), or with their derivatives by the three axes
     (P, q, 4n).
     """
-    factors = points[:, None] ** powers[None, :, :, None]
-    parts = [np.prod(factors, axis=2)]
+    raised = np.ones((powers.max(initial=0) + 1, *points.shape))
+    for power in range(1, len(raised)):
+        raised[power] = raised[power - 1] * points
+
+    def product(powers: Integers) -> Floats:
+        x, y, z = (raised[powers[:, axis], :, axis] for axis in range(3))
+        return np.swapaxes(x * y * z, 0, 1)
+
+    parts = [product(powers)]
     for axis in range(3 if derivatives else 0):
-        power, steep = powers[:, axis, None], factors.copy()
-        steep[:, :, axis] = power * points[:, None, axis] ** np.maximum(power - 1, 0)
-        parts.append(np.prod(steep, axis=2))
+        lower = powers.copy()
+        lower[:, axis] = np.maximum(powers[:, axis] - 1, 0)
+        parts.append(powers[:, axis, None] * product(lower))
     return np.concatenate(parts, axis=2)
 
 

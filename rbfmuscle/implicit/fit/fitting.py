@@ -32,10 +32,9 @@ DOUBTFUL = 1e13
 KEPT = 1e12
 """Condition that this ridge keeps: with a greater one Cholesky may still fail."""
 _DEPENDENT = 1e-9  # norm of a polynomial beside the others, below which it depends on them
-# Fits that are solved at a time: their matrices stay in the second-level cache.
-_CHUNK = 16
-# Unknowns of a fit beyond which LAPACK factors it.
-LARGE = 200
+# Fits that are solved at a time, with what NumPy makes of them beside; fits below which a thread
+# does not pay.
+_CHUNK, _SERIAL = 64, 16
 
 
 class Fits(NamedTuple):
@@ -115,7 +114,7 @@ def _solve_all(basis: Basis, right: Floats, smoothing: float, bound: float) -> F
                 part[some] = values
 
     try:
-        in_chunks(fits, work, least=_CHUNK)
+        in_chunks(fits, work, least=_SERIAL)
     except np.linalg.LinAlgError:
         return None
     return found
@@ -159,7 +158,7 @@ def _solve_some(
     head of this file.
     """
     size, q = directions.shape[1:]
-    turned, products = np.swapaxes(directions, 1, 2), a @ directions
+    turned, products = np.ascontiguousarray(np.swapaxes(directions, 1, 2)), a @ directions
     if q:
         # The constants are all but the strongest direction.
         norm = np.sqrt(np.einsum("mnq,mnq->mq", products, products).max(axis=1))
@@ -167,8 +166,7 @@ def _solve_some(
         gamma = _trace(a) - _trace(inner)
         gamma = np.where(gamma > 0.0, gamma / max(size - q, 1), np.where(norm > 0.0, norm, 1.0))
         half = products - 0.5 * directions @ (inner + gamma[:, None, None] * np.eye(q))
-        both = np.concatenate([half, directions], axis=2)
-        a -= np.concatenate([directions, half], axis=2) @ np.swapaxes(both, 1, 2)
+        _subtract_loop(a, turned, np.ascontiguousarray(np.swapaxes(half, 1, 2)))
     else:
         norm = _largest(a, _probe(np.ones((len(a), size))), 2)
     if math.isfinite(bound):  # a constant vector is all but a polynomial, which M has no share of
@@ -192,14 +190,11 @@ def _factor(a: Floats) -> None:
     """Put upper factors U, A = U^T U, in the upper triangles of matrices (m, size, size);
     LinAlgError where one is not definite.
     """
-    if a.shape[1] > LARGE:
-        for matrix in a:
-            # Its transpose is the same matrix in Fortran's order, whose lower factor is U^T.
-            _, failed = lapack.dpotrf(matrix.T, lower=1, overwrite_a=1, clean=0)
-            if failed:
-                raise np.linalg.LinAlgError("the matrix is not definite")
-    elif not _factor_loop(a):
-        raise np.linalg.LinAlgError("the matrix is not definite")
+    for matrix in a:
+        # Its transpose is the same matrix in Fortran's order, whose lower factor is U^T.
+        _, failed = lapack.dpotrf(matrix.T, lower=1, overwrite_a=1, clean=0)
+        if failed:
+            raise np.linalg.LinAlgError("the matrix is not definite")
 
 
 def _trace(matrices: Floats) -> Floats:
@@ -227,33 +222,16 @@ def _probe(pivots: Floats) -> Floats:
     return found
 
 
-@loop(fastmath={"contract", "reassoc"})
-def _factor_loop(a):
-    """`_factor` of small matrices; whether all are definite.
-
-    Rows are subtracted four at a time: 62 matrices of 60 rows take 0.6 ms, by LAPACK 1.0.
-    """
+@loop(fastmath={"contract"})
+def _subtract_loop(a, directions, half):
+    """Subtract Q^T H + H^T Q from matrices (m, size, size), with Q and H (m, q, size)."""
     size = a.shape[1]
     for p in range(len(a)):
-        u = a[p]
         for i in range(size):
-            k = 0
-            while k + 3 < i:
-                q, r, s, t = u[k, i], u[k + 1, i], u[k + 2, i], u[k + 3, i]
-                for j in range(i, size):
-                    u[i, j] -= q * u[k, j] + r * u[k + 1, j] + s * u[k + 2, j] + t * u[k + 3, j]
-                k += 4
-            while k < i:
-                q = u[k, i]
-                for j in range(i, size):
-                    u[i, j] -= q * u[k, j]
-                k += 1
-            if not u[i, i] > 0.0:
-                return False
-            q = 1.0 / np.sqrt(u[i, i])
-            for j in range(i, size):
-                u[i, j] *= q
-    return True
+            for k in range(directions.shape[1]):
+                one, other = directions[p, k, i], half[p, k, i]
+                for j in range(size):
+                    a[p, i, j] -= one * half[p, k, j] + other * directions[p, k, j]
 
 
 @loop(fastmath={"contract", "reassoc"})
