@@ -153,7 +153,19 @@ def _near_loop(vertices, faces, among, pose, points, start, low, edge, shape, pa
             for j in range(begin[1], end[1] + 1):
                 row = (i * shape[1] + j) * shape[2]
                 for p in range(start[row + begin[2]], start[row + end[2] + 1]):
-                    if _is_near(plane, square, margin, points[p], least, most):
+                    x = points[p, 0]
+                    y = points[p, 1]
+                    z = points[p, 2]
+                    # Most are outside the box.
+                    boxed = (
+                        (least[0] <= x)
+                        & (x <= most[0])
+                        & (least[1] <= y)
+                        & (y <= most[1])
+                        & (least[2] <= z)
+                        & (z <= most[2])
+                    )
+                    if boxed and _is_near(plane, square, margin, x, y, z):
                         if met < len(pairs):
                             pairs[met, 0], pairs[met, 1] = p, f
                         met += 1
@@ -161,21 +173,8 @@ def _near_loop(vertices, faces, among, pose, points, start, low, edge, shape, pa
 
 
 @loop
-def _is_near(plane, square, margin, point, least, most):
-    """Whether a point is within a margin of a triangle: of its plane, not beside it, in its box."""
-    x = point[0]
-    y = point[1]
-    z = point[2]
-    boxed = (
-        (least[0] <= x)
-        & (x <= most[0])
-        & (least[1] <= y)
-        & (y <= most[1])
-        & (least[2] <= z)
-        & (z <= most[2])
-    )
-    if not boxed:
-        return False
+def _is_near(plane, square, margin, x, y, z):
+    """Whether a point is within a margin of a triangle's plane, and not beside it."""
     height = _height(plane, x, y, z)
     at_b, at_c = _areas(plane, x, y, z)
     over = height * height <= margin * margin * square

@@ -40,8 +40,10 @@ class ShownBones:
         self._grids = [grids[name] for name in bones.names]
         self._memories = [Memory.of(len(shown.rest)) for _ in bones.names]
         self._reach = NEAR_FACE * shown.side
-        # Which vertices each bone may be within reach of.
-        self._near = np.zeros((len(bones.names), len(shown.rest)), dtype=np.bool_)
+        # Vertices that each bone may be within reach of, and what is known of these alone.
+        nothing = np.zeros(0, dtype=np.int64)
+        self._near = [nothing for _ in bones.names]
+        self._known = [Memory.of(0) for _ in bones.names]
 
     def at_rest(self) -> "ShownBones":
         """The same bones where they are at rest, with nothing known."""
@@ -49,7 +51,7 @@ class ShownBones:
         other.__dict__.update(self.__dict__)
         other._poses = np.tile(np.eye(4), (len(self._poses), 1, 1))
         other._memories = [Memory.of(len(self._shown.rest)) for _ in self._bones]
-        other._near = np.zeros_like(self._near)
+        other._near, other._known = list(self._near), list(self._known)
         return other
 
     def find_near(self, points: Floats) -> None:
@@ -58,84 +60,68 @@ class ShownBones:
         A bound of the distance is kept for each, which shrinks as the vertex moves. The bone is
         asked only where it falls below the reach, or below what it was when it was found.
         """
-        least, unbounded = np.empty(len(points)), np.full(len(points), -np.inf)
-        for bone, near in enumerate(self._near):
-            self._ask(bone, points, None, unbounded, least)
-            memory = self._memories[bone]
+        unbounded = np.full(len(points), -np.inf)
+        for bone, memory in enumerate(self._memories):
+            least, _ = self._ask(bone, points, unbounded, memory)
             stale = np.flatnonzero((least < self._reach) & (memory.bound >= self._reach))
-            found = np.empty(len(stale))
-            self._ask(bone, points, stale, self._reach[stale], found)
-            least[stale] = found
-            near[:] = least < self._reach
+            known = Memory(*(part[stale] for part in memory))
+            least[stale], _ = self._ask(bone, points[stale], self._reach[stale], known)
+            for part, values in zip(memory, known):
+                part[stale] = values
+            self._near[bone] = np.flatnonzero(least < self._reach)
+            self._known[bone] = Memory(*(part[self._near[bone]] for part in memory))
 
     def _ask(
-        self,
-        bone: int,
-        points: Floats,
-        rows: Integers | None,
-        reach: Floats,
-        distance: Floats,
-    ) -> Floats:
-        """Fill distances (k,) of some vertices, of points (n, 3), to one bone; the directions
-        (k, 3) in which they grow.
+        self, bone: int, points: Floats, reach: Floats, known: Memory
+    ) -> tuple[Floats, Floats]:
+        """Distances (k,) of points (k, 3) to one bone and the directions (k, 3) in which they grow;
+        beyond ``reach`` (k,) lower bounds, without a direction.
         """
-        memory, direction = self._memories[bone], np.empty((len(distance), 3))
-        if rows is not None:
-            points, memory = points[rows], Memory(*(part[rows] for part in memory))
+        distance, direction = np.empty(len(points)), np.empty((len(points), 3))
 
         def work(start: int, stop: int) -> None:
             given = self._bones[bone], self._poses[bone], points[start:stop], reach[start:stop]
-            known = [part[start:stop] for part in memory]
-            distance_loop(*given, *known, distance[start:stop], direction[start:stop])
+            memory = [part[start:stop] for part in known]
+            distance_loop(*given, *memory, distance[start:stop], direction[start:stop])
 
-        in_chunks(len(distance), work)
-        if rows is not None:
-            for part, values in zip(self._memories[bone], memory):
-                part[rows] = values
-        return direction
-
-    def _depth(self, points: Floats, rows: Integers) -> tuple[Floats, Floats]:
-        """Distances (k,) of some vertices, of points (n, 3), to the nearest bone where they are in
-        one, else 0, and the directions (k, 3) in which they grow.
-        """
-        smallest, outward = np.zeros(len(rows)), np.zeros((len(rows), 3))
-        for bone, near in enumerate(self._near):
-            some = np.flatnonzero(near[rows])
-            distance = np.empty(len(some))
-            direction = self._ask(bone, points, rows[some], smallest[some], distance)
-            deeper = distance < smallest[some]
-            smallest[some[deeper]] = distance[deeper]
-            outward[some[deeper]] = direction[deeper]
-        return smallest, outward
+        in_chunks(len(points), work)
+        return distance, direction
 
     def lift(self, sheet: Sheet, rows: Integers | None = None) -> Integers:
         """Move vertices that lie in a bone onto it, where they stay: these.
 
-        Of ``rows``, which count as near all bones from then on; without them, of all that are near
-        one. What looks away from the bone keeps off it, so that both sides of a muscle that sinks
-        into it stay apart.
+        Of ``rows``; without them, of those that `find_near` found. What looks away from the bone
+        keeps off it, so that both sides of a muscle that sinks into it stay apart.
+        """
+        moved = []
+        for bone in range(len(self._bones)):
+            if rows is None:
+                some, known = self._near[bone], self._known[bone]
+            else:
+                some, known = rows, Memory(*(part[rows] for part in self._memories[bone]))
+            for _ in range(LIFTS):
+                points = sheet.vertices[some]
+                distance, outward = self._ask(bone, points, np.zeros(len(some)), known)
+                inside = np.flatnonzero(distance < -OUT * self._shown.edge)
+                if len(inside) == 0:
+                    break
+                some, known = some[inside], Memory(*(part[inside] for part in known))
+                self._move_onto(sheet, some, distance[inside], outward[inside])
+                moved.append(some)
+        return np.unique(np.concatenate(moved)) if moved else np.zeros(0, dtype=np.int64)
+
+    def _move_onto(self, sheet: Sheet, rows: Integers, distance: Floats, outward: Floats) -> None:
+        """Move vertices onto a bone that they lie in by a ``distance`` (k,) below zero, which grows
+        ``outward`` (k, 3).
         """
         edge = self._shown.edge
-        if rows is None:
-            rows = np.flatnonzero(self._near.any(axis=0))
-        else:
-            self._near[:, rows] = True
-        moved = np.zeros(0, dtype=np.int64)
-        for turn in range(LIFTS):
-            distance, outward = self._depth(sheet.vertices, rows)
-            inside = np.flatnonzero(distance < -OUT * edge)
-            rows, distance, outward = rows[inside], distance[inside], outward[inside]
-            if len(rows) == 0:
-                break
-            moved = rows if turn == 0 else moved
-            if not sheet.normals.any():
-                sheet.normals[:] = vertex_normals(sheet.carried, self._shown.faces)
-            away = np.einsum("ij,ij->i", sheet.normals[rows], outward)
-            height = LAMELLA * edge * np.maximum(away, 0.0) - distance
-            sheet.suspect[rows] |= distance < -SUNK * edge
-            sheet.vertices[rows] += height[:, None] * outward
-            sheet.hold(rows)
-        return moved
+        if not sheet.normals.any():
+            sheet.normals[:] = vertex_normals(sheet.carried, self._shown.faces)
+        away = np.einsum("ij,ij->i", sheet.normals[rows], outward)
+        height = LAMELLA * edge * np.maximum(away, 0.0) - distance
+        sheet.suspect[rows] |= distance < -SUNK * edge
+        sheet.vertices[rows] += height[:, None] * outward
+        sheet.hold(rows)
 
     def push_off(self, sheet: Sheet, among: Booleans | None = None) -> None:
         """Move the corners of triangles that a bone's vertices came through, of those with a corner
@@ -145,7 +131,8 @@ class ShownBones:
         for _ in range(2):
             moved = np.zeros(count, dtype=np.bool_)
             for grid, pose, near in zip(self._grids, self._poses, self._near):
-                some = near if among is None else near & among
+                some = np.zeros(count, dtype=np.bool_)
+                some[near] = True if among is None else among[near]
                 if some.any():
                     push_off(sheet.vertices, shown.faces, grid, pose, shown.edge, moved, some)
             rows = np.flatnonzero(moved)
