@@ -35,6 +35,7 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.substeps import SubSteps
+from rbfmuscle.simulation.touching import settle
 from rbfmuscle.simulation.tunnelling import find_crossings
 
 paper_models.register()
@@ -120,7 +121,9 @@ class Experiment:
         clock = time.perf_counter()
         contacts.move(poses[1])
         model.predict(*poses)
-        model.solve(contacts)
+        moving = model.begin(contacts)
+        settle([moving])
+        model.take(moving)
         record.seconds += time.perf_counter() - clock
         crossings = find_crossings(
             contacts,

@@ -15,6 +15,7 @@ import rbfmuscle as rm
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.options import DetectOptions, TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
+from rbfmuscle.simulation.group import Group
 from rbfmuscle.simulation.stepper import MuscleStepper, Path
 
 out = folder("tunnelling")
@@ -30,7 +31,7 @@ def step(action):
     model = build_model(muscle, scene, "pbd")
     reached = BonesInReach(list(fields), list(fields.values()))
     stepper = MuscleStepper(model, BoneContacts(reached, model.attached_bone), scene)
-    stepper.step(Path.between(rest, turned, stepper.poses))
+    Group([stepper]).step(Path.between(rest, turned, stepper.poses))
     _, events, _ = stepper.collect()
     for event in events:
         print(f"{action:8} {event.count:4} points at the {event.bone}: {event.action}")

@@ -10,23 +10,28 @@ import numpy as np
 
 from pbd_baseline.contact import ContactConstraint
 from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
+from pbd_baseline.moving_surface import MovingSurface
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import RestState
+from pbd_baseline.settling import MeshSettling, Sweeps
 from pbd_baseline.shapes import METHODS, Method
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.interpolation import SurfaceInterpolation
 from rbfmuscle.geometry.rest_frame import diameter
-from rbfmuscle.geometry.surfaces import farthest_move
+from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.muscles import attachment_frames
 from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
+from rbfmuscle.simulation.neighbours import SEARCHED
+from rbfmuscle.simulation.touching import Body, even_points
 
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
 FINISHING_REACH = 2.0
+SPACING = 0.015  # of the vertices that meet neighbours, of the size
 # Sweeps after which bones are asked again, and the fibres of a muscle that does not contract.
 FRESH = 10
 # Sweeps at most where a tolerance ends them.
@@ -86,7 +91,8 @@ class PBDMuscle:
         self.size = diameter(self.rest.vertices)
         self.still = method.tolerance * self.size
         self.log = SolveLog(solver_residual=0.0)
-        self.contact_spacing = 0.0
+        self._contacts: BoneContacts
+        self._surface: MovingSurface | None = None
         self.attached_bone = _bone_numbers(self.rest, attachment_frames(scene.bones, muscle))
         self.contact = ContactConstraint(reach=from_mm(REACH, scene.units))
         self.finishing_reach = from_mm(FINISHING_REACH, scene.units)
@@ -112,26 +118,41 @@ class PBDMuscle:
             self.points[:] = blended_motion(self.points, rest.weights, motions)
         _place_loop(rest.vertices, rest.attached_bone, new, self.points)
 
-    def solve(self, contacts: BoneContacts, *, room: bool = False) -> None:
-        """Sweep the shape, contacts inside the iteration and last, the volume on what is not in
-        contact; nothing to make ``room``, as every solve moves vertices out of neighbours.
+    def begin(self, contacts: BoneContacts) -> MeshSettling:
+        """Begin to sweep the shape and contacts inside the iteration; `take` restores the volume on
+        what is not in contact last.
         """
-        if room:
-            return
-        for k in range(self.most_sweeps):
-            fresh = k % FRESH == 0
-            if fresh:
-                self.contact.find(contacts, self.points)
-            if self.fibres is not None and (fresh or not self.fibres.passive):
-                self.shape.contract(self.fibres, self.points)
-            self.swept = k + 1
-            moved = sweep_once(self, last=self.swept == self.most_sweeps)
-            if moved < self.still:
-                break
-        capped = self.still > 0.0 and not moved < self.still
-        _finish(self, contacts)
+        self._contacts = contacts
+        if self._surface is not None:
+            self._surface.move(self.points)
+        sweeps = Sweeps(self._sweep, self.most_sweeps, self.still)
+        return MeshSettling(self.points, self.rest.inverse_mass, self.size, sweeps, self._surface)
+
+    def _sweep(self, number: int) -> None:
+        """One sweep of this number, in place."""
+        fresh = number % FRESH == 0
+        if fresh:
+            self.contact.find(self._contacts, self.points)
+        if self.fibres is not None and (fresh or not self.fibres.passive):
+            self.shape.contract(self.fibres, self.points)
+        sweep_once(self)
+
+    def take(self, moving: MeshSettling) -> None:
+        """Finish where the sweeps ended."""
+        self.swept = moving.iterations
+        capped = self.still > 0.0 and not moving.moved < self.still
+        _finish(self, self._contacts)
         capped = int(capped) + int(self.penetration > self.depth)
-        self.log.add(caps=capped, solver_residual=moved / self.size)
+        self.log.add(caps=capped, solver_residual=moving.moved / self.size)
+
+    def body(self) -> Body:
+        """What others meet that touch this muscle."""
+        free = np.flatnonzero(self.attached_bone < 0)
+        points = even_points(self.rest.vertices, free, SPACING * self.size)
+        faces = self.rest.topology.faces
+        self._surface = MovingSurface(self.rest.vertices, faces, SEARCHED * self.size)
+        area = float(vertex_areas(self.rest.vertices, faces).sum()) / len(points)
+        return Body(points, points, area)
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next `solve` settles under."""
@@ -189,18 +210,13 @@ class PBDMuscle:
         return ModelSurface(np.take(shown, self._place, axis=0), self._faces, quantities, notes)
 
 
-def sweep_once(muscle: PBDMuscle, *, last: bool = False) -> float:
-    """One iteration; how far it moved a vertex, asked for where a tolerance ends the sweeps and of
-    the ``last``.
-    """
+def sweep_once(muscle: PBDMuscle) -> None:
+    """One iteration, in place."""
     shape, points = muscle.shape, muscle.points
-    asked = last or muscle.still > 0.0
-    before = points.copy() if asked else points
     shape.sweep(points, muscle.time / muscle.sweeps)
     muscle.contact.project(points)
     if shape.volume_in_sweeps or muscle.still > 0.0:
         shape.restore_volume(points, muscle.contact)
-    return float(farthest_move(before, points)) if asked else np.inf
 
 
 def _finish(muscle: PBDMuscle, contacts: BoneContacts) -> None:

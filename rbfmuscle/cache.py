@@ -17,6 +17,7 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -94,7 +95,8 @@ def store_arrays(key: str, arrays: Mapping[str, ArrayLike]) -> None:
     harm.
     """
     folder = cache_path()
-    entry: dict[str, Array] = {
+    # Of NumPy's keywords none is among the keys.
+    entry: dict[str, Any] = {
         "key": np.array(key),
         **{k: np.asarray(a, order="C") for k, a in arrays.items()},
     }

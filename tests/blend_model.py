@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 from toy_scene import ToyMuscle, ellipsoid, held
 
+from pbd_baseline.settling import MeshSettling, Sweeps
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.scene.options import OutputOptions
 from rbfmuscle.scene.scene import Scene
@@ -29,12 +30,12 @@ class BlendMuscle(ToyMuscle):
     def predict(self, before, after):
         self.x = self._blend(after)
 
-    def solve(self, contacts, *, room=False):
-        if room:
-            return
+    def begin(self, contacts):
         self.solves += 1
         if self.solves == self.fail_at:
             raise SolveError(f"muscle {self.name!r}: planted failure")
+        free = np.where(self.attached_bone < 0, 1.0, 0.0)
+        return MeshSettling(self.x, free, 60.0, Sweeps(lambda number: None, 1, 0.0), None)
 
     def surface(self, contacts):
         quantities = {

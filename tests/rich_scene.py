@@ -44,7 +44,7 @@ def rich():
     scene.add_muscle("second", raised, attach=attach, model={"name": "rbf", "centres": 90}, **keys)
     scene.muscles[0].fibres = [line]
     scene.set_motion(ramp={"elbow.flexion": {"from": 0, "to": 30, "step": 10}})
-    scene = scene.with_options({"detect.tunnelling.angle": 120.0, "sliding.threshold": 1.5})
+    scene = scene.with_options({"detect.tunnelling.angle": 120.0, "neighbours": False})
     scene.doubts = ["a doubt"]
     scene.joints[1].guess = GuessTable(confidence=0.5, reason="its axis")
     scene.muscles[1].attachments[2].guess = GuessTable(confidence=0.4, reason="its end")

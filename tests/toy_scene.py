@@ -5,6 +5,8 @@ from functools import cache
 import numpy as np
 import trimesh
 
+from pbd_baseline.moving_surface import MovingSurface
+from pbd_baseline.settling import MeshSettling, Sweeps
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.bone import Bone
@@ -13,6 +15,7 @@ from rbfmuscle.scene.objects import Attachment, Motion, Muscle
 from rbfmuscle.scene.options import ContactOptions, DetectOptions, TunnellingOptions
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import ModelSurface, MuscleModel
+from rbfmuscle.simulation.touching import Body, settle
 
 
 class Formula:
@@ -87,7 +90,8 @@ class ToyMuscle(MuscleModel):
         self.names = [bone.name for bone in scene.bones]
         self.rest = np.array(muscle.mesh.vertices, dtype=float)
         self.faces = np.array(muscle.mesh.faces)
-        self.attached_bone, self.contact_spacing = np.full(len(self.rest), -1), 0.0
+        self.attached_bone = np.full(len(self.rest), -1)
+        self._surface = None
         for attachment in muscle.attachments:
             self.attached_bone[attachment.vertices] = self.names.index(attachment.bone)
         self.sweeps = sweeps
@@ -127,13 +131,25 @@ class ToyMuscle(MuscleModel):
         self.x = self.x + target - self._blend(before)
         self.target = target
 
-    def solve(self, contacts, *, room=False):
-        if room:
-            return
+    def begin(self, contacts):
         self.solves += 1
-        for _ in range(self.sweeps):
+        if self._surface is not None:
+            self._surface.move(self.x)
+
+        def sweep(number):
             near = contacts.half_spaces(self.x, self.reach)
-            self.x = press(self.target, self.x, self.inverse, near.point, near.gap, near.normal)
+            self.x[:] = press(self.target, self.x, self.inverse, near.point, near.gap, near.normal)
+
+        free = np.where(self.attached_bone < 0, 1.0, 0.0)
+        return MeshSettling(self.x, free, 60.0, Sweeps(sweep, self.sweeps, 0.0), self._surface)
+
+    def take(self, moving):
+        pass
+
+    def body(self):
+        self._surface = MovingSurface(self.rest, self.faces, 6.0)
+        free = np.flatnonzero(self.attached_bone < 0)
+        return Body(free, free, 1.0)
 
     def transform(self, motion):
         self.x, self.target = (
@@ -197,14 +213,14 @@ def muscle(name, mesh, attachments, **options):
     return Muscle(name, mesh, options=options, attachments=attachments)
 
 
-def scene(fields, joints, muscles, frames, *, initial="keep", sliding=None, tunnelling=None):
+def scene(fields, joints, muscles, frames, *, initial="keep", neighbours=None, tunnelling=None):
     """A scene of these parts, its bones from their fields by name."""
     bones = [bone(name, field) for name, field in fields.items()]
     parts = {"bones": bones, "joints": joints, "muscles": muscles}
     detect = DetectOptions(tunnelling=tunnelling or TunnellingOptions(action="off"))
     contact = ContactOptions(initial=initial)
     return Scene(
-        "toy", **parts, motion=Motion(frames), contact=contact, sliding=sliding, detect=detect
+        "toy", **parts, motion=Motion(frames), contact=contact, neighbours=neighbours, detect=detect
     )
 
 
@@ -231,7 +247,7 @@ def box_mesh(low, high):
     return mesh
 
 
-def neighbour_scene(angles, gap=1.0, *, sliding, order=(0, 1)):
+def neighbour_scene(angles, gap=1.0, *, neighbours, order=(0, 1)):
     """Two long muscles side by side, "lower" and "upper", in a scene, and its fields.
 
     An arm presses an end of the upper, lifts it or rolls it, by a dict of angles in degrees for
@@ -250,9 +266,18 @@ def neighbour_scene(angles, gap=1.0, *, sliding, order=(0, 1)):
         "hinge", "trunk", "arm", (-30, 0, 0), press=(0, 1, 0), lift=(0, -1, 0), roll=(1, 0, 0)
     )
     frames = [{f"hinge.{name}": np.radians(a) for name, a in angle.items()} for angle in angles]
-    return scene(fields, [hinge], [muscles[k] for k in order], frames, sliding=sliding), fields
+    return scene(
+        fields, [hinge], [muscles[k] for k in order], frames, neighbours=neighbours
+    ), fields
 
 
 def neighbour_parts(made):
     """Toy muscles of such a scene, by name."""
     return {one.name: ToyMuscle(one, made, sweeps=4, reach=2.0) for one in made.muscles}
+
+
+def solve(model, contacts):
+    """Bring a model to rest, as if it had no neighbours."""
+    moving = model.begin(contacts)
+    settle([moving])
+    model.take(moving)

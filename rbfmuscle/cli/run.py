@@ -24,10 +24,7 @@ from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError
 
 Simulated = Annotated[
     str | None,
-    Parameter(
-        help="Muscles to simulate, separated by commas, without the others and without [sliding]; "
-        "all by default."
-    ),
+    Parameter(help="Muscles to simulate, separated by commas, without the others all by default."),
 ]
 
 
@@ -84,7 +81,10 @@ def run(
 
         settings, loaded = changes.parse_settings(), open_scene(scene)
         if muscles is not None:
-            loaded.muscles, loaded.sliding = chosen_muscles(loaded, muscles), None
+            loaded.muscles = chosen_muscles(loaded, muscles)
+            if loaded.neighbours is not None:
+                names = [muscle.name for muscle in loaded.muscles]
+                loaded.neighbours = loaded.neighbours.among(names)
         limited = partial(stream_run, frames=frames, fail_on=fail_on, progress=advance)
         try:
             limited(loaded, output, model=changes.model, settings=settings)

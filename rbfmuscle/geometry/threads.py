@@ -112,20 +112,20 @@ def each(act: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
 
 
 def in_stages(
-    first: Callable[[Item], object],
+    first: Callable[[int], object],
     second: Callable[[Item], Result],
-    items: Sequence[Item],
-    costs: Sequence[tuple[float, float]],
-) -> list[Result]:
-    """``[second(item) for item in items]``, each after ``first(item)``, as `each` does it.
+    groups: Sequence[Sequence[Item]],
+    cost: Callable[[Item], tuple[float, float]],
+) -> list[list[Result]]:
+    """``[[second(item) for item in group] for group in groups]``, each group after ``first`` of its
+    number, as `each` does it.
 
-    ``costs`` says how long both will take of each item: what has the most left to do goes first,
-    so that no thread waits long for the last of them.
+    ``cost`` says how long an item takes in both stages: what has the most left to do goes first, so
+    that no thread waits long for the last of them.
     """
-    ready = [(-sum(cost), number) for number, cost in enumerate(costs)]
+    ready = [(-sum(sum(cost(item)) for item in group), k, -1) for k, group in enumerate(groups)]
     heapify(ready)
-    begun: set[int] = set()
-    results: dict[int, Result] = {}
+    results: dict[tuple[int, int], Result] = {}
     lock = Lock()
 
     def work(_: int) -> None:
@@ -134,22 +134,25 @@ def in_stages(
             with lock:
                 if not ready:
                     return
-                _, number = heappop(ready)
+                _, number, part = heappop(ready)
             try:
-                if number in begun:
-                    results[number] = second(items[number])
+                if part >= 0:
+                    results[number, part] = second(groups[number][part])
                     continue
-                first(items[number])
+                first(number)
             except BaseException:
                 with lock:
                     ready.clear()
                 raise
             with lock:
-                begun.add(number)
-                heappush(ready, (-costs[number][1], number))
+                for part, item in enumerate(groups[number]):
+                    heappush(ready, (-cost(item)[1], number, part))
 
-    each(work, range(min(thread_count(), len(items))))
-    return [results[number] for number in range(len(items))]
+    if len(groups) == 1:  # it has all threads to itself
+        first(0)
+        return [each(second, groups[0])]
+    each(work, range(min(thread_count(), len(groups))))
+    return [[results[k, part] for part in range(len(group))] for k, group in enumerate(groups)]
 
 
 def in_chunks(count: int, work: Callable[[int, int], object], *, least: int = LEAST_SHARE) -> None:

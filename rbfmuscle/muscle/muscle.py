@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -18,11 +17,14 @@ from rbfmuscle.scene.joints.joint import Joint
 from rbfmuscle.scene.muscles import attachment_frames, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.contact import EVERYWHERE, BoneContacts
+from rbfmuscle.simulation.contact import EVERYWHERE, BoneContacts, Fences
 from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
-from rbfmuscle.solid.contact import NO_FENCES, Fences, Mobility, Obstacles
+from rbfmuscle.simulation.neighbours import SEARCHED
+from rbfmuscle.simulation.touching import Body, even_points
+from rbfmuscle.solid.contact import NO_FENCES, Mobility, Obstacles
 from rbfmuscle.solid.kernels import turned_normals
 from rbfmuscle.solid.lattice import Lattice
+from rbfmuscle.solid.material import Material
 from rbfmuscle.solid.model import (
     SolidModel,
     attached_owner,
@@ -31,16 +33,11 @@ from rbfmuscle.solid.model import (
     lattice_slopes,
     stiffness,
 )
-from rbfmuscle.solid.solve import NEAR, Settling, find_slowness, settle
+from rbfmuscle.solid.solve import NEAR, Settling, find_slowness
 from rbfmuscle.solid.state import SolidState, predict, rest_state, transform
-from rbfmuscle.solid.touching import SEARCHED, Body, Material, carried, even_points
 from rbfmuscle.surface.drawing import Carry, SurfaceBuilder
 
-# Neighbours meet a muscle at contact points so far apart, of the side of a lattice cell, which has
-# three nodes on it.
-CONTACT_SPACING = 0.3
-
-
+APART = 0.02  # spacing of the points that meet neighbours, of the size
 # A muscle whose activation changes while the bones stand still ends nearer to its equilibrium: what
 # is left of each step adds up.
 ERROR_ACTIVE = 2e-6
@@ -110,9 +107,9 @@ class RBFMuscle:
         names = attachment_frames(scene.bones, muscle)
         numbers = np.array([names.index(bone) for bone in self.rest.bones])
         owner = attached_owner(self.model)
-        self.contact_spacing = CONTACT_SPACING * self.model.side
         self.attached_bone = np.where(owner < 0, -1, numbers[owner])
         self._met: tuple[BoneContacts, Obstacles] | None = None
+        self._material: Material | None = None
         self.log = SolveLog(solver_residual=0.0, solid_volume_error=0.0)
 
     def contact_points(self) -> np.ndarray:
@@ -129,22 +126,14 @@ class RBFMuscle:
         old, new = np.array([[poses[bone] for bone in bones] for poses in (before, after)])
         self.state = predict(self.model, self.state, old, new)
 
-    def solve(self, contacts: BoneContacts, *, room: bool = False) -> None:
-        """Solve for the equilibrium under elasticity, volume and contact at the bones' present
-        poses.
+    def begin(self, contacts: BoneContacts) -> Settling:
+        """Begin to solve for the equilibrium under elasticity, volume and contact at the bones'
+        present poses.
         """
-        if room:
-            return
-        solid = self.settling(contacts)
-        settle([solid])
-        self.take(solid)
-
-    def settling(self, contacts: BoneContacts) -> Settling:
-        """The solid on its way to equilibrium."""
         if self._met is None or self._met[0] is not contacts:
             self._met = contacts, self._obstacles(contacts)
         obstacles = self._met[1]
-        fences = [Fences(p.index, p.gap, p.normal, p.anchor) for p in contacts.neighbours]
+        fences = contacts.fences
         obstacles.fences = Fences(*map(np.concatenate, zip(*fences))) if fences else NO_FENCES
         return Settling(
             self.model,
@@ -154,6 +143,7 @@ class RBFMuscle:
             obstacles,
             slowness=self._slowness,
             error=ERROR_ACTIVE if self.state.activation or not self.state.step.any() else None,
+            material=self._material,
         )
 
     def take(self, solid: Settling) -> None:
@@ -179,9 +169,11 @@ class RBFMuscle:
         return Obstacles(exact, boxes, rounded, contacts.placed, contacts.free, contacts.allowed)
 
     def body(self) -> Body:
-        """What this muscle is to others that it touches."""
+        """What others meet that touch this muscle."""
         model, lattice, frame = self.model, self._lattice, self.frame
-        points = even_points(model.points, model.owner, model.size)
+        points = even_points(
+            model.points, np.flatnonzero(self.attached_bone < 0), APART * model.size
+        )
         spacing = float(np.sqrt(model.area))
         rest = BoneSDF.from_mesh(self._rest_mesh, name=self.name)
         reach = SEARCHED * model.size
@@ -189,7 +181,7 @@ class RBFMuscle:
         origin = frame.origin + np.linalg.solve(turn, lattice.low / lattice.spacing)
         every = np.indices(tuple(lattice.count)).reshape(3, -1).T
         nearest = lattice.tree.query(every + 0.5)[1].astype(np.int64)
-        material = Material(
+        self._material = Material(
             origin,
             turn,
             np.linalg.inv(turn),
@@ -200,7 +192,7 @@ class RBFMuscle:
         )
         places = (model.points[points] - origin) @ turn.T
         area = float(self._rest_mesh.area) / len(points)
-        return Body(self.name, material, points, places, area, model.size)
+        return Body(points, places, area)
 
     def _stiffen(self, activation: float) -> None:
         self._stiffness = stiffness(self.model, activation)
@@ -233,7 +225,7 @@ class RBFMuscle:
 
     def _carry(self, points: np.ndarray) -> Carry:
         """What gives the places (n, 3) of points (n, 3) of the muscle at rest from the nodes."""
-        return partial(carried, *embed(self._lattice, self.frame, points))
+        return embed(self._lattice, self.frame, points).of
 
     def embedded_mesh(self) -> Mesh:
         """The shown mesh where the solid carries it."""
@@ -248,7 +240,7 @@ class RBFMuscle:
         drawn = self.drawer.draw(self.state.points, nodes, normals, contacts)
         quantities, notes = self.log.take()
         # Before what the solve left in a bone was lifted out of it.
-        settled = carried(*self.model.embedding, self.state.nodes)
+        settled = self.model.embedding.of(self.state.nodes)
         drawn.quantities["solver_penetration_max"] = contacts.depth(settled)
         drawn.quantities.update(quantities)
         drawn.notes.extend(notes)

@@ -19,8 +19,9 @@ from rbfmuscle.scene.options import (
     DetectOptions,
     FileName,
     MotionOptions,
+    NeighbourOptions,
+    Neighbours,
     OutputOptions,
-    SlidingOptions,
     Table,
     check_plain,
 )
@@ -218,6 +219,7 @@ class SceneFile(Table):
     hints: ClassVar[Mapping[str, str]] = {
         **dict.fromkeys(SceneTable.model_fields, "it belongs into the table [scene]"),
         "defaults": f"[classes.{MAIN}] holds the keys of all muscles",
+        "sliding": "muscles touch without it; [neighbours] says which, neighbours = false none",
     }
     scene: SceneTable
     classes: dict[str, ClassTable] = Field(default_factory=dict)
@@ -227,7 +229,7 @@ class SceneFile(Table):
     motion: MotionOptions = MotionOptions()
     muscle: list[MuscleTable] = Field(default_factory=list)
     contact: ContactOptions = ContactOptions()
-    sliding: SlidingOptions | None = None
+    neighbours: Neighbours = NeighbourOptions()
     detect: DetectOptions = DetectOptions()
     output: OutputOptions = OutputOptions()
 

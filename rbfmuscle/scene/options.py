@@ -4,7 +4,7 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
@@ -168,12 +168,27 @@ class ContactOptions(Table):
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
 
 
-class SlidingOptions(Table):
-    """``[sliding]``: neighbouring muscles that keep their distance and slide."""
+class NeighbourOptions(Table):
+    """``[neighbours]``: muscles that touch; ``neighbours = false`` lets them pass through."""
 
-    threshold: Positive | None = None
-    bones: bool = False
     pairs: list[Annotated[list[str], Field(min_length=2, max_length=2)]] | None = None
+
+    def among(self, names: Collection[str]) -> "NeighbourOptions":
+        """The same for some of the muscles."""
+        if self.pairs is None:
+            return self
+        left = [pair for pair in self.pairs if set(pair) <= set(names)]
+        return self.model_copy(update={"pairs": left})
+
+
+def _accept_neighbours(value: object) -> object:
+    """False stands for none, true for the usual ones."""
+    if isinstance(value, bool):
+        return NeighbourOptions() if value else None
+    return value
+
+
+Neighbours = Annotated[NeighbourOptions | None, BeforeValidator(_accept_neighbours)]
 
 
 class TunnellingOptions(Table):

@@ -36,7 +36,7 @@ def record_scene(scene: Scene) -> dict[str, object]:
         "motion": {**motion, "frames": len(scene.motion), "whole": scene.motion.whole, **times},
         "muscles": [record_muscle(muscle) for muscle in scene.muscles],
         "contact": scene.contact.model_dump(),
-        "sliding": scene.sliding.model_dump() if scene.sliding else None,
+        "neighbours": scene.neighbours.model_dump() if scene.neighbours else False,
         "detect": scene.detect.model_dump(),
         "output": scene.output.model_dump(),
     }

@@ -49,11 +49,11 @@ def table_text(
     head: str, row: Mapping[str, object], comments: Mapping[str, str | list[str]] | None = None
 ) -> str:
     """A table as TOML, lists of tables with one a line, after its first line ``head``, as
-    ``[[bone]]``.
+    ``[[bone]]``, which the keys before all tables have not.
 
     ``comments`` stand after the line of a key, or after each table of its list.
     """
-    lines = [head]
+    lines = [head] if head else []
     for key, value in row.items():
         said = (comments or {}).get(key, "")
         if isinstance(value, list) and value and isinstance(value[0], dict):
@@ -77,7 +77,6 @@ def attachment_file(muscle: str, bone: str) -> str:
     return f"attachments/{muscle}.{bone}.txt"
 
 
-OPTIONAL = ("sliding",)  # tables that change a scene even where they are empty
 TableRow: TypeAlias = tuple[str, Mapping[str, object]]  # the head of a table, and its keys
 
 
@@ -173,8 +172,7 @@ class SceneFiles:
                 file = self._new(row["file"].name)
                 shutil.copyfile(row["file"], file)
                 row["file"] = self._relative(file)
-            # What a scene may lack is switched on by its mere table.
-            if row or key in OPTIONAL:
+            if row:
                 found.append((f"[{key}]", row))
         return found
 

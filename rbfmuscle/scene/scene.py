@@ -28,8 +28,8 @@ from rbfmuscle.scene.options import (
     ContactOptions,
     DetectOptions,
     MotionOptions,
+    NeighbourOptions,
     OutputOptions,
-    SlidingOptions,
     Table,
 )
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
@@ -65,7 +65,7 @@ class Scene(Compared):
     muscles: list[Muscle] = field(default_factory=list)
     motion: Motion = field(default_factory=Motion)
     contact: ContactOptions = field(default_factory=ContactOptions)
-    sliding: SlidingOptions | None = None
+    neighbours: NeighbourOptions | None = field(default_factory=NeighbourOptions)  # None: unfelt
     detect: DetectOptions = field(default_factory=DetectOptions)
     output: OutputOptions = field(default_factory=OutputOptions)
     path: Path | None = None  # the file it was loaded from
@@ -220,7 +220,9 @@ class Scene(Compared):
         files = SceneFiles(Path(path), folder)
         about = {key: getattr(self, key) for key in ABOUT if getattr(self, key)}
         with files.kept_whole():
+            unfelt = [("", {"neighbours": False})] if self.neighbours is None else []
             tables = [
+                *unfelt,
                 ("[scene]", {"format": FORMAT, "name": self.name, **about}),
                 *files.skeleton(self.bones, self.meshless_bones, self.joints, self.couplings),
                 *(("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles),

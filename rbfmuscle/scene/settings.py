@@ -15,14 +15,14 @@ from rbfmuscle.scene.names import find_named
 from rbfmuscle.scene.objects import Muscle, split_model
 from rbfmuscle.scene.options import (
     MotionOptions,
-    SlidingOptions,
+    NeighbourOptions,
     Table,
     check_plain,
     set_dotted,
 )
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
 
-TABLES = ("contact", "sliding", "detect", "output", "motion")
+TABLES = ("contact", "neighbours", "detect", "output", "motion")
 HEADS = ("model", "muscle", *KEYS, *TABLES)
 
 
@@ -55,6 +55,8 @@ def change_settings(
             set_on_muscles(chosen, head, rest, value, key)
         elif head not in tables:
             raise SceneError(f"{key}: unknown setting, {did_you_mean(head, HEADS)}")
+        elif head == "neighbours" and isinstance(value, bool) and not rest:
+            tables[head] = NeighbourOptions() if value else None
         elif not rest:
             raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
         else:
@@ -111,7 +113,7 @@ def changed_table(
     folder: Path | None,
 ) -> Table:
     """A table of settings with one key changed; one that the scene lacks begins with defaults."""
-    table = SlidingOptions() if table is None else table
+    table = NeighbourOptions() if table is None else table
     values = table.model_dump(by_alias=True, exclude_unset=True)
     if isinstance(table, MotionOptions):
         _change_motion(values, rest, value, context)

@@ -1,14 +1,13 @@
-"""Contacts as half-spaces, with several bones and neighbouring muscles at once.
+"""Contacts with several bones at once, as half-spaces.
 
-Obstacles are the bones' distance fields, which stay in bone coordinates and are never rebuilt, and,
-with sliding, the surfaces of neighbouring muscles. Nothing here depends on how a muscle is
-represented.
+The bones' distance fields stay in bone coordinates and are never rebuilt. Nothing here depends on
+how a muscle is represented.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,38 +31,18 @@ class HalfSpaces(NamedTuple):
     point: np.ndarray  # (c,) number of the contact point
     gap: np.ndarray  # (c,) signed distance now [scene unit], negative is violated
     normal: np.ndarray  # (c, 3) unit direction of growing distance, world axes
-    source: np.ndarray  # (c,) row of the bone in reach, or -1 - k for virtual edges of family k
+    source: np.ndarray  # (c,) row of the bone in reach, or -1 for a fence
 
 
-class Planes:
-    """Half-spaces of one kind against one obstacle, at points ``anchor`` (c, 3), fixed through a
-    sub-step.
-
-    ``softness`` says how far they yield to a force, relative to a bone; for models that solve for
-    forces.
+class Fences(NamedTuple):
+    """Half-spaces that hold contact points on their side of a bone that they would pass through,
+    fixed through a sub-step.
     """
 
-    def __init__(self, softness: float = 1.0) -> None:
-        self.softness = softness
-        self.clear()
-
-    def clear(self) -> None:
-        """Remove the planes."""
-        self.set(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-
-    def set(self, index: Integers, gap: Floats, normal: Floats, anchor: Floats) -> None:
-        """Replace the planes."""
-        self.index = index
-        self.gap = gap
-        self.normal = normal
-        self.anchor = anchor
-
-
-class Neighbour(Protocol):
-    """A sliding neighbour, for the muscle's surface."""
-
-    def excess(self, points: Floats) -> Floats:
-        """How far (n,) points (n, 3) are to move inwards for it [scene unit]."""
+    point: Integers  # (f,)
+    gap: Floats  # (f,) distance of the anchor [scene unit]
+    normal: Floats  # (f, 3) unit
+    anchor: Floats  # (f, 3)
 
 
 # Grows a box so far that it holds all that can be near the bone in it.
@@ -132,7 +111,7 @@ class BonesInReach:
 
 
 class BoneContacts:
-    """The obstacles of one muscle: the bones that it can reach, in one pose, and its neighbours.
+    """The obstacles of one muscle: the bones that it can reach, in one pose.
 
     ``attached_bone`` (n,) holds the bone that each contact point is attached to, -1 where it is
     ``free``; attached points take no contact. ``poses`` are those of all bones by name, ``placed``
@@ -144,9 +123,8 @@ class BoneContacts:
         self.free = np.asarray(attached_bone, dtype=np.int64) < 0
         self.poses: Mapping[str, Floats] = AT_REST
         self.placed = bones.place(AT_REST)
-        #: Planes of sliding neighbours, and those that hold points on their side of a bone.
-        self.neighbours: list[Planes] = []
-        self.beside: list[Neighbour] = []
+        #: What holds points on their side of a bone, in a sub-step that needs it.
+        self.fences: list[Fences] = []
         self._free = np.flatnonzero(self.free)
         self.allowed = np.zeros((len(bones.names), len(self.free)))
         #: What is known of the free points about each bone in reach.
@@ -172,14 +150,6 @@ class BoneContacts:
         """
         return self.bones.fields[row].distance_and_gradient(points, self.placed[row])
 
-    def excess(self, points: Floats) -> Floats:
-        """How far (n,) points (n, 3) of the surface are to move inwards for sliding neighbours
-        [scene unit].
-        """
-        return np.max(
-            [np.zeros(len(points)), *(pair.excess(points) for pair in self.beside)], axis=0
-        )
-
     def depth(self, points: Floats) -> float:
         """Greatest depth of a free contact point (n, 3) in a bone [scene unit]; 0 outside."""
         some, depth = points[self._free], 0.0
@@ -190,7 +160,7 @@ class BoneContacts:
 
     def half_spaces(self, points: Floats, reach: float) -> HalfSpaces:
         """Pairs of contact point (n, 3) and obstacle nearer than ``reach`` [scene unit], bone by
-        bone, then neighbours.
+        bone, then fences.
         """
         if len(points) != len(self.free):
             raise ValueError(
@@ -206,13 +176,12 @@ class BoneContacts:
             near = np.flatnonzero(gap < reach)
             source = np.full(len(near), row)
             found.append(HalfSpaces(self._free[near], gap[near], normal[near], source))
-        for kind, planes in enumerate(self.neighbours):
-            gap = planes.gap + np.einsum(
-                "ij,ij->i", planes.normal, points[planes.index] - planes.anchor
-            )
+        for fences in self.fences:
+            away = points[fences.point] - fences.anchor
+            gap = fences.gap + np.einsum("ij,ij->i", fences.normal, away)
             near = np.flatnonzero(gap < reach)
-            source = np.full(len(near), -1 - kind)
-            found.append(HalfSpaces(planes.index[near], gap[near], planes.normal[near], source))
+            source = np.full(len(near), -1)
+            found.append(HalfSpaces(fences.point[near], gap[near], fences.normal[near], source))
         return HalfSpaces(*map(np.concatenate, zip(*found)))
 
     def lifted(self, points: Floats) -> Floats:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
+from rbfmuscle.simulation.touching import Body, Moving
 
 Mesh: TypeAlias = tuple[np.ndarray, np.ndarray]
 
@@ -99,8 +100,6 @@ class Frame:
     wall: float  # time for all muscles together [s], since the frame before
     activations: dict = field(default_factory=dict)  # of the muscles that contract
     work: dict = field(default_factory=dict)  # MuscleStatus by muscle
-    # Of each pair that slides: overlap, and RMS gap opened where they touched at rest.
-    neighbours: dict = field(default_factory=dict)
     # TendonLine by the end that each holds; the poses have these too
     tendons: dict = field(default_factory=dict)
     # The bones that each muscle can reach, by muscle
@@ -149,9 +148,6 @@ class MuscleModel(Protocol):
 
     name: str
     attached_bone: np.ndarray  # (n,) bone that a contact point is attached to, -1 where it is free
-    # length over which it bends as a whole: neighbours meet it at points so far apart; 0 for all
-    # points
-    contact_spacing: float
 
     def contact_points(self) -> np.ndarray:
         """Present contact points (n, 3); their number and order never change."""
@@ -159,12 +155,16 @@ class MuscleModel(Protocol):
     def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
         """Move with the bones from one set of poses to the next."""
 
-    def solve(self, contacts: BoneContacts, *, room: bool = False) -> None:
-        """Solve for equilibrium under the model's constraints and these contacts.
-
-        With ``room`` only move what is shown out of neighbours, by planes at where these are now;
-        nothing where every solve does that.
+    def begin(self, contacts: BoneContacts) -> Moving:
+        """Begin to solve for equilibrium under the model's constraints and these contacts; `settle`
+        iterates it, with those that it touches.
         """
+
+    def take(self, moving: Any) -> None:  # each model has a type of its own for what `begin` gives
+        """Take the state where a solve ended."""
+
+    def body(self) -> Body:
+        """What others meet that touch this muscle."""
 
     def transform(self, motion: np.ndarray) -> None:
         """Move the whole muscle rigidly by (4, 4)."""

@@ -14,9 +14,10 @@ from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
+from rbfmuscle.simulation.group import Group, GroupState
+from rbfmuscle.simulation.neighbours import Link, connected, find_links
 from rbfmuscle.simulation.rigid_transport import RigidTransport
-from rbfmuscle.simulation.sliding import Sliding, SlidingState
-from rbfmuscle.simulation.stepper import MuscleStepper, StepperState, keep_initial_overlap
+from rbfmuscle.simulation.stepper import MuscleStepper, keep_initial_overlap
 from rbfmuscle.simulation.substeps import PoseCache
 
 Path = tuple[list[dict[str, float]], list[dict[str, float]]]
@@ -28,8 +29,7 @@ class LoopState(NamedTuple):
     here: dict[str, float]
     activations: dict[str, float]
     next_index: int
-    steppers: list[StepperState]
-    sliding: SlidingState | None
+    groups: list[GroupState]
 
 
 class FrameLoop:
@@ -53,6 +53,8 @@ class FrameLoop:
     activations : Activations
         Of the muscles that contract.
     steppers : list of MuscleStepper
+    groups : list of Group
+        The same, those together that may touch.
 
     Raises
     ------
@@ -78,30 +80,31 @@ class FrameLoop:
         ]
         self.here: dict[str, float] = {}
         self.activations = Activations(scene.muscles, scene.motion)
-        for stepper in self.steppers:
-            if scene.sliding is None and not stepper.contracts:
+        names = [stepper.name for stepper in self.steppers]
+        links = find_links(scene, names)
+        joined = connected(len(names), links)
+        for first, *others in joined:
+            stepper = self.steppers[first]
+            if not others and not stepper.contracts:
                 stepper.rigid_transport = RigidTransport(scene.muscle(stepper.name), scene)
         self._next_index = 0
         self._wall = 0.0
         with self.working():
             each(keep_initial_overlap, self.steppers)
-            self._sliding = None if scene.sliding is None else Sliding(scene, self.steppers)
+            self.groups = [_group(self.steppers, members, links) for members in joined]
 
     def snapshot(self) -> LoopState:
         """The state between two frames, for :meth:`restore`; times are none of it."""
-        steppers = [stepper.snapshot() for stepper in self.steppers]
-        sliding = None if self._sliding is None else self._sliding.snapshot()
-        return LoopState(self.here, self.activations.here, self._next_index, steppers, sliding)
+        groups = [group.snapshot() for group in self.groups]
+        return LoopState(self.here, self.activations.here, self._next_index, groups)
 
     def restore(self, state: LoopState) -> None:
         """Return to a snapshot, which stays valid: what is asked for from here on comes out alike
         to the bit.
         """
-        self.here, self.activations.here, self._next_index, steppers, sliding = state
-        for stepper, known in zip(self.steppers, steppers):
-            stepper.restore(known)
-        if self._sliding is not None and sliding is not None:
-            self._sliding.restore(sliding)
+        self.here, self.activations.here, self._next_index, groups = state
+        for group, known in zip(self.groups, groups):
+            group.restore(known)
 
     def at_rest(self) -> tuple[dict[str, ModelSurface], Poses]:
         """Surfaces of the muscles before the first frame, by muscle, and the poses of the bones
@@ -135,20 +138,7 @@ class FrameLoop:
         """
         with self.working():
             paths = self._path_to(coordinates)
-            if self.surfaces and self._sliding is None:
-                # No muscle waits for another.
-                drawn = in_stages(
-                    lambda stepper: stepper.advance(*paths[stepper.name]),
-                    MuscleStepper.surface,
-                    self.steppers,
-                    [stepper.cost for stepper in self.steppers],
-                )
-            else:
-                self._solve(paths)
-                drawn = []
-                if self.surfaces and self._sliding is not None:
-                    self._sliding.finish_frame()
-                    drawn = each(MuscleStepper.surface, self.steppers)
+            drawn = self._solve_and_draw(paths) if self.surfaces else self._solve(paths)
             frame = self._frame(drawn)
         frame.wall, self._wall = self._wall, 0.0
         return frame
@@ -178,36 +168,43 @@ class FrameLoop:
         numbers = self.scene.motion.numbers
         return int(numbers[place]) if place < len(numbers) else place
 
-    def _path_to(self, coordinates: Mapping[str, float]) -> dict[str, Path]:
-        """For each muscle the coordinates and the activations of its sub-steps to the next
-        frame.
-        """
+    def _path_to(self, coordinates: Mapping[str, float]) -> list[Path]:
+        """For each group the coordinates and the activations of its sub-steps to the next frame."""
         # Coordinates start at rest, which is zero for most.
         here = self.here or dict.fromkeys(coordinates, 0.0) | rest_coordinates(self.scene)
         self.here = completed(self.scene, coordinates)
         for stepper in self.steppers:
             stepper.frame = self._number(self._next_index)
         # Side by side, as tendons are placed at each stop.
-        stops = each(lambda stepper: stepper.split(here, self.here), self.steppers)
-        paths: dict[str, Path] = {
-            stepper.name: ([here, *found], []) for stepper, found in zip(self.steppers, stops)
-        }
-        if any(stepper.rigid_transport is None for stepper in self.steppers):
-            # Muscles that slide or contract share the sub-steps of the one that has the most.
-            longest = max((stops for stops, _ in paths.values()), key=len)
+        stops = each(lambda group: group.split(here, self.here), self.groups)
+        paths: list[Path] = [([here, *found], []) for found in stops]
+        if any(group.contracts for group in self.groups):
+            # Muscles that contract share the sub-steps of the one that has the most.
+            longest = max((stops for stops, _ in paths), key=len)
             shared = self.activations.refine(self._next_index, longest)
-            paths |= {
-                stepper.name: shared for stepper in self.steppers if stepper.rigid_transport is None
-            }
+            paths = [shared if group.contracts else path for group, path in zip(self.groups, paths)]
         self._next_index += 1
         return paths
 
-    def _solve(self, paths: dict[str, Path]) -> None:
-        """Advance all muscles through their sub-steps."""
-        if self._sliding is None:
-            each(lambda stepper: stepper.advance(*paths[stepper.name]), self.steppers)
-        elif self.steppers:
-            self._sliding.advance(*paths[self.steppers[0].name])
+    def _solve(self, paths: list[Path]) -> list[ModelSurface]:
+        """Advance all groups through their sub-steps; no surfaces."""
+        each(lambda row: row[0].advance(*row[1]), list(zip(self.groups, paths)))
+        return []
+
+    def _solve_and_draw(self, paths: list[Path]) -> list[ModelSurface]:
+        """The same, and draw each muscle as soon as its group is done."""
+        drawn = in_stages(
+            lambda number: self.groups[number].advance(*paths[number]),
+            MuscleStepper.surface,
+            [group.steppers for group in self.groups],
+            lambda stepper: stepper.cost,
+        )
+        shown = {
+            stepper.name: surface
+            for group, surfaces in zip(self.groups, drawn)
+            for stepper, surface in zip(group.steppers, surfaces)
+        }
+        return [shown[stepper.name] for stepper in self.steppers]
 
     def _frame(self, drawn: list[ModelSurface]) -> Frame:
         """The present frame, with its surfaces, if any were drawn."""
@@ -233,7 +230,6 @@ class FrameLoop:
             0.0,
             activations=dict(self.activations.here),
             work=dict(zip(carried, (status for _, _, status in found))),
-            neighbours={} if self._sliding is None else dict(self._sliding.pairs),
             tendons=dict(poses.tendons),
             bones={stepper.name: stepper.contacts.bones for stepper in self.steppers},
         )
@@ -270,6 +266,17 @@ def simulate_frames(
             yield loop.advance(coordinates)
         else:
             loop.skip(coordinates)
+
+
+def _group(steppers: list[MuscleStepper], members: list[int], links: list[Link]) -> Group:
+    """Some of the muscles together, in an order of their places: that of the file changes nothing,
+    nor do their names.
+    """
+    place = {m: tuple(steppers[m].model.contact_points().mean(axis=0)) for m in members}
+    ordered = sorted(members, key=place.__getitem__)
+    number = {m: k for k, m in enumerate(ordered)}
+    inner = [(number[a], number[b]) for a, b in links if a in number]
+    return Group([steppers[m] for m in ordered], inner)
 
 
 def _obstacles(scene, models, bone_sdfs):

@@ -47,7 +47,7 @@ def plan_scene(scene: Scene) -> dict[str, object]:
 
 def _count_substeps(muscle: Muscle, scene: Scene, bones: list[str], poses: PoseCache) -> int:
     """Sub-steps in which the motion requires a muscle to be solved."""
-    always = scene.sliding is not None or muscle.contraction is not None
+    always = muscle.contraction is not None
     cut = SubSteps(scene, muscle, bones=bones, poses=poses)
     rigid_transport = RigidTransport(muscle, scene)
     count = 0

@@ -23,7 +23,7 @@ from rbfmuscle.geometry.triangles import BX, CX, CY, INVERSE_BC, INVERSE_CA, nea
 from rbfmuscle.geometry.vectors import to_local
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.options import TunnellingOptions
-from rbfmuscle.simulation.contact import BoneContacts, Planes
+from rbfmuscle.simulation.contact import BoneContacts, Fences
 
 # A path whose directions at the bone, where it goes in and comes out, are within 90 degrees has
 # slid along it.
@@ -128,7 +128,7 @@ def one_sided_planes(
     start: Floats,
     before: Mapping[str, Floats],
     after: Mapping[str, Floats],
-) -> Planes:
+) -> Fences:
     """A half-space for each point that crossed, to hold it on its side of the bone.
 
     The plane lies between the point and the bone, normal to the distance's gradient, and moves with
@@ -138,10 +138,8 @@ def one_sided_planes(
     name, field = bones.names[crossing.bone], bones.fields[crossing.bone]
     motion, points = after[name] @ np.linalg.inv(before[name]), start[crossing.index]
     distance, way = field.distance_and_gradient(to_local(points, before[name]))
-    planes = Planes()
     moved = points @ motion[:3, :3].T + motion[:3, 3]
-    planes.set(crossing.index, distance, way @ after[name][:3, :3].T, moved)
-    return planes
+    return Fences(crossing.index, distance, way @ after[name][:3, :3].T, moved)
 
 
 @loop

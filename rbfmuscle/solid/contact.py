@@ -1,18 +1,6 @@
-"""Contact of a solid with bones: which points are near, the half-spaces they meet, the forces.
+"""What the contact points of a solid meet, and how these yield to forces.
 
-A unit force at contact i along n_i moves contact j along n_j, with the volumes of the regions kept,
-by
-
-    G_ij = (n_i · n_j) s_i A⁻¹ s_j - ρ_i · ρ_j,    ρ_i = Σ_k s_ik n_i · U_k,
-
-the Delassus matrix of the contacts after the Schur complement of the volumes; s_i are the shape
-functions of the point, U the whitened responses to the regions' pressures (`solve.py`). Forces λ
-give every contact the motion z that it needs,
-
-    0 <= λ_i <= λ_max,    (G λ)_i + ε λ_i >= z_i where λ_i < λ_max,    λ_i = 0 where it is greater,
-
-and ε is what a contact yields for a unit force. A contact between two muscles has a row in the
-matrix of each.
+Bones are met with their facets rounded, fences where a point would pass through a bone.
 """
 
 from collections.abc import Sequence
@@ -24,9 +12,9 @@ from rbfmuscle.bones.distance import BoneArrays, Memory, distance_loop
 from rbfmuscle.bones.rounded import RoundedBone, rounded_at
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.loops import loop
+from rbfmuscle.simulation.contact import Fences
 from rbfmuscle.solid.kernels import add_rows
 
-SWEEPS = 200  # of the Gauss-Seidel method, at most
 MOST_ROWS = 800  # contact points whose rows are kept: more are found anew
 
 
@@ -40,37 +28,6 @@ class Touch(NamedTuple):
 
 
 NO_TOUCH = Touch(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)))
-
-
-class Wanted(NamedTuple):
-    """What is asked of the forces of c contacts."""
-
-    point: Integers  # (c,) contact point of the solid
-    source: Integers  # (c,) as in `Touch`
-    normal: Floats  # (c, 3)
-    motion: Floats  # (c,) along the normal that it needs
-    yields: Floats  # (c,) motion for a unit force
-    most: Floats  # (c,) greatest force
-    force: Floats  # (c,) first guess
-
-
-class Rows(NamedTuple):
-    """What unit forces at w contacts do to a solid."""
-
-    normal: Floats  # (w, 3) of the forces
-    motion: Floats  # (w, N) of the nodes, along the force, by A⁻¹
-    soft: Floats  # (w, m) share of the soft modes in it
-    rho: Floats  # (w, M) taken from the whitened pressures
-    delassus: Floats  # (w, w) for the share of a step that is taken
-
-
-class Fences(NamedTuple):
-    """Half-spaces that hold contact points on their side of a bone they would pass through."""
-
-    point: Integers  # (f,)
-    gap: Floats  # (f,) distance of the anchor [scene unit]
-    normal: Floats  # (f, 3) unit
-    anchor: Floats  # (f, 3)
 
 
 NO_FENCES = Fences(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
@@ -292,71 +249,3 @@ class Mobility:
         columns, shares = self.columns[self.points], self.shares[self.points]
         add_rows(columns[first:], shares[first:], self.inverse, self.rows[first:count])
         fill_mobilities(columns, shares, self.rows[:count], first, self.pairs)
-
-
-@loop
-def solve_forces(
-    delassus, start, width, one, row, other, across, wants, yields, most, force, moved, tolerance
-):
-    """Contact forces (c,) of a group of solids, by projected Gauss-Seidel from a first guess.
-
-    ``delassus`` holds the matrices of the solids behind each other: that of solid m, ``width[m]``
-    wide, from ``start[m]`` on. Contact c is row ``row[c]`` of solid ``one[c]``, and row
-    ``across[c]`` of solid ``other[c]`` where that is not -1. It ``wants`` a motion, ``yields`` one
-    for a unit force, and bears ``most``. ``moved`` holds the motions of the rows behind each other,
-    solid m's from Σ width before it on. Returns whether no contact moved by more than the
-    ``tolerance`` in the last sweep.
-    """
-    count = len(wants)
-    moved[:] = 0.0
-    first = np.empty(len(width), np.int64)
-    total = 0
-    for m in range(len(width)):
-        first[m] = total
-        total += width[m]
-    for c in range(count):
-        if force[c] != 0.0:
-            _move_rows(
-                delassus, start[one[c]], width[one[c]], row[c], force[c], moved, first[one[c]]
-            )
-            if other[c] >= 0:
-                _move_rows(
-                    delassus,
-                    start[other[c]],
-                    width[other[c]],
-                    across[c],
-                    force[c],
-                    moved,
-                    first[other[c]],
-                )
-    for _ in range(SWEEPS):
-        largest = 0.0
-        for c in range(count):
-            m = one[c]
-            own = delassus[start[m] + row[c] * width[m] + row[c]]
-            here = moved[first[m] + row[c]]
-            if other[c] >= 0:
-                o = other[c]
-                own += delassus[start[o] + across[c] * width[o] + across[c]]
-                here += moved[first[o] + across[c]]
-            own = own * (1.0 + 1e-7) + yields[c]
-            change = (wants[c] - here - yields[c] * force[c]) / own
-            change = min(max(force[c] + change, 0.0), most[c]) - force[c]
-            if change != 0.0:
-                force[c] += change
-                largest = max(largest, abs(change) * own)
-                _move_rows(delassus, start[m], width[m], row[c], change, moved, first[m])
-                if other[c] >= 0:
-                    o = other[c]
-                    _move_rows(delassus, start[o], width[o], across[c], change, moved, first[o])
-        if largest < tolerance:
-            return True
-    return False
-
-
-@loop
-def _move_rows(delassus, start, width, row, force, moved, first):
-    """Add what a force at one row does to all rows of its solid."""
-    at = start + row * width
-    for k in range(width):
-        moved[first + k] += delassus[at + k] * force

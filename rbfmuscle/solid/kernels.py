@@ -209,24 +209,6 @@ def region_volumes(nodes, slopes, weights, region, y, out):
 
 
 @loop(fastmath={"contract"})
-def carry(columns, shares, nodes, out):
-    """Fill the places (n, 3) of points that are sums of 27 nodes, Σ_k shares_k nodes_k."""
-    for i in range(len(columns)):
-        x = 0.0
-        y = 0.0
-        z = 0.0
-        for k in range(columns.shape[1]):
-            share = shares[i, k]
-            n = columns[i, k]
-            x += share * nodes[n, 0]
-            y += share * nodes[n, 1]
-            z += share * nodes[n, 2]
-        out[i, 0] = x
-        out[i, 1] = y
-        out[i, 2] = z
-
-
-@loop(fastmath={"contract"})
 def carry_steps(which, columns, shares, y, step, push, margin, here, motion, reach):
     """Fill the places (m, 3) of points ``which`` (m,), their ``motion`` (m, 3) in a step (N, 3) of
     the nodes, and how far to look for obstacles (m,): half as far again as they go with the last

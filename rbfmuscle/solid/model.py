@@ -28,6 +28,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.embedding import Embedding
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.solid.kernels import add_rows
 from rbfmuscle.solid.lattice import Embedding as LatticePoints
@@ -89,13 +90,6 @@ class Cells(NamedTuple):
     points: np.ndarray  # (Q, 3) at rest
     region: np.ndarray  # (C,) its region
     volumes: np.ndarray  # (M,) of the regions at rest [scene unit cubed]
-
-
-class Embedding(NamedTuple):
-    """Points of the muscle as sums of 27 of its nodes."""
-
-    columns: np.ndarray  # (n, 27)
-    shares: np.ndarray  # (n, 27) shape functions
 
 
 class SolidModel(NamedTuple):
@@ -383,13 +377,14 @@ def mobility(embedding: Embedding, inverse: Floats) -> Floats:
     out = np.empty(len(embedding.columns))
     rows = np.empty((min(len(out), BLOCK), len(inverse)))
     for first in range(0, len(out), BLOCK):
-        columns, shares = (part[first : first + BLOCK] for part in embedding)
+        part = slice(first, first + BLOCK)
+        columns, shares = embedding.columns[part], embedding.shares[part]
         some = rows[: len(columns)]
         add_rows(columns, shares, inverse, some)
         np.einsum(
             "nk,nk->n",
             shares,
             np.take_along_axis(some, columns, axis=1),
-            out=out[first : first + BLOCK],
+            out=out[part],
         )
     return out

@@ -16,7 +16,6 @@ lifted over each edge. A muscle on a bone has not. So the solid settles with con
 little, on bones whose facets are rounded (`rbfmuscle/bones/rounded.py`): one shape for each pose.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,14 +23,15 @@ from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.solid.contact import (
-    Mobility,
-    Obstacles,
-    Rows,
+from rbfmuscle.geometry.embedding import Embedding, carry
+from rbfmuscle.simulation.touching import (
+    TOLERANCE,
+    Contacts,
     Wanted,
-    fill_mobilities,
-    solve_forces,
+    find_forces,
+    meet,
 )
+from rbfmuscle.solid.contact import Mobility, Obstacles, fill_mobilities
 from rbfmuscle.solid.kernels import (
     ACTIVE,
     DETERMINANT,
@@ -45,15 +45,14 @@ from rbfmuscle.solid.kernels import (
     UPPER,
     WEIGHT,
     add_rows,
-    carry,
     carry_steps,
     local_step,
     pull_apart,
     region_volumes,
 )
-from rbfmuscle.solid.model import Embedding, SolidModel, Stiffness
+from rbfmuscle.solid.material import Material, ask_material
+from rbfmuscle.solid.model import SolidModel, Stiffness
 from rbfmuscle.solid.state import Metric, SolidState, rest_state, tension
-from rbfmuscle.solid.touching import MET, Body, Met, Pair, ask_pair, carried
 
 # All lengths are relative to the muscle's size.
 # A solve ends where its estimated error is below this: the distance of material from where further
@@ -61,7 +60,7 @@ from rbfmuscle.solid.touching import MET, Body, Met, Pair, ask_pair, carried
 ERROR = 2e-5
 LONGEST = 0.2  # a longer step is shortened to it
 GROWTH = 2.0  # a motion beyond this multiple of the least so far restarts the acceleration
-MEMORY = 5  # steps that Anderson acceleration combines
+MEMORY = 20  # steps that Anderson acceleration combines
 # Iterations in which the motion has not halved, after which steps are plain until it has: where a
 # muscle slips over an edge of a bone, accelerated ones go round in circles.
 STALLED = 12
@@ -74,11 +73,7 @@ LOOKED_AT = (
 NEAR = 0.015  # contact points nearer to an obstacle take part in a solve
 STALE = 0.4  # share of NEAR by which a node moves before they are chosen again
 MARGIN = 0.003  # obstacles are looked for beyond where a point goes by this
-TOLERANCE = 2e-5  # violation of a contact that a lift leaves
-PRECISE = 1e-7  # error of the gaps for which contact forces are found
 YIELDING = 1e-4  # how far a contact yields under a pressure of 2 μ
-BATCH = 48  # contacts that join those with a force in one iteration, the deepest first
-ROUNDS = 10  # in which contacts join those that bear a force, in an iteration
 LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
 # Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in
 # volume, by a share of pressure / bulk modulus. With 50, Poisson's ratio 0.495, muscles of the leg
@@ -101,7 +96,7 @@ TURNED_WAY = 0.03
 LEAST, STIFFNESS = 0.5, 100.0
 
 
-NO_FEET = Embedding(np.zeros((0, 27), dtype=np.int64), np.zeros((0, 27)))
+ACTS = np.ones(1, dtype=np.bool_)
 
 
 class Report(NamedTuple):
@@ -117,6 +112,26 @@ class Report(NamedTuple):
     error: float
     volume_error: float
     caps: tuple[str, ...]
+
+
+class SolidRows(NamedTuple):
+    """What unit forces at w contacts do to a solid."""
+
+    metric: Metric
+    part: float  # of a full step that is taken
+    normal: Floats  # (w, 3) of the forces
+    direct: Floats  # (w, N) motion of the nodes, along the force, by A⁻¹
+    soft: Floats  # (w, m) share of the soft modes in it
+    rho: Floats  # (w, M) taken from the whitened pressures
+    delassus: Floats  # (w, w) for the share of a step that is taken
+
+    def motion(self, force: Floats) -> Floats:
+        """Motion (N, 3) of the nodes by contact forces (w,), volumes kept."""
+        return self.part * (
+            self.direct.T @ (force[:, None] * self.normal)
+            + self.metric.soft @ (force @ self.soft)
+            - self.metric.response @ (force @ self.rho)
+        )
 
 
 class Mixer:
@@ -182,6 +197,8 @@ class Settling:
         Way to the equilibrium over a step at the end of a solve, at least (`find_slowness`).
     error : float, optional
         Of the muscle's size, below which the solve ends; `ERROR` where it is not given.
+    material : Material, optional
+        What others ask that meet it.
     """
 
     def __init__(
@@ -194,29 +211,35 @@ class Settling:
         *,
         slowness: float = 1.0,
         error: float | None = None,
+        material: Material | None = None,
     ) -> None:
         self.model = model
+        self.size = model.size
+        self.material = material
         self.stiffness = stiffness
         self.mobility = mobility
         self.state = state
         self.obstacles = obstacles
         self.tension = tension(model, state.anchors)
         self.springs = model.springs @ state.anchors
-        self.y = state.nodes.copy()
+        self.nodes = state.nodes.copy()
         self.pressure = state.pressures.copy()
         count = len(model.cells.volumes)
         self.work = start_work(model, state)
         self.squeezed = np.zeros(len(model.cells.weights), dtype=np.bool_)
-        self.right = np.empty_like(self.y)
-        self.gradient = np.empty((count, 3, len(self.y)))
+        self.right = np.empty_like(self.nodes)
+        self.gradient = np.empty((count, 3, len(self.nodes)))
         self.volumes = np.empty(count)
         self.iterations = 0
         self.error = np.inf
         self.residual = np.inf
         self.part = 1.0  # of a full step that is taken
+        self.asleep = False
+        self._free: tuple[Floats, Floats]
+        self._asked: Wanted
         self.caps: set[str] = set()
         self.forces_capped = False
-        self.mixer = Mixer(self.y.size, self.y.size + len(self.pressure))
+        self.mixer = Mixer(self.nodes.size, self.nodes.size + len(self.pressure))
         self._least = np.inf
         self._halved = (np.inf, 0)
         self.softened = True
@@ -227,7 +250,7 @@ class Settling:
             self._renew_metric()
         else:
             self.metric = state.metric
-            self._metric_y = self.y.copy()
+            self._metric_y = self.nodes.copy()
         sources = obstacles.count
         forces = state.forces
         self.forces = (
@@ -242,7 +265,7 @@ class Settling:
             cells.nodes,
             cells.slopes,
             cells.region,
-            self.y,
+            self.nodes,
             self.tension,
             self.work,
             self.right,
@@ -264,22 +287,23 @@ class Settling:
     def _choose_near(self) -> None:
         """Choose the contact points near an obstacle."""
         points = np.empty_like(self.state.points)
-        carry(*self.model.embedding, self.y, points)
+        carry(*self.model.embedding, self.nodes, points)
         self.near = self.obstacles.find_near(points, NEAR * self.model.size)
-        self._near_y = self.y.copy()
-        self._push = np.zeros_like(self.y)
+        self._near_y = self.nodes.copy()
+        self._push = np.zeros_like(self.nodes)
 
-    def free_step(self, extra: Floats | float = 0.0) -> None:
-        """The global step, with the volumes corrected, as if there were no contact; ``extra``
-        (N, 3) are forces on the nodes from elsewhere.
-        """
+    def free_step(self) -> None:
+        """The global step, with the volumes corrected, as if there were no contact."""
+        if self.asleep:
+            self.step, self.change = self._free[0].copy(), self._free[1].copy()
+            return
         model, metric = self.model, self.metric
         highest = np.abs(self.pressure).max(initial=0.0)
         self.part = 1.0 / max(1.0, highest / CALM_PRESSURE)
         flat = self.gradient.reshape(len(self.volumes), -1)
         pressed = (self.pressure @ flat).reshape(3, -1).T
-        force = self.right + self.springs + pressed + extra
-        force -= metric.matrix @ self.y
+        force = self.right + self.springs + pressed
+        force -= metric.matrix @ self.nodes
         free = self.part * yielded(metric, force)
         rest = model.cells.volumes
         # What contacts take from the pressures is found with the metric's gradients: with others
@@ -288,44 +312,66 @@ class Settling:
         lacking = rest * (1.0 - self.pressure / BULK) - self.volumes - adds
         self.change = metric.whiten @ lacking
         self.step = free + metric.response @ self.change
+        self._free = self.step.copy(), self.change.copy()
 
     def meet(self) -> Wanted:
         """The contacts with obstacles within reach, and what they want after the free step."""
+        if self.asleep:
+            return self._asked
         size = self.model.size
         count = len(self.near)
         here, motion, reach = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
-        nodes = self.y, self.step, self._push
+        nodes = self.nodes, self.step, self._push
         carry_steps(self.near, *self.model.embedding, *nodes, MARGIN * size, here, motion, reach)
         found = self.obstacles.meet(self.near, here, reach)
-        wants = -found.gap - np.einsum("ca,ca->c", found.normal, motion[found.near])
         point = self.near[found.near]
-        force = self.forces[point, found.source]
-        count = len(point)
-        return Wanted(
+        most, softness = self.bearing(point, self.model.area)
+        self._asked = Wanted(
             point,
             found.source,
             found.normal,
-            wants,
-            np.full(count, YIELDING * size / self.model.area),
-            self.stiffness.most[point],
-            force,
+            -found.gap - np.einsum("ca,ca->c", found.normal, motion[found.near]),
+            np.full(len(point), softness),
+            most,
+            self.forces[point, found.source],
         )
+        return self._asked
 
-    def lacking(self, asked: Wanted, push: Floats) -> Floats:
-        """Motion (c,) that contacts still want after a push (N, 3) of the nodes."""
-        columns, shares = (part[asked.point] for part in self.model.embedding)
-        moved = carried(columns, shares, push)
-        return np.asarray(asked.motion - np.einsum("ca,ca->c", asked.normal, moved))
+    def bearing(self, points: Integers, area: Floats | float) -> tuple[Floats, Floats | float]:
+        """Greatest force (k,) at contact points that stand for an area each, and how far these
+        yield to a unit force.
+        """
+        most = area / self.model.area * self.stiffness.most[points]
+        return most, YIELDING * self.model.size / area
 
-    def rows_of(self, points: Integers, normal: Floats, feet: Embedding = NO_FEET) -> Rows:
+    def feet_of(self, points: Integers) -> Embedding:
+        """Contact points (w,) as sums of nodes."""
+        return self.model.embedding.some(points)
+
+    def ask(self, points: Floats, place: Floats) -> tuple[Floats, Floats, Embedding]:
+        """Gaps (k,) of points (k, 3) to this muscle, their normals (k, 3) and feet; the search
+        begins from ``place`` (k, 3), which is brought up to date.
+        """
+        assert self.material is not None
+        count = len(points)
+        gap, normal = np.empty(count), np.empty((count, 3))
+        feet = Embedding(np.zeros((count, 27), dtype=np.int64), np.zeros((count, 27)))
+        ask_material(self.material, self.nodes, points, place, gap, normal, *feet)
+        return gap, normal, feet
+
+    def rows_of(
+        self, points: Integers, normal: Floats, feet: Embedding | None = None
+    ) -> "SolidRows":
         """What unit forces along ``normal`` (w, 3) at contact points, and behind them at other
         ``feet`` in the material, do to the solid.
         """
         slots = self.mobility.find(points)
         known = len(slots)
-        columns = np.concatenate([self.model.embedding.columns[points], feet.columns])
-        shares = np.concatenate([self.model.embedding.shares[points], feet.shares])
-        count, nodes = len(columns), len(self.y)
+        columns, shares = self.model.embedding.some(points)
+        if feet is not None:
+            columns = np.concatenate([columns, feet.columns])
+            shares = np.concatenate([shares, feet.shares])
+        count, nodes = len(columns), len(self.nodes)
         motion, pairs = np.empty((count, nodes)), np.empty((count, count))
         motion[:known] = self.mobility.rows[slots]
         pairs[:known, :known] = self.mobility.pairs[np.ix_(slots, slots)]
@@ -337,53 +383,53 @@ class Settling:
             for part in (self.metric.response, self.metric.soft)
         )
         delassus = (normal @ normal.T) * pairs + soft @ soft.T - rho @ rho.T
-        return Rows(normal, motion, soft, rho, self.part * delassus)
+        return SolidRows(self.metric, self.part, normal, motion, soft, rho, self.part * delassus)
 
-    def moved_by(self, rows: Rows, force: Floats) -> Floats:
-        """Motion (N, 3) of the nodes by contact forces (w,), volumes kept."""
-        return (
-            rows.motion.T @ (force[:, None] * rows.normal)
-            + self.metric.soft @ (force @ rows.soft)
-            - self.metric.response @ (force @ rows.rho)
-        )
-
-    def push(self, push: Floats, taken: Floats) -> None:
-        """Add a motion (N, 3) by contact to the step, which ``taken`` (M,) from the whitened
-        pressures.
+    def push(self, motion: Floats | None, rows: "SolidRows", force: Floats, asked: Wanted) -> None:
+        """Add the motion (N, 3) by contact forces (w,) to the step, and keep those with
+        obstacles.
         """
-        self._push = push
-        self.step += push
-        self.change -= taken
+        self._push = np.zeros_like(self.nodes) if motion is None else motion
+        if motion is not None:
+            self.step += motion
+            self.change -= self.part * (force @ rows.rho)
+        self.forces[:] = 0.0
+        self.forces[asked.point, asked.source] = asked.force
 
     def advance(self) -> None:
         """Go on to where the next iteration starts from, and estimate the error there."""
         size = self.model.size
-        self.iterations += 1
-        pressure = self.pressure + self.metric.whiten.T @ self.change / self.part
-        pressure = np.clip(pressure, -MOST_PRESSURE, MOST_PRESSURE)
         moved = self._way(self.step)
         if not np.isfinite(moved):
             raise FloatingPointError("the solid does not settle")
+        if self.asleep:
+            near = moved * self.slowness < self.wanted * self.part * size
+            if near or self.iterations >= self.model.iterations:
+                return
+            self.asleep = False
+        self.iterations += 1
+        pressure = self.pressure + self.metric.whiten.T @ self.change / self.part
+        pressure = np.clip(pressure, -MOST_PRESSURE, MOST_PRESSURE)
         self.residual = moved / self.part / size
         if moved > GROWTH * self._least or moved > LONGEST * size:
             self.mixer.restart()
         self._least = moved if moved > GROWTH * self._least else min(self._least, moved)
         if moved < 0.5 * self._halved[0]:
             self._halved = (moved, self.iterations)
-        here = np.concatenate([self.y.ravel(), self.pressure])
-        plain = np.concatenate([(self.y + self.step).ravel(), pressure])
+        here = np.concatenate([self.nodes.ravel(), self.pressure])
+        plain = np.concatenate([(self.nodes + self.step).ravel(), pressure])
         stalled = self.iterations - self._halved[1] >= STALLED
         if stalled:
             self.mixer.restart()
         mixed = self.mixer.mix(here, plain)
         way = mixed - here
-        far = self._way(way[: self.y.size].reshape(-1, 3))
+        far = self._way(way[: self.nodes.size].reshape(-1, 3))
         self.error = self._estimate(moved) / self.part / size
         way *= min(1.0, LONGEST * size / max(far, 1e-300))
-        self.y = (here + way)[: self.y.size].reshape(-1, 3)
-        self.pressure = (here + way)[self.y.size :]
+        self.nodes = (here + way)[: self.nodes.size].reshape(-1, 3)
+        self.pressure = (here + way)[self.nodes.size :]
         joined = self._localise()
-        far = np.abs(self.y - self._metric_y).max() > TURNED_WAY * size
+        far = np.abs(self.nodes - self._metric_y).max() > TURNED_WAY * size
         if stalled and self.softened:
             # Where a solid buckles, soft modes are not what they are at rest.
             self.softened = False
@@ -391,8 +437,11 @@ class Settling:
             joined = True
         if joined or far:
             self._renew_metric()
-        if np.abs(self.y - self._near_y).max() > STALE * NEAR * size:
+        if np.abs(self.nodes - self._near_y).max() > STALE * NEAR * size:
             self._choose_near()
+        if self.iterations >= self.model.iterations and self.error >= self.wanted:
+            self.caps.add("iterations")
+        self.asleep = self.error < self.wanted or self.iterations >= self.model.iterations
 
     def _way(self, motion: Floats) -> float:
         """How far material goes, about, when nodes move (N, 3): nodes that hold none settle slowly,
@@ -429,17 +478,8 @@ class Settling:
         modes = self.stiffness.soft if self.softened else self.stiffness.soft[:, :, :0]
         modes = turned_modes(self.model, modes, self.work)
         self.metric = find_metric(self.model, self.gradient, matrix, inverse, modes)
-        self._metric_y = self.y.copy()
+        self._metric_y = self.nodes.copy()
         self.mixer.restart()
-
-    def has_ended(self) -> bool:
-        """Whether the error is below what is wanted, or all iterations are done."""
-        if self.error < self.wanted:
-            return True
-        if self.iterations >= self.model.iterations:
-            self.caps.add("iterations")
-            return True
-        return False
 
     def report(self) -> Report:
         """How the solve ended."""
@@ -460,34 +500,15 @@ class Settling:
         if left:
             self.caps.add("lifts")
         return self.state._replace(
-            nodes=self.y,
+            nodes=self.nodes,
             lifted_nodes=nodes,
-            points=carried(*self.model.embedding, nodes),
+            points=self.model.embedding.of(nodes),
             rotations=rows[:, ROTATION : ROTATION + 4].swapaxes(1, 2).reshape(-1, 4).copy(),
             stretches=rows[:, STRETCH].ravel().copy(),
             pressures=self.pressure,
             forces=self.forces,
             metric=None if self.squeezed.any() or not self.softened else self.metric,
         )
-
-
-def settle(
-    solids: Sequence[Settling], pairs: Sequence[Pair] = (), bodies: Sequence[Body] = ()
-) -> None:
-    """Iterate solids that may touch each other until the error of each is below `ERROR`, or the
-    greatest number of iterations is reached.
-
-    ``pairs`` hold the points of the ``bodies``, one for each solid, that may meet; they keep their
-    forces. Raises FloatingPointError where a solid diverges.
-    """
-    while True:
-        for solid in solids:
-            solid.free_step()
-        meet(solids, pairs, bodies)
-        for solid in solids:
-            solid.advance()
-        if all([solid.has_ended() for solid in solids]):
-            return
 
 
 def find_slowness(model: SolidModel, stiffness: Stiffness, mobility: Mobility) -> float:
@@ -506,214 +527,9 @@ def find_slowness(model: SolidModel, stiffness: Stiffness, mobility: Mobility) -
     solid = Settling(model, stiffness, mobility, state, nothing)
     for _ in range(SHAKES):
         solid.free_step()
-        meet([solid])
+        meet([solid], ACTS)
         solid.advance()
     return solid.slowness
-
-
-def meet(
-    solids: Sequence[Settling], pairs: Sequence[Pair] = (), bodies: Sequence[Body] = ()
-) -> None:
-    """Find the contact forces of solids that have made a free step, and push them.
-
-    The working set starts from the contacts that bore a force and takes in the deepest violations
-    until none is left.
-    """
-    asked = [solid.meet() for solid in solids]
-    met = meet_pairs(solids, pairs, bodies) if pairs else []
-    tolerance = PRECISE * min(solid.model.size for solid in solids)
-    chosen = [deepest(one.motion, one.force, tolerance) for one in asked]
-    for _ in range(ROUNDS):
-        wanted = [pick(one, some) for one, some in zip(asked, chosen, strict=True)]
-        rows = _rows(solids, wanted, met, bodies)
-        force, found = find_forces(wanted, met, rows, tolerance)
-        pushes = _pushes(solids, wanted, met, rows, force)
-        added = False
-        first = 0
-        for m, (solid, one) in enumerate(zip(solids, asked, strict=True)):
-            one.force[:] = 0.0
-            one.force[chosen[m]] = force[first : first + len(chosen[m])]
-            first += len(chosen[m])
-            lacks = solid.lacking(one, pushes[m][0])
-            lacks[chosen[m]] = -np.inf
-            more = deepest(lacks, np.zeros(len(lacks)), TOLERANCE * solid.model.size)
-            added |= len(more) > 0
-            chosen[m] = np.union1d(chosen[m], more)
-        if not added:
-            break
-    _keep_forces(solids, wanted, met, force)
-    for solid, (push, taken) in zip(solids, pushes, strict=True):
-        solid.push(push, taken)
-        solid.forces_capped = not found or added
-
-
-def pick(asked: Wanted, chosen: Integers) -> Wanted:
-    """Some of the contacts."""
-    return Wanted(
-        asked.point[chosen],
-        asked.source[chosen],
-        asked.normal[chosen],
-        asked.motion[chosen],
-        asked.yields[chosen],
-        asked.most[chosen],
-        asked.force[chosen],
-    )
-
-
-def _rows(
-    solids: Sequence[Settling], wanted: Sequence[Wanted], met: Sequence[Met], bodies: Sequence[Body]
-) -> list[Rows]:
-    """What unit forces at all contacts do to each solid: with obstacles, at its points that meet
-    others, and at the feet of others' points in it.
-    """
-    rows = []
-    for m, (solid, own) in enumerate(zip(solids, wanted, strict=True)):
-        points, normals = [own.point], [own.normal]
-        feet = [NO_FEET]
-        behind = []
-        for one in met:
-            chosen, pair = one.chosen, one.pair
-            if pair.one == m:
-                points.append(bodies[m].points[pair.which[chosen]])
-                normals.append(pair.normal[chosen])
-            elif pair.other == m:
-                feet.append(Embedding(pair.columns[chosen], pair.shares[chosen]))
-                behind.append(-pair.normal[chosen])
-        rows.append(
-            solid.rows_of(
-                np.concatenate(points),
-                np.concatenate([*normals, *behind]),
-                Embedding(*map(np.concatenate, zip(*feet, strict=True))),
-            )
-        )
-    return rows
-
-
-def meet_pairs(
-    solids: Sequence[Settling], pairs: Sequence[Pair], bodies: Sequence[Body]
-) -> list[Met]:
-    """The contacts between solids that bear a force or would be violated by their free steps."""
-    points = []
-    steps = []
-    for solid, body in zip(solids, bodies, strict=True):
-        embedding = Embedding(*(part[body.points] for part in solid.model.embedding))
-        points.append(carried(*embedding, solid.y))
-        steps.append(carried(*embedding, solid.step))
-    met = []
-    for pair in pairs:
-        body, solid, other = bodies[pair.one], solids[pair.one], solids[pair.other]
-        ask_pair(pair, bodies[pair.other].material, other.y, points[pair.one])
-        foot = carried(pair.columns, pair.shares, other.step)
-        relative = steps[pair.one][pair.which] - foot
-        wants = -pair.gap - pair.allowed - np.einsum("ka,ka->k", pair.normal, relative)
-        size = min(body.size, bodies[pair.other].size)
-        reached = pair.gap < MET * size
-        chosen = deepest(np.where(reached, wants, -np.inf), pair.force, PRECISE * size)
-        pair.force[~np.isfinite(pair.gap)] = 0.0
-        chosen = chosen[np.isfinite(pair.gap[chosen])]
-        softness = np.full(len(chosen), YIELDING * size / body.area)
-        share = body.area / solid.model.area
-        most = share * solid.stiffness.most[body.points[pair.which[chosen]]]
-        met.append(Met(pair, chosen, wants[chosen], softness, most))
-    return met
-
-
-def deepest(wants: Floats, force: Floats, least: float) -> Integers:
-    """Which contacts bear a force, and the `BATCH` others that want the longest way, more than the
-    ``least``; in order.
-    """
-    bears = force > 0.0
-    lacking = np.flatnonzero((wants > least) & ~bears)
-    if len(lacking) > BATCH:
-        lacking = lacking[np.argsort(-wants[lacking], kind="stable")[:BATCH]]
-    return np.sort(np.concatenate([np.flatnonzero(bears), lacking]))
-
-
-def find_forces(
-    wanted: Sequence[Wanted], met: Sequence[Met], rows: Sequence[Rows], tolerance: float
-) -> tuple[Floats, bool]:
-    """Forces of all contacts, those of each solid with its obstacles and then those of the pairs;
-    and whether they were found to the tolerance.
-    """
-    one, row, other, across = [], [], [], []
-    behind = [len(own.point) for own in wanted]
-    for m, own in enumerate(wanted):
-        count = len(own.point)
-        one.append(np.full(count, m))
-        row.append(np.arange(count))
-        other.append(np.full(count, -1))
-        across.append(np.full(count, -1))
-    feet = list(behind)
-    for contact in met:
-        feet[contact.pair.one] += len(contact.chosen)
-    for contact in met:
-        count, pair = len(contact.chosen), contact.pair
-        one.append(np.full(count, pair.one))
-        row.append(behind[pair.one] + np.arange(count))
-        other.append(np.full(count, pair.other))
-        across.append(feet[pair.other] + np.arange(count))
-        behind[pair.one] += count
-        feet[pair.other] += count
-    width = np.array([len(part.normal) for part in rows])
-    start = np.concatenate([[0], np.cumsum(width**2)[:-1]])
-    force = np.concatenate([*(w.force for w in wanted), *(c.pair.force[c.chosen] for c in met)])
-    found = solve_forces(
-        np.concatenate([part.delassus.ravel() for part in rows]),
-        start,
-        width,
-        *(np.concatenate(part) for part in (one, row, other, across)),
-        np.concatenate([*(w.motion for w in wanted), *(c.motion for c in met)]),
-        np.concatenate([*(w.yields for w in wanted), *(c.yields for c in met)]),
-        np.concatenate([*(w.most for w in wanted), *(c.most for c in met)]),
-        force,
-        np.empty(int(width.sum())),
-        tolerance,
-    )
-    return force, found
-
-
-def _pushes(
-    solids: Sequence[Settling],
-    wanted: Sequence[Wanted],
-    met: Sequence[Met],
-    rows: Sequence[Rows],
-    force: Floats,
-) -> list[tuple[Floats, Floats]]:
-    """Motion (N, 3) of the nodes of each solid by the forces of `find_forces`, and what these take
-    from its whitened pressures.
-    """
-    first = 0
-    own: list[list[Floats]] = []
-    feet: list[list[Floats]] = [[] for _ in solids]
-    for one in wanted:
-        own.append([force[first : first + len(one.point)]])
-        first += len(one.point)
-    for contact in met:
-        some = force[first : first + len(contact.chosen)]
-        own[contact.pair.one].append(some)
-        feet[contact.pair.other].append(some)
-        first += len(contact.chosen)
-    out = []
-    for m, solid in enumerate(solids):
-        strength = np.concatenate([*own[m], *feet[m]])
-        taken = solid.part * (strength @ rows[m].rho)
-        out.append((solid.part * solid.moved_by(rows[m], strength), taken))
-    return out
-
-
-def _keep_forces(
-    solids: Sequence[Settling], wanted: Sequence[Wanted], met: Sequence[Met], force: Floats
-) -> None:
-    """Keep the forces of `find_forces` for the next iteration."""
-    first = 0
-    for solid, one in zip(solids, wanted, strict=True):
-        solid.forces[:] = 0.0
-        solid.forces[one.point, one.source] = force[first : first + len(one.point)]
-        first += len(one.point)
-    for contact in met:
-        contact.pair.force[:] = 0.0
-        contact.pair.force[contact.chosen] = force[first : first + len(contact.chosen)]
-        first += len(contact.chosen)
 
 
 def lifted(solid: Settling) -> tuple[Floats, bool]:
@@ -721,7 +537,7 @@ def lifted(solid: Settling) -> tuple[Floats, bool]:
     whether some may be left all the same.
     """
     model, size = solid.model, solid.model.size
-    y, metric = solid.y, solid.metric
+    y, metric = solid.nodes, solid.metric
     solid.part = 1.0  # a lift is a whole step
     settled = np.empty(len(model.cells.volumes))
     volumes = np.empty_like(settled)
@@ -738,8 +554,12 @@ def lifted(solid: Settling) -> tuple[Floats, bool]:
         zero = np.zeros(len(point))
         wanted = Wanted(point, touch.source, touch.normal, -touch.gap, zero, zero + np.inf, zero)
         rows = solid.rows_of(point, touch.normal)
-        force, _ = find_forces([wanted], [], [rows], 0.1 * TOLERANCE * size)
-        y = y + solid.moved_by(rows, force)
+        every = np.arange(len(point))
+        met = Contacts(wanted, solid.feet_of(point))
+        force, _ = find_forces(
+            {0: met}, {0: every}, None, every[:0], {0: rows}, 0.1 * TOLERANCE * size
+        )
+        y = y + rows.motion(force[0])
         # A push keeps the volumes to first order.
         region_volumes(cells.nodes, cells.slopes, cells.weights, cells.region, y, volumes)
         y = y + metric.response @ (metric.whiten @ (settled - volumes))

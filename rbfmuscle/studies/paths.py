@@ -81,7 +81,7 @@ def sample_muscles(
     are added to the list ``found``, after an interrupt those of the poses that are done.
     """
     scene = require_complete(scene).with_options({"output.fibres": fibres})
-    scene.sliding = None
+    scene.neighbours = None
     found = [] if found is None else found
     held = {name: low for name, (low, high) in given.items() if low == high}
     groups = _groups(scene, held)
@@ -223,15 +223,17 @@ def _settled(loop, gauges, pose):
     """Lengths (n,) when the muscles rest at a pose, or have had `MOST_SOLVES`: an event."""
     loop.skip(pose)
     with loop.working():
-        each(lambda stepper: _settle(stepper, loop.here), loop.steppers)
+        each(lambda group: _settle(group, loop.here), loop.groups)
     return gauges.lengths([stepper.model for stepper in loop.steppers], loop.here)
 
 
-def _settle(stepper, here):
+def _settle(group, here):
+    """Solve a muscle, alone as neighbours are off, until it rests."""
+    (stepper,) = group.steppers
     points = stepper.model.contact_points().copy()
     small = SETTLED * box_size(points)
     for _ in range(MOST_SOLVES):
-        stepper.solve(dict(here))
+        group.solve(dict(here))
         before, points = points, stepper.model.contact_points().copy()
         if np.abs(points - before).max() <= small:
             return

@@ -16,7 +16,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar, TypedDict
+from typing import TYPE_CHECKING, Any, ClassVar, TypedDict
 
 import numpy as np
 from pydantic import BaseModel
@@ -623,7 +623,10 @@ def measure_point(
                 pose = " ".join(f"{key}={round(value, 9) + 0.0:.9f}" for key, value in at) or "rest"
                 shown[f"{pose}|{name}"] = surface.vertices, surface.faces
             if point.role == "reference":
-                arrays = {f"{place}|{k}": mesh[k] for place, mesh in shown.items() for k in (0, 1)}
+                # Of NumPy's keywords none is among the keys.
+                arrays: dict[str, Any] = {
+                    f"{place}|{k}": mesh[k] for place, mesh in shown.items() for k in (0, 1)
+                }
                 fresh = folder.references / f".{point.key}.{os.getpid()}.npz"
                 np.savez_compressed(fresh, **arrays)
                 os.replace(fresh, folder.surfaces(point.key))

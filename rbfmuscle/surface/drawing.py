@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.point_grid import PointGrid
-from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.scene.objects import Muscle
@@ -161,9 +160,6 @@ class SurfaceBuilder:
             sheet = Sheet.at(sheet.carried)
             fill_material(shown, bones, sheet)
         sheet.suspect[self._meeting(centres)] = True
-        if contacts.beside:
-            inwards = vertex_normals(sheet.vertices, shown.faces)
-            sheet.displace(-contacts.excess(sheet.vertices)[:, None] * inwards)
         change, crossing = finish(shown, bones, sheet)
         if not np.isfinite(change) or not np.isfinite(sheet.vertices).all():
             raise SolveError(

@@ -96,7 +96,7 @@ class TestRun:
 
     def test_one_muscle_alone(self, folder, tmp_path, capsys):
         command = ("run", "phantom", "-o", tmp_path / "o", "--model", "pbd", "--frames", "0:1")
-        code, _, _ = call(capsys, *command, "--muscles", "extensor", "--set", "sliding.threshold=2")
+        code, _, _ = call(capsys, *command, "--muscles", "extensor", "--set", "neighbours=false")
         info = json.loads((tmp_path / "o" / "run.json").read_text(encoding="utf-8"))
         assert code == 0 and list(info["muscles"]) == ["extensor"] and info["kernels"] == {}
         code, _, err = call(capsys, *command, "--muscles", "extensor,abducto")

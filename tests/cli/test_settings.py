@@ -21,7 +21,7 @@ from rbfmuscle.scene.settings import HEADS
 PAIRS = [["biceps", "brachialis"]]
 TABLES = {
     "contact": (options.ContactOptions, {"initial": "error", "substep_angle": 4.0}),
-    "sliding": (options.SlidingOptions, {"threshold": 1.5, "bones": True, "pairs": PAIRS}),
+    "neighbours": (options.NeighbourOptions, {"pairs": PAIRS}),
     "detect.tunnelling": (
         options.TunnellingOptions,
         {"angle": 120.0, "action": "report"},

@@ -17,6 +17,7 @@ from contraction_scenes import (
     with_frames,
 )
 from peers.known_scenes import Bar
+from toy_scene import solve
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
@@ -75,7 +76,7 @@ def test_snapshot_holds_the_activation():
 
     def solved():
         model.predict(contacts.poses, contacts.poses)
-        model.solve(contacts)
+        solve(model, contacts)
         return model.contact_points()
 
     model.activate(0.5)

@@ -31,18 +31,24 @@ def test_the_second_stage_of_an_item_follows_its_first(threads):
         assert item in begun
         return item * item
 
-    costs = [(float(k % 3), float(k % 5)) for k in range(40)]
-    assert in_stages(begun.add, second, range(40), costs) == [k * k for k in range(40)]
+    groups = [[k] if k % 3 else [k, k + 40] for k in range(40)]
+
+    def first(number):
+        begun.update(groups[number])
+
+    wanted = [[item * item for item in group] for group in groups]
+    assert in_stages(first, second, groups, lambda item: (item % 3, item % 5)) == wanted
 
 
 def test_what_has_most_left_to_do_goes_first():
     order = []
     with threads_limited(1):
+        costs = {"a": (1.0, 2.0), "b": (5.0, 4.0), "c": (1.0, 4.5)}
         in_stages(
-            lambda item: order.append((1, item)),
+            lambda number: order.append((1, "abc"[number])),
             lambda item: order.append((2, item)),
             "abc",
-            [(1.0, 2.0), (5.0, 4.0), (1.0, 4.5)],
+            costs.get,
         )
     assert order == [(1, "b"), (1, "c"), (2, "c"), (2, "b"), (1, "a"), (2, "a")]
 
@@ -52,8 +58,8 @@ def test_two_threads_draw_one_item_while_another_is_solved():
         pytest.skip("one processor")
     solving, drawn = threading.Event(), threading.Event()
 
-    def first(item):
-        if item == "slow":
+    def first(number):
+        if number == 0:
             solving.set()
             assert drawn.wait(60.0)
 
@@ -62,7 +68,7 @@ def test_two_threads_draw_one_item_while_another_is_solved():
             assert solving.wait(60.0)
             drawn.set()
 
-    in_stages(first, second, ["slow", "quick"], [(9.0, 1.0), (1.0, 1.0)])
+    in_stages(first, second, [["slow"], ["quick"]], {"slow": (9, 1), "quick": (1, 1)}.get)
 
 
 def test_an_error_is_raised_when_nothing_is_being_worked_on(threads):
@@ -71,7 +77,7 @@ def test_an_error_is_raised_when_nothing_is_being_worked_on(threads):
             raise ValueError("third")
 
     with pytest.raises(ValueError, match="third"):
-        in_stages(lambda item: None, second, range(20), [(1.0, 1.0)] * 20)
+        in_stages(lambda number: None, second, [[k] for k in range(20)], lambda item: (1.0, 1.0))
 
 
 def _blas_threads():

@@ -105,6 +105,7 @@ def test_overlap_is_that_of_a_literal_search_and_the_same_for_both_orders():
 def test_every_run_measures_neighbours_and_its_verdict_counts_them():
     scene = phantom_scene(end=36.0, step=12.0)
     scene.muscles = [scene.muscle(name) for name in ("extensor", "abductor")]
+    scene.neighbours = None
     run = simulate(scene, model="pbd")
     for name in ("extensor", "abductor"):
         values = run.values(name, "neighbour_overlap_max")
@@ -129,7 +130,7 @@ def test_what_is_cut_away_in_the_drawing_stays_an_overlap_of_the_material():
             middle = self.x.mean(axis=0)
             return ModelSurface(middle + 0.8 * (self.x - middle), self.faces, {})
 
-    made, fields = toy.neighbour_scene([{}, {"press": 4.0}], gap=0.2, sliding=None)
+    made, fields = toy.neighbour_scene([{}, {"press": 4.0}], gap=0.2, neighbours=None)
     models = [Trimmed(muscle, made, sweeps=4, reach=2.0) for muscle in made.muscles]
     measures = MuscleMeasures(made, {model.name: model.material_mesh() for model in models})
     frames = simulate_frames(made, models, bone_sdfs=fields)
@@ -142,8 +143,8 @@ def test_what_is_cut_away_in_the_drawing_stays_an_overlap_of_the_material():
 
 
 def test_check_lists_muscles_whose_meshes_overlap():
-    made, _ = toy.neighbour_scene([{}], gap=-1.0, sliding=None)
+    made, _ = toy.neighbour_scene([{}], gap=-1.0, neighbours=None)
     (said,) = [f for f in check_scene(made) if f.place == "lower and upper"]
     assert said.level == "note" and "overlap by 0.998 mm" in said.message
-    apart, _ = toy.neighbour_scene([{}], gap=1.0, sliding=None)
+    apart, _ = toy.neighbour_scene([{}], gap=1.0, neighbours=None)
     assert not [f for f in check_scene(apart) if f.place == "lower and upper"]

@@ -8,7 +8,7 @@ from toy_scene import ToyMuscle, attach, box, ellipsoid, muscle, scene, sphere
 
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.scene.joints.joint import rotation_about
-from rbfmuscle.simulation.contact import BoneContacts, BonesInReach, Planes
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach, Fences
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.stepper import MuscleStepper, keep_initial_overlap
 
@@ -52,16 +52,15 @@ def test_half_spaces_are_all_pairs_nearer_than_reach(reach):
         points = points + rng.normal(size=points.shape) * 0.4
 
 
-def test_planes_of_neighbours_come_behind_those_of_bones():
+def test_fences_come_behind_bones():
     contacts, _ = _pair()
     points, rng = _points(), np.random.default_rng(4)
     bones = len(contacts.half_spaces(points, 0.5).point)
-    contacts.neighbours = [Planes(), Planes(3.0)]
     wanted = []
-    for kind, planes in enumerate(contacts.neighbours):
+    for _ in range(2):
         at, gap = rng.permutation(400)[:60], rng.normal(size=60)
-        planes.set(at, gap, rng.normal(size=(60, 3)), points[at])
-        wanted += [(i, -1 - kind, g) for i, g in zip(at, gap) if g < 0.5]
+        contacts.fences.append(Fences(at, gap, rng.normal(size=(60, 3)), points[at]))
+        wanted += [(i, -1, g) for i, g in zip(at, gap) if g < 0.5]
     found = contacts.half_spaces(points, 0.5)
     rows = list(zip(found.point[bones:], found.source[bones:], found.gap[bones:]))
     assert rows == wanted and (found.source[:bones] >= 0).all()

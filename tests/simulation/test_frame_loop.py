@@ -83,8 +83,7 @@ class _Breaking(ToyMuscle):
 
     breaks = None
 
-    def solve(self, contacts, *, room=False):
-        super().solve(contacts, room=room)
+    def take(self, moving):
         if self.solves > 12:
             self.x = self.x * np.nan
             if self.breaks is not None:

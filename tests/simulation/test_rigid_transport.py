@@ -9,7 +9,6 @@ from toy_scene import box_mesh, ellipsoid, held
 import rbfmuscle as rm
 from rbfmuscle.models import build_model, build_models
 from rbfmuscle.scene.objects import Motion
-from rbfmuscle.scene.options import SlidingOptions
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 from rbfmuscle.simulation.plan import plan_scene
 from rbfmuscle.simulation.substeps import SubSteps
@@ -20,7 +19,7 @@ DEG = np.pi / 180.0
 
 def _arm(angles, muscles=("brachialis",)):
     """A trunk, an upper arm and a forearm in a row; a shoulder and an elbow that bend about y."""
-    scene = rm.Scene("arm", units="mm")
+    scene = rm.Scene("arm", units="mm", neighbours=None)
     scene.add_bone("trunk", box_mesh([-40, -3, -3], [-1, 3, 3]))
     scene.add_bone("upper", box_mesh([1, -3, -3], [49, 3, 3]))
     scene.add_bone("fore", box_mesh([51, -3, -3], [100, 3, 3]))
@@ -99,9 +98,6 @@ def test_sub_steps_are_those_of_a_muscles_own_bones():
     assert cuts["brachialis"] <= 3 and cuts["deltoid"] >= 20
     end = {"shoulder.flexion": 0.7}
     assert SubSteps(scene, scene.muscles[0]).split({}, end) == [end]
-    scene.sliding = SlidingOptions()  # shares the sub-steps, but no more than the one muscle needs
-    work = _run(scene, "pbd", surfaces=False)[-1].work
-    assert {name: work[name].substeps for name in cuts} == cuts
 
 
 def test_muscles_side_by_side_in_any_order_are_what_they_are_alone():

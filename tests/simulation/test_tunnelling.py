@@ -10,6 +10,7 @@ from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
+from rbfmuscle.simulation.group import Group
 from rbfmuscle.simulation.stepper import MuscleStepper, Path
 from rbfmuscle.simulation.tunnelling import find_crossings
 
@@ -200,7 +201,7 @@ def _swing(action, thickness=0.6):
     stepper = MuscleStepper(model, contacts, made)
     start = model.x.copy()
     before, after = {"hinge.turn": 0.0}, {"hinge.turn": np.radians(40)}
-    stepper.step(Path.between(before, after, stepper.poses))
+    Group([stepper]).step(Path.between(before, after, stepper.poses))
     poses = [bone_poses(made, c) for c in (before, after)]
     crossed = find_crossings(contacts, start, model.x, *poses, TunnellingOptions(), tolerance=0.1)
     return stepper, sum(len(crossing.index) for crossing in crossed)
@@ -219,7 +220,7 @@ def test_fast_muscle_tunnels_through_a_plate_when_only_reported_or_not_looked_fo
 
 @pytest.mark.parametrize("thickness", [0.6, 0.05])
 def test_correction_leaves_no_point_behind_the_plate(thickness, monkeypatch):
-    monkeypatch.setattr("rbfmuscle.simulation.stepper.SMALLEST_STEP", np.radians(2.0))
+    monkeypatch.setattr("rbfmuscle.simulation.group.SMALLEST_STEP", np.radians(2.0))
     stepper, crossed = _swing("substep", thickness)
     assert crossed == 0
     actions = {event.action for event in stepper.collect()[1]}
@@ -228,19 +229,21 @@ def test_correction_leaves_no_point_behind_the_plate(thickness, monkeypatch):
 
 def test_what_crosses_all_the_same_is_held_on_its_side(monkeypatch):
     # As the step may not be halved, all depends on the planes.
-    monkeypatch.setattr("rbfmuscle.simulation.stepper.SMALLEST_STEP", np.radians(40.0))
+    monkeypatch.setattr("rbfmuscle.simulation.group.SMALLEST_STEP", np.radians(40.0))
     stepper, crossed = _swing("substep")
     assert crossed == 0
     assert {event.action for event in stepper.collect()[1]} == {"held_back"}
 
 
 def test_steps_are_not_halved_again_while_points_stay_across_a_bone(monkeypatch):
-    monkeypatch.setattr("rbfmuscle.simulation.stepper.FENCES", 0)
-    monkeypatch.setattr("rbfmuscle.simulation.stepper.SMALLEST_STEP", np.radians(10.0))
+    monkeypatch.setattr("rbfmuscle.simulation.group.FENCES", 0)
+    monkeypatch.setattr("rbfmuscle.simulation.group.SMALLEST_STEP", np.radians(10.0))
     stepper, _ = _swing("substep")
     _, events, first = stepper.collect()
     assert {"halved", "unresolved"} <= {event.action for event in events}
-    stepper.step(Path.between({"hinge.turn": np.radians(40)}, {"hinge.turn": 0.0}, stepper.poses))
+    Group([stepper]).step(
+        Path.between({"hinge.turn": np.radians(40)}, {"hinge.turn": 0.0}, stepper.poses)
+    )
     _, events, second = stepper.collect()
     actions = {event.action for event in events}
     assert (

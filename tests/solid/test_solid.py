@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ROOT
+from rbfmuscle.solid.touching import carried
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
@@ -19,6 +20,7 @@ from rbfmuscle.scene.joints.joint import rotation_about
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame_loop import simulate_frames
+from rbfmuscle.simulation.touching import settle
 from rbfmuscle.solid import lattice as lattices
 from rbfmuscle.solid.contact import Mobility, Obstacles
 from rbfmuscle.solid.kernels import (
@@ -41,11 +43,9 @@ from rbfmuscle.solid.solve import (
     STIFFNESS,
     Settling,
     find_slowness,
-    settle,
     start_work,
 )
 from rbfmuscle.solid.state import predict, rest_state, tension
-from rbfmuscle.solid.touching import carried
 
 DATA = ROOT / "tests" / "data"
 

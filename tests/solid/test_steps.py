@@ -1,9 +1,13 @@
 """Laws of the solid's loops on systems of a few nodes: contact, volumes, acceleration."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from rbfmuscle.solid.contact import Mobility, Obstacles, Rows, Wanted, fill_mobilities, solve_forces
+from rbfmuscle.geometry.embedding import Embedding, carry
+from rbfmuscle.simulation.touching import Contacts, Wanted, find_forces, solve_forces
+from rbfmuscle.solid.contact import Mobility, Obstacles, fill_mobilities
 from rbfmuscle.solid.kernels import (
     GRADIENT,
     POINTS,
@@ -12,13 +16,12 @@ from rbfmuscle.solid.kernels import (
     STRETCH,
     WEIGHT,
     add_rows,
-    carry,
     carry_steps,
     local_step,
     region_volumes,
 )
-from rbfmuscle.solid.model import Embedding, mobility
-from rbfmuscle.solid.solve import BULK, Mixer, find_forces
+from rbfmuscle.solid.model import mobility
+from rbfmuscle.solid.solve import BULK, Mixer
 
 NODES, HANGING = 40, 9
 
@@ -58,9 +61,10 @@ def forces_of(delassus, wants, most=np.inf, yields=0.0, tolerance=1e-13):
         np.full(count, most),
         np.zeros(count),
     )
-    none = np.zeros((count, 0))
-    rows = Rows(np.zeros((count, 3)), none, none, none, delassus)
-    return find_forces([wanted], [], [rows], tolerance)
+    contacts = Contacts(wanted, Embedding(np.zeros((count, 1), dtype=int), np.ones((count, 1))))
+    rows = SimpleNamespace(delassus=delassus)
+    force, found = find_forces({0: contacts}, {0: every}, None, every[:0], {0: rows}, tolerance)
+    return force[0], found
 
 
 def test_one_contact_takes_its_share_up_to_the_greatest_force():

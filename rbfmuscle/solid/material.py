@@ -1,31 +1,22 @@
-"""Contact between solids that settle together: gaps asked of the neighbour's field at rest.
+"""The gap of a point to a solid, asked of its field at rest.
 
 A point x of the world is at the material coordinates X of a solid with φ(X) = x, which Newton steps
 find from those of the last question. The neighbour's distance at rest D(X), smoothed by a cubic
 B-spline, then gives to first order the gap D / |g| with g = ∇ₓD = A⁻ᵀ ∇D, A = ∂φ/∂X: smooth in
 space and time, without a search over triangles. A force acts on the point along g / |g|, and the
 opposite one on the material of the neighbour at the foot X - D ∇D.
-
-What overlaps at rest keeps that gap as its zero.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rbfmuscle.bones.rounded import RoundedBone, rounded_at
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.loops import loop
-from rbfmuscle.solid.kernels import carry
 
 NEWTON = 8  # steps that find material coordinates, at most
 EXACT = 1e-4  # of a cell: a step of less is the last, as it squares the error
-# Lengths relative to the size of the smaller muscle of a pair: how near points of one are to those
-# of the other that may meet in a sub-step, and the gap from which on a contact takes part.
-SEARCHED, MET = 0.06, 0.01
-APART = 0.03  # spacing of the points that meet neighbours, of the muscle's size
 
 
 class Material(NamedTuple):
@@ -38,17 +29,6 @@ class Material(NamedTuple):
     cells: Integers  # (C, 3) place of each cell in the box
     nodes: Integers  # (C, 27)
     rest: RoundedBone  # the surface at rest
-
-
-class Body(NamedTuple):
-    """What never changes of a solid that meets others."""
-
-    name: str
-    material: Material
-    points: Integers  # (k,) contact points that meet neighbours, of the solid's
-    places: Floats  # (k, 3) of these in the lattice
-    area: float  # that each stands for [scene unit squared]
-    size: float  # of the muscle
 
 
 @loop
@@ -174,108 +154,3 @@ def ask_material(material, y, points, place, gap, normal, columns, shares):
         total = shares[i].sum()
         for k in range(27):
             shares[i, k] /= total
-
-
-def even_points(points: Floats, owner: Integers, size: float) -> Integers:
-    """Which of the contact points (n, 3) meet neighbours: free ones, about `APART` of the size
-    apart.
-    """
-    left = np.flatnonzero(owner < 0)
-    tree = cKDTree(points[left])
-    taken = np.zeros(len(left), dtype=np.bool_)
-    chosen = []
-    for i in range(len(left)):
-        if not taken[i]:
-            chosen.append(i)
-            taken[tree.query_ball_point(points[left[i]], APART * size)] = True
-    return left[chosen]
-
-
-class Pair:
-    """Points of one solid that may meet another in a sub-step; ``one`` and ``other`` are their
-    numbers in the group.
-    """
-
-    def __init__(
-        self,
-        one: int,
-        other: int,
-        which: Integers,
-        place: Floats,
-        allowed: Floats,
-        force: Floats,
-    ) -> None:
-        self.one = one
-        self.other = other
-        self.which = which  # (k,) of the body's points
-        self.place = place  # (k, 3) in the lattice of the other
-        self.allowed = allowed  # (k,) overlap at rest [scene unit]
-        self.force = force  # (k,) over 2 μ
-        count = len(which)
-        self.gap = np.empty(count)
-        self.normal = np.empty((count, 3))
-        self.columns = np.empty((count, 27), dtype=np.int64)
-        self.shares = np.empty((count, 27))
-
-
-class Met(NamedTuple):
-    """Contacts of one pair in an iteration."""
-
-    pair: Pair
-    chosen: Integers  # (c,) of the pair's points
-    motion: Floats  # (c,) along the normal that each wants
-    yields: Floats  # (c,) for a unit force
-    most: Floats  # (c,)
-
-
-def near_points(
-    body: Body, other: Body, points: Floats, others: Floats, reach: float
-) -> tuple[Integers, Floats]:
-    """Which points (k,) of a body, now at ``points`` (p, 3), are near those of another, now at
-    ``others`` (q, 3), and the place (k, 3) in its lattice of the nearest of these.
-    """
-    low, high = others.min(axis=0) - reach, others.max(axis=0) + reach
-    which = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
-    if len(which) == 0:
-        return which, np.zeros((0, 3))
-    away, nearest = cKDTree(others).query(points[which], distance_upper_bound=reach)
-    found = np.isfinite(away)
-    return which[found], other.places[nearest[found]]
-
-
-def find_overlaps(
-    bodies: Sequence[Body], rest: Sequence[Floats], nodes: Sequence[Floats]
-) -> dict[tuple[str, str], Floats]:
-    """Overlap (k,) of the points of each body with each other one at rest [scene unit], where there
-    is any, by the names of both. ``rest`` has the places (k, 3) of the points of each, ``nodes``
-    (N, 3) those of the solids.
-    """
-    found = {}
-    for i, body in enumerate(bodies):
-        for j, other in enumerate(bodies):
-            if i == j:
-                continue
-            reach = SEARCHED * min(body.size, other.size)
-            which, place = near_points(body, other, rest[i], rest[j], reach)
-            pair = Pair(i, j, which, place, np.zeros(len(which)), np.zeros(len(which)))
-            ask_pair(pair, other.material, nodes[j], rest[i])
-            depth = np.zeros(len(body.points))
-            depth[which] = np.maximum(-pair.gap, 0.0)
-            if depth.any():
-                found[body.name, other.name] = depth
-    return found
-
-
-def ask_pair(pair: Pair, material: Material, y: Floats, points: Floats) -> None:
-    """Bring the gaps of a pair up to date, for nodes y (N, 3) of the other solid and the places
-    (p, 3) of all points of the body.
-    """
-    here = np.ascontiguousarray(points[pair.which])
-    ask_material(material, y, here, pair.place, pair.gap, pair.normal, pair.columns, pair.shares)
-
-
-def carried(columns: Integers, shares: Floats, y: Floats) -> Floats:
-    """Places (n, 3) of points that hang on nodes y (N, 3)."""
-    out = np.empty((len(columns), 3))
-    carry(columns, shares, y, out)
-    return out

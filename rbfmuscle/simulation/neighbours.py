@@ -1,0 +1,179 @@
+"""Which muscles may touch, and where they do.
+
+What overlaps at rest, as segmentations often do, keeps that overlap as the zero of its contact.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.threads import each
+from rbfmuscle.scene.objects import from_mm
+from rbfmuscle.scene.scene import Scene
+from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
+from rbfmuscle.simulation.stepper import MuscleStepper
+from rbfmuscle.simulation.touching import Body, Meeting, Moving
+from rbfmuscle.validation import SceneError
+
+Link = tuple[int, int]
+
+# Muscles may touch whose swept boxes come nearer to each other than this [mm].
+REACH = 3.0
+# How near points of one muscle are to those of another that may meet it in a sub-step, of the size
+# of the smaller one.
+SEARCHED = 0.06
+NEAR = 0.02  # gap of points that are looked at in a sub-step, of that size
+
+
+class Neighbours:
+    """The contacts between the muscles of a group, in their rest state.
+
+    Parameters
+    ----------
+    steppers : list of MuscleStepper
+    links : sequence of (int, int)
+        Which of them may touch which, by number.
+
+    Attributes
+    ----------
+    forces : mapping of (int, int) to ndarray
+        Of the points (k,) of one muscle at another when last solved; never changed in place.
+    """
+
+    def __init__(self, steppers: Sequence[MuscleStepper], links: Sequence[Link]) -> None:
+        self.links = sorted({*links, *(link[::-1] for link in links)})
+        self.forces: Mapping[Link, Floats] = {}
+        self.bodies: list[Body] = []
+        self.overlaps: dict[Link, Floats] = {}
+        if not links:
+            return
+        self.bodies = each(lambda stepper: stepper.model.body(), steppers)
+        solids = [stepper.model.begin(stepper.contacts) for stepper in steppers]
+        meeting = self.find(solids)
+        if meeting is not None:
+            depth = np.where(np.isfinite(meeting.gap), np.maximum(-meeting.gap, 0.0), 0.0)
+            self.overlaps = self._by_link(meeting, depth)
+
+    def find(self, solids: Sequence[Moving]) -> Meeting | None:
+        """The points that may meet another muscle in a sub-step; None where there are none."""
+        if not self.links:
+            return None
+        own = [solid.feet_of(body.points) for solid, body in zip(solids, self.bodies)]
+        points = [feet.of(solid.nodes) for feet, solid in zip(own, solids)]
+        trees = [cKDTree(here) for here in points]
+        size = [solid.size for solid in solids]
+        found: list[tuple[int, int, Integers, Integers]] = []
+        for one, other in self.links:
+            reach = SEARCHED * min(size[one], size[other])
+            which, nearest = _near_points(points[one], trees[other], reach)
+            if len(which):
+                found.append((one, other, which, nearest))
+        if not found:
+            return None
+        counts = [len(which) for _, _, which, _ in found]
+        ones, others = [one for one, *_ in found], [other for _, other, *_ in found]
+        which = {m: [row[2] for row in found if row[0] == m] for m in range(len(solids))}
+        nearest = {m: [row[3] for row in found if row[1] == m] for m in range(len(solids))}
+        none = [np.zeros(0, dtype=np.int64)]
+        bearing = [
+            solids[one].bearing(self.bodies[one].points[rows], self.bodies[one].area)
+            for one, _, rows, _ in found
+        ]
+        meeting = Meeting(
+            np.repeat(ones, counts),
+            np.repeat(others, counts),
+            np.concatenate([self.bodies[one].points[rows] for one, _, rows, _ in found]),
+            [own[m].some(np.concatenate(rows or none)) for m, rows in which.items()],
+            [self.bodies[m].places[np.concatenate(rows or none)] for m, rows in nearest.items()],
+            (
+                np.concatenate([most for most, _ in bearing]),
+                np.repeat([y for _, y in bearing], counts),
+            ),
+            *(
+                np.concatenate([self._known(known, *row[:3]) for row in found])
+                for known in (self.overlaps, self.forces)
+            ),
+        )
+        meeting.ask(solids)
+        sizes = np.array(size)
+        reach = NEAR * np.minimum(sizes[meeting.one], sizes[meeting.other])
+        return meeting.without(~(meeting.gap < reach) & (meeting.force == 0.0))
+
+    def keep(self, meeting: Meeting | None) -> None:
+        """Keep the forces of a solve for the next one."""
+        if meeting is not None:
+            self.forces = self._by_link(meeting, meeting.force)
+
+    def _known(self, known: Mapping[Link, Floats], one: int, other: int, which: Integers) -> Floats:
+        found = known.get((one, other))
+        return np.zeros(len(which)) if found is None else found[which]
+
+    def _by_link(self, meeting: Meeting, values: Floats) -> dict[Link, Floats]:
+        """Values (K,) of points that are not zero, for all points (k,) of a muscle at another."""
+        found: dict[Link, Floats] = {}
+        for k in np.flatnonzero(values):
+            one, other = int(meeting.one[k]), int(meeting.other[k])
+            body = self.bodies[one]
+            full = found.setdefault((one, other), np.zeros(len(body.points)))
+            full[np.searchsorted(body.points, meeting.point[k])] = values[k]
+        return found
+
+
+def _near_points(points: Floats, other: cKDTree, reach: float) -> tuple[Integers, Integers]:
+    """Which (k,) of the points (p, 3) of a muscle are near those of another, and the number (k,) of
+    the nearest of these.
+    """
+    low, high = other.mins - reach, other.maxes + reach
+    which = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    if len(which) == 0:
+        return which, which
+    away, nearest = other.query(points[which], distance_upper_bound=reach)
+    found = np.isfinite(away)
+    return which[found], nearest[found]
+
+
+def find_links(scene: Scene, names: Sequence[str]) -> list[Link]:
+    """Which of the named muscles may touch in the scene's motion: those of its ``pairs``, or all,
+    as far as their swept boxes come near each other. SceneError on an unknown name in ``pairs``.
+    """
+    options = scene.neighbours
+    if options is None:
+        return []
+    for name in sorted({name for pair in options.pairs or [] for name in pair}):
+        known = [muscle.name for muscle in scene.muscles]
+        if name not in known:
+            raise SceneError(
+                f"[neighbours] pairs: unknown muscle {name!r}, known: {', '.join(known)}"
+            )
+    wanted = None if options.pairs is None else [frozenset(pair) for pair in options.pairs]
+    muscles = [scene.muscle(name) for name in names]
+    poses, reach = sampled_poses(scene), from_mm(REACH, scene.units)
+
+    @cache
+    def box(k: int, bone: str) -> Floats:
+        return swept_boxes(muscles[k], [bone], poses)[0]
+
+    def meet(i: int, k: int) -> bool:
+        """Whether the swept boxes meet in the coordinates of every bone that holds one of both."""
+        bones = {held.attachment_frame for m in (i, k) for held in muscles[m].attachments}
+        boxes = ((box(i, bone), box(k, bone)) for bone in bones)
+        return all((a[0] - reach <= b[1]).all() and (b[0] - reach <= a[1]).all() for a, b in boxes)
+
+    return [
+        (k, i)
+        for i in range(len(muscles))
+        for k in range(i)
+        if (wanted is None or frozenset((names[k], names[i])) in wanted) and meet(i, k)
+    ]
+
+
+def connected(count: int, links: Sequence[Link]) -> list[list[int]]:
+    """The sets of muscles, of so many, that links join, each in order."""
+    group = list(range(count))
+    for one, other in links:
+        old, new = max(group[one], group[other]), min(group[one], group[other])
+        group = [new if g == old else g for g in group]
+    return [[k for k in range(count) if group[k] == g] for g in sorted(set(group))]

@@ -1,0 +1,224 @@
+"""RBF muscles pressed together: forces, symmetry, rings, sheets, and the gap asked of a muscle."""
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+from toy_scene import box_mesh, ellipsoid, held
+
+import rbfmuscle as rm
+from rbfmuscle.models import build_models
+from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.objects import Motion
+from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
+from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
+
+pytestmark = pytest.mark.numeric
+OPTIONS = {"centres": 150, "nodes": 150, "samples": 1200}
+
+
+def _scene(muscles, frames, slides):
+    """Muscles, each a mesh and masks of what holds its vertices, between bones that shift."""
+    scene = rm.Scene("press", units="mm")
+    scene.add_bone("floor", trimesh.creation.box([4, 4, 4]).apply_translation([0, 0, -200]))
+    for name, axis in slides.items():
+        far = -200.0 * np.array(axis, dtype=float)
+        scene.add_bone(name, trimesh.creation.box([4, 4, 4]).apply_translation(far))
+        scene.add_joint(f"of_{name}", "floor", name, (0, 0, 0), {"by": axis}, type="slide")
+    for name, (mesh, ends) in muscles.items():
+        scene.add_muscle(name, mesh, attach=held(**ends), model={"name": "rbf", **OPTIONS})
+    scene.motion = Motion([{f"of_{k}.by": v for k, v in frame.items()} for frame in frames])
+    return scene
+
+
+def _run(scene):
+    models = build_models(scene)
+    loop = FrameLoop(scene, models, surfaces=False)
+    for frame in scene.motion.frames:
+        loop.advance(frame)
+    return loop, {model.name: model for model in models}
+
+
+def _overlap(one, other):
+    """Deepest of the free material of one muscle in another."""
+    points = one.contact_points()[one.attached_bone < 0]
+    vertices, faces = other.material_mesh()
+    return max(0.0, -igl.signed_distance(points, np.array(vertices), np.array(faces))[0].min())
+
+
+def _total_force(loop, axis):
+    """Contact force of each muscle of a single group at each other one, along an axis, over 2 μ."""
+    (group,) = loop.groups
+    solids = [stepper.model.begin(stepper.contacts) for stepper in group.steppers]
+    meeting = group.neighbours.find(solids)
+    meeting.ask(solids)
+    names = [stepper.name for stepper in group.steppers]
+    found = {}
+    for one, other, force in zip(
+        meeting.one, meeting.other, meeting.force * (meeting.normal @ np.asarray(axis, float))
+    ):
+        key = names[one], names[other]
+        found[key] = found.get(key, 0.0) + float(force)
+    return found
+
+
+BLOCK = 15.0
+
+
+@pytest.fixture(scope="module")
+def blocks():
+    """Two blocks, one on the other, of which the upper is pressed down by 3 mm."""
+    lower = box_mesh([-BLOCK, -BLOCK, -30], [BLOCK, BLOCK, -0.05])
+    upper = box_mesh([-BLOCK, -BLOCK, 0.05], [BLOCK, BLOCK, 30])
+    muscles = {
+        "lower": (lower, {"floor": lower.vertices[:, 2] < -29}),
+        "upper": (upper, {"press": upper.vertices[:, 2] > 29}),
+    }
+    frames = [{"press": -s} for s in (0.0, 1.0, 2.0, 3.0)]
+    return _run(_scene(muscles, frames, {"press": (0, 0, 1)}))
+
+
+def test_blocks_pressed_together_share_the_way_and_meet_in_a_plane(blocks):
+    _, models = blocks
+    lower, upper = (models[name].contact_points() for name in ("lower", "upper"))
+    rest = models["lower"].model.points, models["upper"].model.points
+    inner = [np.abs(points[:, :2]).max(axis=1) < 0.7 * BLOCK for points in rest]
+    faces = [
+        points[(np.abs(at[:, 2]) < 0.06) & some][:, 2]
+        for points, at, some in zip((lower, upper), rest, inner)
+    ]
+    # The interface of two equal blocks goes half of the way, and both faces lie on it.
+    assert len(faces[0]) > 20 and len(faces[1]) > 20
+    for face in faces:
+        assert face.mean() == pytest.approx(-1.5, abs=0.1) and face.std() < 0.1
+    assert _overlap(models["lower"], models["upper"]) < 0.1
+    assert _overlap(models["upper"], models["lower"]) < 0.1
+
+
+def test_blocks_bulge_alike(blocks):
+    _, models = blocks
+    widths = [np.ptp(models[name].contact_points()[:, 0]) for name in ("lower", "upper")]
+    assert widths[0] > 2 * BLOCK + 0.3 and widths[0] == pytest.approx(widths[1], abs=0.1)
+
+
+def test_forces_between_blocks_are_those_that_their_bones_feel(blocks):
+    loop, models = blocks
+    between = _total_force(loop, (0, 0, 1))
+    pressed = between["upper", "lower"] - between["lower", "upper"]
+    assert pressed > 0.0
+    for name, sign in (("upper", 1.0), ("lower", -1.0)):
+        solid, state = models[name].model, models[name].state
+        # What the springs of the held points bear along z, at rest with all else.
+        stretch = state.anchors - solid.embedding.some(solid.held).of(state.nodes)
+        borne = (solid.springs @ stretch)[:, 2].sum()
+        assert sign * borne == pytest.approx(-pressed, rel=0.01)
+
+
+def _ring(order=(0, 1, 2), names="abc"):
+    """Three ellipsoids around a point, each pressed inwards."""
+    muscles, slides = {}, {}
+    for k in order:
+        turn = rotation_about((0, 0, 1), 2.0 * np.pi * k / 3.0, np.zeros(3))
+        mesh = ellipsoid((8, 8, 25), (0, 9.4, 0), subdivisions=3)
+        ends = np.abs(mesh.vertices[:, 2]) > 19
+        mesh.apply_transform(turn)
+        bone = f"bone_{k}"
+        slides[bone] = tuple(turn[:3, 1].tolist())
+        muscles[names[k]] = (mesh, {bone: ends})
+    frames = [dict.fromkeys(slides, -s) for s in (0.0, 1.0, 2.0)]
+    return _scene(muscles, frames, dict(sorted(slides.items())))
+
+
+def test_three_muscles_in_a_ring_stay_apart_and_alike():
+    loop, models = _run(_ring())
+    assert len(loop.groups) == 1
+    for one, other in (("a", "b"), ("b", "c"), ("c", "a")):
+        assert _overlap(models[one], models[other]) < 0.15
+    # A third of a turn takes each to the next.
+    turn = rotation_about((0, 0, 1), 2.0 * np.pi / 3.0, np.zeros(3))[:3, :3]
+    way = {name: model.contact_points().mean(axis=0) for name, model in models.items()}
+    assert np.abs(turn @ way["a"] - way["b"]).max() < 0.05
+    assert np.abs(turn @ way["b"] - way["c"]).max() < 0.05
+
+
+def test_order_and_names_of_muscles_change_nothing():
+    first = _run(_ring())[1]
+    size = 60.0
+    other = _run(_ring(order=(2, 0, 1), names="zxy"))[1]
+    for one, two in zip("abc", "zxy"):
+        moved = np.abs(first[one].contact_points() - other[two].contact_points()).max()
+        assert moved < 1e-9 * size
+
+
+def test_sheet_between_two_bellies_stays_in_the_middle():
+    sheet = box_mesh([-20, -1.5, -20], [20, 1.5, 20])
+    muscles = {"sheet": (sheet, {"floor": np.abs(sheet.vertices[:, 2]) > 18})}
+    for name, side in (("left", -1.0), ("right", 1.0)):
+        belly = ellipsoid((9, 8, 16), (0, 9.7 * side, 0), subdivisions=3)
+        muscles[name] = (belly, {name: side * belly.vertices[:, 1] > 15})
+    frames = [{"left": s, "right": -s} for s in (0.0, 1.0, 2.0)]
+    loop, models = _run(_scene(muscles, frames, {"left": (0, 1, 0), "right": (0, 1, 0)}))
+    middle = models["sheet"].contact_points()
+    near = np.abs(models["sheet"].model.points[:, [0, 2]]).max(axis=1) < 8
+    assert abs(middle[near][:, 1].mean()) < 0.05
+    for side in ("left", "right"):
+        assert _overlap(models["sheet"], models[side]) < 0.15
+        assert _overlap(models[side], models["sheet"]) < 0.15
+    # The forces of both sides hold each other the balance.
+    between = _total_force(loop, (0, 1, 0))
+    on_sheet = {
+        side: between.get(("sheet", side), 0.0) - between.get((side, "sheet"), 0.0)
+        for side in ("left", "right")
+    }
+    assert on_sheet["left"] > 0.0 and on_sheet["left"] == pytest.approx(
+        -on_sheet["right"], rel=0.05
+    )
+
+
+def test_overlap_at_rest_is_kept_and_moves_nothing():
+    muscles = {}
+    for name, side in (("one", -1.0), ("other", 1.0)):
+        mesh = ellipsoid((8, 8, 25), (0, 7.2 * side, 0), subdivisions=3)
+        muscles[name] = (mesh, {"floor": np.abs(mesh.vertices[:, 2]) > 19})
+    scene = _scene(muscles, [{}], {})
+    _, models = _run(scene)
+    for model in models.values():
+        moved = np.linalg.norm(model.contact_points() - model.model.points, axis=1)
+        assert moved.max() < 0.02
+    assert _overlap(models["one"], models["other"]) > 1.0
+
+
+def test_gap_and_normal_are_those_of_the_surface_where_it_has_been_carried():
+    """At rest, turned, and stretched along the normal, where the gap grows in proportion."""
+    mesh = box_mesh([-20, -10, -10], [20, 10, 10])
+    scene = _scene({"block": (mesh, {"floor": mesh.vertices[:, 0] < -19})}, [{}], {})
+    (model,) = build_models(scene)
+    contacts = BoneContacts(BonesInReach([], []), model.attached_bone)
+    model.body()
+    solid = model.begin(contacts)
+    rng = np.random.default_rng(3)
+    points = np.column_stack([rng.uniform(-6, 6, (40, 2)), rng.uniform(8.0, 11.0, 40)])
+    places = (points - model._material.origin) @ model._material.turn.T
+    turn = rotation_about((1, 2, 3), 0.7, np.zeros(3))[:3, :3]
+    for matrix, factor in ((np.eye(3), 1.0), (turn, 1.0), (np.diag([1.0, 1.0, 1.5]), 1.5)):
+        solid.nodes = model.model.rest @ matrix.T
+        gap, normals, feet = solid.ask(np.ascontiguousarray(points @ matrix.T), places.copy())
+        np.testing.assert_allclose(gap, factor * (points[:, 2] - 10.0), atol=0.1)
+        normal = matrix[:, 2] / np.linalg.norm(matrix[:, 2])
+        assert (normals @ normal).min() > 0.998
+        found = feet.of(solid.nodes)
+        np.testing.assert_allclose(found, (points * [1, 1, 0] + [0, 0, 10.0]) @ matrix.T, atol=0.06)
+
+
+def test_muscle_alone_is_the_same_with_neighbours_on_and_off():
+    mesh = box_mesh([-20, -6, -6], [20, 6, 6])
+    ends = {"floor": mesh.vertices[:, 0] < -18, "pull": mesh.vertices[:, 0] > 18}
+    shapes = []
+    for on in (True, False):
+        scene = _scene({"bar": (mesh, ends)}, [{"pull": 0.0}, {"pull": 3.0}], {"pull": (1, 0, 0)})
+        if not on:
+            scene.neighbours = None
+        models = build_models(scene)
+        list(simulate_frames(scene, models, surfaces=False))
+        shapes.append(models[0].contact_points())
+    np.testing.assert_array_equal(*shapes)
