@@ -1,16 +1,16 @@
-"""Muscles that slide on each other over a squat of the whole leg: overlap and gaps.
+"""Muscles that touch over a squat of the whole leg: overlap and gaps.
 
     python benchmarks/leg_neighbours.py [--frames 0:37:6] [--model rbf] [--muscles A,B] [--without]
 
-Runs a scene of ``data/leg`` with tendons (``leg_tendons.py``) and ``[sliding]`` through its whole
-motion and measures the shown surfaces of the chosen frames by exact distances, which the solver
-does not use: how deep a vertex of one muscle lies in another, and for vertices nearer than the
-threshold at rest how much farther they are now (RMS by pair). Both are listed by pair, the worst
-first, and as 95th percentiles over pairs and frames. What two bones hold on both sides is counted
-apart: where a vertex and what it meets of the other muscle both go along with bones, these decide
-how far they come apart or into each other. Beside the gap stands the RMS over the vertices that the
-neighbour still faces, without what slid past its rim (the way to the neighbour is more than 60
-degrees off the vertex's own normal). ``--without`` measures the same run without sliding.
+Runs a scene of ``data/leg`` with tendons (``leg_tendons.py``) through its whole motion and measures
+the shown surfaces of the chosen frames by exact distances, which the solver does not use: how deep
+a vertex of one muscle lies in another, and for vertices nearer than the threshold at rest how much
+farther they are now (RMS by pair). Both are listed by pair, the worst first, and as 95th
+percentiles over pairs and frames. What two bones hold on both sides is counted apart: where a
+vertex and what it meets of the other muscle both go along with bones, these decide how far they
+come apart or into each other. Beside the gap stands the RMS over the vertices that the neighbour
+still faces, without what slid past its rim (the way to the neighbour is more than 60 degrees off
+the vertex's own normal). ``--without`` measures the same run without contact.
 """
 
 import argparse
@@ -33,26 +33,23 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame_loop import FrameLoop
 
-THRESHOLD = 2.0  # mm: nearer at rest is touching, as `[sliding]` has it
+THRESHOLD = 2.0  # mm: nearer at rest is touching
 # cosine between a vertex's normal and the way to its neighbour, from which on it faces that
 FACING = 0.5
 TOLD = 12  # pairs listed of these
 
 
 class Bench:
-    """The scene with and without sliding; models and bones' fields are built once for all runs."""
+    """The scene with and without contact of neighbours; models and bones' fields are built once."""
 
     def __init__(self, arguments):
         with tempfile.TemporaryDirectory() as folder:
             scene = Scene.load(convert(data_folder("leg") / arguments.scene, Path(folder)))
         asked = {key: float(value) for key, value in (pair.split("=") for pair in arguments.set)}
         self.scenes = {
-            True: scene.with_options(
-                {"sliding.threshold": THRESHOLD, **asked}, model=arguments.model
-            ),
-            False: scene.with_options({}, model=arguments.model),
+            True: scene.with_options(asked, model=arguments.model),
+            False: scene.with_options({"neighbours": False}, model=arguments.model),
         }
-        self.scenes[False].sliding = None
         named = (
             arguments.muscles.split(",") if arguments.muscles else [m.name for m in scene.muscles]
         )
@@ -62,11 +59,11 @@ class Bench:
         self.rest = [model.snapshot() for model in self.models]
         self.fields = build_fields(self.scenes[True], find_contact_pairs(self.scenes[True]))
 
-    def loop(self, *, sliding=True):
+    def loop(self, *, touching=True):
         """A loop at rest."""
         for model, state in zip(self.models, self.rest):
             model.restore(state)
-        return FrameLoop(self.scenes[sliding], self.models, bone_sdfs=self.fields)
+        return FrameLoop(self.scenes[touching], self.models, bone_sdfs=self.fields)
 
     @property
     def path(self):
@@ -182,7 +179,7 @@ def _surfaces(frame):
 
 
 COLUMNS = [
-    "sliding",
+    "touching",
     "pairs that meet",
     "overlap, 95 %",
     "gap opened, 95 %",
@@ -198,7 +195,7 @@ def pairs(bench, arguments):
     touching = None
     every = ([], [])
     spent = 0.0
-    loop = bench.loop(sliding=not arguments.without)
+    loop = bench.loop(touching=not arguments.without)
     for k, coordinates in enumerate(bench.path[: max(wanted) + 1]):
         begin = time.process_time()
         frame = loop.advance(coordinates) if k in wanted else loop.skip(coordinates)
@@ -288,7 +285,7 @@ def main():
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="of the scene"
     )
-    parser.add_argument("--without", action="store_true", help="measure a run without sliding")
+    parser.add_argument("--without", action="store_true", help="measure a run without contact")
     parser.add_argument("-o", "--output", help="file of evidence for the pages: with and without")
     arguments = parser.parse_args()
     if arguments.output:

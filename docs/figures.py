@@ -42,7 +42,6 @@ COMMANDS = {
     "mesh_models": "mesh_models.py",
     "one_pose": f"one_pose.py {_FLEXION} --muscles gluteus_maximus,iliacus",
     "combined_motions": f"combined_motions.py {_FLEXION} --seeds 7 8",
-    "neighbours": "leg_neighbours.py --frames 0:37:12",
     "bone_fields": "bench_sdf.py --data DATA --bones femur",
     "kernels": "kernel_table.py DATA --kernels cubic,quintic,gaussian,wendland_c4 --centres 300",
     "interpolation": "interpolation.py",

@@ -18,7 +18,7 @@ EXAMPLES = (
     "choosing_a_kernel",
     "rbf_against_pbd",
     "tunnelling",
-    "sliding",
+    "touching",
     "sweep",
     "exporting",
 )

@@ -1,5 +1,5 @@
-"""Pictures of the contact page: tunnelled and corrected, overlapping and resolved, apart and
-sliding.
+"""Pictures of the contact page: tunnelled and corrected, overlapping and resolved, passing through
+each other and touching.
 
     python examples/contact_pictures.py docs/images
 
@@ -18,8 +18,9 @@ from PIL import Image
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.options import DetectOptions, SlidingOptions, TunnellingOptions
+from rbfmuscle.scene.options import DetectOptions, NeighbourOptions, TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
+from rbfmuscle.simulation.group import Group
 from rbfmuscle.simulation.stepper import MuscleStepper, Path
 
 out = folder("contact_pictures")
@@ -120,18 +121,18 @@ for action, title in (("report", "tunnelled"), ("substep", "corrected")):
     stepper = MuscleStepper(
         model, BoneContacts(BonesInReach(names, fields), model.attached_bone), scene
     )
-    stepper.step(Path.between(rest, turned, stepper.poses))
+    Group([stepper]).step(Path.between(rest, turned, stepper.poses))
     remaining[action] = {event.action for event in stepper.collect()[1]}
     panels.append((title, [(*model.material_mesh(), "#a63d38", 0.75), *bones(scene, turned)]))
 picture("tunnelling", panels, view=(0.55, -0.8, 0.1), zoom=1.3)
 
-# Apart and sliding: two neighbours in extension.
+# Unfelt and touching: two neighbours in extension.
 panels, overlap = [], {}
 pair = ("adductor_anterior", "adductor_posterior")
-for sliding, title in ((None, "without [sliding]"), (SlidingOptions(), "with [sliding]")):
+for neighbours, title in ((None, "neighbours = false"), (NeighbourOptions(), "neighbours")):
     scene = rm.phantom_scene()
     scene.muscles = [scene.muscle(name) for name in pair]
-    scene.sliding = sliding
+    scene.neighbours = neighbours
     scene.set_motion(ramp={"hip.flexion": {"from": 0, "to": -20, "step": 2}})
     run = rm.simulate(scene, model="rbf")
     one, two = (run[name].surface() for name in pair)
@@ -139,9 +140,9 @@ for sliding, title in ((None, "without [sliding]"), (SlidingOptions(), "with [sl
     text = f"{title}: {overlap[title]:.1f} mm into each other"
     meshes = [(one.vertices, one.faces, "#7a2340", 1.0), (two.vertices, two.faces, "#c4698f", 0.7)]
     panels.append((text, [*meshes, *bones(scene, {"hip.flexion": math.radians(-20.0)})]))
-slices("sliding", panels, height=float(one.vertices[:, 2].mean()))
+slices("neighbours", panels, height=float(one.vertices[:, 2].mean()))
 
 print(remaining, overlap)
 assert all(isinstance(mesh, trimesh.Trimesh) and mesh.is_watertight for mesh in (one, two))
 assert "reported" in remaining["report"] and "unresolved" not in remaining["substep"]
-assert overlap["without [sliding]"] > 1.0 and overlap["with [sliding]"] < 0.5
+assert overlap["neighbours = false"] > 1.0 and overlap["neighbours"] < 0.5

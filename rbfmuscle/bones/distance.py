@@ -65,6 +65,10 @@ class Memory(NamedTuple):
             np.zeros((count, 3)), np.full(count, -np.inf), np.full(count, -1, dtype=np.int64)
         )
 
+    def some(self, rows: Integers) -> "Memory":
+        """What is known about some of the points."""
+        return Memory(self.anchor[rows], self.bound[rows], self.triangle[rows])
+
 
 def bone_arrays(exact: ExactDistance, *, closed: bool) -> BoneArrays:
     """Arrays of a mesh; ``closed`` says that it is closed and does not intersect itself."""

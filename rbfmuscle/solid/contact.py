@@ -123,7 +123,7 @@ class Obstacles:
         normals (m, 3).
         """
         known = self._exact[b]
-        some = Memory(known.anchor[which], known.bound[which], known.triangle[which])
+        some = known.some(which)
         gap, normal = np.empty(len(which)), np.empty((len(which), 3))
         allowed = self.allowed[b, which]
         distance_loop(self.exact[b], self.poses[b], here, reach - allowed, *some, gap, normal)

@@ -64,12 +64,12 @@ class ShownBones:
         for bone, memory in enumerate(self._memories):
             least, _ = self._ask(bone, points, unbounded, memory)
             stale = np.flatnonzero((least < self._reach) & (memory.bound >= self._reach))
-            known = Memory(*(part[stale] for part in memory))
+            known = memory.some(stale)
             least[stale], _ = self._ask(bone, points[stale], self._reach[stale], known)
             for part, values in zip(memory, known):
                 part[stale] = values
             self._near[bone] = np.flatnonzero(least < self._reach)
-            self._known[bone] = Memory(*(part[self._near[bone]] for part in memory))
+            self._known[bone] = memory.some(self._near[bone])
 
     def _ask(
         self, bone: int, points: Floats, reach: Floats, known: Memory
@@ -98,14 +98,14 @@ class ShownBones:
             if rows is None:
                 some, known = self._near[bone], self._known[bone]
             else:
-                some, known = rows, Memory(*(part[rows] for part in self._memories[bone]))
+                some, known = rows, self._memories[bone].some(rows)
             for _ in range(LIFTS):
                 points = sheet.vertices[some]
                 distance, outward = self._ask(bone, points, np.zeros(len(some)), known)
                 inside = np.flatnonzero(distance < -OUT * self._shown.edge)
                 if len(inside) == 0:
                     break
-                some, known = some[inside], Memory(*(part[inside] for part in known))
+                some, known = some[inside], known.some(inside)
                 self._move_onto(sheet, some, distance[inside], outward[inside])
                 moved.append(some)
         return np.unique(np.concatenate(moved)) if moved else np.zeros(0, dtype=np.int64)

@@ -127,7 +127,7 @@ def test_restored_loop_of_neighbours_goes_on_to_the_bit(name):
     go(3, 0.1)
     state = loop.snapshot()
     first = [go(*stop) for stop in stops]
-    assert any(group.neighbours.forces for group in loop.groups)  # they meet
+    assert [len(group.steppers) for group in loop.groups] == [2]  # they may meet
     loop.restore(state)
     for stop, (shapes, facts) in zip(stops, first):
         again, said = go(*stop)
