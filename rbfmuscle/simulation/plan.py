@@ -6,6 +6,7 @@ from rbfmuscle.scene.motion import completed, rest_coordinates
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import bone_regions, find_contact_pairs
+from rbfmuscle.simulation.neighbours import connected, find_links
 from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 from rbfmuscle.validation import SceneError
@@ -22,9 +23,14 @@ def plan_scene(scene: Scene) -> dict[str, object]:
     muscles: list[dict[str, object]] = []
     counts: list[int] = []
     fields = []
-    for muscle in scene.muscles:
-        bones = [bone for name, bone in regions if name == muscle.name]
-        counts.append(_count_substeps(muscle, scene, bones, poses))
+    met = {m.name: [bone for name, bone in regions if name == m.name] for m in scene.muscles}
+    cuts = [SubSteps(scene, m, bones=met[m.name], poses=poses) for m in scene.muscles]
+    names = [muscle.name for muscle in scene.muscles]
+    groups = connected(len(names), find_links(scene, names))
+    together = {m: [cuts[k] for k in group] for group in groups for m in group}
+    for number, muscle in enumerate(scene.muscles):
+        bones = met[muscle.name]
+        counts.append(_count_substeps(muscle, scene, together[number], poses))
         muscles.append(
             {
                 "name": muscle.name,
@@ -45,10 +51,13 @@ def plan_scene(scene: Scene) -> dict[str, object]:
     return {"frames": len(scene.motion), "substeps": most, "muscles": muscles, "fields": fields}
 
 
-def _count_substeps(muscle: Muscle, scene: Scene, bones: list[str], poses: PoseCache) -> int:
-    """Sub-steps in which the motion requires a muscle to be solved."""
-    always = muscle.contraction is not None
-    cut = SubSteps(scene, muscle, bones=bones, poses=poses)
+def _count_substeps(
+    muscle: Muscle, scene: Scene, together: list[SubSteps], poses: PoseCache
+) -> int:
+    """Sub-steps in which the motion requires a muscle to be solved, ``together`` with others those
+    of the one that needs most.
+    """
+    always = muscle.contraction is not None or len(together) > 1
     rigid_transport = RigidTransport(muscle, scene)
     count = 0
     here = rest_coordinates(scene)
@@ -56,7 +65,7 @@ def _count_substeps(muscle: Muscle, scene: Scene, bones: list[str], poses: PoseC
     for index, frame in enumerate(scene.motion.frames):
         there = completed(scene, frame)
         try:
-            stops = cut.split(here, there)
+            stops = max((cut.split(here, there) for cut in together), key=len)
         except SceneError as error:
             raise SceneError(f"muscle {muscle.name!r}, frame {index}: {error}") from None
         for stop in stops:
