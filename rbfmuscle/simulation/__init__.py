@@ -1,1 +1,1 @@
-"""The frame loop: sub-steps, contact, tunnelling, sliding."""
+"""The frame loop: sub-steps, contact, tunnelling, neighbours."""

@@ -243,7 +243,8 @@ class Settling:
         self._least = np.inf
         self._halved = (np.inf, 0)
         self.softened = True
-        self.slowness = slowness
+        self.slowness = max(slowness, state.slowness)
+        self._seen = 0.0
         self.wanted = ERROR if error is None else error
         self._localise()
         if state.metric is None or self._has_turned(state.metric):
@@ -403,7 +404,7 @@ class Settling:
         if not np.isfinite(moved):
             raise FloatingPointError("the solid does not settle")
         if self.asleep:
-            near = moved * self.slowness < self.wanted * self.part * size
+            near = SAFETY * moved * self.slowness < self.wanted * self.part * size
             if near or self.iterations >= self.model.iterations:
                 return
             self.asleep = False
@@ -467,7 +468,8 @@ class Settling:
             gram = changes @ changes.T
             gram.flat[:: len(gram) + 1] *= 1.0 + 1e-6
             ratios = np.linalg.eigvals(np.linalg.solve(gram, ways @ ways.T))
-            self.slowness = max(self.slowness, float(np.sqrt(np.abs(ratios).max())))
+            self._seen = max(self._seen, float(np.sqrt(np.abs(ratios).max())))
+            self.slowness = max(self.slowness, self._seen)
         return SAFETY * moved * self.slowness
 
     def _renew_metric(self) -> None:
@@ -507,6 +509,7 @@ class Settling:
             stretches=rows[:, STRETCH].ravel().copy(),
             pressures=self.pressure,
             forces=self.forces,
+            slowness=self._seen,
             metric=None if self.squeezed.any() or not self.softened else self.metric,
         )
 

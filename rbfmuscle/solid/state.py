@@ -46,6 +46,7 @@ class SolidState(NamedTuple):
     start_pressures: np.ndarray
     activation: float
     metric: Metric | None  # of the last solve
+    slowness: float  # way to the equilibrium over a step, as the last solve saw it
 
 
 def rest_state(model: SolidModel) -> SolidState:
@@ -66,6 +67,7 @@ def rest_state(model: SolidModel) -> SolidState:
         np.zeros(regions),
         0.0,
         None,
+        0.0,
     )
 
 

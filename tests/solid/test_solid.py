@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ROOT
-from rbfmuscle.solid.touching import carried
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
@@ -318,17 +317,17 @@ def ways_after_the_end(scene, monkeypatch):
     the material beyond where that ended, and the error that it stated, both over the muscle's size.
     """
     met, ended = {}, {}
-    settling, take = RBFMuscle.settling, RBFMuscle.take
+    begin, take = RBFMuscle.begin, RBFMuscle.take
 
-    def settling_noted(muscle, contacts):
+    def begin_noted(muscle, contacts):
         met[muscle.name] = contacts
-        return settling(muscle, contacts)
+        return begin(muscle, contacts)
 
     def taken(muscle, solid):
         ended[muscle.name] = solid.report()
         take(muscle, solid)
 
-    monkeypatch.setattr(RBFMuscle, "settling", settling_noted)
+    monkeypatch.setattr(RBFMuscle, "begin", begin_noted)
     monkeypatch.setattr(RBFMuscle, "take", taken)
     found = []
     models = build_models(scene)
@@ -337,12 +336,12 @@ def ways_after_the_end(scene, monkeypatch):
             stated = ended.pop(muscle.name, None)
             if stated is None:  # not solved in this frame
                 continue
-            solid = settling(muscle, met[muscle.name])
+            solid = begin(muscle, met[muscle.name])
             solid.wanted = 1e-3 * ERROR
             solid.model = solid.model._replace(iterations=10 * stated.iterations)
-            before = carried(*solid.model.embedding, solid.y)
+            before = solid.model.embedding.of(solid.nodes)
             settle([solid])
-            way = np.linalg.norm(carried(*solid.model.embedding, solid.y) - before, axis=1).max()
+            way = np.linalg.norm(solid.model.embedding.of(solid.nodes) - before, axis=1).max()
             found.append((frame.index, muscle.name, way / solid.model.size, stated))
     return found
 
@@ -358,6 +357,7 @@ def check_ways(found, muscles):
 def test_a_solve_of_the_phantom_ends_within_its_stated_error_of_the_equilibrium(monkeypatch):
     scene = phantom_scene()
     scene.set_motion(waypoints=[{}, {"hip.flexion": 60.0}], step=6.0)
+    scene.neighbours = None
     # The others do not move in each frame.
     check_ways(ways_after_the_end(scene, monkeypatch), ["extensor", "adductor_posterior"])
 
@@ -366,6 +366,7 @@ def test_a_solve_of_the_phantom_ends_within_its_stated_error_of_the_equilibrium(
 def test_a_solve_of_the_hip_ends_within_its_stated_error_of_the_equilibrium(hip_data, monkeypatch):
     scene = Scene.load(hip_data / "flexion.toml")
     scene.set_motion(waypoints=[{}, {"hip.flexion": 90.0}], step=9.0)
+    scene.neighbours = None
     names = [muscle.name for muscle in scene.muscles]
     check_ways(ways_after_the_end(scene, monkeypatch), names)
 

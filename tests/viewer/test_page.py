@@ -147,7 +147,7 @@ def test_buttons_turn_the_camera_of_their_own_browser(page, tab):
 def test_solve_error_sets_controls_to_rest_and_says_so(page, tab):
     model = page.sides[0].figure.session.models[0]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(model, "solve", Mock(side_effect=np.linalg.LinAlgError("planted")))
+        patch.setattr(model, "begin", Mock(side_effect=np.linalg.LinAlgError("planted")))
         page.panel.controls["hip.flexion"].value = 6.0
         wait_for(lambda: page.panel.controls["hip.flexion"].value == 0.0, SLOW)
     page._touch()
