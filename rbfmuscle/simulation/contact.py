@@ -6,7 +6,7 @@ how a muscle is represented.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -123,6 +123,8 @@ class BoneContacts:
         self.free = np.asarray(attached_bone, dtype=np.int64) < 0
         self.poses: Mapping[str, Floats] = AT_REST
         self.placed = bones.place(AT_REST)
+        #: Displacements (n, 3) that take points (n, 3) that are shown out of neighbours.
+        self.clear_way: Callable[[Floats], Floats] = np.zeros_like
         #: What holds points on their side of a bone, in a sub-step that needs it.
         self.fences: list[Fences] = []
         self._free = np.flatnonzero(self.free)

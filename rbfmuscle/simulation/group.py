@@ -7,6 +7,7 @@ Most groups are one muscle. A muscle alone that need not be solved is moved rigi
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from time import perf_counter
 from typing import NamedTuple
 
@@ -64,6 +65,8 @@ class Group:
         self.scene = self.steppers[0].scene
         self.detects = self.scene.detect.tunnelling.action
         self.neighbours = Neighbours(self.steppers, links)
+        for number, stepper in enumerate(self.steppers if links else ()):
+            stepper.contacts.clear_way = partial(self.neighbours.clear_way, number)
 
     @property
     def contracts(self) -> bool:
@@ -124,7 +127,7 @@ class Group:
         except FAILURES as error:
             lost = [not np.isfinite(solid.step).all() for solid in solids]
             raise _failure(self.steppers[int(np.argmax(lost))], coordinates, error) from error
-        self.neighbours.keep(meeting)
+        self.neighbours.keep(meeting, solids)
         for stepper, solid in zip(self.steppers, solids):
             try:
                 stepper.model.take(solid)

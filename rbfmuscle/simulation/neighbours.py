@@ -47,6 +47,8 @@ class Neighbours:
         self.links = sorted({*links, *(link[::-1] for link in links)})
         self.forces: Mapping[Link, Floats] = {}
         self.bodies: list[Body] = []
+        self._solids: Sequence[Moving] = ()
+        self._trees: list[cKDTree] = []
         self.overlaps: dict[Link, Floats] = {}
         if not links:
             return
@@ -102,10 +104,43 @@ class Neighbours:
         reach = NEAR * np.minimum(sizes[meeting.one], sizes[meeting.other])
         return meeting.without(~(meeting.gap < reach) & (meeting.force == 0.0))
 
-    def keep(self, meeting: Meeting | None) -> None:
-        """Keep the forces of a solve for the next one."""
+    def keep(self, meeting: Meeting | None, solids: Sequence[Moving]) -> None:
+        """Keep the forces of a solve for the next one, and where it ended."""
         if meeting is not None:
             self.forces = self._by_link(meeting, meeting.force)
+        if self.links:
+            self._solids = solids
+            self._trees = [
+                cKDTree(solid.feet_of(body.points).of(solid.nodes))
+                for solid, body in zip(solids, self.bodies)
+            ]
+
+    def clear_way(self, number: int, points: Floats) -> Floats:
+        """Displacements (n, 3) that take points (n, 3) of the shown surface of a muscle to where
+        its own distance is that to a neighbour, as the last solve left both, where the neighbour is
+        nearer: so both are shown up to the same surface (Gascuel 1993). What overlapped at rest
+        stays so deep.
+        """
+        out = np.zeros_like(points)
+        if not self._solids:
+            return out
+        size = [solid.size for solid in self._solids]
+        for one, other in self.links:
+            if one != number:
+                continue
+            reach = SEARCHED * min(size[one], size[other])
+            which, nearest = _near_points(points, self._trees[other], reach)
+            if len(which) == 0:
+                continue
+            here = points[which]
+            own = self._trees[one].query(here)[1]
+            mine, _, _ = self._solids[one].ask(here, self.bodies[one].places[own])
+            gap, normal, _ = self._solids[other].ask(here, self.bodies[other].places[nearest])
+            if (one, other) in self.overlaps:
+                gap += self.overlaps[one, other][own]
+            nearer = np.isfinite(gap) & np.isfinite(mine) & (mine > gap)
+            out[which[nearer]] += 0.5 * (mine - gap)[nearer, None] * normal[nearer]
+        return out
 
     def _known(self, known: Mapping[Link, Floats], one: int, other: int, which: Integers) -> Floats:
         found = known.get((one, other))
