@@ -407,7 +407,10 @@ class Settling:
             near = SAFETY * moved * self.slowness < self.wanted * self.part * size
             if near or self.iterations >= self.model.iterations:
                 return
+            # Where a contact has moved it is another problem.
             self.asleep = False
+            self._least, self._halved = np.inf, (np.inf, self.iterations)
+            self.mixer.restart()
         self.iterations += 1
         pressure = self.pressure + self.metric.whiten.T @ self.change / self.part
         pressure = np.clip(pressure, -MOST_PRESSURE, MOST_PRESSURE)
