@@ -141,6 +141,30 @@ def test_three_muscles_in_a_ring_stay_apart_and_alike():
     assert np.abs(turn @ way["b"] - way["c"]).max() < 0.05
 
 
+def test_shown_surfaces_meet_between_muscles_that_touch():
+    """Also where the level sets bulge beyond the material: half of the way each."""
+    scene = _ring()
+    loop = FrameLoop(scene, build_models(scene))
+    for frame in scene.motion.frames:
+        shown = loop.advance(frame).surfaces
+    meshes = {name: (np.array(s.vertices), np.array(s.faces)) for name, s in shown.items()}
+    for one, other in (("a", "b"), ("b", "c"), ("c", "a"), ("b", "a")):
+        depth = -igl.signed_distance(meshes[one][0], *meshes[other])[0].min()
+        assert depth < 0.1
+    (group,) = loop.groups
+    number = [stepper.name for stepper in group.steppers].index("a")
+    # What bulges by a millimetre towards its neighbours goes back; what is far from them stays.
+    vertices = meshes["a"][0]
+    normals = trimesh.Trimesh(*meshes["a"], process=False).vertex_normals
+    moved = group.neighbours.clear_way(number, vertices + normals)
+    away = np.linalg.norm(moved, axis=1)
+    touching = np.min(
+        [igl.signed_distance(vertices, *meshes[name])[0] for name in ("b", "c")], axis=0
+    )
+    assert (away[touching < 0.2] > 0.2).all() and (away[touching > 3.0] == 0.0).all()
+    assert (touching < 0.2).any()
+
+
 def test_order_and_names_of_muscles_change_nothing():
     first = _run(_ring())[1]
     size = 60.0
