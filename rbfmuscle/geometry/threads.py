@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import lru_cache
 from heapq import heapify, heappop, heappush
 from itertools import pairwise
-from threading import Lock, local
+from threading import Condition, Lock, local
 from typing import TypeVar
 
 from numba import config
@@ -126,12 +126,12 @@ def in_stages(
     ready = [(-sum(sum(cost(item)) for item in group), k, -1) for k, group in enumerate(groups)]
     heapify(ready)
     results: dict[tuple[int, int], Result] = {}
-    lock = Lock()
+    changed, pending = Condition(), {*range(len(groups))}  # groups whose first stage is not over
 
     def work(_: int) -> None:
-        # A thread ends where nothing is ready: what becomes ready later, others go on with.
         while True:
-            with lock:
+            with changed:
+                changed.wait_for(lambda: ready or not pending)
                 if not ready:
                     return
                 _, number, part = heappop(ready)
@@ -141,17 +141,21 @@ def in_stages(
                     continue
                 first(number)
             except BaseException:
-                with lock:
+                with changed:
                     ready.clear()
+                    pending.clear()
+                    changed.notify_all()
                 raise
-            with lock:
+            with changed:
+                pending.discard(number)
                 for part, item in enumerate(groups[number]):
                     heappush(ready, (-cost(item)[1], number, part))
+                changed.notify_all()
 
     if len(groups) == 1:  # it has all threads to itself
         first(0)
         return [each(second, groups[0])]
-    each(work, range(min(thread_count(), len(groups))))
+    each(work, range(min(thread_count(), sum(map(len, groups)))))
     return [[results[k, part] for part in range(len(group))] for k, group in enumerate(groups)]
 
 

@@ -71,6 +71,24 @@ def test_two_threads_draw_one_item_while_another_is_solved():
     in_stages(first, second, [["slow"], ["quick"]], {"slow": (9, 1), "quick": (1, 1)}.get)
 
 
+def test_items_of_a_group_that_ends_late_are_shared_by_the_threads():
+    if thread_count() < 2:
+        pytest.skip("one processor")
+    drawn, both = threading.Event(), threading.Barrier(2, timeout=60.0)
+
+    def first(number):
+        if number == 0:
+            assert drawn.wait(60.0)
+
+    def second(item):
+        if item == "quick":
+            drawn.set()
+        else:
+            both.wait()
+
+    in_stages(first, second, [["one", "other"], ["quick"]], lambda item: (1.0, 1.0))
+
+
 def test_an_error_is_raised_when_nothing_is_being_worked_on(threads):
     def second(item):
         if item == 3:
