@@ -136,6 +136,6 @@ class MeshSettling:
         gap = self.surface.ask(points, place, *feet, normal)
         return gap, normal, feet
 
-    def bearing(self, points: Integers, area: Floats | float) -> tuple[Floats, float]:
+    def contact_law(self, points: Integers, area: Floats | float) -> tuple[Floats, float]:
         """No greatest force, and hard contacts."""
         return np.full(len(points), np.inf), 0.0

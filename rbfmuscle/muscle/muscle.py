@@ -169,13 +169,13 @@ class RBFMuscle:
         return Obstacles(exact, boxes, rounded, contacts.placed, contacts.free, contacts.allowed)
 
     def body(self) -> Body:
-        """What others meet that touch this muscle."""
+        """What others meet that touch this muscle, whose solves answer them from then on."""
         model, lattice, frame = self.model, self._lattice, self.frame
         points = even_points(
             model.points, np.flatnonzero(self.attached_bone < 0), APART * model.size
         )
         spacing = float(np.sqrt(model.area))
-        rest = BoneSDF.from_mesh(self._rest_mesh, name=self.name)
+        rest = BoneSDF.from_mesh(self._rest_mesh, name=f"muscle {self.name!r}")
         reach = SEARCHED * model.size
         turn = lattice.axes @ frame.axes / frame.size / lattice.spacing[:, None]
         origin = frame.origin + np.linalg.solve(turn, lattice.low / lattice.spacing)

@@ -219,7 +219,7 @@ class SceneFile(Table):
     hints: ClassVar[Mapping[str, str]] = {
         **dict.fromkeys(SceneTable.model_fields, "it belongs into the table [scene]"),
         "defaults": f"[classes.{MAIN}] holds the keys of all muscles",
-        "sliding": "muscles touch without it; [neighbours] says which, neighbours = false none",
+        "sliding": "muscles touch by default: [neighbours] names pairs, neighbours = false none",
     }
     scene: SceneTable
     classes: dict[str, ClassTable] = Field(default_factory=dict)

@@ -123,8 +123,8 @@ class BoneContacts:
         self.free = np.asarray(attached_bone, dtype=np.int64) < 0
         self.poses: Mapping[str, Floats] = AT_REST
         self.placed = bones.place(AT_REST)
-        #: Displacements (n, 3) that take points (n, 3) that are shown out of neighbours.
-        self.clear_way: Callable[[Floats], Floats] = np.zeros_like
+        #: Displacements (n, 3) that take shown points (n, 3) of the muscle out of its neighbours.
+        self.out_of_neighbours: Callable[[Floats], Floats] = np.zeros_like
         #: What holds points on their side of a bone, in a sub-step that needs it.
         self.fences: list[Fences] = []
         self._free = np.flatnonzero(self.free)

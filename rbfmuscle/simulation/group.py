@@ -17,7 +17,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.motion import step_angle
-from rbfmuscle.simulation.neighbours import Link, Neighbours
+from rbfmuscle.simulation.neighbours import Link, Neighbours, NeighbourState
 from rbfmuscle.simulation.stepper import MuscleStepper, Path, StepperState
 from rbfmuscle.simulation.touching import settle
 from rbfmuscle.simulation.tunnelling import Crossing, one_sided_planes
@@ -36,17 +36,17 @@ class GroupState(NamedTuple):
     """What changes of a group between sub-steps."""
 
     steppers: list[StepperState]
-    forces: Mapping[Link, Floats]
+    neighbours: NeighbourState
 
 
 class Saved(NamedTuple):
-    """What a sub-step is taken back to: the models' states, their contact points (n, 3) and the
-    forces between them.
+    """What a sub-step is taken back to: the models' states, their contact points (n, 3) and what is
+    between them.
     """
 
     models: list[object]
     points: list[Floats]
-    forces: Mapping[Link, Floats]
+    neighbours: NeighbourState
 
 
 class Group:
@@ -66,7 +66,7 @@ class Group:
         self.detects = self.scene.detect.tunnelling.action
         self.neighbours = Neighbours(self.steppers, links)
         for number, stepper in enumerate(self.steppers if links else ()):
-            stepper.contacts.clear_way = partial(self.neighbours.clear_way, number)
+            stepper.contacts.out_of_neighbours = partial(self.neighbours.out_of_neighbours, number)
 
     @property
     def contracts(self) -> bool:
@@ -146,23 +146,23 @@ class Group:
     def snapshot(self) -> GroupState:
         """The state, for :meth:`restore`."""
         steppers = [stepper.snapshot() for stepper in self.steppers]
-        return GroupState(steppers, self.neighbours.forces)
+        return GroupState(steppers, self.neighbours.state)
 
     def restore(self, state: GroupState) -> None:
         """Return to a snapshot, which stays valid."""
         for stepper, known in zip(self.steppers, state.steppers):
             stepper.restore(known)
-        self.neighbours.forces = state.forces
+        self.neighbours.state = state.neighbours
 
     def _save(self) -> Saved:
         models = [stepper.model for stepper in self.steppers]
         points = [model.contact_points().copy() for model in models]
-        return Saved([model.snapshot() for model in models], points, self.neighbours.forces)
+        return Saved([model.snapshot() for model in models], points, self.neighbours.state)
 
     def _take_back(self, saved: Saved) -> None:
         for stepper, state in zip(self.steppers, saved.models):
             stepper.model.restore(state)
-        self.neighbours.forces = saved.forces
+        self.neighbours.state = saved.neighbours
 
     def _follow(self, path: Path) -> None:
         """Predict and solve."""

@@ -5,6 +5,7 @@ What overlaps at rest, as segmentations often do, keeps that overlap as the zero
 
 from collections.abc import Mapping, Sequence
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,7 +17,7 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
 from rbfmuscle.simulation.stepper import MuscleStepper
 from rbfmuscle.simulation.touching import Body, Meeting, Moving
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import SceneError, did_you_mean
 
 Link = tuple[int, int]
 
@@ -26,6 +27,16 @@ REACH = 3.0
 # of the smaller one.
 SEARCHED = 0.06
 NEAR = 0.02  # gap of points that are looked at in a sub-step, of that size
+SHOWN = 0.04  # distance of shown vertices from those points, of that size
+
+
+class NeighbourState(NamedTuple):
+    """How the last solve of a group ended: forces (k,) of the points of one muscle at another, and
+    the bodies, none before the first. Nothing is changed in place.
+    """
+
+    forces: Mapping[Link, Floats]
+    bodies: Sequence[Moving]
 
 
 class Neighbours:
@@ -39,16 +50,13 @@ class Neighbours:
 
     Attributes
     ----------
-    forces : mapping of (int, int) to ndarray
-        Of the points (k,) of one muscle at another when last solved; never changed in place.
+    state : NeighbourState
     """
 
     def __init__(self, steppers: Sequence[MuscleStepper], links: Sequence[Link]) -> None:
         self.links = sorted({*links, *(link[::-1] for link in links)})
-        self.forces: Mapping[Link, Floats] = {}
+        self.state = NeighbourState({}, ())
         self.bodies: list[Body] = []
-        self._solids: Sequence[Moving] = ()
-        self._trees: list[cKDTree] = []
         self.overlaps: dict[Link, Floats] = {}
         if not links:
             return
@@ -80,8 +88,8 @@ class Neighbours:
         which = {m: [row[2] for row in found if row[0] == m] for m in range(len(solids))}
         nearest = {m: [row[3] for row in found if row[1] == m] for m in range(len(solids))}
         none = [np.zeros(0, dtype=np.int64)]
-        bearing = [
-            solids[one].bearing(self.bodies[one].points[rows], self.bodies[one].area)
+        law = [
+            solids[one].contact_law(self.bodies[one].points[rows], self.bodies[one].area)
             for one, _, rows, _ in found
         ]
         meeting = Meeting(
@@ -91,12 +99,12 @@ class Neighbours:
             [own[m].some(np.concatenate(rows or none)) for m, rows in which.items()],
             [self.bodies[m].places[np.concatenate(rows or none)] for m, rows in nearest.items()],
             (
-                np.concatenate([most for most, _ in bearing]),
-                np.repeat([y for _, y in bearing], counts),
+                np.concatenate([most for most, _ in law]),
+                np.repeat([y for _, y in law], counts),
             ),
             *(
                 np.concatenate([self._known(known, *row[:3]) for row in found])
-                for known in (self.overlaps, self.forces)
+                for known in (self.overlaps, self.state.forces)
             ),
         )
         meeting.ask(solids)
@@ -105,44 +113,39 @@ class Neighbours:
         return meeting.without(~(meeting.gap < reach) & (meeting.force == 0.0))
 
     def keep(self, meeting: Meeting | None, solids: Sequence[Moving]) -> None:
-        """Keep the forces of a solve for the next one, and where it ended."""
-        if meeting is not None:
-            self.forces = self._by_link(meeting, meeting.force)
-        if self.links:
-            self._solids = solids
-            self._trees = [
-                cKDTree(solid.feet_of(body.points).of(solid.nodes))
-                for solid, body in zip(solids, self.bodies)
-            ]
+        """Keep how a solve ended."""
+        forces = {} if meeting is None else self._by_link(meeting, meeting.force)
+        self.state = NeighbourState(forces, solids)
 
-    def clear_way(self, number: int, points: Floats) -> Floats:
+    def out_of_neighbours(self, number: int, points: Floats) -> Floats:
         """Displacements (n, 3) that take points (n, 3) of the shown surface of a muscle to where
         its own distance is that to a neighbour, as the last solve left both, where the neighbour is
         nearer: so both are shown up to the same surface (Gascuel 1993). What overlapped at rest
         stays so deep.
         """
-        out = np.zeros_like(points)
-        if not self._solids:
-            return out
-        size = [solid.size for solid in self._solids]
-        for one, other in self.links:
-            if one != number:
-                continue
-            reach = SEARCHED * min(size[one], size[other])
-            which, nearest = _near_points(points, self._trees[other], reach)
+        out, solids = np.zeros_like(points), self.state.bodies
+        others = [other for one, other in self.links if one == number] if solids else []
+        for other in others:
+            reach = SHOWN * min(solids[number].size, solids[other].size)
+            which, nearest = _near_points(points, self._tree(other), reach)
             if len(which) == 0:
                 continue
             here = points[which]
-            own = self._trees[one].query(here)[1]
-            mine, _, _ = self._solids[one].ask(here, self.bodies[one].places[own])
-            gap, normal, _ = self._solids[other].ask(here, self.bodies[other].places[nearest])
-            if (one, other) in self.overlaps:
-                gap += self.overlaps[one, other][own]
+            own = self._tree(number).query(here)[1]
+            mine, _, _ = solids[number].ask(here, self.bodies[number].places[own])
+            gap, normal, _ = solids[other].ask(here, self.bodies[other].places[nearest])
+            gap += self._known(self.overlaps, number, other, own)
             nearer = np.isfinite(gap) & np.isfinite(mine) & (mine > gap)
             out[which[nearer]] += 0.5 * (mine - gap)[nearer, None] * normal[nearer]
         return out
 
+    def _tree(self, number: int) -> cKDTree:
+        """Of the points of a muscle that meet neighbours, where the last solve left them."""
+        solid = self.state.bodies[number]
+        return cKDTree(solid.feet_of(self.bodies[number].points).of(solid.nodes))
+
     def _known(self, known: Mapping[Link, Floats], one: int, other: int, which: Integers) -> Floats:
+        """Values of some points of a muscle at another, 0 where there are none."""
         found = known.get((one, other))
         return np.zeros(len(which)) if found is None else found[which]
 
@@ -177,12 +180,10 @@ def find_links(scene: Scene, names: Sequence[str]) -> list[Link]:
     options = scene.neighbours
     if options is None:
         return []
-    for name in sorted({name for pair in options.pairs or [] for name in pair}):
-        known = [muscle.name for muscle in scene.muscles]
-        if name not in known:
-            raise SceneError(
-                f"[neighbours] pairs: unknown muscle {name!r}, known: {', '.join(known)}"
-            )
+    known = [muscle.name for muscle in scene.muscles]
+    for name in sorted({name for pair in options.pairs or [] for name in pair} - {*known}):
+        hint = did_you_mean(name, known)
+        raise SceneError(f"[neighbours] pairs: unknown muscle {name!r}, {hint}")
     wanted = None if options.pairs is None else [frozenset(pair) for pair in options.pairs]
     muscles = [scene.muscle(name) for name in names]
     poses, reach = sampled_poses(scene), from_mm(REACH, scene.units)

@@ -23,10 +23,7 @@ from rbfmuscle.simulation.rigid_transport import (
     RigidTransport,
 )
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
-from rbfmuscle.simulation.tunnelling import (
-    Crossing,
-    find_crossings,
-)
+from rbfmuscle.simulation.tunnelling import Crossing, find_crossings
 from rbfmuscle.validation import SceneError, SolveError
 
 # Depth [mm] below which a path through a bone counts as touching it.

@@ -118,7 +118,7 @@ class Moving(Protocol):
         date.
         """
 
-    def bearing(self, points: Integers, area: Floats | float) -> tuple[Floats, Floats | float]:
+    def contact_law(self, points: Integers, area: Floats | float) -> tuple[Floats, Floats | float]:
         """Greatest force (k,) at contact points that stand for an area each, and how far these
         yield to a unit force.
         """
@@ -138,7 +138,7 @@ class Meeting:
     place : sequence of ndarray
         For each body, where the search begins for the feet in it of those that may meet it, in
         their order.
-    bearing : tuple of two (K,) ndarray
+    law : tuple of two (K,) ndarray
         The greatest force at each point, and how far it yields to a unit force.
     allowed : (K,) ndarray
         Overlap at rest [scene unit].
@@ -153,7 +153,7 @@ class Meeting:
         point: Integers,
         own: Sequence[Embedding],
         place: Sequence[NDArray[Any]],
-        bearing: tuple[Floats, Floats],
+        law: tuple[Floats, Floats],
         allowed: Floats,
         force: Floats,
     ) -> None:
@@ -162,7 +162,7 @@ class Meeting:
         self.point = point
         self.own = own
         self.place = place
-        self.most, self.yields = bearing
+        self.most, self.yields = law
         self.allowed = allowed
         self.force = force
         bodies = range(len(own))
@@ -222,20 +222,20 @@ class Meeting:
         sizes = np.array([solid.size for solid in solids])
         steps = [solid.step if acts else None for solid, acts in zip(solids, acting, strict=True)]
         self.wants = -self.gap - self.allowed - self.apart(steps)
-        unknown = ~np.isfinite(self.gap)
-        reach = MET * np.minimum(sizes[self.one], sizes[self.other])
+        # Also where the gap is not known, and so infinite.
+        apart = self.gap > MET * np.minimum(sizes[self.one], sizes[self.other])
         idle = ~(acting[self.one] | acting[self.other])
-        self.wants[unknown | idle | (self.gap > reach)] = -np.inf
-        self.force[unknown] = 0.0
+        self.wants[apart | idle] = -np.inf
+        self.force[apart] = 0.0
 
     def without(self, far: Booleans) -> "Meeting":
         """The same without some of the points (K,)."""
         left = ~far
         own = [part.some(np.flatnonzero(left[mine])) for part, mine in zip(self.own, self.mine)]
         place = [part[left[behind]] for part, behind in zip(self.place, self.behind)]
-        bearing = self.most[left], self.yields[left]
+        law = self.most[left], self.yields[left]
         numbers = self.one[left], self.other[left], self.point[left]
-        return Meeting(*numbers, own, place, bearing, self.allowed[left], self.force[left])
+        return Meeting(*numbers, own, place, law, self.allowed[left], self.force[left])
 
 
 class Contacts(NamedTuple):

@@ -96,7 +96,7 @@ TURNED_WAY = 0.03
 LEAST, STIFFNESS = 0.5, 100.0
 
 
-ACTS = np.ones(1, dtype=np.bool_)
+ALONE = np.ones(1, dtype=np.bool_)  # a group of one body, which acts
 
 
 class Report(NamedTuple):
@@ -326,7 +326,7 @@ class Settling:
         carry_steps(self.near, *self.model.embedding, *nodes, MARGIN * size, here, motion, reach)
         found = self.obstacles.meet(self.near, here, reach)
         point = self.near[found.near]
-        most, softness = self.bearing(point, self.model.area)
+        most, softness = self.contact_law(point, self.model.area)
         self._asked = Wanted(
             point,
             found.source,
@@ -338,7 +338,7 @@ class Settling:
         )
         return self._asked
 
-    def bearing(self, points: Integers, area: Floats | float) -> tuple[Floats, Floats | float]:
+    def contact_law(self, points: Integers, area: Floats | float) -> tuple[Floats, Floats | float]:
         """Greatest force (k,) at contact points that stand for an area each, and how far these
         yield to a unit force.
         """
@@ -533,7 +533,7 @@ def find_slowness(model: SolidModel, stiffness: Stiffness, mobility: Mobility) -
     solid = Settling(model, stiffness, mobility, state, nothing)
     for _ in range(SHAKES):
         solid.free_step()
-        meet([solid], ACTS)
+        meet([solid], ALONE)
         solid.advance()
     return solid.slowness
 

@@ -160,7 +160,7 @@ class SurfaceBuilder:
             sheet = Sheet.at(sheet.carried)
             fill_material(shown, bones, sheet)
         sheet.suspect[self._meeting(centres)] = True
-        sheet.displace(contacts.clear_way(sheet.vertices))
+        sheet.displace(contacts.out_of_neighbours(sheet.vertices))
         change, crossing = finish(shown, bones, sheet)
         if not np.isfinite(change) or not np.isfinite(sheet.vertices).all():
             raise SolveError(

@@ -156,7 +156,7 @@ def test_shown_surfaces_meet_between_muscles_that_touch():
     # What bulges by a millimetre towards its neighbours goes back; what is far from them stays.
     vertices = meshes["a"][0]
     normals = trimesh.Trimesh(*meshes["a"], process=False).vertex_normals
-    moved = group.neighbours.clear_way(number, vertices + normals)
+    moved = group.neighbours.out_of_neighbours(number, vertices + normals)
     away = np.linalg.norm(moved, axis=1)
     touching = np.min(
         [igl.signed_distance(vertices, *meshes[name])[0] for name in ("b", "c")], axis=0
