@@ -86,8 +86,10 @@ def test_fibres_between_two_aponeuroses_follow_polylines():
     # Two corners of the bar, a fifth of it, are reached from one aponeurosis only.
     # Of the others the ends may lie 1 mm away, which are 17 mm apart.
     assert np.percentile(angles(lines, direction), 70) < 5.0
-    free, _ = trace_fibres(mesh, ends, 20)
-    assert angles(free, direction) == pytest.approx(45.0, abs=1.0)
+    fine = tuple(grid((0.0, -half), (LENGTH, half), 1, y, count=120) for y in (-half, half))
+    free, _ = trace_fibres(mesh, fine, 20)
+    # Lines end on points 0.5 mm apart, 12 mm from each other; between two of them either is taken.
+    assert angles(free, direction) == pytest.approx(45.0, abs=2.5)
 
 
 def test_fibres_of_a_feather_have_its_pennation_angle():

@@ -98,8 +98,8 @@ def strip():
         mesh = mesh.subdivide()
     x = mesh.vertices[:, 0]
     ends = [
-        Attachment("trunk", np.flatnonzero(x == x.min())),
-        Attachment("limb", np.flatnonzero(x == x.max())),
+        Attachment("trunk", np.flatnonzero(x < x.min() + 1e-6)),
+        Attachment("limb", np.flatnonzero(x > x.max() - 1e-6)),
     ]
     muscle = SimpleNamespace(name="strip", mesh=mesh, attachments=ends)
     joint = SimpleNamespace(name="joint", parent="trunk", child="limb", coordinates={})

@@ -21,7 +21,7 @@ def box_scene():
     places = {
         "trunk": ((-10, 0, 0), (-1, 20, 20)),
         "limb": ((60, 0, 0), (70, 20, 20)),
-        "plate": ((10, 5, 18), (20, 15, 30)),
+        "plate": ((10, 4, 18), (20, 16, 30)),
     }
     for name, (low, high) in places.items():
         scene.add_bone(name, toy.box_mesh(low, high))
@@ -29,7 +29,7 @@ def box_scene():
     scene.add_joint("still", "trunk", "plate", (0, 0, 0), {"bend": (0, -1, 0)})
     mesh = toy.box_mesh((0, 0, 0), (40, 20, 20))
     x = mesh.vertices[:, 0]
-    scene.add_muscle("box", mesh, attach=toy.held(trunk=x == 0, limb=x == 40))
+    scene.add_muscle("box", mesh, attach=toy.held(trunk=x < 1e-6, limb=x > 40 - 1e-6))
     scene.set_motion(ramp={"slide.bend": {"to": 2.0, "step": 1.0}})
     return scene
 
@@ -84,9 +84,9 @@ def test_volume_and_length_grow_by_a_tenth(found):
 
 def test_depths_are_those_of_the_plate(scene, found):
     vertices = stretched(scene).surfaces["box"].vertices
-    low, high = np.array([10, 5, 18]), np.array([20, 15, 30])
+    low, high = np.array([10, 4, 18]), np.array([20, 16, 30])
     depth = np.minimum(vertices - low, high - vertices).min(axis=1)
-    assert found["penetration_max"] == pytest.approx(depth.max()) and depth.max() == 2.0
+    assert found["penetration_max"] == pytest.approx(2.0)
     assert found["penetration_fraction"] == pytest.approx(np.mean(depth > 0.0))
     # Its lower side is 2 below the muscle's upper one.
     assert found["bone_penetration_max"] == pytest.approx(2.0)
@@ -138,9 +138,9 @@ def test_stretch_of_fibres_is_in_percentiles(scene):
 def test_tendons_of_one_end_count_by_the_areas_of_their_patches():
     mesh = toy.box_mesh((0, 0, 0), (40, 20, 20))
     x, y = mesh.vertices[:, 0], mesh.vertices[:, 1]
-    near = Attachment("limb", np.flatnonzero((x == 40) & (y <= 5)))
-    far = Attachment("limb", np.flatnonzero((x == 40) & (y > 5)))
-    held = [Attachment("trunk", np.flatnonzero(x == 0)), near, far]
+    near = Attachment("limb", np.flatnonzero((x > 40 - 1e-6) & (y < 6)))
+    far = Attachment("limb", np.flatnonzero((x > 40 - 1e-6) & (y >= 6)))
+    held = [Attachment("trunk", np.flatnonzero(x < 1e-6)), near, far]
     muscle = SimpleNamespace(name="box", mesh=mesh, attachments=held)
     line = Centreline(muscle, [], np.array(mesh.vertices), np.array(mesh.faces))
     # One body holds all, so the first attachment is the origin.
