@@ -7,7 +7,7 @@ import numpy as np
 from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.loops import loop
-from rbfmuscle.scene.activation.contraction import make_contraction
+from rbfmuscle.scene.activation import make_contraction
 from rbfmuscle.scene.objects import Muscle
 
 # Weight of tendon edges in the ARAP energy. Beside a belly that shortens by a fifth tendon keeps

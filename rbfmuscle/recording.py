@@ -45,10 +45,9 @@ from rbfmuscle.scene.check import (
     stated_doubts,
 )
 from rbfmuscle.scene.frames import parse_slice
-from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.phantom import open_scene
-from rbfmuscle.scene.scene import Scene, require_complete
+from rbfmuscle.scene.scene import Scene, doubtful, require_complete
 from rbfmuscle.simulation.frame import Event, Frame
 from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.simulation.substeps import check_substeps

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 import rbfmuscle as rm
-from rbfmuscle.scene.guesses import GuessTable
+from rbfmuscle.scene.options import GuessTable
 
 
 def built():

@@ -10,7 +10,7 @@ from pbd_baseline.settling import MeshSettling, Sweeps
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.joints.tables import JointTable
+from rbfmuscle.scene.joints import JointTable
 from rbfmuscle.scene.objects import Attachment, Motion, Muscle
 from rbfmuscle.scene.options import ContactOptions, DetectOptions, TunnellingOptions
 from rbfmuscle.scene.scene import Scene

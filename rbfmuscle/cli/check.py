@@ -50,8 +50,8 @@ def check(
             facts["accuracy"] = _accuracy(loaded)
         if picture:
             facts["picture"] = _draw(loaded, scene.with_suffix(".png"))
+    from rbfmuscle.run.info import record_scene
     from rbfmuscle.scene.check import attachment_facts
-    from rbfmuscle.scene.record import record_scene
 
     lines = [*_scene_lines(loaded), *map(str, findings), *_more_lines(facts, loaded.units)]
     facts |= {"scene": record_scene(loaded), "findings": [vars(finding) for finding in findings]}

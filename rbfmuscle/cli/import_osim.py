@@ -30,7 +30,7 @@ def import_(
         Make a tube of each muscle of the model, along its path.
     """
     from rbfmuscle.importers.opensim.scene import import_osim, scene_folder, write_imported
-    from rbfmuscle.scene.record import record_scene
+    from rbfmuscle.run.info import record_scene
 
     scene_folder(output, force=force)
     for folder in geometry or []:

@@ -172,8 +172,7 @@ def parse_targets(scene: "Scene", texts: list[str]) -> dict[str, str]:
 
 
 def _full_name(scene, name, context):
-    from rbfmuscle.scene.joints.joint import all_coordinates
-    from rbfmuscle.scene.joints.tables import full_name
+    from rbfmuscle.scene.joints import all_coordinates, full_name
 
     try:
         return full_name(name, list(all_coordinates(scene.joints)), context=context)

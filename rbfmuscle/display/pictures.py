@@ -20,9 +20,8 @@ from rbfmuscle.loops import loop
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.appearance import rgb, tendon_mesh
 from rbfmuscle.run.data import RunData, frame_caption, open_run
-from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.objects import Muscle, body_axes
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.scene import Scene, doubtful
 from rbfmuscle.scene.tendons import AT_REST
 from rbfmuscle.validation import SolveError, UsageError
 

@@ -23,7 +23,7 @@ from rbfmuscle.geometry.vectors import to_local
 from rbfmuscle.loops import loop
 from rbfmuscle.metrics.rows import bones_about
 from rbfmuscle.scene.bone import BoneDistance
-from rbfmuscle.scene.joints.joint import Joint, all_coordinates, rigid_body
+from rbfmuscle.scene.joints import Joint, all_coordinates, rigid_body
 from rbfmuscle.scene.objects import Attachment, Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import TendonLine

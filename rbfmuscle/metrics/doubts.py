@@ -8,7 +8,7 @@ from rbfmuscle.metrics.published import published_band
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import ROUGH
 from rbfmuscle.metrics.summary import Doubt, Table, shown_number
-from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.scene.joints import all_coordinates
 from rbfmuscle.scene.motion import rest_coordinates
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene

@@ -18,9 +18,8 @@ from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
 from rbfmuscle.metrics.rows import bone_depth, bones_about, surface_depth
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.check import articular_share, end_gap, scene_surfaces
-from rbfmuscle.scene.guesses import doubtful, guessed_muscles
 from rbfmuscle.scene.objects import Muscle, from_mm
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.scene import Scene, doubtful, guessed_muscles
 from rbfmuscle.simulation.frame import Event, Frame, Mesh, ModelSurface
 
 Values = dict[str, float]

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.scene.neighbours import InputOverlap, input_distances, input_overlaps
+from rbfmuscle.scene.check import InputOverlap, input_distances, input_overlaps
 from rbfmuscle.scene.objects import Muscle, from_mm
 
 # Surfaces that are nearer than this at rest [mm] touch there.

@@ -16,11 +16,10 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, percentiles, unit_text
 from rbfmuscle.scene.bone import BoneDistance
-from rbfmuscle.scene.guesses import guessed_muscles
-from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.scene.joints import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, shown_value
 from rbfmuscle.scene.objects import from_mm
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.scene import Scene, guessed_muscles
 from rbfmuscle.simulation.frame import Frame
 
 

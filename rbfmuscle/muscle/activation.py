@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.muscle.fibres import flux
-from rbfmuscle.scene.activation.contraction import make_contraction
+from rbfmuscle.scene.activation import make_contraction
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.solid.model import Fibres, SolidModel
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
-from rbfmuscle.scene.joints.joint import Joint
+from rbfmuscle.scene.joints import Joint
 from rbfmuscle.scene.muscles import attachment_ends
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.solid.model import SolidModel, hung_matrix

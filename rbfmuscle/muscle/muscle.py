@@ -13,7 +13,7 @@ from rbfmuscle.muscle.activation import contracting_fibres
 from rbfmuscle.muscle.fibres import along_fibres, held_at_insertion
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
-from rbfmuscle.scene.joints.joint import Joint
+from rbfmuscle.scene.joints import Joint
 from rbfmuscle.scene.muscles import attachment_frames, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene

@@ -23,7 +23,7 @@ from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.info import FORMAT, FrameInfo, RunInfo
 from rbfmuscle.run.vtk_files import fibre_file, read_fibres, read_vtp
-from rbfmuscle.scene.joints.tables import full_name
+from rbfmuscle.scene.joints import full_name
 from rbfmuscle.scene.meshes.repair import InputOrder
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
 from rbfmuscle.scene.scene import Scene

@@ -2,14 +2,91 @@
 read.
 """
 
+from __future__ import annotations
+
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt
 
+from rbfmuscle.geometry.surfaces import mesh_hash
 from rbfmuscle.metrics.summary import Doubt, Exceedance, QuantityFacts, Unmeasured
+from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.joints import all_coordinates, coupling_row, joint_row
 from rbfmuscle.scene.names import check_name
+from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
+
+if TYPE_CHECKING:
+    Facts: TypeAlias = QuantityFacts
+else:  # on Python 3.11 pydantic takes no TypedDict of the standard library
+    Facts = dict[str, str | int | float | None]
+
+
+def record_scene(scene: Scene) -> dict[str, object]:
+    """A scene as plain data: names, counts, options, sources and hashes."""
+    known = all_coordinates(scene.joints)
+    units = {name: coordinate.unit_sign(scene.units) for name, coordinate in known.items()}
+    motion = scene.motion.options.model_dump(mode="json", by_alias=True, exclude_none=True)
+    times = {} if scene.motion.times is None else {"times": scene.motion.times}
+    return {
+        "name": scene.name,
+        "units": scene.units,
+        "file": str(scene.path) if scene.path else None,
+        "superior": scene.superior,
+        "anterior": scene.anterior,
+        "bones": [{"name": bone.name, **record_mesh(bone)} for bone in scene.bones],
+        "meshless_bones": list(scene.meshless_bones),
+        "missing_bones": list(scene.missing_bones),
+        "doubts": list(scene.doubts),
+        "guesses": [guess._asdict() for guess in scene.guesses],
+        "notes": list(scene.notes),
+        "joints": [joint_row(joint) for joint in scene.joints],
+        "couplings": [coupling_row(coupling, scene.joints) for coupling in scene.couplings],
+        "coordinate_units": {name: unit for name, unit in units.items() if unit != "°"},
+        "motion": {**motion, "frames": len(scene.motion), "whole": scene.motion.whole, **times},
+        "muscles": [record_muscle(muscle) for muscle in scene.muscles],
+        "contact": scene.contact.model_dump(),
+        "neighbours": scene.neighbours.model_dump() if scene.neighbours else False,
+        "detect": scene.detect.model_dump(),
+        "output": scene.output.model_dump(),
+    }
+
+
+def record_muscle(muscle: Muscle) -> dict[str, object]:
+    """A muscle by its name, options, attachments in numbers, and mesh."""
+    keys = muscle.contraction
+    return {
+        "name": muscle.name,
+        "model": {"name": muscle.model, **muscle.options},
+        "attach": [
+            {"bone": held.bone, "vertices": len(held.vertices)}
+            | ({} if held.tendon is None else {"tendon": held.tendon.model_dump()})
+            | ({"via": True} if held.via else {})
+            for held in muscle.attachments
+        ],
+        "fibres": len(muscle.fibres) if muscle.fibres else 0,
+        "aponeuroses": [len(patch) for patch in muscle.aponeuroses],
+        **({} if keys is None else keys.model_dump(exclude_none=True)),
+        **record_mesh(muscle),
+    }
+
+
+def record_mesh(item: Bone | Muscle) -> dict[str, object]:
+    """Source, size and hash of a mesh."""
+    vertices = np.asarray(item.mesh.vertices)
+    faces = np.asarray(item.mesh.faces)
+    return {
+        "mesh": item.source,
+        "vertices": len(vertices),
+        "triangles": len(faces),
+        "volume": float(item.mesh.volume),
+        "sha256": mesh_hash(vertices, faces),
+        "mended": list(item.notes),
+    }
+
 
 # Version of ``run.json``: raised where readers of the one before would misread it.
 FORMAT = 2
@@ -18,12 +95,6 @@ FORMAT = 2
 # Names become those of files.
 BoneName = Annotated[str, AfterValidator(partial(check_name, what="bone"))]
 MuscleName = Annotated[str, AfterValidator(partial(check_name, what="muscle"))]
-
-
-if TYPE_CHECKING:
-    Facts: TypeAlias = QuantityFacts
-else:  # on Python 3.11 pydantic takes no TypedDict of the standard library
-    Facts = dict[str, str | int | float | None]
 
 
 class Part(BaseModel):
@@ -150,7 +221,7 @@ class RunInfo(Part):
         """What ``run.json`` holds."""
         return self.model_dump(exclude_unset=True)
 
-    def replaced(self, **facts: object) -> "RunInfo":
+    def replaced(self, **facts: object) -> RunInfo:
         """The facts with others in place of some."""
         return self.model_copy(update=facts)
 

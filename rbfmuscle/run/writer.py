@@ -26,7 +26,7 @@ from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.run.appearance import muscle_groups, tendon_mesh
 from rbfmuscle.run.data import given_file
-from rbfmuscle.run.info import FORMAT, RunInfo
+from rbfmuscle.run.info import FORMAT, RunInfo, record_scene
 from rbfmuscle.run.vtk_files import (
     FOLDER,
     TABLE,
@@ -38,7 +38,6 @@ from rbfmuscle.run.vtk_files import (
 )
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.objects import from_mm
-from rbfmuscle.scene.record import record_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import Frame, Mesh

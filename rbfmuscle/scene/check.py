@@ -3,29 +3,60 @@ motion.
 """
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.extents import check_place, check_size
-from rbfmuscle.scene.guesses import doubtful, guessed_muscles
 from rbfmuscle.scene.motion import bone_poses
-from rbfmuscle.scene.muscles import attachment_ends
-from rbfmuscle.scene.neighbours import input_distances, input_overlaps
+from rbfmuscle.scene.muscles import attachment_ends, check_place, check_size
 from rbfmuscle.scene.objects import Muscle, from_mm
-from rbfmuscle.scene.scene import Scene, require_complete
+from rbfmuscle.scene.scene import Scene, doubtful, guessed_muscles, require_complete
 from rbfmuscle.validation import RBFMuscleError, SceneError
 
 if TYPE_CHECKING:
     import trimesh
+
+
+class InputOverlap(NamedTuple):
+    """Where the input meshes of two muscles overlap at rest: vertices (n, 3) of either inside the
+    other, and their depths (n,) [scene unit].
+    """
+
+    places: Floats
+    depths: Floats
+
+
+def input_distances(muscles: Sequence[Muscle]) -> dict[str, MeshDistance]:
+    """Distance to the input mesh of each muscle, by name."""
+    return {m.name: MeshDistance(m.mesh.vertices, m.mesh.faces) for m in muscles}
+
+
+def input_overlaps(
+    distances: Mapping[str, MeshDistance],
+) -> dict[tuple[str, str], InputOverlap]:
+    """The pairs of muscles whose input meshes overlap, from `input_distances`."""
+    found = {}
+    for one, other in combinations(distances, 2):
+        depths = [
+            distances[other].depth(distances[one].vertices),
+            distances[one].depth(distances[other].vertices),
+        ]
+        inside = [depth > 0.0 for depth in depths]
+        if any(each.any() for each in inside):
+            places = [distances[n].vertices[i] for n, i in zip((one, other), inside)]
+            deep = [depth[i] for depth, i in zip(depths, inside)]
+            found[one, other] = InputOverlap(np.concatenate(places), np.concatenate(deep))
+    return found
 
 
 # Faces within this of the least gap face each other [mm], if the gap is no joint's beyond FARTHEST.
@@ -59,8 +90,11 @@ def articular_points(
         if parent not in meshes or child not in meshes:
             continue
         pair = meshes[parent], meshes[child]
-        radius = 0.0 if centre is None else _head_radius(pair[1], centre) / millimetre
-        if centre is not None and HEAD[0] <= radius <= HEAD[1]:
+        radius = 0.0
+        if centre is not None:
+            away = np.linalg.norm(np.asarray(pair[1].triangles_center) - centre, axis=1)
+            radius = float(np.median(np.sort(away)[:NEAREST])) / millimetre
+        if HEAD[0] <= radius <= HEAD[1]:
             found[parent].append(_about(pair[0], centre, SOCKET * radius * millimetre, -1.0))
             found[child].append(_about(pair[1], centre, SHELL * radius * millimetre, 1.0))
         else:
@@ -134,11 +168,6 @@ def attachment_facts(scene: Scene) -> list[AttachmentFacts]:
             row = (end, how, held.bone, len(held.vertices), area / from_mm(10.0, scene.units) ** 2)
             found.append(AttachmentFacts(muscle.name, *row, area / float(areas.sum())))
     return found
-
-
-def _head_radius(mesh, centre):
-    away = np.sort(np.linalg.norm(np.asarray(mesh.triangles_center) - centre, axis=1))
-    return float(np.median(away[:NEAREST]))
 
 
 def _about(mesh, centre, reach, sign):

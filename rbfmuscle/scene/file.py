@@ -1,6 +1,7 @@
 """The scene file: its tables, and the scene that they describe."""
 
 import os
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,13 +10,13 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from rbfmuscle.scene.activation.keys import KEYS, ContractionTable
-from rbfmuscle.scene.guesses import refuse_marks
-from rbfmuscle.scene.joints.tables import CouplingTable, JointTable
-from rbfmuscle.scene.meshes.transform import MeshTransform
+from rbfmuscle.scene.joints import CouplingTable, JointTable
+from rbfmuscle.scene.meshes.read import MeshTransform
 from rbfmuscle.scene.options import (
+    KEYS,
     Axis,
     ContactOptions,
+    ContractionTable,
     DetectOptions,
     FileName,
     MotionOptions,
@@ -37,14 +38,15 @@ DEEPEST_INCLUDE = 8
 LISTS = ("bone", "joint", "coupling", "muscle")
 # Keys that name files, wherever they stand.
 FILES = ("mesh", "fibres", "vertices", "points", "region", "file")
+# How guesses were marked before they were keys.
+_MARK = re.compile(r"#.*\bGUESS [01]\.\d")
 
 
-def read_tables(path: Path) -> Tables:
-    """The tables of a scene file; names of files are relative to its folder."""
-    return _read(path, (path,))
-
-
-def _read(path: Path, chain: tuple[Path, ...]) -> Tables:
+def read_tables(path: Path, *, including: tuple[Path, ...] = ()) -> Tables:
+    """The tables of a scene file, which the files ``including`` it led to; names of files are
+    relative to its folder.
+    """
+    chain = (*including, path)
     text = _read_text(path)
     data = _parse(path, text)
     check_plain(data, context=f"{path}: ")
@@ -54,7 +56,7 @@ def _read(path: Path, chain: tuple[Path, ...]) -> Tables:
             f"{path}: files of format 1 are read no more; write the scene anew by "
             f"docs/scene_file.md, with format = {FORMAT}"
         )
-    refuse_marks(text, context=f"{path}: ")
+    _refuse_marks(text, context=f"{path}: ")
     names = data.pop("include", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise SceneError(f"{path}: include must be a list of names of files")
@@ -62,10 +64,22 @@ def _read(path: Path, chain: tuple[Path, ...]) -> Tables:
         file = path.parent / name
         if file.resolve() in [one.resolve() for one in chain] or len(chain) > DEEPEST_INCLUDE:
             raise SceneError(f"{path}: include {name!r}: a file would include itself")
-        inner = _read(file, (*chain, file))
+        inner = read_tables(file, including=chain)
         moved = {key: _moved(value, Path(name).parent) for key, value in inner.items()}
         data = _merged(moved, data, f"{path}: include {name!r}: ")
     return data
+
+
+def _refuse_marks(text: str, *, context: str) -> None:
+    """SceneError where a comment in a scene file marks a guess; lines that are comments as a whole
+    may say anything.
+    """
+    for number, line in enumerate(text.splitlines(), start=1):
+        if _MARK.search(line) and not line.lstrip().startswith("#"):
+            raise SceneError(
+                f"{context}line {number}: comments mark no guesses any more; give the joint or "
+                'attachment guess = { confidence = 0.5, reason = "..." }, or remove the word GUESS'
+            )
 
 
 def _merged(inner: Tables, own: Tables, context: str) -> Tables:

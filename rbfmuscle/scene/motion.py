@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.scene.joints.joint import (
+from rbfmuscle.scene.joints import (
     all_coordinates,
     coordinate_values,
     joint_poses,

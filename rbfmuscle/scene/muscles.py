@@ -1,12 +1,16 @@
-"""A muscle from its mesh: which vertices are held by which bone, fibres, ends of tendons."""
+"""A muscle from its mesh: which vertices are held by which bone, fibres, ends of tendons; what its
+size and place must be.
+"""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import trimesh
@@ -15,16 +19,20 @@ from numpy.typing import ArrayLike
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.rest_frame import numbered_by_place
 from rbfmuscle.geometry.surfaces import vertex_areas
-from rbfmuscle.scene.activation.contraction import check_activation, make_contraction
-from rbfmuscle.scene.activation.keys import contraction_keys
+from rbfmuscle.geometry.vectors import box_size
+from rbfmuscle.scene.activation import (
+    check_activation,
+    contraction_keys,
+    make_contraction,
+)
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.file import MuscleKeys
-from rbfmuscle.scene.joints.joint import Joint, bones_between, rigid_body
-from rbfmuscle.scene.meshes.read import MeshInput, as_mesh, read_fibres
+from rbfmuscle.scene.joints import Joint, bones_between, rigid_body
+from rbfmuscle.scene.meshes.read import MeshInput, MeshTransform, as_mesh, read_fibres
 from rbfmuscle.scene.meshes.repair import ReadMesh
-from rbfmuscle.scene.meshes.transform import MeshTransform
 from rbfmuscle.scene.names import find_named
 from rbfmuscle.scene.objects import (
+    MM_PER_UNIT,
     Attachment,
     LineTable,
     Motion,
@@ -34,7 +42,7 @@ from rbfmuscle.scene.objects import (
 )
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable, select_vertices
 from rbfmuscle.scene.tendons import BonePoint, TendonEnd, tendon_name
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import MeshError, SceneError
 
 
 def ordered_muscle(muscle: Muscle) -> tuple[Muscle, Integers]:
@@ -295,3 +303,65 @@ def check_file_names(bones: list[Bone], muscles: list[Muscle]) -> None:
 def attachment_frames(bones: Sequence[Bone], muscle: Muscle) -> list[str]:
     """Names of the bones, then of the ends that tendons of a muscle hold."""
     return [*(bone.name for bone in bones), *(end.name for end in muscle.tendons)]
+
+
+Item: TypeAlias = Bone | Muscle | ReadMesh
+
+SMALLEST_MM = 2.0  # across: the bones of a mouse
+LARGEST_MM = 3000.0  # across: a person with arms raised
+# A muscle further from the bones than this many diagonals of their box is in another frame.
+FAR_AWAY = 1.0
+# The same for the centre of a joint: a nearly straight path has one far away.
+FARTHEST_CENTRE = 1000.0
+
+
+def check_size(kind: str, name: str, item: Item, units: str) -> None:
+    """Raise MeshError for a mesh smaller than a mouse's or larger than a person's."""
+    size = box_size(item.mesh.vertices)
+    millimetres = size * MM_PER_UNIT[units]
+    if not SMALLEST_MM <= millimetres <= LARGEST_MM:
+        best = 10.0 ** round(math.log10(300.0 / max(millimetres, 1e-12)))
+        raise MeshError(
+            f"{kind} {name!r} ({item.source or 'built in code'}) is {size:.4g} {units} "
+            "across, which "
+            f"cannot be right; correct the scene's units, or set its scale ({best:g} times the "
+            "present one would "
+            f"make it {millimetres * best:.4g} mm)"
+        )
+
+
+def check_place(name: str, muscle: Item, bones: list[Bone], units: str) -> None:
+    """Raise MeshError for a muscle of a wrong size, or one that lies far away from all bones."""
+    check_size("muscle", name, muscle, units)
+    away, size = _away_from_bones(bones, *muscle.mesh.bounds)
+    if away > FAR_AWAY * size:
+        raise MeshError(
+            f"muscle {name!r} ({muscle.source or 'built in code'}) lies {away:.4g} {units} "
+            "away from "
+            "all bones; bring the meshes into one frame and unit (scale)"
+        )
+
+
+def check_centre(name: str, centre: Floats, bones: list[Bone], units: str) -> None:
+    """Raise SceneError for a joint whose centre lies so far from all bones that poses lose their
+    digits.
+    """
+    away, size = _away_from_bones(bones, centre, centre)
+    if away > FARTHEST_CENTRE * size:
+        raise SceneError(
+            f"joint {name!r}: centre {np.asarray(centre).tolist()} lies {away:.4g} {units} "
+            "away from all bones; "
+            f"correct it, it is in the scene's unit ({units})"
+        )
+
+
+def _away_from_bones(bones, low, high):
+    """Distance of a box from that of all bones, and the diagonal of that; no distance without
+    bones.
+    """
+    if not bones:
+        return 0.0, 0.0
+    corners = np.concatenate([bone.mesh.bounds for bone in bones])
+    least, most = corners.min(axis=0), corners.max(axis=0)
+    away = np.maximum(least - high, low - most).clip(min=0)
+    return float(np.linalg.norm(away)), float(np.linalg.norm(most - least))

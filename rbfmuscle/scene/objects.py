@@ -10,11 +10,9 @@ import numpy as np
 from pydantic import Field
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.content import Compared
-from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.scene.meshes.repair import InputOrder
-from rbfmuscle.scene.options import MotionOptions, Table, Vector
+from rbfmuscle.scene.options import ContractionTable, GuessTable, MotionOptions, Table, Vector
 from rbfmuscle.scene.tendons import TendonEnd
 from rbfmuscle.validation import SceneError, shown
 

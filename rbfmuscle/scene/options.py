@@ -2,11 +2,12 @@
 ``--set``.
 """
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import (
@@ -21,6 +22,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.validation import SceneError, did_you_mean, shown
 
 # How deep tables and lists of a scene file may lie in each other, and how large a whole number may
@@ -161,6 +163,13 @@ def _describe_error(error, name_row):
     return f"{where}: {message}{value}" if where else message + value
 
 
+class GuessTable(Table):
+    """``guess`` of a joint or an attachment: that it is one, how sure, and why."""
+
+    confidence: Annotated[float, Field(ge=0.0, le=1.0)]
+    reason: str = ""
+
+
 class ContactOptions(Table):
     """``[contact]``: how muscles meet bones."""
 
@@ -257,3 +266,96 @@ class MotionOptions(Table):
         if self.step is not None and self.waypoints is None:
             raise ValueError("step belongs to waypoints; a ramp has its own step")
         return self
+
+
+KEYS = ("activation", "fibre_stretch_at_rest", "tendon_region")
+TENDON_STRAIN = 0.033  # at full activation (Zajac 1989)
+
+
+class TendonRegionTable(Table):
+    """``tendon_region``: where the tendon is, and its strain at full activation.
+
+    ``length`` from every attachment, or from the bone ``at`` alone. The strain of 0.033 at the
+    greatest isometric force is Zajac's (Critical Reviews in Biomedical Engineering 17, 1989).
+    """
+
+    length: Positive
+    at: str | None = None
+    strain: Annotated[float, Field(ge=0, le=0.5)] = TENDON_STRAIN
+
+
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class ActivationTable(Table):
+    """``activation``: values, 0 to 1, at frames of the motion, counted from 0, or at times [s], or
+    a column of an OpenSim storage file; straight between them, and constant beyond.
+    """
+
+    frames: list[Annotated[int, Field(ge=0)]] | None = Field(default=None, min_length=1)
+    times: list[Finite] | None = Field(default=None, min_length=1)
+    values: list[Share] | None = None
+    file: FileName | None = None
+    column: str | None = None
+
+    @model_validator(mode="after")
+    def _check_places(self) -> Self:
+        given = [key for key in ("frames", "times", "file") if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"give one of frames, times and file, got {' and '.join(given) or 0}")
+        if self.file is None and self.column is not None:
+            raise ValueError("column belongs to file")
+        if (self.values is None) != (self.file is not None):
+            raise ValueError("values belong to frames or times, a file has its own")
+        at = self.frames or self.times or []
+        if self.values is not None and len(self.values) != len(at):
+            raise ValueError(f"{given[0]} has {len(at)} numbers and values {len(self.values)}")
+        if any(b <= a for a, b in itertools.pairwise(at)):
+            raise ValueError(f"{given[0]} must increase")
+        return self
+
+
+def _check_activation(value: object) -> object:
+    """One message in place of one for each of the forms that it may take."""
+    if isinstance(value, (dict, ActivationTable)):
+        return value
+    for number in value if isinstance(value, list) and value else [value]:
+        if (
+            isinstance(number, bool)
+            or not isinstance(number, (int, float))
+            or not 0.0 <= number <= 1.0
+        ):
+            words = "a number from 0 to 1, a list of them over the motion, or a table"
+            raise ValueError(f"must be {words}")
+    return value
+
+
+class ContractionTable(Table):
+    """The keys of one muscle that contracts."""
+
+    # 0 to 1; of a list, waypoints are spread evenly over the motion.
+    activation: Annotated[
+        ActivationTable | float | list[float],
+        Field(union_mode="left_to_right"),
+        BeforeValidator(_check_activation),
+    ] = 0.0
+    # Stretch of the fibres in the scan pose against their slack length.
+    fibre_stretch_at_rest: Annotated[float, Field(gt=0.2, lt=5)] | None = None
+    tendon_region: TendonRegionTable | None = None
+
+
+class Contraction(NamedTuple):
+    """What the keys of a muscle come to."""
+
+    stretch_at_rest: float
+    tendon: Booleans  # vertices (n,) of the muscle's mesh that are tendon
+    tendon_strain: float = TENDON_STRAIN  # at full activation
+    # The scene says where passive fibres are slack, in place of the model's slack band.
+    slack: bool = False
+
+    @property
+    def shortest(self) -> float:
+        """Stretch against the scan at which a fully active fibre has no tension: half its slack
+        length (Zajac 1989).
+        """
+        return 0.5 / self.stretch_at_rest

@@ -14,12 +14,19 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.guesses import GuessTable
 from rbfmuscle.scene.meshes.formats import read_part, read_vertex_array
+from rbfmuscle.scene.meshes.read import MeshTransform
 from rbfmuscle.scene.meshes.repair import ReadMesh
-from rbfmuscle.scene.meshes.transform import MeshTransform
 from rbfmuscle.scene.objects import LineTable
-from rbfmuscle.scene.options import FileName, NotNegative, Positive, Table, Vector, in_folder
+from rbfmuscle.scene.options import (
+    FileName,
+    GuessTable,
+    NotNegative,
+    Positive,
+    Table,
+    Vector,
+    in_folder,
+)
 from rbfmuscle.validation import MeshError, SceneError, check_points, read_text, shown, shown_path
 
 if TYPE_CHECKING:
@@ -64,15 +71,6 @@ def read_points(path: Path, *, context: str) -> Floats:
         raise SceneError(f"{context}every line must hold three coordinates") from None
     if not len(points) or not np.isfinite(points).all():
         raise SceneError(f"{context}{len(points)} points, all must be finite")
-    return points
-
-
-def check_patch(points: Floats, *, context: str) -> Floats:
-    """Points that make a patch without a radius; SceneError where they are too few."""
-    if len(points) < FEWEST:
-        raise SceneError(
-            f"{context}{len(points)} points, at least {FEWEST} make a patch; give a radius"
-        )
     return points
 
 
@@ -295,7 +293,10 @@ def _about(given: Path | list, radius: float | None, points: Floats, context: st
     places = read_points(given, context=context) if isinstance(given, Path) else np.array(given)
     if radius is None:
         context += f"{shown_path(given)}: " if isinstance(given, Path) else ""
-        return picked_vertices(check_patch(places, context=context), points, context=context)
+        if len(places) < FEWEST:
+            words = f"{len(places)} points, at least {FEWEST} make a patch; give a radius"
+            raise SceneError(f"{context}{words}")
+        return picked_vertices(places, points, context=context)
     away = np.min([np.linalg.norm(points - place, axis=1) for place in places], axis=0)
     return _within(away, radius, "radius", context)
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.joints.joint import Coupling, Joint
-from rbfmuscle.scene.joints.tables import coupling_row, joint_row
+from rbfmuscle.scene.joints import Coupling, Joint, coupling_row, joint_row
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.options import Table
 from rbfmuscle.validation import UsageError

@@ -7,21 +7,39 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 from numpy.typing import ArrayLike
 
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.content import Compared
-from rbfmuscle.scene.extents import check_centre, check_place, check_size
 from rbfmuscle.scene.file import ABOUT, SceneFile, given_keys, read_scene_file
 from rbfmuscle.scene.frames import check_coordinates, make_motion, slice_motion
-from rbfmuscle.scene.guesses import Guess
-from rbfmuscle.scene.joints.joint import Coupling, Joint, check_tree, ordered
-from rbfmuscle.scene.joints.tables import CouplingTable, JointTable, make_coupling
-from rbfmuscle.scene.meshes.read import MeshInput, as_mesh, read_mesh
-from rbfmuscle.scene.meshes.transform import TransformInput, mesh_transform
-from rbfmuscle.scene.muscles import check_file_names, check_muscle, make_muscle, tendon_ends
+from rbfmuscle.scene.joints import (
+    Coupling,
+    CouplingTable,
+    Joint,
+    JointTable,
+    check_tree,
+    make_coupling,
+    ordered,
+)
+from rbfmuscle.scene.meshes.read import (
+    MeshInput,
+    MeshTransform,
+    TransformInput,
+    as_mesh,
+    read_mesh,
+)
+from rbfmuscle.scene.muscles import (
+    check_centre,
+    check_file_names,
+    check_muscle,
+    check_place,
+    check_size,
+    make_muscle,
+    tendon_ends,
+)
 from rbfmuscle.scene.names import check_new_name, find_named
 from rbfmuscle.scene.objects import MM_PER_UNIT, Attachment, Motion, Muscle, from_mm
 from rbfmuscle.scene.options import (
@@ -36,6 +54,33 @@ from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
 from rbfmuscle.scene.save import FORMAT, SceneFiles
 from rbfmuscle.scene.settings import TABLES, change_settings
 from rbfmuscle.validation import MeshError, SceneError, UsageError
+
+DOUBTFUL = 0.6  # a guess of less confidence is reported by check and by the verdict of a run
+
+
+class Guess(NamedTuple):
+    """A guess in a scene: the table (``"muscle"``, ``"joint"``) and the name of what it is about,
+    its confidence (0 to 1), and the reason.
+    """
+
+    table: str
+    name: str
+    confidence: float
+    text: str
+
+
+def guessed_muscles(guesses: list[Guess]) -> set[str]:
+    """Names of the muscles about which there are guesses, however sure."""
+    return {guess.name for guess in guesses if guess.table == "muscle"}
+
+
+def doubtful(guesses: list[Guess], table: str, name: str = "") -> list[Guess]:
+    """The doubtful ones of some guesses about a table, or about one name in it."""
+    return [
+        guess
+        for guess in guesses
+        if guess.table == table and guess.confidence < DOUBTFUL and name in ("", guess.name)
+    ]
 
 
 @dataclass(eq=False, repr=False)
@@ -255,7 +300,8 @@ class Scene(Compared):
             Then applied; a dict holds ``rotate`` and ``translate``, as in ``[[bone]]``.
         """
         check_new_name(self.bones, name, "bone")
-        lies = mesh_transform(scale, mirror, transform, context=f"bone {name!r}: ")
+        given = {"scale": scale, "mirror": mirror, "transform": transform}
+        lies = MeshTransform.build(given, context=f"bone {name!r}: ")
         if name in self.meshless_bones:
             raise SceneError(f"bone {name!r} is given twice")
         if mesh is None:

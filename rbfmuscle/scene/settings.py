@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rbfmuscle.scene.activation.keys import KEYS, contraction_keys
+from rbfmuscle.scene.activation import contraction_keys
 from rbfmuscle.scene.names import find_named
 from rbfmuscle.scene.objects import Muscle, split_model
 from rbfmuscle.scene.options import (
+    KEYS,
     MotionOptions,
     NeighbourOptions,
     Table,
@@ -78,31 +79,21 @@ def set_on_muscles(
     muscles: Sequence[Muscle], head: str, rest: str, value: object, context: str
 ) -> None:
     """Set a model, an option of it, or a key of contraction of muscles, in place."""
-    if head == "model" and not rest:
-        set_models(muscles, value)
-    elif head == "model":
-        for muscle in muscles:
-            set_dotted(muscle.options, rest, value, context=context)
-    else:
-        for muscle in muscles:
-            _set_contraction(muscle, head, rest, value)
-
-
-def set_models(muscles: Sequence[Muscle], model: object) -> None:
-    """Give muscles another model; options of a different model are dropped."""
-    name, options = split_model(model, context="model")
     for muscle in muscles:
-        kept = muscle.options if muscle.model == name else {}
-        muscle.model = name
-        muscle.options = kept | options
-
-
-def _set_contraction(muscle, key, rest, value):
-    given = {} if muscle.contraction is None else muscle.contraction.model_dump(exclude_unset=True)
-    if rest and not isinstance(given.get(key), dict):
-        given[key] = {}
-    set_dotted(given, f"{key}.{rest}" if rest else key, value, context=key)
-    muscle.contraction = contraction_keys(given, muscle=muscle.name)
+        if head == "model" and not rest:
+            name, options = split_model(value, context="model")
+            # Options of a different model are dropped.
+            muscle.options = (muscle.options if muscle.model == name else {}) | options
+            muscle.model = name
+        elif head == "model":
+            set_dotted(muscle.options, rest, value, context=context)
+        else:
+            keys = muscle.contraction
+            given = {} if keys is None else keys.model_dump(exclude_unset=True)
+            if rest and not isinstance(given.get(head), dict):
+                given[head] = {}
+            set_dotted(given, f"{head}.{rest}" if rest else head, value, context=head)
+            muscle.contraction = contraction_keys(given, muscle=muscle.name)
 
 
 def changed_table(

@@ -11,6 +11,7 @@ bones alone and continuously: a pose has the same ends however it is reached.
 from __future__ import annotations
 
 import itertools
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,9 +22,9 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.lines import distance_along, line_length, points_along, taut_line
 from rbfmuscle.geometry.vectors import across, to_local, to_world, unit
-from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.joints import rotation_about
+from rbfmuscle.scene.options import TENDON_STRAIN
 
 # Strain of a passive belly at which it bears the force that strains its tendon by `TENDON_STRAIN`
 # (Zajac 1989), and the tendon's strain over the belly's.
@@ -57,14 +58,8 @@ class TendonLine(NamedTuple):
     settled: bool = True
 
 
-class AtRest(dict[str, Floats]):
-    """The pose (4, 4) of every bone, and of every end, at rest."""
-
-    def __missing__(self, name: str) -> Floats:
-        return np.eye(4)
-
-
-AT_REST = AtRest()
+# The pose (4, 4) of every bone, and of every end, at rest.
+AT_REST: Mapping[str, Floats] = defaultdict(lambda: np.eye(4))
 
 
 class Poses(dict[str, Floats]):

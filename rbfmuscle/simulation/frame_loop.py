@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.threads import blas_limited, each, in_stages
-from rbfmuscle.scene.activation.contraction import Activations
+from rbfmuscle.scene.activation import Activations
 from rbfmuscle.scene.motion import completed, rest_coordinates
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import Poses

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.scene.activation.contraction import STEP
-from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.scene.activation import STEP
+from rbfmuscle.scene.joints import all_coordinates
 from rbfmuscle.scene.motion import SHIFT_LEVER
 from rbfmuscle.scene.objects import Motion, from_mm
 from rbfmuscle.scene.scene import Scene

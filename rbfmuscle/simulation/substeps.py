@@ -11,7 +11,7 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.rest_frame import RestFrame, diameter
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.frames import interpolate
-from rbfmuscle.scene.joints.joint import Coordinate, all_coordinates
+from rbfmuscle.scene.joints import Coordinate, all_coordinates
 from rbfmuscle.scene.motion import (
     bone_poses,
     rest_coordinates,

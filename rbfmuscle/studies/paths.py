@@ -18,7 +18,7 @@ from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
 from rbfmuscle.run.writer import write_csv
-from rbfmuscle.scene.joints.joint import all_coordinates, exponents
+from rbfmuscle.scene.joints import all_coordinates, exponents
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Motion, from_mm
 from rbfmuscle.scene.scene import Scene, require_complete

@@ -8,9 +8,8 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.vectors import to_world, unit
 from rbfmuscle.scene.check import stated_doubts
-from rbfmuscle.scene.guesses import doubtful
 from rbfmuscle.scene.objects import from_mm
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.scene import Scene, doubtful
 from rbfmuscle.simulation.frame import Mesh
 
 if TYPE_CHECKING:

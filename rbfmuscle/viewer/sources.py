@@ -19,8 +19,8 @@ from rbfmuscle.metrics.verdict import describe_doubts
 from rbfmuscle.models import build_models, configure_scene, model_names
 from rbfmuscle.run.appearance import muscle_colours, muscle_groups, tendon_mesh
 from rbfmuscle.run.data import RunData, frame_caption
-from rbfmuscle.scene.activation.contraction import STEP
-from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.scene.activation import STEP
+from rbfmuscle.scene.joints import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import body_axes, from_mm
 from rbfmuscle.scene.scene import Scene, require_complete

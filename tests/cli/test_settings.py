@@ -13,8 +13,8 @@ from pydantic import BaseModel
 from pbd_baseline.options import PBDOptions
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene import options
-from rbfmuscle.scene.activation.keys import KEYS
 from rbfmuscle.scene.file import MuscleTable, SceneFile
+from rbfmuscle.scene.options import KEYS
 from rbfmuscle.scene.settings import HEADS
 
 # A value for every key, other than its default; model settings of quick muscles.

@@ -21,7 +21,7 @@ from toy_scene import solve
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_model
-from rbfmuscle.scene.activation.keys import ContractionTable
+from rbfmuscle.scene.options import ContractionTable
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 
 pytestmark = pytest.mark.numeric

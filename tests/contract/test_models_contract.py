@@ -10,7 +10,7 @@ import rbfmuscle as rm
 from pbd_baseline.shapes import METHODS
 from rbfmuscle.metrics.summary import LIMITS
 from rbfmuscle.models import build_model, model_names
-from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach

@@ -13,7 +13,7 @@ from rbfmuscle.geometry.fibres import fibre_directions
 from rbfmuscle.geometry.rest_frame import RestFrame, numbered_by_place
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.scene.muscles import attachment_ends, ordered_muscle
 from rbfmuscle.scene.objects import Attachment, Motion
 

@@ -177,10 +177,10 @@ def test_a_run_in_memory_exports_as_its_folder_does(textured, tmp_path):
 
 @pytest.mark.parametrize("axis", ["x", "z"])
 def test_a_mirrored_file_keeps_its_order(tmp_path, axis):
-    from rbfmuscle.scene.meshes.transform import mesh_transform
+    from rbfmuscle.scene.meshes.read import MeshTransform
 
     path, points, faces, *_ = write(tmp_path, "vtp")
-    read = read_mesh(path, transform=mesh_transform(2.0, axis, None, context=""))
+    read = read_mesh(path, transform=MeshTransform(scale=2.0, mirror=axis))
     turn = np.ones(3)
     turn["xyz".index(axis)] = -1.0
     vertices = read.vertices[read.given.source]

@@ -33,7 +33,7 @@ from rbfmuscle.importers.guess.guess import guess_scene, write_scene
 from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
 from rbfmuscle.recording import Run
 from rbfmuscle.scene.check import check_scene
-from rbfmuscle.scene.joints.tables import JointTable
+from rbfmuscle.scene.joints import JointTable
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import UsageError

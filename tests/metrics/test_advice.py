@@ -8,7 +8,7 @@ from tendon_scene import arm
 from rbfmuscle.metrics.quantities import ALL
 from rbfmuscle.metrics.summary import LIMITS
 from rbfmuscle.recording import simulate
-from rbfmuscle.scene.guesses import GuessTable
+from rbfmuscle.scene.options import GuessTable
 from rbfmuscle.scene.phantom import phantom_scene
 
 LOOK = "look at that frame"

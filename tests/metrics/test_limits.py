@@ -25,7 +25,7 @@ from rbfmuscle.metrics.verdict import describe_verdict, judge
 from rbfmuscle.recording import Run, simulate, stream_run
 from rbfmuscle.run.data import RunData
 from rbfmuscle.scene.check import check_scene, stated_doubts
-from rbfmuscle.scene.guesses import GuessTable
+from rbfmuscle.scene.options import GuessTable
 from rbfmuscle.validation import LimitExceededError, UsageError
 
 # Of issue and docs, in millimetres: what is just allowed, and what is not.

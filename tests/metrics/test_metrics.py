@@ -15,7 +15,7 @@ from rbfmuscle.metrics.quantities import Row
 from rbfmuscle.metrics.rows import _roughness, _smoothness, bone_depth, moment_arms, surface_depth
 from rbfmuscle.recording import simulate
 from rbfmuscle.scene.bone import Bone, BoneDistance
-from rbfmuscle.scene.joints.joint import Coordinate
+from rbfmuscle.scene.joints import Coordinate
 from rbfmuscle.scene.objects import Attachment, Motion
 from rbfmuscle.simulation.frame import Frame, ModelSurface
 

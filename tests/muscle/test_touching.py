@@ -8,7 +8,7 @@ from toy_scene import box_mesh, ellipsoid, held
 
 import rbfmuscle as rm
 from rbfmuscle.models import build_models
-from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames

@@ -12,7 +12,7 @@ from pbd_baseline.options import PBDOptions
 from pbd_baseline.shapes import METHODS
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.models import build_models
-from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.validation import MeshError

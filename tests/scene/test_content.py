@@ -10,8 +10,8 @@ from pydantic import BaseModel
 from rich_scene import rich
 
 import rbfmuscle as rm
-from rbfmuscle.scene.activation.keys import ContractionTable
 from rbfmuscle.scene.meshes.repair import InputOrder
+from rbfmuscle.scene.options import ContractionTable
 from rbfmuscle.studies.sweep import scene_content
 
 # Where files lie, and what follows from attachments and joints.

@@ -6,14 +6,14 @@ from blend_model import arm_scene
 from contraction_scenes import MUSCLE, spindle_scene
 
 from rbfmuscle.models import build_model
-from rbfmuscle.scene.activation.contraction import (
+from rbfmuscle.scene.activation import (
     SETTLING,
     STEP,
     Activations,
     activation_curve,
+    contraction_keys,
     make_contraction,
 )
-from rbfmuscle.scene.activation.keys import contraction_keys
 from rbfmuscle.scene.frames import slice_motion
 from rbfmuscle.scene.objects import Motion, Muscle
 from rbfmuscle.scene.scene import Scene, require_complete

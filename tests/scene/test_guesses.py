@@ -6,9 +6,9 @@ import trimesh
 from blend_model import arm_files
 
 from rbfmuscle.scene.check import articular_points, check_scene
-from rbfmuscle.scene.guesses import GuessTable, doubtful
+from rbfmuscle.scene.options import GuessTable
 from rbfmuscle.scene.patches import picked_vertices, read_points
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.scene import Scene, doubtful
 from rbfmuscle.validation import SceneError
 
 

@@ -12,16 +12,17 @@ from scipy.spatial.transform import Rotation
 from toy_scene import held
 
 from rbfmuscle.scene.check import check_scene
-from rbfmuscle.scene.joints.joint import (
+from rbfmuscle.scene.joints import (
     KINDS,
+    JointTable,
     Linear,
     PiecewiseLinear,
     Polynomial,
     Spline,
     all_coordinates,
     coordinate_values,
+    joint_row,
 )
-from rbfmuscle.scene.joints.tables import JointTable, joint_row
 from rbfmuscle.scene.motion import bone_poses, step_angle, turned_angle
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene

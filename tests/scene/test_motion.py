@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.phantom import MUSCLES, Tube
 from rbfmuscle.scene.scene import Scene

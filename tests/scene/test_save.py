@@ -9,8 +9,8 @@ from command_line import call
 from rich_scene import built, rich
 
 import rbfmuscle as rm
+from rbfmuscle.run.info import record_scene
 from rbfmuscle.scene.objects import Motion
-from rbfmuscle.scene.record import record_scene
 
 FROM_FILES = ("file", "mesh", "mended")  # what the record of a scene says of where its files lie
 

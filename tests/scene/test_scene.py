@@ -10,11 +10,11 @@ import pytest
 import trimesh
 from conftest import ROOT
 
+from rbfmuscle.run.info import record_scene
 from rbfmuscle.scene.check import bone_collisions, check_initial, check_scene
 from rbfmuscle.scene.frames import parse_slice
 from rbfmuscle.scene.names import new_name
 from rbfmuscle.scene.objects import from_mm
-from rbfmuscle.scene.record import record_scene
 from rbfmuscle.scene.save import attachment_file
 from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.scene.settings import parse_settings

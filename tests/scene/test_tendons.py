@@ -14,8 +14,8 @@ import rbfmuscle as rm
 from rbfmuscle.geometry.lines import line_length, taut_line
 from rbfmuscle.recording import Run
 from rbfmuscle.run.appearance import LONGEST_TAPER, TAPER, tendon_mesh
-from rbfmuscle.scene.activation.keys import TENDON_STRAIN
 from rbfmuscle.scene.motion import bone_poses
+from rbfmuscle.scene.options import TENDON_STRAIN
 from rbfmuscle.scene.tendons import AT_REST, STIFFNESS_RATIO, TendonEnd, TendonLine
 
 

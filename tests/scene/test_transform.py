@@ -6,7 +6,7 @@ import trimesh
 from blend_model import arm_files
 
 import rbfmuscle as rm
-from rbfmuscle.scene.meshes.transform import MeshTransform
+from rbfmuscle.scene.meshes.read import MeshTransform
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
 

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.extents import (
+from rbfmuscle.scene.motion import turned_angle
+from rbfmuscle.scene.muscles import (
     FAR_AWAY,
     FARTHEST_CENTRE,
     LARGEST_MM,
@@ -24,7 +25,6 @@ from rbfmuscle.scene.extents import (
     check_place,
     check_size,
 )
-from rbfmuscle.scene.motion import turned_angle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, SolveError
 

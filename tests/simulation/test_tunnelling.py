@@ -6,7 +6,7 @@ import trimesh
 from toy_scene import ToyMuscle, attach, box, ellipsoid, joint, muscle, scene
 
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rbfmuscle.geometry.rest_frame import RestFrame
 from rbfmuscle.models import build_models
 from rbfmuscle.muscle.muscle import RBFMuscle
-from rbfmuscle.scene.joints.joint import rotation_about
+from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame_loop import simulate_frames

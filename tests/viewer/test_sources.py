@@ -11,8 +11,8 @@ from blend_model import arm_scene
 import rbfmuscle as rm
 from rbfmuscle.run.data import RunData
 from rbfmuscle.scene.bone import BoneDistance
-from rbfmuscle.scene.guesses import GuessTable
-from rbfmuscle.scene.joints.joint import Coordinate
+from rbfmuscle.scene.joints import Coordinate
+from rbfmuscle.scene.options import GuessTable
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession, coordinate_limits
 from rbfmuscle.viewer.marks import KINDS, MarkView, scene_marks

@@ -19,10 +19,9 @@ from rbfmuscle.importers.guess.parts import Parts, read_parts
 from rbfmuscle.importers.guess.tendons import unused_tendons
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import articular_points
-from rbfmuscle.scene.guesses import DOUBTFUL
 from rbfmuscle.scene.names import plain_name
 from rbfmuscle.scene.save import FORMAT, MAIN, attachment_file, table_text
-from rbfmuscle.scene.scene import Scene
+from rbfmuscle.scene.scene import DOUBTFUL, Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 
 _TAIL = """[contact]

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.importers.opensim.model import GROUND
-from rbfmuscle.scene.joints.joint import (
+from rbfmuscle.scene.joints import (
     Function,
     Linear,
     Multivariate,

@@ -7,7 +7,7 @@ import numpy as np
 
 from rbfmuscle.importers.opensim.elements import Frames, Node, frame_at, read_function
 from rbfmuscle.importers.opensim.model import ModelConstraint, ModelJoint, OsimModel
-from rbfmuscle.scene.joints.joint import (
+from rbfmuscle.scene.joints import (
     KINDS,
     Coordinate,
     Coupling,

@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.scene.joints.joint import (
+from rbfmuscle.scene.joints import (
     Coordinate,
     Coupling,
     Joint,
     all_coordinates,
     coordinate_values,
+    full_name,
 )
-from rbfmuscle.scene.joints.tables import full_name
 
 GROUND = "ground"
 

@@ -7,7 +7,7 @@ import numpy as np
 from rbfmuscle.importers.opensim.elements import Node, frame_at, read_function, socket
 from rbfmuscle.importers.opensim.joints import Reading
 from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
-from rbfmuscle.scene.joints.joint import Linear, all_coordinates
+from rbfmuscle.scene.joints import Linear, all_coordinates
 from rbfmuscle.scene.names import new_name
 from rbfmuscle.validation import SceneError
 

@@ -18,7 +18,7 @@ from rbfmuscle.importers.opensim.model import (
     joints_between,
 )
 from rbfmuscle.importers.opensim.muscles import read_muscles
-from rbfmuscle.scene.joints.joint import Coupling, ordered
+from rbfmuscle.scene.joints import Coupling, ordered
 from rbfmuscle.scene.names import plain_name
 from rbfmuscle.validation import SceneError
 

@@ -15,7 +15,7 @@ from rbfmuscle.geometry.vectors import box_size, to_world
 from rbfmuscle.importers.opensim.model import ModelMesh, OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.tubes import TUBE_MODEL, make_tube
-from rbfmuscle.scene.joints.joint import all_coordinates
+from rbfmuscle.scene.joints import all_coordinates
 from rbfmuscle.scene.meshes.formats import ALL, MESH_SUFFIXES, read_part
 from rbfmuscle.scene.meshes.read import prepare_mesh
 from rbfmuscle.scene.meshes.repair import ReadMesh

@@ -6,18 +6,21 @@ became.
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import BeforeValidator, Field
+from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.scene.meshes.formats import read_part
 from rbfmuscle.scene.meshes.polydata import read_polydata
 from rbfmuscle.scene.meshes.repair import ReadMesh, input_order, repair
-from rbfmuscle.scene.meshes.transform import MeshTransform
+from rbfmuscle.scene.options import Finite, Positive, Table, Vector
 from rbfmuscle.validation import (
     MeshError,
     SceneError,
@@ -26,6 +29,74 @@ from rbfmuscle.validation import (
     read_text,
     shown,
 )
+
+FLAT = 1e-9  # least determinant of a transform, over the cube of its largest entry
+TransformInput: TypeAlias = ArrayLike | Mapping[str, Sequence[float]] | None
+AXES = {"x": 0, "y": 1, "z": 2}
+
+
+class TransformParts(Table):
+    """``transform`` by its parts: turns about the scene's x, then y, then z axis through the
+    origin [degree], then a shift [scene unit].
+    """
+
+    rotate: Vector = Field(default=[0.0, 0.0, 0.0])
+    translate: Vector = Field(default=[0.0, 0.0, 0.0])
+
+    def matrix(self) -> Floats:
+        """The transform (4, 4)."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_euler("xyz", self.rotate, degrees=True).as_matrix()
+        matrix[:3, 3] = self.translate
+        return matrix
+
+
+def _as_matrix(value: object) -> object:
+    """Parts, or an array, as rows of a matrix."""
+    if value is None:
+        return None
+    if isinstance(value, dict):
+        return TransformParts.build(value, context="").matrix().tolist()
+    try:
+        matrix = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (4, 4):
+        raise ValueError("must be a table with rotate and translate, or 4 rows of 4 numbers")
+    if not (np.isfinite(matrix).all() and (matrix[3] == [0.0, 0.0, 0.0, 1.0]).all()):
+        raise ValueError("needs finite numbers, and 0, 0, 0, 1 in its last row")
+    if abs(np.linalg.det(matrix[:3, :3])) <= FLAT * np.abs(matrix[:3, :3]).max() ** 3:
+        raise ValueError("makes the mesh flat, its first three columns must be independent")
+    return matrix.tolist()
+
+
+class MeshTransform(Table):
+    """Keys of a bone or a muscle that say where its mesh lies: the scale first, then the mirror,
+    then the transform.
+    """
+
+    scale: Positive = 1.0
+    mirror: Literal["x", "y", "z"] | None = None
+    transform: Annotated[list[list[Finite]] | None, BeforeValidator(_as_matrix)] = None
+
+    @property
+    def matrix(self) -> Floats | None:
+        """Mirror and transform (4, 4) of points in the scene's unit; None where neither is given.
+
+        A file without them has exactly its own points times the scale.
+        """
+        if self.mirror is None and self.transform is None:
+            return None
+        matrix = np.eye(4) if self.transform is None else np.array(self.transform)
+        if self.mirror is not None:
+            matrix[:, AXES[self.mirror]] *= -1.0
+        return matrix
+
+    def points(self, points: Floats) -> Floats:
+        """Points (n, 3) of a file, in the scene."""
+        scaled, matrix = np.asarray(points, dtype=float) * self.scale, self.matrix
+        return scaled if matrix is None else to_world(scaled, matrix)
+
 
 # In any unit: beyond it, squares of squares of lengths leave the range in which volumes are exact.
 LARGEST_COORDINATE = 1e12
@@ -65,7 +136,8 @@ def _placed(vertices, faces, transform):
     """Vertices and triangles of a file in the scene."""
     with np.errstate(over="ignore", invalid="ignore"):
         vertices = transform.points(vertices)
-    return vertices, faces[:, ::-1] if transform.turns_inside_out else faces
+    mirrored = transform.matrix is not None and np.linalg.det(transform.matrix[:3, :3]) < 0.0
+    return vertices, faces[:, ::-1] if mirrored else faces
 
 
 def as_mesh(

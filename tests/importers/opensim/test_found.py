@@ -27,7 +27,7 @@ import rbfmuscle as rm
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import import_osim, write_imported
 from rbfmuscle.scene.check import check_scene
-from rbfmuscle.scene.joints.joint import joint_poses, rotation_about
+from rbfmuscle.scene.joints import joint_poses, rotation_about
 
 
 @pytest.fixture

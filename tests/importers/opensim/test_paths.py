@@ -7,7 +7,7 @@ import pytest
 from command_line import call
 
 from rbfmuscle.cli.paths import parse_ranges, parse_targets
-from rbfmuscle.scene.joints.joint import exponents
+from rbfmuscle.scene.joints import exponents
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.contact_pairs import find_contact_pairs

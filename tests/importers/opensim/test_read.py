@@ -11,7 +11,7 @@ import rbfmuscle as rm
 from rbfmuscle.importers.opensim.elements import frame_at
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import import_osim, write_imported
-from rbfmuscle.scene.joints.joint import all_coordinates, rotation_about
+from rbfmuscle.scene.joints import all_coordinates, rotation_about
 from rbfmuscle.scene.motion import bone_poses
 
 MODELS = (

@@ -4,6 +4,7 @@ motion.
 
 import itertools
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -11,15 +12,15 @@ from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import geodesic, surface_graph
 from rbfmuscle.geometry.vectors import box_size
-from rbfmuscle.scene.activation.keys import (
+from rbfmuscle.scene.frames import interpolate, read_storage
+from rbfmuscle.scene.objects import Motion, Muscle
+from rbfmuscle.scene.options import (
     TENDON_STRAIN,
     ActivationTable,
     Contraction,
     ContractionTable,
     TendonRegionTable,
 )
-from rbfmuscle.scene.frames import interpolate
-from rbfmuscle.scene.objects import Motion, Muscle
 from rbfmuscle.validation import SceneError, did_you_mean
 
 # A fibre that lies farther outside than this share of the muscle's diagonal is one of another
@@ -29,6 +30,39 @@ OUTSIDE = 0.1
 # less than 0.1 mm (tests/contract/test_contraction.py).
 STEP = 0.1
 SETTLING = 4  # further solves after activation has changed while no bone moved
+
+
+def contraction_keys(given: Mapping[str, object], *, muscle: str) -> ContractionTable | None:
+    """The checked keys of one muscle, or None where it has none; a value None counts as not
+    given.
+    """
+    found = {key: value for key, value in given.items() if value is not None}
+    if not found:
+        return None
+    table = ContractionTable.build(found, context=f"muscle {muscle!r} ")
+    if isinstance(table.activation, ActivationTable):
+        table = table.model_copy(update={"activation": _read_activation(table.activation, muscle)})
+    return table
+
+
+def _read_activation(given: ActivationTable, muscle: str) -> ActivationTable:
+    """The values of a table's file, of the column of a muscle where none is named."""
+    if given.file is None:
+        return given
+    context = f"muscle {muscle!r} activation: "
+    _, labels, rows = read_storage(given.file, context=context)
+    name = given.column or muscle
+    forms = (name, f"{name}/activation", f"/forceset/{name}/activation", f"{name}.activation")
+    column = next((labels.index(form) for form in forms if form in labels), -1)
+    if column < 0 or "time" not in labels:
+        wanted = name if column < 0 else "time"
+        hint = did_you_mean(wanted, labels)
+        raise SceneError(f"{context}{given.file} has no column {wanted!r}, {hint}")
+    values = {
+        "times": rows[:, labels.index("time")].tolist(),
+        "values": rows[:, column].tolist(),
+    }
+    return ActivationTable.build(values, context=f"{context}{given.file} column {name!r}: ")
 
 
 def make_contraction(muscle: Muscle) -> Contraction:

@@ -1,1 +1,0 @@
-"""Muscles that contract: keys, activation curves and the law of fibres."""

@@ -1,1 +1,0 @@
-"""Joints: their kinds, functions and poses."""
