@@ -22,7 +22,7 @@ sys.path.insert(0, str(ROOT))
 import numpy as np  # noqa: E402
 
 from rbfmuscle.display.plots import Band, Track, line_plot  # noqa: E402
-from rbfmuscle.metrics.published import published_band  # noqa: E402
+from rbfmuscle.metrics.doubts import published_band  # noqa: E402
 from rbfmuscle.metrics.quantities import QUANTITIES  # noqa: E402
 from rbfmuscle.metrics.summary import LIMITS, LOWER_BOUNDS  # noqa: E402
 from rbfmuscle.run.appearance import MUSCLE_COLOURS  # noqa: E402

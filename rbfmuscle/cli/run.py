@@ -101,7 +101,7 @@ def run(
 
 
 def _lines(output, frames, seconds):
-    from rbfmuscle.cli.verdict import verdict_lines
+    from rbfmuscle.cli.report import verdict_lines
 
     yield from verdict_lines(output)
     report = output / "report.html"

@@ -16,9 +16,8 @@ from rbfmuscle.run.data import RunData
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SolveError
-from rbfmuscle.viewer.marks import KINDS
 from rbfmuscle.viewer.server import open_server
-from rbfmuscle.viewer.side import COLOURINGS, ModelView, ViewSettings, legend
+from rbfmuscle.viewer.side import COLOURINGS, KINDS, ModelView, ViewSettings, legend
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
 if TYPE_CHECKING:

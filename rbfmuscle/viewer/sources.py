@@ -28,7 +28,7 @@ from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import FibreLines, Frame, MuscleModel
 from rbfmuscle.simulation.live import LiveSession, live_fields
 from rbfmuscle.validation import UsageError
-from rbfmuscle.viewer.marks import Marks, scene_marks
+from rbfmuscle.viewer.side import Marks, scene_marks
 
 Mesh = tuple[Floats, Integers]
 REST_TRIANGLES = 3000  # of a muscle, until its model is built

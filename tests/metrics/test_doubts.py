@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from rbfmuscle.metrics.doubts import measured_doubts
-from rbfmuscle.metrics.published import published_band
+from rbfmuscle.metrics.doubts import measured_doubts, published_band
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import Summary
 from rbfmuscle.scene.phantom import phantom_scene

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from blend_model import arm_scene, use_blend_model
 
-from rbfmuscle.cli.verdict import verdict_lines
+from rbfmuscle.cli.report import verdict_lines
 from rbfmuscle.display.report import write_report
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
 from rbfmuscle.metrics.rows import joint_gaps

@@ -12,11 +12,15 @@ from rbfmuscle.anatomy.bones import Orientation, Part, find_orientation
 from rbfmuscle.anatomy.cuts import EXACT, find_cut
 from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
-from rbfmuscle.importers.guess.attachments import FEWEST, MuscleGuess, guess_attachments
-from rbfmuscle.importers.guess.frames import bone_frames
+from rbfmuscle.importers.guess.attachments import (
+    FEWEST,
+    MuscleGuess,
+    guess_attachments,
+    unused_tendons,
+)
 from rbfmuscle.importers.guess.joints import Skeleton, guess_joints
 from rbfmuscle.importers.guess.parts import Parts, read_parts
-from rbfmuscle.importers.guess.tendons import unused_tendons
+from rbfmuscle.importers.guess.sites import bone_frames
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import articular_points
 from rbfmuscle.scene.names import plain_name

@@ -24,8 +24,7 @@ from rbfmuscle.importers.guess.anatomy import (
     place_patellae,
     set_rest,
 )
-from rbfmuscle.importers.guess.frames import BoneFrame
-from rbfmuscle.importers.guess.sites import Site, find_site
+from rbfmuscle.importers.guess.sites import BoneFrame, Site, find_site
 from rbfmuscle.scene.bone import Bone
 
 CLEAR = 1.5  # via points and insertions lie so far out of bones [mm]

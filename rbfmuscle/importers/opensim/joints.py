@@ -5,8 +5,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rbfmuscle.importers.opensim.elements import Frames, Node, frame_at, read_function
-from rbfmuscle.importers.opensim.model import ModelConstraint, ModelJoint, OsimModel
+from rbfmuscle.importers.opensim.elements import (
+    Frames,
+    ModelConstraint,
+    ModelJoint,
+    Node,
+    OsimModel,
+    frame_at,
+    read_function,
+)
 from rbfmuscle.scene.joints import (
     KINDS,
     Coordinate,

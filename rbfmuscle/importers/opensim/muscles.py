@@ -4,9 +4,15 @@ from collections import defaultdict
 
 import numpy as np
 
-from rbfmuscle.importers.opensim.elements import Node, frame_at, read_function, socket
+from rbfmuscle.importers.opensim.elements import (
+    ModelMuscle,
+    Node,
+    WrapShape,
+    frame_at,
+    read_function,
+    socket,
+)
 from rbfmuscle.importers.opensim.joints import Reading
-from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
 from rbfmuscle.scene.joints import Linear, all_coordinates
 from rbfmuscle.scene.names import new_name
 from rbfmuscle.validation import SceneError

@@ -7,16 +7,20 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.importers.opensim.elements import Frames, Node, frame_at, read_xml, socket
-from rbfmuscle.importers.opensim.joints import Reading, read_constraints, read_joint
-from rbfmuscle.importers.opensim.model import (
+from rbfmuscle.importers.opensim.elements import (
     GROUND,
+    Frames,
     ModelJoint,
     ModelMesh,
+    Node,
     OsimModel,
     Walk,
+    frame_at,
     joints_between,
+    read_xml,
+    socket,
 )
+from rbfmuscle.importers.opensim.joints import Reading, read_constraints, read_joint
 from rbfmuscle.importers.opensim.muscles import read_muscles
 from rbfmuscle.scene.joints import Coupling, ordered
 from rbfmuscle.scene.names import plain_name

@@ -6,12 +6,10 @@ import trimesh
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.lines import line_length
-from rbfmuscle.importers.opensim.elements import read_xml
-from rbfmuscle.importers.opensim.model import ModelMuscle, WrapShape
+from rbfmuscle.importers.opensim.elements import ModelMuscle, WrapShape, read_xml
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import LEAST_MISSED, import_osim, write_imported
-from rbfmuscle.importers.opensim.tubes import FITTED, SIDES, make_tube
-from rbfmuscle.importers.opensim.wraps import wrap_path
+from rbfmuscle.importers.opensim.tubes import FITTED, SIDES, make_tube, wrap_path
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import SceneError
