@@ -193,13 +193,13 @@ def arms_image():
     parts = []
     for facts in plots:
         markup = arms_plot(facts, colours[facts["muscle"]])
-        wide, high = (float(re.search(rf' {key}="([\d.]+)"', markup)[1]) for key in SIZE)
+        wide, high = (float(re.search(rf' {key}="([\d.]+)pt"', markup)[1]) for key in SIZE)
         x = wide * motions.index(facts["motion"])
         y = high * muscles.index(facts["muscle"])
         markup = " ".join(re.sub(r"(\.\d)\d+", r"\1", markup).split())
         parts.append(markup.replace("<svg", f'<svg x="{x:g}" y="{y:g}"', 1))
     box = f"0 0 {wide * len(motions):g} {high * len(muscles):g}"
-    space = 'xmlns="http://www.w3.org/2000/svg"'
+    space = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
     return "\n".join([f'<svg {space} viewBox="{box}">', *parts, "</svg>", ""])
 
 

@@ -1,4 +1,4 @@
-"""``rbfmuscle export``: a run in other formats."""
+"""``rbfmuscle export`` and ``render``: a run in other formats, and as pictures."""
 
 from pathlib import Path
 from typing import Annotated

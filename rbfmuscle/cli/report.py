@@ -1,4 +1,6 @@
-"""``rbfmuscle report``: the page of a run or a study, written again."""
+"""``rbfmuscle report``: the page of a run or a study, written again; the verdict of a run on a
+terminal.
+"""
 
 import json
 from collections.abc import Iterator

@@ -1,26 +1,50 @@
-"""Plots: lines along a motion, and points of error against time."""
+"""Plots as markup of SVG, by matplotlib: lines along a motion, and points of error against time."""
 
-from collections.abc import Mapping, Sequence
+import io
+import re
+from collections.abc import Sequence
 from itertools import cycle
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from markupsafe import escape
 
-from rbfmuscle.display import svg
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.run.appearance import MUSCLE_COLOURS
 from rbfmuscle.run.data import RunData
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 _LIMIT = "#a3281f"
-# Width and height of a plot of lines, what lies beside its axes, and height of a row of labels
-# [point].
-_WIDE, _TALL = 302.4, 165.6
-_LEFT, _RIGHT = 36.0, 10.0
-_TOP, _BOTTOM = 18.0, 30.0
+# Width and height of the axes, what lies at their left, right, above and below, height of a row of
+# names and width of a letter [point].
+_LINES, _FRONT = (256.0, 118.0), (331.0, 235.0)
+_LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 10.0, 20.0, 32.0
+_ROW, _LETTER = 11.5, 5.4
+_SOFT = "#5f646b"
+_STYLE = {
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 8.5,
+    "axes.edgecolor": "#b9b5ab",
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.axisbelow": True,
+    "axes.titlesize": 8.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelcolor": _SOFT,
+    "grid.color": "#e8e6e0",
+    "lines.linewidth": 1.4,
+    "xtick.labelcolor": _SOFT,
+    "ytick.labelcolor": _SOFT,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "rbfmuscle",  # the same plot has the same names of its parts
+    "text.parse_math": False,
+}
 _STILL = 1e-9  # coordinates that vary by less do not move [radian, or scene unit]
-_ROW = 11.5
-# Sides of the axes of a plot of points.
-_FRONT = (331.0, 235.0)
 
 
 class Track(NamedTuple):
@@ -67,130 +91,115 @@ def line_plot(
     legend: bool = False,
 ) -> str:
     """Markup of a plot of lines; one that bears a muscle's name is switched on and off with it, as
-    are ``bands``. Several lines have their names at their ends, beside the plot.
+    are ``bands``. Several lines have their names beside the plot.
 
     ``labels`` are those of the axes, ``limits`` dashed lines; the axis begins at ``zero``; a
     ``legend`` stands below instead.
     """
-    named = [] if legend or len(tracks) < 2 else tracks
-    tall = max(_TALL, _TOP + _BOTTOM + _ROW * len(named))
-    places = [*(track.x for track in tracks), *(band.x for band in bands)]
-    values = [track.y for track in tracks]
-    values += [edge for band in bands for edge in (band.low, band.high)]
-    x = svg.axis_about(places, _LEFT, _WIDE - _RIGHT)
-    known = [*values, np.array(limits, dtype=float)]
-    y = svg.axis_about(known, tall - _BOTTOM, _TOP, margin=0.05)
-    if zero:
-        y = y._replace(low=0.0)
-    parts = [svg.frame(x, y, labels)]
-    parts.append(svg.text(title, _LEFT, _TOP - svg.LETTER, colour="black", bold=True))
-    for limit in limits:
-        ends = y.place([limit, limit])
-        parts.append(svg.line([x.start, x.end], ends, _LIMIT, width=0.8, dashed=True))
-    for band in bands:
-        parts.append(_named(band.name, _band(band, x, y)))
-    for track in tracks:
-        parts.append(_named(track.name, svg.line(x.place(track.x), y.place(track.y), track.colour)))
-    for k, track in enumerate(tracks if legend else ()):
-        height = tall + _ROW * (k + 0.5)
-        parts.append(svg.line([4.0, 16.0], [height, height], track.colour))
-        parts.append(svg.text(track.name, 20.0, height, colour="black"))
-    parts += _names_at_ends(named, x, y)
-    letters = max((len(track.name) for track in named), default=0)
-    beside = 14.0 + svg.WIDE * letters if named else 0.0
-    return svg.picture(parts, (_WIDE + beside, tall + _ROW * len(tracks) * legend), title)
+    from matplotlib import rc_context
 
-
-def _names_at_ends(tracks: Sequence[Track], x: svg.Axis, y: svg.Axis) -> list[str]:
-    """The names of lines below each other beside the plot, each joined to the last known place of
-    its line.
-    """
-    places = []
-    for track in tracks:
-        known = np.flatnonzero(np.isfinite(track.y))
-        if len(known):
-            last = known[np.argmax(track.x[known])]
-            places.append((track, float(x.place(track.x[last])), float(y.place(track.y[last]))))
-    top, parts = y.end, []
-    for k, (track, at, height) in enumerate(sorted(places, key=lambda place: place[2])):
-        top = min(max(height, top), y.start - _ROW * (len(places) - 1 - k))
-        join = svg.line([at, x.end + _RIGHT], [height, top], track.colour, width=0.5)
-        name = svg.text(track.name, x.end + _RIGHT + 2.0, top, colour=track.colour)
-        parts.append(_named(track.name, join + name))
-        top += _ROW
-    return parts
-
-
-def _named(name: str, markup: str) -> str:
-    """Markup that is switched on and off with a muscle."""
-    name = svg.escape(name)
-    return f'<g data-muscle="{name}"><title>{name}</title>{markup}</g>\n'
-
-
-def _band(band: Band, x: svg.Axis, y: svg.Axis) -> str:
-    """A band as an area, or its edges dashed."""
-    at, edges = x.place(band.x), (y.place(band.low), y.place(band.high))
-    if not band.dashed:
-        return svg.area(at, *edges, band.colour)
-    return "".join(svg.line(at, edge, band.colour, width=0.8, dashed=True) for edge in edges)
+    rows = _ROW * len(tracks)
+    beside = 0.0 if legend or len(tracks) < 2 else _LETTER * max(len(t.name) for t in tracks) + 30.0
+    with rc_context(_STYLE):
+        figure, axes = _axes(_LINES[0], max(_LINES[1], rows), labels, beside, rows * legend)
+        axes.set_title(title)
+        for band in bands:
+            if band.dashed:
+                drawn = axes.plot(band.x, np.transpose([band.low, band.high]), "--", lw=0.8)
+            else:
+                drawn = [axes.fill_between(band.x, band.low, band.high, alpha=0.2, lw=0.0)]
+            for part in drawn:
+                part.set(color=band.colour, gid=_part_name(band.name))
+        lines = [axes.plot(t.x, t.y, color=t.colour, label=t.name)[0] for t in tracks]
+        for line, track in zip(lines, tracks):
+            line.set_gid(_part_name(track.name))
+        for limit in limits:
+            axes.axhline(limit, color=_LIMIT, linestyle="--", linewidth=0.8)
+        if zero:
+            axes.set_ylim(bottom=0.0)
+        if legend:
+            figure.legend(handles=lines, loc="lower left", frameon=False, labelspacing=0.2)
+        elif beside:
+            axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        return _markup(figure, title)
 
 
 def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
     """Markup of error against time on logarithmic axes: each group's front joined, it and the
     default labelled.
     """
+    from matplotlib import rc_context
+    from matplotlib.ticker import LogLocator
+
     shown = [point for point in points if point.x > 0 and point.y > 0]
     if not shown:
         return ""
     colours = dict(zip(sorted({point.group for point in shown}), cycle(MUSCLE_COLOURS)))
-    groups = colours if len(colours) > 1 else {}
-    named = [point for point in shown if point.star or point.front]
-    letters = max((len(text) for text in (*groups, *(point.label for point in named))), default=0)
-    tall = max(_FRONT[1], _ROW * (len(named) + len(groups)))
-    x = _logarithmic([point.x for point in shown], _LEFT + 8.0, _LEFT + 8.0 + _FRONT[0])
-    y = _logarithmic([point.y for point in shown], _TOP + tall, _TOP)
-    parts = [svg.frame(x, y, labels)]
-    for group, colour in colours.items():
-        front = sorted(point for point in shown if point.front and point.group == group)
-        places = x.place([point.x for point in front]), y.place([point.y for point in front])
-        parts.append(svg.line(*places, colour, width=1.0))
-    for point in shown:
-        place, opacity = _at(point, x, y), 1.0 if point.star or point.front else 0.4
-        parts.append(svg.mark(*place, colours[point.group], star=point.star, opacity=opacity))
-    parts += _labels_beside([(point, _at(point, x, y)) for point in named], groups, x.end, y)
-    size = x.end + 14.0 + svg.WIDE * letters, _TOP + tall + _BOTTOM
-    return svg.picture(parts, size, f"{labels[1]} against {labels[0]}")
+    named = sorted((p for p in shown if p.star or p.front), key=lambda point: point.y)
+    rows = _ROW * (len(named) + len(colours))
+    beside = _LETTER * max(len(text) for text in (*colours, *(p.label for p in named))) + 30.0
+    with rc_context(_STYLE):
+        figure, axes = _axes(_FRONT[0], max(_FRONT[1], rows), labels, beside, 0.0)
+        axes.loglog(subs=())
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter("{x:.4g}")
+        for point in shown:
+            style = {"marker": "*", "markersize": 12.0} if point.star else {"marker": "o"}
+            alpha = 1.0 if point in named else 0.4
+            axes.plot(point.x, point.y, color=colours[point.group], alpha=alpha, **style)
+        for group, colour in colours.items():
+            front = sorted(point for point in shown if point.front and point.group == group)
+            axes.plot([p.x for p in front], [p.y for p in front], color=colour, label=group, lw=1.0)
+        if len(colours) > 1:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        # Labels below each other beside the plot, each joined to its point.
+        for row, point in enumerate(named):
+            axes.annotate(
+                point.label,
+                (point.x, point.y),
+                (1.04, (row + 0.5) / (len(named) + len(colours))),
+                textcoords="axes fraction",
+                verticalalignment="center",
+                fontweight="bold" if point.star else "normal",
+                arrowprops={"arrowstyle": "-", "color": _SOFT, "linewidth": 0.5},
+            )
+        return _markup(figure, f"{labels[1]} against {labels[0]}")
 
 
-def _logarithmic(values: Sequence[float], start: float, end: float) -> svg.Axis:
-    """A logarithmic axis about values."""
-    found = svg.axis_about([np.log10(values)], start, end, margin=0.05)
-    return svg.Axis(10.0**found.low, 10.0**found.high, start, end, logarithmic=True)
-
-
-def _at(point: Point, x: svg.Axis, y: svg.Axis) -> tuple[float, float]:
-    return float(x.place(point.x)), float(y.place(point.y))
-
-
-def _labels_beside(
-    places: Sequence[tuple[Point, tuple[float, float]]],
-    groups: Mapping[str, str],
-    side: float,
-    y: svg.Axis,
-) -> list[str]:
-    """Groups, then the points' labels, below each other beside the plot, each joined to its point
-    at a place.
+def _axes(
+    wide: float, tall: float, labels: tuple[str, str], beside: float, below: float
+) -> "tuple[Figure, Axes]":
+    """A figure and its axes of a size, with room ``beside`` and ``below`` [point]; the label of
+    the vertical axis stands above, at its right end.
     """
-    top, parts = y.end, []
-    for name, colour in groups.items():
-        parts.append(svg.text(name, side + 13.0, top, colour=colour, bold=True))
-        top += _ROW
-    for k, (point, (x, height)) in enumerate(sorted(places, key=lambda found: found[1][1])):
-        top = min(max(height, top), y.start - _ROW * (len(places) - 1 - k))
-        parts.append(svg.line([x, side + 11.0], [height, top], svg.SOFT, width=0.5))
-        parts.append(svg.text(point.label, side + 13.0, top, colour="black", bold=point.star))
-        top += _ROW
-    return parts
+    from matplotlib.figure import Figure
+
+    size = np.array([_LEFT + wide + _RIGHT + beside, _TOP + tall + _BOTTOM + below])
+    figure = Figure(figsize=tuple(size / 72.0))
+    low = np.array([_LEFT, _BOTTOM + below]) / size
+    axes = figure.add_axes((*low, *(np.array([wide, tall]) / size)))
+    axes.set_xlabel(labels[0])
+    axes.set_title(labels[1], loc="right", color=_SOFT, fontweight="normal")
+    return figure, axes
+
+
+def _part_name(muscle: str) -> str:
+    """Name of a part that is switched on and off with a muscle."""
+    return f"muscle:{muscle}"
+
+
+def _markup(figure: "Figure", title: str) -> str:
+    """Markup for a page, which names no address; its title is read out."""
+    content = io.StringIO()
+    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    figure.savefig(content, format="svg", metadata=nothing)
+    _, _, text = content.getvalue().partition("<svg ")
+    text = re.sub(r'(xmlns(:\w+)?|version)="[^"]*"|<metadata>.*?</metadata>', "", text, flags=re.S)
+    text = re.sub(
+        r"""<g id=(["'])muscle:(.*?)\1>""", r"<g data-muscle=\1\2\1><title>\2</title>", text
+    )
+    return f'<svg role="img" aria-label="{escape(title)}" {text}'
 
 
 def motion_axis(saved: RunData) -> tuple[dict[int, float], str]:

@@ -1,5 +1,5 @@
-"""One of the models that stand beside each other: its bones and muscles in the browser's scene, and
-their colours.
+"""One of the models that stand beside each other: its bones, muscles, attachments and joints in the
+browser's scene, and their colours.
 """
 
 import math

@@ -7,46 +7,51 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rbfmuscle.display.plots import Point, Track, front_plot, line_plot
-from rbfmuscle.display.svg import Axis
 from rbfmuscle.run.appearance import MUSCLE_COLOURS
 
 
-def ticks(svg, anchor):
-    """Places of the ticks whose numbers have this anchor, and the numbers."""
-    pattern = rf'<text x="([\d.]+)" y="([\d.]+)" text-anchor="{anchor}"[^>]*>([−\d.]+)<'
-    return np.array(
-        [[float(x.replace("−", "-")) for x in found] for found in re.findall(pattern, svg)]
+def ticks(svg, axis):
+    """Places (n, 2) of the ticks of an axis, and their numbers (n,)."""
+    found = re.findall(
+        rf'<g id="{axis}tick_\d+">.*?<use [^>]*x="([\d.]+)" y="([\d.]+)".*?<text[^>]*>([−\d.]+)<',
+        svg,
+        re.S,
     )
+    numbers = np.array([[float(x.replace("−", "-")) for x in row] for row in found])
+    return numbers[:, :2], numbers[:, 2]
 
 
 def drawn(svg, line):
     """Values of a line that a pattern finds, read back by the ticks of the axes."""
-    x, y = ticks(svg, "middle"), ticks(svg, "end")
-    across, up = np.polyfit(x[:, 0], x[:, 2], 1), np.polyfit(y[:, 1], y[:, 2], 1)
-    points = np.array(
-        re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", re.search(line, svg, re.S)[1]), dtype=float
-    )
-    return np.polyval(across, points[:, 0]), np.polyval(up, points[:, 1])
+    (across, x), (up, y) = ticks(svg, "x"), ticks(svg, "y")
+    path = re.search(line, svg, re.S)[1]
+    points = np.array(re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", path), dtype=float)
+    at = np.polyval(np.polyfit(across[:, 0], x, 1), points[:, 0])
+    return at, np.polyval(np.polyfit(up[:, 1], y, 1), points[:, 1])
+
+
+STRAP = r'<g data-muscle="strap">.*?<path d="([^"]*)"'
 
 
 def test_lines_lie_where_the_numbers_at_the_axes_say():
     x, y = np.arange(0.0, 90.0, 10.0), np.sin(np.arange(9)) * 30.0 + 7.0
     svg = line_plot("a <title>", [Track("strap", "#cc6677", x, y)], ("angle", "mm"), limits=[50.0])
-    np.testing.assert_allclose(
-        drawn(svg, r'<g data-muscle="strap">.*?<path d="([^"]*)"'), [x, y], atol=1e-4
-    )
+    np.testing.assert_allclose(drawn(svg, STRAP), [x, y], atol=1e-3)  # six digits of a point
     limit = drawn(svg, r'<path d="([^"]*)"[^>]*stroke-dasharray')[1]
-    np.testing.assert_allclose(limit, 50.0, atol=1e-4)
-    assert (
-        "a &lt;title&gt;" in svg
-        and "http" not in svg
-        and ">angle</text>" in svg
-        and ">mm</text>" in svg
-    )
+    np.testing.assert_allclose(limit, 50.0, atol=1e-3)
+    for text in ("a &lt;title&gt;", ">angle</text>", ">mm</text>"):
+        assert text in svg
+    assert "http" not in svg
     y[4] = np.nan  # where the line is broken
     svg = line_plot("a", [Track("strap", "#cc6677", x, y)], ("angle", "mm"))
-    path = re.search(r'<g data-muscle="strap">.*?<path d="([^"]*)"', svg, re.S)[1]
+    path = re.search(STRAP, svg, re.S)[1]
     assert path.count("M") == 2 and path.count("L") == 6
+
+
+def test_the_same_plot_is_the_same_markup():
+    track = Track("strap", "#cc6677", np.arange(3.0), np.arange(3.0))
+    plots = {line_plot("a", [track], ("angle", "mm"), limits=[1.0]) for _ in range(2)}
+    assert len(plots) == 1
 
 
 def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
@@ -56,57 +61,33 @@ def test_front_labels_the_front_and_the_default_and_no_label_covers_another():
         Point(x, y, f"point {k}", "one", k == 0, k % 2 == 0) for k, (x, y) in enumerate(places)
     ]
     svg = front_plot(points, ("ms", "mm"))
-    labels = re.findall(r'x="[\d.]+" y="([\d.]+)"[^>]*>point (\d+)</text>', svg)
+    labels = re.findall(r'translate\([\d.]+ ([\d.]+)\)"[^>]*>point (\d+)</text>', svg) or (
+        re.findall(r'y="([\d.]+)"[^>]*>point (\d+)</text>', svg)
+    )
     heights, numbers = zip(*((float(y), int(number)) for y, number in labels))
     assert sorted(numbers) == list(range(0, 40, 2))
-    assert np.diff(sorted(heights)).min() > 11.0  # a row is 11.5 points high
-    colour = MUSCLE_COLOURS[0]
-    assert len(re.findall(rf'<(?:circle|path) [^>]* fill="{colour}"', svg)) == 40
-    front = re.search(rf'<path d="([^"]*)"[^>]*stroke="{colour}"', svg)[1]
+    assert np.diff(sorted(heights)).min() > 10.0  # letters are 8.5 points high
+    colour = MUSCLE_COLOURS[0].lower()
+    assert len(re.findall(rf"<use [^>]*fill: {colour}", svg)) == 40
+    front = max(re.findall(rf'<path d="([^"]*)"[^>]*stroke: {colour}', svg), key=len)
     x = np.array(re.findall(r"[ML] ([-\d.]+)", front), dtype=float)
     wanted = np.sort([np.log(point.x) for point in points if point.front])
     np.testing.assert_allclose(
-        (x - x[0]) / np.ptp(x), (wanted - wanted[0]) / np.ptp(wanted), atol=1e-6
+        (x - x[0]) / np.ptp(x), (wanted - wanted[0]) / np.ptp(wanted), atol=1e-5
     )
     assert front_plot([Point(1.0, 0.0, "exact", "one")], ("ms", "mm")) == ""
-
-
-def test_ticks_are_round_numbers_within_the_axis_wherever_it_lies():
-    rng = np.random.default_rng(3)
-    for _ in range(200):
-        size = 10.0 ** rng.uniform(-14, 8)
-        low = rng.normal() * size
-        axis = Axis(low, low + size, 100.0, 0.0)
-        values = np.array([value for value, _ in axis.ticks(20.0)])
-        assert 2 <= len(values) <= 6
-        assert values[0] >= low - 1e-9 * size and values[-1] <= low + size * (1 + 1e-9)
-        step = float(np.ptp(values)) / (len(values) - 1)
-        digits = step / 10.0 ** np.floor(np.log10(step) + 1e-6)
-        assert min(abs(digits - n) for n in (1.0, 2.0, 5.0)) < 1e-3
-        texts = [float(text) for _, text in axis.ticks(20.0)]
-        if abs(low) < 10 * size:  # of a range far from zero three digits say less
-            np.testing.assert_allclose(texts, values, atol=0.051 * step, rtol=6e-3)
-
-
-def test_a_logarithmic_axis_has_ticks_over_less_than_a_decade_and_over_many():
-    for high in (2.0, 9.0, 30.0, 1e4, 1e12):
-        axis = Axis(1.5, high, 0.0, 200.0, logarithmic=True)
-        values = np.array([value for value, _ in axis.ticks(20.0)])
-        assert 1 <= len(values) <= 11
-        assert values[0] >= 1.5 and values[-1] <= high * (1 + 1e-9)
 
 
 def test_a_plot_of_one_value_or_of_none_has_axes():
     for values in ([3.0, 3.0], [np.nan, np.nan]):
         svg = line_plot("a", [Track("b", "#cc6677", np.arange(2.0), np.array(values))], ("x", "y"))
-        assert "nan " not in svg and len(ticks(svg, "end")) > 1
+        assert "nan " not in svg and len(ticks(svg, "y")[1]) > 1
 
 
 def test_any_name_stands_in_a_plot_as_it_is():
     tracks = [Track('<"strap">', "#cc6677", np.arange(3.0), np.arange(3.0))]
-    found = ElementTree.fromstring(
-        line_plot(r"$\frac$ & <b>", tracks, ("angle", "mm"), legend=True)
-    )
+    plot = line_plot(r"$\frac$ & <b>", tracks, ("angle", "mm"), legend=True)
+    found = ElementTree.fromstring(plot.replace("xlink:href", "href"))
     assert found.get("aria-label") == r"$\frac$ & <b>"
-    assert '<"strap">' in [group.get("data-muscle") for group in found]
+    assert '<"strap">' in [group.get("data-muscle") for group in found.iter("g")]
     assert {r"$\frac$ & <b>", '<"strap">'} <= {element.text for element in found.iter("text")}

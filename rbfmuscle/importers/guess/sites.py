@@ -1,4 +1,7 @@
-"""Sites of attachment on bones, found by landmarks of the bone itself.
+"""Axes and size of each bone, and sites of attachment on it, by its own landmarks.
+
+Places on bones are lateral, anterior and superior, as shares of the bone's size. So they are scaled
+to the bone, and are the same on both sides of the body.
 
 A site lies about the places that ``sites.toml`` gives in the bone's frame, moved to the landmark
 that stands out there. Articular surfaces belong to no site.
