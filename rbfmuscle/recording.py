@@ -243,7 +243,12 @@ class Run(RunData):
         """
         folder = run_folder(directory)
         if self._recording is not None:
-            self._recording.finish(self._write(directory), pictures=pictures)
+            writer = RunWriter(directory, self.scene)
+            for frame in self.frames:
+                writer.write(frame)
+            writer.close(self.metrics)
+            writer.write_info(self.info)
+            self._recording.finish(writer, pictures=pictures)
         elif self.directory and Path(directory).resolve() != self.directory.resolve():
             with folder.staged() as stage:
                 copy_listed(self.directory, stage, "run")
@@ -285,14 +290,6 @@ class Run(RunData):
         if not self.has_surfaces:
             return html.escape(repr(self))
         return figure_html(lambda file: render_run(self, file), f"{self!r} {self.verdict}")
-
-    def _write(self, directory):
-        writer = RunWriter(directory, self.scene)
-        for frame in self.frames:
-            writer.write(frame)
-        writer.close(self.metrics)
-        writer.write_info(self.info)
-        return writer
 
 
 class MemorySink:
@@ -396,7 +393,11 @@ class Recording:
             self.message = f"a bug: {type(error).__name__}: {error}"
             raise
         finally:
-            rows = moment_arm_rows(self.scene, self._path, self._lengths())
+            series = self.summary.series
+            muscles, paths, active = map(series, ("length", "path_length", "activation"))
+            rows = moment_arm_rows(
+                self.scene, self._path, Lengths(muscles, paths, self._fibres, active)
+            )
             self.summary.add(rows)
             self._doubts += measured_doubts(self.scene, self.summary.table(), rows, self._path)
             # What ended the run says more than a disk that then refuses the rest.
@@ -473,12 +474,6 @@ class Recording:
             neighbours=self._measures.neighbours.table(),
             frames=self.written,
         )
-
-    def _lengths(self) -> Lengths:
-        """What was recorded of lengths by now."""
-        series = self.summary.series
-        muscles, paths, active = map(series, ("length", "path_length", "activation"))
-        return Lengths(muscles, paths, self._fibres, active)
 
     def _verdict(self, table: Table) -> Verdict:
         """What the run is worth; where it failed, of how many frames that holds."""

@@ -91,8 +91,11 @@ def _run(arguments, as_json):
         action, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False)
     except CycloptsError as error:
         if arguments[0] in REPLACED:
-            instead = f"use 'rbfmuscle {REPLACED[arguments[0]]}'"
-            return _fail(f"there is no command {arguments[0]!r}; {instead}", 2, as_json)
+            return _fail(
+                f"there is no command {arguments[0]!r}; use 'rbfmuscle {REPLACED[arguments[0]]}'",
+                2,
+                as_json,
+            )
         command = f"{arguments[0]} " if arguments[0] in app else ""
         message = one_line(error)
         if isinstance(error, UnusedCliTokensError):
@@ -149,9 +152,9 @@ def _report_bug(kind, error, trace):
         return
     while trace.tb_next:
         trace = trace.tb_next
-    place = f"{os.path.basename(trace.tb_frame.f_code.co_filename)}:{trace.tb_lineno}"
     print(
-        f"rbfmuscle: a bug: {kind.__name__}: {one_line(error)} (at {place}); "
-        "set RBFMUSCLE_TRACEBACK=1 for the whole trace and report it",
+        f"rbfmuscle: a bug: {kind.__name__}: {one_line(error)} (at "
+        f"{os.path.basename(trace.tb_frame.f_code.co_filename)}:{trace.tb_lineno}); set "
+        "RBFMUSCLE_TRACEBACK=1 for the whole trace and report it",
         file=sys.stderr,
     )

@@ -49,7 +49,12 @@ def check(
         if accuracy and usable:
             facts["accuracy"] = _accuracy(loaded)
         if picture:
-            facts["picture"] = _draw(loaded, scene.with_suffix(".png"))
+            from rbfmuscle.display.pictures import draw_scene
+
+            path = scene.with_suffix(".png")
+            with stage("drawing the picture"):
+                draw_scene(loaded, path)
+            facts["picture"] = str(path)
     from rbfmuscle.run.info import record_scene
     from rbfmuscle.scene.check import attachment_facts
 
@@ -61,14 +66,6 @@ def check(
         last = f"usable; next: rbfmuscle run {scene} -o results" if usable else "not usable"
         print(last, file=sys.stderr)
     return 0 if usable else SceneError.exit_code
-
-
-def _draw(scene, path):
-    from rbfmuscle.display.pictures import draw_scene
-
-    with stage("drawing the picture"):
-        draw_scene(scene, path)
-    return str(path)
 
 
 def _more_lines(facts, units):

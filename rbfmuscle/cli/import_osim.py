@@ -46,12 +46,9 @@ def import_(
 def _import_lines(written, notes, scene):
     yield from (f"note: {note}" for note in notes)
     yield from (f"doubtful: {doubt}" for doubt in scene.doubts)
-    counts = (
-        f"{len(scene.bones)} bones, {len(scene.meshless_bones)} without a mesh, "
-        f"{len(scene.joints)} joints"
-    )
     yield (
-        f"{written}: {counts}, {len(scene.couplings)} couplings, {len(scene.muscles)} muscles "
-        "as tubes"
+        f"{written}: {len(scene.bones)} bones, {len(scene.meshless_bones)} without a mesh, "
+        f"{len(scene.joints)} joints, {len(scene.couplings)} couplings, {len(scene.muscles)} "
+        "muscles as tubes"
     )
     yield f"next: rbfmuscle check {written}, then rbfmuscle run {written} -o out"

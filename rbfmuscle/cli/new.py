@@ -51,7 +51,9 @@ def new(
     if output is not None and output.suffix.lower() == ".toml":
         raise UsageError(f"--output {output}: give a folder, scene.toml is written to it")
     output = (output or (_beside(source) if volume else source)) / "scene.toml"
-    out = _new_folder(output, force)
+    if output.exists() and not force:
+        raise UsageError(f"{output} exists; give another --output, or --force to replace it")
+    out = OutputFolder(output.parent, "new", beside=True, replace=force, forced=[output.name])
     base = output.parent
     read = read_labels(source, names=labels) if volume else guess_scene(source, units, base)
     with out.staged(replaces=()) as stage:
@@ -74,15 +76,6 @@ def _new_lines(output, doubts, findings, scene):
     if scene.guesses:
         yield "how to correct guesses: docs/new.md; removing a key guess confirms it"
     yield f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out"
-
-
-def _new_folder(file, force):
-    """The folder of a new scene file, in which the user's meshes may be; with ``force`` the file
-    and what an earlier ``new`` wrote may be replaced.
-    """
-    if file.exists() and not force:
-        raise UsageError(f"{file} exists; give another --output, or --force to replace it")
-    return OutputFolder(file.parent, "new", beside=True, replace=force, forced=[file.name])
 
 
 def _is_segmentation(source):

@@ -146,8 +146,10 @@ def parse_ranges(scene: "Scene", texts: Pairs) -> "Ranges":
             low, *more = (float(end) for end in ends.split(":"))
             (high,) = more or [low]
         except ValueError:
-            form = "COORDINATE=LOW:HIGH, for instance hip.flexion=0:60, nor COORDINATE=VALUE"
-            raise UsageError(f"--range {text!r} is not {form}") from None
+            raise UsageError(
+                f"--range {text!r} is not "
+                "COORDINATE=LOW:HIGH, for instance hip.flexion=0:60, nor COORDINATE=VALUE"
+            ) from None
         full = _full_name(scene, name, "--range")
         ordered = low < high if more else low == high
         if not (ordered and math.isfinite(low) and math.isfinite(high)):
@@ -162,8 +164,10 @@ def parse_targets(scene: "Scene", texts: list[str]) -> dict[str, str]:
     for text in texts:
         name, _, target = text.partition("=")
         if not re.fullmatch(r"[^\s/]+/[^\s/]+", target):
-            form = "COORDINATE=JOINT/COORDINATE, for instance hip.flexion=hip_r/hip_flexion_r"
-            raise UsageError(f"--coordinate {text!r} is not {form}")
+            raise UsageError(
+                f"--coordinate {text!r} is not "
+                "COORDINATE=JOINT/COORDINATE, for instance hip.flexion=hip_r/hip_flexion_r"
+            )
         path = f"/jointset/{target}"
         if path in found.values():
             raise UsageError(f"--coordinate {text!r}: {target} is given for two coordinates")

@@ -133,8 +133,9 @@ def _redraw_study(directory, *, pictures):
             else:
                 sweep.write_page(directory, sweep.SweepTable.model_validate(facts))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            message = f"{path} is not as it was written ({error!r}); run the command again"
-            raise UsageError(message) from None
+            raise UsageError(
+                f"{path} is not as it was written ({error!r}); run the command again"
+            ) from None
         return directory / page, facts
     return None
 

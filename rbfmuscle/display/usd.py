@@ -27,8 +27,9 @@ def check_usd() -> None:
     try:
         import pxr.Usd  # noqa: F401
     except ImportError:
-        message = "export to usd needs usd-core: pip install -e '.[usd]' in rbfmuscle's folder"
-        raise MissingDependencyError(message) from None
+        raise MissingDependencyError(
+            "export to usd needs usd-core: pip install -e '.[usd]' in rbfmuscle's folder"
+        ) from None
 
 
 def write_usd(path: Path, run: Animation) -> None:

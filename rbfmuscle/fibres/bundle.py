@@ -115,8 +115,9 @@ def build_bundles(scene: Scene, models: Sequence[MuscleModel]) -> dict[str, Fibr
         try:
             return FibreBundle(muscle, scene, model, count)
         except np.linalg.LinAlgError as error:
-            message = f"muscle {muscle.name!r} has no fibres: {error}"
-            warnings.warn(message, SceneWarning, stacklevel=2)
+            warnings.warn(
+                f"muscle {muscle.name!r} has no fibres: {error}", SceneWarning, stacklevel=2
+            )
             return None
 
     found = zip(models, each(build, models))

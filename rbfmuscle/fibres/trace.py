@@ -58,14 +58,25 @@ class FluxField:
     ) -> None:
         low = mesh.vertices.min(axis=0)
         extent = np.ptp(mesh.vertices, axis=0)
-        self.side = _side(mesh, extent)
+        # Side of a cell [scene unit] with which the muscle has about `CELLS`.
+        a, b, c = (mesh.vertices[mesh.faces[:, k]] - mesh.vertices[0] for k in range(3))
+        volume = abs(float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum())) / 6.0
+        self.side = float(max((volume / CELLS) ** (1 / 3), extent.max() / 1000.0))
         self.low = low - 1.5 * self.side
         self.shape = np.ceil(extent / self.side).astype(int) + 3
         self.cells = self._cells(mesh, ends)
         self.middles = self.low + (self.cells + 0.5) * self.side
-        self._number_nodes()
+        corner = self.cells[:, None, :] + _CORNERS
+        flat = np.ravel_multi_index(tuple(np.moveaxis(corner, -1, 0)), tuple(self.shape + 1))
+        self._known, nodes = np.unique(flat, return_inverse=True)
+        self.nodes = nodes.reshape(flat.shape)
         conductivity = _conductivity(self.middles, polylines)
-        matrix = self._assemble(conductivity)
+        # Matrix of the potential's energy, trilinear in each cell.
+        element = self.side * np.einsum("cij,ijkl->ckl", conductivity, _element_matrices())
+        rows = np.repeat(self.nodes, 8, axis=1).ravel()
+        columns = np.tile(self.nodes, (1, 8)).ravel()
+        size = len(self._known)
+        matrix = sparse.csr_matrix((element.ravel(), (rows, columns)), shape=(size, size))
         source = self._source(ends)
         if polylines:
             grip = GRIP * self.side * len(self.cells) ** (1 / 3)
@@ -115,20 +126,6 @@ class FluxField:
         piece = self._piece(inside, ends[0])
         return bool(piece[tuple(ends[1].T)].mean() > 1 / 2)
 
-    def _number_nodes(self) -> None:
-        corner = self.cells[:, None, :] + _CORNERS
-        flat = np.ravel_multi_index(tuple(np.moveaxis(corner, -1, 0)), tuple(self.shape + 1))
-        self._known, nodes = np.unique(flat, return_inverse=True)
-        self.nodes = nodes.reshape(flat.shape)
-
-    def _assemble(self, conductivity: Floats) -> sparse.csr_matrix:
-        """Matrix of the potential's energy, trilinear in each cell."""
-        element = self.side * np.einsum("cij,ijkl->ckl", conductivity, _element_matrices())
-        rows = np.repeat(self.nodes, 8, axis=1).ravel()
-        columns = np.tile(self.nodes, (1, 8)).ravel()
-        size = len(self._known)
-        return sparse.csr_matrix((element.ravel(), (rows, columns)), shape=(size, size))
-
     def _source(self, ends: tuple[Floats, Floats]) -> Floats:
         """Flux (n,) into each node: one in all through the origin, as much out of the insertion."""
         out = np.zeros(len(self._known))
@@ -158,13 +155,6 @@ class FluxField:
         known[where] = True
         nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
         self._flux = grid[tuple(nearest)]
-
-
-def _side(mesh: MeshDistance, extent: Floats) -> float:
-    """Side of a cell [scene unit] with which the muscle has about `CELLS`."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] - mesh.vertices[0] for k in range(3))
-    volume = abs(float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum())) / 6.0
-    return float(max((volume / CELLS) ** (1 / 3), extent.max() / 1000.0))
 
 
 def _surface_points(mesh: MeshDistance, apart: float) -> Floats:
@@ -323,8 +313,11 @@ class _Tracer:
         here = seeds.copy()
         open_lines = np.arange(len(seeds))
         for _ in range(self.most):
-            here = self._ahead(here, sense)
-            here, beyond = self._inside(here)
+            half = here + 0.5 * sense * self.step * unit(self.flux(here))
+            here = here + sense * self.step * unit(self.flux(half))
+            beyond = ~self.mesh.inside(here)
+            if beyond.any():  # back to the surface
+                here[beyond] = self.mesh.nearest(here[beyond])[1]
             distance, nearest = patch.query(here)
             # At the surface and nearer to the patch than a cell: it has come through it.
             done = beyond & (distance < self.flux.side)
@@ -336,17 +329,6 @@ class _Tracer:
             if not len(open_lines):
                 break
         return [np.array(line) for line in lines], arrived
-
-    def _ahead(self, here: Floats, sense: int) -> Floats:
-        half = here + 0.5 * sense * self.step * unit(self.flux(here))
-        return here + sense * self.step * unit(self.flux(half))
-
-    def _inside(self, points: Floats) -> tuple[Floats, Booleans]:
-        """Points (n, 3), those outside moved to the surface, and which (n,) these are."""
-        outside = ~self.mesh.inside(points)
-        if outside.any():
-            points[outside] = self.mesh.nearest(points[outside])[1]
-        return points, outside
 
 
 def _even(line: Floats) -> Floats:

@@ -90,8 +90,10 @@ class LabelVolume:
         sizes = {label: int(self.mask(label).sum()) for label in (one, other)}
         small = min(sizes, key=lambda label: sizes[label])
         share = 100 * count / sizes[small]
-        pair = f"{self.name(one)} and {self.name(other)}"
-        return f"{pair} overlap in {count} voxels ({share:.3g} % of {self.name(small)}), both kept"
+        return (
+            f"{self.name(one)} and {self.name(other)}"
+            f" overlap in {count} voxels ({share:.3g} % of {self.name(small)}), both kept"
+        )
 
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
@@ -411,7 +413,10 @@ def read_names(path: Path) -> dict[int, str]:
     if not path.exists() and path.name in tables:
         return dict(enumerate(tables[path.name].split(), start=1))
     try:
-        text = _decoded(path.read_bytes())
+        data = path.read_bytes()
+        # UTF-16 with its mark at the beginning, as spreadsheets write it, else UTF-8.
+        marked = data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        text = data.decode("utf-16" if marked else "utf-8-sig", errors="replace")
     except OSError as error:
         known = ", ".join(tables)
         raise UsageError(f"cannot read {path}: {error.strerror}; known tables: {known}") from None
@@ -425,12 +430,6 @@ def read_names(path: Path) -> dict[int, str]:
     if not names:
         raise UsageError(f"{path} names no label; write lines of number and name, or JSON")
     return names
-
-
-def _decoded(data):
-    """Text of UTF-8, or of UTF-16 where it begins with its mark, as spreadsheets write it."""
-    marked = data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    return data.decode("utf-16" if marked else "utf-8-sig", errors="replace")
 
 
 def _row_names(text, path):

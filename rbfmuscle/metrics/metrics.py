@@ -254,17 +254,11 @@ class MuscleMeasurer:
 
     def _places_at_rest(self, vertices: Floats, material: Floats) -> Floats:
         """Where vertices (n, 3) of a surface lie in the input, from the material (k, 3) there."""
-        return vertices + material_shift(vertices, material, self.material - material)
-
-
-def material_shift(points: Floats, at: Floats, shift: Floats) -> Floats:
-    """Shifts (n, 3) of points (n, 3): those of the three nearest places ``at`` (k, 3), weighted by
-    1 / distance^2.
-    """
-    distance, near = cKDTree(at).query(points, k=3)
-    weights = 1.0 / np.maximum(distance, 1e-9 * np.ptp(at)) ** 2
-    weights /= weights.sum(axis=1, keepdims=True)
-    return np.einsum("nk,nkd->nd", weights, shift[near])
+        # The shifts of the three nearest places, weighted by 1 / distance^2.
+        distance, near = cKDTree(material).query(vertices, k=3)
+        weights = 1.0 / np.maximum(distance, 1e-9 * np.ptp(material)) ** 2
+        weights /= weights.sum(axis=1, keepdims=True)
+        return vertices + np.einsum("nk,nkd->nd", weights, (self.material - material)[near])
 
 
 def bone_overlap(

@@ -29,16 +29,12 @@ def surface_depth(vertices: Floats, probes: list[BoneDistance], poses: dict[str,
     """
     out = np.zeros(len(vertices))
     for probe in bones_about(vertices, probes, poses):
-        np.maximum(out, probe.depth(vertices, pose=inverse_pose(poses[probe.name])), out=out)
+        pose = poses[probe.name]
+        back = np.eye(4)
+        back[:3, :3] = pose[:3, :3].T
+        back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+        np.maximum(out, probe.depth(vertices, pose=back), out=out)
     return out
-
-
-def inverse_pose(pose: Floats) -> Floats:
-    """The pose (4, 4) that takes a rigid one back."""
-    back = np.eye(4)
-    back[:3, :3] = pose[:3, :3].T
-    back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return back
 
 
 def bones_about(

@@ -262,7 +262,7 @@ def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> Limits:
         if not given and name not in LIMITS:
             raise UsageError(f"fail_on {name}: give a value, for instance {name}=1")
         found[name] = _number(value, part) if given else found.get(name)
-    values = {name: default_limit(name, scene) for name in LIMITS}
+    values = {name: _in_unit(LIMITS[name].value, name, scene.units) for name in LIMITS}
     return Limits(
         values | {name: value for name, value in found.items() if value is not None}, found
     )
@@ -276,11 +276,6 @@ def _number(text, part):
     if not math.isfinite(value) or value < 0:
         raise UsageError(f"fail_on {part}: the limit must be a number, zero or more")
     return value
-
-
-def default_limit(quantity: str, scene: Scene) -> float:
-    """Limit of a quantity in the scene's unit."""
-    return _in_unit(LIMITS[quantity].value, quantity, scene.units)
 
 
 def _in_unit(value, quantity, unit):

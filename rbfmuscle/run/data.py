@@ -403,8 +403,9 @@ def read_given(directory: Path, muscle: str) -> InputOrder | None:
         if not np.array_equal(np.unique(order.faces), np.arange(len(order.source))):
             raise ValueError("triangles of other vertices")
     except _DAMAGE as error:
-        message = f"{path} is not as it was written ({error}); run the scene again"
-        raise UsageError(message) from None
+        raise UsageError(
+            f"{path} is not as it was written ({error}); run the scene again"
+        ) from None
     return order
 
 
@@ -520,8 +521,9 @@ def _read_table(directory: Path, name: str, read: Callable[[list[str]], _Row]) -
         rows = list(csv.reader(io.StringIO(whole, newline="")))[1:]
         return [read(row) for row in rows]
     except (ValueError, IndexError, csv.Error) as error:
-        message = f"{path} is not as it was written ({error}); run the scene again"
-        raise UsageError(message) from None
+        raise UsageError(
+            f"{path} is not as it was written ({error}); run the scene again"
+        ) from None
 
 
 def _read_poses(directory: Path) -> Poses:
@@ -569,8 +571,10 @@ def _read_frames(info: RunInfo, directory: Path, poses: Poses) -> list[Frame]:
         placed = poses.get(index, {})
         lost = next((bone.name for bone in scene.bones if bone.name not in placed), None)
         if lost is not None:
-            what = f"lacks frame {index} of bone {lost!r}"
-            raise UsageError(f"{directory / 'poses.csv'} {what}; run the scene again")
+            raise UsageError(
+                f"{directory / 'poses.csv'} lacks frame {index} of bone {lost!r}; run the scene "
+                "again"
+            )
         shown = muscles if scene.output.surfaces else []
         surfaces = {name: surface_file(directory, name, index) for name in shown}
         fibres = {name: directory / fibre_file(name, index) for name in muscles}

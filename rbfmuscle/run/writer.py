@@ -148,8 +148,9 @@ class RunWriter:
             if self.meshes:
                 self._write_orders()
         except OSError as error:
-            message = f"cannot write to {self.directory}: {error.strerror}; choose another folder"
-            raise UsageError(message) from None
+            raise UsageError(
+                f"cannot write to {self.directory}: {error.strerror}; choose another folder"
+            ) from None
 
     def _write_orders(self):
         """The vertex order of muscles' own files, where it is another one than that of the mesh."""
@@ -169,10 +170,12 @@ class RunWriter:
             self._write(frame, rows)
         except OSError as error:
             self._failed = True
-            self._remove_meshes(frame.index)
-            kept = f"{self.count} frames are kept in {self.directory}"
+            for name in self.folder.listed:
+                if name.endswith(f"{_frame_end(frame.index)}.vtp"):
+                    (self.directory / name).unlink(missing_ok=True)
             raise SolveError(
-                f"cannot write frame {frame.index}: {error.strerror}; {kept}"
+                f"cannot write frame {frame.index}: {error.strerror}; "
+                f"{self.count} frames are kept in {self.directory}"
             ) from None
         self.count += 1
 
@@ -261,12 +264,6 @@ class RunWriter:
         self._bones[name] = pose, file
         self.folder.add(file)
         write_vtp(self.directory / file, vertices, faces)
-
-    def _remove_meshes(self, frame):
-        """Take away the meshes of a frame that could not be written."""
-        for name in self.folder.listed:
-            if name.endswith(f"{_frame_end(frame)}.vtp"):
-                (self.directory / name).unlink(missing_ok=True)
 
 
 def _light_mesh(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:

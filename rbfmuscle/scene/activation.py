@@ -117,8 +117,10 @@ def check_activation(muscle: Muscle, motion: Motion) -> None:
     """Raise SceneError where an activation goes by time and the motion has no times."""
     given = None if muscle.contraction is None else muscle.contraction.activation
     if isinstance(given, ActivationTable) and given.times is not None and motion.times is None:
-        words = "goes by time, and the motion has none; give frames, or a motion file with time"
-        raise SceneError(f"muscle {muscle.name!r} activation: {words}")
+        raise SceneError(
+            f"muscle {muscle.name!r} activation: "
+            "goes by time, and the motion has none; give frames, or a motion file with time"
+        )
 
 
 def activation_curve(muscle: Muscle, motion: Motion) -> Floats:

@@ -408,11 +408,14 @@ def _rest_overlaps(scene):
             continue
         share = inside / len(depth)
         level = "error" if scene.contact.initial == "error" or share > 1 / 2 else "note"
-        message = (
-            f"{inside} free vertices ({100 * share:.2g} %) start inside bone {bone.name!r}, "
-            f"up to {depth.max():.3g} {scene.units} deep"
+        findings.append(
+            Finding(
+                level,
+                muscle.name,
+                f"{inside} free vertices ({100 * share:.2g} %) start inside bone {bone.name!r}, "
+                f"up to {depth.max():.3g} {scene.units} deep",
+            )
         )
-        findings.append(Finding(level, muscle.name, message))
     return findings
 
 
@@ -437,8 +440,9 @@ def check_initial(scene: Scene) -> None:
     """
     for finding in _rest_overlaps(scene):
         if finding.level == "error":
-            remedy = "move it, or set [contact] initial"
-            raise SceneError(f"muscle {finding.place!r}: {finding.message}; {remedy}")
+            raise SceneError(
+                f"muscle {finding.place!r}: {finding.message}; move it, or set [contact] initial"
+            )
 
 
 def bone_collisions(

@@ -133,8 +133,10 @@ def _storage_notes(path, header, unknown, shape):
     for count, what, old in zip(shape, ("nRows", "nColumns"), ("datarows", "datacolumns")):
         said = header.get(what.lower(), header.get(old))
         if said is not None and said != str(count):
-            there = f"{count} {what[1:].lower()} are there"
-            notes.append(f"{path}: {what} says {shown(said)}, {there}: is it whole?")
+            notes.append(
+                f"{path}: {what} says {shown(said)}, {count} {what[1:].lower()} are there: is it "
+                "whole?"
+            )
     return notes
 
 
@@ -166,8 +168,10 @@ def _time_notes(path, times):
     if not len(back):
         return []
     row = int(back[0])
-    words = f"the first after row {row + 1}, {times[row]:g} and {times[row + 1]:g} s"
-    return [f"{path}: {len(back)} times do not increase, {words}; each row is a frame all the same"]
+    return [
+        f"{path}: {len(back)} times do not increase, the first after row {row + 1}, "
+        f"{times[row]:g} and {times[row + 1]:g} s; each row is a frame all the same"
+    ]
 
 
 def _degree_notes(path, known, tracks):
@@ -176,8 +180,10 @@ def _degree_notes(path, known, tracks):
         most = float(np.abs(track).max())
         ends = known[name].range or (-TURN, TURN)
         if most > min(TURN, max(math.pi, 1.5 * max(map(abs, ends)))):
-            what = f"{name} reaches {most:.4g} radians, {most / TURN:.3g} turns"
-            return [f"{path}: {what}: does the file mean degrees (inDegrees=yes)?"]
+            return [
+                f"{path}: {name} reaches {most:.4g} radians, {most / TURN:.3g} turns: does the "
+                "file mean degrees (inDegrees=yes)?"
+            ]
     return []
 
 
@@ -216,8 +222,10 @@ def _angle_factor(path, header):
     """Radians in the file's unit of angles, and a note where the header does not say it."""
     said = header.get("indegrees")
     if said is None:
-        words = "angles are taken as radians; add inDegrees=yes to its header"
-        return 1.0, [f"{path} does not say inDegrees: {words}"]
+        return 1.0, [
+            f"{path} does not say inDegrees: "
+            "angles are taken as radians; add inDegrees=yes to its header"
+        ]
     if said not in IN_DEGREES:
         raise SceneError(f"[motion]: {path}: inDegrees={said} is neither yes nor no")
     return IN_DEGREES[said], []
@@ -284,8 +292,9 @@ def parse_slice(text: str) -> slice:
         if len(numbers) > 3 or numbers[2:] == [0]:
             raise ValueError
     except ValueError:
-        example = "A:B:S (whole numbers, S not 0), for instance 0:46:5"
-        raise UsageError(f"frames {text!r} must look like {example}") from None
+        raise UsageError(
+            f"frames {text!r} must look like A:B:S (whole numbers, S not 0), for instance 0:46:5"
+        ) from None
     return slice(*numbers)
 
 

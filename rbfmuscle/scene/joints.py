@@ -525,8 +525,10 @@ class FunctionTable(Table):
         else:
             *slopes, constant = self.linear or [1.0, 0.0]
             if len(slopes) != count:
-                needed = f"a slope for each of {count} coordinates and a constant"
-                raise SceneError(f"{context}: linear needs {needed}, got {self.linear}")
+                raise SceneError(
+                    f"{context}: linear needs a slope for each of {count} coordinates and a "
+                    f"constant, got {self.linear}"
+                )
             found = Linear(tuple(slopes), constant)
         return found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
 
@@ -539,8 +541,10 @@ class FunctionTable(Table):
 def _multivariate(terms, count, context):
     for term in terms:
         if len(term) != count + 1 or any(power < 0 or power % 1 for power in term[1:]):
-            needed = f"a coefficient and the whole powers of {count} coordinates"
-            raise SceneError(f"{context}: each of terms is {needed}, got {term}")
+            raise SceneError(
+                f"{context}: each of terms is a coefficient and the whole powers of {count} "
+                f"coordinates, got {term}"
+            )
     return Multivariate(tuple((c, *map(int, powers)) for c, *powers in terms))
 
 
@@ -644,8 +648,10 @@ class JointTable(Table):
         """The kind where none is given: of one to three axes, each of which is turned about."""
         count = len(self.axes or self.coordinates)
         if self.rotations or self.translations or not 0 < count < len(BY_TURNS):
-            words = "one to three axes make a hinge, universal or ball joint"
-            raise SceneError(f"{context}: give its type; without one, {words}")
+            raise SceneError(
+                f"{context}: give its type; without one, "
+                "one to three axes make a hinge, universal or ball joint"
+            )
         return BY_TURNS[count]
 
     def _axes_of_kind(self, kind, context):

@@ -66,8 +66,10 @@ def find_named(items: Sequence[NamedItem], name: str, what: str, *, context: str
 def check_name(name: object, what: str) -> str:
     """Return the name, or raise SceneError if it is no name for a file."""
     if not isinstance(name, str) or not name or not set(name) <= _CHARACTERS:
-        allowed = "letters, digits, '_' and '-' only (it becomes a file name)"
-        raise SceneError(f"{what} name {shown(repr(name))} may hold {allowed}")
+        raise SceneError(
+            f"{what} name {shown(repr(name))} may hold "
+            "letters, digits, '_' and '-' only (it becomes a file name)"
+        )
     if len(name) > LONGEST_NAME:
         raise SceneError(
             f"{what} name {shown(repr(name))} has {len(name)} letters, at most {LONGEST_NAME} are "

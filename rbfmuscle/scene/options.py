@@ -325,8 +325,9 @@ def _check_activation(value: object) -> object:
             or not isinstance(number, (int, float))
             or not 0.0 <= number <= 1.0
         ):
-            words = "a number from 0 to 1, a list of them over the motion, or a table"
-            raise ValueError(f"must be {words}")
+            raise ValueError(
+                "must be a number from 0 to 1, a list of them over the motion, or a table"
+            )
     return value
 
 

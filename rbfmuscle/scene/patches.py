@@ -202,8 +202,10 @@ class PatchTable(Table):
     def _check_ways(self):
         given = [key for key in self.ways if getattr(self, key) is not None]
         if given != ["colour", "region"] and len(given) != 1:
-            words = f"{', '.join(self.ways[:-1])} and {self.ways[-1]}"
-            raise ValueError(f"give one of {words}, got {' and '.join(given) or 'none'}")
+            raise ValueError(
+                f"give one of {', '.join(self.ways[:-1])} and {self.ways[-1]}, got "
+                f"{' and '.join(given) or 'none'}"
+            )
         if self.radius is not None and self.points is None:
             raise ValueError("radius belongs to points")
         return self
@@ -294,8 +296,9 @@ def _about(given: Path | list, radius: float | None, points: Floats, context: st
     if radius is None:
         context += f"{shown_path(given)}: " if isinstance(given, Path) else ""
         if len(places) < FEWEST:
-            words = f"{len(places)} points, at least {FEWEST} make a patch; give a radius"
-            raise SceneError(f"{context}{words}")
+            raise SceneError(
+                f"{context}{len(places)} points, at least {FEWEST} make a patch; give a radius"
+            )
         return picked_vertices(places, points, context=context)
     away = np.min([np.linalg.norm(points - place, axis=1) for place in places], axis=0)
     return _within(away, radius, "radius", context)

@@ -128,8 +128,10 @@ class Scene(Compared):
 
     def __repr__(self) -> str:
         muscles = ", ".join(f"{muscle.name} ({muscle.model})" for muscle in self.muscles)
-        counts = f"{len(self.bones)} bones, {muscles or 'no muscles'}, {len(self.motion)} frames"
-        return f"<Scene {self.name!r}, {self.units}: {counts}>"
+        return (
+            f"<Scene {self.name!r}, {self.units}: {len(self.bones)} bones, "
+            f"{muscles or 'no muscles'}, {len(self.motion)} frames>"
+        )
 
     @classmethod
     def load(cls, path: str | Path, *, skeleton: bool = False) -> Self:

@@ -70,8 +70,11 @@ def split_muscle_key(key: str) -> tuple[str, str, str]:
     name, _, inner = inner.partition(".")
     head, _, rest = inner.partition(".")
     if head != "model" and head not in KEYS:
-        allowed = f"its model (muscle.{name}.model.KEY) and {', '.join(KEYS)}"
-        raise SceneError(f"{key}: of a muscle {allowed} can be set")
+        raise SceneError(
+            f"{key}: of a muscle "
+            f"its model (muscle.{name}.model.KEY) and {', '.join(KEYS)}"
+            " can be set"
+        )
     return name, head, rest
 
 

@@ -719,6 +719,11 @@ def _page(found: Comparison, runs: Mapping[str, RunData]) -> ReportPage:
     # Of the bowing each muscle has a limit of its own.
     limits = first.info.limits | {"bowing": None, DEEPER: first.info.limits.get("penetration_max")}
     terms = [(m.title, m.meaning) for m in MEASURES.values()]
+    models = found.models
+    rows = [
+        [Cell(muscle), *(Cell(found.unknowns[name][muscle]) for name in models)]
+        for muscle in found.unknowns[models[0]]
+    ]
     return ReportPage(
         f"{found.scene}: models compared",
         [f"{counts[what]} {what}" for what in ("muscles", "frames", "threads")],
@@ -733,7 +738,10 @@ def _page(found: Comparison, runs: Mapping[str, RunData]) -> ReportPage:
                 table=_measures(found),
             ),
             Section("Mean and standard deviation over the frames", table=_statistics(found)),
-            Section("What each model solves for", table=_unknowns(found)),
+            Section(
+                "What each model solves for",
+                table=Table(["", *(found.labels[name] for name in models)], rows),
+            ),
             Section("Over the motion", plots=_plots(runs)),
             Section("How to read this", text=_READING, terms=terms),
         ],
@@ -793,15 +801,6 @@ def _statistics(found: Comparison) -> Table:
             title = f"{quantity.replace('_', ' ')} {about}".strip()
             rows.append([Cell(muscle), Cell(title), *map(Cell, texts)])
     return Table(["", "", *(found.labels[name] for name in models)], rows)
-
-
-def _unknowns(found: Comparison) -> Table:
-    models = found.models
-    rows = [
-        [Cell(muscle), *(Cell(found.unknowns[name][muscle]) for name in models)]
-        for muscle in found.unknowns[models[0]]
-    ]
-    return Table(["", *(found.labels[name] for name in models)], rows)
 
 
 def _plots(runs: Mapping[str, RunData]) -> list[str]:

@@ -801,8 +801,9 @@ def write_page(directory: Path, facts: KernelFacts) -> None:
     for name, digest in facts.meshes.items():
         rows = [row for row in facts.rows if row.surface == name]
         studies[name] = SurfaceStudy(rows, [], recommend(rows), digest)
-    made = f"rbfmuscle {facts.version}, {facts.date}"
-    _page(KernelStudy(studies, facts.units), made).write(directory / "kernels.html")
+    _page(KernelStudy(studies, facts.units), f"rbfmuscle {facts.version}, {facts.date}").write(
+        directory / "kernels.html"
+    )
 
 
 def _page(study: KernelStudy, made: str) -> ReportPage:

@@ -93,7 +93,12 @@ def sample_muscles(
         part.muscles = muscles
         values = _poses([ranges[name] for name in names], counts[names])
         box = {name: ranges[name] for name in names}
-        order = _tour(values, _rest(scene, names), np.ptp(list(box.values()), axis=1))
+        known = all_coordinates(scene.joints)
+        order = _tour(
+            values,
+            np.array([known[name].rest for name in names]),
+            np.ptp(list(box.values()), axis=1),
+        )
         poses = [{**held, **dict(zip(names, values[k].tolist()))} for k in order]
         part.motion = Motion(poses)
         models = build_models(part)
@@ -250,11 +255,6 @@ def _poses(ranges, samples):
     return low + points[:samples] * (high - low)
 
 
-def _rest(scene, names):
-    known = all_coordinates(scene.joints)
-    return np.array([known[name].rest for name in names])
-
-
 def _tour(values, start, span):
     """The order (n,) of points (n, d) on a short way through all, from near ``start``: always to
     the nearest that is left, in shares of a ``span`` (d,).
@@ -408,8 +408,9 @@ def _fit(found, radian):
     count = len(found.lengths)
     failed = count - int(use.sum() + out.sum())
     if not fittable(found):
-        why = f"{failed} of {count} poses failed, too few are left to fit"
-        raise SolveError(f"muscle {found.muscle!r}: {why}")
+        raise SolveError(
+            f"muscle {found.muscle!r}: {failed} of {count} poses failed, too few are left to fit"
+        )
     parts = (found.values[use], found.lengths[use], found.arms[use])
     path = fit_path(found.muscle, found.coordinates, *parts, radian=radian, most=HIGHEST_ORDER)
     row = {"muscle": path.muscle, "order": path.order, "fitted": int(use.sum()), "failed": failed}

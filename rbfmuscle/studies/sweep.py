@@ -549,11 +549,10 @@ def _connect_cluster(address: str) -> Client:
     try:
         from distributed import Client
     except ImportError as error:
-        message = (
+        raise MissingDependencyError(
             "Dask is not installed, which a cluster needs: pip install -e '.[cluster]' in "
             "rbfmuscle's folder"
-        )
-        raise MissingDependencyError(message) from error
+        ) from error
     try:
         client = Client(address, timeout=CONNECT_WITHIN)
         client.wait_for_workers(2, timeout=CONNECT_WITHIN)

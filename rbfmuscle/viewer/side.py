@@ -12,7 +12,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import EdgeStretch, joined_meshes, mesh_volume
-from rbfmuscle.geometry.vectors import to_world, unit
+from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.rows import surface_depth
 from rbfmuscle.run.appearance import (
     BONE_COLOUR,
@@ -24,13 +24,11 @@ from rbfmuscle.run.appearance import (
     stretch_colours,
 )
 from rbfmuscle.scene.bone import BoneDistance
-from rbfmuscle.scene.check import stated_doubts
-from rbfmuscle.scene.objects import from_mm
-from rbfmuscle.scene.scene import Scene, doubtful
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.viewer.sources import (
     LiveFigure,
     LiveSource,
+    Marks,
     Mesh,
     Picture,
     SavedFigure,
@@ -51,58 +49,7 @@ if TYPE_CHECKING:
 KINDS = ("Attachments", "Joint axes", "Names")
 AXIS_COLOUR = (0.86, 0.20, 0.18)  # red, green, blue
 HELD_COLOUR = (0.05, 0.35, 0.75)  # of vertices that bones hold
-REACH = 25.0  # of a joint's axis to either side of its centre [mm]
 POINT = 0.0012  # size of a vertex that a bone holds [m]
-
-
-class Axes(NamedTuple):
-    """Lines (k, 2, 3) along the axes of a joint at rest, which move with its parent."""
-
-    parent: str
-    lines: Floats
-
-
-class Held(NamedTuple):
-    """Vertices (n, 3) of a muscle at rest that move with a bone."""
-
-    muscle: str
-    bone: str
-    points: Floats
-
-
-class Marks(NamedTuple):
-    """What can be marked: axes of joints by name, held vertices, and sentences on what is
-    doubtful.
-    """
-
-    axes: dict[str, Axes]
-    held: list[Held]
-    doubts: list[str]
-
-
-def scene_marks(scene: Scene) -> Marks:
-    """The marks of a scene; attachments that tendons hold are left out."""
-    axes, reach = {}, from_mm(REACH, scene.units)
-    for joint in scene.joints:
-        moving = [a for a in (*joint.rotations, *joint.translations) if a.coordinates]
-        along = np.array([axis.direction for axis in moving]).reshape(-1, 3)
-        along = reach * unit(along)
-        if len(along):
-            ends = np.stack([joint.centre - along, joint.centre + along], axis=1)
-            axes[joint.name] = Axes(joint.parent, ends)
-    held = [
-        Held(muscle.name, end.bone, np.asarray(muscle.mesh.vertices)[end.vertices])
-        for muscle in scene.muscles
-        for end in muscle.attachments
-        if end.tendon is None
-    ]
-    guesses = [
-        f"{guess.table} {guess.name}: {guess.text}"
-        for table in ("joint", "muscle")
-        for guess in doubtful(scene.guesses, table)
-    ]
-    stated = [f"{name}: {text}" if name else text for name, text in stated_doubts(scene)]
-    return Marks(axes, held, [*stated, *guesses])
 
 
 class MarkView:
@@ -244,9 +191,9 @@ def legend(colouring: Colouring, units: str, millimetre: float) -> str:
     stops = ",".join(to_hex(colormaps[colouring.colours](share)) for share in np.linspace(0, 1, 9))
     ends = "".join(f"<span>{value:.3g}</span>" for value in (low, (low + high) / 2, high))
     return (
-        f"<b>{colouring.title}{f' [{units}]' if colouring.length else ''}</b>"
-        f"<div style='height:12px;background:linear-gradient(90deg,{stops})'></div>"
-        f"<div style='display:flex;justify-content:space-between'>{ends}</div>"
+        f"<b>{colouring.title}{f' [{units}]' if colouring.length else ''}</b><div "
+        f"style='height:12px;background:linear-gradient(90deg,{stops})'></div><div "
+        f"style='display:flex;justify-content:space-between'>{ends}</div>"
     )
 
 
@@ -319,7 +266,13 @@ class ModelView:
         for name, mesh in self.picture.surfaces.items():
             values = vertex_values(look.colour, name, self.picture, self.rest, probes, other)
             if self.figure is not None:
-                self.numbers[name] = self._measure(name, values)
+                self.numbers[name] = {
+                    "volume": 100.0
+                    * (mesh_volume(*self.picture.surfaces[name]) / self._volumes[name] - 1),
+                    "depth": self.picture.depth.get(name, math.nan),
+                    "moment": self.picture.moment_arms.get(name, math.nan),
+                    "mean": float(values.mean()),
+                }
             part, shown = self._part(mesh, look.cut), name not in look.hidden
             if look.colour == "fibres" and name in self.picture.fibres:
                 shown = False  # the surface would hide them
@@ -337,15 +290,6 @@ class ModelView:
         for node in self._nodes.values():
             # The inside is seen in a cut alone, and software drawing pays for it.
             node.side = "front" if look.cut is None else "double"
-
-    def _measure(self, name: str, values: Floats) -> dict[str, float]:
-        """Numbers of a muscle, of which the vertices have these values of the colour (n,)."""
-        return {
-            "volume": 100.0 * (mesh_volume(*self.picture.surfaces[name]) / self._volumes[name] - 1),
-            "depth": self.picture.depth.get(name, math.nan),
-            "moment": self.picture.moment_arms.get(name, math.nan),
-            "mean": float(values.mean()),
-        }
 
     def _draw_fibres(self, look: ViewSettings) -> None:
         """Show fibres as lines where they are asked for, coloured by their stretch."""

@@ -13,6 +13,7 @@ from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
+from rbfmuscle.geometry.vectors import unit
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.metrics.verdict import describe_doubts
@@ -20,17 +21,70 @@ from rbfmuscle.models import build_models, configure_scene, model_names
 from rbfmuscle.run.appearance import muscle_colours, muscle_groups, tendon_mesh
 from rbfmuscle.run.data import RunData, frame_caption
 from rbfmuscle.scene.activation import STEP
+from rbfmuscle.scene.check import stated_doubts
 from rbfmuscle.scene.joints import all_coordinates
 from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
 from rbfmuscle.scene.objects import body_axes, from_mm
-from rbfmuscle.scene.scene import Scene, require_complete
+from rbfmuscle.scene.scene import Scene, doubtful, require_complete
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import FibreLines, Frame, MuscleModel
 from rbfmuscle.simulation.live import LiveSession, live_fields
 from rbfmuscle.validation import UsageError
-from rbfmuscle.viewer.side import Marks, scene_marks
 
 Mesh = tuple[Floats, Integers]
+REACH = 25.0  # of a joint's axis to either side of its centre [mm]
+
+
+class Axes(NamedTuple):
+    """Lines (k, 2, 3) along the axes of a joint at rest, which move with its parent."""
+
+    parent: str
+    lines: Floats
+
+
+class Held(NamedTuple):
+    """Vertices (n, 3) of a muscle at rest that move with a bone."""
+
+    muscle: str
+    bone: str
+    points: Floats
+
+
+class Marks(NamedTuple):
+    """What can be marked: axes of joints by name, held vertices, and sentences on what is
+    doubtful.
+    """
+
+    axes: dict[str, Axes]
+    held: list[Held]
+    doubts: list[str]
+
+
+def scene_marks(scene: Scene) -> Marks:
+    """The marks of a scene; attachments that tendons hold are left out."""
+    axes, reach = {}, from_mm(REACH, scene.units)
+    for joint in scene.joints:
+        moving = [a for a in (*joint.rotations, *joint.translations) if a.coordinates]
+        along = np.array([axis.direction for axis in moving]).reshape(-1, 3)
+        along = reach * unit(along)
+        if len(along):
+            ends = np.stack([joint.centre - along, joint.centre + along], axis=1)
+            axes[joint.name] = Axes(joint.parent, ends)
+    held = [
+        Held(muscle.name, end.bone, np.asarray(muscle.mesh.vertices)[end.vertices])
+        for muscle in scene.muscles
+        for end in muscle.attachments
+        if end.tendon is None
+    ]
+    guesses = [
+        f"{guess.table} {guess.name}: {guess.text}"
+        for table in ("joint", "muscle")
+        for guess in doubtful(scene.guesses, table)
+    ]
+    stated = [f"{name}: {text}" if name else text for name, text in stated_doubts(scene)]
+    return Marks(axes, held, [*stated, *guesses])
+
+
 REST_TRIANGLES = 3000  # of a muscle, until its model is built
 TRAIL = 16  # pictures along which moment arms are measured
 ACTIVATION = "activation "  # what the name of a muscle's control begins with

@@ -17,8 +17,8 @@ from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession, coordinate_limits
 from rbfmuscle.viewer.page import Panel
 from rbfmuscle.viewer.server import open_server
-from rbfmuscle.viewer.side import KINDS, MarkView, scene_marks, vertex_values
-from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource
+from rbfmuscle.viewer.side import KINDS, MarkView, vertex_values
+from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource, scene_marks
 
 
 @pytest.fixture

@@ -308,7 +308,13 @@ def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -
             NO_BONE if known else NO_NAME, f"{why}; the bones are the nearest to its two ends"
         )
     holds = [_hold(place, distances[place.bone], ends, muscle, skeleton) for place in places]
-    guess.holds = _disjoint(holds, distances)
+    # Each vertex is held by one bone: the one that it lies nearer to, as its patch sees it.
+    for second, first in combinations(holds, 2):
+        shared = np.intersect1d(first.vertices, second.vertices)
+        nearer = distances[first.bone][shared] < distances[second.bone][shared]
+        first.vertices = np.setdiff1d(first.vertices, shared[~nearer])
+        second.vertices = np.setdiff1d(second.vertices, shared[nearer])
+    guess.holds = [hold for hold in holds if len(hold.vertices)]
     if by_name:
         _say_touched(guess, distances, skeleton.bodies)
     _doubt(guess, skeleton.bodies)
@@ -324,8 +330,10 @@ def _say_touched(guess, distances, bodies):
         near = {bone: float(distance[hold.vertices].min()) for bone, distance in distances.items()}
         nearest = min(near, key=near.__getitem__)
         if hold.gap > NEAR and near[nearest] < TOUCH and bodies[nearest] not in named:
-            away = f"by its name on the {hold.bone.name}, {hold.gap:.0f} mm away"
-            guess.reasons.append(f"{away}, but it touches {nearest.name}")
+            guess.reasons.append(
+                f"by its name on the {hold.bone.name}, {hold.gap:.0f} mm away, but it touches "
+                f"{nearest.name}"
+            )
 
 
 def _named_places(guess, distances, ends, skeleton):
@@ -503,16 +511,6 @@ def _end(near, ends, place, muscle, millimetre):
     return chosen if len(chosen) >= FEWEST else np.sort(np.argsort(near, kind="stable")[:FEWEST])
 
 
-def _disjoint(holds, distances):
-    """Each vertex is held by one bone: the one that it lies nearer to, as its patch sees it."""
-    for second, first in combinations(holds, 2):
-        shared = np.intersect1d(first.vertices, second.vertices)
-        nearer = distances[first.bone][shared] < distances[second.bone][shared]
-        first.vertices = np.setdiff1d(first.vertices, shared[~nearer])
-        second.vertices = np.setdiff1d(second.vertices, shared[nearer])
-    return [hold for hold in holds if len(hold.vertices)]
-
-
 def _doubt(guess, bodies):
     """Lower the confidence, or say that the muscle cannot be run."""
     for hold in guess.holds:
@@ -522,8 +520,10 @@ def _doubt(guess, bodies):
                 f"its site on the {hold.bone.name} is not known: the nearest place"
             )
         if hold.tendon is not None and not hold.confidence > NO_SITE:
-            away = f"{hold.gap:.0f} mm from the {hold.bone.name}"
-            guess.reasons.append(f"the mesh ends {away}: a straight tendon was added")
+            guess.reasons.append(
+                f"the mesh ends {hold.gap:.0f} mm from the {hold.bone.name}: a straight tendon "
+                "was added"
+            )
     if guess.muscle.doubt:
         guess.confidence = min(guess.confidence, 0.3)
     share = sum(len(hold.vertices) for hold in guess.holds) / len(guess.muscle.points)

@@ -194,7 +194,11 @@ def _load_trial(guess, trial, final):
         try:
             return Scene.load(trial)
         except (SceneError, MeshError) as error:
-            _leave_out(guess, error, final)
+            # The muscle that it is about is wrong; an error about none is raised.
+            found = [muscle for muscle in guess.muscles if muscle.muscle.name == error.muscle]
+            if not found or found[0].wrong:
+                raise
+            found[0].wrong, found[0].confidence = final(str(error)), 0.0
             _check_runs(guess, final(str(trial)))
 
 
@@ -213,16 +217,6 @@ def _write_coarse(guess, stage):
 def _check_runs(guess, path):
     if all(muscle.wrong for muscle in guess.muscles):
         raise UsageError(f"{path}: no muscle can be held by two bones ({guess.muscles[0].wrong})")
-
-
-def _leave_out(guess, error, final):
-    """Mark the muscle that an error is about as wrong; an error about none is raised. ``final``
-    gives the final names of staged files in a text.
-    """
-    found = [muscle for muscle in guess.muscles if muscle.muscle.name == error.muscle]
-    if not found or found[0].wrong:
-        raise error
-    found[0].wrong, found[0].confidence = final(str(error)), 0.0
 
 
 def _scene_text(guess: SceneGuess, stage: str = "") -> str:

@@ -166,8 +166,9 @@ def _read_part(path, stem, mesh, base, names, facts, found, *, closed):
     vertices, faces = mesh.vertices, mesh.faces
     coarse = len(faces) > MOST_TRIANGLES and not closed  # cells of thin walls may open a surface
     if coarse:
-        words = f"{len(faces)} triangles, made coarser to about {MOST_TRIANGLES}"
-        found.notes.append(f"{path.name}: {words}")
+        found.notes.append(
+            f"{path.name}: {len(faces)} triangles, made coarser to about {MOST_TRIANGLES}"
+        )
         vertices, faces = clustered(vertices, faces, MOST_TRIANGLES)
     read = prepare_mesh(vertices, faces, context=str(path), name=stem, may_be_open=not closed)
     read.notes[:0] = mesh.notes

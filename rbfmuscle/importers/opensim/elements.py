@@ -156,7 +156,8 @@ class OsimModel:
         steps: list[tuple[ModelJoint, bool]] = []
         roots: list[str] = []
         reached: set[str] = set()
-        for body in [GROUND, *_by_depth(self.bodies, joints)]:
+        children = {joint.child for joint in joints}
+        for body in [GROUND, *sorted(self.bodies, key=lambda body: body in children)]:
             if body in reached:
                 continue
             reached.add(body)
@@ -190,12 +191,6 @@ class OsimModel:
             else:
                 found[joint.child] = found[joint.parent] @ across
         return found
-
-
-def _by_depth(bodies: list[str], joints: list[ModelJoint]) -> list[str]:
-    """Bodies that are no joint's child, then the others: the order in which roots are chosen."""
-    children = {joint.child for joint in joints}
-    return sorted(bodies, key=lambda body: body in children)
 
 
 def joints_between(walk: Walk, first: str, second: str) -> list[ModelJoint]:
@@ -524,12 +519,15 @@ def _read(node):
     if node.tag == "PiecewiseLinearFunction" or node.tag in SPLINES:
         x, y = node.numbers("x"), node.numbers("y")
         if not x or len(x) != len(y) or any(b <= a for a, b in itertools.pairwise(x)):
-            words = f"needs as many y as x, and x that increase, got {len(x)} and {len(y)}"
-            raise node.owner.error(f"{node.tag} {words}")
+            raise node.owner.error(
+                f"{node.tag} needs as many y as x, and x that increase, got {len(x)} and {len(y)}"
+            )
         kind = Spline if node.tag in SPLINES else PiecewiseLinear
         return kind(tuple(x), tuple(y))
-    known = "use a SimmSpline or a PolynomialFunction instead"
-    raise node.owner.error(f"a function {node.tag!r} is not in the table of functions; {known}")
+    raise node.owner.error(
+        f"a function {node.tag!r} is not in the table of functions; "
+        "use a SimmSpline or a PolynomialFunction instead"
+    )
 
 
 def _read_multivariate(node):
@@ -537,8 +535,9 @@ def _read_multivariate(node):
     dimension, order = int(node.number("dimension", 1)), int(node.number("order", 0))
     if not (1 <= dimension <= MOST_COORDINATES and 0 <= order <= HIGHEST_ORDER):
         words = f"of {dimension} coordinates and order {order}"
-        most = f"at most {MOST_COORDINATES} and {HIGHEST_ORDER} are taken"
-        raise node.owner.error(f"a polynomial {words}; {most}")
+        raise node.owner.error(
+            f"a polynomial {words}; at most {MOST_COORDINATES} and {HIGHEST_ORDER} are taken"
+        )
     powers, coefficients = exponents(dimension, order), node.numbers("coefficients", "0")
     if len(coefficients) != len(powers):
         words = f"{len(powers)} coefficients are needed, got {len(coefficients)}"

@@ -68,9 +68,9 @@ def read_joint(reading: Reading, node: Node, ends: list[End], tag: str) -> None:
     kind = node.tag.removesuffix("Joint").lower()
     kind = RENAMED.get(kind, kind)
     if kind not in KINDS and kind not in CARRYING:
-        why = f"is not in the table of joints, so body {child!r} cannot be placed"
         raise node.error(
-            f"{parent} to {child}: its kind {why}; replace it by a CustomJoint in OpenSim"
+            f"{parent} to {child}: its kind is not in the table of joints, so body {child!r} "
+            "cannot be placed; replace it by a CustomJoint in OpenSim"
         )
     taken = [joint.name for joint in model.joints]
     name = new_name(node.name, taken, file=False)
@@ -260,8 +260,10 @@ def _coordinate(node, motion, model):
     if limits is not None and limits[0] > limits[1]:
         raise node.error(f"its range {node.word('range')!r} goes downwards; turn it round")
     if node.truth("prescribed"):
-        what = f"coordinate {node.name!r} is prescribed by a function of time"
-        model.notes.append(f"{what}: not taken, it stays at {rest:g}")
+        model.notes.append(
+            f"coordinate {node.name!r} is prescribed by a function of time: not taken, it stays "
+            f"at {rest:g}"
+        )
     clamped = node.truth("clamped") and limits is not None
     return Coordinate(motion, rest, limits, clamped, node.truth("locked"))
 
@@ -325,5 +327,6 @@ def _read_coupler(reading, node):
     function = scaled(function, factor) if factor != 1.0 else function
     reading.model.couplings.append(Coupling(full[0], tuple(full[1:]), function))
     if reading.model.coordinates()[full[0]].locked:
-        words = "is locked and follows others: it follows"
-        reading.model.notes.append(f"coordinate {target!r} {words}")
+        reading.model.notes.append(
+            f"coordinate {target!r} is locked and follows others: it follows"
+        )

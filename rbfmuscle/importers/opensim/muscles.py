@@ -55,8 +55,10 @@ def read_muscles(reading: Reading, model: Node, forces: list[Node]) -> None:
             if path is None:
                 raise SceneError("it has no path; give it one")
             if path.tag == "FunctionBasedPath":
-                why = "gives its length and no points; give it a mesh, or the model before"
-                raise SceneError(f"its FunctionBasedPath {why}")
+                raise SceneError(
+                    "its FunctionBasedPath "
+                    "gives its length and no points; give it a mesh, or the model before"
+                )
             reading.model.muscles.append(_read_muscle(reading, force, path, title, shapes))
         except SceneError as error:
             reading.model.doubts.append(f"{title} is not taken: {error}")
@@ -121,10 +123,13 @@ class _Shapes:
             self._note(f"{title}: there is no wrapping object {name!r}; correct its path")
             return None
         shape = found[0]
-        body, frame = self._place(shape)
+        owner = _owner(shape)
+        body, frame = self._frames.place(owner.name if owner.tag == "Body" else owner.path)
         if len(found) > 1:
-            where = f"the first, on {body}, is taken, as OpenSim does"
-            self._note(f"{len(found)} wrapping objects are named {name!r}: {where}")
+            self._note(
+                f"{len(found)} wrapping objects are named {name!r}: "
+                f"the first, on {body}, is taken, as OpenSim does"
+            )
         radii = _radii(shape)
         if radii is None:
             self._note(f"{title}: its wrapping object {name!r} ({shape.tag}) is not taken")
@@ -141,8 +146,11 @@ class _Shapes:
         shape = self._geometry.get(name)
         radii = None if shape is None else _radii(shape)
         if shape is None or radii is None:
-            what = f"obstacle {name!r} ({'not there' if shape is None else shape.tag})"
-            self._note(f"{title}: its {what} is not taken")
+            self._note(
+                f"{title}: its "
+                f"obstacle {name!r} ({'not there' if shape is None else shape.tag})"
+                " is not taken"
+            )
             return None
         body, frame = self._frames.place(socket(shape, "frame"), inside=shape.path)
         own = frame_at(shape.vector("location"), shape.vector("orientation").tolist())
@@ -151,10 +159,6 @@ class _Shapes:
         quadrant = "" if hint[k] == 0.0 else f"{'-' if hint[k] < 0.0 else ''}{'xyz'[k]}"
         kind = shape.tag.replace("Contact", "Wrap")
         return WrapShape(body, frame @ own, np.array(radii), kind, quadrant)
-
-    def _place(self, shape):
-        owner = _owner(shape)
-        return self._frames.place(owner.name if owner.tag == "Body" else owner.path)
 
     def _note(self, text):
         if text not in self._notes:

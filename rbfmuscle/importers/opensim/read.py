@@ -42,8 +42,9 @@ def assemble(model: OsimModel) -> OsimModel:
         _name_loop(model, walk, joint)
     for weld in model.welds:
         if weld not in walk.left:
-            ends = f"{weld.parent} to {weld.child}"
-            model.notes.append(f"{weld.name} is taken as a fixed joint, {ends}")
+            model.notes.append(
+                f"{weld.name} is taken as a fixed joint, {weld.parent} to {weld.child}"
+            )
     for constraint in model.constraints:
         first, second = constraint.bodies
         names = _moving(joints_between(walk, first, second))
@@ -195,14 +196,19 @@ def _read_model(root, path):
     model = OsimModel(plain_name(node.name or path.stem), version, path)
     model.notes += notes
     model.bodies = list(frames.bodies.values())
-    _note_names(model, frames)
+    changed = [f"{old!r} as {new}" for old, new in frames.bare.items() if old != new]
+    if changed:
+        more = f" and {len(changed) - MOST_RENAMED} more" if len(changed) > MOST_RENAMED else ""
+        listed = ", ".join(changed[:MOST_RENAMED])
+        model.notes.append(f"names are written in plain letters: {listed}{more}")
     if version > NEWEST or not version:
         said = f"is of version {version}, newer than 4.6" if version else "states no version"
         model.notes.append(f"the file {said}: read as one of version 4.6 where nothing else shows")
     units = node.word("length_units", "meters")
     if units not in ("meters", "m", "metres"):
-        words = "lengths are read as metres, as OpenSim reads them"
-        model.notes.append(f"<length_units> says {units!r}; {words}")
+        model.notes.append(
+            f"<length_units> says {units!r}; lengths are read as metres, as OpenSim reads them"
+        )
     reading = Reading(model, frames)
     own = node.objects("components")
     if version >= SOCKETS or node.child("JointSet") is not None:
@@ -248,15 +254,6 @@ def _name_joints(node):
     return notes
 
 
-def _note_names(model, frames):
-    """Say which bodies have another name in the scene."""
-    changed = [f"{old!r} as {new}" for old, new in frames.bare.items() if old != new]
-    if changed:
-        more = f" and {len(changed) - MOST_RENAMED} more" if len(changed) > MOST_RENAMED else ""
-        listed = ", ".join(changed[:MOST_RENAMED])
-        model.notes.append(f"names are written in plain letters: {listed}{more}")
-
-
 def _read_sockets(reading, node, joints):
     """Versions from 4 on: joints in a set, which name frames; geometry attached to frames."""
     model, frames = reading.model, reading.frames
@@ -276,8 +273,10 @@ def _read_sockets(reading, node, joints):
         body, transform = frames.place(owner.path)
         for shape in attached.nodes():
             if shape.tag != "Mesh":
-                what = f"geometry {shape.name or shape.tag!r} is a {shape.tag}"
-                model.notes.append(f"body {body!r}: {what}, no mesh: not taken")
+                model.notes.append(
+                    f"body {body!r}: geometry {shape.name or shape.tag!r} is a {shape.tag}, no "
+                    "mesh: not taken"
+                )
                 continue
             look = shape.child("Appearance")
             shown = look is None or look.truth("visible", True)

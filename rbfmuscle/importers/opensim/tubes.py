@@ -69,7 +69,10 @@ def around_shape(wrap: WrapShape, start: np.ndarray, end: np.ndarray) -> np.ndar
     axis = "xyz".find(wrap.quadrant[-1:] or "?")
     sign = -1.0 if wrap.quadrant.startswith("-") else 1.0
     sided = 0 <= axis < width
-    nearest = _nearest_to_origin(scaled)
+    # The point of the straight line that is nearest to the origin.
+    along = scaled[1] - scaled[0]
+    share = -(scaled[0] @ along) / max(float(along @ along), 1e-300)
+    nearest = scaled[0] + np.clip(share, 0.0, 1.0) * along
     wrong_side = sided and width == 2 and sign * nearest[axis] < 0.0
     if np.linalg.norm(nearest) >= 1.0 and not wrong_side:
         return np.empty((0, 3))
@@ -81,13 +84,6 @@ def around_shape(wrap: WrapShape, start: np.ndarray, end: np.ndarray) -> np.ndar
         if length < least:
             best, least = arc, length
     return best
-
-
-def _nearest_to_origin(points):
-    """The point nearest to the origin of the straight line between two points (2, k)."""
-    along = points[1] - points[0]
-    share = -(points[0] @ along) / max(float(along @ along), 1e-300)
-    return points[0] + np.clip(share, 0.0, 1.0) * along
 
 
 def _tangent_arcs(points, radius):
@@ -256,17 +252,16 @@ def _clear_line(line, fixed, radius, bones):
         shift[fixed] *= 0.5
         if number % 10 == 9:
             for bone in bones:
-                shift = _out_of_bone(bone, line + shift, 0.8 * radius) - line
+                points = line + shift
+                reach = 0.8 * radius
+                # No nearer to the bone than that; what is deeper in it is left where it is.
+                distance, closest, *_ = bone.nearest(points, reach=float(reach.max()))
+                away = (points - closest) / np.where(distance == 0.0, 1.0, distance)[:, None]
+                shift = (
+                    np.where((distance < reach)[:, None], closest + away * reach[:, None], points)
+                    - line
+                )
     return line + shift
-
-
-def _out_of_bone(bone, points, reach):
-    """Points (n, 3) no nearer to a bone than ``reach`` (n,), those deeper in it left where they
-    are.
-    """
-    distance, closest, *_ = bone.nearest(points, reach=float(reach.max()))
-    away = (points - closest) / np.where(distance == 0.0, 1.0, distance)[:, None]
-    return np.where((distance < reach)[:, None], closest + away * reach[:, None], points)
 
 
 def _beside_bones(vertices, faces, bones):
@@ -284,19 +279,15 @@ def _beside_bones(vertices, faces, bones):
             shift = 0.5 * (shift + beside / count[:, None])
         points = vertices + shift
         for bone in bones:
-            points = _pushed(bone, points)
+            # What is in a bone, but not deep in it, is moved to `MARGIN` before it.
+            distance, closest, *_ = bone.nearest(points, reach=FLATTENED)
+            inside = (distance < MARGIN) & (distance > -FLATTENED)
+            away = (points - closest) / np.where(distance == 0.0, 1.0, distance)[:, None]
+            points = np.where(inside[:, None], closest + MARGIN * away, points)
         if number >= FLATTENINGS // 2:  # coarse faces cut across what is between their corners
             points = points + _pressed_in(points, faces, bones)
         shift = points - vertices
     return vertices + shift
-
-
-def _pushed(bone, points):
-    """Points (n, 3), those in a bone, but not deep in it, moved to `MARGIN` before it."""
-    distance, closest, *_ = bone.nearest(points, reach=FLATTENED)
-    inside = (distance < MARGIN) & (distance > -FLATTENED)
-    away = (points - closest) / np.where(distance == 0.0, 1.0, distance)[:, None]
-    return np.where(inside[:, None], closest + MARGIN * away, points)
 
 
 def _pressed_in(vertices, faces, bones):

@@ -162,10 +162,9 @@ def read_part(path: Path) -> FilePart:
         return parts[names.index(name)]
     if name:
         raise MeshError(f"{path}: no mesh of this name in the file, {did_you_mean(name, names)}")
-    example = f"{file.name}#{names[0]}"
     raise MeshError(
         f"{path}: {len(parts)} meshes in one file ({', '.join(names[:8])}); name one of them, as "
-        f"{example}, or take all as one rigid mesh by {file.name}#{ALL}"
+        f"{file.name}#{names[0]}, or take all as one rigid mesh by {file.name}#{ALL}"
     )
 
 
@@ -173,10 +172,10 @@ def read_file(path: Path) -> list[FilePart]:
     """Return the meshes of a file as they stand, at least one; several have names, each another."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        words = (
+        raise MeshError(
+            f"{shown_path(path)}: "
             f"{shown(suffix) or 'no suffix'} is not a mesh format, use {', '.join(MESH_SUFFIXES)}"
         )
-        raise MeshError(f"{shown_path(path)}: {words}")
     if not os.path.isfile(path):
         raise MeshError(f"{shown_path(path)}: no such mesh file{_neighbours(path)}")
     try:

@@ -225,8 +225,9 @@ def read_fibres(
         kept = np.append(True, np.diff(points, axis=0).any(axis=1))[: len(points)]
         points = points[kept]  # none twice in a row
         if len(points) < 2:
-            words = f"polyline {number} has {len(points)} points, a fibre needs two or more"
-            raise SceneError(f"{context}: {words}")
+            raise SceneError(
+                f"{context}: polyline {number} has {len(points)} points, a fibre needs two or more"
+            )
         lines.append(transform.points(points))
     if not lines:
         raise SceneError(f"{context}: no polylines")
