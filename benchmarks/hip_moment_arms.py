@@ -26,7 +26,7 @@ from leg_tendons import convert
 
 from rbfmuscle.geometry.lines import line_length
 from rbfmuscle.metrics.centreline import NODES, shortest_path
-from rbfmuscle.metrics.doubts import published_band
+from rbfmuscle.metrics.verdict import published_band
 from rbfmuscle.recording import simulate
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.scene import Scene

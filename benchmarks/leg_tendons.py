@@ -20,7 +20,7 @@ from evidence import data_folder
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.scene.save import table_text
+from rbfmuscle.scene.file import table_text
 
 HEEL = {"to": [-567.3, -347.0, 133.0]}
 PES = {"to": [-597.0, -436.0, 441.0], "via": [[-582.0, -412.0, 470.0]]}

@@ -22,9 +22,9 @@ sys.path.insert(0, str(ROOT))
 import numpy as np  # noqa: E402
 
 from rbfmuscle.display.plots import Band, Track, line_plot  # noqa: E402
-from rbfmuscle.metrics.doubts import published_band  # noqa: E402
 from rbfmuscle.metrics.quantities import QUANTITIES  # noqa: E402
 from rbfmuscle.metrics.summary import LIMITS, LOWER_BOUNDS  # noqa: E402
+from rbfmuscle.metrics.verdict import published_band  # noqa: E402
 from rbfmuscle.run.appearance import MUSCLE_COLOURS  # noqa: E402
 
 EVIDENCE = ROOT / "docs" / "evidence"

@@ -19,7 +19,6 @@ from rbfmuscle.display.export import export_run
 from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.folders import copy_listed
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.metrics.doubts import measured_doubts
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import Lengths, frame_rows, joint_gaps, moment_arm_rows
@@ -31,7 +30,13 @@ from rbfmuscle.metrics.summary import (
     Table,
     parse_limits,
 )
-from rbfmuscle.metrics.verdict import Verdict, describe_verdict, judge, require_limits
+from rbfmuscle.metrics.verdict import (
+    Verdict,
+    describe_verdict,
+    judge,
+    measured_doubts,
+    require_limits,
+)
 from rbfmuscle.models import build_models, configure_scene, kernel_names
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.run.data import FolderMeshes, RunData, SceneMeshes, named_coordinates

@@ -80,7 +80,7 @@ def _new_lines(output, doubts, findings, scene):
 
 def _is_segmentation(source):
     from rbfmuscle.importers.volumes import VOLUME_SUFFIXES, is_volume
-    from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES
+    from rbfmuscle.scene.meshes.read import MESH_SUFFIXES
 
     if source.is_file() and not is_volume(source):
         raise UsageError(

@@ -1,25 +1,333 @@
-"""A run in other formats and units: files for each frame, or an animation in one file."""
+"""A run in other formats and units: files for each frame, or an animation in one file, glTF or
+USD.
+"""
 
+import json
 import re
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 
-from rbfmuscle.display.animation import AnimatedMesh, Animation, read_animation
-from rbfmuscle.display.gltf import animated_glb
-from rbfmuscle.display.usd import check_usd, write_usd
+from rbfmuscle.display.animation import (
+    FRAMES_A_SECOND,
+    AnimatedFibres,
+    AnimatedMesh,
+    Animation,
+    read_animation,
+)
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.solids import SolidDistance
 from rbfmuscle.geometry.vectors import to_local, to_world
+from rbfmuscle.run.appearance import linear_rgb, rgb, stretch_colours
 from rbfmuscle.run.data import RunData, open_run
 from rbfmuscle.run.vtk_files import NORMALS, Collection, write_fibres, write_vtp
 from rbfmuscle.run.writer import VertexArrays
 from rbfmuscle.scene.names import DEVICES
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.validation import MissingDependencyError, SolveError, UsageError
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdGeom
+
+
+def check_usd() -> None:
+    """Raise MissingDependencyError where the package that writes USD is absent."""
+    try:
+        import pxr.Usd  # noqa: F401
+    except ImportError:
+        raise MissingDependencyError(
+            "export to usd needs usd-core: pip install -e '.[usd]' in rbfmuscle's folder"
+        ) from None
+
+
+def write_usd(path: Path, run: Animation) -> None:
+    """Write a run as one ``.usdc`` file; usd-core must be there (`check_usd`).
+
+    Time codes count 24 a second. A surface that keeps its vertices has its topology once and its
+    points at every time; another one has both at every time. Lengths stay in the run's unit, named
+    by ``metersPerUnit``; the root brings superior to z. The default value of whatever is sampled is
+    that of the first frame.
+    """
+    from pxr import Gf, Usd, UsdGeom
+
+    codes = (run.times * FRAMES_A_SECOND).tolist()
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, MM_PER_UNIT[run.unit] / 1000.0)
+    stage.SetTimeCodesPerSecond(FRAMES_A_SECOND)
+    stage.SetFramesPerSecond(FRAMES_A_SECOND)
+    stage.SetStartTimeCode(codes[0])
+    stage.SetEndTimeCode(codes[-1])
+    place = f"/{identifier(run.name, set())}"
+    root = UsdGeom.Xform.Define(stage, place)
+    stage.SetDefaultPrim(root.GetPrim())
+    upright = np.eye(4)
+    upright[:3, :3] = run.body
+    root.AddTransformOp().Set(Gf.Matrix4d(upright.T))
+    used: set[str] = set()
+    for part in (*run.bones, *run.muscles):
+        mesh = UsdGeom.Mesh.Define(stage, f"{place}/{identifier(part.name, used)}")
+        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+        _fill(mesh, part, codes)
+        mesh.CreateDisplayColorAttr([Gf.Vec3f(*linear_rgb(rgb(part.colour)).tolist())])
+        mesh.GetPrim().SetDisplayName(part.name)
+    for fibres in run.fibres:
+        curves = UsdGeom.BasisCurves.Define(stage, f"{place}/{identifier(fibres.name, used)}")
+        _fill_curves(curves, fibres, codes)
+        curves.GetPrim().SetDisplayName(fibres.name)
+    stage.GetRootLayer().Export(str(path))
+
+
+def _fill_curves(curves: "UsdGeom.BasisCurves", fibres: AnimatedFibres, codes: list[float]) -> None:
+    """Fibres get their points and their colours, by their stretch, at each time."""
+    from pxr import UsdGeom, Vt
+
+    count, points = fibres.lines[0].points.shape[:2]
+    curves.CreateTypeAttr(UsdGeom.Tokens.linear)
+    curves.CreateCurveVertexCountsAttr(Vt.IntArray(count, points))
+    colours = curves.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+    for code, lines in zip(codes, fibres.lines):
+        places = np.ascontiguousarray(lines.points.reshape(-1, 3), dtype=np.float32)
+        extent = np.stack([places.min(axis=0), places.max(axis=0)])
+        shades = linear_rgb(stretch_colours(lines.local_stretch)).reshape(-1, 3)
+        curves.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(places), code)
+        curves.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), code)
+        colours.Set(Vt.Vec3fArray.FromNumpy(shades.astype(np.float32)), code)
+
+
+def _fill(mesh: "UsdGeom.Mesh", part: AnimatedMesh, codes: list[float]) -> None:
+    """A muscle gets its points at each time, and its faces where they change; a bone its points
+    once and its poses.
+    """
+    from pxr import Gf, UsdGeom, Vt
+
+    for k in range(len(part.vertices)):
+        vertices, faces, normals = part.own(k)
+        at = [codes[k]] if part.poses is None else []
+        if k == 0 or not part.keeps_vertices:
+            topology_at = [] if part.keeps_vertices else at
+            corners = np.ascontiguousarray(faces, dtype=np.int32).ravel()
+            counts = Vt.IntArray(len(faces), 3)
+            _set(mesh.CreateFaceVertexCountsAttr(), counts, topology_at, first=k == 0)
+            corners = Vt.IntArray.FromNumpy(corners)
+            _set(mesh.CreateFaceVertexIndicesAttr(), corners, topology_at, first=k == 0)
+        points = np.ascontiguousarray(vertices, dtype=np.float32)
+        extent = np.stack([points.min(axis=0), points.max(axis=0)])
+        _set(mesh.CreatePointsAttr(), Vt.Vec3fArray.FromNumpy(points), at, first=k == 0)
+        _set(mesh.CreateExtentAttr(), Vt.Vec3fArray.FromNumpy(extent), at, first=k == 0)
+        # Without normals a surface that is no subdivision surface is drawn facet by facet.
+        turned = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, dtype=np.float32))
+        _set(mesh.CreateNormalsAttr(), turned, at, first=k == 0)
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    if part.poses is not None:
+        place = mesh.AddTransformOp()
+        for k, (code, pose) in enumerate(zip(codes, part.poses)):
+            _set(place, Gf.Matrix4d(pose.T), [code] if part.moves else [], first=k == 0)
+
+
+def _set(attribute: "Usd.Attribute", value: object, at: list[float], *, first: bool) -> None:
+    """Give an attribute a value at time codes; without any, or of the first frame, as its default
+    too.
+    """
+    if first or not at:
+        attribute.Set(value)
+    for code in at:
+        attribute.Set(value, code)
+
+
+def identifier(name: str, used: set[str]) -> str:
+    """A name as USD allows it, unlike those used before."""
+    from pxr import Tf
+
+    base = Tf.MakeValidIdentifier(name)
+    found = next(text for k in count(1) if (text := base if k == 1 else f"{base}_{k}") not in used)
+    used.add(found)
+    return found
+
+
+_FLOAT, _INT = 5126, 5125  # types of numbers
+_VERTICES, _INDICES = 34962, 34963  # what a view is bound as
+_LINES = 1  # mode of a primitive
+
+
+def animated_glb(run: Animation) -> bytes:
+    """The content of an animated ``.glb``; UsageError if a muscle's surface has other vertices in
+    other frames.
+    """
+    changing = [muscle.name for muscle in run.muscles if not muscle.keeps_vertices]
+    if changing:
+        raise UsageError(
+            f"animated-glb needs surfaces that keep their vertices, those of {changing[0]!r} "
+            "do not; "
+            "run with surface = 'material', or export to usd, pvd or glb"
+        )
+    file = _File([_key_name(caption) for caption in run.captions])
+    if len(run.times) > 1:
+        file.times = file.add(run.times[:, None] - run.times[0], "SCALAR", bounds=True)
+    children = [_add_part(file, part) for part in (*run.bones, *run.muscles)]
+    children += [_add_fibres(file, fibres) for fibres in run.fibres]
+    root: dict[str, object] = {"name": run.name, "children": children}
+    left, posterior, superior = run.body  # glTF looks at what faces +z, with y up
+    root["rotation"] = _quaternions(np.stack([left, superior, -posterior])[None])[0].tolist()
+    return file.content({"name": run.name, "nodes": [file.append("nodes", root)]})
+
+
+def _key_name(caption: str) -> str:
+    """The caption of a frame as the name of a shape key, of which Blender keeps 63 bytes."""
+    return caption.encode()[:63].decode(errors="ignore")
+
+
+def _add_part(file: "_File", part: AnimatedMesh) -> int:
+    """Number of a new node: a muscle has a morph target for each frame but the first, a bone a pose
+    for each.
+    """
+    base, faces, normals = part.own(0)
+    colour = [*linear_rgb(rgb(part.colour)).tolist(), 1.0]
+    look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}
+    primitive: dict[str, object] = {
+        "attributes": {
+            "POSITION": file.add(base, "VEC3", target=_VERTICES, bounds=True),
+            "NORMAL": file.add(normals, "VEC3", target=_VERTICES),
+        },
+        "indices": file.add(faces.reshape(-1, 1), "SCALAR", target=_INDICES),
+        "material": file.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
+    }
+    targets = []
+    for k in range(1, len(part.vertices)):
+        vertices, _, turned = part.own(k)
+        position = file.add(vertices - base, "VEC3", target=_VERTICES, bounds=True)
+        normal = file.add(turned - normals, "VEC3", target=_VERTICES)
+        targets.append({"POSITION": position, "NORMAL": normal})
+    node = file.add_node(part.name, primitive, targets)
+    if part.poses is not None:
+        turns, shifts = _quaternions(part.poses[:, :3, :3]), part.poses[:, :3, 3]
+        place = {"rotation": turns[0].tolist(), "translation": shifts[0].tolist()}
+        file.lists["nodes"][node] |= place
+        if part.moves:
+            file.animate(node, "rotation", file.add(turns, "VEC4"))
+            file.animate(node, "translation", file.add(shifts, "VEC3"))
+    return node
+
+
+def _add_fibres(file: "_File", fibres: AnimatedFibres) -> int:
+    """Number of a new node of lines, coloured by the stretch of the first frame."""
+    first = fibres.lines[0]
+    base = first.points.reshape(-1, 3)
+    colours = linear_rgb(stretch_colours(first.local_stretch)).reshape(-1, 3)
+    primitive: dict[str, object] = {
+        "mode": _LINES,
+        "attributes": {
+            "POSITION": file.add(base, "VEC3", target=_VERTICES, bounds=True),
+            "COLOR_0": file.add(colours, "VEC3", target=_VERTICES),
+        },
+        "indices": file.add(fibres.segments.reshape(-1, 1), "SCALAR", target=_INDICES),
+    }
+    targets = []
+    for lines in fibres.lines[1:]:
+        moved = lines.points.reshape(-1, 3) - base
+        targets.append({"POSITION": file.add(moved, "VEC3", target=_VERTICES, bounds=True)})
+    return file.add_node(fibres.name, primitive, targets)
+
+
+def _quaternions(rotations):
+    """Quaternions (T, 4), scalar last, none more than half a turn from the one before."""
+    from scipy.spatial.transform import Rotation
+
+    found = Rotation.from_matrix(rotations).as_quat()
+    for k in range(1, len(found)):
+        if found[k] @ found[k - 1] < 0.0:
+            found[k] = -found[k]
+    return found
+
+
+class _File:
+    """The content of a glTF file: the binary part and the lists that describe it; ``names`` are
+    those of the frames.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = names
+        self.parts: list[bytes] = []
+        self.size, self.times = 0, 0
+        keys = "bufferViews", "accessors", "meshes", "materials", "nodes"
+        self.lists: dict[str, list[dict[str, object]]] = {key: [] for key in keys}
+        self.samplers: list[object] = []
+        self.channels: list[object] = []
+
+    def append(self, key: str, entry: dict[str, object]) -> int:
+        """Number of a new entry of a list."""
+        self.lists[key].append(entry)
+        return len(self.lists[key]) - 1
+
+    def add(
+        self,
+        values: Floats | Integers,
+        shape: str,
+        *,
+        target: int | None = None,
+        bounds: bool = False,
+    ) -> int:
+        """Number of a new accessor of these rows: whole numbers as indices, others in single
+        precision.
+        """
+        whole = np.issubdtype(values.dtype, np.integer)
+        rows = np.ascontiguousarray(values, dtype="<u4" if whole else "<f4")
+        view: dict[str, object] = {"buffer": 0, "byteOffset": self.size, "byteLength": rows.nbytes}
+        view |= {} if target is None else {"target": target}
+        self.parts.append(rows.tobytes())
+        self.size += rows.nbytes
+        entry = {"bufferView": self.append("bufferViews", view), "count": len(rows), "type": shape}
+        entry["componentType"] = _INT if whole else _FLOAT
+        if bounds:
+            entry |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        return self.append("accessors", entry)
+
+    def add_node(
+        self, name: str, primitive: dict[str, object], targets: Sequence[Mapping[str, int]]
+    ) -> int:
+        """Number of a new node with one primitive, which takes the forms of its morph targets, one
+        for each frame but the first.
+        """
+        entry: dict[str, object] = {"name": name, "primitives": [primitive]}
+        if targets:
+            primitive["targets"] = list(targets)
+            entry["weights"] = [0.0] * len(targets)
+            entry["extras"] = {"targetNames": list(self.names[1:])}
+        node = self.append("nodes", {"name": name, "mesh": self.append("meshes", entry)})
+        if targets:
+            weights = np.eye(len(targets) + 1)[:, 1:]
+            self.animate(node, "weights", self.add(weights.reshape(-1, 1), "SCALAR"))
+        return node
+
+    def animate(self, node: int, path: str, values: int) -> None:
+        """Let an accessor move a node's ``path`` over the times."""
+        self.samplers.append({"input": self.times, "output": values, "interpolation": "LINEAR"})
+        self.channels.append(
+            {"sampler": len(self.samplers) - 1, "target": {"node": node, "path": path}}
+        )
+
+    def content(self, scene: dict[str, object]) -> bytes:
+        """The whole file."""
+        asset = {"version": "2.0", "generator": "rbfmuscle"}
+        tree: dict[str, object] = {"asset": asset, "scene": 0, "scenes": [scene], **self.lists}
+        tree["buffers"] = [{"byteLength": self.size}]
+        if self.channels:
+            tree["animations"] = [
+                {"name": "motion", "samplers": self.samplers, "channels": self.channels}
+            ]
+        text = json.dumps(tree, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + self.size, len(text), b"JSON")
+        return b"".join([head, text, struct.pack("<I4s", self.size, b"BIN\0"), *self.parts])
+
 
 # One file a muscle (or bone) and frame.
 MESHES = ("pvd", "vtp", "ply", "stl", "obj")
@@ -239,8 +547,6 @@ def write_mesh(
     if path.suffix == ".vtp":
         write_vtp(path, vertices, faces, {**arrays, NORMALS: normals})
         return
-    import trimesh
-
     made = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
     options: dict[str, dict[str, object]] = {
         ".ply": {"vertex_normal": True},

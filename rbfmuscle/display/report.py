@@ -22,7 +22,6 @@ from rbfmuscle.display.page import (
 from rbfmuscle.display.pictures import chosen_frames, render_run
 from rbfmuscle.display.plots import Band, Track, arm_unit, line_plot, motion_axis
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.metrics.doubts import published_band
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, quantity_of
 from rbfmuscle.metrics.summary import (
     COUNTS,
@@ -44,6 +43,7 @@ from rbfmuscle.metrics.verdict import (
     describe_unmeasured,
     describe_verdict,
     judge,
+    published_band,
     require_limits,
 )
 from rbfmuscle.run.data import RunData, moment_arm_coordinates

@@ -7,9 +7,9 @@ import re
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 from scipy.ndimage import binary_fill_holes, find_objects, gaussian_filter, map_coordinates
 from scipy.ndimage import label as connected
 
@@ -20,10 +20,6 @@ from rbfmuscle.geometry.solids import label_shells
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normals
 from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.validation import BROKEN_FILE, MeshError, UsageError
-
-if TYPE_CHECKING:
-    import trimesh
-
 
 # A label's number is its value in its layer, and this much more for each layer before.
 LAYER = 1 << 16
@@ -498,7 +494,7 @@ class LabelSurface:
     """
 
     name: str
-    mesh: "trimesh.Trimesh"
+    mesh: trimesh.Trimesh
     volume: float
     notes: list[str]
     capped: np.ndarray
@@ -510,8 +506,6 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
     With ``pieces`` (bones of several parts) every piece of a hundredth or more is kept, not the
     largest alone.
     """
-    import trimesh
-
     name, notes = volume.name(label), []
     mask = volume.mask(label)
     box = find_objects(mask.astype(np.int8))[0]

@@ -12,9 +12,10 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
+import trimesh
 from pydantic import ValidationError
 
 from rbfmuscle.geometry.arrays import Floats, Integers
@@ -30,10 +31,6 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import Event, FibreLines, Frame, ModelSurface
 from rbfmuscle.validation import SceneError, UsageError, did_you_mean
-
-if TYPE_CHECKING:
-    import trimesh
-
 
 # Coordinates that a caption names at most.
 MOST_SHOWN = 4
@@ -262,8 +259,6 @@ class MuscleRun:
         ``frame`` is the number of a frame; negative counts from the end. ``units`` of length are
         "m", "cm" or "mm", the scene's where not given.
         """
-        import trimesh
-
         vertices, faces = self.run.mesh(self.name, frame)
         if units is not None and units not in MM_PER_UNIT:
             raise UsageError(f"units must be m, cm or mm, got {units!r}")

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.solids import SolidDistance
 from rbfmuscle.scene.content import Compared
 from rbfmuscle.validation import check_mesh
-
-if TYPE_CHECKING:
-    import trimesh
 
 SURFACE_POINTS = 2000  # about how many points cover a bone: 4.5 mm apart on a femur
 

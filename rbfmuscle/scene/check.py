@@ -6,9 +6,10 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import trimesh
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
@@ -22,9 +23,6 @@ from rbfmuscle.scene.muscles import attachment_ends, check_place, check_size
 from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene, doubtful, guessed_muscles, require_complete
 from rbfmuscle.validation import RBFMuscleError, SceneError
-
-if TYPE_CHECKING:
-    import trimesh
 
 
 class InputOverlap(NamedTuple):
@@ -77,7 +75,7 @@ TOUCHED = 8.0  # what is farther from the bone than this [mm] lies on none of it
 
 def articular_points(
     joints: Iterable[tuple[str, str, Floats | None]],
-    meshes: Mapping[str, "trimesh.Trimesh"],
+    meshes: Mapping[str, trimesh.Trimesh],
     millimetre: float,
 ) -> dict[str, Floats]:
     """Points (n, 3) of the articular surfaces by bone.

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import trimesh
 from pydantic import BaseModel
 
 from rbfmuscle.geometry.surfaces import mesh_hash
@@ -50,8 +51,6 @@ def content(value: object) -> object:
         left = value.not_compared if isinstance(value, Compared) else ()
         names = [each.name for each in fields(value) if each.name not in left]
         return {"": type(value).__name__, **{name: content(getattr(value, name)) for name in names}}
-    import trimesh
-
     if isinstance(value, trimesh.Trimesh):
         return mesh_hash(np.asarray(value.vertices), np.asarray(value.faces))
     raise TypeError(f"{type(value).__name__} is no part of a scene")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 from pydantic import Field
 
 from rbfmuscle.geometry.arrays import Floats, Integers
@@ -15,9 +15,6 @@ from rbfmuscle.scene.meshes.repair import InputOrder
 from rbfmuscle.scene.options import ContractionTable, GuessTable, MotionOptions, Table, Vector
 from rbfmuscle.scene.tendons import TendonEnd
 from rbfmuscle.validation import SceneError, shown
-
-if TYPE_CHECKING:
-    import trimesh
 
 MM_PER_UNIT = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
 

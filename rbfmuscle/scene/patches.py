@@ -5,17 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, cast
+from typing import Annotated, ClassVar, cast
 
 import numpy as np
+import trimesh
 from pydantic import BeforeValidator, ValidationInfo, model_validator
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.meshes.formats import read_part, read_vertex_array
-from rbfmuscle.scene.meshes.read import MeshTransform
+from rbfmuscle.scene.meshes.read import MeshTransform, read_part, read_vertex_array
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.objects import LineTable
 from rbfmuscle.scene.options import (
@@ -28,10 +28,6 @@ from rbfmuscle.scene.options import (
     in_folder,
 )
 from rbfmuscle.validation import MeshError, SceneError, check_points, read_text, shown, shown_path
-
-if TYPE_CHECKING:
-    import trimesh
-
 
 FEWEST = 3  # picked points of a patch
 # A patch reaches so many times the greatest distance of a picked point from its nearest neighbour;
@@ -112,8 +108,6 @@ def painted_vertices(colour: str, read: ReadMesh, *, context: str) -> Integers:
 
 def _painted(colour: str, path: Path, count: int, context: str) -> Booleans:
     """Whether each of the ``count`` vertices of a file has a colour."""
-    import trimesh
-
     if re.fullmatch(r"#[0-9a-fA-F]{6}", colour) is None:
         raise SceneError(f"{context}colour must be like '#ff0000', got {shown(repr(colour))}")
     visual = trimesh.load(path, process=False).visual

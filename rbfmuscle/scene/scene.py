@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.content import Compared
-from rbfmuscle.scene.file import ABOUT, SceneFile, given_keys, read_scene_file
+from rbfmuscle.scene.file import ABOUT, FORMAT, SceneFile, SceneFiles, given_keys, read_scene_file
 from rbfmuscle.scene.frames import check_coordinates, make_motion, slice_motion
 from rbfmuscle.scene.joints import (
     Coupling,
@@ -51,7 +51,6 @@ from rbfmuscle.scene.options import (
     Table,
 )
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
-from rbfmuscle.scene.save import FORMAT, SceneFiles
 from rbfmuscle.scene.settings import TABLES, change_settings
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+import trimesh
 
 from rbfmuscle.run.appearance import UPRIGHT, VIEWS, view_axes
 from rbfmuscle.run.data import RunData
@@ -258,8 +259,6 @@ class ViewerPage:
         colour: str = "group",
         served: "tuple[ViserServer, str] | None" = None,
     ) -> None:
-        import trimesh
-
         self.source, (self.server, self.address) = source, served or open_server()
         self._probes = [
             BoneDistance(n, trimesh.Trimesh(*m, process=False)) for n, m in source.bones.items()

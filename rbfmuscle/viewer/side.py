@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import trimesh
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.coarse import clustered
@@ -333,8 +334,6 @@ class ModelView:
         """Show coloured meshes as glTF, which the browser needs a moment to read: the last stays
         until the next.
         """
-        import trimesh
-
         self.forget(bool(painted))
         if painted:
             vertices, faces, shades = zip(*painted)

@@ -61,7 +61,7 @@ print(len(names))
 def test_each_format_of_meshes_is_read(elsewhere, tmp_path):
     code = """
 import pyvista, sys, trimesh
-from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES
+from rbfmuscle.scene.meshes.read import MESH_SUFFIXES
 from rbfmuscle.scene.meshes.read import read_mesh
 ball = trimesh.creation.icosphere(subdivisions=2, radius=20.0)
 for suffix in MESH_SUFFIXES:

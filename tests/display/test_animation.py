@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.display import animation as page
 from rbfmuscle.display.animation import AnimatedMesh, Animation
-from rbfmuscle.display.export import export_run
-from rbfmuscle.display.gltf import _key_name
+from rbfmuscle.display.export import _key_name, export_run
 from rbfmuscle.display.page import ReportPage
 from rbfmuscle.recording import Run
 from rbfmuscle.run.data import frame_caption
@@ -260,7 +259,7 @@ def test_times_of_a_motion_are_those_of_the_files(folder, tmp_path):
 
 
 def test_names_that_usd_does_not_know_stay_apart():
-    from rbfmuscle.display.usd import identifier
+    from rbfmuscle.display.export import identifier
 
     used = set()
     assert [identifier(name, used) for name in ("a-b", "a_b", "1x")] == ["a_b", "a_b_2", "_x"]

@@ -12,7 +12,7 @@ from toy_scene import held
 import rbfmuscle as rm
 from rbfmuscle.geometry.lines import line_length
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.metrics.doubts import published_band
+from rbfmuscle.metrics.verdict import published_band
 from rbfmuscle.run.appearance import stretch_colours
 from rbfmuscle.validation import SceneError, UsageError
 from rbfmuscle.viewer.sources import SavedSource

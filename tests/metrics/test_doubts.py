@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from rbfmuscle.metrics.doubts import measured_doubts, published_band
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import Summary
+from rbfmuscle.metrics.verdict import measured_doubts, published_band
 from rbfmuscle.scene.phantom import phantom_scene
 
 FLEXION = "hip.flexion"

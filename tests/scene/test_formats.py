@@ -9,8 +9,7 @@ import pyvista
 import trimesh
 from command_line import call
 
-from rbfmuscle.scene.meshes.formats import read_file, read_part
-from rbfmuscle.scene.meshes.read import read_mesh
+from rbfmuscle.scene.meshes.read import read_file, read_mesh, read_part
 from rbfmuscle.validation import MeshError
 
 L_SHAPE = np.array([(20, 0), (20, 10), (10, 10), (10, 30), (0, 30), (0, 0)], float)

@@ -15,9 +15,8 @@ import trimesh
 from fuzz.meshes import FORMS, suffix_of, write_mesh
 
 from rbfmuscle.scene.meshes import polydata
-from rbfmuscle.scene.meshes.formats import read_part
 from rbfmuscle.scene.meshes.polydata import MOST_ARRAYS
-from rbfmuscle.scene.meshes.read import read_mesh
+from rbfmuscle.scene.meshes.read import read_mesh, read_part
 from rbfmuscle.validation import MeshError
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=20.0)

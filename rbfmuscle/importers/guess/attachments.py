@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import trimesh
 from scipy.spatial import cKDTree
 
 from rbfmuscle.anatomy.bones import Part
@@ -20,9 +21,6 @@ from rbfmuscle.geometry.surfaces import geodesic, surface_graph
 from rbfmuscle.geometry.vectors import unit
 from rbfmuscle.importers.guess.joints import Skeleton
 from rbfmuscle.importers.guess.sites import PELVIS, Anatomy, Site, anatomy_of, sites_on, whole_bone
-
-if TYPE_CHECKING:
-    import trimesh
 
 
 class Ends:

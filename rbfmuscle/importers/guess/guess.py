@@ -8,8 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from rbfmuscle.anatomy.bones import Orientation, Part, find_orientation
-from rbfmuscle.anatomy.cuts import EXACT, find_cut
+from rbfmuscle.anatomy.bones import EXACT, Orientation, Part, find_cut, find_orientation
 from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
 from rbfmuscle.importers.guess.attachments import (
@@ -23,8 +22,8 @@ from rbfmuscle.importers.guess.parts import Parts, read_parts
 from rbfmuscle.importers.guess.sites import bone_frames
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import articular_points
+from rbfmuscle.scene.file import FORMAT, MAIN, attachment_file, table_text
 from rbfmuscle.scene.names import plain_name
-from rbfmuscle.scene.save import FORMAT, MAIN, attachment_file, table_text
 from rbfmuscle.scene.scene import DOUBTFUL, Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
 

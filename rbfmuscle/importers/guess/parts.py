@@ -8,8 +8,7 @@ from pathlib import Path
 from rbfmuscle.anatomy.bones import Part
 from rbfmuscle.anatomy.names import name_facts
 from rbfmuscle.geometry.coarse import clustered
-from rbfmuscle.scene.meshes.formats import MESH_SUFFIXES, read_file
-from rbfmuscle.scene.meshes.read import prepare_mesh
+from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_file
 from rbfmuscle.scene.muscles import LARGEST_MM, SMALLEST_MM
 from rbfmuscle.scene.names import new_name
 from rbfmuscle.scene.objects import MM_PER_UNIT, from_mm

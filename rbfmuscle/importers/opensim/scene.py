@@ -16,8 +16,7 @@ from rbfmuscle.importers.opensim.elements import ModelMesh, OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.tubes import TUBE_MODEL, make_tube
 from rbfmuscle.scene.joints import all_coordinates
-from rbfmuscle.scene.meshes.formats import ALL, MESH_SUFFIXES, read_part
-from rbfmuscle.scene.meshes.read import prepare_mesh
+from rbfmuscle.scene.meshes.read import ALL, MESH_SUFFIXES, prepare_mesh, read_part
 from rbfmuscle.scene.meshes.repair import ReadMesh
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, SceneError, check_mesh

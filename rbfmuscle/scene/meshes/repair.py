@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import igl
 import numpy as np
+import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -19,9 +20,6 @@ from rbfmuscle.geometry.surfaces import repeated_faces
 from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.geometry.winding import winding_numbers
 from rbfmuscle.validation import MeshError
-
-if TYPE_CHECKING:
-    import trimesh
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
 # Of the diagonal: triangles whose corners lie farther apart, up to the last, are joined where that
@@ -72,8 +70,6 @@ class ReadMesh:
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
         """The surface."""
-        import trimesh
-
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
