@@ -248,7 +248,7 @@ class Run(RunData):
         """
         folder = run_folder(directory)
         if self._recording is not None:
-            writer = RunWriter(directory, self.scene)
+            writer = RunWriter(directory, self._recording.scene)
             for frame in self.frames:
                 writer.write(frame)
             writer.close(self.metrics)

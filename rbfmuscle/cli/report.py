@@ -16,18 +16,7 @@ from rbfmuscle.cli.options import (
     Printing,
     print_result,
 )
-from rbfmuscle.metrics.quantities import quantity_of
-from rbfmuscle.metrics.summary import LIMITS, LOOK, Summary
-from rbfmuscle.metrics.verdict import (
-    describe_doubts,
-    describe_excess,
-    describe_unmeasured,
-    find_remedy,
-    worst_first,
-)
 from rbfmuscle.progress import Progress, stage
-from rbfmuscle.run.data import RunData
-from rbfmuscle.scene.phantom import PHANTOM
 from rbfmuscle.validation import (
     LimitExceededError,
     UsageError,
@@ -40,6 +29,18 @@ LONGEST = 140  # characters about what was not measured or is doubtful: two line
 
 def verdict_lines(directory: Path) -> Iterator[str]:
     """Lines about a run in a folder, at most `WIDTH` characters each where no name is longer."""
+    from rbfmuscle.metrics.quantities import quantity_of
+    from rbfmuscle.metrics.summary import LIMITS, LOOK, Summary
+    from rbfmuscle.metrics.verdict import (
+        describe_doubts,
+        describe_excess,
+        describe_unmeasured,
+        find_remedy,
+        worst_first,
+    )
+    from rbfmuscle.run.data import RunData
+    from rbfmuscle.scene.phantom import PHANTOM
+
     saved = RunData.load(directory)
     info, summary = saved.info, Summary()
     summary.add(saved.metrics)
@@ -141,8 +142,6 @@ def _redraw_study(directory, *, pictures):
 
 
 def _report_lines(directory, facts, page):
-    from rbfmuscle.cli.report import verdict_lines
-
     if page.name == "report.html":
         yield from [facts["answer"]] if "answer" in facts else verdict_lines(directory)
     yield f"open {page}"

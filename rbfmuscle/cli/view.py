@@ -108,20 +108,16 @@ def _check_stops(stops, known):
 
 
 def _open(path):
-    """A scene, or the runs in a folder."""
+    """A scene; of a folder the run in it, or those of the models of a comparison, by name."""
+    from rbfmuscle.run.data import RunData
     from rbfmuscle.scene.phantom import open_scene
 
-    return _open_runs(path) if path.is_dir() else open_scene(path)
-
-
-def _open_runs(folder):
-    """The run in a folder, or those of the models of a comparison, by name."""
-    from rbfmuscle.run.data import RunData
-
-    inside = sorted(path.parent for path in folder.glob("*/run.json"))
-    if (folder / "run.json").exists() or not inside:
-        return {folder.resolve().name: RunData.load(folder)}
-    return {path.name: RunData.load(path) for path in inside}
+    if not path.is_dir():
+        return open_scene(path)
+    inside = sorted(file.parent for file in path.glob("*/run.json"))
+    if (path / "run.json").exists() or not inside:
+        return {path.resolve().name: RunData.load(path)}
+    return {folder.name: RunData.load(folder) for folder in inside}
 
 
 def _draw(opened, model, stops, path):

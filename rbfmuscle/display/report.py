@@ -107,11 +107,17 @@ def write_report(directory: str | Path, *, pictures: bool = True) -> None:
     else:
         pages: list[ReportPage] = []
         scenes: list[str] = []
+
+        def draw_preview() -> None:
+            if len(saved.frames) > 1:
+                file = directory / "preview.webp"
+                render_run(saved, file, views=["motion"], area=110_000, most=12, seconds=4.0)
+
         # Plots take the interpreter's lock, and pictures and packing leave it.
         each(
             lambda draw: draw(),
             [
-                lambda: _draw_preview(saved, directory),
+                draw_preview,
                 lambda: scenes.append(packed_scene({"": saved})),
                 lambda: pages.append(_page(saved)),
             ],
@@ -119,13 +125,6 @@ def write_report(directory: str | Path, *, pictures: bool = True) -> None:
         page = pages[0]
         page.scene = scenes[0]
     page.write(directory / "report.html")
-
-
-def _draw_preview(saved: RunData, directory: Path) -> None:
-    """Draw ``preview.webp`` of a run of several frames."""
-    if len(saved.frames) > 1:
-        preview = directory / "preview.webp"
-        render_run(saved, preview, views=["motion"], area=110_000, most=12, seconds=4.0)
 
 
 def packed_scene(runs: Mapping[str, RunData]) -> str:

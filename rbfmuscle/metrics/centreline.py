@@ -82,7 +82,11 @@ class Centreline:
         self.operator = slice_operator(vertices, faces, field, even)
         first, last = (_rest_middle(end) for end in self.ends)
         line = np.vstack([first, self.operator @ vertices, last])
-        self.clearance = _half_thickness(line, vertices, faces)
+        # Of the line at rest to the surface, at even distances along it; 0 at both ends.
+        distance = MeshDistance(vertices, faces).unsigned(line)
+        distance[[0, -1]] = 0.0
+        places = distance_along(line)
+        self.clearance = np.interp(np.linspace(0.0, places[-1], NODES), places, distance)
         #: What the shortest path goes through: patches as those of an end, by its node.
         self.via = _passed(muscle, areas, resampled(line, NODES - 1))
         #: Shortest paths that did not come to rest, since they were last asked for.
@@ -134,16 +138,6 @@ class Centreline:
             ]
             total += float(np.average(lengths, weights=areas))
         return total
-
-
-def _half_thickness(line: Floats, vertices: Floats, faces: Integers) -> Floats:
-    """Distance (`NODES`,) from a line at rest (n, 3) to the surface, at even distances along it; 0
-    at both ends.
-    """
-    distance = MeshDistance(vertices, faces).unsigned(line)
-    distance[[0, -1]] = 0.0
-    along = distance_along(line)
-    return np.interp(np.linspace(0.0, along[-1], NODES), along, distance)
 
 
 def _passed(muscle: Muscle, areas: Floats, path: Floats) -> dict[int, End]:

@@ -113,7 +113,8 @@ class NeighbourMeasures:
         names = list(shown)
         if not names:
             return {}
-        fresh = [name for name, surface in shown.items() if self._is_new(name, surface.at_rest)]
+        # Those that are shown by other vertices than in the frame before.
+        fresh = [n for n, surface in shown.items() if self._places.get(n) is not surface.at_rest]
         each(lambda name: self._renew(name, shown[name].at_rest, names), fresh)
         low, high = np.swapaxes([surface.box for surface in shown.values()], 0, 1)
         met = np.all((low[:, None] <= high) & (low <= high[:, None]), axis=2)
@@ -165,17 +166,14 @@ class NeighbourMeasures:
     ) -> tuple[float, list[Floats]]:
         """Deepest overlap beyond rest of a pair, and how far touching places of either parted."""
         deepest, parted = 0.0, []
-        for one, other in _ways(row):
+        first, second, met = row
+        for one, other in ((first, second), (second, first)):
             side, there = self._sides[one, other], shown[other].distance
             vertices = shown[one].distance.vertices
-            if row[2]:
+            if met:
                 deepest = max(deepest, _deepest(vertices, there, side.allowed))
             parted.append(_parted(vertices[side.touching], there, side.gap))
         return deepest, parted
-
-    def _is_new(self, name: str, at_rest: Floats) -> bool:
-        """Whether a muscle is shown by other vertices than in the frame before."""
-        return name not in self._places or self._places[name] is not at_rest
 
     def _renew(self, one: str, at_rest: Floats, names: Sequence[str]) -> None:
         """Find what a muscle's vertices (n, 3) do beside the others at rest."""
@@ -185,12 +183,6 @@ class NeighbourMeasures:
                 self._sides[one, other] = side = self.input.side(one, other, at_rest)
                 if len(side.touching):
                     self._touched |= {(one, other), (other, one)}
-
-
-def _ways(row: tuple[str, str, bool]) -> tuple[tuple[str, str], tuple[str, str]]:
-    """Both orders of a pair."""
-    one, other, _ = row
-    return (one, other), (other, one)
 
 
 def _spread(overlap: InputOverlap, points: Floats, reach: float) -> Floats:

@@ -3,13 +3,14 @@ directions.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.lines import distance_along, tube_mesh
 from rbfmuscle.geometry.surfaces import joined_meshes
+from rbfmuscle.run.info import JointInfo
+from rbfmuscle.scene.joints import Joint
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.tendons import TendonLine
 
@@ -47,23 +48,9 @@ TAPER = 2.5
 LONGEST_TAPER = 0.6
 
 
-class Link(Protocol):
-    """A joint between two bones, by their names."""
-
-    @property
-    def name(self) -> str:
-        """The joint's."""
-
-    @property
-    def parent(self) -> str:
-        """The bone that moves the other."""
-
-    @property
-    def child(self) -> str:
-        """The bone that is moved."""
-
-
-def muscle_groups(joints: Sequence[Link], held: Mapping[str, Sequence[str]]) -> dict[str, str]:
+def muscle_groups(
+    joints: Sequence[Joint] | Sequence[JointInfo], held: Mapping[str, Sequence[str]]
+) -> dict[str, str]:
     """Group of each muscle by the joints that it crosses.
 
     ``held`` names the bones that each muscle is attached to, once for each attachment. Joints that

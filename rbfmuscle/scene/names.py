@@ -3,8 +3,11 @@
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
+from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.joints import Joint
+from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.validation import SceneError, did_you_mean, shown
 
 _CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
@@ -43,15 +46,7 @@ def new_name(name: str, taken: Iterable[str], *, file: bool = True) -> str:
     return found
 
 
-class Named(Protocol):
-    """Anything with a name."""
-
-    @property
-    def name(self) -> str:
-        """As the scene file has it."""
-
-
-NamedItem = TypeVar("NamedItem", bound=Named)
+NamedItem = TypeVar("NamedItem", Bone, Muscle)
 
 
 def find_named(items: Sequence[NamedItem], name: str, what: str, *, context: str = "") -> NamedItem:
@@ -83,7 +78,9 @@ def check_name(name: object, what: str) -> str:
     return name
 
 
-def check_new_name(items: Sequence[Named], name: str, what: str) -> None:
+def check_new_name(
+    items: Sequence[Bone] | Sequence[Joint] | Sequence[Muscle], name: str, what: str
+) -> None:
     """Raise SceneError if a name is no name for a file, or taken, in letters of another case
     too.
     """

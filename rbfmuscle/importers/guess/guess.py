@@ -96,7 +96,11 @@ def guess_scene(
         guess.muscles = [
             guess_attachments(muscle, skeleton, named=False) for muscle in parts.muscles
         ]
-    _say_unused(guess, skeleton)
+    tendons = (hold.tendon for muscle in guess.muscles for hold in muscle.holds)
+    used = {tendon.mesh for tendon in tendons if tendon is not None and tendon.mesh is not None}
+    unused = unused_tendons(parts.tendons, parts.muscles, used, skeleton)
+    parts.unusable |= unused
+    parts.notes += [f"{file} is not used: {reason}" for file, reason in unused.items()]
     for muscle in guess.muscles:
         _leave_caps(muscle, _capped_vertices(muscle.muscle, capped))
     order = [root, *(joint.child for joint in joints)]
@@ -121,16 +125,6 @@ def _skeleton(guess, bodies, millimetre):
         {bone: surfaces[bone.name] for bone in bones},
         guess.parts.tendons,
     )
-
-
-def _say_unused(guess, skeleton):
-    """Name tendons of no use."""
-    holds = [hold for muscle in guess.muscles for hold in muscle.holds if hold.tendon is not None]
-    used = {hold.tendon.mesh for hold in holds}
-    parts = guess.parts
-    unused = unused_tendons(parts.tendons, parts.muscles, used, skeleton)
-    parts.unusable |= unused
-    parts.notes += [f"{file} is not used: {reason}" for file, reason in unused.items()]
 
 
 def _capped_vertices(part, capped):

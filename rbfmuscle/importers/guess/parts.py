@@ -86,7 +86,11 @@ def read_parts(
         kinds.get(tissue, unknown).append(part)
     if other:
         found.notes.append(f"left out, neither bone nor muscle: {', '.join(other)}")
-    _sort_unknown(found, unknown)
+    # The largest of the others are bones until there are two, the rest muscles if they can be.
+    for part in sorted(unknown, key=lambda part: -part.size):
+        is_bone = len(found.bones) < 2 or not _can_be_muscle(part)
+        part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
+        (found.bones if is_bone else found.muscles).append(part)
     if not found.bones or not found.muscles:
         kind, rest = ("bone", "muscles") if not found.bones else ("muscle", "bones")
         listed = [Path(part.file).name for part in found.bones or found.muscles]
@@ -106,16 +110,6 @@ def _tissue(facts, parent, folder):
     if facts.tissue == "tendon" or parent == folder:
         return facts.tissue
     return FOLDERS[parent.name.lower()]
-
-
-def _sort_unknown(found, unknown):
-    """Of names that are not known: the largest are bones until there are two, the others muscles if
-    they can be.
-    """
-    for part in sorted(unknown, key=lambda part: -part.size):
-        is_bone = len(found.bones) < 2 or not _can_be_muscle(part)
-        part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
-        (found.bones if is_bone else found.muscles).append(part)
 
 
 def _can_be_muscle(part):
