@@ -7,6 +7,7 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,18 +38,8 @@ if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
 
 
-def check_usd() -> None:
-    """Raise MissingDependencyError where the package that writes USD is absent."""
-    try:
-        import pxr.Usd  # noqa: F401
-    except ImportError:
-        raise MissingDependencyError(
-            "export to usd needs usd-core: pip install -e '.[usd]' in rbfmuscle's folder"
-        ) from None
-
-
 def write_usd(path: Path, run: Animation) -> None:
-    """Write a run as one ``.usdc`` file; usd-core must be there (`check_usd`).
+    """Write a run as one ``.usdc`` file; usd-core must be there.
 
     Time codes count 24 a second. A surface that keeps its vertices has its topology once and its
     points at every time; another one has both at every time. Lengths stay in the run's unit, named
@@ -392,11 +383,14 @@ def export_run(
         raise UsageError(f"{run.directory or 'the run'} has no surfaces to export")
     if output is None and run.directory is None:
         raise UsageError("the run is in memory; name the folder to export to")
-    missing = _missing_part(formats)
-    if missing is not None:
+    missing = None
+    if "usd" in formats and find_spec("pxr") is None:
+        missing = MissingDependencyError(
+            "export to usd needs usd-core: pip install -e '.[usd]' in rbfmuscle's folder"
+        )
         formats.remove("usd")
-    if missing is not None and not formats:
-        raise missing
+        if not formats:
+            raise missing
     base = Path(output) if output is not None else Path(run.directory or "", "export")
     folder = OutputFolder(base, "export", formats, beside=True)
     written: list[Path] = []
@@ -417,16 +411,6 @@ def export_run(
         missing.written = files
         raise missing
     return files
-
-
-def _missing_part(formats: Sequence[str]) -> MissingDependencyError | None:
-    """What a package lacks that one of the formats needs."""
-    try:
-        if "usd" in formats:
-            check_usd()
-    except MissingDependencyError as error:
-        return error
-    return None
 
 
 def _check_words(formats: Sequence[str], units: str | None, fps: float | None) -> None:
@@ -470,7 +454,9 @@ def _file_name(name: str) -> str:
 
 def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -> list[Path]:
     written, suffix = [], "vtp" if name == "pvd" else name
-    measure = SurfaceArrays(run) if suffix == "vtp" else None
+    measure = VertexArrays({part.name: part.group for part in run.muscles})
+    near = run.bones if suffix == "vtp" else []
+    solids = [(SolidDistance(bone.vertices[0], bone.faces[0]), bone) for bone in near]
     taken = {part.name.lower() for part in run.muscles}
     for group, parts in (("surfaces", run.muscles), ("bones", run.bones)):
         # No name of a part holds a full stop.
@@ -483,7 +469,9 @@ def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -
             moved = [p for p in parts if k == 0 or p.poses is None or p.moves]
             files |= {p.name: f"{stems[p.name]}_{frame:04d}.{suffix}" for p in moved}
             for part in moved:
-                arrays = measure.of(part, k) if measure and group == "surfaces" else {}
+                arrays: dict[str, Floats] = {}
+                if suffix == "vtp" and group == "surfaces":
+                    arrays = measure.of(part.name, part.mesh(k), _bone_distance(part, solids, k))
                 vertices, faces, normals = part.own(k)
                 if part.given is not None:
                     arrays = {key: values[part.given.source] for key, values in arrays.items()}
@@ -496,42 +484,25 @@ def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -
                 collection.add(run.times[k] if run.timed else frame, list(files.items()))
         if collection is not None:
             written.append(folder / f"{group}.pvd")
-    return written + (_export_fibres(run, folder, frames) if suffix == "vtp" else [])
-
-
-def _export_fibres(run: Animation, folder: Path, frames: list[int]) -> list[Path]:
-    """Write the fibres of a run as polylines, and return the files."""
-    written = []
-    for part in run.fibres:
-        for frame, lines in zip(frames, part.lines):
-            written.append(folder / f"{part.name}_{frame:04d}.vtp")
+    for fibres in run.fibres if suffix == "vtp" else ():
+        for frame, lines in zip(frames, fibres.lines):
+            written.append(folder / f"{fibres.name}_{frame:04d}.vtp")
             write_fibres(written[-1], lines)
     return written
 
 
-class SurfaceArrays:
-    """Arrays at the vertices of muscles: those of `VertexArrays` against the first frame, and the
-    distance to the nearest bone, negative inside.
+def _bone_distance(
+    part: AnimatedMesh, solids: Sequence[tuple[SolidDistance, AnimatedMesh]], k: int
+) -> Floats | None:
+    """Distance (n,) of a muscle to the nearest bone in frame ``k``, negative inside; None without
+    bones.
     """
-
-    def __init__(self, run: Animation) -> None:
-        self._bones = [(SolidDistance(bone.vertices[0], bone.faces[0]), bone) for bone in run.bones]
-        self._groups = sorted({part.group for part in run.muscles})
-        self._first: dict[str, VertexArrays] = {}
-
-    def of(self, part: AnimatedMesh, k: int) -> dict[str, Floats]:
-        """Arrays (n,) of a muscle in frame ``k``; no stretch where triangles change."""
-        mesh = part.mesh(k)
-        if part.name not in self._first:
-            self._first[part.name] = VertexArrays(part.mesh(0), self._groups.index(part.group))
-        found = self._first[part.name].of(mesh)
-        distances = [
-            field.signed(mesh[0] if bone.poses is None else to_local(mesh[0], bone.poses[k]))
-            for field, bone in self._bones
-        ]
-        if distances:
-            found["bone_distance"] = np.min(distances, axis=0)
-        return found
+    points = part.mesh(k)[0]
+    found = [
+        solid.signed(points if bone.poses is None else to_local(points, bone.poses[k]))
+        for solid, bone in solids
+    ]
+    return np.min(found, axis=0) if found else None
 
 
 def write_mesh(

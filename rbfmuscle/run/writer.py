@@ -47,52 +47,30 @@ FARTHEST = 20.0  # distance to the bones that is told from others [mm]
 
 
 class VertexArrays:
-    """The number of a muscle's ``group``, and ``stretch``, the mean change of the edges about each
-    vertex against the first mesh, where the triangles are the same.
+    """Arrays at the vertices of muscles, frame by frame: the number of a muscle's ``group``;
+    ``stretch``, the mean change of the edges about each vertex against the first frame, where the
+    triangles are the same; ``bone_distance`` to the nearest bone, negative inside.
+
+    ``groups`` are those of the muscles by name.
     """
 
-    def __init__(self, first: Mesh, group: int) -> None:
-        self._faces = first[1]
-        self._group = float(group)
-        self._stretch = EdgeStretch(*first)
-
-    def of(self, mesh: Mesh) -> dict[str, Floats]:
-        """Arrays (n,) of a mesh."""
-        vertices, faces = mesh
-        found = {"group": np.full(len(vertices), self._group)}
-        if faces is self._faces or np.array_equal(faces, self._faces):
-            found["stretch"] = self._stretch(vertices)
-        return found
-
-
-class RunArrays:
-    """Arrays at the vertices of each muscle of a scene, frame by frame.
-
-    Those of `VertexArrays` against the first frame; ``bone_distance`` to the nearest bone that the
-    muscle can reach, negative inside, 20 mm at most [scene unit]; and what its model adds, as
-    ``level_offset``.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        held = {m.name: [end.bone for end in m.attachments] for m in scene.muscles}
-        groups = muscle_groups(scene.joints, held)
+    def __init__(self, groups: Mapping[str, str]) -> None:
         numbers = sorted(set(groups.values()))
-        self._groups = {name: numbers.index(group) for name, group in groups.items()}
-        self._farthest = from_mm(FARTHEST, scene.units)
-        self._first: dict[str, VertexArrays] = {}
+        self._groups = {name: float(numbers.index(group)) for name, group in groups.items()}
+        self._first: dict[str, tuple[Integers, EdgeStretch]] = {}
 
-    def of(self, frame: Frame, name: str) -> Mapping[str, Floats]:
+    def of(self, muscle: str, mesh: Mesh, distance: Floats | None) -> dict[str, Floats]:
         """Arrays (n,) of a muscle; no distance where no bone is in reach."""
-        surface = frame.surfaces[name]
-        mesh = surface.vertices, surface.faces
-        if name not in self._first:
-            self._first[name] = VertexArrays(mesh, self._groups[name])
-        found = self._first[name].of(mesh)
-        bones = frame.bones.get(name)
-        if bones is not None and bones.names:
-            distance = bones.distance(surface.vertices, frame.poses, self._farthest)
-            found["bone_distance"] = np.minimum(distance, self._farthest)
-        return found | dict(surface.arrays)
+        vertices, faces = mesh
+        if muscle not in self._first:
+            self._first[muscle] = faces, EdgeStretch(*mesh)
+        first, stretch = self._first[muscle]
+        found = {"group": np.full(len(vertices), self._groups[muscle])}
+        if faces is first or np.array_equal(faces, first):
+            found["stretch"] = stretch(vertices)
+        if distance is not None:
+            found["bone_distance"] = distance
+        return found
 
 
 TABLES = {
@@ -130,7 +108,9 @@ class RunWriter:
         self.scene = scene
         self.meshes = bool(scene.output.surfaces)
         self.count, self._failed = 0, False
-        self._arrays = RunArrays(scene)
+        held = {m.name: [end.bone for end in m.attachments] for m in scene.muscles}
+        self._arrays = VertexArrays(muscle_groups(scene.joints, held))
+        self._farthest = from_mm(FARTHEST, scene.units)
         # Pose and file that show a bone now, and its mesh for a series.
         self._bones: dict[str, tuple[Floats, str]] = {}
         self._light: dict[str, tuple[Floats, Integers]] = {}
@@ -234,11 +214,23 @@ class RunWriter:
 
         def write(entry):
             name, file = entry
-            arrays = self._arrays.of(frame, name) if name in frame.surfaces else None
+            arrays = self._arrays_of(frame, name) if name in frame.surfaces else None
             write_vtp(self.directory / file, *meshes[name], arrays)
 
         each(write, entries)
         return entries
+
+    def _arrays_of(self, frame, name):
+        """Arrays (n,) at a muscle's vertices: those of `VertexArrays`, with the distance to bones
+        that it can reach, `FARTHEST` at most, and what its model adds, as ``level_offset``.
+        """
+        surface = frame.surfaces[name]
+        bones, distance = frame.bones.get(name), None
+        if bones is not None and bones.names:
+            distance = bones.distance(surface.vertices, frame.poses, self._farthest)
+            distance = np.minimum(distance, self._farthest)
+        mesh = surface.vertices, surface.faces
+        return self._arrays.of(name, mesh, distance) | dict(surface.arrays)
 
     def _write_bones(self, frame):
         """Bones where they are now: the mesh at rest once, and few triangles of one that has moved,
