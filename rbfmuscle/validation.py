@@ -166,6 +166,12 @@ def shown(value: object, *, longest: int = LONGEST_SHOWN) -> str:
     return text if len(text) <= longest else f"{text[: longest - 15]} ... {text[-10:]}"
 
 
+def listed(names: Sequence[str], most: int, *, separator: str = ", ") -> str:
+    """Return the first of some names as a message lists them, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return separator.join(names[:most]) + more
+
+
 def shown_path(path: str | os.PathLike[str]) -> str:
     """Return a path as a message shows it: whole, unless it is longer than paths are."""
     return shown(str(path), longest=400)
@@ -270,5 +276,4 @@ def did_you_mean(word: object, known: Iterable[object]) -> str:
         return f"did you mean {lower[near[0]]!r}?"
     if not names:
         return "there are none"
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return "known: " + ", ".join(shown(name) for name in names[:MOST_NAMED]) + more
+    return f"known: {listed([shown(name) for name in names], MOST_NAMED)}"

@@ -310,18 +310,13 @@ def rest_errors(
 def surface_distance(
     vertices: Floats, faces: Integers, other_vertices: Floats, other_faces: Integers
 ) -> tuple[float, float]:
-    """`distance_between` two surfaces of vertices (n, 3) and faces (m, 3)."""
-    return distance_between(
-        MeshDistance(vertices, faces), MeshDistance(other_vertices, other_faces)
-    )
-
-
-def distance_between(one: MeshDistance, other: MeshDistance) -> tuple[float, float]:
-    """Distance between two surfaces, from the vertices of each to the other [scene unit].
+    """Distance between two surfaces of vertices (n, 3) and faces (m, 3), from the vertices of each
+    to the other [scene unit].
 
     Root of the mean of both directions' mean squares, and the greatest distance of either.
     """
-    there, back = other.unsigned(one.vertices), one.unsigned(other.vertices)
+    there = MeshDistance(other_vertices, other_faces).unsigned(vertices)
+    back = MeshDistance(vertices, faces).unsigned(other_vertices)
     rms = math.sqrt((np.mean(there**2) + np.mean(back**2)) / 2)
     return rms, float(max(there.max(), back.max()))
 

@@ -29,7 +29,7 @@ from rbfmuscle.scene.joints import all_coordinates
 from rbfmuscle.scene.motion import rest_coordinates
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.validation import LimitExceededError
+from rbfmuscle.validation import LimitExceededError, listed
 
 MOST_NAMED = 6  # exceeded limits that a verdict names
 
@@ -68,7 +68,7 @@ def _outcome(table: Table, found: list[Exceedance], missing: list[Unmeasured]) -
         count = (
             f"{right} of {len(muscles)} muscles {'is' if right == 1 else 'are'} within all limits"
         )
-        text = f"{count}; {_listed(wrong)} {'is' if len(wrong) == 1 else 'are'} not"
+        text = f"{count}; {listed(wrong, MOST_NAMED)} {'is' if len(wrong) == 1 else 'are'} not"
     bones = any(row.muscle == ALL for row in found) and not wrong
     return f"{text}; the bones are not" if bones else text
 
@@ -112,9 +112,8 @@ def describe_unmeasured(missing: Sequence[tuple[str, str]]) -> str:
     by_quantity: dict[str, list[str]] = {}
     for muscle, quantity in missing:
         by_quantity.setdefault(quantity, []).extend([] if muscle == ALL else [muscle])
-    texts = [f"{q}{f' of {_listed(n)}' if n else ''}" for q, n in by_quantity.items()]
-    more = f" and {len(texts) - MOST_NAMED} more" if len(texts) > MOST_NAMED else ""
-    return "; ".join(texts[:MOST_NAMED]) + more
+    texts = [f"{q}{f' of {listed(n, MOST_NAMED)}' if n else ''}" for q, n in by_quantity.items()]
+    return listed(texts, MOST_NAMED, separator="; ")
 
 
 def _worst_and_remedies(found, table, missing_bones):
@@ -149,11 +148,6 @@ def find_remedy(row: Exceedance, table: Table) -> str:
     return (is_mesh and limit_kind.mesh_remedy) or limit_kind.remedy
 
 
-def _listed(names):
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return f"{', '.join(names[:MOST_NAMED])}{more}"
-
-
 def describe_excess(row: Exceedance, table: Table, missing_bones: Sequence[str] = ()) -> str:
     """One value beyond its limit, in words; bones ``missing_bones``."""
     muscle, quantity, worst, limit, frame = row
@@ -168,7 +162,7 @@ def describe_excess(row: Exceedance, table: Table, missing_bones: Sequence[str] 
     quantity, coordinate = split_name(quantity)
     title = LIMITS[quantity].title if quantity in LIMITS else quantity
     title += f" ({coordinate})" if coordinate else ""
-    title += f" ({_listed(missing_bones)})" if quantity == "missing_bones" else ""
+    title += f" ({listed(missing_bones, MOST_NAMED)})" if quantity == "missing_bones" else ""
     return f"{place}, {title} {value} at frame {frame} (limit {shown_limit})"
 
 

@@ -22,7 +22,7 @@ from rbfmuscle.scene.joints import (
 from rbfmuscle.scene.names import plain_name
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions
-from rbfmuscle.validation import SceneError, UsageError, did_you_mean, read_text, shown
+from rbfmuscle.validation import SceneError, UsageError, did_you_mean, listed, read_text, shown
 
 
 def read_storage(
@@ -127,9 +127,8 @@ def _storage_notes(path, header, unknown, shape):
     """Columns of a motion file that are of no coordinate, and rows or columns counted wrongly."""
     notes = []
     if unknown:
-        more = f" and {len(unknown) - MOST_LISTED} more" if len(unknown) > MOST_LISTED else ""
-        listed = ", ".join(map(shown, unknown[:MOST_LISTED]))
-        notes.append(f"{path}: columns of no coordinate of the scene are not used: {listed}{more}")
+        labels = listed([shown(label) for label in unknown], MOST_LISTED)
+        notes.append(f"{path}: columns of no coordinate of the scene are not used: {labels}")
     for count, what, old in zip(shape, ("nRows", "nColumns"), ("datarows", "datacolumns")):
         said = header.get(what.lower(), header.get(old))
         if said is not None and said != str(count):

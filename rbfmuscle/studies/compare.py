@@ -50,7 +50,7 @@ from rbfmuscle.scene.settings import chooses_model
 from rbfmuscle.simulation.frame import Mesh
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.studies.result import OnProgress, Study, part_progress, study_folder
-from rbfmuscle.validation import SolveError, UsageError
+from rbfmuscle.validation import SolveError, UsageError, listed
 
 if TYPE_CHECKING:
     from rbfmuscle.scene.scene import Scene
@@ -576,16 +576,12 @@ def _failures(beyond: Beyond, labels: dict[str, str]) -> list[str]:
         named = {quantity: sorted(muscles) for quantity, muscles in found.items() if muscles}
         named.pop(ALL, None)
         most = sorted(named, key=lambda quantity: len(named[quantity]), reverse=True)[:MOST_TOLD]
-        told = [f"{LIMITS[quantity].title} ({_some(named[quantity])})" for quantity in most]
+        told = [
+            f"{LIMITS[quantity].title} ({listed(named[quantity], MOST_TOLD)})" for quantity in most
+        ]
         if told:
             texts.append(f"Beyond limits, {labels[model]}: {', '.join(told)}")
     return texts
-
-
-def _some(names: list[str]) -> str:
-    """A few of some names."""
-    more = f" and {len(names) - MOST_TOLD} more" if len(names) > MOST_TOLD else ""
-    return ", ".join(names[:MOST_TOLD]) + more
 
 
 def _differences(

@@ -214,28 +214,27 @@ def plan_sweep(
     the greatest number of centres, samples, nodes, iterations and cells in it and the least angle
     and step.
     """
-    return [
-        point
-        for n, s in scenes.items()
-        for point in _points(n, s, grid, frames, dict(reference or {}))
-    ]
+    points: list[SweepPoint] = []
+    for name, scene in scenes.items():
+        content = scene_content(scene, frames)
+        found: dict[str, SweepPoint] = {}
+        target = ""
+        if grid:
+            finest = _model_first(_finest(grid) | dict(reference or {}))
+            target = point_key(content, finest)
+            found[target] = SweepPoint(target, name, finest, "reference", target)
+        for number, chosen in enumerate([(), *itertools.product(*grid.values())]):
+            settings = _model_first(dict(zip(grid, chosen)))
+            key, role = point_key(content, settings), "" if number else "default"
+            found.setdefault(key, SweepPoint(key, name, settings, role, target))
+        points += found.values()
+    return points
 
 
-def _points(name, scene, grid, frames, reference):
-    content = scene_content(scene, frames)
-    found = {}
-    target = ""
-    if grid:
-        up = {key: max(values) for key, values in grid.items() if key in FINER_UP}
-        down = {key: min(values) for key, values in grid.items() if key in FINER_DOWN}
-        finest = _model_first(up | down | reference)
-        target = point_key(content, finest)
-        found[target] = SweepPoint(target, name, finest, "reference", target)
-    for number, values in enumerate([(), *itertools.product(*grid.values())]):
-        settings = _model_first(dict(zip(grid, values)))
-        key = point_key(content, settings)
-        found.setdefault(key, SweepPoint(key, name, settings, "" if number else "default", target))
-    return list(found.values())
+def _finest(grid):
+    """Of the settings that make a run finer the greatest value, or the least."""
+    up = {key: max(values) for key, values in grid.items() if key in FINER_UP}
+    return up | {key: min(values) for key, values in grid.items() if key in FINER_DOWN}
 
 
 def _model_first(settings):

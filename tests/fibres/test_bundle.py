@@ -184,7 +184,7 @@ def test_fibres_are_exported_and_drawn(run, tmp_path):
     run.save(tmp_path / "run", pictures=False)
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     plot = page[page.index('aria-label="Moment arm: elbow.bend"') :].partition("</svg>")[0]
-    assert plot.count('fill-opacity="0.2"') == 1  # the fibres' band
+    assert plot.count("fill-opacity: 0.2") == 1  # the fibres' band
     run.export(tmp_path / "out", ["vtp", "animated-glb"], units=None)
     moved = pyvista.read(tmp_path / "out" / "vtp" / "strap_fibres_0004.vtp")
     np.testing.assert_allclose(moved.points, run["strap"].fibres(4).reshape(-1, 3), rtol=1e-12)

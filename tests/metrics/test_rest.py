@@ -6,7 +6,7 @@ import toy_scene as toy
 from blend_model import BlendMuscle, arm_scene, use_blend_model
 
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.metrics.metrics import bone_overlap, distance_between, rest_errors
+from rbfmuscle.metrics.metrics import bone_overlap, rest_errors, surface_distance
 from rbfmuscle.recording import simulate
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.simulation.frame import ModelSurface
@@ -17,7 +17,7 @@ HERE = {"bone": np.eye(4)}
 def test_distance_of_two_boxes_is_the_root_of_the_mean_of_both_mean_squares():
     one, other = toy.box_mesh((0, 0, 0), (8, 8, 8)), toy.box_mesh((-1, 0, 0), (8, 8, 8))
     there, back = MeshDistance(one.vertices, one.faces), MeshDistance(other.vertices, other.faces)
-    rms, worst = distance_between(there, back)
+    rms, worst = surface_distance(there.vertices, there.faces, back.vertices, back.faces)
     # From the shared sides nothing; from the face at 0 to that at -1 one, where no edge is nearer.
     moved = np.array(other.vertices)[other.vertices[:, 0] < -1e-6]
     face = np.array(one.vertices)[np.abs(one.vertices[:, 0]) < 1e-6]

@@ -24,7 +24,7 @@ from rbfmuscle.importers.opensim.joints import Reading, read_constraints, read_j
 from rbfmuscle.importers.opensim.muscles import read_muscles
 from rbfmuscle.scene.joints import Coupling, ordered
 from rbfmuscle.scene.names import plain_name
-from rbfmuscle.validation import SceneError
+from rbfmuscle.validation import SceneError, listed
 
 MOST_ROUNDS = 200  # of meeting the weld constraints; a few are enough where they can be met
 LEAST_MOVE = 1e-12  # of a round that goes on [metre and radian]
@@ -198,9 +198,8 @@ def _read_model(root, path):
     model.bodies = list(frames.bodies.values())
     changed = [f"{old!r} as {new}" for old, new in frames.bare.items() if old != new]
     if changed:
-        more = f" and {len(changed) - MOST_RENAMED} more" if len(changed) > MOST_RENAMED else ""
-        listed = ", ".join(changed[:MOST_RENAMED])
-        model.notes.append(f"names are written in plain letters: {listed}{more}")
+        names = listed(changed, MOST_RENAMED)
+        model.notes.append(f"names are written in plain letters: {names}")
     if version > NEWEST or not version:
         said = f"is of version {version}, newer than 4.6" if version else "states no version"
         model.notes.append(f"the file {said}: read as one of version 4.6 where nothing else shows")
