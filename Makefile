@@ -72,6 +72,7 @@ check: $(DEV)
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 	$(BIN)/python docs/check.py
+	$(BIN)/python -m pytest -n 0 --collect-only --quiet --quiet $$(grep -v '^#' tests/nojit.txt) >/dev/null
 
 bench: $(DEV)
 	$(BIN)/python benchmarks/interpolation.py

@@ -52,7 +52,6 @@ class TestInterrupts:
             ("SIGINT", "builtins.__import__", "given[0] == 'cyclopts'", ""),
             ("SIGTERM", "pbd_baseline.muscle._bone_numbers", "True", ""),
             ("SIGINT", "rbfmuscle.run.writer.write_vtp", "len(calls) == 8", ""),
-            ("SIGTERM", "rbfmuscle.run.writer.write_vtp", "len(calls) == 8", ""),
             # As ctypes does in a callback.
             ("SIGINT", "rbfmuscle.run.writer.write_vtp", "len(calls) == 8", "KeyboardInterrupt"),
         ],

@@ -80,8 +80,9 @@ def test_a_scene_that_is_moved_and_in_another_unit_gives_the_same_surface(
 
 @pytest.mark.parametrize("kernel", [k for k in KERNELS if k != "gaussian"])
 def test_any_kernel_drives_a_muscle(kernel):
-    options = {"model.kernel": kernel, "model.centres": 120, "model.resolution": 32}
-    scene = phantom_scene().with_options(options, frames="0:6:5")
+    options = {"kernel": kernel, "centres": 120, "resolution": 32, "nodes": 100}
+    scene = phantom_scene(end=10.0, step=10.0)
+    scene = scene.with_options({f"model.{key}": value for key, value in options.items()})
     scene.muscles = [scene.muscle("adductor_posterior")]
     smooth = get_kernel(kernel).hermite
     with warnings.catch_warnings(record=True) as said:
