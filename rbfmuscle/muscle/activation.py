@@ -3,20 +3,28 @@ modulus.
 
 A fibre that is stretched by λ against the scan bears, beside the tension of the passive solid,
 
-    a d PEAK μ (λ - l) / (1/s - l),   l = 0.5 / s,
+    a d D(x) PEAK μ (λ - l) / (1/s - l),   l = 0.5 / s,
 
 with a the activation, s the stretch in the scan, l the stretch at which active fibres bear nothing
 and d the number of fibres through a unit area, 1 where the belly is widest: fibres run from end to
 end, so where it narrows each area bears more. At the slack length a fully active fibre bears `PEAK`
 shear moduli (Blemker, Pinsky & Delp 2005). Tendon is a spring that this tension stretches by
 ``tendon_strain``.
+
+D is 1 up to the slack length. Where x, the mean of s λ over the belly, is beyond it, D makes of the
+straight line of a belly that is stretched evenly the descending limb of the force-length curve,
+1 - ((x - 1) / 0.5)², which ends at one and a half slack lengths (Zajac 1989). It goes by the mean,
+as in models of Hill's type: by each place's own stretch a place that is longer would be weaker and
+give way ever more, until a part of the belly is torn out and the rest has the least length (Zahalak
+1997, "Can muscle fibers be stable on the descending limbs of their sarcomere length-tension
+relations?").
 """
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
-from rbfmuscle.muscle.fibres import flux
+from rbfmuscle.muscle.fibres import fibre_stretches, flux
 from rbfmuscle.scene.activation import make_contraction
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.solid.model import Fibres, SolidModel
@@ -49,6 +57,17 @@ def contracting_fibres(model: SolidModel, muscle: Muscle, insertion: Booleans) -
     stiff[tendon] = density[tendon] * 0.5 * PEAK / strain
     content = np.full(len(active), given.shortest)
     return Fibres(passive.direction, stiff, active, lower, upper, content)
+
+
+def descending_limb(model: SolidModel, nodes: Floats) -> float:
+    """Share of its springs' tension that an active belly with nodes (N, 3) bears, from 1 where its
+    mean fibre is at the slack length or shorter to 0 at one and a half of it.
+    """
+    fibres = model.fibres
+    weights = model.cells.weights * (fibres.active > 0.0)
+    lengths = 0.5 * fibre_stretches(model, nodes) / fibres.content
+    x = max(1.0, float(weights @ lengths / weights.sum()))
+    return max(0.0, 1.0 - ((x - 1.0) / 0.5) ** 2) / ((x - 0.5) / 0.5)
 
 
 def fibre_density(model: SolidModel, belly: Booleans, insertion: Booleans) -> Floats:

@@ -45,6 +45,13 @@ def flux(model: SolidModel, insertion: Booleans) -> Floats:
     return _gradient(model, np.linalg.lstsq(model.matrix, right, rcond=None)[0])
 
 
+def fibre_stretches(model: SolidModel, nodes: Floats) -> Floats:
+    """Stretch against rest (Q,) along the fibres at the quadrature points for nodes (N, 3)."""
+    direction = model.fibres.direction
+    along = [(_gradient(model, nodes[:, axis]) * direction).sum(axis=1) for axis in range(3)]
+    return np.asarray(np.linalg.norm(along, axis=0))
+
+
 def _gradient(model: SolidModel, values: Floats) -> Floats:
     """Gradient (Q, 3) at the quadrature points of values (N,) at the nodes."""
     cells = model.cells

@@ -9,7 +9,7 @@ from rbfmuscle.bones.rounded import round_bone
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.fibres import fibre_directions
 from rbfmuscle.geometry.rest_frame import RestFrame
-from rbfmuscle.muscle.activation import contracting_fibres
+from rbfmuscle.muscle.activation import contracting_fibres, descending_limb
 from rbfmuscle.muscle.fibres import along_fibres, held_at_insertion
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
@@ -88,6 +88,7 @@ class RBFMuscle:
             muscle, scene.joints, self._lattice, self.frame, self.rest, self.options
         )
         self.state = rest_state(self.model)
+        self._asked = 0.0
         self._stiffen(0.0)
         self._slowness = find_slowness(self.model, self._stiffness, self._mobility)
         self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
@@ -125,6 +126,7 @@ class RBFMuscle:
         bones = self.rest.bones
         old, new = np.array([[poses[bone] for bone in bones] for poses in (before, after)])
         self.state = predict(self.model, self.state, old, new)
+        self.activate(self._asked)
 
     def begin(self, contacts: BoneContacts) -> Settling:
         """Begin to solve for the equilibrium under elasticity, volume and contact at the bones'
@@ -199,7 +201,15 @@ class RBFMuscle:
         self._mobility = Mobility(*self.model.embedding, self._stiffness.inverse)
 
     def activate(self, activation: float) -> None:
-        """Take an activation, 0 to 1, that the next `solve` settles under."""
+        """Take an activation, 0 to 1, that the next solve settles under: less of it where fibres
+        are long.
+        """
+        self._asked = activation
+        if activation:
+            activation *= descending_limb(self.model, self.state.nodes)
+        self._take_activation(activation)
+
+    def _take_activation(self, activation: float) -> None:
         if activation != self.state.activation:
             self._stiffen(activation)
             self.state = self.state._replace(activation=activation, metric=None)
@@ -208,14 +218,14 @@ class RBFMuscle:
         """Go along with a rigid motion (4, 4), as the muscle is."""
         self.state = transform(self.state, motion)
 
-    def snapshot(self) -> tuple[SolidState, float, LogState]:
+    def snapshot(self) -> tuple[SolidState, float, float, LogState]:
         """Everything that :meth:`restore` needs."""
-        return self.state, self.drawer.level, self.log.state
+        return self.state, self._asked, self.drawer.level, self.log.state
 
-    def restore(self, state: tuple[SolidState, float, LogState]) -> None:
+    def restore(self, state: tuple[SolidState, float, float, LogState]) -> None:
         """Go back to a snapshot."""
-        solid, self.drawer.level, self.log.state = state
-        self.activate(solid.activation)
+        solid, self._asked, self.drawer.level, self.log.state = state
+        self._take_activation(solid.activation)
         self.state = solid
 
     def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
