@@ -85,11 +85,15 @@ class Obstacles:
         """The half-spaces that points ``which`` (m,), now ``here`` (m, 3), meet within ``reach``
         (m,).
         """
+        room = len(which) * len(self.exact)
+        found = Touch(
+            np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room), np.empty((room, 3))
+        )
+        unknown = np.empty(len(which), np.int64)
         parts = [self._meet_fences(which, here)]
+        count = 0
         for b in range(len(self.exact)):
-            gap, normal = np.empty(len(which)), np.empty((len(which), 3))
-            anchor, bound = self._smooth[b]
-            meet_bone(
+            count, lost = meet_bone(
                 self.rounded[b],
                 self.poses[b],
                 self.boxes[b],
@@ -97,17 +101,19 @@ class Obstacles:
                 here,
                 reach,
                 self.allowed[b],
-                anchor,
-                bound,
-                gap,
-                normal,
+                *self._smooth[b],
+                b,
+                count,
+                *found,
+                unknown,
             )
-            lost = np.flatnonzero(np.isnan(gap))
-            if len(lost):
-                gap[lost], normal[lost] = self.ask(b, which[lost], here[lost], reach[lost])
-            near = np.flatnonzero(gap < reach)
-            parts.append(Touch(near, np.full(len(near), b), gap[near], normal[near]))
-        return Touch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+            if lost:
+                some = unknown[:lost]
+                gap, normal = self.ask(b, which[some], here[some], reach[some])
+                near = np.flatnonzero(gap < reach[some])
+                parts.append(Touch(some[near], np.full(len(near), b), gap[near], normal[near]))
+        parts.append(Touch(*(column[:count] for column in found)))
+        return _joined(parts)
 
     def meet_exactly(self, which: Integers, here: Floats, reach: float) -> Touch:
         """The same with the bones as they are."""
@@ -116,7 +122,7 @@ class Obstacles:
             gap, normal = self.ask(b, which, here, np.full(len(which), reach))
             near = np.flatnonzero(gap < reach)
             parts.append(Touch(near, np.full(len(near), b), gap[near], normal[near]))
-        return Touch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        return _joined(parts)
 
     def ask(self, b: int, which: Integers, here: Floats, reach: Floats) -> tuple[Floats, Floats]:
         """Gaps (m,) to bone b as it is, at least ``reach`` (m,) where they are more, and its
@@ -143,16 +149,43 @@ class Obstacles:
         return Touch(near, np.full(len(near), len(self.exact)), gap, normal)
 
 
-@loop
-def meet_bone(rounded, pose, box, which, here, reach, allowed, anchor, bound, gap, normal):
-    """Fill the gaps (m,) and unit normals (m, 3) of points ``here`` (m, 3) at one rounded bone.
+def _joined(parts: Sequence[Touch]) -> Touch:
+    some = [part for part in parts if len(part.near)]
+    if len(some) == 1:
+        return some[0]
+    return Touch(*(np.concatenate(column) for column in zip(NO_TOUCH, *some, strict=True)))
 
-    ``which`` (m,) are their numbers in ``allowed`` (n,), how deep each may be in the bone, and in
-    what is known of each: its distance was ``bound`` (n,) at ``anchor`` (n, 3) in bone coordinates,
-    and changes by no more than the point moves. A gap beyond ``reach`` (m,) is infinite, one where
-    the rounded bone has no answer NaN. ``box`` (2, 3) is that of the bone.
+
+@loop
+def meet_bone(
+    rounded,
+    pose,
+    box,
+    which,
+    here,
+    reach,
+    allowed,
+    anchor,
+    bound,
+    bone,
+    count,
+    near,
+    source,
+    gap,
+    normal,
+    unknown,
+):
+    """Add the half-spaces that points ``here`` (m, 3) meet at one rounded bone within ``reach``
+    (m,) to the ``count`` first rows of a `Touch` with ``bone`` as their source. Returns their
+    number then, and that of the points where the rounded bone has no answer, whose places are
+    written to ``unknown`` (m,).
+
+    ``which`` (m,) are the numbers of the points in ``allowed`` (n,), how deep each may be in the
+    bone, and in what is known of each: its distance was ``bound`` (n,) at ``anchor`` (n, 3) in bone
+    coordinates, and changes by no more than the point moves. ``box`` (2, 3) is that of the bone.
     """
     local = np.empty(3)
+    lost = 0
     for k in range(len(which)):
         i = which[k]
         outside = 0.0
@@ -165,13 +198,13 @@ def meet_bone(rounded, pose, box, which, here, reach, allowed, anchor, bound, ga
             beyond = max(box[0, a] - at, at - box[1, a], 0.0)
             outside += beyond * beyond
             moved += (at - anchor[i, a]) ** 2
-        gap[k] = np.inf
         wanted = reach[k] - allowed[i]
         if bound[i] - np.sqrt(moved) >= wanted or (outside > 0.0 and np.sqrt(outside) >= wanted):
             continue
         smooth, distance, x, y, z = rounded_at(rounded, local[0], local[1], local[2])
         if np.isnan(distance):
-            gap[k] = np.nan
+            unknown[lost] = k
+            lost += 1
             continue
         if distance == np.inf:
             continue
@@ -179,9 +212,13 @@ def meet_bone(rounded, pose, box, which, here, reach, allowed, anchor, bound, ga
         for a in range(3):
             anchor[i, a] = local[a]
         if distance < wanted:
-            gap[k] = distance + allowed[i]
+            near[count] = k
+            source[count] = bone
+            gap[count] = distance + allowed[i]
             for a in range(3):
-                normal[k, a] = pose[a, 0] * x + pose[a, 1] * y + pose[a, 2] * z
+                normal[count, a] = pose[a, 0] * x + pose[a, 1] * y + pose[a, 2] * z
+            count += 1
+    return count, lost
 
 
 @loop(fastmath={"contract"})

@@ -67,9 +67,6 @@ STALLED = 12
 # Of the estimated error: the last steps hide a slow mode that they hardly move. Measured without
 # it: up to 1.07 times the estimate from the equilibrium, on the phantom.
 SAFETY = 1.4
-LOOKED_AT = (
-    10.0  # multiple of `ERROR` from which on a solve may end: how slowly it contracts is seen
-)
 NEAR = 0.015  # contact points nearer to an obstacle take part in a solve
 STALE = 0.4  # share of NEAR by which a node moves before they are chosen again
 MARGIN = 0.003  # obstacles are looked for beyond where a point goes by this
@@ -464,7 +461,8 @@ class Settling:
         if self.iterations < 3:
             return np.inf
         # Where this is not the end in any case it need not be known.
-        if moved * self.slowness < LOOKED_AT * ERROR * self.model.size and self.mixer.count > 1:
+        ends = SAFETY * moved * self.slowness < self.wanted * self.part * self.model.size
+        if ends and self.mixer.count > 1:
             ways, changes = self.mixer.history()
             weight = np.repeat(self.model.reach, 3)
             ways, changes = ways * weight, changes * weight
