@@ -23,20 +23,21 @@ Link = tuple[int, int]
 
 # Muscles may touch whose swept boxes come nearer to each other than this [mm].
 REACH = 3.0
-# How near points of one muscle are to those of another that may meet it in a sub-step, of the size
-# of the smaller one.
+# How near points of one muscle are to those of another that may meet it in a sub-step, or whose
+# shown surface may, of the size of the smaller one.
 SEARCHED = 0.06
 NEAR = 0.02  # gap of points that are looked at in a sub-step, of that size
-SHOWN = 0.04  # distance of shown vertices from those points, of that size
 
 
 class NeighbourState(NamedTuple):
-    """How the last solve of a group ended: forces (k,) of the points of one muscle at another, and
-    the bodies, none before the first. Nothing is changed in place.
+    """How the last solve of a group ended: forces (k,) of the points of one muscle at another, the
+    bodies, none before the first, and which point of another muscle was the nearest to each (k,) of
+    one, -1 where none was near. Nothing is changed in place.
     """
 
     forces: Mapping[Link, Floats]
     bodies: Sequence[Moving]
+    near: Mapping[Link, Integers]
 
 
 class Neighbours:
@@ -55,8 +56,9 @@ class Neighbours:
 
     def __init__(self, steppers: Sequence[MuscleStepper], links: Sequence[Link]) -> None:
         self.links = sorted({*links, *(link[::-1] for link in links)})
-        self.state = NeighbourState({}, ())
+        self.state = NeighbourState({}, (), {})
         self.bodies: list[Body] = []
+        self._own: dict[int, Integers] = {}
         self.overlaps: dict[Link, Floats] = {}
         if not links:
             return
@@ -76,11 +78,15 @@ class Neighbours:
         trees = [cKDTree(here) for here in points]
         size = [solid.size for solid in solids]
         found: list[tuple[int, int, Integers, Integers]] = []
+        near: dict[Link, Integers] = {}
         for one, other in self.links:
             reach = SEARCHED * min(size[one], size[other])
             which, nearest = _near_points(points[one], trees[other], reach)
             if len(which):
                 found.append((one, other, which, nearest))
+                near[one, other] = np.full(len(points[one]), -1)
+                near[one, other][which] = nearest
+        self.state = self.state._replace(near=near)
         if not found:
             return None
         counts = [len(which) for _, _, which, _ in found]
@@ -115,34 +121,41 @@ class Neighbours:
     def keep(self, meeting: Meeting | None, solids: Sequence[Moving]) -> None:
         """Keep how a solve ended."""
         forces = {} if meeting is None else self._by_link(meeting, meeting.force)
-        self.state = NeighbourState(forces, solids)
+        self.state = NeighbourState(forces, solids, self.state.near)
 
     def out_of_neighbours(self, number: int, points: Floats) -> Floats:
-        """Displacements (n, 3) that take points (n, 3) of the shown surface of a muscle to where
-        its own distance is that to a neighbour, as the last solve left both, where the neighbour is
-        nearer: so both are shown up to the same surface (Gascuel 1993). What overlapped at rest
-        stays so deep.
+        """Displacements (n, 3) that take the points (n, 3) of the shown surface of a muscle, always
+        the same ones, to where its own distance is that to a neighbour, as the last solve left
+        both, where the neighbour is nearer: so both are shown up to the same surface (Gascuel
+        1993). What overlapped at rest stays so deep.
         """
-        out, solids = np.zeros_like(points), self.state.bodies
-        others = [other for one, other in self.links if one == number] if solids else []
+        out, state = np.zeros_like(points), self.state
+        others = [other for one, other in state.near if one == number] if state.bodies else []
         for other in others:
-            reach = SHOWN * min(solids[number].size, solids[other].size)
-            which, nearest = _near_points(points, self._tree(other), reach)
+            # Those that hang near a point that is near the neighbour.
+            nearest = state.near[number, other][self._nearest_points(number, points)]
+            which = np.flatnonzero(nearest >= 0)
             if len(which) == 0:
                 continue
-            here = points[which]
-            own = self._tree(number).query(here)[1]
-            mine, _, _ = solids[number].ask(here, self.bodies[number].places[own])
-            gap, normal, _ = solids[other].ask(here, self.bodies[other].places[nearest])
+            here, own = points[which], self._own[number][which]
+            mine, _, _ = state.bodies[number].ask(here, self.bodies[number].places[own])
+            foot = self.bodies[other].places[nearest[which]]
+            gap, normal, _ = state.bodies[other].ask(here, foot)
             gap += self._known(self.overlaps, number, other, own)
             nearer = np.isfinite(gap) & np.isfinite(mine) & (mine > gap)
-            out[which[nearer]] += 0.5 * (mine - gap)[nearer, None] * normal[nearer]
+            away = 0.5 * (mine[nearer] - gap[nearer])
+            out[which[nearer]] += away[:, None] * normal[nearer]
         return out
 
-    def _tree(self, number: int) -> cKDTree:
-        """Of the points of a muscle that meet neighbours, where the last solve left them."""
-        solid = self.state.bodies[number]
-        return cKDTree(solid.feet_of(self.bodies[number].points).of(solid.nodes))
+    def _nearest_points(self, number: int, points: Floats) -> Integers:
+        """For each of the shown points (n, 3) of a muscle the nearest of those that meet
+        neighbours; they stay so, as they move together.
+        """
+        if number not in self._own:
+            solid = self.state.bodies[number]
+            here = solid.feet_of(self.bodies[number].points).of(solid.nodes)
+            self._own[number] = cKDTree(here).query(points)[1]
+        return self._own[number]
 
     def _known(self, known: Mapping[Link, Floats], one: int, other: int, which: Integers) -> Floats:
         """Values of some points of a muscle at another, 0 where there are none."""
