@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -23,36 +22,13 @@ from rbfmuscle.progress import Progress
 from rbfmuscle.validation import UsageError
 
 
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Fits:
-    """Which fits are tried."""
-
-    names: Annotated[
-        str | None,
-        Parameter(name="--kernels", help="Kernels, separated by commas; all by default."),
-    ] = None
-    centres: Annotated[
-        str | None,
-        Parameter(help="Numbers of centres, separated by commas; 150,300 by default."),
-    ] = None
-    resolution: Annotated[
-        int | None,
-        Parameter(
-            help="Cells along the longest side of extracted surfaces; by default 128, and more for "
-            "slender muscles."
-        ),
-    ] = None
-
-
-USUAL_FITS = Fits()
-
-
 def kernels(
     source: str,
     *,
     output: Output,
-    fits: Fits = USUAL_FITS,
+    names: Annotated[str | None, Parameter(name="--kernels")] = None,
+    centres: str | None = None,
+    resolution: int | None = None,
     muscles: Muscles = None,
     units: str | None = None,
     error: float | None = None,
@@ -64,6 +40,13 @@ def kernels(
     ----------
     source
         A mesh (STL, OBJ, PLY, VTK, VTP), a scene file, or ``phantom``.
+    names
+        Kernels, separated by commas; all by default.
+    centres
+        Numbers of centres, separated by commas; 150,300 by default.
+    resolution
+        Cells along the longest side of extracted surfaces; by default 128, and more for slender
+        muscles.
     units
         Name of the mesh's unit, for tables and plots; nothing is converted.
     error
@@ -73,12 +56,12 @@ def kernels(
     from rbfmuscle.studies.kernels import kernels_folder, open_surfaces, study_kernels
 
     if error is not None:
-        refuse("--error", {"--centres": fits.centres, "--resolution": fits.resolution})
-    counts = split_list("150,300" if fits.centres is None else fits.centres)
+        refuse("--error", {"--centres": centres, "--resolution": resolution})
+    counts = split_list("150,300" if centres is None else centres)
     if not counts or not all(count.isdecimal() and int(count) >= 8 for count in counts):
-        raise UsageError(f"--centres must be whole numbers of 8 and more, got {fits.centres!r}")
+        raise UsageError(f"--centres must be whole numbers of 8 and more, got {centres!r}")
     kernels_folder(output)
-    chosen, named = split_list(fits.names) or None, named_muscles(muscles)
+    chosen, named = split_list(names) or None, named_muscles(muscles)
     if error is not None:
         meshes, unit = open_surfaces(source, named, units)
         with work.threads():
@@ -90,7 +73,7 @@ def kernels(
             muscles=named,
             kernels=chosen,
             centres=[int(count) for count in counts],
-            resolution=fits.resolution or 0,
+            resolution=resolution or 0,
             units=units,
             jobs=work.jobs,
             progress=bar,

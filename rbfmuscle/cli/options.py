@@ -109,21 +109,6 @@ Pairs = Annotated[list[str] | None, Parameter(negative="")]
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Changes:
-    """Options that change a scene."""
-
-    model: Model = None
-    settings: Settings = None
-
-    def parse_settings(self) -> dict[str, object]:
-        """Dotted keys with their values."""
-        from rbfmuscle.scene.settings import parse_settings
-
-        return parse_settings(self.settings)
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
 class Work(Printing):
     """Options for the cores that a command uses, and for what it prints."""
 
@@ -136,7 +121,6 @@ class Work(Printing):
         return cores_limited(self.jobs)
 
 
-UNCHANGED = Changes()
 USUAL_WORK = Work()
 
 

@@ -3,20 +3,19 @@
 import math
 import re
 import time
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from rbfmuscle.cli.options import (
-    UNCHANGED,
     USUAL_WORK,
-    Changes,
+    Model,
     Muscles,
     Output,
     Pairs,
     SceneName,
+    Settings,
     Work,
     chosen_muscles,
     print_result,
@@ -32,52 +31,31 @@ if TYPE_CHECKING:
 FEWEST = 10  # poses from which paths are kept after an interrupt
 
 
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Sampling:
-    """What is sampled."""
-
-    samples: Annotated[
-        int | None,
-        Parameter(
-            help="Poses for each muscle, of which every fifth is held out of the fit; by default "
-            "20 for each coordinate."
-        ),
-    ] = None
-    fibres: Annotated[
-        int,
-        Parameter(
-            help="Of each muscle, for each of which a path is fitted, in place of one for the "
-            "muscle."
-        ),
-    ] = 0
-    ranges: Annotated[
-        Pairs,
-        Parameter(
-            name="--range",
-            help="COORDINATE=LOW:HIGH in degrees or scene units, else the coordinate's range, or "
-            "what the motion covers; COORDINATE=VALUE holds one; may be repeated.",
-        ),
-    ] = None
-
-
-USUAL_SAMPLING = Sampling()
-
-
 def paths(
     scene: SceneName,
     *,
     output: Output,
-    sampling: Sampling = USUAL_SAMPLING,
+    samples: int | None = None,
+    fibres: int = 0,
+    ranges: Annotated[Pairs, Parameter(name="--range")] = None,
     muscles: Muscles = None,
     names: Annotated[Pairs, Parameter(name="--coordinate")] = None,
-    changes: Changes = UNCHANGED,
+    model: Model = None,
+    settings: Settings = None,
     work: Work = USUAL_WORK,
 ) -> int:
     """Sample muscles' lengths and moment arms over coordinates and fit paths that OpenSim loads.
 
     Parameters
     ----------
+    samples
+        Poses for each muscle, of which every fifth is held out of the fit; by default 20 for each
+        coordinate.
+    fibres
+        Of each muscle, for each of which a path is fitted, in place of one for the muscle.
+    ranges
+        COORDINATE=LOW:HIGH in degrees or scene units, else the coordinate's range, or what the
+        motion covers; COORDINATE=VALUE holds one; may be repeated.
     names
         COORDINATE=JOINT/COORDINATE, what the OpenSim model calls a coordinate of the scene, for
         instance hip.flexion=hip_r/hip_flexion_r; may be repeated; else the scene's own names.
@@ -85,14 +63,14 @@ def paths(
     from rbfmuscle import interruption
     from rbfmuscle.models import configure_scene
     from rbfmuscle.scene.phantom import open_scene
+    from rbfmuscle.scene.settings import parse_settings
     from rbfmuscle.studies.paths import Samples, fittable, paths_folder, report_fits, sample_muscles
 
-    samples = sampling.samples
     if samples is not None and samples < 10:
         raise UsageError(f"--samples {samples} is too few to fit anything, give 10 or more")
-    loaded = configure_scene(open_scene(scene), changes.parse_settings(), model=changes.model)
+    loaded = configure_scene(open_scene(scene), parse_settings(settings), model=model)
     loaded.muscles = chosen_muscles(loaded, muscles)
-    ranges, targets = parse_ranges(loaded, sampling.ranges), parse_targets(loaded, names or [])
+    spans, targets = parse_ranges(loaded, ranges), parse_targets(loaded, names or [])
     paths_folder(output)
     sampled: list[Samples] = []
     done, begun = 0, time.monotonic()
@@ -111,11 +89,11 @@ def paths(
     def kept():
         return f"paths from {done} poses are in {output}" if done >= FEWEST else ""
 
-    sample = partial(sample_muscles, samples=samples, fibres=sampling.fibres, found=sampled)
+    sample = partial(sample_muscles, samples=samples, fibres=fibres, found=sampled)
     with interruption.keeping(kept):
         try:
             with Progress(loaded.name, "pose") as progress, work.threads():
-                sample(loaded, ranges, progress=advance)
+                sample(loaded, spans, progress=advance)
         except KeyboardInterrupt:
             if usable := [found for found in sampled if fittable(found)]:
                 report_fits(loaded, usable, output, targets=targets)

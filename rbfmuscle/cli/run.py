@@ -8,13 +8,13 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from rbfmuscle.cli.options import (
-    UNCHANGED,
     USUAL_WORK,
-    Changes,
     FailOn,
     Frames,
+    Model,
     Output,
     SceneName,
+    Settings,
     Work,
     chosen_muscles,
     print_result,
@@ -31,7 +31,8 @@ Simulated = Annotated[
 def demo(
     *,
     output: Output = Path("demo_output"),
-    changes: Changes = UNCHANGED,
+    model: Model = None,
+    settings: Settings = None,
     muscles: Simulated = None,
     frames: Frames = None,
     fail_on: FailOn = None,
@@ -41,7 +42,8 @@ def demo(
     return run(
         Path("phantom"),
         output=output,
-        changes=changes,
+        model=model,
+        settings=settings,
         muscles=muscles,
         frames=frames,
         fail_on=fail_on,
@@ -53,7 +55,8 @@ def run(
     scene: SceneName,
     *,
     output: Output,
-    changes: Changes = UNCHANGED,
+    model: Model = None,
+    settings: Settings = None,
     muscles: Simulated = None,
     frames: Frames = None,
     fail_on: FailOn = None,
@@ -78,8 +81,9 @@ def run(
         from rbfmuscle.recording import stream_run
         from rbfmuscle.run.data import RunData
         from rbfmuscle.scene.phantom import open_scene
+        from rbfmuscle.scene.settings import parse_settings
 
-        settings, loaded = changes.parse_settings(), open_scene(scene)
+        changes, loaded = parse_settings(settings), open_scene(scene)
         if muscles is not None:
             loaded.muscles = chosen_muscles(loaded, muscles)
             if loaded.neighbours is not None:
@@ -87,7 +91,7 @@ def run(
                 loaded.neighbours = loaded.neighbours.among(names)
         limited = partial(stream_run, frames=frames, fail_on=fail_on, progress=advance)
         try:
-            limited(loaded, output, model=changes.model, settings=settings)
+            limited(loaded, output, model=model, settings=changes)
         except SolveError as error:
             failed = SolveError("; ".join(filter(None, [str(error), kept()])))
             if not done:

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from rbfmuscle.cli.options import (
-    UNCHANGED,
     USUAL,
-    Changes,
     FailOn,
     Frames,
     Jobs,
+    Model,
     Output,
     Pairs,
     Printing,
+    Settings,
     named_scenes,
     one_line,
     print_result,
@@ -27,62 +23,17 @@ from rbfmuscle.progress import Progress
 from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError, UsageError
 
 
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Axes:
-    """What a sweep varies, and the quantity that it weighs against time."""
-
-    grid: Annotated[
-        Pairs,
-        Parameter(
-            help="KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300; "
-            "may be repeated."
-        ),
-    ] = None
-    reference: Annotated[
-        Pairs,
-        Parameter(
-            help="KEY=VALUE of the reference that errors are measured against; may be repeated; by "
-            "default the finest values of the grid."
-        ),
-    ] = None
-    quantity: Annotated[
-        str | None,
-        Parameter(
-            help="The error on the axis of the Pareto front, error_rms by default; the other axis "
-            "is time."
-        ),
-    ] = None
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Workers:
-    """Where the points of a sweep are run."""
-
-    jobs: Jobs = None
-    cluster: Annotated[
-        str | None,
-        Parameter(
-            help="Address of a Dask scheduler, for instance tcp://127.0.0.1:8786; its workers must "
-            "see the folder."
-        ),
-    ] = None
-
-
-NO_AXES = Axes()
-
-
-USUAL_WORKERS = Workers()
-
-
 def sweep(
     *scenes: str,
     output: Output,
-    axes: Axes = NO_AXES,
-    changes: Changes = UNCHANGED,
+    grid: Pairs = None,
+    reference: Pairs = None,
+    quantity: str | None = None,
+    model: Model = None,
+    settings: Settings = None,
     frames: Frames = None,
-    workers: Workers = USUAL_WORKERS,
+    jobs: Jobs = None,
+    cluster: str | None = None,
     fail_on: FailOn = None,
     printing: Printing = USUAL,
 ) -> int:
@@ -94,6 +45,17 @@ def sweep(
     ----------
     scenes
         Scene files (TOML), or "phantom" for a hip made by formulas.
+    grid
+        KEY=a,b,c with keys as for run --set, for instance model.centres=100,200,300; may be
+        repeated.
+    reference
+        KEY=VALUE of the reference that errors are measured against; may be repeated; by default the
+        finest values of the grid.
+    quantity
+        The error on the axis of the Pareto front, error_rms by default; the other axis is time.
+    cluster
+        Address of a Dask scheduler, for instance tcp://127.0.0.1:8786; its workers must see the
+        folder.
     """
     from rbfmuscle import interruption
     from rbfmuscle.metrics.summary import parse_limits
@@ -103,32 +65,28 @@ def sweep(
     from rbfmuscle.studies.sweep import parse_grid
     from rbfmuscle.studies.sweep import sweep as run_scenes
 
-    grid, settings = parse_grid(axes.grid or []), changes.parse_settings()
-    if not grid:
-        refuse(
-            "a sweep without --grid", {"--reference": axes.reference, "--quantity": axes.quantity}
-        )
-    if workers.cluster is not None:
-        refuse("--cluster", {"--jobs": workers.jobs})
-    if not scenes or (len(scenes) == 1 and not grid):
+    values, changes = parse_grid(grid or []), parse_settings(settings)
+    if not values:
+        refuse("a sweep without --grid", {"--reference": reference, "--quantity": quantity})
+    if cluster is not None:
+        refuse("--cluster", {"--jobs": jobs})
+    if not scenes or (len(scenes) == 1 and not values):
         raise UsageError(
             "a sweep needs several scenes, or a grid, for instance --grid model.centres=100,200"
         )
     opened = {name: open_scene(path) for name, path in named_scenes(scenes).items()}
-    loaded = {
-        name: configure_scene(each, settings, model=changes.model) for name, each in opened.items()
-    }
+    loaded = {name: configure_scene(each, changes, model=model) for name, each in opened.items()}
     limits = {name: parse_limits(fail_on, each) for name, each in loaded.items()}
     progress = Progress("sweep", what="point")
     with progress, interruption.keeping(lambda: f"finished points are kept in {output}"):
         table = run_scenes(
             loaded,
             output,
-            grid=grid,
+            grid=values,
             frames=frames,
-            reference=parse_settings(axes.reference),
-            jobs=workers.cluster or workers.jobs,
-            quantity=axes.quantity or "error_rms",
+            reference=parse_settings(reference),
+            jobs=cluster or jobs,
+            quantity=quantity or "error_rms",
             progress=progress,
         )
     return _finish(table, output, limits, printing)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple
 
 import numpy as np
 
@@ -201,18 +201,17 @@ class Band(NamedTuple):
     source: str
 
 
-class _Table(TypedDict):
-    """``published.json``: by kind of motion and muscle the angles and both ends of the band."""
-
-    hip: dict[str, dict[str, dict[str, list[float]]]]
-    source: str
-
-
 @cache
-def _table() -> "_Table":
-    text = (files("rbfmuscle.metrics") / "published.json").read_text(encoding="utf-8")
-    found: _Table = json.loads(text)
-    return found
+def _bands() -> dict[tuple[str, str], Band]:
+    """The bands of ``published.json`` by kind of motion and muscle."""
+    table = json.loads((files("rbfmuscle.metrics") / "published.json").read_text(encoding="utf-8"))
+    return {
+        (kind, muscle): Band(
+            *(np.array(row[key]) for key in ("angle", "least", "greatest")), table["source"]
+        )
+        for kind, muscles in table["hip"].items()
+        for muscle, row in muscles.items()
+    }
 
 
 def published_band(muscle: str, coordinate: str) -> Band | None:
@@ -235,11 +234,7 @@ def published_band(muscle: str, coordinate: str) -> Band | None:
         plain = plain.removesuffix(end)
     if _JOINT not in joint.split("_") or kind is None:
         return None
-    band = _table()["hip"][kind].get(_MUSCLES.get(plain, plain))
-    if band is None:
-        return None
-    angle, least, greatest = (np.array(band[key]) for key in ("angle", "least", "greatest"))
-    return Band(angle, least, greatest, _table()["source"])
+    return _bands().get((kind, _MUSCLES.get(plain, plain)))
 
 
 # A muscle that is moved by more than this out of bones at rest [mm] is not the scanned shape there.

@@ -203,11 +203,14 @@ def _measure(name, scene, folder, progress):
         turn = _surfaces(finer, [*coarse, last])[1][-1]
     with stage(f"{name}: on one thread"), threads_limited(1):
         walls = _surfaces(scene, [*range(min(last + 1, ONE_THREAD))])[2]
-    again = Repeated(build, float(np.median(walls[1:] or walls)))
-    if coarse:
-        again = again._replace(turn=turn, end=shown[-1])
     with stage(f"{name}: measuring"):
-        return measure_run(RunData.load(folder), again)
+        return measure_run(
+            RunData.load(folder),
+            build=build,
+            one_thread=float(np.median(walls[1:] or walls)),
+            turn=turn if coarse else None,
+            end=shown[-1] if coarse else None,
+        )
 
 
 def _surfaces(scene, chosen):
@@ -372,22 +375,20 @@ class Comparison(BaseModel, Study):
 FORMAT = 4  # of comparison.json
 
 
-class Repeated(NamedTuple):
-    """What a model gives beside its run: the time to build it and that of a frame on one thread
-    [s]; where the motion has more than one frame, surfaces by muscle at the last pose by shorter
-    sub-steps (``turn``), and back at the first after the motion there and back (``end``).
-    """
-
-    build: float
-    one_thread: float
-    turn: dict[str, Mesh] | None = None
-    end: dict[str, Mesh] | None = None
-
-
-def measure_run(saved: RunData, again: Repeated) -> Values:
+def measure_run(
+    saved: RunData,
+    *,
+    build: float,
+    one_thread: float,
+    turn: Mapping[str, Mesh] | None = None,
+    end: Mapping[str, Mesh] | None = None,
+) -> Values:
     """Values of every measure but the distances for one model: muscle -> quantity -> value.
 
-    Under ``"all"`` the worst over muscles, or the wall time.
+    Under ``"all"`` the worst over muscles, or the wall time. ``build`` is the time to build the
+    model, ``one_thread`` that of a frame on one thread [s]; where the motion has more than one
+    frame, ``turn`` are surfaces by muscle at the last pose by shorter sub-steps, and ``end`` back
+    at the first after the motion there and back.
     """
     found: Values = {}
     for muscle in saved.muscles:
@@ -400,7 +401,7 @@ def measure_run(saved: RunData, again: Repeated) -> Values:
         times = saved.series(muscle, "time_frame")[1][1:]  # the first loads and compiles
         if len(times):
             values["time_frame"] = float(np.median(times))
-        for name, frame, meshes in (("return", 0, again.end), ("step", -1, again.turn)):
+        for name, frame, meshes in (("return", 0, end), ("step", -1, turn)):
             if meshes is not None:
                 mine = saved.mesh(muscle, saved.frame_numbers[frame])
                 pair = surface_distance(*mine, *meshes[muscle])
@@ -415,8 +416,8 @@ def measure_run(saved: RunData, again: Repeated) -> Values:
     if len(wall):
         together["time_frame"] = float(np.median(wall))
         together["time_frame_p95"] = float(np.percentile(wall, 95))
-    together["time_build"] = again.build
-    together["time_one_thread"] = again.one_thread
+    together["time_build"] = build
+    together["time_one_thread"] = one_thread
     found[ALL] = together
     return found
 
