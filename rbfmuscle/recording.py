@@ -21,7 +21,7 @@ from rbfmuscle.folders import copy_listed
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
 from rbfmuscle.metrics.quantities import ALL, Row
-from rbfmuscle.metrics.rows import Lengths, frame_rows, joint_gaps, moment_arm_rows
+from rbfmuscle.metrics.rows import frame_rows, joint_gaps, moment_arm_rows
 from rbfmuscle.metrics.summary import (
     LIMITS,
     Doubt,
@@ -399,9 +399,13 @@ class Recording:
             raise
         finally:
             series = self.summary.series
-            muscles, paths, active = map(series, ("length", "path_length", "activation"))
             rows = moment_arm_rows(
-                self.scene, self._path, Lengths(muscles, paths, self._fibres, active)
+                self.scene,
+                self._path,
+                lengths=series("length"),
+                shortest=series("path_length"),
+                fibres=self._fibres,
+                activations=series("activation"),
             )
             self.summary.add(rows)
             self._doubts += measured_doubts(self.scene, self.summary.table(), rows, self._path)

@@ -83,13 +83,14 @@ def kernels(
 
 
 def _study_lines(study, output):
-    from rbfmuscle.studies.kernels import describe
+    from rbfmuscle.studies.kernels import describe, recommend
 
-    for name, each in study.studies.items():
-        if each.recommended is not None:
-            yield f"{name}: {describe(each.rows)}"
-            yield f"to paste at the end of its [[muscle]]:\n\n{each.recommended.toml()}\n"
-    if len(study.studies) > 1 or not study.recommended:
+    for name, rows in study.by_surface.items():
+        best = recommend(rows)
+        if best is not None:
+            yield f"{name}: {describe(rows)}"
+            yield f"to paste at the end of its [[muscle]]:\n\n{best.toml()}\n"
+    if len(study.meshes) > 1 or not study.recommended:
         yield study.answer()
     yield f"all rows: open {output / 'kernels.html'}"
 

@@ -130,7 +130,7 @@ def _redraw_study(directory, *, pictures):
                 table = compare.Comparison.model_validate(facts)
                 compare.write_page(directory, table, pictures=pictures)
             elif command == "kernels":
-                kernels.write_page(directory, kernels.KernelFacts.model_validate(facts))
+                kernels.write_page(directory, kernels.KernelStudy.model_validate(facts))
             else:
                 sweep.write_page(directory, sweep.SweepTable.model_validate(facts))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:

@@ -5,7 +5,6 @@ along the motion.
 import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -107,20 +106,20 @@ def frame_rows(
     ]
 
 
-class Lengths(NamedTuple):
-    """What a run recorded along its motion, by muscle and frame: lengths, shortest paths, lengths
-    (N,) of fibres [scene unit], and activations of those that contract.
-    """
-
-    muscles: Mapping[str, Mapping[int, float]]
-    paths: Mapping[str, Mapping[int, float]]
-    fibres: Mapping[str, Mapping[int, Floats]]
-    activations: Mapping[str, Mapping[int, float]]
-
-
-def moment_arm_rows(scene: Scene, path: Mapping[int, Coordinates], lengths: Lengths) -> list[Row]:
+def moment_arm_rows(
+    scene: Scene,
+    path: Mapping[int, Coordinates],
+    *,
+    lengths: Mapping[str, Mapping[int, float]],
+    shortest: Mapping[str, Mapping[int, float]],
+    fibres: Mapping[str, Mapping[int, Floats]],
+    activations: Mapping[str, Mapping[int, float]],
+) -> list[Row]:
     """Rows of the moment arms, and of how rough lengths are, from each frame's coordinates [radian
     or scene unit].
+
+    By muscle and frame: lengths, shortest paths, lengths (N,) of fibres [scene unit], and
+    activations of those that contract.
 
     Where the activation of a muscle changes its moment arm is NaN: the change of length is not the
     joint's alone.
@@ -129,26 +128,25 @@ def moment_arm_rows(scene: Scene, path: Mapping[int, Coordinates], lengths: Leng
     known = all_coordinates(scene.joints)
     guessed = guessed_muscles(scene.guesses)
     places = {index: place for place, index in enumerate(path)}
-    for muscle, found in lengths.muscles.items():
+    for muscle, found in lengths.items():
         along = np.array([found.get(index, math.nan) for index in path])
-        active = lengths.activations.get(muscle, {})
+        active = activations.get(muscle, {})
         arms = [
             row._replace(muscle=muscle, value=float(moments))
             for moments, row in _moments(scene, path, along, active)
         ]
         rows += arms
-        shortest = lengths.paths.get(muscle, {})
         for name in dict.fromkeys(row.coordinate for row in arms):
             if known[name].motion != "rotation":
                 continue
             mine = [row for row in arms if row.coordinate == name]
             for part in _stretches(mine, places, active):
                 rows += _smoothness(part, guessed=muscle in guessed)
-                rows += _roughness(part, found, shortest)
-    for muscle, of_fibres in lengths.fibres.items():
+                rows += _roughness(part, found, shortest.get(muscle, {}))
+    for muscle, of_fibres in fibres.items():
         none = np.full(len(next(iter(of_fibres.values()))), math.nan)
         along = np.array([of_fibres.get(index, none) for index in path])
-        active = lengths.activations.get(muscle, {})
+        active = activations.get(muscle, {})
         for moments, row in _moments(scene, path, along, active):
             for quantity, value in percentiles("fibre_moment_arm", moments).items():
                 rows.append(row._replace(muscle=muscle, quantity=quantity, value=value))

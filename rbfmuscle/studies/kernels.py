@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict, Field
 
 from rbfmuscle.display.page import (
     BAD,
@@ -124,16 +124,25 @@ def study_kernels(
         raise UsageError(f"centres must be numbers of at least 8, got {list(centres)}")
     meshes, units = open_surfaces(scene, muscles, units)
     checked = {name: check_request(mesh, kernels or KERNELS) for name, mesh in meshes.items()}
-    found, done = {}, 0
+    study = KernelStudy(
+        units=units,
+        version=versions()["rbfmuscle"],
+        date=datetime.date.today().isoformat(),
+        meshes={name: mesh_hash(*mesh) for name, (*mesh, _) in checked.items()},
+    )
+    done = 0
     with cores_limited(jobs), study_folder(directory) as folder:
         for name, (vertices, faces, chosen) in checked.items():
             fits = len(chosen) * len(centres)
             count = part_progress(progress, done, len(meshes) * fits)
             judge = ReferenceSurface(vertices, faces, resolution)
             with stage(name):
-                found[name] = measure_fits(judge, chosen, centres, count)
+                found = measure_fits(judge, chosen, centres, count)
+            for one in found:
+                one.row.surface = name
+            study.rows += [one.row for one in found]
+            study.surfaces += [one.surface for one in found]
             done += fits
-        study = KernelStudy(found, units)
         write_study(study, folder)
         return study.kept_in(folder, own=directory is None)
 
@@ -222,18 +231,6 @@ class KernelRow(BaseModel):
         return "\n".join(lines)
 
 
-class KernelFacts(BaseModel):
-    """What ``kernels.json`` holds: the unit, the library's version, the date, the hash of each mesh
-    by its name, and the rows of all.
-    """
-
-    units: str
-    version: str
-    date: str
-    meshes: dict[str, str]
-    rows: list[KernelRow]
-
-
 def at_end(shape: float) -> bool:
     """Whether epsilon times the spacing lies at an end of its search, within a scan's step."""
     low, high = SPAN
@@ -270,7 +267,7 @@ def describe(rows: list[KernelRow]) -> str:
     return f"{use}: {near}, and of these {best.kernel} is among the quickest{shape}.{more}"
 
 
-def recommend(rows: list[KernelRow]) -> KernelRow | None:
+def recommend(rows: Sequence[KernelRow]) -> KernelRow | None:
     """The quickest of the rows that err at most 5 % more than the best, None where every one is
     unfit.
 
@@ -444,49 +441,33 @@ def _spent(work: Callable[[], object]) -> float:
     return (time.process_time() - start) / runs
 
 
-@dataclass
-class SurfaceStudy:
-    """What a study found of one surface.
+class KernelStudy(BaseModel, Study):
+    """What `rbfmuscle.study_kernels` found, as ``kernels.json`` holds it: the unit of lengths, the
+    library's version, the date, the hash of each mesh by the name of its surface, and a row for
+    each kernel and number of centres of each surface, of each the smallest error first and unfit
+    ones last.
 
-    ``rows`` are `KernelRow` for each kernel and number of centres, the smallest error first, unfit
-    ones last. ``surfaces`` (vertices, faces) are those of the rows, None where there is none.
-    ``recommended`` is the quickest row that errs at most 5 % more than the best, None where every
-    one is unfit. ``sha256`` is that of the mesh.
+    ``surfaces`` are vertices and faces of each row's surface, None where there is none; a study
+    that is read from a file has none.
     """
 
-    rows: list[KernelRow]
-    surfaces: list[tuple[Floats, Integers] | None]
-    recommended: KernelRow | None
-    sha256: str
-
-
-@dataclass(eq=False)
-class KernelStudy(Study):
-    """What `rbfmuscle.study_kernels` found: a `SurfaceStudy` of each surface by its name, whose
-    lengths are in ``units``.
-    """
-
+    model_config = ConfigDict(arbitrary_types_allowed=True)
     command: ClassVar[str] = "kernels"
     page: ClassVar[str] = "kernels.html"
 
-    studies: dict[str, SurfaceStudy] = field(repr=False)
-    units: str = ""
+    units: str
+    version: str
+    date: str
+    meshes: dict[str, str]
+    rows: list[KernelRow] = []
+    surfaces: list[tuple[np.ndarray, np.ndarray] | None] = Field(
+        default=[], exclude=True, repr=False
+    )
 
     @property
-    def rows(self) -> list[KernelRow]:
-        """A row for each kernel and number of centres of each surface, of each the smallest error
-        first and unfit ones last.
-        """
-        return [
-            row.model_copy(update={"surface": name})
-            for name, study in self.studies.items()
-            for row in study.rows
-        ]
-
-    @property
-    def surfaces(self) -> list[tuple[Floats, Integers] | None]:
-        """Vertices and faces of each row's surface, None where there is none."""
-        return [surface for study in self.studies.values() for surface in study.surfaces]
+    def by_surface(self) -> dict[str, list[KernelRow]]:
+        """The rows of each surface."""
+        return {name: [row for row in self.rows if row.surface == name] for name in self.meshes}
 
     @property
     def recommended(self) -> KernelRow | None:
@@ -494,8 +475,8 @@ class KernelStudy(Study):
         of several surfaces that of the first for which it is the kernel that serves most.
         """
         kernel = self._kernel()[0]
-        rows = [study.recommended for study in self.studies.values() if study.recommended]
-        return next((row for row in rows if row.kernel == kernel), None)
+        best = (recommend(rows) for rows in self.by_surface.values())
+        return next((row for row in best if row is not None and row.kernel == kernel), None)
 
     def table(self) -> np.ndarray:
         """The rows as a structured ndarray, with the columns of ``kernels.csv``."""
@@ -511,13 +492,13 @@ class KernelStudy(Study):
         """What to use and why: of one surface its own sentence, of several the kernel that is near
         the best on most.
         """
-        if len(self.studies) == 1:
+        if len(self.meshes) == 1:
             return describe(self.rows)
         kernel, tied, chosen = self._kernel()
         if not kernel:
             return "Every field is unfit on every surface; take more centres."
         return (
-            f"Use {kernel}: within 5 % of the least error on {tied} of {len(self.studies)} "
+            f"Use {kernel}: within 5 % of the least error on {tied} of {len(self.meshes)} "
             f"muscles, and the quickest such kernel on {chosen}."
         )
 
@@ -526,11 +507,11 @@ class KernelStudy(Study):
         recommended; "" where every field is unfit.
         """
         tied: Counter[str] = Counter()
-        for study in self.studies.values():
-            good = [row for row in study.rows if not row.unfit]
+        for rows in self.by_surface.values():
+            good = [row for row in rows if not row.unfit]
             tied.update({row.kernel for row in good if row.error <= ALIKE * good[0].error})
-        found = (study.recommended for study in self.studies.values())
-        chosen = Counter(row.kernel for row in found if row)
+        best = (recommend(rows) for rows in self.by_surface.values())
+        chosen = Counter(row.kernel for row in best if row)
         kernel = max(chosen, key=lambda name: (tied[name], chosen[name]), default="")
         return kernel, tied[kernel], chosen[kernel]
 
@@ -540,8 +521,10 @@ def measure_fits(
     kernels: Sequence[Kernel],
     counts: Sequence[int],
     progress: OnProgress | None,
-) -> SurfaceStudy:
-    """Fit a surface with each kernel and number of centres, and measure each fit."""
+) -> list[Measured]:
+    """Fit a surface with each kernel and number of centres, and measure each fit; the smallest
+    error first, unfit ones last.
+    """
     calls = []
     for count in counts:
         sample = sample_surface(judge.vertices, judge.faces, int(count), placement="greedy")
@@ -559,9 +542,7 @@ def measure_fits(
     front = pareto_front([row.error for row in good], [row.cost for row in good])
     for row in rows:  # no other row beats those of the front both in error and in time
         row.front = any(row is good[index] for index in front)
-    surfaces = [one.surface for one in found]
-    sha256 = mesh_hash(judge.vertices, judge.faces)
-    return SurfaceStudy(rows, surfaces, recommend(rows), sha256)
+    return found
 
 
 def _measure_all(
@@ -776,18 +757,11 @@ def kernels_folder(directory: str | Path) -> OutputFolder:
 
 def write_study(study: KernelStudy, directory: str | Path) -> None:
     """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html`` of a study."""
-    facts = KernelFacts(
-        units=study.units,
-        version=versions()["rbfmuscle"],
-        date=datetime.date.today().isoformat(),
-        meshes={name: each.sha256 for name, each in study.studies.items()},
-        rows=study.rows,
-    )
     with kernels_folder(directory).staged() as stage:
-        rows = [[getattr(row, name) for name in _columns()] for row in facts.rows]
+        rows = [[getattr(row, name) for name in _columns()] for row in study.rows]
         write_csv(stage / "kernels.csv", [_columns(), *rows])
-        (stage / "kernels.json").write_text(json_text(facts.model_dump()), encoding="utf-8")
-        write_page(stage, facts)
+        (stage / "kernels.json").write_text(json_text(study.model_dump()), encoding="utf-8")
+        write_page(stage, study)
 
 
 def _columns() -> list[str]:
@@ -795,103 +769,97 @@ def _columns() -> list[str]:
     return [name for name in KernelRow.model_fields if name != "trials"]
 
 
-def write_page(directory: Path, facts: KernelFacts) -> None:
+def write_page(directory: Path, study: KernelStudy) -> None:
     """Write ``kernels.html`` of what ``kernels.json`` holds."""
-    studies = {}
-    for name, digest in facts.meshes.items():
-        rows = [row for row in facts.rows if row.surface == name]
-        studies[name] = SurfaceStudy(rows, [], recommend(rows), digest)
-    _page(KernelStudy(studies, facts.units), f"rbfmuscle {facts.version}, {facts.date}").write(
-        directory / "kernels.html"
-    )
-
-
-def _page(study: KernelStudy, made: str) -> ReportPage:
-    studies, units, rows = study.studies, study.units, study.rows
-    several = len(studies) > 1
-    surfaces = f"all {len(studies)} muscles" if several else next(iter(studies)).replace("_", " ")
-    kernels = len({row.kernel for row in rows})
-    counts = ", ".join(map(str, sorted({row.centres for row in rows})))
-    found = {name: study.recommended for name, study in studies.items() if study.recommended}
-    code = "\n\n".join(f"# {name}\n{row.toml()}" for name, row in found.items())
+    surfaces, units = study.by_surface, study.units
+    several = len(surfaces) > 1
+    title = f"all {len(surfaces)} muscles" if several else next(iter(surfaces)).replace("_", " ")
+    counts = ", ".join(map(str, sorted({row.centres for row in study.rows})))
+    best = {name: recommend(rows) for name, rows in surfaces.items()}
+    code = "\n\n".join(f"# {name}\n{row.toml()}" for name, row in best.items() if row)
     hint = f"distances in {units or 'mesh units'}"
-    return ReportPage(
-        f"Kernels for {surfaces}",
+    ReportPage(
+        f"Kernels for {title}",
         [
-            f"{kernels} kernels",
+            f"{len({row.kernel for row in study.rows})} kernels",
             f"{counts} centres",
             *["every muscle; --muscles for some"][:several],
-            made,
+            f"rbfmuscle {study.version}, {study.date}",
         ],
         study.answer(),
-        GOOD if found else BAD,
-        plot=_plot(studies, units),
-        lights=_lights(studies, units),
+        GOOD if any(best.values()) else BAD,
+        plot=_plot(surfaces, units),
+        lights=_lights(surfaces, units),
         heads=["RMS error", "fit and 20,000 values"],
         sections=[
             *(
-                Section(f"Fitted rows of {name}", f"{hint}; mesh {s.sha256[:12]}", table=_rows(s))
-                for name, s in studies.items()
+                Section(
+                    f"Fitted rows of {name}",
+                    f"{hint}; mesh {study.meshes[name][:12]}",
+                    table=_rows(rows),
+                )
+                for name, rows in surfaces.items()
             ),
             *(
-                Section(f"Unfit rows of {name}", hint, table=_rows(s, unfit=True))
-                for name, s in studies.items()
-                if any(row.unfit for row in s.rows)
+                Section(f"Unfit rows of {name}", hint, table=_rows(rows, unfit=True))
+                for name, rows in surfaces.items()
+                if any(row.unfit for row in rows)
             ),
             *(
-                Section(f"Error against epsilon: {name}", plots=_curves(s, units))
-                for name, s in studies.items()
-                if any(row.trials for row in s.rows)
+                Section(f"Error against epsilon: {name}", plots=_curves(rows, units))
+                for name, rows in surfaces.items()
+                if any(row.trials for row in rows)
             ),
             Section("To paste at the end of a [[muscle]]", code=code),
             Section("How to read this", text=_READING),
         ],
-    )
+    ).write(directory / "kernels.html")
 
 
-def _lights(studies: Mapping[str, SurfaceStudy], units: str) -> list[CheckRow]:
+def _lights(surfaces: Mapping[str, Sequence[KernelRow]], units: str) -> list[CheckRow]:
     """Of one surface its best rows, each with whether it ties; of several what is recommended for
     each.
     """
-    chosen = [
-        (name, study.recommended, GOOD) for name, study in studies.items() if study.recommended
-    ]
-    if len(studies) == 1:
-        (study,) = studies.values()
-        good = [row for row in study.rows if not row.unfit]
-        others = [row for row in good if row is not study.recommended]
+    best = {name: recommend(rows) for name, rows in surfaces.items()}
+    chosen = [(name, row, GOOD) for name, row in best.items() if row is not None]
+    if len(surfaces) == 1:
+        ((name, rows),) = surfaces.items()
+        good = [row for row in rows if not row.unfit]
         chosen = [("recommended", row, GOOD) for _, row, _ in chosen]
         chosen += [
-            ("", row, GOOD if row.error <= ALIKE * good[0].error else PLAIN) for row in others
+            ("", row, GOOD if row.error <= ALIKE * good[0].error else PLAIN)
+            for row in good
+            if row is not best[name]
         ]
         chosen = chosen[:_MOST_LIGHTS]
     cells = [[number_cell(row.rms, units, s), number_cell(row.cost, "s")] for _, row, s in chosen]
     return [CheckRow(row.title, pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
 
 
-def _plot(studies: Mapping[str, SurfaceStudy], units: str) -> str:
+def _plot(surfaces: Mapping[str, Sequence[KernelRow]], units: str) -> str:
     """Error against the time of a fit and 20,000 values: a colour a surface, or of one a number of
     centres.
     """
     points = []
-    for name, study in studies.items():
-        for row in study.rows:
+    for name, rows in surfaces.items():
+        best = recommend(rows)
+        for row in rows:
             if not row.unfit:
-                group = name if len(studies) > 1 else f"{row.centres} centres"
+                group = name if len(surfaces) > 1 else f"{row.centres} centres"
                 place = 1e3 * row.cost, row.error, row.kernel, group
-                points.append(Point(*place, row is study.recommended, row.front))
+                points.append(Point(*place, row is best, row.front))
     labels = ("a fit and 20,000 values [ms of one thread]", f"RMS error [{units or 'mesh units'}]")
     return front_plot(points, labels)
 
 
-def _curves(study: SurfaceStudy, units: str) -> list[str]:
+def _curves(rows: Sequence[KernelRow], units: str) -> list[str]:
     """For each number of centres the error at the held-out points against epsilon, by kernel."""
     pictures = []
     unit = units or "mesh units"
-    for count in dict.fromkeys(row.centres for row in study.rows):
-        rows = [row for row in study.rows if row.centres == count and row.trials]
+    for count in dict.fromkeys(row.centres for row in rows):
+        tried = [row for row in rows if row.centres == count and row.trials]
         tracks = []
-        for row, colour in zip(rows, cycle(MUSCLE_COLOURS)):
+        for row, colour in zip(tried, cycle(MUSCLE_COLOURS)):
             shapes, errors = np.array(row.trials).T
             tracks.append(Track(row.kernel, colour, np.log10(shapes), np.log10(errors)))
         labels = "log10 of epsilon times spacing", f"log10 of the RMS error [{unit}]"
@@ -900,12 +868,12 @@ def _curves(study: SurfaceStudy, units: str) -> list[str]:
     return pictures
 
 
-def _rows(study: SurfaceStudy, *, unfit: bool = False) -> Table:
-    rows = []
-    for row in (row for row in study.rows if bool(row.unfit) == unfit):
-        state = GOOD if row is study.recommended else BAD if row.unfit else PLAIN
+def _rows(rows: Sequence[KernelRow], *, unfit: bool = False) -> Table:
+    lines, best = [], recommend(rows)
+    for row in (row for row in rows if bool(row.unfit) == unfit):
+        state = GOOD if row is best else BAD if row.unfit else PLAIN
         front = "on the front" if row.front else ""
-        verdict = row.unfit or ("recommended" if row is study.recommended else front)
+        verdict = row.unfit or ("recommended" if row is best else front)
         verdict = "; ".join(
             filter(None, [verdict, ENDS if row.shape and at_end(row.shape) else ""])
         )
@@ -914,5 +882,5 @@ def _rows(study: SurfaceStudy, *, unfit: bool = False) -> Table:
             shown_number(x * factor) if isinstance(x, float) else str(x or "")
             for x, factor in values
         ]
-        rows.append([Cell(row.kernel), Cell(verdict, state), *map(Cell, texts)])
-    return Table(["kernel", "verdict", *(head for head, _ in COLUMNS.values())], rows)
+        lines.append([Cell(row.kernel), Cell(verdict, state), *map(Cell, texts)])
+    return Table(["kernel", "verdict", *(head for head, _ in COLUMNS.values())], lines)

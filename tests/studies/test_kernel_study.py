@@ -20,8 +20,8 @@ from rbfmuscle.studies import kernels
 from rbfmuscle.studies.kernels import (
     ENDS,
     STEP,
-    KernelFacts,
     KernelRow,
+    KernelStudy,
     ReferenceSurface,
     at_end,
     describe,
@@ -271,7 +271,7 @@ def test_page_has_curves_of_epsilon_flags_its_ends_and_folds_unfit_rows(tmp_path
     planted = {"surface": "m", "unfit": "open", "kernel": "planted"}
     rows.append(gaussian.model_copy(update=planted))
     meshes = {"m": "0" * 64}
-    write_page(tmp_path, KernelFacts(units="mm", version="1", date="2", meshes=meshes, rows=rows))
+    write_page(tmp_path, KernelStudy(units="mm", version="1", date="2", meshes=meshes, rows=rows))
     page = (tmp_path / "kernels.html").read_text(encoding="utf-8")
     assert ENDS in page and "Error against epsilon: m" in page
     assert page.index("Fitted rows of m") < page.index("Unfit rows of m") < page.rindex("planted")
