@@ -207,7 +207,10 @@ def _bands() -> dict[tuple[str, str], Band]:
     table = json.loads((files("rbfmuscle.metrics") / "published.json").read_text(encoding="utf-8"))
     return {
         (kind, muscle): Band(
-            *(np.array(row[key]) for key in ("angle", "least", "greatest")), table["source"]
+            np.array(row["angle"]),
+            np.array(row["least"]),
+            np.array(row["greatest"]),
+            table["source"],
         )
         for kind, muscles in table["hip"].items()
         for muscle, row in muscles.items()

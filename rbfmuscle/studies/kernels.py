@@ -128,7 +128,7 @@ def study_kernels(
         units=units,
         version=versions()["rbfmuscle"],
         date=datetime.date.today().isoformat(),
-        meshes={name: mesh_hash(*mesh) for name, (*mesh, _) in checked.items()},
+        meshes={name: mesh_hash(points, faces) for name, (points, faces, _) in checked.items()},
     )
     done = 0
     with cores_limited(jobs), study_folder(directory) as folder:
