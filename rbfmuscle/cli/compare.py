@@ -1,7 +1,5 @@
 """``rbfmuscle compare``: models on one scene."""
 
-from __future__ import annotations
-
 from rbfmuscle.cli.options import (
     USUAL_WORK,
     FailOn,

@@ -1,7 +1,5 @@
 """``rbfmuscle kernels``: kernels on a surface or on the muscles of a scene."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """``rbfmuscle sweep``: scenes under a grid of settings."""
 
-from __future__ import annotations
-
 import sys
 
 from rbfmuscle.cli.options import (

@@ -1,7 +1,5 @@
 """A bone: a rigid body with a mesh, its distances and points on it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """What a scene and its parts hold, compared and hashed: every field but where files lie."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

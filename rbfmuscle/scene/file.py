@@ -2,8 +2,6 @@
 meshes, lists of vertices and fibres in a folder beside it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

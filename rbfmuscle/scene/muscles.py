@@ -2,8 +2,6 @@
 size and place must be.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping, Sequence

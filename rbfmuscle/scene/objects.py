@@ -1,7 +1,5 @@
 """What a scene is made of: muscles with their attachments, and a motion."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 

@@ -1,7 +1,5 @@
 """``attach``: the ways to say which vertices of a muscle a bone holds."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -2,8 +2,6 @@
 ``Scene.with_options``.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a study returns: its table, the folder of its files, and its page."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 import weakref

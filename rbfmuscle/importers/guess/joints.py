@@ -7,8 +7,6 @@ the face's slippable motions (Gelfand and Guibas 2004, Shape segmentation using 
 analysis). Knee, ankle and patella have methods of their own.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from typing import NamedTuple
 

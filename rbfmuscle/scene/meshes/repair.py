@@ -1,7 +1,5 @@
 """Mending meshes where it is safe: what is changed never moves a vertex by more than rounding."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
