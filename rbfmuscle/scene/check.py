@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.geometry.surfaces import vertex_areas
@@ -181,25 +181,29 @@ def _about(mesh, centre, reach, sign):
 
 def _facing(mesh, other, millimetre):
     """Middles of the triangles that look at another bone within `BAND` of the least gap."""
+    points, tree = np.asarray(mesh.triangles_center), cKDTree(other.triangles_center)
     reach = (FARTHEST + BAND) * millimetre
-    near = _within(mesh, other.bounds, reach)
-    points = np.asarray(mesh.triangles_center)[near]
-    theirs = np.asarray(other.triangles_center)[_within(other, mesh.bounds, reach)]
-    if len(points) == 0 or len(theirs) == 0:
+    close, distance, _, look = looking_at(points, mesh.face_normals, tree, other.bounds, reach)
+    if distance.min(initial=np.inf) > FARTHEST * millimetre:
         return points[:0]
-    distance, nearest = cKDTree(theirs).query(points)
-    if distance.min() > FARTHEST * millimetre:
-        return points[:0]
-    away = (theirs[nearest] - points) / np.maximum(distance, 1e-12)[:, None]
-    look = np.einsum("ij,ij->i", np.asarray(mesh.face_normals)[near], away)
-    return points[(distance < distance.min() + BAND * millimetre) & (look > LOOK)]
+    return points[close[(distance < distance.min() + BAND * millimetre) & (look > LOOK)]]
 
 
-def _within(mesh, bounds, reach):
-    """Which triangles have their middles in a box (2, 3) or so near to it."""
+def looking_at(
+    points: Floats, normals: Floats, others: cKDTree, bounds: Floats, reach: float
+) -> tuple[Integers, Floats, Integers, Floats]:
+    """Which points (n, 3) lie within ``reach`` of others, which have a box (2, 3): their numbers
+    (k,), the distances to the nearest of the others, its numbers, and the cosines between normals
+    (n, 3) and the directions there.
+    """
     low, high = bounds
-    points = np.asarray(mesh.triangles_center)
-    return ((points > low - reach) & (points < high + reach)).all(axis=1)
+    close = np.flatnonzero(((points > low - reach) & (points < high + reach)).all(axis=1))
+    distance, nearest = others.query(points[close], distance_upper_bound=reach)
+    found = np.isfinite(distance)
+    close, distance, nearest = close[found], distance[found], nearest[found]
+    away = (others.data[nearest] - points[close]) / np.maximum(distance, 1e-12)[:, None]
+    look = np.einsum("ij,ij->i", np.asarray(normals)[close], away)
+    return close, distance, nearest, look
 
 
 MOST_ARTICULAR = 0.5  # share of an attachment that may lie on an articular surface

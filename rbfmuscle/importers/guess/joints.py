@@ -24,6 +24,7 @@ from rbfmuscle.importers.guess.anatomy import (
 )
 from rbfmuscle.importers.guess.sites import BoneFrame, Site, find_site
 from rbfmuscle.scene.bone import Bone
+from rbfmuscle.scene.check import looking_at
 
 CLEAR = 1.5  # via points and insertions lie so far out of bones [mm]
 
@@ -90,16 +91,11 @@ def find_face(first: Part, second: Part, millimetre: float, band: float = BAND) 
     """
     reach = (FARTHEST + band) * millimetre
     points, normals, areas = first.faces
-    low, high = np.asarray(second.mesh.bounds)
-    close = np.flatnonzero(((points > low - reach) & (points < high + reach)).all(axis=1))
-    distance, nearest = second.tree.query(points[close], distance_upper_bound=reach)
-    close, distance, nearest = (
-        values[np.isfinite(distance)] for values in (close, distance, nearest)
+    close, distance, nearest, look = looking_at(
+        points, normals, second.tree, second.mesh.bounds, reach
     )
     if len(close) == 0:
         return None
-    away = (second.faces[0][nearest] - points[close]) / np.maximum(distance, 1e-12)[:, None]
-    look = np.einsum("ij,ij->i", normals[close], away)
     opposed = -np.einsum("ij,ij->i", normals[close], second.faces[1][nearest])
     near = (distance < distance.min() + band * millimetre) & (look > LOOK) & (opposed > OPPOSED)
     chosen = close[near]
