@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.implicit.field import RBFField, off_surface_points
@@ -140,3 +142,19 @@ def test_cells_are_those_from_which_no_vertex_wants_to_go(monkeypatch):
     mesh = SHAPES["ellipsoid"]()
     sample_surface(mesh.vertices, mesh.faces, 40, placement="even")
     assert seen == [True]
+
+
+def test_cells_start_from_farthest_points():
+    """Against a search of all vertices by shortest paths from all points so far."""
+    mesh = trimesh.creation.icosphere(2, 10.0)
+    vertices = mesh.vertices * np.random.default_rng(4).uniform(0.7, 1.3, (len(mesh.vertices), 1))
+    fine = clustering.refine_mesh(vertices, np.asarray(mesh.faces), 60)
+    count = len(fine.vertices)
+    graph = csr_array((fine.length, fine.other, fine.start), shape=(count, count))
+    labels = np.full(count, -1)
+    clustering._farthest_loop(fine.start, fine.other, fine.length, 5, 40, labels)
+    chosen = [5]
+    while len(chosen) < 40:
+        chosen.append(int(np.argmax(dijkstra(graph, indices=chosen, min_only=True))))
+    wanted = np.argmin(dijkstra(graph, indices=chosen), axis=0)
+    np.testing.assert_array_equal(labels, wanted)

@@ -126,9 +126,9 @@ def cluster_mesh(
 def _farthest_loop(start, other, length, first, count, labels):
     """Farthest points by distance along edges; labels become the nearest of them."""
     distance = np.full(len(start) - 1, np.inf)
-    for v in range(len(distance)):
-        if start[v] == start[v + 1]:
-            distance[v] = -1.0
+    # The greatest distance comes first, of equal ones the lowest number; what a vertex was before
+    # it came nearer is passed over. A search of all vertices for each point would be quadratic.
+    farthest = [(-np.inf, v) for v in range(len(distance)) if start[v] < start[v + 1]]
     chosen = first
     for k in range(count):
         distance[chosen] = 0.0
@@ -144,7 +144,11 @@ def _farthest_loop(start, other, length, first, count, labels):
                     distance[w] = d + length[e]
                     labels[w] = k
                     heapq.heappush(heap, (distance[w], w))
-        chosen = np.argmax(distance)
+                    heapq.heappush(farthest, (-distance[w], w))
+        while len(farthest) > 0:
+            d, chosen = heapq.heappop(farthest)
+            if -d == distance[chosen]:
+                break
 
 
 @loop
