@@ -56,7 +56,7 @@ class RBFOptions(Table):
     }
     centres: Annotated[int, Field(ge=0, le=20_000), AfterValidator(_enough_centres)] = 0
     rest_error: NotNegative = 0.0
-    samples: Annotated[int, Field(ge=50, le=200_000)] = 6000
+    samples: Annotated[int, Field(ge=50, le=50_000)] = 6000
     nodes: Annotated[int, Field(ge=30, le=3000)] = 300
     iterations: Annotated[int, Field(ge=1, le=1000)] = 150
     slack_ratio: Annotated[float, Field(ge=1.0, le=5.0)] = 1.8

@@ -145,6 +145,16 @@ def test_fewer_centres_than_a_linear_polynomial_needs_are_refused(count):
         RBFOptions.build({"centres": count}, context="muscle 'm': ")
 
 
+@pytest.mark.parametrize(
+    ("key", "most"),
+    [("centres", 20_000), ("samples", 50_000), ("nodes", 3000), ("resolution", 1000)],
+)
+def test_sizes_beyond_those_of_the_page_on_limits_are_refused_before_anything_is_built(key, most):
+    assert getattr(RBFOptions.build({key: most}, context="muscle 'm': "), key) == most
+    with pytest.raises(SceneError, match=f"{key}.*{most}"):
+        RBFOptions.build({key: most + 1}, context="muscle 'm': ")
+
+
 def test_a_chosen_epsilon_never_gives_a_broken_field():
     narrow = {
         "kernel": "gaussian",
