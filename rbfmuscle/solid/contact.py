@@ -112,7 +112,9 @@ class Obstacles:
                 gap, normal = self.ask(b, which[some], here[some], reach[some])
                 near = np.flatnonzero(gap < reach[some])
                 parts.append(Touch(some[near], np.full(len(near), b), gap[near], normal[near]))
-        parts.append(Touch(*(column[:count] for column in found)))
+        parts.append(
+            Touch(found.near[:count], found.source[:count], found.gap[:count], found.normal[:count])
+        )
         return _joined(parts)
 
     def meet_exactly(self, which: Integers, here: Floats, reach: float) -> Touch:
