@@ -783,7 +783,7 @@ def write_page(directory: Path, study: KernelStudy) -> None:
         [
             f"{len({row.kernel for row in study.rows})} kernels",
             f"{counts} centres",
-            *["every muscle; --muscles for some"][:several],
+            *["every muscle of the scene, or those that are named"][:several],
             f"rbfmuscle {study.version}, {study.date}",
         ],
         study.answer(),

@@ -19,7 +19,7 @@ from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame_loop import simulate_frames
-from rbfmuscle.simulation.touching import settle
+from rbfmuscle.simulation.touching import meet, settle
 from rbfmuscle.solid import lattice as lattices
 from rbfmuscle.solid.contact import Mobility, Obstacles
 from rbfmuscle.solid.kernels import (
@@ -593,3 +593,21 @@ def test_bar_that_is_pushed_together_is_not_turned_inside_out():
         assert np.isfinite(solid.state.nodes).all()
     f = at_points(solid.localise(solid.state.nodes, 0.0).work, GRADIENT, 3, 3)
     assert np.linalg.det(f).min() > 0.0
+
+
+def test_a_step_is_at_most_a_fifth_of_the_size_however_far_its_mixture_goes(monkeypatch):
+    bar = Bar(subdivisions=2)
+    moved = predict(bar.model, bar.state, bar.poses, np.array([np.eye(4), shift(2.0)]))
+    stiff = stiffness(bar.model, 0.0)
+    mobility = Mobility(*bar.model.embedding, stiff.inverse)
+    solid = Settling(bar.model, stiff, mobility, moved, bar.obstacles)
+    # On a linear map mixtures go fifty times as far as the step that they are made from.
+    monkeypatch.setattr(solid.mixer, "mix", lambda here, image: here + 1000.0 * (image - here))
+    before = solid.nodes
+    solid.free_step()
+    meet([solid], np.ones(1, dtype=np.bool_))
+    step = np.linalg.norm(bar.model.embedding.of(solid.step), axis=1).max()
+    solid.advance()
+    way = np.linalg.norm(bar.model.embedding.of(solid.nodes - before), axis=1).max()
+    assert 1000.0 * step > bar.model.size
+    assert 0.05 * bar.model.size < way <= 0.2 * (1.0 + 1e-9) * bar.model.size
