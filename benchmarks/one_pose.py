@@ -1,12 +1,14 @@
-"""One pose reached over six ways: how far the muscle's material lies apart.
+"""One pose reached over seven ways: how far muscles lie apart, which touch each other.
 
-    python benchmarks/one_pose.py SCENE --muscles A,B [--pose hip.flexion=60 hip.adduction=-25]
-                                  [--set nodes=300 ...]
+    python benchmarks/one_pose.py SCENE [--muscles A,B] [--pose hip.flexion=60 hip.adduction=-25]
+                                  [--ways both "half a degree"] [--set model.nodes=300 ...]
 
 The ways to a pose of two coordinates, by default in sub-steps of 2 degrees: both at once, either
 one first, a detour through the third coordinate, a seeded random walk that ends there, both at once
-in sub-steps of half a degree and of 10 degrees. Distances are between material points of the
-carried surface, RMS and greatest over all pairs [mm].
+in sub-steps of half a degree and of 10 degrees; and farther by half, and back. Distances are
+between vertices of the surface as the solid carries it, and as it is shown, RMS and greatest over
+all pairs of ways [mm]. Muscles touch as the scene has it: ``--set neighbours=false`` solves each
+alone.
 """
 
 import argparse
@@ -17,8 +19,7 @@ from pathlib import Path
 import numpy as np
 from evidence import write_evidence
 
-from rbfmuscle.muscle.muscle import RBFMuscle
-from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.models import build_models
 from rbfmuscle.scene.objects import Motion, from_mm
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.scene.scene import Scene
@@ -48,6 +49,7 @@ def ways(pose, others, step=STEP):
         "random walk": ([rest, *walk, end], step),
         "half a degree": ([rest, end], 0.5),
         "10 degrees": ([rest, end], 10.0),
+        "there and back": ([rest, {key: 1.5 * value for key, value in end.items()}, end], step),
     }
     if others:
         aside = {**rest, **{key: 0.5 * value for key, value in pose.items()}, others[0]: 25.0}
@@ -69,64 +71,63 @@ def frames(waypoints, step):
     return [{k: float(np.radians(v)) for k, v in frame.items()} for frame in out]
 
 
-def ends(scene, pose, others, settings):
-    """Carried vertices (n, 3) at the end of each way, by name, and the processor time of all
-    [s]."""
+def ends(scene, pose, others, wanted=(), step=STEP):
+    """Vertices (n, 3) of carried and shown surfaces at the end of each of the wanted ways, by
+    muscle and way, and the processor time of all [s].
+    """
     found, start = {}, time.process_time()
-    for name, (waypoints, step) in ways(pose, others).items():
-        part = scene.with_options({"contact.substep_angle": step})
-        part.motion = Motion(frames(waypoints, step))
-        muscle = part.muscles[0]
-        model = RBFMuscle(muscle, part, RBFOptions(**{**muscle.options, **settings}))
+    for name, (waypoints, angle) in ways(pose, others, step).items():
+        if wanted and name not in wanted:
+            continue
+        part = scene.with_options({"contact.substep_angle": angle})
+        part.motion = Motion(frames(waypoints, angle))
         last = len(part.motion.frames) - 1
-        (frame,) = simulate_frames(part, [model], surfaces=False, written={last})
-        found[name] = frame.material_meshes[muscle.name][0] / from_mm(1.0, part.units)
+        (frame,) = simulate_frames(part, build_models(part), written={last})
+        for muscle, shown in frame.surfaces.items():
+            found.setdefault(muscle, {})[name] = [
+                points / from_mm(1.0, part.units)
+                for points in (frame.material_meshes[muscle][0], shown.vertices)
+            ]
     return found, time.process_time() - start
 
 
 def spread(found):
-    """(rms, greatest) of the pair of ways farthest apart, and its names."""
-    worst = (0.0, 0.0, "")
+    """Of surfaces by way (RMS, greatest) of the pair of ways farthest apart, and its names."""
+    worst = (0.0, "")
     greatest = 0.0
     for a, b in itertools.combinations(found, 2):
         away = np.linalg.norm(found[a] - found[b], axis=1)
-        rms = float(np.sqrt((away**2).mean()))
         greatest = max(greatest, float(away.max()))
-        if rms > worst[0]:
-            worst = (rms, greatest, f"{a} / {b}")
-    return worst[0], greatest, worst[2]
+        worst = max(worst, (float(np.sqrt((away**2).mean())), f"{a} / {b}"))
+    return worst[0], greatest, worst[1]
+
+
+COLUMNS = ["muscle", "RMS", "greatest", "paths", "shown: RMS", "greatest"]
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", help="a scene file, or 'phantom'")
-    parser.add_argument("--muscles", required=True, help="separated by commas")
+    parser.add_argument("--muscles", help="separated by commas; all")
     parser.add_argument("--pose", nargs="+", default=["hip.flexion=60", "hip.adduction=-25"])
     parser.add_argument("--others", nargs="*", default=["hip.internal_rotation"])
+    parser.add_argument("--ways", nargs="*", default=[], help="some of them")
     parser.add_argument("--set", nargs="*", default=[], dest="settings")
     parser.add_argument("-o", "--output", type=Path, help="file of evidence for the pages")
     given = parser.parse_args()
-    rows = [row_of(name, given) for name in given.muscles.split(",")]
-    if given.output:
-        command = ["benchmarks/one_pose.py", given.scene, "--muscles", given.muscles]
-        write_evidence(given.output, command, rows, ["muscle", "RMS", "greatest", "paths"])
-
-
-def row_of(muscle, given):
-    """Spread of the paths of one muscle [mm], which is printed with all distances."""
     scene = phantom_scene() if given.scene == "phantom" else Scene.load(given.scene)
-    scene.muscles = [scene.muscle(muscle)]
-    settings = parse_settings(given.settings)
-    found, seconds = ends(scene, parse_settings(given.pose), given.others, settings)
-    rms, greatest, pair = spread(found)
-    print(
-        f"{muscle} {settings}: {rms:.3f} mm RMS ({pair}), {greatest:.2f} greatest, {seconds:.1f} s"
-    )
-    names = list(found)
-    for a in names:
-        row = [float(np.sqrt(((found[a] - found[b]) ** 2).sum(axis=1).mean())) for b in names]
-        print(f"  {a:22}" + " ".join(f"{value:6.3f}" for value in row), flush=True)
-    return [muscle, rms, greatest, pair]
+    scene = scene.with_options(parse_settings(given.settings))
+    if given.muscles:
+        scene.muscles = [scene.muscle(name) for name in given.muscles.split(",")]
+    found, seconds = ends(scene, parse_settings(given.pose), given.others, given.ways)
+    rows = []
+    for muscle, by_way in found.items():
+        carried, shown = (spread({way: both[k] for way, both in by_way.items()}) for k in (0, 1))
+        rows.append([muscle, *carried, *shown[:2]])
+        print(*rows[-1], flush=True)
+    print(f"{seconds:.1f} s")
+    if given.output:
+        write_evidence(given.output, ["benchmarks/one_pose.py", given.scene], rows, COLUMNS)
 
 
 if __name__ == "__main__":
