@@ -15,14 +15,7 @@ from pbd_baseline.moving_surface import MovingSurface
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.embedding import Embedding
 from rbfmuscle.geometry.surfaces import farthest_move
-from rbfmuscle.simulation.touching import Wanted
-
-NOTHING = Wanted(
-    np.zeros(0, dtype=np.int64),
-    np.zeros(0, dtype=np.int64),
-    np.zeros((0, 3)),
-    *(np.zeros(0) for _ in range(4)),
-)
+from rbfmuscle.simulation.touching import NOTHING, Wanted
 
 
 class Sweeps(NamedTuple):

@@ -44,6 +44,7 @@ def check(
             check_picture(scene.with_suffix(".png"))
         loaded, findings = _findings(scene)
         usable = bool(loaded.bones) and not any(f.level == "error" for f in findings)
+        pairs = _touching_pairs(loaded) if usable else []
         if plan and usable:
             facts["plan"] = _plan(loaded, time)
         if accuracy and usable:
@@ -58,8 +59,9 @@ def check(
     from rbfmuscle.run.info import record_scene
     from rbfmuscle.scene.check import attachment_facts
 
-    lines = [*_scene_lines(loaded), *map(str, findings), *_more_lines(facts, loaded.units)]
+    lines = [*_scene_lines(loaded, pairs), *map(str, findings), *_more_lines(facts, loaded.units)]
     facts |= {"scene": record_scene(loaded), "findings": [vars(finding) for finding in findings]}
+    facts["neighbours"] = pairs
     facts["attachments"] = [held._asdict() for held in attachment_facts(loaded)]
     print_result(work, facts, lines)
     if not work.as_json:
@@ -121,7 +123,15 @@ def _field_notes(scene):
         logger.setLevel(level)
 
 
-def _scene_lines(scene):
+def _touching_pairs(scene):
+    """Names of the muscles of each pair that may touch in the motion."""
+    from rbfmuscle.simulation.neighbours import find_links
+
+    names = [muscle.name for muscle in scene.muscles]
+    return [[names[one], names[other]] for one, other in find_links(scene, names)]
+
+
+def _scene_lines(scene, pairs):
     from rbfmuscle.scene.check import attachment_facts
     from rbfmuscle.scene.objects import body_axes
 
@@ -152,6 +162,10 @@ def _scene_lines(scene):
                 f"    {held.end}: {held.vertices} vertices {held.how} {held.bone}, "
                 f"{held.area:.3g} cm2, {100 * held.share:.2g} % of the surface"
             )
+        others = [name for pair in pairs if muscle.name in pair for name in pair]
+        others = [name for name in others if name != muscle.name]
+        if others:
+            yield f"    can touch {', '.join(others)}"
 
 
 def _accuracy(scene):

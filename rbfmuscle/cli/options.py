@@ -14,7 +14,6 @@ from cyclopts import Parameter
 from rbfmuscle.validation import RBFMuscleError, SceneError, UsageError
 
 if TYPE_CHECKING:
-    from rbfmuscle.scene.objects import Muscle
     from rbfmuscle.scene.scene import Scene
 
 
@@ -137,15 +136,19 @@ def refuse(what: str, options: Mapping[str, object]) -> None:
         raise UsageError(f"{what} does not take {' and '.join(given)}; leave it out")
 
 
-def chosen_muscles(scene: "Scene", names: str | None) -> "list[Muscle]":
-    """The muscles that ``--muscles`` names, all where it is not given; UsageError if there is no
-    such muscle.
+def keep_muscles(scene: "Scene", names: str | None) -> None:
+    """Keep of a scene the muscles that ``--muscles`` names, all where it is not given; UsageError
+    if there is no such muscle.
     """
     named = named_muscles(names)
+    if named is None:
+        return
     try:
-        return scene.muscles if named is None else [scene.muscle(name) for name in named]
+        scene.muscles = [scene.muscle(name) for name in named]
     except SceneError as error:
         raise UsageError(f"--muscles: {error}") from None
+    if scene.neighbours is not None:
+        scene.neighbours = scene.neighbours.among(named)
 
 
 def named_muscles(names: str | None) -> list[str] | None:

@@ -17,7 +17,7 @@ from rbfmuscle.cli.options import (
     SceneName,
     Settings,
     Work,
-    chosen_muscles,
+    keep_muscles,
     print_result,
 )
 from rbfmuscle.progress import Progress
@@ -69,7 +69,7 @@ def paths(
     if samples is not None and samples < 10:
         raise UsageError(f"--samples {samples} is too few to fit anything, give 10 or more")
     loaded = configure_scene(open_scene(scene), parse_settings(settings), model=model)
-    loaded.muscles = chosen_muscles(loaded, muscles)
+    keep_muscles(loaded, muscles)
     spans, targets = parse_ranges(loaded, ranges), parse_targets(loaded, names or [])
     paths_folder(output)
     sampled: list[Samples] = []

@@ -16,7 +16,7 @@ from rbfmuscle.cli.options import (
     SceneName,
     Settings,
     Work,
-    chosen_muscles,
+    keep_muscles,
     print_result,
 )
 from rbfmuscle.progress import Progress
@@ -84,11 +84,7 @@ def run(
         from rbfmuscle.scene.settings import parse_settings
 
         changes, loaded = parse_settings(settings), open_scene(scene)
-        if muscles is not None:
-            loaded.muscles = chosen_muscles(loaded, muscles)
-            if loaded.neighbours is not None:
-                names = [muscle.name for muscle in loaded.muscles]
-                loaded.neighbours = loaded.neighbours.among(names)
+        keep_muscles(loaded, muscles)
         limited = partial(stream_run, frames=frames, fail_on=fail_on, progress=advance)
         try:
             limited(loaded, output, model=model, settings=changes)

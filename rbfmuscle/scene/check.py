@@ -428,8 +428,8 @@ def _neighbour_findings(scene):
         Finding(
             "note",
             f"{one} and {other}",
-            f"the meshes of these muscles overlap by {found.depths.max():.3g} {scene.units}: what "
-            "does so at rest counts apart",
+            f"the meshes of these muscles overlap by {found.depths.max():.3g} {scene.units}, "
+            f"{len(found.depths)} vertices lie in the other: what does so at rest counts apart",
         )
         for (one, other), found in sorted(overlaps.items(), key=lambda row: -row[1].depths.max())
     ]

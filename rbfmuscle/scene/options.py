@@ -177,17 +177,21 @@ class ContactOptions(Table):
     substep_angle: Annotated[float, Field(gt=0, le=90)] = 2.0
 
 
+Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
+
+
 class NeighbourOptions(Table):
     """``[neighbours]``: muscles that touch; ``neighbours = false`` lets them pass through."""
 
-    pairs: list[Annotated[list[str], Field(min_length=2, max_length=2)]] | None = None
+    pairs: list[Pair] | None = None
+    together: bool = False
+    bones: list[Pair] = Field(default_factory=list)  # muscle, bone
 
     def among(self, names: Collection[str]) -> "NeighbourOptions":
         """The same for some of the muscles."""
-        if self.pairs is None:
-            return self
-        left = [pair for pair in self.pairs if set(pair) <= set(names)]
-        return self.model_copy(update={"pairs": left})
+        bones = [pair for pair in self.bones if pair[0] in names]
+        pairs = self.pairs and [pair for pair in self.pairs if set(pair) <= set(names)]
+        return self.model_copy(update={"pairs": pairs, "bones": bones})
 
 
 def _accept_neighbours(value: object) -> object:

@@ -490,11 +490,24 @@ def require_complete(scene: Scene) -> Scene:
         if not getattr(scene, what):
             raise SceneError(f"scene {scene.name!r} has no {what}, add a [[{what[:-1]}]]")
     check_file_names(scene.bones, scene.muscles)
+    _check_neighbours(scene, scene.neighbours)
     check_coordinates(scene.motion, scene.joints)
     for muscle in scene.muscles:
         with _naming(muscle.name):
             check_muscle(muscle, scene.motion)
     return scene
+
+
+def _check_neighbours(scene: Scene, options: NeighbourOptions | None) -> None:
+    """Raise SceneError where ``[neighbours]`` names an unknown muscle or bone."""
+    if options is None:
+        return
+    for pair in options.pairs or []:
+        for name in pair:
+            find_named(scene.muscles, name, "muscle", context="[neighbours] pairs: ")
+    for muscle, bone in options.bones:
+        find_named(scene.muscles, muscle, "muscle", context="[neighbours] bones: ")
+        find_named(scene.bones, bone, "bone", context="[neighbours] bones: ")
 
 
 @contextmanager
@@ -538,6 +551,8 @@ def _settings(scene: Scene) -> dict[str, Table | None]:
 def _take_settings(scene: Scene, tables: Mapping[str, Table | None]) -> None:
     """Give a scene tables of settings, and the motion of its own where that is another one."""
     for key, table in tables.items():
+        if isinstance(table, NeighbourOptions):
+            _check_neighbours(scene, table)
         if not isinstance(table, MotionOptions):
             setattr(scene, key, table)
         elif table is not scene.motion.options:

@@ -121,13 +121,14 @@ class Group:
                 solids.append(stepper.model.begin(stepper.contacts))
             except FAILURES as error:
                 raise _failure(stepper, coordinates, error) from error
-        meeting = self.neighbours.find(solids)
+        bodies = [*solids, *self.neighbours.bones]
+        meeting = self.neighbours.find(bodies)
         try:
-            settle(solids, meeting)
+            settle(bodies, meeting)
         except FAILURES as error:
             lost = [not np.isfinite(solid.step).all() for solid in solids]
             raise _failure(self.steppers[int(np.argmax(lost))], coordinates, error) from error
-        self.neighbours.keep(meeting, solids)
+        self.neighbours.keep(meeting, bodies)
         for stepper, solid in zip(self.steppers, solids):
             try:
                 stepper.model.take(solid)

@@ -1,6 +1,8 @@
 """Which muscles may touch, and where they do.
 
 What overlaps at rest, as segmentations often do, keeps that overlap as the zero of its contact.
+Where a scene asks for it, what touches at rest is held together at the distance that it has there,
+muscle on muscle or muscle on bone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,19 +12,25 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
+from rbfmuscle.simulation.held_bone import NO_POINTS, HeldBone
 from rbfmuscle.simulation.stepper import MuscleStepper
-from rbfmuscle.simulation.touching import Body, Meeting, Moving
-from rbfmuscle.validation import SceneError, did_you_mean
+from rbfmuscle.simulation.touching import HELD, Body, Meeting, Moving, even_points
 
 Link = tuple[int, int]
 
 # Muscles may touch whose swept boxes come nearer to each other than this [mm].
 REACH = 3.0
+# Points nearer than this at rest [mm] are held, where that is asked for; these are so far apart, of
+# the size: what a solid does between them its nodes decide.
+TOUCHED, HOLDING = 2.0, 0.05
+# Points so near to an attachment, of the size, do not meet others that lie as near to one: where
+# bones drive both, contact would crush what little is between.
+BESIDE = 0.03
 # How near points of one muscle are to those of another that may meet it in a sub-step, or whose
 # shown surface may, of the size of the smaller one.
 SEARCHED = 0.06
@@ -52,6 +60,8 @@ class Neighbours:
     Attributes
     ----------
     state : NeighbourState
+    bones : list of HeldBone
+        Bodies beside the muscles, whose numbers go on from theirs.
     """
 
     def __init__(self, steppers: Sequence[MuscleStepper], links: Sequence[Link]) -> None:
@@ -60,18 +70,35 @@ class Neighbours:
         self.bodies: list[Body] = []
         self._own: dict[int, Integers] = {}
         self.overlaps: dict[Link, Floats] = {}
-        if not links:
+        self.held: dict[Link, Floats] = {}  # gaps (k,) that points keep, NaN where they are free
+        holders, self.bones = _held_bones(steppers)
+        if not links and not holders:
             return
         self.bodies = each(lambda stepper: stepper.model.body(), steppers)
         solids = [stepper.model.begin(stepper.contacts) for stepper in steppers]
-        meeting = self.find(solids)
+        sizes = [solid.size for solid in solids]
+        self.beside = [_beside(*row) for row in zip(steppers, self.bodies, sizes)]
+        self.bodies += [NO_POINTS] * len(self.bones)
+        scene = steppers[0].scene
+        touched = from_mm(TOUCHED, scene.units)
+        bodies = [*solids, *self.bones]
+        meeting = self.find(bodies)
         if meeting is not None:
-            depth = np.where(np.isfinite(meeting.gap), np.maximum(-meeting.gap, 0.0), 0.0)
-            self.overlaps = self._by_link(meeting, depth)
+            meeting.ask(bodies)
+            gap = np.where(np.isfinite(meeting.gap), meeting.gap, np.nan)
+            self.overlaps = self._by_link(meeting, np.fmax(-gap, 0.0), 0.0)
+            if scene.neighbours is not None and scene.neighbours.together:
+                self.held = self._by_link(meeting, gap, np.nan)
+        points = [s.feet_of(body.points).of(s.nodes) for s, body in zip(solids, self.bodies)]
+        for number, (m, bone) in enumerate(zip(holders, self.bones), len(steppers)):
+            self.held[m, number] = bone.ask(points[m], self.bodies[number].places)[0]
+        for (m, _), gap in self.held.items():
+            some = even_points(points[m], np.flatnonzero(gap < touched), HOLDING * sizes[m])
+            gap[np.setdiff1d(np.arange(len(gap)), some)] = np.nan
 
     def find(self, solids: Sequence[Moving]) -> Meeting | None:
         """The points that may meet another muscle in a sub-step; None where there are none."""
-        if not self.links:
+        if not self.bodies:
             return None
         own = [solid.feet_of(body.points) for solid, body in zip(solids, self.bodies)]
         points = [feet.of(solid.nodes) for feet, solid in zip(own, solids)]
@@ -82,11 +109,20 @@ class Neighbours:
         for one, other in self.links:
             reach = SEARCHED * min(size[one], size[other])
             which, nearest = _near_points(points[one], trees[other], reach)
-            if len(which):
-                found.append((one, other, which, nearest))
-                near[one, other] = np.full(len(points[one]), -1)
-                near[one, other][which] = nearest
+            if len(which) == 0:
+                continue
+            near[one, other] = np.full(len(points[one]), -1)
+            near[one, other][which] = nearest
+            met = ~(self.beside[one][which] & self.beside[other][nearest])
+            if met.any():
+                found.append((one, other, which[met], nearest[met]))
         self.state = self.state._replace(near=near)
+        muscles = len(solids) - len(self.bones)
+        for (one, other), gap in self.held.items():
+            if other >= muscles:
+                which = np.flatnonzero(np.isfinite(gap))
+                found.append((one, other, which, np.zeros(len(which), dtype=np.int64)))
+        found.sort(key=lambda row: row[:2])
         if not found:
             return None
         counts = [len(which) for _, _, which, _ in found]
@@ -98,6 +134,15 @@ class Neighbours:
             solids[one].contact_law(self.bodies[one].points[rows], self.bodies[one].area)
             for one, _, rows, _ in found
         ]
+        overlap, held, force = (
+            np.concatenate([self._known(known, *row[:3], empty) for row in found])
+            for known, empty in (
+                (self.overlaps, 0.0),
+                (self.held, np.nan),
+                (self.state.forces, 0.0),
+            )
+        )
+        holds = np.isfinite(held)
         meeting = Meeting(
             np.repeat(ones, counts),
             np.repeat(others, counts),
@@ -108,19 +153,18 @@ class Neighbours:
                 np.concatenate([most for most, _ in law]),
                 np.repeat([y for _, y in law], counts),
             ),
-            *(
-                np.concatenate([self._known(known, *row[:3]) for row in found])
-                for known in (self.overlaps, self.state.forces)
-            ),
+            holds,
+            np.where(holds, -held, overlap),
+            force,
         )
         meeting.ask(solids)
         sizes = np.array(size)
-        reach = NEAR * np.minimum(sizes[meeting.one], sizes[meeting.other])
+        reach = np.where(holds, HELD, NEAR) * np.minimum(sizes[meeting.one], sizes[meeting.other])
         return meeting.without(~(meeting.gap < reach) & (meeting.force == 0.0))
 
     def keep(self, meeting: Meeting | None, solids: Sequence[Moving]) -> None:
         """Keep how a solve ended."""
-        forces = {} if meeting is None else self._by_link(meeting, meeting.force)
+        forces = {} if meeting is None else self._by_link(meeting, meeting.force, 0.0)
         self.state = NeighbourState(forces, solids, self.state.near)
 
     def out_of_neighbours(self, number: int, points: Floats) -> Floats:
@@ -141,7 +185,7 @@ class Neighbours:
             mine, _, _ = state.bodies[number].ask(here, self.bodies[number].places[own])
             foot = self.bodies[other].places[nearest[which]]
             gap, normal, _ = state.bodies[other].ask(here, foot)
-            gap += self._known(self.overlaps, number, other, own)
+            gap += self._known(self.overlaps, number, other, own, 0.0)
             nearer = np.isfinite(gap) & np.isfinite(mine) & (mine > gap)
             away = 0.5 * (mine[nearer] - gap[nearer])
             out[which[nearer]] += away[:, None] * normal[nearer]
@@ -157,20 +201,45 @@ class Neighbours:
             self._own[number] = cKDTree(here).query(points)[1]
         return self._own[number]
 
-    def _known(self, known: Mapping[Link, Floats], one: int, other: int, which: Integers) -> Floats:
-        """Values of some points of a muscle at another, 0 where there are none."""
+    def _known(
+        self, known: Mapping[Link, Floats], one: int, other: int, which: Integers, empty: float
+    ) -> Floats:
+        """Values of some points of a muscle at another, ``empty`` where there are none."""
         found = known.get((one, other))
-        return np.zeros(len(which)) if found is None else found[which]
+        return np.full(len(which), empty) if found is None else found[which]
 
-    def _by_link(self, meeting: Meeting, values: Floats) -> dict[Link, Floats]:
-        """Values (K,) of points that are not zero, for all points (k,) of a muscle at another."""
+    def _by_link(self, meeting: Meeting, values: Floats, empty: float) -> dict[Link, Floats]:
+        """Values (K,) of points, for all points (k,) of a muscle at another: ``empty`` where there
+        are none.
+        """
         found: dict[Link, Floats] = {}
-        for k in np.flatnonzero(values):
+        for k in np.flatnonzero(np.isfinite(values) & (values != empty)):
             one, other = int(meeting.one[k]), int(meeting.other[k])
             body = self.bodies[one]
-            full = found.setdefault((one, other), np.zeros(len(body.points)))
+            full = found.setdefault((one, other), np.full(len(body.points), empty))
             full[np.searchsorted(body.points, meeting.point[k])] = values[k]
         return found
+
+
+def _held_bones(steppers: Sequence[MuscleStepper]) -> tuple[list[int], list[HeldBone]]:
+    """The bones within reach that hold muscles, and the number of the muscle of each."""
+    options = steppers[0].scene.neighbours
+    wanted = [] if options is None else options.bones
+    muscles, bones = [], []
+    for number, stepper in enumerate(steppers):
+        contacts = stepper.contacts
+        for row, (name, field) in enumerate(zip(contacts.bones.names, contacts.bones.fields)):
+            if [stepper.name, name] in wanted:
+                muscles.append(number)
+                bones.append(HeldBone(field, contacts.placed[row]))
+    return muscles, bones
+
+
+def _beside(stepper: MuscleStepper, body: Body, size: float) -> Booleans:
+    """Which (k,) of the points of a muscle lie beside one of its attachments."""
+    points = stepper.model.contact_points()
+    attached = points[stepper.model.attached_bone >= 0]
+    return np.asarray(cKDTree(attached).query(points[body.points])[0] < BESIDE * size)
 
 
 def _near_points(points: Floats, other: cKDTree, reach: float) -> tuple[Integers, Integers]:
@@ -188,15 +257,11 @@ def _near_points(points: Floats, other: cKDTree, reach: float) -> tuple[Integers
 
 def find_links(scene: Scene, names: Sequence[str]) -> list[Link]:
     """Which of the named muscles may touch in the scene's motion: those of its ``pairs``, or all,
-    as far as their swept boxes come near each other. SceneError on an unknown name in ``pairs``.
+    as far as their swept boxes come near each other.
     """
     options = scene.neighbours
     if options is None:
         return []
-    known = [muscle.name for muscle in scene.muscles]
-    for name in sorted({name for pair in options.pairs or [] for name in pair} - {*known}):
-        hint = did_you_mean(name, known)
-        raise SceneError(f"[neighbours] pairs: unknown muscle {name!r}, {hint}")
     wanted = None if options.pairs is None else [frozenset(pair) for pair in options.pairs]
     muscles = [scene.muscle(name) for name in names]
     poses, reach = sampled_poses(scene), from_mm(REACH, scene.units)

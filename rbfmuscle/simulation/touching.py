@@ -14,7 +14,8 @@ give every contact the motion z that it needs,
 
 and ε is what a contact yields for a unit force. A contact between two bodies has a row in the
 matrix of each: that of its point, along the normal, and that of the foot in the neighbour, against
-it.
+it. One that holds bodies together pulls too: -λ_max <= λ_i, and (G λ)_i + ε λ_i = z_i between the
+bounds.
 
 All bodies of a group iterate together: each makes a free step, then the forces of all contacts are
 found, with bones and between bodies, then each goes on. A body whose error is below what is wanted
@@ -37,8 +38,9 @@ TOLERANCE = 2e-5  # violation of a contact, of the body's size, that is left
 PRECISE = 1e-7  # error of the gaps, of the size, for which contact forces are found
 BATCH = 48  # contacts that join those with a force at a time, the deepest first
 ROUNDS = 10  # in which contacts join those that bear a force, in an iteration
-# Gap from which on a contact of two bodies takes part, of the size of the smaller one.
-MET = 0.01
+# Gap from which on a contact of two bodies takes part, of the size of the smaller one; gap up to
+# which one that holds them together does.
+MET, HELD = 0.01, 0.05
 
 
 class Wanted(NamedTuple):
@@ -51,6 +53,14 @@ class Wanted(NamedTuple):
     yields: Floats  # (c,) motion for a unit force
     most: Floats  # (c,) greatest force
     force: Floats  # (c,) first guess
+
+
+NOTHING = Wanted(
+    np.zeros(0, dtype=np.int64),
+    np.zeros(0, dtype=np.int64),
+    np.zeros((0, 3)),
+    *(np.zeros(0) for _ in range(4)),
+)
 
 
 class Rows(Protocol):
@@ -140,8 +150,10 @@ class Meeting:
         their order.
     law : tuple of two (K,) ndarray
         The greatest force at each point, and how far it yields to a unit force.
+    holds : (K,) ndarray of bool
+        Which hold together, and so pull as far as they push.
     allowed : (K,) ndarray
-        Overlap at rest [scene unit].
+        Overlap at rest [scene unit]; a gap, below zero, where a point holds.
     force : (K,) ndarray
         First guess; kept up to date.
     """
@@ -154,6 +166,7 @@ class Meeting:
         own: Sequence[Embedding],
         place: Sequence[NDArray[Any]],
         law: tuple[Floats, Floats],
+        holds: Booleans,
         allowed: Floats,
         force: Floats,
     ) -> None:
@@ -163,6 +176,7 @@ class Meeting:
         self.own = own
         self.place = place
         self.most, self.yields = law
+        self.holds = holds
         self.allowed = allowed
         self.force = force
         bodies = range(len(own))
@@ -210,7 +224,7 @@ class Meeting:
     def joined(self, awake: Booleans) -> Booleans:
         """Which bodies are awake or press on one that is."""
         acting = awake.copy()
-        pressed = (self.force > 0.0) & (awake[self.one] | awake[self.other])
+        pressed = (self.force != 0.0) & (awake[self.one] | awake[self.other])
         acting[self.one[pressed]] = acting[self.other[pressed]] = True
         return acting
 
@@ -223,7 +237,8 @@ class Meeting:
         steps = [solid.step if acts else None for solid, acts in zip(solids, acting, strict=True)]
         self.wants = -self.gap - self.allowed - self.apart(steps)
         # Also where the gap is not known, and so infinite.
-        apart = self.gap > MET * np.minimum(sizes[self.one], sizes[self.other])
+        reach = np.where(self.holds, HELD, MET)
+        apart = self.gap > reach * np.minimum(sizes[self.one], sizes[self.other])
         idle = ~(acting[self.one] | acting[self.other])
         self.wants[apart | idle] = -np.inf
         self.force[apart] = 0.0
@@ -235,7 +250,15 @@ class Meeting:
         place = [part[left[behind]] for part, behind in zip(self.place, self.behind)]
         law = self.most[left], self.yields[left]
         numbers = self.one[left], self.other[left], self.point[left]
-        return Meeting(*numbers, own, place, law, self.allowed[left], self.force[left])
+        known = self.holds[left], self.allowed[left], self.force[left]
+        return Meeting(*numbers, own, place, law, *known)
+
+    def lacking(self, motion: Floats) -> Floats:
+        """How much is lacking (K,) of a motion (K,) that points want: also of one back, where they
+        hold.
+        """
+        back = self.holds & np.isfinite(motion)
+        return np.where(back, np.abs(motion), motion)
 
 
 class Contacts(NamedTuple):
@@ -288,7 +311,7 @@ def meet(solids: Sequence[Moving], acting: Booleans, meeting: Meeting | None = N
     batch = BATCH * len(bodies)
     if meeting is not None:
         meeting.prepare(solids, acting)
-        touching = deepest(meeting.wants, meeting.force, PRECISE * size, batch)
+        touching = deepest(meeting.lacking(meeting.wants), meeting.force, PRECISE * size, batch)
         touching = touching[np.isfinite(meeting.wants[touching])]
     rows: dict[int, Rows] = {}
     stale = set(bodies)
@@ -306,7 +329,7 @@ def meet(solids: Sequence[Moving], acting: Booleans, meeting: Meeting | None = N
                 stale.add(m)
         if meeting is not None:
             lacks = meeting.wants - meeting.apart([motions.get(m) for m in range(len(solids))])
-            more = _more(lacks, touching, TOLERANCE * size, batch)
+            more = _more(meeting.lacking(lacks), touching, TOLERANCE * size, batch)
             if len(more):
                 touching = np.union1d(touching, more)
                 stale |= {*meeting.one[more].tolist(), *meeting.other[more].tolist()} & {*bodies}
@@ -321,7 +344,7 @@ def deepest(wants: Floats, force: Floats, least: float, batch: int) -> Integers:
     """Which contacts bear a force, and the ``batch`` others that want the longest way, more than
     the ``least``; in order.
     """
-    bears = force > 0.0
+    bears = force != 0.0
     lacking = np.flatnonzero((wants > least) & ~bears)
     if len(lacking) > batch:
         lacking = lacking[np.argsort(-wants[lacking], kind="stable")[:batch]]
@@ -373,7 +396,7 @@ def find_forces(
     bodies = np.arange(len(counts))
     one, other = np.repeat(bodies, counts), np.full(counts.sum(), -1)
     row = np.concatenate([np.arange(count) for count in counts])
-    across = other
+    across, least = other, np.zeros(len(one))
     motion, yields, most, force = (
         np.concatenate([getattr(part.wanted, name)[chosen[m]] for m, part in asked.items()])
         for name in ("motion", "yields", "most", "force")
@@ -387,6 +410,8 @@ def find_forces(
         one, other = np.concatenate([one, mine]), np.concatenate([other, theirs])
         row = np.concatenate([row, counts[mine] + _rank(mine, len(counts))])
         across = np.concatenate([across, owned[theirs] + _rank(theirs, len(counts))])
+        pulls = np.where(meeting.holds, -meeting.most, 0.0)
+        least = np.concatenate([least, pulls[touching]])
         motion, yields, most, force = (
             np.concatenate([part, more[touching]])
             for part, more in (
@@ -407,6 +432,7 @@ def find_forces(
         across,
         motion,
         yields,
+        least,
         most,
         force,
         np.empty(int(width.sum())),
@@ -449,16 +475,29 @@ def even_points(points: Floats, free: Integers, spacing: float) -> Integers:
 
 @loop
 def solve_forces(
-    delassus, start, width, one, row, other, across, wants, yields, most, force, moved, tolerance
+    delassus,
+    start,
+    width,
+    one,
+    row,
+    other,
+    across,
+    wants,
+    yields,
+    least,
+    most,
+    force,
+    moved,
+    tolerance,
 ):
     """Contact forces (c,) of a group of bodies, by projected Gauss-Seidel from a first guess.
 
     ``delassus`` holds the matrices of the bodies behind each other: that of body m, ``width[m]``
     wide, from ``start[m]`` on. Contact c is row ``row[c]`` of body ``one[c]``, and row
     ``across[c]`` of body ``other[c]``, each where it is not -1. It ``wants`` a motion, ``yields``
-    one for a unit force, and bears ``most``. ``moved`` holds the motions of the rows behind each
-    other, body m's from Σ width before it on. Returns whether no contact moved by more than the
-    ``tolerance`` in the last sweep.
+    one for a unit force, and bears from ``least`` to ``most``. ``moved`` holds the motions of the
+    rows behind each other, body m's from Σ width before it on. Returns whether no contact moved by
+    more than the ``tolerance`` in the last sweep.
     """
     count = len(wants)
     moved[:] = 0.0
@@ -488,7 +527,7 @@ def solve_forces(
                 here += moved[first[o] + across[c]]
             own = own * (1.0 + 1e-7) + yields[c]
             change = (wants[c] - here - yields[c] * force[c]) / own
-            change = min(max(force[c] + change, 0.0), most[c]) - force[c]
+            change = min(max(force[c] + change, least[c]), most[c]) - force[c]
             if change != 0.0:
                 force[c] += change
                 largest = max(largest, abs(change) * own)

@@ -240,7 +240,10 @@ class TestOtherCommands:
         assert code == 3 and "joint elbow" in said and "add a [[muscle]]" in said
         assert err.splitlines()[-1].startswith("usable; next: rbfmuscle run ")
         found = json.loads(call(capsys, "check", folder / "arm.toml", "--json")[1])
-        assert found["scene"]["units"] == "mm"
+        assert found["scene"]["units"] == "mm" and found["neighbours"] == []
+        code, said, _ = call(capsys, "check", "phantom")
+        lines = [line.strip() for line in said.splitlines() if "can touch" in line]
+        assert code == 0 and any(re.search(r"can touch .*\babductor\b", line) for line in lines)
         muscle = rm.Scene.load(folder / "arm.toml").muscle("biceps")
         held = found["attachments"]
         assert [row["bone"] for row in held] == [a.bone for a in muscle.attachments]

@@ -21,7 +21,10 @@ from rbfmuscle.scene.settings import HEADS
 PAIRS = [["biceps", "brachialis"]]
 TABLES = {
     "contact": (options.ContactOptions, {"initial": "error", "substep_angle": 4.0}),
-    "neighbours": (options.NeighbourOptions, {"pairs": PAIRS}),
+    "neighbours": (
+        options.NeighbourOptions,
+        {"pairs": PAIRS, "together": True, "bones": [["biceps", "upper"]]},
+    ),
     "detect.tunnelling": (
         options.TunnellingOptions,
         {"angle": 120.0, "action": "report"},

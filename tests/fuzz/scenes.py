@@ -267,6 +267,7 @@ TABLES = (
     ("contact", "substep_angle", [1e-300, 1e-9, 1e-3, 0.5, 90, 91, 0, -1]),
     ("contact", "initial", ["keep", "error", "resolv"]),
     ("neighbours", "pairs", [[], [["muscle", "muscle"]], [["a", "b"]], [["muscle"]], 1]),
+    ("neighbours", "bones", [[], [["muscle", "pelvis"]], [["a", "b"]], [["muscle"]], 1]),
     ("detect", "tunnelling", [{}, {"angle": 1e-300}, {"action": "report"}, 1]),
     ("output", "surfaces", [False, True, {"format": "stl"}, {"format": "glb"}, {"format": "x"}]),
     ("scene", "units", ["m", "cm", "km", 1]),

@@ -1,5 +1,8 @@
 """Overlap and gaps of shown surfaces of muscles against known answers: balls and boxes."""
 
+import itertools
+
+import igl
 import numpy as np
 import pytest
 import toy_scene as toy
@@ -145,6 +148,11 @@ def test_what_is_cut_away_in_the_drawing_stays_an_overlap_of_the_material():
 def test_check_lists_muscles_whose_meshes_overlap():
     made, _ = toy.neighbour_scene([{}], gap=-1.0, neighbours=None)
     (said,) = [f for f in check_scene(made) if f.place == "lower and upper"]
-    assert said.level == "note" and "overlap by 0.998 mm" in said.message
+    assert said.level == "note" and "overlap by 0.998 mm, " in said.message
+    inside = [
+        np.count_nonzero(igl.signed_distance(a.vertices, b.vertices, b.faces)[0] < 0.0)
+        for a, b in itertools.permutations([muscle.mesh for muscle in made.muscles])
+    ]
+    assert f"{sum(inside)} vertices" in said.message
     apart, _ = toy.neighbour_scene([{}], gap=1.0, neighbours=None)
     assert not [f for f in check_scene(apart) if f.place == "lower and upper"]

@@ -10,6 +10,8 @@ import rbfmuscle as rm
 from rbfmuscle.models import build_models
 from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.options import NeighbourOptions
+from rbfmuscle.simulation import neighbours
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 
@@ -17,7 +19,7 @@ pytestmark = pytest.mark.numeric
 OPTIONS = {"centres": 150, "nodes": 150, "samples": 1200}
 
 
-def _scene(muscles, frames, slides):
+def _scene(muscles, frames, slides, model=None):
     """Muscles, each a mesh and masks of what holds its vertices, between bones that shift."""
     scene = rm.Scene("press", units="mm")
     scene.add_bone("floor", trimesh.creation.box([4, 4, 4]).apply_translation([0, 0, -200]))
@@ -26,7 +28,7 @@ def _scene(muscles, frames, slides):
         scene.add_bone(name, trimesh.creation.box([4, 4, 4]).apply_translation(far))
         scene.add_joint(f"of_{name}", "floor", name, (0, 0, 0), {"by": axis}, type="slide")
     for name, (mesh, ends) in muscles.items():
-        scene.add_muscle(name, mesh, attach=held(**ends), model={"name": "rbf", **OPTIONS})
+        scene.add_muscle(name, mesh, attach=held(**ends), model=model or {"name": "rbf", **OPTIONS})
     scene.motion = Motion([{f"of_{k}.by": v for k, v in frame.items()} for frame in frames])
     return scene
 
@@ -101,17 +103,102 @@ def test_blocks_bulge_alike(blocks):
     assert widths[0] > 2 * BLOCK + 0.3 and widths[0] == pytest.approx(widths[1], abs=0.1)
 
 
+def _borne(model, some=slice(None)):
+    """Force (3,) that the springs of some held points exert on a muscle at rest, over 2 μ."""
+    solid, state = model.model, model.state
+    stretch = state.anchors - solid.embedding.some(solid.held).of(state.nodes)
+    return (solid.springs[:, some] @ stretch[some]).sum(axis=0)
+
+
 def test_forces_between_blocks_are_those_that_their_bones_feel(blocks):
     loop, models = blocks
     between = _total_force(loop, (0, 0, 1))
     pressed = between["upper", "lower"] - between["lower", "upper"]
     assert pressed > 0.0
     for name, sign in (("upper", 1.0), ("lower", -1.0)):
-        solid, state = models[name].model, models[name].state
-        # What the springs of the held points bear along z, at rest with all else.
-        stretch = state.anchors - solid.embedding.some(solid.held).of(state.nodes)
-        borne = (solid.springs @ stretch)[:, 2].sum()
-        assert sign * borne == pytest.approx(-pressed, rel=0.01)
+        assert sign * _borne(models[name])[2] == pytest.approx(-pressed, rel=0.01)
+
+
+@pytest.mark.parametrize("model", ["rbf", "pbd"])
+def test_blocks_pulled_apart_part_or_stay_together_and_bear_the_pull(model):
+    lower = box_mesh([-BLOCK, -BLOCK, -30], [BLOCK, BLOCK, -0.05])
+    upper = box_mesh([-BLOCK, -BLOCK, 0.05], [BLOCK, BLOCK, 30])
+    muscles = {
+        "lower": (lower, {"floor": lower.vertices[:, 2] < -29}),
+        "upper": (upper, {"press": upper.vertices[:, 2] > 29}),
+    }
+    frames = [{"press": s} for s in (0.0, 0.5, 1.0, 1.5, 2.0)]
+    gaps = {}
+    for together in (False, True):
+        options = {"model": "pbd"} if model == "pbd" else {}
+        scene = _scene(muscles, frames, {"press": (0, 0, 1)}, **options)
+        scene.neighbours = NeighbourOptions(together=together)
+        loop, models = _run(scene)
+        meshes = [np.array(models[name].material_mesh()[0]) for name in ("lower", "upper")]
+        rest = [scene.muscle(name).mesh.vertices for name in ("lower", "upper")]
+        if model == "rbf":
+            rest = [models[name].rest.samples for name in ("lower", "upper")]
+        below, above = (
+            points[(np.abs(at[:, 2]) < 0.06) & (np.abs(at[:, :2]).max(axis=1) < 0.8 * BLOCK)][:, 2]
+            for points, at in zip(meshes, rest)
+        )
+        gaps[together] = above.mean() - below.mean()
+    assert gaps[False] == pytest.approx(2.1, abs=0.02)
+    assert gaps[True] == pytest.approx(0.1, abs=0.05 if model == "rbf" else 0.25)
+    if model == "rbf":
+        between = _total_force(loop, (0, 0, 1))
+        pulled = between["lower", "upper"] - between["upper", "lower"]
+        assert pulled > 0.0
+        for name, sign in (("upper", 1.0), ("lower", -1.0)):
+            assert sign * _borne(models[name])[2] == pytest.approx(pulled, rel=0.01)
+
+
+@pytest.mark.parametrize("model", ["rbf", "pbd"])
+def test_muscle_held_to_a_bone_stays_there(model):
+    block = box_mesh([-BLOCK, -BLOCK, 0.05], [BLOCK, BLOCK, 30])
+    muscles = {"block": (block, {"press": block.vertices[:, 2] > 29})}
+    frames = [{"press": s} for s in (0.0, 0.5, 1.0, 1.5, 2.0)]
+    for stays in (False, True):
+        options = {"model": "pbd"} if model == "pbd" else {}
+        scene = _scene(muscles, frames, {"press": (0, 0, 1)}, **options)
+        plate = trimesh.creation.box([60, 60, 4]).apply_translation([0, 0, -2])
+        scene.add_bone("plate", plate)
+        scene.neighbours = NeighbourOptions(bones=[["block", "plate"]] if stays else [])
+        _, models = _run(scene)
+        points = np.array(models["block"].contact_points())
+        rest = models["block"].model.points if model == "rbf" else models["block"].rest.vertices
+        face = (rest[:, 2] < 0.06) & (np.abs(rest[:, :2]).max(axis=1) < 0.8 * BLOCK)
+        low = points[face][:, 2]
+        near = 0.05 if model == "rbf" else 0.25  # of a mesh every third vertex or so is held
+        assert low.mean() == pytest.approx(0.05 if stays else 2.05, abs=near)
+
+
+def _driven_together(monkeypatch, exempt):
+    """Two blocks side by side whose attachments are driven into each other: greatest pressure in
+    them, over 2 μ, and how many of their contacts bear all that they can.
+    """
+    if not exempt:
+        monkeypatch.setattr(neighbours, "BESIDE", 0.0)
+    muscles = {}
+    for name, low, high in (("one", -10, -0.05), ("two", 0.05, 10)):
+        mesh = box_mesh([low, -5, -30], [high, 5, 30])
+        z = mesh.vertices[:, 2]
+        muscles[name] = (mesh, {name: z < -26, "floor": z > 26})
+    frames = [{"one": s, "two": -s} for s in (0.0, 0.5, 1.0, 1.5)]
+    loop, models = _run(_scene(muscles, frames, {"one": (1, 0, 0), "two": (1, 0, 0)}))
+    (group,) = loop.groups
+    full = 0
+    for (one, _), force in group.neighbours.state.forces.items():
+        body = group.neighbours.bodies[one]
+        most, _ = group.neighbours.state.bodies[one].contact_law(body.points, body.area)
+        full += int((force >= most).sum())
+    return max(np.abs(model.state.pressures).max() for model in models.values()), full
+
+
+def test_attachments_side_by_side_that_are_driven_together_crush_less(monkeypatch):
+    pressure, full = _driven_together(monkeypatch, True)
+    unexempt, more = _driven_together(monkeypatch, False)
+    assert pressure < 0.85 * unexempt and full < more
 
 
 def _ring(order=(0, 1, 2), names="abc"):
@@ -203,13 +290,17 @@ def test_overlap_at_rest_is_kept_and_moves_nothing():
     muscles = {}
     for name, side in (("one", -1.0), ("other", 1.0)):
         mesh = ellipsoid((8, 8, 25), (0, 7.2 * side, 0), subdivisions=3)
-        muscles[name] = (mesh, {"floor": np.abs(mesh.vertices[:, 2]) > 19})
-    scene = _scene(muscles, [{}], {})
+        z = mesh.vertices[:, 2]
+        muscles[name] = (mesh, {"floor": z < -19, "stretch": z > 19})
+    scene = _scene(muscles, [{"stretch": 0.0}, {"stretch": 0.5}], {"stretch": (0, 0, 1)})
     _, models = _run(scene)
-    for model in models.values():
-        moved = np.linalg.norm(model.contact_points() - model.model.points, axis=1)
-        assert moved.max() < 0.02
     assert _overlap(models["one"], models["other"]) > 1.0
+    # Stretched, they part rather than press: what they do alone they do together.
+    scene.neighbours = None
+    _, alone = _run(scene)
+    for name, model in models.items():
+        moved = np.linalg.norm(model.contact_points() - alone[name].contact_points(), axis=1)
+        assert moved.max() < 0.02
 
 
 def test_gap_and_normal_are_those_of_the_surface_where_it_has_been_carried():

@@ -16,6 +16,7 @@ from rbfmuscle.scene.file import attachment_file
 from rbfmuscle.scene.frames import parse_slice
 from rbfmuscle.scene.names import new_name
 from rbfmuscle.scene.objects import from_mm
+from rbfmuscle.scene.options import NeighbourOptions
 from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.scene.settings import parse_settings
 from rbfmuscle.validation import SceneError, UsageError
@@ -128,6 +129,16 @@ class TestMistakes:
             ("format = 2\n", "", r"\[scene\]: key format is missing, write format = 2$"),
             ("[classes.main]", "[defaults]", r"'defaults', \[classes.main\] holds"),
             ("units =", "left_out = []\nunits =", r"'left_out', did you mean 'missing_bones'\?"),
+            (
+                "[classes.main]",
+                '[neighbours]\npairs = [["biceps", "bicep"]]\n\n[classes.main]',
+                r"\[neighbours\] pairs: unknown muscle 'bicep', did you mean 'biceps'",
+            ),
+            (
+                "[classes.main]",
+                '[neighbours]\nbones = [["biceps", "uper"]]\n\n[classes.main]',
+                r"\[neighbours\] bones: unknown bone 'uper', did you mean 'upper'",
+            ),
         ],
     )
     def test_one_line_names_file_place_and_remedy(self, folder, old, new, message):
@@ -249,6 +260,15 @@ class TestOptions:
     def test_unknown_settings(self, key, message):
         with pytest.raises(UsageError, match=message):
             built().with_options({key: 1})
+
+    def test_unknown_neighbours(self):
+        scene = built()
+        for key in ("pairs", "bones"):
+            with pytest.raises(UsageError, match=f"{key}: unknown muscle 'bices', did you mean"):
+                scene.with_options({f"neighbours.{key}": [["bices", "biceps"]]})
+        scene.neighbours = NeighbourOptions(pairs=[["biceps", "brachialis"]])
+        with pytest.raises(SceneError, match="unknown muscle 'brachialis'"):
+            require_complete(scene)
 
     def test_settings_from_text(self):
         texts = [

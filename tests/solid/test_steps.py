@@ -105,6 +105,7 @@ def test_forces_between_two_solids_are_those_of_one_with_both_matrices(rng):
         np.array([-1, 0, -1]),
         wants,
         np.zeros(3),
+        np.zeros(3),
         np.full(3, np.inf),
         force,
         np.empty(4),
