@@ -24,7 +24,7 @@ import trimesh
 from evidence import ROOT, data_folder, write_evidence
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.coarse import simplified
+from rbfmuscle.geometry.surfaces import simplified
 from rbfmuscle.importers.guess.guess import guess_scene
 
 COLUMNS = ["confidence", "guesses", "wrong", "%"]

@@ -11,8 +11,8 @@ import numpy as np
 
 from pbd_baseline.topology import Topology, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.frames import quaternion_matrix, rotate
 from rbfmuscle.geometry.harmonic import cotangent_laplacian, graph_laplacian
-from rbfmuscle.geometry.rotations import quaternion_matrix, rotate
 from rbfmuscle.loops import loop
 
 # Newton steps for the rotations: warm starts need one or two, a turn by 30 degrees at once four.

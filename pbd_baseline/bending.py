@@ -6,7 +6,7 @@ import numpy as np
 
 from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.rotations import cross, dot
+from rbfmuscle.geometry.frames import cross, dot
 from rbfmuscle.loops import loop
 
 # A gradient shorter than this share of its natural size belongs to a collapsed element: it has no

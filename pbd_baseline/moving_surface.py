@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.exact_distance import nearest_weights, triangle_normal
+from rbfmuscle.geometry.mesh_distance import winding_loop
 from rbfmuscle.geometry.surfaces import touching_balls, vertex_normals
-from rbfmuscle.geometry.triangles import nearest_weights, triangle_normal
-from rbfmuscle.geometry.winding import winding_loop
 from rbfmuscle.loops import loop
 
 # Greatest thickness of a muscle, relative to rest.

@@ -15,9 +15,9 @@ from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import RestState
 from pbd_baseline.settling import MeshSettling, Sweeps
 from pbd_baseline.shapes import METHODS, Method
+from rbfmuscle.geometry.frames import diameter
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.interpolation import SurfaceInterpolation
-from rbfmuscle.geometry.rest_frame import diameter
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.muscles import attachment_frames

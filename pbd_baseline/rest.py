@@ -13,8 +13,8 @@ from pbd_baseline.topology import Topology, cache_order
 from pbd_baseline.weights import even_weights
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.fibres import fibre_directions
 from rbfmuscle.geometry.harmonic import harmonic_weights, surface_gradient
+from rbfmuscle.geometry.lines import fibre_directions
 from rbfmuscle.geometry.surfaces import edge_lengths, vertex_normals
 from rbfmuscle.scene.muscles import attachment_ends, ordered_muscle
 from rbfmuscle.scene.objects import Muscle

@@ -13,7 +13,7 @@ import numpy as np
 
 from pbd_baseline.moving_surface import MovingSurface
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.embedding import Embedding
+from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.geometry.surfaces import farthest_move
 from rbfmuscle.simulation.touching import NOTHING, Wanted
 

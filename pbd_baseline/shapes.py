@@ -15,7 +15,7 @@ from pbd_baseline.fibres import edge_stiffness
 from pbd_baseline.options import PBDOptions
 from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.rotations import turned_quaternions
+from rbfmuscle.geometry.frames import turned_quaternions
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.loops import loop
 

@@ -12,7 +12,7 @@ import numpy as np
 from rbfmuscle.bones.mesh import prepare_bone
 from rbfmuscle.geometry.arrays import Booleans, Floats, MeshLike
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.winding import inside_test
+from rbfmuscle.geometry.mesh_distance import inside_test
 from rbfmuscle.validation import check_mesh, check_points
 
 # Share of the longest side that a baseline's grid reaches beyond the mesh.

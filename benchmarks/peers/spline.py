@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from peers.detectors import PointDetector, grid_of, sample_nodes
 from rbfmuscle.geometry.arrays import MeshLike
-from rbfmuscle.geometry.bsplines import bspline_weights
+from rbfmuscle.geometry.interpolation import bspline_weights
 from rbfmuscle.validation import check_points
 
 

@@ -18,7 +18,7 @@ import trimesh
 from scipy.spatial import ConvexHull, cKDTree
 
 from rbfmuscle.anatomy.names import MuscleFacts, name_facts
-from rbfmuscle.geometry.vectors import across, box_size, unit
+from rbfmuscle.geometry.arrays import across, box_size, unit
 from rbfmuscle.scene.meshes.repair import boundary_rims
 from rbfmuscle.scene.scene import Scene
 

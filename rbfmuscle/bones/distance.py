@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, nearest_triangle, record_square
-from rbfmuscle.geometry.triangles import (
+from rbfmuscle.geometry.exact_distance import (
     BX,
     CORNER,
     CX,
@@ -23,7 +22,11 @@ from rbfmuscle.geometry.triangles import (
     FIRST,
     INVERSE_BC,
     INVERSE_CA,
+    STACK,
+    ExactDistance,
     nearest_in_frame,
+    nearest_triangle,
+    record_square,
 )
 from rbfmuscle.loops import loop
 

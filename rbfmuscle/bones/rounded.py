@@ -15,8 +15,8 @@ import numpy as np
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.bsplines import bspline_sum
-from rbfmuscle.geometry.rest_frame import RestFrame, box_corners
+from rbfmuscle.geometry.frames import RestFrame, box_corners
+from rbfmuscle.geometry.interpolation import bspline_sum
 from rbfmuscle.loops import loop
 
 SIDE = 4  # cells along a block

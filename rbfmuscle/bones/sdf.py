@@ -9,12 +9,11 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.bones.distance import BoneArrays, Memory, bone_arrays, distance_loop, winding_loop
 from rbfmuscle.bones.mesh import prepare_bone
-from rbfmuscle.geometry.arrays import Floats, MeshLike
+from rbfmuscle.geometry.arrays import Floats, MeshLike, box_size, unit
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.rest_frame import numbered_by_place, on_one_line
+from rbfmuscle.geometry.frames import numbered_by_place, on_one_line
 from rbfmuscle.geometry.solids import outer_surface
 from rbfmuscle.geometry.threads import in_chunks
-from rbfmuscle.geometry.vectors import box_size, unit
 from rbfmuscle.validation import MeshError, check_mesh, check_points
 
 log = logging.getLogger(__name__)

@@ -10,9 +10,8 @@ from itertools import groupby
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, to_world
 from rbfmuscle.geometry.surfaces import vertex_normals
-from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.appearance import VIEWS
 from rbfmuscle.run.data import RunData, frame_caption

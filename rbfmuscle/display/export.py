@@ -23,9 +23,8 @@ from rbfmuscle.display.animation import (
     read_animation,
 )
 from rbfmuscle.folders import OutputFolder
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, to_local, to_world
 from rbfmuscle.geometry.solids import SolidDistance
-from rbfmuscle.geometry.vectors import to_local, to_world
 from rbfmuscle.run.appearance import linear_rgb, rgb, stretch_colours
 from rbfmuscle.run.data import RunData, open_run
 from rbfmuscle.run.vtk_files import NORMALS, Collection, write_fibres, write_vtp

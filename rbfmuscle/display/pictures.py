@@ -12,10 +12,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from rbfmuscle.folders import write_whole
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, to_world
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.loops import loop
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.appearance import rgb, tendon_mesh

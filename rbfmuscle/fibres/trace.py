@@ -9,11 +9,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.fibres import nearest_pieces
-from rbfmuscle.geometry.lines import distance_along, points_along
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, box_size, unit
+from rbfmuscle.geometry.lines import distance_along, nearest_pieces, points_along
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.vectors import box_size, unit
 from rbfmuscle.scene.bone import BoneDistance
 
 CELLS = 30_000  # of a muscle, about

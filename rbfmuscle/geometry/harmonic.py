@@ -7,7 +7,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
-from rbfmuscle.geometry.rotations import matrix_quaternion
+from rbfmuscle.geometry.frames import matrix_quaternion
 from rbfmuscle.geometry.surfaces import face_normals
 from rbfmuscle.loops import loop
 

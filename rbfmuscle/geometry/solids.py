@@ -16,9 +16,8 @@ from scipy.sparse.csgraph import connected_components
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.exact_distance import faces_across
-from rbfmuscle.geometry.mesh_distance import MeshDistance
+from rbfmuscle.geometry.mesh_distance import MeshDistance, inside_test
 from rbfmuscle.geometry.surfaces import repeated_faces, sorted_half_edges
-from rbfmuscle.geometry.winding import inside_test
 
 # Parts whose union has less volume than they have together, by more than this share, overlap.
 LEAST_OVERLAP = 1e-9

@@ -13,12 +13,11 @@ import trimesh
 from scipy.ndimage import binary_fill_holes, find_objects, gaussian_filter, map_coordinates
 from scipy.ndimage import label as connected
 
-from rbfmuscle.geometry.arrays import Array, Booleans, Floats
+from rbfmuscle.geometry.arrays import Array, Booleans, Floats, to_world
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.exact_distance import faces_across
 from rbfmuscle.geometry.solids import label_shells
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normals
-from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.validation import BROKEN_FILE, MeshError, UsageError
 
 # A label's number is its value in its layer, and this much more for each layer before.

@@ -14,12 +14,11 @@ import scipy.sparse as sparse
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, to_local
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.lines import distance_along, line_length, points_along
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import connected_vertices, vertex_areas
-from rbfmuscle.geometry.vectors import to_local
 from rbfmuscle.loops import loop
 from rbfmuscle.metrics.rows import bones_about
 from rbfmuscle.scene.bone import BoneDistance

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, to_world
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import EdgeLengths, label_sheets, mesh_volume
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
 from rbfmuscle.metrics.neighbours import InputNeighbours, NeighbourMeasures, Shown
 from rbfmuscle.metrics.quantities import QUANTITIES, percentiles

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, to_world
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, percentiles, unit_text
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.joints import all_coordinates

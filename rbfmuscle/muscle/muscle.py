@@ -7,8 +7,8 @@ import numpy as np
 
 from rbfmuscle.bones.rounded import round_bone
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.fibres import fibre_directions
-from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.frames import RestFrame
+from rbfmuscle.geometry.lines import fibre_directions
 from rbfmuscle.muscle.activation import contracting_fibres, descending_limb
 from rbfmuscle.muscle.fibres import along_fibres, held_at_insertion
 from rbfmuscle.muscle.options import RBFOptions

@@ -9,7 +9,7 @@ import numpy as np
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
-from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.frames import RestFrame
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.extraction.surface import extract_surface
 from rbfmuscle.implicit.field import FieldFit

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.rest_frame import RestFrame, principal_axes
+from rbfmuscle.geometry.frames import RestFrame, principal_axes
 from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.muscle.placement import choose_centres, place_points

@@ -17,11 +17,9 @@ import numpy as np
 import rbfmuscle
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.folders import OutputFolder, write_whole
-from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.coarse import simplified
-from rbfmuscle.geometry.surfaces import EdgeStretch
+from rbfmuscle.geometry.arrays import Floats, Integers, to_world
+from rbfmuscle.geometry.surfaces import EdgeStretch, simplified
 from rbfmuscle.geometry.threads import each, thread_count
-from rbfmuscle.geometry.vectors import to_world
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.run.appearance import muscle_groups, tendon_mesh

@@ -8,10 +8,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.geometry.arrays import Booleans, Floats, box_size
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import geodesic, surface_graph
-from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.frames import interpolate, read_storage
 from rbfmuscle.scene.objects import Motion, Muscle
 from rbfmuscle.scene.options import (

@@ -12,11 +12,10 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, box_size
+from rbfmuscle.geometry.frames import moved_box
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.rest_frame import moved_box
 from rbfmuscle.geometry.surfaces import vertex_areas
-from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.muscles import attachment_ends, check_place, check_size

@@ -14,10 +14,9 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.rest_frame import numbered_by_place
+from rbfmuscle.geometry.arrays import Floats, Integers, box_size
+from rbfmuscle.geometry.frames import numbered_by_place
 from rbfmuscle.geometry.surfaces import vertex_areas
-from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.scene.activation import (
     check_activation,
     contraction_keys,

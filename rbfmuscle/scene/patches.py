@@ -10,8 +10,7 @@ import trimesh
 from pydantic import BeforeValidator, ValidationInfo, model_validator
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.vectors import box_size
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, box_size
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.meshes.read import MeshTransform, read_part, read_vertex_array
 from rbfmuscle.scene.meshes.repair import ReadMesh

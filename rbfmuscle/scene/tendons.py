@@ -19,9 +19,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, across, to_local, to_world, unit
 from rbfmuscle.geometry.lines import distance_along, line_length, points_along, taut_line
-from rbfmuscle.geometry.vectors import across, to_local, to_world, unit
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.scene.options import TENDON_STRAIN

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from rbfmuscle.bones.distance import Memory
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.geometry.frames import moved_box
 from rbfmuscle.scene.tendons import AT_REST
 from rbfmuscle.validation import check_finite, check_points
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.geometry.frames import moved_box
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.motion import bone_poses, completed, rest_coordinates

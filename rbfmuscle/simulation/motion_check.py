@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.geometry.frames import moved_box
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import Finding
 from rbfmuscle.scene.motion import bone_poses

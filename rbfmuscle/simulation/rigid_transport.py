@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.geometry.frames import RestFrame, diameter
 from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts

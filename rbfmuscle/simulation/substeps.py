@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.geometry.frames import RestFrame, diameter
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.joints import Coordinate, all_coordinates

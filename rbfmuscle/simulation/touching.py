@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.embedding import Embedding
+from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.loops import loop
 
 SWEEPS = 200  # of the Gauss-Seidel method, at most

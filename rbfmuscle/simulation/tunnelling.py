@@ -17,10 +17,16 @@ import numpy as np
 
 from rbfmuscle.bones.distance import distance_at
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.exact_distance import STACK
-from rbfmuscle.geometry.triangles import BX, CX, CY, INVERSE_BC, INVERSE_CA, nearest_in_frame
-from rbfmuscle.geometry.vectors import to_local
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, to_local
+from rbfmuscle.geometry.exact_distance import (
+    BX,
+    CX,
+    CY,
+    INVERSE_BC,
+    INVERSE_CA,
+    STACK,
+    nearest_in_frame,
+)
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, Fences

@@ -11,7 +11,7 @@ matrices and the forces on the nodes another; between them processors treat seve
 
 import numpy as np
 
-from rbfmuscle.geometry.rotations import cross, dot, quaternion_matrix, turn_towards
+from rbfmuscle.geometry.frames import cross, dot, quaternion_matrix, turn_towards
 from rbfmuscle.loops import loop
 from rbfmuscle.solid.lattice import GROUPS as POINTS
 

@@ -28,8 +28,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.embedding import Embedding
-from rbfmuscle.geometry.rest_frame import RestFrame, diameter
+from rbfmuscle.geometry.frames import RestFrame, diameter
+from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.solid.kernels import add_rows
 from rbfmuscle.solid.lattice import Embedding as LatticePoints
 from rbfmuscle.solid.lattice import Lattice

@@ -23,7 +23,7 @@ from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.embedding import Embedding, carry
+from rbfmuscle.geometry.interpolation import Embedding, carry
 from rbfmuscle.simulation.touching import (
     TOLERANCE,
     Contacts,

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.frames import turned_quaternions
 from rbfmuscle.geometry.harmonic import exponential_loop, logarithm_loop
-from rbfmuscle.geometry.rotations import turned_quaternions
 from rbfmuscle.solid.model import ANTI_BUCKLING_TENSION, GREATEST_TENSION, SolidModel
 
 # Greatest multiple of the last sub-step's correction that the next one starts with, and the least

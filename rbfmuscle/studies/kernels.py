@@ -36,8 +36,8 @@ from rbfmuscle.display.page import (
 from rbfmuscle.display.plots import Point, Track, front_plot, line_plot
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
+from rbfmuscle.geometry.frames import principal_axes
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.rest_frame import principal_axes
 from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, vertex_areas
 from rbfmuscle.geometry.threads import blas_limited, cores_limited, each, threads_limited
 from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets

@@ -13,8 +13,8 @@ import numpy as np
 
 from rbfmuscle.fibres.bundle import build_bundles
 from rbfmuscle.folders import OutputFolder
+from rbfmuscle.geometry.arrays import box_size
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.geometry.vectors import box_size
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.models import build_models
 from rbfmuscle.run.writer import write_csv

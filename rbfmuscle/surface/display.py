@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
-from rbfmuscle.geometry.rest_frame import RestFrame, principal_axes
+from rbfmuscle.geometry.frames import RestFrame, principal_axes
 from rbfmuscle.geometry.surfaces import face_normals, opposite_half_edges, vertex_normals
 from rbfmuscle.implicit.placement.cached import cached_sample
 from rbfmuscle.loops import loop

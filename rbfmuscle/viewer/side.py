@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import trimesh
 
-from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.coarse import clustered
+from rbfmuscle.geometry.arrays import Floats, Integers, to_world
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import EdgeStretch, joined_meshes, mesh_volume
-from rbfmuscle.geometry.vectors import to_world
+from rbfmuscle.geometry.surfaces import EdgeStretch, clustered, joined_meshes, mesh_volume
 from rbfmuscle.metrics.rows import surface_depth
 from rbfmuscle.run.appearance import (
     BONE_COLOUR,

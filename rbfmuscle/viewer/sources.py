@@ -11,9 +11,8 @@ import numpy as np
 from rbfmuscle.anatomy.bones import orient_scene
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.fibres.bundle import build_bundles
-from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.coarse import clustered
-from rbfmuscle.geometry.vectors import unit
+from rbfmuscle.geometry.arrays import Floats, Integers, unit
+from rbfmuscle.geometry.surfaces import clustered
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.metrics.verdict import describe_doubts

@@ -12,7 +12,7 @@ from rbfmuscle import cache
 from rbfmuscle.bones import rounded
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.cache import SUFFIX, cache_path, content_key, load_arrays, store_arrays
-from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.frames import RestFrame
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ import trimesh
 
 from rbfmuscle.bones.rounded import ROUNDING, WIDE, RoundedBone, round_bone, rounded_at
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.frames import RestFrame
 
 SPACING = 1.5
 BOX = np.array([[-30.0] * 3, [30.0] * 3])

@@ -9,8 +9,8 @@ import trimesh
 from toy_scene import held
 
 import rbfmuscle as rm
-from rbfmuscle.geometry.fibres import fibre_directions
-from rbfmuscle.geometry.rest_frame import RestFrame, numbered_by_place
+from rbfmuscle.geometry.frames import RestFrame, numbered_by_place
+from rbfmuscle.geometry.lines import fibre_directions
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints import rotation_about

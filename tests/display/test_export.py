@@ -12,7 +12,7 @@ from blend_model import arm_files
 
 from rbfmuscle.cli.options import one_line
 from rbfmuscle.display.export import _file_name, export_run
-from rbfmuscle.geometry.coarse import simplified
+from rbfmuscle.geometry.surfaces import simplified
 from rbfmuscle.recording import Run, simulate
 from rbfmuscle.run.info import FORMAT
 from rbfmuscle.run.vtk_files import Collection, read_vtp, write_vtp

@@ -6,10 +6,8 @@ import trimesh
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.geometry.bsplines import bspline_sum, bspline_weights
-from rbfmuscle.geometry.coarse import clustered, simplified
-from rbfmuscle.geometry.fibres import nearest_pieces
-from rbfmuscle.geometry.rest_frame import (
+from rbfmuscle.geometry.arrays import across, box_size, to_local, to_world, unit
+from rbfmuscle.geometry.frames import (
     BoneFrame,
     RestFrame,
     box_corners,
@@ -17,9 +15,11 @@ from rbfmuscle.geometry.rest_frame import (
     on_one_line,
     principal_axes,
 )
+from rbfmuscle.geometry.interpolation import bspline_sum, bspline_weights
+from rbfmuscle.geometry.lines import nearest_pieces
+from rbfmuscle.geometry.mesh_distance import inside_test, winding_loop
 from rbfmuscle.geometry.solids import SolidDistance, label_shells, outer_surface
-from rbfmuscle.geometry.vectors import across, box_size, to_local, to_world, unit
-from rbfmuscle.geometry.winding import inside_test, winding_loop
+from rbfmuscle.geometry.surfaces import clustered, simplified
 
 POINTS = np.random.default_rng(4).normal(size=(60, 3)) * [9.0, 4.0, 1.5] + [3.0, -2.0, 8.0]
 TURN = Rotation.from_rotvec([0.4, -1.0, 0.7]).as_matrix()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from rbfmuscle.geometry.frames import diameter
 from rbfmuscle.geometry.lines import (
     STEEPEST,
     distance_along,
@@ -12,7 +13,6 @@ from rbfmuscle.geometry.lines import (
     taut_line,
     tube_mesh,
 )
-from rbfmuscle.geometry.rest_frame import diameter
 
 CORNER = np.array([[0.0, 0, 0], [3.0, 0, 0], [3.0, 4.0, 0]])
 UP = np.array([0.0, 1.0, 0.0])

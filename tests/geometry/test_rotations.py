@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.geometry.rotations import (
+from rbfmuscle.geometry.frames import (
     cross,
     dot,
     matrix_quaternion,

@@ -9,7 +9,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.crossing import FaceTree
-from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.exact_distance import nearest_weights
+from rbfmuscle.geometry.frames import RestFrame
 from rbfmuscle.geometry.surfaces import (
     EdgeLengths,
     edge_lengths,
@@ -20,7 +21,6 @@ from rbfmuscle.geometry.surfaces import (
     vertex_areas,
     vertex_normals,
 )
-from rbfmuscle.geometry.triangles import nearest_weights
 
 BOX = trimesh.creation.box((2.0, 3.0, 4.0)).subdivide()
 VERTICES, FACES = np.array(BOX.vertices), np.array(BOX.faces)

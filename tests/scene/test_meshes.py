@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from fuzz.meshes import write_mesh
 
-from rbfmuscle.geometry.winding import inside_test
+from rbfmuscle.geometry.mesh_distance import inside_test
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.meshes.read import prepare_mesh, read_mesh
 from rbfmuscle.validation import MeshError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toy_scene import ToyMuscle, attach, box, ellipsoid, muscle, scene, sphere
 
-from rbfmuscle.geometry.rest_frame import moved_box
+from rbfmuscle.geometry.frames import moved_box
 from rbfmuscle.scene.joints import rotation_about
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach, Fences
 from rbfmuscle.simulation.frame_loop import simulate_frames

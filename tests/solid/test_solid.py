@@ -12,7 +12,7 @@ from conftest import ROOT
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.geometry.rest_frame import RestFrame
+from rbfmuscle.geometry.frames import RestFrame
 from rbfmuscle.models import build_models
 from rbfmuscle.muscle.muscle import RBFMuscle
 from rbfmuscle.scene.joints import rotation_about

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rbfmuscle.geometry.embedding import Embedding, carry
+from rbfmuscle.geometry.interpolation import Embedding, carry
 from rbfmuscle.simulation.touching import Contacts, Wanted, find_forces, solve_forces
 from rbfmuscle.solid.contact import Mobility, Obstacles, fill_mobilities
 from rbfmuscle.solid.kernels import (

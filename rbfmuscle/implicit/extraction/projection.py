@@ -5,7 +5,7 @@ volume.
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.fields import ClipDistance, Field
+from rbfmuscle.geometry.mesh_distance import ClipDistance, Field
 from rbfmuscle.geometry.point_grid import Obstacles, push_off
 from rbfmuscle.geometry.surfaces import volume_cubic
 

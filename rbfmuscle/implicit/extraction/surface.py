@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.fields import ClipDistance, Field
+from rbfmuscle.geometry.mesh_distance import ClipDistance, Field
 from rbfmuscle.geometry.point_grid import Obstacles
 from rbfmuscle.geometry.surfaces import label_sheets, mesh_volume
 from rbfmuscle.implicit.extraction.projection import Projector

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry import surfaces
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.triangles import nearest_weights
+from rbfmuscle.geometry.exact_distance import nearest_weights
 from rbfmuscle.implicit.field import RBFField
 from rbfmuscle.implicit.placement.clustering import FineMesh, cluster_mesh, refine_mesh
 from rbfmuscle.loops import loop

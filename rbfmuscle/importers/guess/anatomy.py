@@ -23,7 +23,7 @@ from rbfmuscle.anatomy.bones import (
     shank_up,
     sole_direction,
 )
-from rbfmuscle.geometry.vectors import across, unit
+from rbfmuscle.geometry.arrays import across, unit
 
 # Class of bone: its possible parents, the likeliest first, and the kind of joint between.
 PARENTS = {

@@ -17,8 +17,8 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from rbfmuscle.anatomy.bones import Part
+from rbfmuscle.geometry.arrays import unit
 from rbfmuscle.geometry.surfaces import geodesic, surface_graph
-from rbfmuscle.geometry.vectors import unit
 from rbfmuscle.importers.guess.joints import Skeleton
 from rbfmuscle.importers.guess.sites import PELVIS, Anatomy, Site, anatomy_of, sites_on, whole_bone
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rbfmuscle.anatomy.bones import Part
 from rbfmuscle.anatomy.names import name_facts
-from rbfmuscle.geometry.coarse import clustered
+from rbfmuscle.geometry.surfaces import clustered
 from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_file
 from rbfmuscle.scene.muscles import LARGEST_MM, SMALLEST_MM
 from rbfmuscle.scene.names import new_name

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.anatomy.bones import Orientation, Part, fit_condyles, shank_up
-from rbfmuscle.geometry.vectors import across, unit
+from rbfmuscle.geometry.arrays import across, unit
 from rbfmuscle.importers.guess.anatomy import JointGuess
 
 PELVIS = ("pelvis", "ilium", "ischium", "pubis")

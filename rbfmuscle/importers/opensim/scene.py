@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.folders import OutputFolder
+from rbfmuscle.geometry.arrays import box_size, to_world
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.surfaces import joined_meshes
-from rbfmuscle.geometry.vectors import box_size, to_world
 from rbfmuscle.importers.opensim.elements import ModelMesh, OsimModel
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.tubes import TUBE_MODEL, make_tube

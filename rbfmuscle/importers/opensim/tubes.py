@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import to_world, unit
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.lines import distance_along, line_length, points_along, tube_mesh
 from rbfmuscle.geometry.surfaces import mesh_volume, unique_edges
-from rbfmuscle.geometry.vectors import to_world, unit
 from rbfmuscle.importers.opensim.elements import ModelMuscle, WrapShape
 from rbfmuscle.validation import SceneError
 

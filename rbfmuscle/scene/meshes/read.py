@@ -20,9 +20,8 @@ from numpy.typing import ArrayLike
 from pydantic import BeforeValidator, Field
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, MeshLike
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, MeshLike, to_world, unit
 from rbfmuscle.geometry.surfaces import joined_meshes
-from rbfmuscle.geometry.vectors import to_world, unit
 from rbfmuscle.scene.meshes.polydata import read_polydata
 from rbfmuscle.scene.meshes.repair import ReadMesh, input_order, repair
 from rbfmuscle.scene.options import Finite, Positive, Table, Vector

@@ -12,11 +12,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, box_size
+from rbfmuscle.geometry.mesh_distance import winding_numbers
 from rbfmuscle.geometry.solids import outer_surface
 from rbfmuscle.geometry.surfaces import repeated_faces
-from rbfmuscle.geometry.vectors import box_size
-from rbfmuscle.geometry.winding import winding_numbers
 from rbfmuscle.validation import MeshError
 
 MERGE_TOLERANCE = 1e-7  # of the diagonal: float32 files repeat vertices to about this
