@@ -11,9 +11,9 @@ import warnings
 
 import numpy as np
 
-from rbfmuscle.implicit.extraction.surface import extract_surface
+from rbfmuscle.implicit.extraction import extract_surface
 from rbfmuscle.implicit.field import FieldFit
-from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+from rbfmuscle.implicit.kernels import KERNELS, get_kernel
 from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.validation import NumericalWarning
 

@@ -14,7 +14,7 @@ from evidence import machine, write_evidence
 from scipy.interpolate import RBFInterpolator
 
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.kernels.table import KERNELS
+from rbfmuscle.implicit.kernels import KERNELS
 from rbfmuscle.validation import NumericalWarning
 
 SHARED = {

@@ -17,9 +17,9 @@ import trimesh
 from evidence import write_evidence
 
 from rbfmuscle.geometry.threads import threads_limited
-from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
-from rbfmuscle.implicit.kernels.table import KERNELS
-from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.implicit.extraction import extract_surface, find_sheets
+from rbfmuscle.implicit.kernels import KERNELS
+from rbfmuscle.implicit.placement import sample_surface
 from rbfmuscle.implicit.selection import SPAN, spacing, surface_error
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.phantom import phantom_scene

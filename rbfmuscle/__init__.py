@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rbfmuscle.bones.sdf import BoneSDF as BoneSDF
     from rbfmuscle.implicit.field import RBFField as RBFField
-    from rbfmuscle.implicit.kernels.table import register_kernel as register_kernel
+    from rbfmuscle.implicit.kernels import register_kernel as register_kernel
     from rbfmuscle.models import ModelKind as ModelKind
     from rbfmuscle.models import model_kind as model_kind
     from rbfmuscle.models import register_model as register_model
@@ -62,7 +62,7 @@ _HOME = {
     "discretisation_error": "rbfmuscle.studies.accuracy",
     "model_kind": "rbfmuscle.models",
     "phantom_scene": "rbfmuscle.scene.phantom",
-    "register_kernel": "rbfmuscle.implicit.kernels.table",
+    "register_kernel": "rbfmuscle.implicit.kernels",
     "register_model": "rbfmuscle.models",
     "reach_error": "rbfmuscle.studies.kernels",
     "show": "rbfmuscle.viewer.page",

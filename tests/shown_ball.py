@@ -10,7 +10,7 @@ from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
 from rbfmuscle.geometry.point_grid import PointGrid
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.field import SMALL, FieldFit, overlapping_parts
-from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.surface.bones import ShownBones
 from rbfmuscle.surface.display import neighbour_lists

@@ -456,22 +456,6 @@ def record_square(records, n, x, y, z):
 
 
 @loop
-def record_feature(records, n, x, y, z):
-    """Feature of the triangle of record n (FACE, EDGE + k, CORNER + k) that is nearest to a
-    point.
-    """
-    qx = x - records[n, 0]
-    qy = y - records[n, 1]
-    qz = z - records[n, 2]
-    u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
-    v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
-    bx = records[n, BX]
-    cx = records[n, CX]
-    cy = records[n, CY]
-    return nearest_in_frame(bx, cx, cy, records[n, INVERSE_BC], records[n, INVERSE_CA], u, v)[2]
-
-
-@loop
 def nearest_triangle(tree, at, best, square, slack, stack):
     """Record of the triangle of a `Tree` nearest to a point ``at``, and the squared distance.
 

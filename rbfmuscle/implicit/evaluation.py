@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 
 from rbfmuscle.geometry.arrays import Booleans, Floats
 from rbfmuscle.geometry.threads import in_chunks
-from rbfmuscle.implicit.kernels.table import Kernel
+from rbfmuscle.implicit.kernels import Kernel
 from rbfmuscle.loops import loop
 
 # Points of a block, which stays in the first-level cache; points below which a thread does not pay;

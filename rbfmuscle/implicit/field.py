@@ -19,9 +19,8 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.surfaces import touching_balls
 from rbfmuscle.implicit.evaluation import Terms, evaluate
-from rbfmuscle.implicit.fit.assembly import Basis
-from rbfmuscle.implicit.fit.fitting import solve
-from rbfmuscle.implicit.kernels.table import Kernel, get_kernel
+from rbfmuscle.implicit.fitting import Basis, solve
+from rbfmuscle.implicit.kernels import Kernel, get_kernel
 from rbfmuscle.validation import (
     NumericalWarning,
     UsageError,
@@ -199,7 +198,7 @@ class RBFField:
         """
         import trimesh
 
-        from rbfmuscle.implicit.extraction.surface import extract_surface
+        from rbfmuscle.implicit.extraction import extract_surface
 
         result = extract_surface(self, points=self.centres, resolution=resolution)
         return trimesh.Trimesh(result.vertices, result.faces, process=False)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.extraction.surface import find_sheets
+from rbfmuscle.implicit.extraction import find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
 from rbfmuscle.validation import NumericalWarning, UsageError, check_points, check_vectors
 

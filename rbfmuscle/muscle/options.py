@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.scene.options import NotNegative, Table
 from rbfmuscle.validation import UsageError
 

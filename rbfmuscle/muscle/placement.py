@@ -11,11 +11,10 @@ from rbfmuscle.geometry.arrays import Integers
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.frames import RestFrame
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction.surface import extract_surface
+from rbfmuscle.implicit.extraction import extract_surface
 from rbfmuscle.implicit.field import FieldFit
-from rbfmuscle.implicit.kernels.table import get_kernel
-from rbfmuscle.implicit.placement.cached import cached_sample
-from rbfmuscle.implicit.placement.sampling import GREEDY_LARGEST, SurfaceSample
+from rbfmuscle.implicit.kernels import get_kernel
+from rbfmuscle.implicit.placement import GREEDY_LARGEST, SurfaceSample, cached_sample
 from rbfmuscle.implicit.selection import BOUND, choose_epsilon, spacing, surface_error
 from rbfmuscle.muscle.options import RBFOptions
 from rbfmuscle.scene.objects import Muscle, from_mm

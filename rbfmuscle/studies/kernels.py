@@ -40,10 +40,10 @@ from rbfmuscle.geometry.frames import principal_axes
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, vertex_areas
 from rbfmuscle.geometry.threads import blas_limited, cores_limited, each, threads_limited
-from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
+from rbfmuscle.implicit.extraction import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
-from rbfmuscle.implicit.kernels.table import KERNELS, Kernel, get_kernel
-from rbfmuscle.implicit.placement.sampling import (
+from rbfmuscle.implicit.kernels import KERNELS, Kernel, get_kernel
+from rbfmuscle.implicit.placement import (
     GREEDY_LARGEST,
     SurfaceSample,
     sample_surface,

@@ -12,7 +12,7 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.frames import RestFrame, principal_axes
 from rbfmuscle.geometry.surfaces import face_normals, opposite_half_edges, vertex_normals
-from rbfmuscle.implicit.placement.cached import cached_sample
+from rbfmuscle.implicit.placement import cached_sample
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.objects import Muscle
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.point_grid import PointGrid
-from rbfmuscle.implicit.extraction.surface import extract_surface
+from rbfmuscle.implicit.extraction import extract_surface
 from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene

@@ -8,10 +8,9 @@ import trimesh
 from scipy import linalg
 
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.fit.assembly import Basis
-from rbfmuscle.implicit.fit.fitting import solve
-from rbfmuscle.implicit.kernels.table import KERNELS
-from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.implicit.fitting import Basis, solve
+from rbfmuscle.implicit.kernels import KERNELS
+from rbfmuscle.implicit.placement import sample_surface
 from rbfmuscle.implicit.selection import spacing, surface_error
 
 

@@ -10,8 +10,8 @@ from toy_scene import Formula
 
 from rbfmuscle.geometry.point_grid import PointGrid
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.implicit.extraction import surface as extraction
-from rbfmuscle.implicit.extraction.surface import Grid, LevelSet
+from rbfmuscle.implicit import extraction
+from rbfmuscle.implicit.extraction import Grid, LevelSet
 
 CENTRE = np.array([1.0, 2.0, 3.0])
 

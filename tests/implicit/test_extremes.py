@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 from rbfmuscle.implicit.field import FieldFit, RBFField
-from rbfmuscle.implicit.kernels.table import KERNELS
-from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.implicit.kernels import KERNELS
+from rbfmuscle.implicit.placement import sample_surface
 from rbfmuscle.implicit.selection import spacing
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.validation import NumericalWarning

@@ -5,9 +5,8 @@ import pytest
 from scipy.interpolate import RBFInterpolator
 
 from rbfmuscle.implicit.field import COVERED, PART, FieldFit, RBFField, overlapping_parts
-from rbfmuscle.implicit.fit.assembly import Basis
-from rbfmuscle.implicit.fit.fitting import solve
-from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
+from rbfmuscle.implicit.fitting import Basis, solve
+from rbfmuscle.implicit.kernels import KERNELS, get_kernel
 from rbfmuscle.validation import UsageError
 
 HERMITE = [name for name, kernel in KERNELS.items() if kernel.hermite]

@@ -7,8 +7,8 @@ import trimesh
 from scipy.spatial.distance import cdist
 
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.fit.assembly import exponents
-from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel, register_kernel
+from rbfmuscle.implicit.fitting import exponents
+from rbfmuscle.implicit.kernels import KERNELS, get_kernel, register_kernel
 from rbfmuscle.studies.kernels import study_kernels
 from rbfmuscle.validation import UsageError
 

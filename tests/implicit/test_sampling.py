@@ -7,10 +7,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.implicit import placement
 from rbfmuscle.implicit.field import RBFField, off_surface_points
-from rbfmuscle.implicit.placement import clustering
-from rbfmuscle.implicit.placement.clustering import contract_clusters
-from rbfmuscle.implicit.placement.sampling import sample_surface, spread_points
+from rbfmuscle.implicit.placement import contract_clusters, sample_surface, spread_points
 from rbfmuscle.validation import MeshError
 
 SHAPES = {
@@ -130,7 +129,7 @@ def test_off_surface_points_stay_nearest_to_their_own_point():
 
 def test_cells_are_those_from_which_no_vertex_wants_to_go(monkeypatch):
     """Once more over the edges moves nothing, as the loop only ends there."""
-    loop, seen = clustering._equalise_loop, []
+    loop, seen = placement._equalise_loop, []
 
     def twice(*given):
         loop(*given)
@@ -138,7 +137,7 @@ def test_cells_are_those_from_which_no_vertex_wants_to_go(monkeypatch):
         loop(*given)
         seen.append(np.array_equal(labels, given[3]))
 
-    monkeypatch.setattr(clustering, "_equalise_loop", twice)
+    monkeypatch.setattr(placement, "_equalise_loop", twice)
     mesh = SHAPES["ellipsoid"]()
     sample_surface(mesh.vertices, mesh.faces, 40, placement="even")
     assert seen == [True]
@@ -148,11 +147,11 @@ def test_cells_start_from_farthest_points():
     """Against a search of all vertices by shortest paths from all points so far."""
     mesh = trimesh.creation.icosphere(2, 10.0)
     vertices = mesh.vertices * np.random.default_rng(4).uniform(0.7, 1.3, (len(mesh.vertices), 1))
-    fine = clustering.refine_mesh(vertices, np.asarray(mesh.faces), 60)
+    fine = placement.refine_mesh(vertices, np.asarray(mesh.faces), 60)
     count = len(fine.vertices)
     graph = csr_array((fine.length, fine.other, fine.start), shape=(count, count))
     labels = np.full(count, -1)
-    clustering._farthest_loop(fine.start, fine.other, fine.length, 5, 40, labels)
+    placement._farthest_loop(fine.start, fine.other, fine.length, 5, 40, labels)
     chosen = [5]
     while len(chosen) < 40:
         chosen.append(int(np.argmax(dijkstra(graph, indices=chosen, min_only=True))))

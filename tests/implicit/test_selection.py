@@ -10,10 +10,10 @@ import trimesh
 from toy_scene import Formula
 
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.implicit.extraction.surface import extract_surface, find_sheets
+from rbfmuscle.implicit.extraction import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField
-from rbfmuscle.implicit.kernels.table import get_kernel
-from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.implicit.kernels import get_kernel
+from rbfmuscle.implicit.placement import sample_surface
 from rbfmuscle.implicit.selection import BOUND, SPAN, choose_epsilon, spacing, surface_error
 from rbfmuscle.validation import NumericalWarning, UsageError
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rbfmuscle.implicit.evaluation import Terms, evaluate
-from rbfmuscle.implicit.kernels.table import KERNELS
+from rbfmuscle.implicit.kernels import KERNELS
 
 
 @pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import rbfmuscle as rm
 from rbfmuscle.geometry.threads import threads_limited
-from rbfmuscle.implicit.kernels.table import KERNELS, get_kernel
-from rbfmuscle.implicit.placement.cached import cached_sample
+from rbfmuscle.implicit.kernels import KERNELS, get_kernel
+from rbfmuscle.implicit.placement import cached_sample
 from rbfmuscle.models import build_model, build_models
 from rbfmuscle.muscle import placement
 from rbfmuscle.muscle.muscle import RBFMuscle

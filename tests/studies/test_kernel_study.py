@@ -14,7 +14,7 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import mesh_hash
 from rbfmuscle.geometry.threads import thread_count, threads_limited
 from rbfmuscle.implicit.field import RBFField
-from rbfmuscle.implicit.placement.sampling import sample_surface
+from rbfmuscle.implicit.placement import sample_surface
 from rbfmuscle.implicit.selection import SPAN
 from rbfmuscle.studies import kernels
 from rbfmuscle.studies.kernels import (

@@ -5,7 +5,7 @@ import pytest
 from shown_ball import CENTRES, PARTS, X
 
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
-from rbfmuscle.implicit.kernels.table import get_kernel
+from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.surface.field import MovingField
 
 

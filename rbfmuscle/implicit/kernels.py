@@ -8,9 +8,8 @@ gradients and Hermite fits need are ``2**k d^k phi / du^k``::
     k = 2   second  (phi'' - phi'/r) / r**2
 
 For all kernels of the table they have the form ``s**j * (base(s) * A(s) + B(s))`` with polynomials
-A and B of degree four at most. A row lists j, A and B of phi, the others follow; ``radial.py``
-knows the bases and no kernel. Kernels of another form are registered as functions of arrays
-(``given.py``).
+A and B of degree four at most. A row lists j, A and B of phi, the others follow. Kernels of another
+form are registered as functions of arrays.
 
 Sources: Fasshauer, *Meshfree Approximation Methods with MATLAB* (2007); Wendland (1995); Buhmann
 (2000); SciPy's ``RBFInterpolator`` for names and signs. ``skala_cervenka`` is second-hand: the
@@ -19,6 +18,7 @@ exponent.
 """
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from hashlib import sha256
@@ -28,10 +28,138 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.implicit.kernels import radial
-from rbfmuscle.implicit.kernels.given import LEAST, Radial, check_functions, limits
-from rbfmuscle.implicit.kernels.radial import TERMS
 from rbfmuscle.validation import UsageError, check_finite, did_you_mean, shown
+
+ONE, EXP, GAUSS, BINOMIAL, CUT, LOG, POWER = range(7)
+"""Bases: 1, exp(-s), exp(-s^2), (1+s^2)^beta, (1-s)+ with an exponent, log s, s^a."""
+
+TERMS = 5  # coefficients of a polynomial: of degree 4 at most
+_TINY = np.finfo(float).tiny
+
+
+def base_values(base: int, parameter: float, u: Floats, s: Floats) -> Floats:
+    """The base of a kernel at u = s**2."""
+    if base == EXP:
+        return np.exp(-s)
+    if base == GAUSS:
+        return np.exp(-u)
+    if base == BINOMIAL:
+        return np.asarray((1.0 + u) ** parameter)
+    if base == CUT:
+        return np.maximum(1.0 - s, 0.0)
+    if base == LOG:
+        return 0.5 * np.log(np.maximum(u, _TINY))
+    return s**parameter if base == POWER else np.ones_like(s)
+
+
+def row_values(base: int, row: Floats, u: Floats, s: Floats, b: Floats) -> Floats:
+    """s**j (base * A(s) + B(s)) of a row of `Kernel.table`, for the base's values ``b``.
+
+    Where the function is infinite at s = 0 the value there is 0: it is only ever multiplied by
+    vectors that vanish.
+    """
+    power, extra = int(row[0]), int(row[1])
+    inner, outer = row[2 : 2 + TERMS], row[2 + TERMS :]
+    values = np.zeros_like(s)
+    if inner.any():
+        values = _polynomial(inner, s)
+        values *= b**extra if base == CUT else b
+        if base == BINOMIAL and extra:
+            values /= (1.0 + u) ** extra
+    if outer.any():
+        values = values + _polynomial(outer, s)
+    for _ in range(power // 2):
+        values *= u
+    if power > 0 and power % 2:
+        values *= s
+    for _ in range(-power):
+        values = np.divide(values, s, out=np.zeros_like(s), where=s > 0.0)
+    return values
+
+
+def _polynomial(coefficients: Floats, s: Floats) -> Floats:
+    """A polynomial, constant first."""
+    highest = int(np.flatnonzero(coefficients)[-1])
+    values = np.full_like(s, coefficients[highest])
+    for coefficient in coefficients[:highest][::-1]:
+        values *= s
+        values += coefficient
+    return values
+
+
+Radial = Callable[[Floats], Floats]  # of s (n,)
+
+NAMES = ("phi", "first", "second")
+# Between these powers of two of s, in so many panels to an octave, each function is checked
+# against the one before it.
+LOW, HIGH, PANELS = -30, 15, 16
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
+# How far the integral of a derivative over a panel may be off, by the size of the functions there
+# or at s from 1/2 to 1.
+INTEGRATED = 1e-9
+LEAST = 2.0**LOW  # functions are called for this in place of smaller s
+
+
+def check_functions(functions: Sequence[Radial], compact: bool) -> Floats:
+    """Check phi, first and second, of which the third may be missing, against each other.
+
+    Over each panel the integral of s * first is the change of phi, and that of s * second the
+    change of first. Returns the values that were compared (k, panels), which stand for the
+    formula. UsageError says which function is not finite, or not the derivative of the one before.
+    """
+    ends = np.exp2(np.linspace(LOW, 0 if compact else HIGH, (HIGH - LOW) * PANELS + 1))
+    start, length = ends[:-1], np.diff(ends)
+    if compact:
+        ends[-1] = np.nextafter(1.0, 0.0)
+    between = start[:, None] + 0.5 * length[:, None] * (NODES + 1.0)
+    usual = (start >= 0.5) & (start < 1.0)
+    values = np.stack([_finite(*given, ends) for given in zip(NAMES, functions)])
+    for k in range(1, len(functions)):
+        slope = _finite(NAMES[k], functions[k], between.ravel()).reshape(between.shape)
+        integral = 0.5 * length * ((slope * between) @ WEIGHTS)
+        size = np.abs(values[k - 1][:-1])
+        size = np.maximum(size, max(size[usual].max(), np.finfo(float).tiny))
+        if k == 2:  # a function of s counts times s**2 beside the one before it
+            size = np.maximum(size, np.abs(values[0][:-1]) / start**2)
+        miss = np.abs(np.diff(values[k - 1]) - integral) / size
+        worst = int(np.argmax(miss))
+        if miss[worst] > INTEGRATED:
+            raise UsageError(
+                f"{NAMES[k]} of a kernel is not the derivative of {NAMES[k - 1]} by s, divided by "
+                f"s, near s = {start[worst]:.3g}"
+            )
+    return values
+
+
+def limits(functions: Sequence[Radial]) -> list[float]:
+    """The functions at s = 0, of which the first must be finite; where the second has no value
+    there, that at the least s.
+    """
+    found = [float(_values(*given, np.zeros(1))[0]) for given in zip(NAMES, functions)]
+    if not np.isfinite(found[0]):
+        raise UsageError(f"phi of a kernel must be finite at s = 0, got {found[0]}")
+    if np.isnan(found[1]):
+        found[1] = float(functions[1](np.array([LEAST]))[0])
+    return found
+
+
+def _finite(name: str, function: Radial, s: Floats) -> Floats:
+    values = _values(name, function, s)
+    if not np.isfinite(values).all():
+        where = s[int(np.argmin(np.isfinite(values)))]
+        raise UsageError(f"{name} of a kernel is not finite near s = {where:.3g}")
+    return values
+
+
+def _values(name: str, function: Radial, s: Floats) -> Floats:
+    with np.errstate(all="ignore"):
+        values = np.asarray(function(s), dtype=float)
+    if values.shape != s.shape:
+        raise UsageError(
+            f"{name} of a kernel takes an array (n,) and gives as many values, "
+            f"got {values.shape} for {s.shape}"
+        )
+    return values
 
 
 @dataclass(frozen=True)
@@ -99,8 +227,8 @@ class Kernel:
         s = np.sqrt(u)
         if self.functions:
             return [self._given(k, s) for k in range(count)]
-        b = radial.base_values(self.base, self.parameter, u, s)
-        found = [radial.row_values(self.base, row, u, s, b) for row in self.table[:count]]
+        b = base_values(self.base, self.parameter, u, s)
+        found = [row_values(self.base, row, u, s, b) for row in self.table[:count]]
         if self.compact:
             for values in found:
                 values[u >= 1.0] = 0.0
@@ -135,9 +263,9 @@ class Kernel:
         inner = self.table[k, 2 : 2 + TERMS]
         outer = self.table[k, 2 + TERMS :]
         limit = outer[0]
-        if self.base == radial.LOG:
+        if self.base == LOG:
             limit = -math.inf * inner[0] if inner[0] else limit
-        elif self.base == radial.POWER:
+        elif self.base == POWER:
             power, limit = (power + self.parameter, inner[0]) if not limit else (power, limit)
         else:
             limit += inner[0]
@@ -146,18 +274,9 @@ class Kernel:
         return limit if power == 0 or limit == 0 else math.copysign(math.inf, limit)
 
 
-_E = radial.EXP
-_U = radial.GAUSS
-_T = radial.CUT
-_L = radial.LOG
-_1 = radial.ONE
-_Q = radial.BINOMIAL
-_P = radial.POWER
-
-
 class _Phi(NamedTuple):
     """s**power (base * inner + outer), coefficients from the constant up; extra is the base's own
-    exponent, as of (1 - s)+**4 (1 + 4 s): ``_T, _Phi(0, (1, 4), (), 4)``.
+    exponent, as of (1 - s)+**4 (1 + 4 s): ``CUT, _Phi(0, (1, 4), (), 4)``.
     """
 
     power: int
@@ -168,29 +287,29 @@ class _Phi(NamedTuple):
 
 # name, order m, C^k at 0, compact, has epsilon, own parameter, base, phi
 _ROWS = [
-    ("linear", 1, 0, False, False, 0.0, _1, _Phi(1, (), (-1,))),
-    ("cubic", 2, 2, False, False, 0.0, _1, _Phi(3, (), (1,))),
-    ("quintic", 3, 4, False, False, 0.0, _1, _Phi(5, (), (-1,))),
-    ("septic", 4, 6, False, False, 0.0, _1, _Phi(7, (), (1,))),
-    ("thin_plate_spline", 2, 1, False, False, 0.0, _L, _Phi(2, (1,))),
-    ("polyharmonic_4", 3, 3, False, False, 0.0, _L, _Phi(4, (-1,))),
-    ("gaussian", 0, 99, False, True, 0.0, _U, _Phi(0, (1,))),
+    ("linear", 1, 0, False, False, 0.0, ONE, _Phi(1, (), (-1,))),
+    ("cubic", 2, 2, False, False, 0.0, ONE, _Phi(3, (), (1,))),
+    ("quintic", 3, 4, False, False, 0.0, ONE, _Phi(5, (), (-1,))),
+    ("septic", 4, 6, False, False, 0.0, ONE, _Phi(7, (), (1,))),
+    ("thin_plate_spline", 2, 1, False, False, 0.0, LOG, _Phi(2, (1,))),
+    ("polyharmonic_4", 3, 3, False, False, 0.0, LOG, _Phi(4, (-1,))),
+    ("gaussian", 0, 99, False, True, 0.0, GAUSS, _Phi(0, (1,))),
     # signs as conditional definiteness wants them
-    ("multiquadric", 1, 99, False, True, 0.5, _Q, _Phi(0, (-1,))),
-    ("inverse_multiquadric", 0, 99, False, True, -0.5, _Q, _Phi(0, (1,))),
-    ("inverse_quadratic", 0, 99, False, True, -1.0, _Q, _Phi(0, (1,))),
-    ("generalised_multiquadric", 2, 99, False, True, 1.5, _Q, _Phi(0, (1,))),
-    ("matern_12", 0, 0, False, True, 0.0, _E, _Phi(0, (1,))),
-    ("matern_32", 0, 2, False, True, 0.0, _E, _Phi(0, (1, 1))),
-    ("matern_52", 0, 4, False, True, 0.0, _E, _Phi(0, (1, 1, Fraction(1, 3)))),
-    ("matern_72", 0, 6, False, True, 0.0, _E, _Phi(0, (1, 1, Fraction(2, 5), Fraction(1, 15)))),
-    ("wendland_c0", 0, 0, True, True, 0.0, _T, _Phi(0, (1,), (), 2)),
-    ("wendland_c2", 0, 2, True, True, 0.0, _T, _Phi(0, (1, 4), (), 4)),
-    ("wendland_c4", 0, 4, True, True, 0.0, _T, _Phi(0, (1, 6, Fraction(35, 3)), (), 6)),
-    ("wendland_c6", 0, 6, True, True, 0.0, _T, _Phi(0, (1, 8, 25, 32), (), 8)),
-    ("wendland_51", 0, 2, True, True, 0.0, _T, _Phi(0, (1, 5), (), 5)),
-    ("buhmann", 0, 2, True, True, 0.0, _L, _Phi(0, (0, 0, 0, 0, 12), (1, 0, -12, 32, -21))),
-    ("skala_cervenka", 2, 3, False, False, 1.8, _P, _Phi(2, (1,), (-1,))),
+    ("multiquadric", 1, 99, False, True, 0.5, BINOMIAL, _Phi(0, (-1,))),
+    ("inverse_multiquadric", 0, 99, False, True, -0.5, BINOMIAL, _Phi(0, (1,))),
+    ("inverse_quadratic", 0, 99, False, True, -1.0, BINOMIAL, _Phi(0, (1,))),
+    ("generalised_multiquadric", 2, 99, False, True, 1.5, BINOMIAL, _Phi(0, (1,))),
+    ("matern_12", 0, 0, False, True, 0.0, EXP, _Phi(0, (1,))),
+    ("matern_32", 0, 2, False, True, 0.0, EXP, _Phi(0, (1, 1))),
+    ("matern_52", 0, 4, False, True, 0.0, EXP, _Phi(0, (1, 1, Fraction(1, 3)))),
+    ("matern_72", 0, 6, False, True, 0.0, EXP, _Phi(0, (1, 1, Fraction(2, 5), Fraction(1, 15)))),
+    ("wendland_c0", 0, 0, True, True, 0.0, CUT, _Phi(0, (1,), (), 2)),
+    ("wendland_c2", 0, 2, True, True, 0.0, CUT, _Phi(0, (1, 4), (), 4)),
+    ("wendland_c4", 0, 4, True, True, 0.0, CUT, _Phi(0, (1, 6, Fraction(35, 3)), (), 6)),
+    ("wendland_c6", 0, 6, True, True, 0.0, CUT, _Phi(0, (1, 8, 25, 32), (), 8)),
+    ("wendland_51", 0, 2, True, True, 0.0, CUT, _Phi(0, (1, 5), (), 5)),
+    ("buhmann", 0, 2, True, True, 0.0, LOG, _Phi(0, (0, 0, 0, 0, 12), (1, 0, -12, 32, -21))),
+    ("skala_cervenka", 2, 3, False, False, 1.8, POWER, _Phi(2, (1,), (-1,))),
 ]
 
 
@@ -202,7 +321,7 @@ def _radial_rows(base: int, parameter: float, phi: _Phi) -> Floats:
     exponent = Fraction(parameter)
     size = TERMS + 2
     power, inner, outer, extra = phi
-    if base == radial.ONE and any(inner):
+    if base == ONE and any(inner):
         raise ValueError(f"a kernel with the base 1 has no A, got {inner}: write it as B")
     a, b = (np.array([Fraction(c) for c in (*part, *[0] * size)][:size]) for part in (inner, outer))
     for row in rows:
@@ -214,17 +333,17 @@ def _radial_rows(base: int, parameter: float, phi: _Phi) -> Floats:
         row[2 : 2 + TERMS] = a[:TERMS]
         row[2 + TERMS :] = b[:TERMS]
         slope, b = (power + np.arange(size)) * a, (power + np.arange(size)) * b
-        if base == radial.EXP:
+        if base == EXP:
             slope = slope - np.roll(a, 1)
-        elif base == radial.GAUSS:
+        elif base == GAUSS:
             slope = slope - 2 * np.roll(a, 2)
-        elif base == radial.CUT:
+        elif base == CUT:
             slope, extra = slope - np.roll(slope + extra * a, 1), extra - 1
-        elif base == radial.BINOMIAL:
+        elif base == BINOMIAL:
             slope, extra = slope + np.roll(slope + 2 * (exponent - extra) * a, 2), extra + 1
-        elif base == radial.POWER:
+        elif base == POWER:
             slope = slope + exponent * a
-        elif base == radial.LOG:
+        elif base == LOG:
             b = b + a
         power, a = power - 2, slope
     rows.setflags(write=False)
@@ -320,6 +439,6 @@ def register_kernel(
     at_zero = tuple(limits(functions))
     compared = check_functions(functions, compact)
     facts = name, order, compact, smoothness, has_epsilon
-    kernel = Kernel(*facts, 0.0, radial.ONE, compared, functions, at_zero)
+    kernel = Kernel(*facts, 0.0, ONE, compared, functions, at_zero)
     KERNELS[name] = kernel
     return kernel

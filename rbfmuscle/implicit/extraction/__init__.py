@@ -1,1 +1,0 @@
-"""From a field to a closed triangle mesh."""

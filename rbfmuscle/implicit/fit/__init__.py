@@ -1,1 +1,0 @@
-"""From centres and values to weights: systems, factors, conditions, cross-validation."""

@@ -1,1 +1,0 @@
-"""The radial kernels: their facts, and the loops that evaluate them."""

@@ -1,1 +1,0 @@
-"""Where centres lie on a closed mesh."""
