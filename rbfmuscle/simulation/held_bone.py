@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.embedding import Embedding
+from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.simulation.touching import NOTHING, Body, Wanted
 
 NO_POINTS = Body(np.zeros(0, dtype=np.int64), np.zeros(1), 0.0)
