@@ -187,13 +187,29 @@ class Meeting:
         self.feet: list[Embedding | None] = [None] * len(own)
         self.wants = np.full(len(one), -np.inf)
         self._here = np.zeros((len(one), 3))
+        # Nodes when the bodies were last looked at, how far these have gone in all, and how far
+        # those of a pair had when a point was asked about.
+        self._nodes: list[Floats | None] = [None] * len(own)
+        self._path = np.zeros(len(own))
+        self._asked = np.zeros(len(one))
 
     def ask(self, solids: Sequence["Moving"]) -> None:
-        """Bring gaps, normals and feet up to date where a body of a pair is awake."""
+        """Bring gaps, normals and feet up to date where a body of a pair is awake and the gap may
+        be one that takes part.
+        """
         awake = np.array([not solid.asleep for solid in solids])
         for m in np.flatnonzero(awake).tolist():
-            self._here[self.mine[m]] = self.own[m].of(solids[m].nodes)
-        moved = awake[self.one] | awake[self.other]
+            nodes = solids[m].nodes
+            self._here[self.mine[m]] = self.own[m].of(nodes)
+            last = self._nodes[m]
+            if last is not None:
+                self._path[m] += np.linalg.norm(nodes - last, axis=1).max()
+            self._nodes[m] = nodes.copy()
+        path = self._path[self.one] + self._path[self.other]
+        # What both bodies have moved since brings no point from beyond the reach into it.
+        far = np.isfinite(self.gap) & (self.gap - (path - self._asked) > self._reach(solids))
+        moved = (awake[self.one] | awake[self.other]) & ~far
+        self._asked[moved] = path[moved]
         for m, behind in enumerate(self.behind):
             some = np.flatnonzero(moved[behind])
             if len(some) == 0:
@@ -233,15 +249,19 @@ class Meeting:
         where they are.
         """
         self.ask(solids)
-        sizes = np.array([solid.size for solid in solids])
         steps = [solid.step if acts else None for solid, acts in zip(solids, acting, strict=True)]
         self.wants = -self.gap - self.allowed - self.apart(steps)
         # Also where the gap is not known, and so infinite.
-        reach = np.where(self.holds, HELD, MET)
-        apart = self.gap > reach * np.minimum(sizes[self.one], sizes[self.other])
+        apart = self.gap > self._reach(solids)
         idle = ~(acting[self.one] | acting[self.other])
         self.wants[apart | idle] = -np.inf
         self.force[apart] = 0.0
+
+    def _reach(self, solids: Sequence["Moving"]) -> Floats:
+        """Gaps (K,) up to which contacts take part."""
+        sizes = np.array([solid.size for solid in solids])
+        reach = np.where(self.holds, HELD, MET)
+        return np.asarray(reach * np.minimum(sizes[self.one], sizes[self.other]))
 
     def without(self, far: Booleans) -> "Meeting":
         """The same without some of the points (K,)."""

@@ -16,7 +16,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.loops import loop
 
 NEWTON = 8  # steps that find material coordinates, at most
-EXACT = 1e-4  # of a cell: a step of less is the last, as it squares the error
+EXACT = 1e-3  # of a cell: a step of less is the last, as it squares the error
 
 
 class Material(NamedTuple):
