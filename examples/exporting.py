@@ -8,7 +8,6 @@ import numpy as np
 from pictures import draw, folder
 
 import rbfmuscle as rm
-from rbfmuscle.display.export import export_run
 
 out = folder("exporting")
 scene = rm.phantom_scene()
@@ -20,7 +19,7 @@ for path in sorted((out / "run").iterdir()):
     print(path.name)
 
 # The same from the command line: rbfmuscle export run --format stl,glb --units m
-written = export_run(out / "run", ["stl", "glb"], output=out / "meshes", units="m")
+written = run.export(out / "meshes", ["stl", "glb"], units="m")
 print(len(written), "files, for instance", ", ".join(sorted({path.suffix for path in written})))
 
 # The check of this page: an STL read back has the muscle's volume, in cubic metres now.

@@ -24,7 +24,7 @@ from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError
 
 Simulated = Annotated[
     str | None,
-    Parameter(help="Muscles to simulate, separated by commas, without the others all by default."),
+    Parameter(help="Muscles to simulate, separated by commas, without the others; all by default."),
 ]
 
 

@@ -634,7 +634,8 @@ def describe(results: dict[str, Values], labels: dict[str, str], units: str, bey
     texts += [*_depths(whole, labels, units), *_times_and_shapes(whole, labels, units)]
     if len(results) > 1:
         texts.append(
-            "Which shape is right this cannot say; docs/validation.md compares with finite elements"
+            "The comparison does not show which shape is right; docs/validation.md compares with "
+            "finite elements"
         )
     return f"{'. '.join(texts)}."
 

@@ -52,11 +52,16 @@ def test_meshes_become_a_report_by_the_lines_of_the_readme(tmp_path, monkeypatch
 
 
 @slow
-def test_python_of_the_readme_runs_as_it_stands(tmp_path):
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+@pytest.mark.parametrize(
+    ("page", "report"),
+    [("README.md", "out/report.html"), ("docs/python.md", "hip_run/report.html")],
+)
+def test_python_of_a_page_runs_as_it_stands_and_prints_what_the_page_shows(page, report, tmp_path):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    shutil.copytree(ROOT / "examples" / "meshes", tmp_path / "examples" / "meshes")
     done = subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", "\n".join(blocks)],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -65,8 +70,9 @@ def test_python_of_the_readme_runs_as_it_stands(tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.split()[1] == "True"
-    assert (tmp_path / "out" / "report.html").exists()
+    assert "True" in done.stdout.split()  # the surface is closed
+    assert all(shown in done.stdout for shown in re.findall(r"```text\n(.*?)```", text, re.DOTALL))
+    assert (tmp_path / report).exists()
 
 
 @slow

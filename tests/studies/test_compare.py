@@ -179,11 +179,11 @@ def test_the_first_sentences_name_what_is_beyond_limits_and_differs():
     text = describe(found, {"a": "A", "b": "B"}, "mm", beyond)
     assert text.startswith(
         "Muscles within all limits: 1 of 2 (A), 0 of 2 (B). Beyond limits, A: volume error (one), "
-        "centreline over shortest path (one). Beyond limits, B: self-crossing triangles (one, "
+        "bowing (one). Beyond limits, B: self-crossing triangles (one, "
         "two), volume error (one). Worst values: self-crossings 0 (A), 18 (B); "
         "bowing 1.2 (A), 1 (B); return error (RMS) 0.1 mm (A), 0.5 mm (B). A keeps out"
     )
-    assert "Which shape is right this cannot say" in text
+    assert "The comparison does not show which shape is right" in text
     same = describe(found | {"b": found["a"]}, {"a": "A", "b": "B"}, "mm", beyond)
     assert "self-crossings" not in same.partition("Worst values")[2]
 
