@@ -250,7 +250,7 @@ def describe(rows: list[KernelRow]) -> str:
     counts = {row.centres for row in rows}
     nearest = min((row for row in rows if not row.unfit), key=lambda row: row.error)
     most = len(counts) > 1 and nearest.centres == max(counts)
-    more = " The most centres that were tried err least; more may err less still." if most else ""
+    more = " More centres may lower the error further." if most else ""
     if len(tied) == 1:
         less = 100 * (
             1 - best.error / min((row.error for row in good if row is not best), default=math.inf)
