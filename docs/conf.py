@@ -25,6 +25,8 @@ html_title = f"rbfmuscle {version}"
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 napoleon_use_rtype = False
+# An attribute that is a property too would be described twice.
+napoleon_use_ivar = True
 
 
 def setup(app):
