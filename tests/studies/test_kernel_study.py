@@ -51,9 +51,9 @@ def test_the_sentence_names_those_alike_and_that_the_most_centres_were_best():
     rows = [row("cubic", 80, 1.0), row("quintic", 80, 1.02), row("cubic", 40, 3.0)]
     text = describe(rows)
     assert "errors of cubic, quintic are within 5 % of the least" in text
-    assert text.endswith("more may err less still.")
-    assert "more may" not in describe(rows[:2])
-    assert "more may" not in describe([row("cubic", 80, 1.0), row("cubic", 40, 0.5)])
+    assert text.endswith("More centres may lower the error further.")
+    assert "More centres" not in describe(rows[:2])
+    assert "More centres" not in describe([row("cubic", 80, 1.0), row("cubic", 40, 0.5)])
 
 
 def test_rows_are_ranked_and_more_centres_err_less(study):
