@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from markupsafe import escape
+from scipy.optimize import isotonic_regression
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.run.appearance import MUSCLE_COLOURS
@@ -91,7 +92,7 @@ def line_plot(
     legend: bool = False,
 ) -> str:
     """Markup of a plot of lines; one that bears a muscle's name is switched on and off with it, as
-    are ``bands``. Several lines have their names beside the plot.
+    are ``bands``. The names of several stand beside the plot, joined to the ends of the lines.
 
     ``labels`` are those of the axes, ``limits`` dashed lines; the axis begins at ``zero``; a
     ``legend`` stands below instead.
@@ -120,8 +121,39 @@ def line_plot(
         if legend:
             figure.legend(handles=lines, loc="lower left", frameon=False, labelspacing=0.2)
         elif beside:
-            axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+            _label_ends(axes, tracks)
         return _markup(figure, title)
+
+
+def _label_ends(axes: "Axes", tracks: Sequence[Track]) -> None:
+    """Name lines beside a plot, in the order of their last values and as near to these as leaves
+    each name a row, joined to the ends of the lines.
+    """
+    ends = []
+    for track in tracks:
+        known = np.flatnonzero(np.isfinite(track.y))
+        if len(known):
+            ends.append((track, float(track.x[known[-1]]), float(track.y[known[-1]])))
+    ends.sort(key=lambda end: end[2])
+    low, high = axes.get_ylim()
+    tall = axes.get_position().height * axes.figure.get_size_inches()[1] * 72.0
+    row = _ROW / tall
+    # Places less those of as many rows below each other rise, as the places keep a row apart.
+    rows = row * np.arange(len(ends))
+    wanted = np.clip([(y - low) / (high - low) for _, _, y in ends], 0.0, 1.0)
+    places = rows + isotonic_regression(wanted - rows).x if ends else rows
+    places = np.clip(places, 0.5 * row + rows, 1.0 - 0.5 * row - rows[::-1])
+    for (track, x, y), place in zip(ends, places):
+        label = axes.annotate(
+            track.name,
+            (x, y),
+            (1.04, place),
+            textcoords="axes fraction",
+            verticalalignment="center",
+            color=track.colour,
+            arrowprops={"arrowstyle": "-", "color": track.colour, "linewidth": 0.5},
+        )
+        label.set_gid(_part_name(track.name))
 
 
 def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:

@@ -48,6 +48,21 @@ def test_lines_lie_where_the_numbers_at_the_axes_say():
     assert path.count("M") == 2 and path.count("L") == 6
 
 
+def test_names_of_lines_stand_in_the_order_of_their_ends_and_none_covers_another():
+    x, ends = np.arange(3.0), np.random.default_rng(2).permutation(38) * 0.1
+    ends[:5] = 2.0
+    tracks = [Track(f"muscle {k}", "#cc6677", x, x * end / 2.0) for k, end in enumerate(ends)]
+    svg = line_plot("a", tracks, ("angle", "mm"))
+    labels = re.findall(r'translate\([\d.]+ ([\d.]+)\)"[^>]*>muscle (\d+)</text>', svg) or (
+        re.findall(r'y="([\d.]+)"[^>]*>muscle (\d+)</text>', svg)
+    )
+    heights, numbers = zip(*((float(y), int(number)) for y, number in labels))
+    assert sorted(numbers) == list(range(38))
+    assert np.diff(sorted(heights)).min() > 10.0  # letters are 8.5 points high
+    order = np.array(numbers)[np.argsort(heights)]  # heights count from the top
+    assert (np.diff(ends[order]) <= 0.0).all()
+
+
 def test_the_same_plot_is_the_same_markup():
     track = Track("strap", "#cc6677", np.arange(3.0), np.arange(3.0))
     plots = {line_plot("a", [track], ("angle", "mm"), limits=[1.0]) for _ in range(2)}
