@@ -121,13 +121,13 @@ def line_plot(
         if legend:
             figure.legend(handles=lines, loc="lower left", frameon=False, labelspacing=0.2)
         elif beside:
-            _label_ends(axes, tracks)
+            _label_ends(axes, tracks, _ROW / max(_LINES[1], rows))
         return _markup(figure, title)
 
 
-def _label_ends(axes: "Axes", tracks: Sequence[Track]) -> None:
+def _label_ends(axes: "Axes", tracks: Sequence[Track], row: float) -> None:
     """Name lines beside a plot, in the order of their last values and as near to these as leaves
-    each name a row, joined to the ends of the lines.
+    each name a ``row``, a share of the height, joined to the ends of the lines.
     """
     ends = []
     for track in tracks:
@@ -136,8 +136,6 @@ def _label_ends(axes: "Axes", tracks: Sequence[Track]) -> None:
             ends.append((track, float(track.x[known[-1]]), float(track.y[known[-1]])))
     ends.sort(key=lambda end: end[2])
     low, high = axes.get_ylim()
-    tall = axes.get_position().height * axes.figure.get_size_inches()[1] * 72.0
-    row = _ROW / tall
     # Places less those of as many rows below each other rise, as the places keep a row apart.
     rows = row * np.arange(len(ends))
     wanted = np.clip([(y - low) / (high - low) for _, _, y in ends], 0.0, 1.0)
