@@ -27,7 +27,7 @@ Link = tuple[int, int]
 REACH = 3.0
 # Points nearer than this at rest [mm] are held, where that is asked for; these are so far apart, of
 # the size: what a solid does between them its nodes decide.
-TOUCHED, HOLDING = 2.0, 0.05
+TOUCHED, HOLDING = 1.0, 0.05
 # Points so near to an attachment, of the size, do not meet others that lie as near to one: where
 # bones drive both, contact would crush what little is between.
 BESIDE = 0.03
