@@ -1,6 +1,6 @@
 """Two muscles that a bone presses together, beside finite elements with contact.
 
-    python benchmarks/fe_touching.py solve [FILE] [--cells 20 10 10] [--penalty 100]
+    python benchmarks/fe_touching.py solve [FILE] [--cells 16 8 8] [--penalty 100]
     python benchmarks/fe_touching.py compare [FILE] [-o FILE.json]
 
 Two ellipsoids lie on each other, held at their ends; a ball is moved down onto the upper one, and
@@ -28,11 +28,13 @@ from rbfmuscle.simulation.frame_loop import FrameLoop
 
 HALF = np.array([40.0, 10.0, 10.0])  # half axes [mm]
 GAP = 0.2
-HELD = 30.0  # along the first axis, from the middle on, a surface is held
+# Along the first axis, from the middle on, a surface is held: from where the ends of the cube lie,
+# so that meshes of any size are held alike.
+HELD = HALF[0] / np.sqrt(2.0) - 0.01
 RADIUS, ABOVE = 15.0, 0.2  # of the ball, and how far it lies above the upper muscle
 WAY, FRAMES = 8.0, 16  # of the ball
 STEP, SMALLEST_STEP = 0.5, 0.01
-CELLS, FINE = (20, 10, 10), (36, 14, 14)  # of each solid, and of the surface that is compared
+CELLS, FINE = (16, 8, 8), (36, 14, 14)  # of each solid, and of the surface that is compared
 NAMES = "lower", "upper"
 HEIGHTS = -(HALF[2] + GAP / 2), HALF[2] + GAP / 2
 DATA = Path(__file__).resolve().parents[1] / "tests" / "data" / "fe_touching.npz"

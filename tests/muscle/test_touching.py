@@ -173,6 +173,42 @@ def test_muscle_held_to_a_bone_stays_there(model):
         assert low.mean() == pytest.approx(0.05 if stays else 2.05, abs=near)
 
 
+def test_strip_over_a_cylinder_presses_on_it_by_its_tension_over_the_radius():
+    """Pressure T / R along an arc of the angle 2 α sums up to 2 α T, for a tension T that pulls at
+    the ends at angles α below the horizontal.
+    """
+    radius, half = 14.0, 45.0
+    cylinder = trimesh.creation.cylinder(radius, 60.0, sections=48).subdivide().subdivide()
+    points = np.array(cylinder.vertices)
+    around = np.linalg.norm(points[:, :2], axis=1)
+    side = around > radius - 1.0
+    points[side, :2] *= (radius / around[side])[:, None]
+    cylinder.vertices = points
+    cylinder.apply_transform(rotation_about((1, 0, 0), np.pi / 2, np.zeros(3)))
+    strip = box_mesh([-half, -8, radius + 0.05], [half, 8, radius + 5.05])
+    x = strip.vertices[:, 0]
+    muscles = {
+        "cylinder": (cylinder, {"floor": np.abs(cylinder.vertices[:, 1]) > 12}),
+        "strip": (strip, {"left": x < 4 - half, "right": x > half - 4}),
+    }
+    frames = [{"left": -s, "right": -s} for s in np.linspace(0.0, 8.0, 17)]
+    loop, models = _run(_scene(muscles, frames, {"left": (0, 0, 1), "right": (0, 0, 1)}))
+    strip = models["strip"]
+    right = strip.model.points[strip.model.held][:, 0] > 0
+    ends = [_borne(strip, which) for which in (right, ~right)]
+    tension, angle = np.linalg.norm(ends[0]), np.arctan2(-ends[0][2], ends[0][0])
+    assert np.degrees(angle) > 15.0
+    assert np.abs(ends[0] * [-1, 1, 1] - ends[1]).max() < 0.01 * tension
+    (group,) = loop.groups
+    pressed = sum(float(force.sum()) for force in group.neighbours.state.forces.values())
+    # The strip is 5 thick, and the cylinder yields.
+    assert pressed == pytest.approx(2.0 * angle * tension, rel=0.04)
+    between = _total_force(loop, (0, 0, 1))
+    lifted = between.get(("strip", "cylinder"), 0.0) - between.get(("cylinder", "strip"), 0.0)
+    assert lifted == pytest.approx(-ends[0][2] - ends[1][2], rel=0.01)
+    assert _overlap(strip, models["cylinder"]) < 0.1 > _overlap(models["cylinder"], strip)
+
+
 def _driven_together(monkeypatch, exempt):
     """Two blocks side by side whose attachments are driven into each other: greatest pressure in
     them, over 2 μ, and how many of their contacts bear all that they can.
