@@ -12,12 +12,10 @@ from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.field import SMALL, FieldFit, overlapping_parts
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
-from rbfmuscle.surface.bones import ShownBones
 from rbfmuscle.surface.display import neighbour_lists
-from rbfmuscle.surface.field import MovingField
 from rbfmuscle.surface.finish import fill_material, finish
-from rbfmuscle.surface.projection import reach_level
-from rbfmuscle.surface.sheet import Sheet, Shown
+from rbfmuscle.surface.projection import MovingField, reach_level
+from rbfmuscle.surface.sheet import Sheet, Shown, ShownBones
 
 BALL = trimesh.creation.icosphere(3)
 X = np.array(BALL.vertices)

@@ -19,12 +19,10 @@ from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import ModelSurface
-from rbfmuscle.surface.bones import ShownBones
 from rbfmuscle.surface.display import display_mesh, neighbour_lists
-from rbfmuscle.surface.field import MovingField
 from rbfmuscle.surface.finish import MeetingSheets, clear_rest, fill_material, finish
-from rbfmuscle.surface.projection import UNSURE, reach_level
-from rbfmuscle.surface.sheet import Sheet, Shown
+from rbfmuscle.surface.projection import UNSURE, MovingField, reach_level
+from rbfmuscle.surface.sheet import Sheet, Shown, ShownBones
 from rbfmuscle.validation import SolveError
 
 Carry: TypeAlias = Callable[[Floats], Floats]  # from the nodes of the solid to places (n, 3)

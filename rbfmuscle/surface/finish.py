@@ -1,14 +1,195 @@
-"""The last of a surface: bones out of it, crossings parted, its volume to the last digit."""
+"""The last of a surface: bones out of it, crossings parted, its volume to the last digit.
+
+Where material folds or sheets meet, both sides of a crossing move apart along the direction from
+one to the other at rest, turned as the material around them has turned: so what a fold turned
+inside out goes back, and sheets that ran into each other go back to their own sides. Triangles that
+share a corner have no two sides: their corners go towards the mean of their neighbours. All move by
+the least that parts them, which grows from zero in time; the displacement of sides fades away along
+the surface.
+"""
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.surfaces import vertex_normals, volume_rate
-from rbfmuscle.surface.bones import ShownBones
-from rbfmuscle.surface.crossings import part_crossings
-from rbfmuscle.surface.sheet import Sheet, Shown, level_change
+from rbfmuscle.geometry.crossing import cross
+from rbfmuscle.geometry.surfaces import face_normals, vertex_normals, volume_rate
+from rbfmuscle.loops import loop
+from rbfmuscle.surface.sheet import Sheet, Shown, ShownBones, level_change
+
+# Rounds, at most; where triangles still cross after PARTED of them, in a tangle without sides, they
+# are smoothed as they were, and a ring more of them in each of so many rounds.
+ROUNDS, PARTED, WIDER = 64, 12, 6
+# Both sides go this much farther apart than they must: triangles beside them cross then.
+BEYOND = 1.5
+SWEEPS = 2  # of smoothing for a displacement that was spread
+# Rings around a crossing by which it is seen how the material turned.
+TURNED = 4
+# Halvings of the way by which two triangles part, at most an edge.
+HALVINGS = 10
+# The sides also part along the difference of their normals, where that is shorter, if this is the
+# least cosine between it and the direction at rest.
+ALONG = 0.3
+
+
+def part_crossings(
+    shown: Shown, bones: ShownBones, sheet: Sheet, *, folds: bool = True
+) -> tuple[Booleans, int]:
+    """Move the sides of crossings apart, and out of the bones, where one of the triangles has a
+    suspect corner or, with ``folds``, one at which triangles do not lie side by side.
+
+    Returns which vertices (n,) moved, and how many triangles still cross.
+    """
+    before = sheet.vertices.copy()
+    moved = np.zeros(len(before), dtype=np.bool_)
+    among, pairs = shown.touching(sheet.suspect), np.zeros((0, 2), dtype=np.int64)
+    for turn in range(ROUNDS + 1):
+        pairs = shown.tree.pairs(sheet.vertices, among, folds=folds and turn == 0, again=turn > 0)
+        if len(pairs) == 0 or turn == ROUNDS:
+            break
+        if turn < PARTED:
+            rows, displacement = _displacements(shown, sheet, pairs)
+            sheet.vertices[rows] += displacement
+        else:
+            if turn == PARTED:
+                sheet.vertices[:] = before
+            rows = np.unique(shown.faces[pairs])
+            for _ in range(1 + (turn - PARTED) // WIDER):
+                rows = shown.grown(rows)
+            means = shown.links[rows] @ sheet.vertices / shown.degree[rows, None]
+            sheet.vertices[rows] = 0.5 * (sheet.vertices[rows] + means)
+        bones.lift(sheet, rows)
+        here = np.zeros(len(moved), dtype=np.bool_)
+        here[rows] = True
+        moved |= here
+        among = shown.touching(here)
+    return moved, len(np.unique(pairs))
+
+
+def _displacements(shown: Shown, sheet: Sheet, pairs: Integers) -> tuple[Integers, Floats]:
+    """Vertices (r,) and their displacements (r, 3), which part pairs of triangles (k, 2)."""
+    links = shown.links
+    parted, smoothed = np.zeros_like(sheet.vertices), np.zeros_like(sheet.vertices)
+    corners = np.unique(shown.faces[pairs])
+    means = links[corners] @ sheet.vertices / shown.degree[corners, None]
+    inwards = np.zeros_like(sheet.vertices)
+    inwards[corners] = means - sheet.vertices[corners]
+    directions = _directions(shown, sheet, pairs)
+    given = sheet.vertices, shown.faces, pairs, directions, inwards, shown.edge
+    _part_loop(*given, parted, smoothed)
+    parted *= BEYOND
+    rows = shown.spread(parted)
+    if len(rows):
+        near, degree = links[rows], shown.degree[rows, None]
+        for _ in range(SWEEPS):
+            parted[rows] = 0.5 * (parted[rows] + near @ parted / degree)
+    rows = np.union1d(rows, corners)
+    return rows, parted[rows] + BEYOND * smoothed[rows]
+
+
+def _directions(shown: Shown, sheet: Sheet, pairs: Integers) -> Floats:
+    """Unit vectors (k, 2, 3) along which the first triangle of each pair parts from the second: by
+    its place at rest, and by the normals of both where these agree with it, else that again.
+    """
+    faces, links = shown.faces, shown.links
+    rows = np.unique(faces[pairs])
+    for _ in range(TURNED):
+        rows = shown.grown(rows)
+    place = np.full(len(shown.rest), -1)
+    place[rows] = np.arange(len(rows))
+    corners = place[faces[pairs, 0]]
+    joined = links[rows][:, rows] + coo_matrix(
+        (np.ones(len(pairs)), corners.T), (len(rows), len(rows))
+    )
+    count, label = connected_components(joined, directed=False)
+    middle = shown.rest[faces[pairs]].mean(axis=2)
+    apart = middle[:, 0] - middle[:, 1]
+    for piece in range(count):
+        here, some = rows[label == piece], label[corners[:, 0]] == piece
+        apart[some] = apart[some] @ rotation(shown.rest[here], sheet.carried[here])
+    apart = _unit(apart)
+    normals = _unit(face_normals(sheet.vertices, faces[pairs].reshape(-1, 3))).reshape(-1, 2, 3)
+    along = _unit(normals[:, 0] - normals[:, 1])
+    cosine = np.einsum("ka,ka->k", along, apart)
+    along = np.where((np.abs(cosine) < ALONG)[:, None], apart, np.sign(cosine)[:, None] * along)
+    return np.stack([apart, along], axis=1)
+
+
+def rotation(before: Floats, after: Floats) -> Floats:
+    """The rotation (3, 3) that takes points (n, 3) best to others (n, 3), for rows: x @ rotation
+    (Kabsch 1976).
+    """
+    u, _, v = np.linalg.svd((before - before.mean(axis=0)).T @ (after - after.mean(axis=0)))
+    u[:, 2] *= np.sign(np.linalg.det(u @ v))
+    return np.asarray(u @ v)
+
+
+def _unit(vectors: Floats) -> Floats:
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(lengths, np.finfo(float).tiny))
+
+
+@loop
+def _part_loop(vertices, faces, pairs, directions, inwards, most, parted, smoothed):
+    """Displacements of the corners by which each of some pairs of triangles no longer crosses.
+
+    Of the directions (k, d, 3) of a pair that counts along which the way is shortest, at most
+    ``most``: ``parted`` (n, 3). Pairs that share a corner go by a share of ``inwards`` (n, 3):
+    ``smoothed`` (n, 3). At a corner the pair counts that goes farthest.
+    """
+    corners, ways = np.empty((6, 3)), np.empty((6, 3))
+    both = np.arange(6).reshape(2, 3)
+    for k in range(len(pairs)):
+        shared = False
+        for p in range(3):
+            for q in range(3):
+                same = faces[pairs[k, 0], p] == faces[pairs[k, 1], q]
+                shared |= same
+                both[1, q] = p if same else (both[1, q] if p > 0 else 3 + q)
+        best, way = 0, np.inf
+        for d in range(1 if shared else directions.shape[1]):
+            low, high = 0.0, 1.0 if shared else most
+            for turn in range(HALVINGS + 1):
+                middle = high if turn == 0 else 0.5 * (low + high)
+                for c in range(6):
+                    v = faces[pairs[k, c // 3], c % 3]
+                    for a in range(3):
+                        if shared:
+                            step = inwards[v, a]
+                        else:
+                            step = directions[k, d, a] if c < 3 else -directions[k, d, a]
+                        corners[c, a] = vertices[v, a] + middle * step
+                if not cross(corners, both, 0, 1):
+                    high = middle
+                elif turn == 0:
+                    break
+                else:
+                    low = middle
+            if high < way:
+                best, way = d, high
+                for c in range(6):
+                    v = faces[pairs[k, c // 3], c % 3]
+                    for a in range(3):
+                        if shared:
+                            ways[c, a] = high * inwards[v, a]
+                        else:
+                            step = high * directions[k, best, a]
+                            ways[c, a] = step if c < 3 else -step
+        out = smoothed if shared else parted
+        for c in range(6):
+            v = faces[pairs[k, c // 3], c % 3]
+            square = 0.0
+            known = 0.0
+            for a in range(3):
+                square += ways[c, a] ** 2
+                known += out[v, a] ** 2
+            if square > known:
+                for a in range(3):
+                    out[v, a] = ways[c, a]
+
 
 # Bones, crossings and volume are met up to so many times, as the way back to the volume can make
 # triangles cross.

@@ -7,8 +7,8 @@ from scipy.sparse import csr_matrix
 from shown_ball import EDGE, FACES, VOLUME, Drawn, X, bone
 
 from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
-from rbfmuscle.surface.crossings import part_crossings, rotation
 from rbfmuscle.surface.display import neighbour_lists
+from rbfmuscle.surface.finish import part_crossings, rotation
 from rbfmuscle.surface.sheet import Sheet
 
 

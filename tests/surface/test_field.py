@@ -6,7 +6,7 @@ from shown_ball import CENTRES, PARTS, X
 
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
 from rbfmuscle.implicit.kernels import get_kernel
-from rbfmuscle.surface.field import MovingField
+from rbfmuscle.surface.projection import MovingField
 
 
 @pytest.mark.parametrize("kernel", ["cubic", "gaussian", "linear"])
