@@ -21,8 +21,7 @@ from peers.detectors import TreeDetector, VoxelDetector
 from peers.serendipity import SerendipityField
 from peers.spline import SplineField
 
-from rbfmuscle.bones.mesh import points_near
-from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.bones.sdf import BoneSDF, points_near
 from rbfmuscle.geometry.threads import thread_count, threads_limited
 
 PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL

@@ -24,7 +24,7 @@ from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.muscle.muscle import RBFMuscle
-from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.muscle.rest import RBFOptions
 from rbfmuscle.recording import simulate
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.phantom import ATTACHED_ENDS, ATTACHED_WITHIN, MUSCLES, phantom_scene

@@ -183,7 +183,7 @@ def write_scene_reference(root):
     root : pathlib.Path
     """
     from pbd_baseline.options import PBDOptions
-    from rbfmuscle.muscle.options import RBFOptions
+    from rbfmuscle.muscle.rest import RBFOptions
     from rbfmuscle.scene.file import SceneFile
 
     schema = SceneFile.model_json_schema()

@@ -41,7 +41,7 @@ class ModelKind(NamedTuple):
 
 
 def _rbf() -> ModelKind:
-    from rbfmuscle.muscle.options import RBFOptions
+    from rbfmuscle.muscle.rest import RBFOptions
 
     def build(muscle: Muscle, scene: Scene, options: RBFOptions) -> MuscleModel:
         from rbfmuscle.muscle.muscle import RBFMuscle

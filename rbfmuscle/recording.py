@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from rbfmuscle.anatomy.bones import orient_scene
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.display.export import export_run
-from rbfmuscle.fibres.bundle import build_bundles
+from rbfmuscle.fibres import build_bundles
 from rbfmuscle.folders import copy_listed
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values

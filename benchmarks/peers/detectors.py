@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rbfmuscle.bones.mesh import prepare_bone
+from rbfmuscle.bones.sdf import prepare_bone
 from rbfmuscle.geometry.arrays import Booleans, Floats, MeshLike
 from rbfmuscle.geometry.exact_distance import ExactDistance
 from rbfmuscle.geometry.mesh_distance import inside_test

@@ -9,10 +9,13 @@ from rbfmuscle.bones.rounded import round_bone
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.frames import RestFrame
 from rbfmuscle.geometry.lines import fibre_directions
-from rbfmuscle.muscle.activation import contracting_fibres, descending_limb
-from rbfmuscle.muscle.fibres import along_fibres, held_at_insertion
-from rbfmuscle.muscle.options import RBFOptions
-from rbfmuscle.muscle.rest import LEAST_ATTACHED, RestState
+from rbfmuscle.muscle.activation import (
+    along_fibres,
+    contracting_fibres,
+    descending_limb,
+    held_at_insertion,
+)
+from rbfmuscle.muscle.rest import LEAST_ATTACHED, RBFOptions, RestState
 from rbfmuscle.scene.joints import Joint
 from rbfmuscle.scene.muscles import attachment_frames, ordered_muscle
 from rbfmuscle.scene.objects import Muscle

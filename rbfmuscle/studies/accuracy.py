@@ -7,7 +7,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.models import build_models, configure_scene
-from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.muscle.rest import RBFOptions
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.validation import UsageError

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from rbfmuscle.fibres.bundle import build_bundles
+from rbfmuscle.fibres import build_bundles
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import box_size
 from rbfmuscle.geometry.threads import each

@@ -10,7 +10,7 @@ import numpy as np
 
 from rbfmuscle.anatomy.bones import orient_scene
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.fibres.bundle import build_bundles
+from rbfmuscle.fibres import build_bundles
 from rbfmuscle.geometry.arrays import Floats, Integers, unit
 from rbfmuscle.geometry.surfaces import clustered
 from rbfmuscle.metrics.centreline import Centreline

@@ -11,7 +11,7 @@ from conftest import ROOT
 from pydantic import BaseModel
 
 from pbd_baseline.options import PBDOptions
-from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.muscle.rest import RBFOptions
 from rbfmuscle.scene import options
 from rbfmuscle.scene.file import MuscleTable, SceneFile
 from rbfmuscle.scene.options import KEYS

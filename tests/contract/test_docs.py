@@ -7,7 +7,7 @@ import tomllib
 from conftest import ROOT
 
 from pbd_baseline.options import PBDOptions
-from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.muscle.rest import RBFOptions
 from rbfmuscle.scene.file import SceneFile
 
 sys.path.insert(0, str(ROOT / "docs"))

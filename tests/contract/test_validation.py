@@ -8,7 +8,7 @@ import pytest
 from pbd_baseline.options import PBDOptions
 from rbfmuscle import validation
 from rbfmuscle.cli.app import one_line
-from rbfmuscle.muscle.options import RBFOptions
+from rbfmuscle.muscle.rest import RBFOptions
 from rbfmuscle.scene.options import Table
 from rbfmuscle.validation import (
     MeshError,

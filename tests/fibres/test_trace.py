@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.fibres.trace import FluxField, trace_fibres
+from rbfmuscle.fibres import FluxField, trace_fibres
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.scene.bone import BoneDistance
 

@@ -15,10 +15,9 @@ from rbfmuscle.geometry.threads import threads_limited
 from rbfmuscle.implicit.kernels import KERNELS, get_kernel
 from rbfmuscle.implicit.placement import cached_sample
 from rbfmuscle.models import build_model, build_models
-from rbfmuscle.muscle import placement
+from rbfmuscle.muscle import rest as at_rest
 from rbfmuscle.muscle.muscle import RBFMuscle
-from rbfmuscle.muscle.options import RBFOptions
-from rbfmuscle.muscle.rest import LEAST_ATTACHED
+from rbfmuscle.muscle.rest import LEAST_ATTACHED, RBFOptions
 from rbfmuscle.scene.objects import Motion
 from rbfmuscle.scene.phantom import phantom_scene
 from rbfmuscle.simulation.frame_loop import simulate_frames
@@ -260,14 +259,14 @@ def test_two_tiny_attachments_side_by_side_each_hold_centres_of_their_own():
 
 def test_key_of_the_number_of_centres_holds_all_that_it_depends_on(monkeypatch):
     keys = []
-    real = placement.content_key
-    monkeypatch.setattr(placement, "content_key", lambda *a: keys.append(real(*a)) or keys[-1])
+    real = at_rest.content_key
+    monkeypatch.setattr(at_rest, "content_key", lambda *a: keys.append(real(*a)) or keys[-1])
     scene = phantom_scene(end=0.0, spacing=6.0)
     changes = [{}, {"samples": 300}, {"kernel": "gaussian"}, {"epsilon": 2.0}, {"condition": 1e9}]
     changes += [{"rest_error": 0.4}]
     for change in changes:
         options = RBFOptions(**change)
-        placement.choose_centres(scene.muscles[0], scene, options, known_only=True)
+        at_rest.choose_centres(scene.muscles[0], scene, options, known_only=True)
     assert len(set(keys)) == len(changes)
 
 

@@ -1,1 +1,0 @@
-"""Muscle fibres as lines: traced at rest, carried by the material, measured."""
