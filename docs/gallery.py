@@ -182,7 +182,7 @@ def write_scene_reference(root):
     ----------
     root : pathlib.Path
     """
-    from pbd_baseline.options import PBDOptions
+    from pbd_baseline.rest import PBDOptions
     from rbfmuscle.muscle.rest import RBFOptions
     from rbfmuscle.scene.file import SceneFile
 

@@ -8,12 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pbd_baseline.contact import ContactConstraint
+from pbd_baseline.constraints import ContactConstraint
 from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
-from pbd_baseline.moving_surface import MovingSurface
-from pbd_baseline.options import PBDOptions
-from pbd_baseline.rest import RestState
-from pbd_baseline.settling import MeshSettling, Sweeps
+from pbd_baseline.rest import PBDOptions, RestState
+from pbd_baseline.settling import MeshSettling, MovingSurface, Sweeps
 from pbd_baseline.shapes import METHODS, Method
 from rbfmuscle.geometry.frames import diameter
 from rbfmuscle.geometry.harmonic import blended_motion

@@ -1,25 +1,178 @@
-"""What is known of a mesh muscle at rest, found once and shared by all its models."""
+"""Settings of a PBD muscle, and what is known of it at rest, found once and shared by all its
+models: weights between the bones' motions, softness along the fibres, thickness.
+
+The weights stretch the surface evenly: they minimise the integral of |grad w|^4. Harmonic weights
+(p = 2) are singular at the rim of a small patch that is held, and stretch edges there fivefold.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+import scipy.sparse as sparse
+from pydantic import Field
+from scipy.sparse.linalg import splu, spsolve
+from scipy.spatial import cKDTree
 
 from pbd_baseline.constraints import VolumeConstraint
-from pbd_baseline.fibres import swelling_room
-from pbd_baseline.options import PBDOptions
 from pbd_baseline.topology import Topology, cache_order
-from pbd_baseline.weights import even_weights
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
-from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.harmonic import harmonic_weights, surface_gradient
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, unit
+from rbfmuscle.geometry.harmonic import (
+    cotangent_laplacian,
+    graph_laplacian,
+    harmonic_weights,
+    surface_gradient,
+)
 from rbfmuscle.geometry.lines import fibre_directions
-from rbfmuscle.geometry.surfaces import edge_lengths, vertex_normals
+from rbfmuscle.geometry.surfaces import edge_lengths, vertex_areas, vertex_normals
 from rbfmuscle.scene.muscles import attachment_ends, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.options import NotNegative, Table
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, NotFiniteError, check_finite
+
+
+class PBDOptions(Table):
+    """``[muscle.model]`` of the mesh models.
+
+    Each solve makes ``iterations`` sweeps (0: the method's own number; of a converged model 2,000
+    at most). ``bending`` is the stiffness of dihedral angles in PBD, 0 to 1; ``edge_compliance``
+    and ``bending_compliance`` are those of XPBD, over a time that passes by one for each two
+    degrees of motion. ``fibre_exponent`` is a of k = (1 - |cos|)^a. Fibres shorten without
+    resistance from their length in the scan to 1 / ``slack_ratio`` of it (1: no slack).
+    """
+
+    iterations: Annotated[int, Field(ge=0, le=10_000)] = 0
+    fibre_exponent: NotNegative = 0.5
+    bending: Annotated[float, Field(ge=0.0, le=1.0)] = 0.9
+    edge_compliance: NotNegative = 0.2
+    bending_compliance: NotNegative = 0.2
+    slack_ratio: Annotated[float, Field(ge=1.0, le=5.0)] = 1.6
+
+
+POWER = 4.0  # p of the minimised integral of |grad w|^p: smoother at the ends than 2
+# A choice and not an end at convergence: after these the weights are within 0.001 of their limit,
+# and they only predict; what is solved does not depend on them.
+ROUNDS = 8
+# Faces whose gradient is below this share of the largest count as having this much.
+LEAST_GRADIENT = 1e-3
+COTANGENTS = 1e-3, 1e3
+# Height of a triangle over its longest side below which its gradient is that of this height.
+FLATTEST = 1e-6
+
+
+def even_weights(vertices: Floats, faces: Integers, groups: list[Integers]) -> Floats:
+    """Weights (n, groups) in [0, 1] that sum to one, 1 on a group's own vertices, by re-weighted
+    Laplace solves.
+    """
+    weights = harmonic_weights(vertices, faces, groups)
+    held = np.zeros(len(vertices), dtype=bool)
+    for group in groups:
+        held[group] = True
+    free, fixed = np.flatnonzero(~held), np.flatnonzero(held)
+    if len(free) == 0 or len(groups) < 2:
+        return weights
+    cotangents, gradients = _face_operators(vertices, faces)
+    first, second = (np.roll(faces, -shift, axis=1).T.ravel() for shift in (1, 2))
+    for _ in range(ROUNDS):
+        size = np.sqrt(sum(((gradient @ weights) ** 2).sum(axis=1) for gradient in gradients))
+        conductance = np.maximum(size / size.max(), LEAST_GRADIENT) ** (POWER - 2.0)
+        laplacian = graph_laplacian(
+            first, second, (cotangents * conductance[:, None]).T.ravel(), len(vertices)
+        )[free]
+        solved = splu(laplacian[:, free].tocsc()).solve(-(laplacian[:, fixed] @ weights[fixed]))
+        # a full step oscillates for p > 3; this one is Newton's where the direction of the gradient
+        # stays
+        weights[free] += (solved - weights[free]) / (POWER - 1.0)
+    weights = np.clip(weights, 0.0, 1.0)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def _face_operators(vertices, faces):
+    """Half cotangents (m, 3) opposite to each corner's edge, and three (m, n) gradient matrices."""
+    corners = [vertices[faces[:, k]] for k in range(3)]
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    sides = [corners[k - 1] - corners[k] for k in range(3)]
+    longest = np.max([np.einsum("ij,ij->i", side, side) for side in sides], axis=0)
+    square = np.maximum(np.einsum("ij,ij->i", normal, normal), (FLATTEST * longest) ** 2 + 1e-300)
+    cotangents, slopes = np.empty((len(faces), 3)), []
+    for k in range(3):
+        one, two = corners[(k + 1) % 3], corners[(k + 2) % 3]
+        dot = np.einsum("ij,ij->i", one - corners[k], two - corners[k])
+        cotangents[:, k] = np.clip(0.5 * dot / np.sqrt(square), *COTANGENTS)
+        slopes.append(np.cross(normal, two - one) / square[:, None])
+    rows = np.tile(np.arange(len(faces)), 3)
+    shape = (len(faces), len(vertices))
+    columns = faces.T.ravel()
+    matrices = [
+        sparse.csr_matrix(
+            (np.concatenate([slope[:, d] for slope in slopes]), (rows, columns)), shape=shape
+        )
+        for d in range(3)
+    ]
+    return cotangents, matrices
+
+
+# Distance over which the thickness is smoothed, and falls to 0 at held vertices, as a share of the
+# diagonal.
+SMOOTHING = 0.04
+
+
+def edge_stiffness(
+    vertices: Floats, edges: Integers, directions: Floats, exponent: float
+) -> Floats:
+    """k = (1 - |cos(edge, fibre)|)^a, (e,): edges along the fibres are soft (Cervenka and Kohout, a
+    = 0.5).
+    """
+    if exponent == 0.0:
+        return np.ones(len(edges))
+    along = unit(vertices[edges[:, 1]] - vertices[edges[:, 0]])
+    fibre = directions[edges[:, 0]]
+    other = directions[edges[:, 1]]
+    fibre = unit(fibre + np.where(np.einsum("ij,ij->i", fibre, other) < 0, -1, 1)[:, None] * other)
+    aligned = np.abs(np.einsum("ij,ij->i", along, fibre))
+    return np.clip(1.0 - aligned, 0.0, 1.0) ** exponent
+
+
+def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Booleans) -> Floats:
+    """How far the surface moves at each vertex when the muscle swells: its local half thickness
+    (n,).
+
+    Smooth, [unit of the vertices], 0 at held vertices.
+    """
+    radius = _inner_balls(vertices, normals)
+    reach = SMOOTHING * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    area = vertex_areas(vertices, faces)
+    free = np.flatnonzero(~held)
+    room = np.zeros(len(vertices))
+    if len(free):
+        mass = area / reach**2
+        matrix = (cotangent_laplacian(vertices, faces) + sparse.diags(mass)).tocsc()
+        room[free] = spsolve(matrix[free][:, free], (mass * radius)[free])
+    return np.maximum(room, 0.0)
+
+
+def _inner_balls(vertices, normals):
+    """Radius of the largest inner ball that touches the surface at each vertex (shrinking balls, Ma
+    2012): no vertex is in it but at a right angle or more.
+    """
+    tree = cKDTree(vertices)
+    radius = np.full(len(vertices), 0.5 * float(np.ptp(vertices, axis=0).max()))
+    # A ball becomes smaller each time, through another vertex: this ends.
+    while True:
+        distance, index = tree.query(vertices - radius[:, None] * normals)
+        offset = vertices - vertices[index]
+        height = np.einsum("ij,ij->i", offset, normals)
+        square = np.einsum("ij,ij->i", offset, offset)
+        # a neighbour at a right angle says nothing: the ball would shrink to the sampling
+        inside = (distance < radius * (1 - 1e-6)) & (height > 0.3 * np.sqrt(square))
+        if not inside.any():
+            return radius
+        radius[inside] = np.minimum(radius[inside], square[inside] / (2.0 * height[inside]))
+
 
 # Raise it when weights or room are computed in another way: entries of the cache are then not
 # found.

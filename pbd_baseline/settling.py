@@ -1,7 +1,8 @@
 """A mesh muscle on its way to rest, among those that it touches: a sweep in each iteration.
 
 A contact with a neighbour is a constraint as others of PBD are: it moves a vertex by its inverse
-mass, and the corners of the triangle that it meets by theirs.
+mass, and the corners of the triangle that it meets by theirs. The neighbour's signed distance is
+that to its mesh as it moves.
 """
 
 from __future__ import annotations
@@ -11,11 +12,198 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pbd_baseline.moving_surface import MovingSurface
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.exact_distance import nearest_weights, triangle_normal
 from rbfmuscle.geometry.interpolation import Embedding
-from rbfmuscle.geometry.surfaces import farthest_move
+from rbfmuscle.geometry.mesh_distance import winding_loop
+from rbfmuscle.geometry.surfaces import farthest_move, touching_balls, vertex_normals
+from rbfmuscle.loops import loop
 from rbfmuscle.simulation.touching import NOTHING, Wanted
+
+# Greatest thickness of a muscle, relative to rest.
+DEEPER = 1.5
+# Least cosine between the surface normal and the direction to a point for which the normal is used.
+RIM = 0.7
+# Depth, in mean edges, beyond which a point is inside only where its winding number says so.
+FOLDED = 0.3
+
+
+class Skin(NamedTuple):
+    """Vertices, their normals, faces, and the faces around vertex v, ring[start[v] : start[v
+    + 1]].
+    """
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    start: np.ndarray
+    ring: np.ndarray
+
+
+class MovingSurface:
+    """Signed distance to a mesh whose vertices move, for points near it.
+
+    The nearest point of the surface lies in one of the triangles around the nearest vertex, up to
+    the square of an edge over the radius of curvature. Directions are interpolated vertex normals,
+    or, around a rim, the direction to the point. The sign is that of the triangles that meet at the
+    nearest point.
+
+    Parameters
+    ----------
+    vertices : (n, 3) ndarray
+        At rest.
+    faces : (m, 3) ndarray
+    reach : float
+        Greatest distance that will be asked for [scene unit].
+
+    Attributes
+    ----------
+    vertices : (n, 3) ndarray
+    deepest : (n,) ndarray
+        How deep a point whose nearest vertex is this one may be.
+    """
+
+    def __init__(self, vertices: Floats, faces: Integers, reach: float) -> None:
+        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
+        corner = self.faces.ravel()
+        order = np.argsort(corner, kind="stable")
+        self.ring = order // 3
+        self.start = np.searchsorted(corner[order], np.arange(len(vertices) + 1))
+        sides = vertices[self.faces] - vertices[np.roll(self.faces, 1, axis=1)]
+        self.edge = float(np.linalg.norm(sides, axis=2).mean())
+        self.reach = float(reach)
+        rest, balls = np.ascontiguousarray(vertices, dtype=np.float64), np.empty((2, len(vertices)))
+        touching_balls(rest, vertex_normals(rest, self.faces), balls, np.empty(len(rest)))
+        self.deepest = DEEPER * np.minimum(balls[1], self.reach) + self.edge
+        self.move(rest)
+
+    def move(self, vertices: Floats) -> None:
+        """Take the present vertices (n, 3)."""
+        self.vertices = vertices
+        self.normals = vertex_normals(vertices, self.faces)
+
+    def ask(
+        self, points: Floats, nearest: Integers, columns: Integers, shares: Floats, normal: Floats
+    ) -> Floats:
+        """Distances (n,) of points (n, 3), negative inside, infinite beyond the reach.
+
+        ``nearest`` (n,) are vertices from which the nearest ones are found over edges, and which
+        these replace. The corners of the triangle that is nearest, and their shares, are filled
+        into ``columns`` and ``shares`` (n, 3), the outward normals into ``normal`` (n, 3).
+        """
+        skin = Skin(self.vertices, self.normals, self.faces, self.start, self.ring)
+        away, distance = np.empty(len(points)), np.empty(len(points))
+        _walk_loop(points, skin, nearest, away)
+        _distance_loop(points, nearest, skin, columns, shares, distance, normal)
+        # Beyond a sharp rim the normals of its sides disagree: no point is deeper than the muscle
+        # is thick.
+        distance[(away > self.reach + self.edge) | (distance < -self.deepest[nearest])] = np.inf
+        # A folded triangle at a rim may give a point far outside a large depth.
+        deep = np.flatnonzero(distance < -FOLDED * self.edge)
+        if len(deep):
+            winding = np.empty(len(deep))
+            winding_loop(self.vertices, self.faces, points[deep], winding)
+            distance[deep[winding < 0.5]] = np.inf
+        return distance
+
+
+@loop
+def _walk_loop(points, skin, nearest, away):
+    """From vertices over edges to the nearest ones, and how far away these are."""
+    vertices, _, faces, start, ring = skin
+    for q in range(len(points)):
+        here = nearest[q]
+        least = np.inf
+        last = -1
+        while here != last:
+            last = here
+            for r in range(start[last], start[last + 1]):
+                for corner in range(3):
+                    v, square = faces[ring[r], corner], 0.0
+                    for k in range(3):
+                        square += (vertices[v, k] - points[q, k]) ** 2
+                    if square < least:
+                        least, here = square, v
+        nearest[q], away[q] = here, np.sqrt(least)
+
+
+class _Foot(NamedTuple):
+    """The place of a surface that is nearest to a point."""
+
+    weights: np.ndarray  # (3,) of the corners of its triangle
+    way: np.ndarray  # (3,) from there to the point
+    true: np.ndarray  # (3,) sum of the unit normals of the triangles that meet there
+
+
+@loop
+def _distance_loop(points, nearest, skin, columns, shares, distance, normal):
+    """Fill distances, normals and the corners and shares of the nearest places."""
+    foot = _Foot(np.empty(3), np.empty(3), np.empty(3))
+    at, weights = np.empty(3), np.empty(3)
+    for q in range(len(points)):
+        least, face = _find_foot(points[q], nearest[q], skin, weights, at, foot)
+        for corner in range(3):
+            columns[q, corner] = skin[2][face, corner]
+            shares[q, corner] = foot.weights[corner]
+        size = 0.0
+        side = 0.0
+        agree = 0.0
+        for k in range(3):
+            n = 0.0
+            for corner in range(3):
+                n += foot.weights[corner] * skin[1][skin[2][face, corner], k]
+            normal[q, k] = n
+            size += n * n
+            side += foot.true[k] * foot.way[k]
+            agree += n * foot.way[k]
+        length, size = np.sqrt(least), max(np.sqrt(size), 1e-300)
+        sign = 1.0 if side >= 0.0 else -1.0
+        # Around a rim normals vary fast: the direction from the nearest point is better.
+        along = sign * agree < RIM * size * length
+        for k in range(3):
+            normal[q, k] = sign * foot.way[k] / length if along else normal[q, k] / size
+        distance[q] = sign * length
+
+
+@loop()
+def _find_foot(point, vertex, skin, weights, at, foot):
+    """Squared distance of a point from the triangles about a vertex, and the nearest of these;
+    fills the foot. ``weights`` and ``at`` (3,) are room for those of one triangle.
+    """
+    vertices, _, faces, start, ring = skin
+    least, face = np.inf, -1
+    for r in range(start[vertex], start[vertex + 1]):
+        f = ring[r]
+        nearest_weights(
+            point, vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]], weights
+        )
+        squared = 0.0
+        for k in range(3):
+            here = point[k]
+            for corner in range(3):
+                here -= weights[corner] * vertices[faces[f, corner], k]
+            squared += here * here
+            at[k] = here
+        # The triangles that meet at the nearest point decide the side together.
+        same = squared <= least * (1.0 + 1e-9) and squared >= least * (1.0 - 1e-9)
+        if squared < least or same:
+            if not same:
+                foot.true[:] = 0.0
+            _add_unit_normal(vertices, faces, f, foot.true)
+        if squared < least:
+            least, face = squared, f
+            foot.weights[:], foot.way[:] = weights, at
+    return least, face
+
+
+@loop
+def _add_unit_normal(vertices, faces, f, total):
+    """Add the unit normal of a triangle."""
+    x, y, z = triangle_normal(vertices, faces, f)
+    size = max(np.sqrt(x * x + y * y + z * z), 1e-300)
+    total[0] += x / size
+    total[1] += y / size
+    total[2] += z / size
 
 
 class Sweeps(NamedTuple):

@@ -58,8 +58,7 @@ def _rbf() -> ModelKind:
 
 def _mesh(method: str, title: str, tolerance: float = 0.0) -> ModelKind:
     from pbd_baseline.muscle import PBDMuscle
-    from pbd_baseline.options import PBDOptions
-    from pbd_baseline.rest import solved_points
+    from pbd_baseline.rest import PBDOptions, solved_points
     from pbd_baseline.shapes import METHODS
 
     chosen = METHODS[method]._replace(tolerance=tolerance)

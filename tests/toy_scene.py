@@ -5,8 +5,7 @@ from functools import cache
 import numpy as np
 import trimesh
 
-from pbd_baseline.moving_surface import MovingSurface
-from pbd_baseline.settling import MeshSettling, Sweeps
+from pbd_baseline.settling import MeshSettling, MovingSurface, Sweeps
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.bone import Bone

@@ -6,10 +6,9 @@ Cervenka, Havlicek, Kohout and Váša (GRAPP 2023). ``register()`` makes them kn
 
 import numpy as np
 
-from pbd_baseline.contact import TOUCHING, ContactConstraint, plane_depths
+from pbd_baseline.constraints import TOUCHING, ContactConstraint, plane_depths
 from pbd_baseline.muscle import PBDMuscle
-from pbd_baseline.options import PBDOptions
-from pbd_baseline.rest import solved_points
+from pbd_baseline.rest import PBDOptions, solved_points
 from pbd_baseline.shapes import GlobalARAPShape, Method, PBDShape
 from rbfmuscle.models import ModelKind, model_names, register_model
 

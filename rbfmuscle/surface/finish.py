@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, unit
 from rbfmuscle.geometry.crossing import cross
 from rbfmuscle.geometry.surfaces import face_normals, vertex_normals, volume_rate
 from rbfmuscle.loops import loop
@@ -110,9 +110,9 @@ def _directions(shown: Shown, sheet: Sheet, pairs: Integers) -> Floats:
     for piece in range(count):
         here, some = rows[label == piece], label[corners[:, 0]] == piece
         apart[some] = apart[some] @ rotation(shown.rest[here], sheet.carried[here])
-    apart = _unit(apart)
-    normals = _unit(face_normals(sheet.vertices, faces[pairs].reshape(-1, 3))).reshape(-1, 2, 3)
-    along = _unit(normals[:, 0] - normals[:, 1])
+    apart = unit(apart)
+    normals = unit(face_normals(sheet.vertices, faces[pairs].reshape(-1, 3))).reshape(-1, 2, 3)
+    along = unit(normals[:, 0] - normals[:, 1])
     cosine = np.einsum("ka,ka->k", along, apart)
     along = np.where((np.abs(cosine) < ALONG)[:, None], apart, np.sign(cosine)[:, None] * along)
     return np.stack([apart, along], axis=1)
@@ -125,11 +125,6 @@ def rotation(before: Floats, after: Floats) -> Floats:
     u, _, v = np.linalg.svd((before - before.mean(axis=0)).T @ (after - after.mean(axis=0)))
     u[:, 2] *= np.sign(np.linalg.det(u @ v))
     return np.asarray(u @ v)
-
-
-def _unit(vectors: Floats) -> Floats:
-    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(lengths, np.finfo(float).tiny))
 
 
 @loop

@@ -10,7 +10,7 @@ from command_line import call
 from conftest import ROOT
 from pydantic import BaseModel
 
-from pbd_baseline.options import PBDOptions
+from pbd_baseline.rest import PBDOptions
 from rbfmuscle.muscle.rest import RBFOptions
 from rbfmuscle.scene import options
 from rbfmuscle.scene.file import MuscleTable, SceneFile

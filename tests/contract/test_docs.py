@@ -6,7 +6,7 @@ import tomllib
 
 from conftest import ROOT
 
-from pbd_baseline.options import PBDOptions
+from pbd_baseline.rest import PBDOptions
 from rbfmuscle.muscle.rest import RBFOptions
 from rbfmuscle.scene.file import SceneFile
 

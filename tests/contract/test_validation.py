@@ -5,7 +5,7 @@ with its place.
 import numpy as np
 import pytest
 
-from pbd_baseline.options import PBDOptions
+from pbd_baseline.rest import PBDOptions
 from rbfmuscle import validation
 from rbfmuscle.cli.app import one_line
 from rbfmuscle.muscle.rest import RBFOptions

@@ -8,11 +8,14 @@ import pytest
 import trimesh
 from peers.paper_models import DeepestContact
 
-from pbd_baseline.bending import BendingConstraint
-from pbd_baseline.constraints import EdgeConstraint, VolumeConstraint
-from pbd_baseline.contact import ContactConstraint
+from pbd_baseline.constraints import (
+    BendingConstraint,
+    ContactConstraint,
+    EdgeConstraint,
+    VolumeConstraint,
+)
+from pbd_baseline.rest import even_weights
 from pbd_baseline.topology import Topology, colour
-from pbd_baseline.weights import even_weights
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.simulation.contact import HalfSpaces
 

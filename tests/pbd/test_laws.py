@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pbd_baseline.arap import ARAP, ARAPConstraint
 from pbd_baseline.constraints import _cubic_step
-from pbd_baseline.fibres import _inner_balls
+from pbd_baseline.rest import _inner_balls
+from pbd_baseline.shapes import ARAP, ARAPConstraint
 from pbd_baseline.topology import Topology
 
 

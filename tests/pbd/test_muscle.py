@@ -8,7 +8,7 @@ from spindle_scene import CENTRE, build_scene
 from toy_scene import solve
 
 from pbd_baseline.muscle import PBDMuscle, sweep_once
-from pbd_baseline.options import PBDOptions
+from pbd_baseline.rest import PBDOptions
 from pbd_baseline.shapes import METHODS
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.models import build_models

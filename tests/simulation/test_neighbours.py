@@ -6,7 +6,7 @@ import pytest
 import toy_scene as toy
 import trimesh
 
-from pbd_baseline.moving_surface import MovingSurface
+from pbd_baseline.settling import MovingSurface
 from rbfmuscle.scene.options import NeighbourOptions
 from rbfmuscle.simulation.frame_loop import FrameLoop, simulate_frames
 from rbfmuscle.simulation.neighbours import connected, find_links
