@@ -21,7 +21,7 @@ from peers.detectors import TreeDetector, VoxelDetector
 from peers.serendipity import SerendipityField
 from peers.spline import SplineField
 
-from rbfmuscle.bones.sdf import BoneSDF, points_near
+from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.threads import thread_count, threads_limited
 
 PSEUDONORMAL = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
@@ -49,6 +49,17 @@ def on_one_thread(function, repeats=3):
     """Least time of a call [s] on one thread."""
     with threads_limited(1):
         return least(function, repeats)[0]
+
+
+def points_near(vertices, faces, count, width, *, seed=0):
+    """Random points (count, 3) up to ``width`` from the surface, along the faces' normals."""
+    rng = np.random.default_rng(seed)
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    points = np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), corners[face])
+    return points + rng.uniform(-width, width, (count, 1)) * (normal[face] / area[face, None])
 
 
 def judge(points, vertices, faces):

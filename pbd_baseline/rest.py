@@ -265,7 +265,11 @@ def _renumbered(muscle):
     order = cache_order(np.asarray(muscle.mesh.faces), len(muscle.mesh.vertices))
     place = np.argsort(order, kind="stable")
     vertices = np.ascontiguousarray(muscle.mesh.vertices, dtype=np.float64)[order]
-    faces = _sorted_faces(place[np.asarray(muscle.mesh.faces)])
+    faces = place[np.asarray(muscle.mesh.faces)]
+    # In the order of their vertices, for the cache; each keeps its orientation.
+    faces = np.ascontiguousarray(
+        faces[np.argsort(faces.min(axis=1), kind="stable")], dtype=np.int64
+    )
     bones = list(dict.fromkeys(attachment.attachment_frame for attachment in muscle.attachments))
     attached_bone = np.full(len(vertices), -1)
     for attachment in muscle.attachments:
@@ -289,11 +293,6 @@ def _weights_and_room(vertices, faces, attached_bone, bones):
             check_finite(values, name=name)
         store_arrays(key, known)
     return known["weights"], known["room"]
-
-
-def _sorted_faces(faces):
-    """Faces in the order of their vertices, for the cache; each keeps its orientation."""
-    return np.ascontiguousarray(faces[np.argsort(faces.min(axis=1), kind="stable")], dtype=np.int64)
 
 
 def solved_points(muscle: Muscle, scene: Scene, options: PBDOptions) -> str:

@@ -19,6 +19,8 @@ from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.validation import MeshError, check_mesh, check_points
 
+log = logging.getLogger(__name__)
+
 # Area below this share of the squared longest edge is rounding.
 LEAST_SHAPE = 1e-12
 
@@ -106,27 +108,6 @@ def _mend(mesh):
         across = faces_across(mesh.faces)
     return across
 
-
-def points_near(
-    vertices: Floats, faces: Integers, count: int, width: float, *, seed: int = 0
-) -> Floats:
-    """Random points (count, 3) up to ``width`` from the surface, along the faces' normals."""
-    rng = np.random.default_rng(seed)
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normal, axis=1)
-    face = rng.choice(len(area), count, p=area / area.sum())
-    points = np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), corners[face])
-    return points + rng.uniform(-width, width, (count, 1)) * (normal[face] / area[face, None])
-
-
-def mean_edge(vertices: Floats, faces: Integers) -> float:
-    """Mean length of the sides of triangles."""
-    corners = vertices[faces]
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
-
-
-log = logging.getLogger(__name__)
 
 IDENTITY = np.eye(4)
 # Faces right behind which the winding number tells whether a mesh intersects itself: it is 1 on a

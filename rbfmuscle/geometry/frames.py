@@ -2,8 +2,6 @@
 mesh that stay the same wherever its scene lies.
 """
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -219,63 +217,8 @@ def on_one_line(vertices: Floats) -> bool:
     return bool(sizes[1] <= 1e-12 * max(sizes[0], 1e-300))
 
 
-def _certain_axes(points: Floats) -> Floats:
-    """Right-handed principal axes as rows; the axes themselves where rounding would choose between
-    others.
-    """
-    _, sizes, axes = np.linalg.svd(points, full_matrices=False)
-    if np.diff(sizes).max() > -0.02 * sizes[0]:
-        return np.eye(3)
-    axes[2] *= np.sign(np.linalg.det(axes))
-    return axes
-
-
 def principal_axes(points: Floats) -> Floats:
     """Right-handed principal axes of points (n, 3) as rows, that of the largest extent first."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     axes[2] *= np.sign(np.linalg.det(axes))
     return np.asarray(axes)
-
-
-class BoneFrame:
-    """The rest frame of a bone, along its principal axes so that a grid in it is small.
-
-    ``axes`` are rows in bone coordinates, ``size`` is the length of a local unit, and ``local`` the
-    vertices (n, 3) in these, rounded to 1e-8. They must not all lie on one line.
-    """
-
-    def __init__(self, vertices: Floats) -> None:
-        frame = RestFrame(vertices)
-        # Found in rounded numbers, so that equal moments give the same axes for every pose of the
-        # scene.
-        turn = _certain_axes(frame.local)
-        self.origin = frame.origin
-        self.size = frame.size
-        self.axes = turn @ frame.axes
-        self.local = np.round(frame.local @ turn.T, 8) + 0.0
-        self._placed = lru_cache(maxsize=16)(self._place)
-
-    def __getstate__(self) -> dict[str, object]:
-        return {name: value for name, value in vars(self).items() if name != "_placed"}
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        vars(self).update(state)
-        self._placed = lru_cache(maxsize=16)(self._place)
-
-    def box(self, bounds: ArrayLike) -> Floats:
-        """Local box (2, 3) that holds a box given in bone coordinates."""
-        local = (box_corners(bounds) - self.origin) @ self.axes.T / self.size
-        return np.array([local.min(axis=0), local.max(axis=0)])
-
-    def placed(self, pose: Floats) -> Floats:
-        """Transform (4, 4) whose transpose takes world points to local units, for a pose of the
-        bone.
-        """
-        # The same pose is asked for many times a frame.
-        return self._placed(pose.tobytes())
-
-    def _place(self, pose: bytes) -> Floats:
-        pose, out = np.frombuffer(pose).reshape(4, 4), np.eye(4)
-        out[:3, :3] = pose[:3, :3] @ self.axes.T / self.size
-        out[:3, 3] = pose[:3, :3] @ self.origin + pose[:3, 3]
-        return out

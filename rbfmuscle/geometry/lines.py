@@ -55,7 +55,7 @@ def _frames(line: Floats) -> tuple[Floats, Floats]:
     before = np.eye(3)[np.argmin(np.abs(ahead[0]))]
     for k, direction in enumerate(ahead):
         before = before - (before @ direction) * direction
-        before = across[k] = before / max(float(np.linalg.norm(before)), 1e-300)
+        before = across[k] = unit(before)
     return across, np.cross(ahead, across)
 
 
@@ -91,8 +91,7 @@ def taut_line(
     """
     size = float(np.linalg.norm(end - start))
     along = (end - start) / max(size, 1e-300)
-    up = side - (side @ along) * along
-    up = up / max(float(np.linalg.norm(up)), 1e-300)
+    up = unit(side - (side @ along) * along)
     axes = np.stack([along, up, np.cross(along, up)])
     profile = []
     for pose, points in bones:
@@ -167,13 +166,18 @@ def fibre_directions(
     (3,), zero without one.
     """
     if fibres:
-        along = _along_polylines(points, fibres)
+        directions, share = nearest_pieces(points, fibres, NEAREST)
+        against = (
+            np.einsum("nkd,nd->nk", directions, directions[:, 0]) < 0.0
+        )  # a fibre has no sense
+        directions = np.where(against[:, :, None], -directions, directions)
+        along = (directions * share[:, :, None]).sum(axis=1)
     length = np.linalg.norm(along, axis=1, keepdims=True)
     weak = length <= NO_DIRECTION * length.max(initial=0.0)
-    unit = np.divide(along, length, out=np.zeros_like(along), where=~weak)
+    directions = np.divide(along, length, out=np.zeros_like(along), where=~weak)
     if fallback is not None:
-        unit[weak[:, 0]] = fallback / np.linalg.norm(fallback)
-    return unit
+        directions[weak[:, 0]] = fallback / np.linalg.norm(fallback)
+    return directions
 
 
 def nearest_pieces(points: Floats, fibres: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
@@ -182,15 +186,6 @@ def nearest_pieces(points: Floats, fibres: Sequence[Floats], most: int) -> tuple
     """
     middles = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in fibres])
     pieces = np.concatenate([np.diff(line, axis=0) for line in fibres])
-    unit = pieces / np.maximum(np.linalg.norm(pieces, axis=1, keepdims=True), 1e-300)
     near = np.arange(1, min(most, len(middles)) + 1)
     distance, index = cKDTree(middles).query(points, k=near)
-    return unit[index], 1.0 / np.maximum(distance, 1e-9 * np.ptp(points, axis=0).max())
-
-
-def _along_polylines(points: Floats, fibres: Sequence[Floats]) -> Floats:
-    """Mean direction (n, 3) of the nearest pieces, by the inverse of their distance."""
-    unit, share = nearest_pieces(points, fibres, NEAREST)
-    against = np.einsum("nkd,nd->nk", unit, unit[:, 0]) < 0.0  # a fibre has no sense
-    unit = np.where(against[:, :, None], -unit, unit)
-    return (unit * share[:, :, None]).sum(axis=1)
+    return unit(pieces)[index], 1.0 / np.maximum(distance, 1e-9 * np.ptp(points, axis=0).max())

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.arrays import across, box_size, to_local, to_world, unit
 from rbfmuscle.geometry.frames import (
-    BoneFrame,
     RestFrame,
     box_corners,
     moved_box,
@@ -78,22 +77,6 @@ def test_principal_axes_are_ordered_by_extent_and_right_handed():
     np.testing.assert_allclose(np.abs(found @ TURN), np.eye(3), atol=1e-12)
     assert on_one_line(np.outer([0.0, 1.0, 5.0], [1.0, 2.0, 3.0]) + 7.0)
     assert on_one_line(np.zeros((4, 3))) and not on_one_line(POINTS)
-
-
-def test_a_bone_frame_takes_world_points_to_its_local_units():
-    frame = BoneFrame(POINTS)
-    assert np.linalg.det(frame.axes) == pytest.approx(1.0, abs=1e-12)
-    placed = frame.placed(pose())
-    world = to_world(POINTS, pose())
-    # The transposed rows hold axes per unit: columns are axes over the size.
-    found = (world - placed[:3, 3]) @ placed[:3, :3]
-    np.testing.assert_allclose(found, frame.local, atol=2e-8)
-    box = frame.box([POINTS.min(axis=0), POINTS.max(axis=0)])
-    assert (box[0] <= frame.local.min(axis=0)).all() and (box[1] >= frame.local.max(axis=0)).all()
-    corner = (box_corners([POINTS.min(axis=0), POINTS.max(axis=0)]) - frame.origin) @ frame.axes.T
-    np.testing.assert_allclose(box[1], corner.max(axis=0) / frame.size, atol=1e-12)
-    spread = np.ptp(frame.local, axis=0)
-    assert spread[0] > spread[1] > spread[2]
 
 
 @pytest.mark.parametrize("t", [0.0, 0.3, 1.0])
