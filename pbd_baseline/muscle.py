@@ -13,6 +13,7 @@ from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.rest import PBDOptions, RestState
 from pbd_baseline.settling import MeshSettling, MovingSurface, Sweeps
 from pbd_baseline.shapes import METHODS, Method
+from rbfmuscle.geometry.arrays import to_world
 from rbfmuscle.geometry.frames import diameter
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.interpolation import SurfaceInterpolation
@@ -159,7 +160,7 @@ class PBDMuscle:
 
     def transform(self, motion: np.ndarray) -> None:
         """Go along with a rigid motion (4, 4), as the muscle is."""
-        self.points[:] = self.points @ motion[:3, :3].T + motion[:3, 3]
+        self.points[:] = to_world(self.points, motion)
         self.shape.transform(motion)
 
     def snapshot(self) -> PBDState:

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, to_world
 from rbfmuscle.geometry.exact_distance import (
     FACE,
     STACK,
@@ -332,7 +332,7 @@ class MeshDistance:
         if self.closed:
             return Columns(self.vertices, self.faces).inside
         wound = inside_test(self.vertices, self.faces)
-        return lambda points, pose: wound(points @ pose[:3, :3].T + pose[:3, 3])
+        return lambda points, pose: wound(to_world(points, pose))
 
     @property
     def layout(self) -> Layout | None:
@@ -391,7 +391,7 @@ class MeshDistance:
         points = _as_points(points)
         out, inside = np.zeros(len(points)), self.inside(points, pose=pose)
         if inside.any():
-            out[inside] = self.unsigned(points[inside] @ pose[:3, :3].T + pose[:3, 3])
+            out[inside] = self.unsigned(to_world(points[inside], pose))
         return out
 
 

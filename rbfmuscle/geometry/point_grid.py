@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, to_world
 from rbfmuscle.loops import loop
 
 # A chord is never farther from its surface than this share of a cell. As vertices move while points
@@ -94,7 +94,7 @@ def push_off(
     order = np.argsort(grid.number[point] * len(faces) + face)
     point, near = point[order], np.ascontiguousarray(face[order])
     first = np.flatnonzero(np.diff(point, prepend=-1))
-    places = grid.points[point[first]] @ pose[:3, :3].T + pose[:3, 3]
+    places = to_world(grid.points[point[first]], pose)
     first = np.append(first, met)
     allowed = np.full(len(places), np.nan)
     for _ in range(ROUNDS):

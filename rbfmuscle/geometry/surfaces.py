@@ -154,13 +154,8 @@ def edge_lengths(vertices: Floats, edges: Integers) -> Floats:
 
 def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
     """Area that each vertex stands for: a third of its triangles' (n,)."""
-    corners = vertices[faces]
-    twice = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
-    return np.bincount(faces.ravel(), np.repeat(twice / 6.0, 3), minlength=len(vertices)).astype(
-        np.float64
-    )
+    third = np.linalg.norm(face_normals(vertices, faces), axis=1) / 3.0
+    return np.bincount(faces.ravel(), np.repeat(third, 3), minlength=len(vertices)).astype(float)
 
 
 def barycentric_weights(points: Floats, corners: Floats) -> Floats:
@@ -416,8 +411,7 @@ def clustered(vertices: Floats, faces: Integers, count: int) -> tuple[Floats, In
     vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
     if len(faces) <= count:
         return vertices, faces
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    area = float(np.linalg.norm(face_normals(vertices, faces), axis=1).sum())
     cells = np.floor((vertices - vertices.min(axis=0)) / np.sqrt(2.0 * area / count)).astype(
         np.int64
     )

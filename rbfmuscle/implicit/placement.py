@@ -515,13 +515,10 @@ def spread_points(
     """
     vertices, faces = check_mesh(vertices, faces)
     rng = np.random.default_rng(seed)
-    corners = vertices[faces]
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = np.linalg.norm(face_normals(vertices, faces), axis=1)
     strip = (np.arange(count) + rng.uniform(size=count)) / count
     which = np.searchsorted(np.cumsum(area) / area.sum(), strip).clip(max=len(faces) - 1)
-    return np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), corners[which]), which
+    return np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), vertices[faces[which]]), which
 
 
 def _gather(fine: FineMesh, count: int, labels: Integers, control: Integers) -> SurfaceSample:
