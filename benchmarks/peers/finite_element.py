@@ -12,7 +12,6 @@ on the surface's quadrature points. Mesh, shape functions and quadrature are sci
 ``fem``).
 """
 
-import igl
 import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
@@ -339,117 +338,6 @@ class HexSolid:
         force = np.einsum("fq,fqa->fa", depth, pushed)
         stiffness = np.einsum("fq,fqa,fqb->fab", active, pushed, pushed, optimize=True)
         return self.side_cells[self.touching], force, stiffness
-
-
-class PressedSolids(HexSolid):
-    """Two solids of bricks that push each other, by a penalty on the points of either surface that
-    lie in the other: half of it from each side.
-
-    Parameters
-    ----------
-    one, other : tuple of (points, cells)
-        As of `HexSolid`, whose keywords follow.
-    """
-
-    def __init__(self, one, other, **options):
-        first = len(one[0])
-        points = np.concatenate([one[0], other[0]])
-        super().__init__(points, np.concatenate([one[1], other[1] + first]), **options)
-        second = self.side_cells >= len(one[1])
-        corners = self.surface_faces()
-        middles = self.rest[self.nodes[self.side_cells]].mean(axis=1)
-        faces = []
-        for triangle in (corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]):
-            a, b, c = np.moveaxis(self.rest[triangle], 1, 0)
-            inward = np.einsum("ni,ni->n", np.cross(b - a, c - a), a - middles) < 0.0
-            faces.append(np.where(inward[:, None], triangle[:, ::-1], triangle))
-        #: Which faces are of the other solid, and the triangles of each.
-        self.second = second
-        self.skins = [
-            np.ascontiguousarray(np.concatenate([f[second == k] for f in faces]))
-            for k in (False, True)
-        ]
-
-    def pair_contacts(self, displacement):
-        """Points of either surface in the other solid: numbers of the nodes (c, n) that are pushed,
-        the first of them those of the point, their shares (c, n), below zero for the other solid's,
-        depths (c,), normals (c, 3) from that, weights (c,), and places (c, 3).
-        """
-        place = np.ascontiguousarray(self.rest + displacement)
-        found = []
-        for k in (False, True):
-            rows = np.flatnonzero(self.touching & (self.second == k))
-            shape, nodes = self.side_shape[rows], self.side_nodes[rows]
-            points = np.einsum("fqn,fni->fqi", shape, place[nodes]).reshape(-1, 3)
-            skin = self.skins[1 - k]
-            corners = place[np.unique(skin)]
-            near = np.flatnonzero(
-                ((points > corners.min(axis=0)) & (points < corners.max(axis=0))).all(axis=1)
-            )
-            if len(near) == 0:
-                continue
-            gap, face, foot, _ = igl.signed_distance(points[near], place, skin)
-            deep = gap < 0.0
-            near, gap, foot, corners = near[deep], gap[deep], foot[deep], skin[face[deep]]
-            a, b, c = np.moveaxis(place[corners], 1, 0)
-            normal = np.cross(b - a, c - a)
-            part = np.stack([np.cross(c - b, foot - b), np.cross(a - c, foot - c)], axis=1)
-            square = np.einsum("ci,ci->c", normal, normal)
-            share = np.einsum("cki,ci->ck", part, normal) / square[:, None]
-            share = np.column_stack([share, 1.0 - share.sum(axis=1)])
-            away = foot - points[near]
-            length = np.linalg.norm(away, axis=1)
-            flat = length < 1e-9
-            away[flat], length[flat] = normal[flat], np.sqrt(square[flat])
-            row, q = np.divmod(near, shape.shape[1])
-            found.append(
-                (
-                    np.concatenate([nodes[row], corners], axis=1),
-                    np.concatenate([shape[row, q], -share], axis=1),
-                    -gap,
-                    away / length[:, None],
-                    0.5 * self.side_weights[rows][row, q],
-                    points[near],
-                )
-            )
-        if not found:
-            width = self.side_nodes.shape[1] + 3
-            return np.zeros((0, width), int), *(
-                np.zeros((0, *s)) for s in ((width,), (), (3,), (), (3,))
-            )
-        return tuple(np.concatenate(parts) for parts in zip(*found))
-
-    def pair_force(self, displacement):
-        """Force (3,) of the first solid on the second, and its centre (3,)."""
-        nodes, _, depth, normal, weight, points = self.pair_contacts(displacement)
-        force = (self.penalty * depth * weight)[:, None] * normal
-        own = nodes[:, 0] >= len(self.rest) // 2
-        size = np.linalg.norm(force, axis=1)
-        return (np.where(own[:, None], force, -force)).sum(axis=0), size @ points / size.sum()
-
-    def energy(self, displacement):
-        """Of both, and of their contact."""
-        elastic = super().energy(displacement)
-        if not np.isfinite(elastic):
-            return elastic
-        _, _, depth, _, weight, _ = self.pair_contacts(displacement)
-        return elastic + 0.5 * self.penalty * float((depth**2 * weight).sum())
-
-    def _assemble(self, displacement, *, positive=False):
-        force, matrix = super()._assemble(displacement, positive=positive)
-        nodes, shares, depth, normal, weight, _ = self.pair_contacts(displacement)
-        if len(nodes) == 0:
-            return force, matrix
-        index = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
-        along = (shares[:, :, None] * normal[:, None, :]).reshape(len(nodes), -1)
-        force -= np.bincount(
-            index.ravel(), ((self.penalty * depth * weight)[:, None] * along).ravel(), len(force)
-        )
-        hard = (self.penalty * weight)[:, None, None] * along[:, :, None] * along[:, None, :]
-        width = index.shape[1]
-        row, column = np.repeat(index, width, axis=1), np.tile(index, width)
-        added = sparse.coo_array((hard.ravel(), (row.ravel(), column.ravel())), shape=matrix.shape)
-        return force, (matrix + added).tocsr()
 
 
 class TetSolid(HexSolid):

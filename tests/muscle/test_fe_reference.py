@@ -74,29 +74,6 @@ def test_uniaxial_stretch_is_the_closed_form(kind, stretch):
     assert abs(stretch * side**2 - 1) < 0.01
 
 
-def test_solids_pressed_together_share_the_way_and_the_force():
-    from peers.finite_element import PressedSolids, brick_grid
-
-    cube, bricks = brick_grid((2, 2, 3))
-    half = np.array([5.0, 5.0, 10.0])
-    rest = [cube * half + [0, 0, side * 10.0] for side in (-1.0, 1.0)]
-    solids = PressedSolids(*((points, bricks) for points in rest))
-    held = np.abs(solids.rest[:, 2]) > 19.99
-    solids.set_obstacles(lambda p: (np.full(len(p), np.inf), np.zeros((len(p), 3))), held)
-    u, wanted = np.zeros_like(solids.rest), np.zeros_like(solids.rest)
-    for way in (0.5, 1.0):
-        wanted[solids.rest[:, 2] > 19.99, 2] = -way
-        u = solids.solve(u, held, wanted, tolerance=1e-9, settled=1e-14).displacement
-    force, centre = solids.pair_force(u)
-    # What holds the upper one bears the force; the solids meet in the middle.
-    inner, _ = solids._assemble(u)
-    upper = held & (solids.rest[:, 2] > 0.0)
-    assert inner.reshape(-1, 3)[upper].sum(axis=0) == pytest.approx(-force, abs=1e-6 * force[2])
-    assert force[2] > 0.0 and centre == pytest.approx([0.0, 0.0, -0.5], abs=0.02)
-    # Stretched uniaxially by 0.95 but for the held ends: 3 μ times the strain, and the section.
-    assert force[2] == pytest.approx(3.0 * 0.05 * 100.0, rel=0.15)
-
-
 @pytest.mark.parametrize(("model", "limit"), [("rbf", 4.5), ("arap-volume", 8.0)])
 def test_models_stay_near_the_reference(model, limit):
     rows = study.distances(model, DATA)
