@@ -149,7 +149,9 @@ def test_cells_start_from_farthest_points():
     vertices = mesh.vertices * np.random.default_rng(4).uniform(0.7, 1.3, (len(mesh.vertices), 1))
     fine = placement.refine_mesh(vertices, np.asarray(mesh.faces), 60)
     count = len(fine.vertices)
-    graph = csr_array((fine.length, fine.other, fine.start), shape=(count, count))
+    # Shortest paths of the least SciPy take indices of 32 bits alone.
+    start, other = fine.start.astype(np.int32), fine.other.astype(np.int32)
+    graph = csr_array((fine.length, other, start), shape=(count, count))
     labels = np.full(count, -1)
     placement._farthest_loop(fine.start, fine.other, fine.length, 5, 40, labels)
     chosen = [5]
