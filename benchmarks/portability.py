@@ -3,10 +3,11 @@ processor features, threads and versions.
 
     python benchmarks/portability.py [--only NAME ...] [--jobs N] [--folder DIR] [TESTS ...]
 
-Without ``--only``, what CI runs. Each variant is one process; bone fields are not taken from the
-cache. Those of the oldest and the newest versions have an environment of their own each
-(``.ci/oldest.txt``, ``.ci/newest.txt``), kept in the folder. Names each variant in which a test
-fails; exit code 1 then.
+Without ``--only``, all that combine several changes; CI runs one of these. Cores that no other
+variant takes are workers of a variant; bone fields are not taken from the cache. Those of the
+oldest and the newest versions have an environment of their own each (``.ci/oldest.txt``,
+``.ci/newest.txt``), kept in the folder. Names each variant in which a test fails; exit code 1
+then.
 """
 
 import argparse
@@ -24,8 +25,8 @@ GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 TWO_THREADS = {"OPENBLAS_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2"}
 MOVED = {f"moved-{seed}": {"RBFMUSCLE_MOVED_VERTICES": str(seed)} for seed in (1, 2, 3)}
-# What CI runs, the longest first: those that compile anew. Each is two or three changes at once,
-# for time; the variants of one change tell which of them makes a test fail.
+# The longest first: those that compile anew. Each is two or three changes at once, for time; the
+# variants of one change tell which of them makes a test fail.
 USUAL = {
     "oldest-moved-1": MOVED["moved-1"],
     "generic-one-thread-moved-2": GENERIC | ONE_THREAD | MOVED["moved-2"],
@@ -68,7 +69,7 @@ def interpreter(name: str, folder: Path) -> Path:
     return python
 
 
-def run_variant(name: str, tests: list[str], folder: Path) -> tuple[bool, list[str]]:
+def run_variant(name: str, tests: list[str], folder: Path, workers: int) -> tuple[bool, list[str]]:
     """Whether the tests pass in a variant, and what to print; all that pytest printed is in the
     folder.
     """
@@ -86,7 +87,7 @@ def run_variant(name: str, tests: list[str], folder: Path) -> tuple[bool, list[s
         )
         if trial.returncode:
             return name not in USUAL, ["not run: this processor has not the instructions"]
-        command = [python, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider"]
+        command = [python, "-m", "pytest", "-q", "-n", str(workers), "-p", "no:cacheprovider"]
         command += ["--tb=short", "-m", CHOSEN, *tests]
         done = subprocess.run(command, cwd=ROOT, env=environment, stdout=printed, check=False)
     lines = log.read_text(encoding="utf-8").splitlines() or ["nothing printed"]
@@ -106,8 +107,13 @@ def main() -> int:
     folder = asked.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     failed = []
+    cores = (os.cpu_count() or 1) // min(asked.jobs, len(asked.only))
+    workers = cores if cores > 1 else 0
     with ThreadPoolExecutor(asked.jobs) as pool:
-        runs = [(name, pool.submit(run_variant, name, asked.tests, folder)) for name in asked.only]
+        runs = [
+            (name, pool.submit(run_variant, name, asked.tests, folder, workers))
+            for name in asked.only
+        ]
         for name, run in runs:
             passed, lines = run.result()
             failed += [] if passed else [name]
