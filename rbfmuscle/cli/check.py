@@ -6,7 +6,6 @@ from time import perf_counter
 
 from rbfmuscle.cli.options import USUAL_WORK, Flag, SceneName, Work, print_result
 from rbfmuscle.progress import Progress, stage
-from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.validation import SceneError, UsageError
 
 
@@ -133,7 +132,7 @@ def _touching_pairs(scene):
 
 def _scene_lines(scene, pairs):
     from rbfmuscle.scene.check import attachment_facts
-    from rbfmuscle.scene.objects import body_axes
+    from rbfmuscle.scene.objects import body_axes, from_mm
 
     yield f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}"
     body = body_axes(scene.superior, scene.anterior)
