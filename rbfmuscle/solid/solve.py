@@ -461,7 +461,8 @@ class Settling:
         if self.iterations < 3:
             return np.inf
         # Where this is not the end in any case it need not be known.
-        ends = SAFETY * moved * self.slowness < self.wanted * self.part * self.model.size
+        near = SAFETY * moved * self.slowness < self.wanted * self.part * self.model.size
+        ends = near or self.iterations >= self.model.iterations
         if ends and self.mixer.count > 1:
             ways, changes = self.mixer.history()
             weight = np.repeat(self.model.reach, 3)
