@@ -127,7 +127,9 @@ def main():
         print(*rows[-1], flush=True)
     print(f"{seconds:.1f} s")
     if given.output:
-        write_evidence(given.output, ["benchmarks/one_pose.py", given.scene], rows, COLUMNS)
+        command = ["benchmarks/one_pose.py", given.scene]
+        command += ["--muscles", given.muscles] if given.muscles else []
+        write_evidence(given.output, command, rows, COLUMNS)
 
 
 if __name__ == "__main__":
