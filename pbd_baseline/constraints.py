@@ -15,6 +15,7 @@ import numpy as np
 
 from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order, spread
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.exact_distance import triangle_normal
 from rbfmuscle.geometry.frames import cross, dot
 from rbfmuscle.geometry.surfaces import volume_cubic, volume_loop
 from rbfmuscle.loops import loop
@@ -283,22 +284,10 @@ def _volume_gradient_loop(points, faces, out):
     c / 6.
     """
     for f in range(len(faces)):
-        a = faces[f, 0]
-        b = faces[f, 1]
-        c = faces[f, 2]
-        ux = points[b, 0] - points[a, 0]
-        uy = points[b, 1] - points[a, 1]
-        uz = points[b, 2] - points[a, 2]
-        vx = points[c, 0] - points[a, 0]
-        vy = points[c, 1] - points[a, 1]
-        vz = points[c, 2] - points[a, 2]
-        nx = (uy * vz - uz * vy) / 6.0
-        ny = (uz * vx - ux * vz) / 6.0
-        nz = (ux * vy - uy * vx) / 6.0
-        for v in (a, b, c):
-            out[v, 0] += nx
-            out[v, 1] += ny
-            out[v, 2] += nz
+        normal = triangle_normal(points, faces, f)
+        for v in faces[f]:
+            for k in range(3):
+                out[v, k] += normal[k] / 6.0
 
 
 # Constraints in a block. Rows of the block lie a constant apart in one flat array: only so does the

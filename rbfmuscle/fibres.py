@@ -29,6 +29,13 @@ ACROSS = 0.02  # conductivity across polylines, over that along them
 NEAREST = 4  # pieces of polylines that speak for one place
 TOLERANCE = 1e-8  # relative residual of the potential
 MOST_ITERATIONS = 5_000  # of conjugate gradients; some hundreds serve
+POINTS = 25  # of a fibre, at even distances along it
+STEP = 0.5  # of a line that is traced, in cells
+LONGEST = 6.0  # of a line, in diagonals of the muscle's box
+SPARE = 1.5  # lines traced for each one wanted, as some do not reach both ends
+ROUNDS = 4  # in which points are moved into the muscle and out of bones
+DEPTH = 0.05  # of points inside the surface, in cells
+PATCH_POINTS = 3000  # of an end
 _CORNERS = np.indices((2, 2, 2)).reshape(3, -1).T  # of a cell, (8, 3)
 
 
@@ -179,10 +186,10 @@ def _conductivity(points: Floats, polylines: Sequence[Floats] | None) -> Floats:
     """D (n, 3, 3) at points (n, 3)."""
     if not polylines:
         return np.tile(np.eye(3), (len(points), 1, 1))
-    unit, share = nearest_pieces(points, polylines, NEAREST)
+    tangent, share = nearest_pieces(points, polylines, NEAREST)
     share /= share.sum(axis=1, keepdims=True)
     # Dyads have no sense of direction, as fibres have none.
-    dyads = np.einsum("nk,nka,nkb->nab", share, unit, unit)
+    dyads = np.einsum("nk,nka,nkb->nab", share, tangent, tangent)
     direction = np.linalg.eigh(dyads)[1][:, :, 2]
     along = np.einsum("na,nb->nab", direction, direction)
     return ACROSS * np.eye(3) + (1.0 - ACROSS) * along
@@ -213,14 +220,6 @@ def _solve(matrix: sparse.csr_matrix, source: Floats) -> Floats:
     if status != 0:
         raise np.linalg.LinAlgError("the potential of the fibres does not converge")
     return np.asarray(found)
-
-
-POINTS = 25  # of a fibre, at even distances along it
-STEP = 0.5  # of a line that is traced, in cells
-LONGEST = 6.0  # of a line, in diagonals of the muscle's box
-SPARE = 1.5  # lines traced for each one wanted, as some do not reach both ends
-ROUNDS = 4  # in which points are moved into the muscle and out of bones
-DEPTH = 0.05  # of points inside the surface, in cells
 
 
 class Traced(NamedTuple):
@@ -365,9 +364,6 @@ def _moved_off(points: Floats, mesh: MeshDistance, side: float, depth: float) ->
     wrong = side * distance < depth
     points[wrong] = closest[wrong] + side * depth * unit(outward[wrong])
     return points
-
-
-PATCH_POINTS = 3000  # of an end
 
 
 class FibreBundle:

@@ -32,6 +32,13 @@ from rbfmuscle.scene.muscles import attachment_ends
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.solid.model import Fibres, SolidModel, hung_matrix
 
+PEAK = 30.0  # greatest isometric tension of active fibres, in shear moduli
+WIDEST = 0.2  # share of the belly that counts as its widest part
+# fibres through a unit area, in those of the widest part: the rims of attachments draw more
+# together
+DENSEST = 10.0
+LEAST_STRAIN = 1e-3  # of tendon at full activation, so that it is not rigid
+
 
 def held_at_insertion(model: SolidModel, muscle: Muscle, joints: Sequence[Joint]) -> Booleans:
     """Which of the solid's held points (h,) lie nearer to the second end of the muscle than to the
@@ -78,14 +85,6 @@ def _gradient(model: SolidModel, values: Floats) -> Floats:
     cells = model.cells
     found = np.einsum("ck,ckb->cb", values[cells.nodes], cells.slopes)
     return np.asarray(found.reshape(len(found), 3, -1).swapaxes(1, 2).reshape(-1, 3))
-
-
-PEAK = 30.0  # greatest isometric tension of active fibres, in shear moduli
-WIDEST = 0.2  # share of the belly that counts as its widest part
-# fibres through a unit area, in those of the widest part: the rims of attachments draw more
-# together
-DENSEST = 10.0
-LEAST_STRAIN = 1e-3  # of tendon at full activation, so that it is not rigid
 
 
 def contracting_fibres(model: SolidModel, muscle: Muscle, insertion: Booleans) -> Fibres:

@@ -19,7 +19,7 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
 from rbfmuscle.simulation.held_bone import NO_POINTS, HeldBone
 from rbfmuscle.simulation.stepper import MuscleStepper
-from rbfmuscle.simulation.touching import HELD, Body, Meeting, Moving, even_points
+from rbfmuscle.simulation.touching import Body, Meeting, Moving, even_points
 
 Link = tuple[int, int]
 
@@ -35,6 +35,8 @@ BESIDE = 0.03
 # shown surface may, of the size of the smaller one.
 SEARCHED = 0.06
 NEAR = 0.02  # gap of points that are looked at in a sub-step, of that size
+MET = 0.01  # gap up to which a contact takes part in an iteration, of that size
+HELD = 0.05  # the same of one that holds muscles together
 
 
 class NeighbourState(NamedTuple):
@@ -68,7 +70,7 @@ class Neighbours:
         self.links = sorted({*links, *(link[::-1] for link in links)})
         self.state = NeighbourState({}, (), {})
         self.bodies: list[Body] = []
-        self._own: dict[int, Integers] = {}
+        self._own: dict[int, Integers] = {}  # see `_nearest_points`
         self.overlaps: dict[Link, Floats] = {}
         self.held: dict[Link, Floats] = {}  # gaps (k,) that points keep, NaN where they are free
         holders, self.bones = _held_bones(steppers)
@@ -143,6 +145,7 @@ class Neighbours:
             )
         )
         holds = np.isfinite(held)
+        smaller = np.repeat([min(size[one], size[other]) for one, other, *_ in found], counts)
         meeting = Meeting(
             np.repeat(ones, counts),
             np.repeat(others, counts),
@@ -155,12 +158,12 @@ class Neighbours:
             ),
             holds,
             np.where(holds, -held, overlap),
+            np.where(holds, HELD, MET) * smaller,
             force,
         )
         meeting.ask(solids)
-        sizes = np.array(size)
-        reach = np.where(holds, HELD, NEAR) * np.minimum(sizes[meeting.one], sizes[meeting.other])
-        return meeting.without(~(meeting.gap < reach) & (meeting.force == 0.0))
+        far = ~(meeting.gap < np.where(holds, HELD, NEAR) * smaller)
+        return meeting.without(far & (meeting.force == 0.0))
 
     def keep(self, meeting: Meeting | None, solids: Sequence[Moving]) -> None:
         """Keep how a solve ended."""

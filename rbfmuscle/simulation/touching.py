@@ -38,9 +38,6 @@ TOLERANCE = 2e-5  # violation of a contact, of the body's size, that is left
 PRECISE = 1e-7  # error of the gaps, of the size, for which contact forces are found
 BATCH = 48  # contacts that join those with a force at a time, the deepest first
 ROUNDS = 10  # in which contacts join those that bear a force, in an iteration
-# Gap from which on a contact of two bodies takes part, of the size of the smaller one; gap up to
-# which one that holds them together does.
-MET, HELD = 0.01, 0.05
 
 
 class Wanted(NamedTuple):
@@ -154,6 +151,8 @@ class Meeting:
         Which hold together, and so pull as far as they push.
     allowed : (K,) ndarray
         Overlap at rest [scene unit]; a gap, below zero, where a point holds.
+    reach : (K,) ndarray
+        Gap up to which each takes part.
     force : (K,) ndarray
         First guess; kept up to date.
     """
@@ -168,6 +167,7 @@ class Meeting:
         law: tuple[Floats, Floats],
         holds: Booleans,
         allowed: Floats,
+        reach: Floats,
         force: Floats,
     ) -> None:
         self.one = one
@@ -178,6 +178,7 @@ class Meeting:
         self.most, self.yields = law
         self.holds = holds
         self.allowed = allowed
+        self.reach = reach
         self.force = force
         bodies = range(len(own))
         self.mine = [slice(*np.searchsorted(one, [m, m + 1])) for m in bodies]
@@ -207,7 +208,7 @@ class Meeting:
             self._nodes[m] = nodes.copy()
         path = self._path[self.one] + self._path[self.other]
         # What both bodies have moved since brings no point from beyond the reach into it.
-        far = np.isfinite(self.gap) & (self.gap - (path - self._asked) > self._reach(solids))
+        far = np.isfinite(self.gap) & (self.gap - (path - self._asked) > self.reach)
         moved = (awake[self.one] | awake[self.other]) & ~far
         self._asked[moved] = path[moved]
         for m, behind in enumerate(self.behind):
@@ -252,16 +253,10 @@ class Meeting:
         steps = [solid.step if acts else None for solid, acts in zip(solids, acting, strict=True)]
         self.wants = -self.gap - self.allowed - self.apart(steps)
         # Also where the gap is not known, and so infinite.
-        apart = self.gap > self._reach(solids)
+        apart = self.gap > self.reach
         idle = ~(acting[self.one] | acting[self.other])
         self.wants[apart | idle] = -np.inf
         self.force[apart] = 0.0
-
-    def _reach(self, solids: Sequence["Moving"]) -> Floats:
-        """Gaps (K,) up to which contacts take part."""
-        sizes = np.array([solid.size for solid in solids])
-        reach = np.where(self.holds, HELD, MET)
-        return np.asarray(reach * np.minimum(sizes[self.one], sizes[self.other]))
 
     def without(self, far: Booleans) -> "Meeting":
         """The same without some of the points (K,)."""
@@ -270,8 +265,8 @@ class Meeting:
         place = [part[left[behind]] for part, behind in zip(self.place, self.behind)]
         law = self.most[left], self.yields[left]
         numbers = self.one[left], self.other[left], self.point[left]
-        known = self.holds[left], self.allowed[left], self.force[left]
-        return Meeting(*numbers, own, place, law, *known)
+        lengths = self.allowed[left], self.reach[left]
+        return Meeting(*numbers, own, place, law, self.holds[left], *lengths, self.force[left])
 
     def lacking(self, motion: Floats) -> Floats:
         """How much is lacking (K,) of a motion (K,) that points want: also of one back, where they

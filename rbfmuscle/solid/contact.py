@@ -152,6 +152,7 @@ class Obstacles:
 
 
 def _joined(parts: Sequence[Touch]) -> Touch:
+    """The half-spaces of all parts, one after the other."""
     some = [part for part in parts if len(part.near)]
     if len(some) == 1:
         return some[0]
