@@ -13,6 +13,7 @@ import pytest
 import pyvista
 import trimesh
 from command_line import call
+from conftest import ROOT
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -507,6 +508,16 @@ def test_nothing_is_left_behind_that_does_not_load(tmp_path):
     with pytest.raises(UsageError, match="no muscle can be held"):
         _write(guess_scene(tmp_path, "mm", tmp_path), file)
     assert not file.exists()
+
+
+def test_a_damaged_bone_is_named_where_no_muscle_can_do_without_it(tmp_path, capsys):
+    for mesh in (ROOT / "examples" / "meshes").iterdir():
+        shutil.copy(mesh, tmp_path)
+    femur = tmp_path / "femur.ply"
+    femur.write_bytes(femur.read_bytes()[:3000])
+    code, _, said = call(capsys, "new", tmp_path)
+    assert code == 2 and not (tmp_path / "scene.toml").exists()
+    assert "only one bone is near it; femur.ply cannot be used: not a readable PLY" in said
 
 
 def test_meshes_in_metres_make_a_scene_that_runs_and_an_unused_bone_is_in_the_verdict(

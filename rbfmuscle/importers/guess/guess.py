@@ -92,7 +92,7 @@ def guess_scene(
     skeleton = _skeleton(guess, bodies, millimetre)
     guess.muscles = [guess_attachments(muscle, skeleton) for muscle in parts.muscles]
     # Where the bones that names ask for are not here, what is there is taken.
-    if all(muscle.wrong for muscle in guess.muscles):
+    if len(bones) > 1 and all(muscle.wrong for muscle in guess.muscles):
         guess.muscles = [
             guess_attachments(muscle, skeleton, named=False) for muscle in parts.muscles
         ]
@@ -209,7 +209,9 @@ def _write_coarse(guess, stage):
 
 def _check_runs(guess, path):
     if all(muscle.wrong for muscle in guess.muscles):
-        raise UsageError(f"{path}: no muscle can be held by two bones ({guess.muscles[0].wrong})")
+        reasons = [guess.muscles[0].wrong]
+        reasons += [f"{file} cannot be used: {why}" for file, why in guess.parts.unusable.items()]
+        raise UsageError(f"{path}: no muscle can be held by two bones ({'; '.join(reasons)})")
 
 
 def _scene_text(guess: SceneGuess, stage: str = "") -> str:
