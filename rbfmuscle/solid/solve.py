@@ -401,8 +401,7 @@ class Settling:
         if not np.isfinite(moved):
             raise FloatingPointError("the solid does not settle")
         if self.asleep:
-            near = SAFETY * moved * self.slowness < self.wanted * self.part * size
-            if near or self.iterations >= self.model.iterations:
+            if self._may_end(moved):
                 return
             # Where a contact has moved it is another problem.
             self.asleep = False
@@ -451,6 +450,11 @@ class Settling:
         square = (motion**2).sum(axis=1) * self.model.reach**2
         return float(np.sqrt(square.max()))
 
+    def _may_end(self, moved: float) -> bool:
+        """Whether a step ends the iteration by the slowness known so far, or is the last one."""
+        near = SAFETY * moved * self.slowness < self.wanted * self.part * self.model.size
+        return near or self.iterations >= self.model.iterations
+
     def _estimate(self, moved: float) -> float:
         """Distance of material from the fixed point, about: a step times the greatest ratio of way
         to step that the steps so far have shown.
@@ -461,9 +465,7 @@ class Settling:
         if self.iterations < 3:
             return np.inf
         # Where this is not the end in any case it need not be known.
-        near = SAFETY * moved * self.slowness < self.wanted * self.part * self.model.size
-        ends = near or self.iterations >= self.model.iterations
-        if ends and self.mixer.count > 1:
+        if self._may_end(moved) and self.mixer.count > 1:
             ways, changes = self.mixer.history()
             weight = np.repeat(self.model.reach, 3)
             ways, changes = ways * weight, changes * weight

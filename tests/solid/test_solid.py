@@ -428,6 +428,20 @@ def test_solve_that_is_cut_short_says_so_and_its_residual_shrinks_with_iteration
     assert first > second > 2.0 * last and second > ERROR > last
 
 
+def test_a_slow_solve_that_ends_at_its_cap_says_how_far_it_is_from_the_equilibrium():
+    solid = Bar(iterations=25).with_fibres([1.0, 0.0, 0.0], ratio=4.0, slack=1.5)
+    pose = rotation_about([0, 1, 0], 0.3, np.array([20.0, 0.0, 0.0])) @ shift(-2.0)
+    solid.settle(pose)
+    stated, before = solid.report, solid.state.points
+    assert stated.caps == ("iterations",)
+    solid.model = solid.model._replace(iterations=600)
+    solid.settle_to(pose, 1e-3 * ERROR)
+    assert solid.report.caps == ()
+    left = np.linalg.norm(solid.state.points - before, axis=1).max() / solid.model.size
+    # The slowness near the rest shape alone gave a thirtieth of what is left.
+    assert left < 3.0 * stated.error
+
+
 @pytest.mark.parametrize(
     ("file", "asked", "limits"),
     [
