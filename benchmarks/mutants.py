@@ -16,6 +16,7 @@ import copy
 import json
 import os
 import random
+import resource
 import shutil
 import signal
 import sys
@@ -28,10 +29,11 @@ from evidence import write_evidence
 
 ROOT = Path(__file__).resolve().parent.parent
 COPIED = ("rbfmuscle", "pbd_baseline", "tests", "benchmarks", "docs", "examples")
-PACKAGES = ("metrics", "geometry", "fibres")
+PACKAGES = ("geometry", "metrics", "bones", "surface", "solid")
 LONGEST = 10.0  # seconds of a test, coverage included: slower ones are left out
 SHOWN = 30.0  # seconds of tests that a fault is shown to
-HANGS = 180.0  # seconds after which a fault counts as noticed
+HANGS = 5.0  # times as long as its tests take, and as many seconds more: it counts as noticed
+MEMORY = 4 << 30  # bytes of a process: a fault may ask for any number of them
 TINY = 1e-6  # guards against zero and rounding: no known answer depends on them
 
 # What is imported before processes are forked cannot be rewritten by pytest, and need not be.
@@ -179,6 +181,7 @@ def in_child(folder, act, limit):
         sink = os.open(folder / "printed.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(sink, 1)
         os.dup2(sink, 2)
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         try:
             answer.write_text(json.dumps(act()), encoding="utf-8")
         except BaseException:
@@ -271,16 +274,16 @@ def measure(folder, package, asked):
         first, last = spans(file)[line]
         contexts = lines.get(str(path), {})
         running = {name for k in range(first, last + 1) for name in contexts.get(str(k), ())}
-        tests, budget = [], SHOWN
+        tests, spent = [], 0.0
         # What runs when a module is imported runs for each of its tests.
         for name in sorted(running & set(seconds) or set(seconds), key=seconds.get):
-            budget -= seconds[name]
-            if budget < 0.0:
+            if spent + seconds[name] > SHOWN:
                 break
             tests.append(name)
+            spent += seconds[name]
         before = file.read_text(encoding="utf-8")
         file.write_text(source, encoding="utf-8")
-        seen = bool(tests) and noticed(folder, tests, HANGS)
+        seen = bool(tests) and noticed(folder, tests, HANGS * (spent + 1.0))
         file.write_text(before, encoding="utf-8")
         if not seen:
             survivors.append(f"{path}:{line}: {old} -> {new}")

@@ -123,13 +123,12 @@ def exponential_loop(points, twists, out):
         w = twists[n, 5]
         square = a * a + b * b + c * c
         angle = np.sqrt(square)
-        if angle < 1e-6:
-            first = 1 - square / 6
-            second = 0.5 - square / 24
-            third = 1 / 6 - square / 120
+        if angle < 1e-6:  # further terms are below rounding
+            first, second, third = 1.0, 0.5, 1.0 / 6.0
         else:
-            first, second = np.sin(angle) / angle, (1 - np.cos(angle)) / square
-            third = (angle - np.sin(angle)) / (square * angle)
+            first, half = np.sin(angle) / angle, np.sin(0.5 * angle) / angle
+            second = 2.0 * half * half
+            third = (1.0 - first) / square
         # omega x point and omega x velocity, and omega x these.
         px = b * z - c * y
         py = c * x - a * z

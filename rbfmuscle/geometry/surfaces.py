@@ -169,7 +169,7 @@ def barycentric_weights(points: Floats, corners: Floats) -> Floats:
     square = np.einsum("ij,ij->i", normal, normal)
     v = np.einsum("ij,ij->i", np.cross(points - a, c - a), normal) / square
     w = np.einsum("ij,ij->i", np.cross(b - a, points - a), normal) / square
-    out = np.clip(np.column_stack([1 - v - w, v, w]), 0, 1)
+    out = np.maximum(np.column_stack([1 - v - w, v, w]), 0.0)
     return out / out.sum(axis=1)[:, None]
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from rbfmuscle.geometry.exact_distance import ExactDistance, faces_across
+from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, faces_across, nearest_triangle
 
 ROUGH = trimesh.creation.icosphere(2, 10.0)
 ROUGH.vertices *= np.random.default_rng(3).uniform(0.8, 1.2, (len(ROUGH.vertices), 1))
@@ -63,3 +63,23 @@ def test_faces_across_of_open_turned_and_doubled_meshes():
     assert np.count_nonzero(faces_across(faces[1:]) == -1) == 3
     assert np.count_nonzero(faces_across(turned) == -2) == 6
     assert (faces_across(np.vstack([faces, faces[:1]]))[0] == -2).all()
+
+
+def test_of_triangles_that_are_equally_near_the_first_is_taken_whatever_their_order():
+    """Beyond the corners of a box and the middles of its edges, moved by rounding."""
+    box = trimesh.creation.box((2.0, 3.0, 4.0)).subdivide()
+    points = np.random.default_rng(2).normal(1.5, 1e-15, box.vertices.shape) * box.vertices
+    nearest = trimesh.proximity.closest_point(box, points)[0]
+    stack = np.empty(STACK, np.int64), np.empty(STACK)
+    for seed in range(5):
+        faces = np.random.default_rng(seed).permutation(box.faces)
+        tree = ExactDistance(box.vertices, faces).tree
+        for point, at in zip(points, nearest):
+            best, square = nearest_triangle(tree, tuple(point), -1, np.inf, 1e-9, stack)
+            away = np.linalg.norm(
+                trimesh.triangles.closest_point(box.vertices[faces], np.tile(at, (len(faces), 1)))
+                - at,
+                axis=1,
+            )
+            assert tree.order[best] == np.flatnonzero(away < 1e-9)[0]
+            assert square == pytest.approx(((point - at) ** 2).sum())

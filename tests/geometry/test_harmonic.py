@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
@@ -101,3 +102,17 @@ def test_shared_motion_is_rigid(angle):
     weights = np.random.default_rng(6).dirichlet(np.ones(3), size=30)
     found = blended_motion(points, weights, np.array([motion] * 3))
     assert found == pytest.approx(moved(points, motion), abs=1e-6 if angle == np.pi else 1e-10)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 9.9e-7, 1.1e-6, 1e-4, 0.03, 1.0, 3.0])
+def test_a_twist_moves_points_as_the_exponential_of_its_matrix(angle):
+    rng = np.random.default_rng(8)
+    points, velocity, axis = rng.normal(size=(3, 3))
+    turn = angle * axis / np.linalg.norm(axis)
+    twist = np.zeros((4, 4))
+    twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), turn), velocity
+    found = np.empty((1, 3))
+    harmonic.exponential_loop(points[None], np.concatenate([turn, velocity])[None], found)
+    assert found[0] - points == pytest.approx(
+        (expm(twist) - np.eye(4))[:3] @ np.append(points, 1.0), abs=1e-14
+    )

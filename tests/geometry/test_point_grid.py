@@ -67,3 +67,12 @@ def test_points_that_came_through_end_on_the_surface_and_the_way_fades_where_the
     assert ways[-1] == 0.0 and max(ways) > 0.2
     # Steps of 0.005 edges, of which a deeper point's triangle takes a few times as much.
     assert np.abs(np.diff(ways)).max() < 0.05
+
+
+def test_a_point_exactly_below_an_edge_or_a_corner_is_over_a_triangle():
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]])
+    faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    for x, y in ((0.3, 0.3), (0.5, 0.5)):
+        shown, moved = vertices.copy(), np.zeros(5, dtype=bool)
+        push_off(shown, faces, PointGrid.of(np.array([[x, y, -0.05]])), np.eye(4), 1.0, moved)
+        assert shown[4, 2] < -0.02

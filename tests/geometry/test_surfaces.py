@@ -16,7 +16,9 @@ from rbfmuscle.geometry.surfaces import (
     edge_lengths,
     face_normals,
     farthest_move,
+    geodesic,
     mesh_volume,
+    surface_graph,
     unique_edges,
     vertex_areas,
     vertex_normals,
@@ -112,3 +114,19 @@ def test_farthest_move_is_the_greatest_and_what_is_not_finite_is_not_lost():
     assert farthest_move(before, after) == 5.0
     after[0, 1] = np.nan
     assert farthest_move(before, after) == np.inf
+
+
+def test_paths_over_a_surface_begin_at_the_nearest_vertex_and_cross_edges():
+    """Over a square of one unit around its middle, in four triangles, unfolded on two others."""
+    fan = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]])
+    faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    square = trimesh.Trimesh(fan + [3.0, 2.0, 1.0], faces, process=False)
+    root = np.sqrt(2.0)
+    graph = surface_graph(square)
+    # From corner to corner beyond the middle: over the edge between two triangles, and along edges.
+    assert geodesic(graph, 0) == pytest.approx([0.0, 1.0, root, 1.0, root / 2])
+    assert geodesic(graph, [0, 1]) == pytest.approx([0.0, 0.0, 1.0, 1.0, root / 2])
+    away = trimesh.util.concatenate([square, square.copy().apply_translation([9.0, 0, 0])])
+    assert np.isinf(geodesic(surface_graph(away), 0)[5:]).all()
+    flat = trimesh.Trimesh([[0, 0, 0], [2, 0, 0], [1, 1, 0], [1, -1, 0]], [[0, 1, 2], [1, 0, 3]])
+    assert geodesic(surface_graph(flat), 2)[3] == pytest.approx(2.0)  # across the edge between
