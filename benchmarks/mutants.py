@@ -23,6 +23,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections import defaultdict
 from pathlib import Path
 
 from evidence import write_evidence
@@ -148,11 +149,13 @@ class Watch:
     """A plugin of pytest: notes how long tests take, and ends those that take too long."""
 
     def __init__(self):
-        self.seconds = {}
+        self.seconds, self.left_out = {}, []
 
     def pytest_runtest_logreport(self, report):
         if report.when == "call" and report.passed:
             self.seconds[report.nodeid] = report.duration
+        elif report.failed:
+            self.left_out.append(report.nodeid)
 
     @staticmethod
     def pytest_runtest_setup():
@@ -201,7 +204,7 @@ def in_child(folder, act, limit):
 
 
 def first_run(folder, package):
-    """Seconds of the package's tests, and those that run each line of its modules."""
+    """Seconds of the package's tests, those left out, and which run each line of its modules."""
 
     def act():
         import coverage
@@ -211,21 +214,37 @@ def first_run(folder, package):
             data_file=None, source=[f"rbfmuscle/{package}"], config_file=False
         )
 
+        users = defaultdict(list)  # tests of each fixture that several share
+
         class Contexts:
-            @staticmethod
-            def pytest_runtest_logstart(nodeid):
-                counted.switch_context(nodeid)
+            def pytest_runtest_setup(self, item):
+                self.test = item.nodeid
+                counted.switch_context(self.test)
+                for name in item.fixturenames:
+                    users[name].append(self.test)
+
+            @pytest.hookimpl(wrapper=True)
+            def pytest_fixture_setup(self, fixturedef):
+                if fixturedef.scope == "function":
+                    return (yield)
+                counted.switch_context(fixturedef.argname)
+                made = yield
+                counted.switch_context(self.test)
+                return made
 
         watch = Watch()
         counted.start()
-        pytest.main([*PLAIN, f"tests/{package}"], [watch, Contexts])
+        pytest.main([*PLAIN, f"tests/{package}"], [watch, Contexts()])
         counted.stop()
         data = counted.get_data()
         lines = {
-            str(Path(file).relative_to(folder)): data.contexts_by_lineno(file)
+            str(Path(file).relative_to(folder)): {
+                line: [test for name in names for test in users.get(name, [name])]
+                for line, names in data.contexts_by_lineno(file).items()
+            }
             for file in data.measured_files()
         }
-        return watch.seconds, lines
+        return watch.seconds, watch.left_out, lines
 
     return in_child(folder, act, 3600.0)
 
@@ -255,8 +274,9 @@ def spans(path):
 
 def measure(folder, package, asked):
     """Plant faults in a package; how many, how many were noticed, and those that were not."""
-    seconds, lines = first_run(folder, package)
+    seconds, left_out, lines = first_run(folder, package)
     print(f"{package}: {len(seconds)} tests, {sum(seconds.values()):.0f} s", flush=True)
+    print("".join(f"    left out: {name}\n" for name in left_out), end="", flush=True)
     if not seconds or noticed(folder, list(seconds), 3600.0):
         raise SystemExit(f"tests of {package} fail without a fault: see {folder}/printed.txt")
     planted = [

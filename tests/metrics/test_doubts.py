@@ -2,18 +2,23 @@
 
 import numpy as np
 import pytest
+from toy_scene import box_mesh
 
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import Summary
 from rbfmuscle.metrics.verdict import measured_doubts, published_band
-from rbfmuscle.scene.phantom import phantom_scene
+from rbfmuscle.scene.scene import Scene
 
 FLEXION = "hip.flexion"
 
 
 def doubts(values, *, muscle="iliacus", rows=(), others=0.0, step=2.0):
     """What is said of a muscle with these moment arms in flexion from 0 by ``step`` degrees."""
-    scene = phantom_scene(end=2.0)
+    scene = Scene("hip", units="mm")
+    for bone, high in (("pelvis", 1.0), ("femur", 0.0)):
+        scene.add_bone(bone, box_mesh((0, 0, high - 1.0), (1, 1, high)))
+    axes = {"flexion": (1, 0, 0), "adduction": (0, 1, 0)}
+    scene.add_joint("hip", "pelvis", "femur", (0, 0, 0), axes)
     angles = step * np.arange(len(values))
     arms = [
         Row(k, FLEXION, float(a), muscle, "moment_arm", float(v), "mm")

@@ -135,6 +135,15 @@ def test_stretch_of_fibres_is_in_percentiles(scene):
     assert values == pytest.approx([0.82, 1.0, 1.18])
 
 
+def test_tendons_are_part_of_the_length_and_of_that_of_the_shortest_path(scene, found):
+    frame = stretched(scene)
+    frame.tendons = {"limb": SimpleNamespace(points=np.array([[0.0, 0, 0], [0, 7, 0]]))}
+    longer = measures_of(scene).measure(frame)["box"]
+    assert found["path_length"] == pytest.approx(found["length"] / found["bowing"])
+    for name in ("length", "path_length"):
+        assert longer[name] == pytest.approx(found[name] + 7.0)
+
+
 def test_tendons_of_one_end_count_by_the_areas_of_their_patches():
     mesh = toy.box_mesh((0, 0, 0), (40, 20, 20))
     x, y = mesh.vertices[:, 0], mesh.vertices[:, 1]

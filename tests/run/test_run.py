@@ -38,6 +38,21 @@ class TestSimulate:
         simulate(arm_scene(), progress=True)
         assert "arm: frame 3 of 3 (" in capsys.readouterr().err
 
+    def test_bones_without_an_inside_are_named_in_the_verdict(self):
+        scene, ball = arm_scene(end=4, step=2), trimesh.creation.icosphere(3, 10.0)
+        plain = simulate(scene).verdict
+        flat = trimesh.creation.box([20, 10, 1e-9]).subdivide()
+        # A third of the ball's surface is missing.
+        torn = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] > -10 / 3])
+        for name, mesh, place in (("torn", torn, -40), ("flat", flat, 0), ("whole", ball, 40)):
+            scene.add_bone(name, mesh.copy().apply_translation([place, 80, 0]))
+        verdict = simulate(scene).verdict
+        assert "Doubtful" not in plain
+        assert "Doubtful: torn: " in verdict and "surface is missing" in verdict
+        scene.bones = [bone for bone in scene.bones if bone.name != "torn"]
+        verdict = simulate(scene).verdict
+        assert "Doubtful: flat: it is flat" in verdict and "more" not in verdict
+
     @pytest.mark.parametrize("report", [True, False])
     def test_report_is_written_where_it_is_asked_for(self, report, tmp_path):
         stream_run(arm_scene(end=10), tmp_path, settings={"output.report": report}, pictures=False)

@@ -64,6 +64,11 @@ def crash_or_run(scene, settings, frames):
     return run_point(scene, settings, frames)
 
 
+def failing(scene, settings, frames):
+    """A runner without a run."""
+    raise UsageError("not run")
+
+
 def rows_of(points, folder):
     """Lines of the table without what differs from run to run."""
     write_table(points, folder, {"arm": "mm"})
@@ -205,6 +210,15 @@ class TestRun:
             r.message for r in failed
         )
         assert sweep(tmp_path, ["model.centres=40,-3", "model.resolution=16,24"])[1] == len(failed)
+
+    def test_each_point_is_read_a_few_times_however_many_there_are(self, tmp_path, monkeypatch):
+        read, keys = SweepFolder.read, []
+        monkeypatch.setattr(
+            SweepFolder, "read", lambda self, key: keys.append(key) or read(self, key)
+        )
+        angles = ",".join(str(0.1 * k) for k in range(1, 31))
+        points, count = sweep(tmp_path, [f"contact.substep_angle={angles}"], runner=failing)
+        assert count == len(points) == 31 and 0 < len(keys) <= 2 * count
 
 
 @pytest.fixture
