@@ -54,6 +54,17 @@ def test_string_over_a_ball_is_two_tangents_and_an_arc(height, clearance):
         assert line_length(path) == pytest.approx(2 * FAR, rel=1e-6)
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_path_keeps_its_clearance_from_a_bone_beside_its_box(side):
+    plate = trimesh.creation.box((20.0, 20.0, 4.0)).apply_translation([0.0, 0.0, -side * 3.0])
+    probe = BoneDistance("plate", plate.subdivide().subdivide())
+    line = np.linspace([-30.0, 0.0, 0.0], [30.0, 0.0, 0.0], 20)
+    path, _ = shortest_path(line, [probe], {"plate": np.eye(4)}, clearance=np.full(NODES, 3.0))
+    # One unit of way to the plate's face, two more to keep.
+    assert side * path[len(path) // 2, 2] == pytest.approx(2.0, abs=0.01)
+    assert line_length(path) == pytest.approx(2 * (10.0 + np.hypot(20.0, 2.0)), rel=0.01)
+
+
 def test_path_goes_through_the_patches_via_bones():
     """A bent tube that a third bone holds at its bend: as long as the path through the bend."""
     bend = np.array([0.0, 0.0, 30.0])
@@ -70,6 +81,7 @@ def test_path_goes_through_the_patches_via_bones():
         muscle = SimpleNamespace(mesh=mesh, attachments=held + via)
         centreline = Centreline(muscle, joints, mesh.vertices, mesh.faces)
         measured[len(via)] = centreline.measure(mesh.vertices, poses, [])
+    assert list(centreline.via) == [NODES // 2]  # the node at the bend, in the middle
     # The centroids of slices cut the corner at the bend, by less than the tube's radius.
     assert measured[1][0] == measured[0][0] == pytest.approx(100.0, abs=3.0)
     assert measured[0][1] == pytest.approx(measured[0][0] / 80.0, rel=1e-6)

@@ -19,6 +19,7 @@ from rbfmuscle.metrics.summary import (
     Summary,
     exceeded,
     parse_limits,
+    shown_number,
     unmeasured,
 )
 from rbfmuscle.metrics.verdict import describe_verdict, judge
@@ -167,6 +168,9 @@ def test_what_was_not_measured_is_within_no_limit():
         "every muscle is within all limits that were measured in every frame. Not measured: "
         "rest_error_rms of psoas"
     )
+    assert "Not measured" not in said_of(table(), parse_limits(None, scene))
+    none = {ALL: Summary().table()}  # of a run that stopped before its first frame
+    assert said_of(none, parse_limits(None, scene)) == "nothing was measured"
 
 
 def test_the_worst_by_its_limit_is_named_first_and_bones_are_named_too():
@@ -197,6 +201,28 @@ def test_a_value_just_beyond_its_limit_does_not_look_like_it():
         facts({"rest_error_rms": [0.5004]}), parse_limits("rest_error_rms=0.5", arm_scene())
     )
     assert "rest error 0.5004 mm at frame 0 (limit 0.5)" in said
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "shown"),
+    [
+        (12.3456, "mm", "12.3 mm"),
+        (1234.5, "mm", "1234 mm"),
+        (99_999.0, "1", "99999"),
+        (100_000.0, "", "1e+05"),
+        (0.009, "mm", "< 0.01 mm"),
+        (0.01, "mm", "0.01 mm"),
+        (9e-13, "m", "< 1e-12 m"),
+        (0.25, "s", "250 ms"),
+        (-0.25, "s", "-250 ms"),
+        (1.0, "s", "1 s"),
+        (0.0, "mm", "0 mm"),
+        (None, "mm", "–"),
+        (np.nan, "mm", "–"),
+    ],
+)
+def test_numbers_are_shown_with_three_digits_and_their_unit(value, unit, shown):
+    assert shown_number(value, unit) == shown
 
 
 def test_limits_of_the_command_line_follow_the_unit():

@@ -11,11 +11,19 @@ from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.metrics.centreline import Centreline, split_ends
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
 from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.metrics.rows import _roughness, _smoothness, bone_depth, moment_arms, surface_depth
+from rbfmuscle.metrics.rows import (
+    _roughness,
+    _smoothness,
+    bone_depth,
+    moment_arm_rows,
+    moment_arms,
+    surface_depth,
+)
 from rbfmuscle.recording import simulate
 from rbfmuscle.scene.bone import Bone, BoneDistance
 from rbfmuscle.scene.joints import Coordinate
 from rbfmuscle.scene.objects import Attachment, Motion
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame import Frame, ModelSurface
 
 EYE = np.eye(4)
@@ -343,6 +351,27 @@ def test_roughness_is_the_second_difference_over_two_degrees_beyond_that_of_the_
     alone = _roughness(arms, lengths, dict.fromkeys(paths, np.nan))
     beyond = [row.value for row in alone if row.quantity == "roughness_beyond_path"]
     assert max(beyond) == pytest.approx(0.12 + 1.0)
+
+
+def test_the_way_there_and_the_way_back_are_stretches_of_their_own():
+    """Lengths fall by 2 per degree; the muscle is 5 longer on the way back."""
+    scene = Scene("hinge", units="mm")
+    for name in ("trunk", "limb"):
+        scene.add_bone(name, trimesh.creation.box((1, 1, 1)))
+    scene.add_joint("hinge", "trunk", "limb", (0, 0, 0), {"bend": (0, 0, 1)})
+    angles = np.concatenate([np.arange(11.0), np.arange(9.0, -1.0, -1.0)])
+    path = {k: {"hinge.bend": np.radians(a)} for k, a in enumerate(angles)}
+    lengths = {k: 100.0 - 2.0 * a + 5.0 * (k > 10) for k, a in enumerate(angles)}
+    none = {"shortest": {"m": dict.fromkeys(path, 90.0)}, "fibres": {}, "activations": {}}
+    rows = moment_arm_rows(scene, path, lengths={"m": lengths}, **none)
+    rough = [row for row in rows if row.quantity == "length_roughness"]
+    # Second differences over 2 degrees, from 2 to 8 there and back.
+    there, back = (
+        [row.coordinate_value for row in rough if (row.frame > 10) == later] for later in (0, 1)
+    )
+    assert there == pytest.approx(np.arange(2.0, 9.0))
+    assert back == pytest.approx(np.arange(2.0, 8.0))
+    assert [row.value for row in rough] == pytest.approx([0.0] * len(rough), abs=1e-9)
 
 
 def test_the_sign_of_a_moment_arm_is_judged_where_attachments_are_guessed():
