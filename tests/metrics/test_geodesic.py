@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.lines import line_length, tube_mesh
-from rbfmuscle.metrics.centreline import NODES, Centreline, shortest_path
+from rbfmuscle.metrics.centreline import NODES, Centreline, resampled, shortest_path
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.objects import Attachment
 
@@ -52,6 +52,19 @@ def test_string_over_a_ball_is_two_tangents_and_an_arc(height, clearance):
     for probes, poses in (([], {}), ([ball()], {"ball": away})):
         path, _ = shortest_path(over_the_ball(height), probes, poses, clearance=kept_off)
         assert line_length(path) == pytest.approx(2 * FAR, rel=1e-6)
+
+
+def test_path_is_the_same_in_any_unit_and_is_at_rest_where_it_was(monkeypatch):
+    line, still = over_the_ball(20.0), {"ball": np.eye(4)}
+    path, _ = shortest_path(line, [ball()], still, clearance=np.full(NODES, 2.0))
+    small = BoneDistance("ball", trimesh.creation.icosphere(5, 1e-3 * RADIUS))
+    found, _ = shortest_path(1e-3 * line, [small], still, clearance=np.full(NODES, 2e-3))
+    np.testing.assert_allclose(1e3 * found, path, atol=1e-6)
+    monkeypatch.setattr("rbfmuscle.metrics.centreline.ROUNDS", 2)
+    given = line, [ball()], still, np.full(NODES, 2.0)
+    again, settled = shortest_path(*given, path - resampled(line, NODES - 1))
+    assert settled and np.abs(again - path).max() < 1e-3 * FAR
+    assert not shortest_path(*given)[1]
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

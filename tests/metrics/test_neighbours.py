@@ -68,13 +68,13 @@ def test_sliding_along_a_neighbour_opens_no_gap():
 @pytest.mark.parametrize("units", ["mm", "m"])
 def test_what_overlaps_at_rest_counts_apart_and_only_where_it_does(units):
     scale = 1.0 if units == "mm" else 0.001
-    balls = [trimesh.creation.icosphere(5, 10.0) for _ in range(2)]
+    balls = [trimesh.creation.icosphere(4, 10.0) for _ in range(2)]
     balls[1].apply_translation([19.0, 0, 0])
     for ball in balls:
         ball.apply_scale(scale)
     measures, meshes = pair(*balls, units=units)
-    # Facets lie within 0.01 of a ball of radius 10.
-    near = pytest.approx(1.0 * scale, abs=0.02 * scale)
+    # Facets lie within 0.03 of a ball of radius 10.
+    near = pytest.approx(1.0 * scale, abs=0.06 * scale)
     assert measures.input.deepest("one") == near and measures.input.deepest("other") == near
     at_rest = measures.measure(0, shown(meshes))["other"]["neighbour_overlap_max"]
     assert at_rest == pytest.approx(0.0, abs=1e-12)
