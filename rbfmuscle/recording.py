@@ -420,10 +420,11 @@ class Recording:
         it may fail on; its facts.
         """
         start = time.perf_counter()
-        with timed(self.times, "report"), stage("drawing pictures"):
-            if self.scene.output.report:
-                from rbfmuscle.display.report import write_report
+        if self.scene.output.report:
+            from rbfmuscle.display.report import write_report
 
+            said = "drawing pictures" if pictures else "writing the report"
+            with timed(self.times, "report"), stage(said):
                 write_report(writer.directory, pictures=pictures)
         self._end += time.perf_counter() - start
         info = self.info()

@@ -11,6 +11,7 @@ from rbfmuscle.display.animation import pack_runs, read_animation
 from rbfmuscle.display.page import (
     BAD,
     GOOD,
+    NEAR,
     Cell,
     CheckRow,
     ReportPage,
@@ -38,6 +39,7 @@ from rbfmuscle.metrics.summary import (
     shown_number,
 )
 from rbfmuscle.metrics.verdict import (
+    MOVED,
     Verdict,
     describe_details,
     describe_unmeasured,
@@ -198,7 +200,7 @@ def _lights(saved: RunData) -> list[CheckRow]:
     beyond = {quantity_of(row.quantity) for row in exceeded(saved.info.muscles, limits)}
     other = sorted((beyond | set(limits.fail_on)) - known)
     rows = [_light(saved, *row) for row in (*LIGHTS.items(), *((name, (name,)) for name in other))]
-    found = [row for row in rows if row]
+    found = [row for row in (*rows, _overlap_light(saved)) if row]
     if missing:
         found.append(
             CheckRow(
@@ -241,6 +243,30 @@ def _light(saved: RunData, title: str, quantities: Sequence[str]) -> CheckRow | 
     if note.replace(" ", "_") != name:
         note = f"{note} ({name})"  # its name in ``metrics.csv``
     return CheckRow(title, cells, allowed, note + place if worst else note)
+
+
+def _overlap_light(saved: RunData) -> CheckRow | None:
+    """How far muscles are moved at rest beside overlaps with bones, which is a doubt about the
+    scan; None where there are none.
+    """
+    name = "rest_error_at_overlap"
+    moved = {
+        muscle: value
+        for muscle, table in saved.info.muscles.items()
+        if (value := table.get(name, {}).get("first")) is not None
+    }
+    if not moved:
+        return None
+    muscle = max(moved, key=moved.__getitem__)
+    most = from_mm(MOVED, saved.units)
+    state = GOOD if moved[muscle] <= most else NEAR
+    place = muscle.replace("_", " ")
+    return CheckRow(
+        "Overlaps no bone in the scan",
+        [number_cell(moved[muscle], saved.units, state)],
+        f"doubt > {most:.3g} {saved.units}",
+        f"rest error beside overlaps ({name}): {place}",
+    )
 
 
 def _plots(saved: RunData) -> list[Section]:

@@ -270,7 +270,11 @@ def measured_doubts(
             found.append(Doubt(muscle, text))
         alone = [row for row in mine if _others_rest(path[row.frame], coordinate, rest)]
         found += _outside_band(scene, muscle, coordinate, alone)
-    turning = any(all_coordinates(scene.joints)[name].motion == "rotation" for _, name in arms)
+    known = all_coordinates(scene.joints)
+    turning = any(
+        known[name].motion == "rotation" and np.isfinite([row.value for row in mine]).any()
+        for (_, name), mine in arms.items()
+    )
     if turning and not any(row.quantity == "length_roughness" for row in rows):
         text = f"roughness is not measured: no frames are {ROUGH:g} degrees apart or less"
         found.append(Doubt(ALL, text))

@@ -2,6 +2,7 @@
 limits.
 """
 
+import json
 import shutil
 
 import numpy as np
@@ -10,9 +11,10 @@ from PIL import Image
 
 from rbfmuscle.display import pictures as render
 from rbfmuscle.display.page import Cell, ReportPage, Section, Table, limit_state
-from rbfmuscle.display.report import write_report
+from rbfmuscle.display.report import _lights, write_report
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.run.appearance import muscle_groups
+from rbfmuscle.run.data import RunData
 from rbfmuscle.run.info import JointInfo
 from rbfmuscle.validation import UsageError
 
@@ -115,6 +117,19 @@ def test_lights_are_green_amber_from_four_fifths_and_red_beyond():
     assert [limit_state("components", v, 1.0) for v in (1.0, 2.0)] == ["good", "bad"]
     assert [limit_state("euler_characteristic", v, 2.0) for v in (2.0, 0.0)] == ["good", "bad"]
     assert limit_state("flicker", 5.0, None) == limit_state("flicker", None, 1.0) == "plain"
+
+
+@pytest.mark.parametrize(
+    ("facts", "states"),
+    [({}, []), ({"first": 0.2}, ["good"]), ({"first": 3.0}, ["near"])],
+)
+def test_what_moves_beside_an_overlap_at_rest_is_a_row_of_its_own(folder, tmp_path, facts, states):
+    run = shutil.copytree(folder, tmp_path / "run")
+    info = json.loads((run / "run.json").read_text())
+    info["muscles"]["biceps"]["rest_error_at_overlap"] = {"unit": "mm", **facts}
+    (run / "run.json").write_text(json.dumps(info))
+    rows = [light for light in _lights(RunData.load(run)) if "rest_error_at" in light.note]
+    assert [cell.state for light in rows for cell in light.cells] == states
 
 
 def test_names_stay_text(tmp_path):

@@ -50,6 +50,9 @@ def test_a_moment_arm_that_leaves_the_published_band_is_a_doubt():
 def test_moment_arms_without_a_value_and_steps_too_long_to_see_a_jump_are_doubts():
     (said,) = doubts([3.0, np.nan, np.nan, 4.0], muscle="extensor")
     assert said == ("extensor", said.text) and "not defined in 2 of 4 frames" in said.text
+    # Where no moment arm has a value, the step is not why roughness is not measured.
+    (said,) = doubts([np.nan] * 4, muscle="extensor", step=5.0)
+    assert said == ("extensor", said.text) and "not defined in 4 of 4 frames" in said.text
     (said,) = doubts([3.0] * 4, muscle="extensor", step=5.0)
     assert said.muscle == ALL and "not measured" in said.text
 
