@@ -91,7 +91,8 @@ LOOK = "look at that frame: rbfmuscle render RUN --frame FRAME -o frame.png"
 
 class Limit(NamedTuple):
     """Greatest allowed magnitude of a quantity (of those in `LOWER_BOUNDS` the least), lengths in
-    millimetres; ``mesh_remedy`` is that of mesh models, where it is another.
+    millimetres; ``mesh_remedy`` is that of mesh models, ``active_remedy`` that of muscles which
+    contract, where it is another.
 
     A remedy is one that a test follows (tests/metrics/test_advice.py); where none is known to help,
     the frame is named.
@@ -101,12 +102,14 @@ class Limit(NamedTuple):
     title: str
     remedy: str = LOOK
     mesh_remedy: str = ""
+    active_remedy: str = ""
 
 
 # Numbers from the first to below the second are shown without decimals or a power of ten.
 _WHOLE = (100.0, 1e5)
 _SETTLE = "raise model.iterations"
 _CONVERGE = "take a model that converges, as pbd-converged"
+_RELAX = "lower the activation: docs/contraction.md"
 _JOINT = "correct the joint's centre, axes or range"
 _APART = "move muscle or bone apart: rbfmuscle check SCENE"
 LIMITS = {
@@ -117,7 +120,7 @@ LIMITS = {
     "components": Limit(1.0, "pieces"),
     "euler_characteristic": Limit(2.0, "Euler characteristic"),
     "self_crossings": Limit(0.0, "self-crossing triangles"),
-    "solver_residual": Limit(1e-4, "error left by the solver", _SETTLE, _CONVERGE),
+    "solver_residual": Limit(1e-4, "error left by the solver", _SETTLE, _CONVERGE, _RELAX),
     "solid_volume_error": Limit(0.02, "volume error of the solid"),
     "unfitted_fraction": Limit(0.999, "surface shown without a fit"),
     "flicker": Limit(0.5, "flicker"),

@@ -136,16 +136,18 @@ def worst_first(found: Sequence[Exceedance]) -> list[Exceedance]:
 
 
 def find_remedy(row: Exceedance, table: Table) -> str:
-    """What to do about one excess; smaller steps do not mend an overlap of the meshes at rest, and
-    mesh models have no centres.
+    """What to do about one excess; smaller steps do not mend an overlap of the meshes at rest, mesh
+    models have no iterations, and muscles that contract strongly do not settle with more of them.
     """
     muscle, quantity, _, limit, _ = row
     overlap = table[muscle].get("initial_overlap", {}).get("worst")
     depth = quantity in ("penetration_max", "bone_penetration_max")
     at_rest = depth and overlap is not None and overlap > limit
     limit_kind = LIMITS["initial_overlap" if at_rest else quantity_of(quantity)]
-    is_mesh = "unfitted_fraction" not in table[muscle]
-    return (is_mesh and limit_kind.mesh_remedy) or limit_kind.remedy
+    if "unfitted_fraction" not in table[muscle]:
+        return limit_kind.mesh_remedy or limit_kind.remedy
+    active = table[muscle].get("activation", {}).get("worst")
+    return (active and limit_kind.active_remedy) or limit_kind.remedy
 
 
 def describe_excess(row: Exceedance, table: Table, missing_bones: Sequence[str] = ()) -> str:

@@ -91,6 +91,20 @@ def test_more_iterations_and_models_that_converge_lower_the_residual():
     assert residual("pbd-converged", {}) < 0.5 * residual("pbd", {})
 
 
+def test_a_lower_activation_lowers_the_residual_of_a_muscle_that_contracts(hip_scene):
+    scene = hip_scene.with_options()
+    scene.muscles = [scene.muscle("gluteus_maximus")]
+    keys = {"fibre_stretch_at_rest": 1.1, "tendon_region.length": 40}  # as in docs/contraction.md
+    settings = {f"muscle.gluteus_maximus.{key}": value for key, value in keys.items()}
+    runs = [
+        simulate(scene, frames="0:1", settings=settings | {"activation": activation})
+        for activation in (1.0, 0.3)
+    ]
+    assert LIMITS["solver_residual"].active_remedy in runs[0].verdict
+    before, after = (run.values("gluteus_maximus", "solver_residual").max() for run in runs)
+    assert after < 0.1 * before
+
+
 def test_every_remedy_is_followed_by_a_test():
     # What is left is followed in tests/scene/test_guesses.py: a far end is not articular.
     followed = {quantity for quantity, *_ in MENDED} | {
@@ -100,3 +114,5 @@ def test_every_remedy_is_followed_by_a_test():
     }
     advised = {name for name, limit in LIMITS.items() if not limit.remedy.startswith(LOOK)}
     assert advised == followed
+    for others in ("mesh_remedy", "active_remedy"):
+        assert {name for name, limit in LIMITS.items() if getattr(limit, others)} <= followed
