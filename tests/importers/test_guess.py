@@ -29,10 +29,11 @@ from rbfmuscle.anatomy.bones import (
 from rbfmuscle.anatomy.names import name_facts
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.lines import line_length, points_along, tube_mesh
-from rbfmuscle.importers.guess.attachments import Ends
+from rbfmuscle.importers.guess.attachments import Ends, guess_attachments
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
-from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
+from rbfmuscle.importers.guess.joints import Face, Skeleton, fit_ball, fit_hinge, guess_joints
 from rbfmuscle.recording import Run
+from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.joints import JointTable
 from rbfmuscle.scene.phantom import phantom_scene
@@ -180,6 +181,33 @@ def test_ends_of_a_bent_tube_are_its_tips():
     z = np.sort(mesh.vertices[list(ends.tips), 2])
     assert z[0] < mesh.bounds[0][2] + 5 and z[1] > mesh.bounds[1][2] - 5
     assert ends.along(0)[ends.tips[0]] == 0.0 and ends.along(0)[ends.tips[1]] == 1.0
+
+
+@pytest.mark.parametrize("millimetre", [1.0, 1e-3])
+def test_ends_of_an_unknown_muscle_are_chosen_together_and_one_that_points_away_is_held_whole(
+    millimetre,
+):
+    """A muscle that passes beside the upper bone, as a psoas does the brim, and whose lower end
+    touches it too.
+    """
+    bones, skeleton = [], {}
+    for name, low, high in (("upper", 0.0, 40.0), ("lower", -110.0, -10.0)):
+        mesh = trimesh.creation.box((40.0, 40.0, high - low)).subdivide().subdivide().subdivide()
+        mesh.apply_translation([0.0, 0.0, 0.5 * (low + high)])
+        mesh.apply_scale(millimetre)
+        bones.append(Part(name, name, SimpleNamespace(mesh=mesh), kind=name))
+        skeleton[bones[-1]] = Bone(name, mesh)
+    line = np.array([[27.5, 0.0, z] for z in np.linspace(140.0, -5.0, 60)])
+    mesh = trimesh.Trimesh(*tube_mesh(millimetre * line, millimetre * np.full(60, 4.0)))
+    muscle = Part("mass", "mass", SimpleNamespace(mesh=mesh), kind="")
+    none = {bone: np.empty((0, 3)) for bone in bones}
+    whole = Skeleton(skeleton, {b: b for b in bones}, [], millimetre, {}, none, [])
+    guess = guess_attachments(muscle, whole)
+    heights = {hold.bone.name: mesh.vertices[hold.vertices][:, 2] for hold in guess.holds}
+    assert set(heights) == {"upper", "lower"}
+    assert heights["upper"].min() > 90.0 * millimetre
+    assert heights["lower"].max() < 30.0 * millimetre
+    assert guess.confidence < 0.5 and "mm from the upper" in " ".join(h.reason for h in guess.holds)
 
 
 def test_muscles_without_the_bones_of_their_names_still_make_a_scene(tmp_path):

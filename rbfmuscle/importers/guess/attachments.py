@@ -298,7 +298,7 @@ def guess_attachments(muscle: Part, skeleton: Skeleton, *, named: bool = True) -
         places = _named_places(guess, distances, ends, skeleton)
     by_name = bool(places)
     if not by_name:
-        places = _nearest_places(muscle, skeleton.bodies, distances, ends)
+        places = _nearest_places(muscle, skeleton, distances, ends)
         known = muscle.facts is not None
         why = "the bones of its name are not here" if known else "its name is not known"
         guess.reasons = []
@@ -385,37 +385,46 @@ def _best_of(kinds, muscle, distances):
     return None
 
 
-def _nearest_places(muscle, bodies, distances, ends):
-    """Places without names: what an end touches, else what it points to; not twice the same
-    body.
+def _nearest_places(muscle, skeleton, distances, ends):
+    """Places without names: what the ends touch, else what they point to, not both the same body.
+
+    Both ends are chosen together: what an end that touches nothing leaves to the other counts too.
+    An end that points away from its bone is held whole.
     """
-    places, wishes = [], []
+    bodies = skeleton.bodies
+    scores = []
     for end in (0, 1):
         cap = ends.along(end) < CAP_SHARE
         score = {}
         for bone, distance in distances.items():
             near = distance[cap].min()
+            away, ahead = _aim(muscle.points, ends.along(end), bone)
             score[bone] = (
-                near / NEAR - 1.0 if near < NEAR else _aim(muscle.points, ends.along(end), bone)
+                (near / NEAR - 1.0, True) if near < NEAR else (away / skeleton.millimetre, ahead)
             )
-        order = sorted(score, key=score.__getitem__)
-        wishes.append((score[order[0]], end, order))
-    for _, end, order in sorted(wishes, key=lambda wish: wish[0]):
-        taken = {bodies[place.bone] for place in places}
-        free = (bone for bone in order if bodies[bone] not in taken)
-        places.append(Place(next(free, order[0]), end))
-    return places
+        scores.append(score)
+
+    def cost(pair):
+        return scores[0][pair[0]][0] + scores[1][pair[1]][0]
+
+    pairs = [(one, other) for one in distances for other in distances]
+    apart = [pair for pair in pairs if bodies[pair[0]] != bodies[pair[1]]]
+    chosen = min(apart or pairs, key=cost)
+    return [Place(bone, end, stands_in=not scores[end][bone][1]) for end, bone in enumerate(chosen)]
 
 
 def _aim(points, along, bone):
-    """How far an end is from a bone in the direction that it points to; what lies aside counts as
-    farther.
+    """How far an end is from a bone in the direction that it points to, where what lies aside
+    counts as farther [scene unit]; whether it points there rather than away.
     """
     tip = points[along < TIP].mean(axis=0)
     direction = unit(tip - points[(along > TURN[0]) & (along < TURN[1])].mean(axis=0))
     away = bone.points - tip
     distance = np.maximum(np.linalg.norm(away, axis=1), 1e-300)
-    return float((distance * (1.0 + ASIDE * (1.0 - away @ direction / distance))).min())
+    ahead = away @ direction / distance
+    cost = distance * (1.0 + ASIDE * (1.0 - ahead))
+    best = int(np.argmin(cost))
+    return float(cost[best]), bool(ahead[best] > 0.0)
 
 
 def _hold(place, distance, ends, muscle, skeleton):
