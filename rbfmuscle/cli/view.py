@@ -49,7 +49,8 @@ def view(
     port
         Port of the address, which this machine alone can open; any free one by default.
     screenshot
-        Draw this PNG at --at, without a display, and open nothing.
+        Draw this PNG at --at, without a display, and open nothing; the models of a comparison side
+        by side.
     """
     stops = dict(_parse_stop(text) for text in at or [])
     if scene.is_dir():
@@ -128,16 +129,16 @@ def _draw(opened, model, stops, path):
     from rbfmuscle.recording import simulate
 
     check_picture(path)
-    if isinstance(opened, dict):
-        _check_stops(stops, ["frame"])
-        if len(opened) > 1:
-            names = ", ".join(opened)
-            raise UsageError(f"--screenshot draws one run, give the folder of one of {names}")
-        (saved,) = opened.values()
-        frame = int(stops.get("frame", saved.frame_numbers[0]))
+    if not isinstance(opened, dict):
+        render_run(simulate(_posed(opened, stops), model), path, frame=1)
+        return
+    _check_stops(stops, ["frame"])
+    first = next(iter(opened.values()))
+    frame = int(stops.get("frame", first.frame_numbers[0]))
+    if len(opened) > 1:
+        render_run(opened, path, frame=frame, views=["motion"])
     else:
-        saved, frame = simulate(_posed(opened, stops), model), 1
-    render_run(saved, path, frame=frame)
+        render_run(first, path, frame=frame)
 
 
 def _posed(scene, stops):

@@ -175,7 +175,7 @@ def _raster_loop(points, faces, shades, opacity, depth, image):
 
 
 def render_run(
-    run: RunData | str | Path,
+    run: RunData | str | Path | Mapping[str, RunData],
     output: str | Path,
     *,
     frame: int | None = None,
@@ -184,8 +184,8 @@ def render_run(
     most: int | None = None,
     seconds: float | None = None,
 ) -> None:
-    """Draw a run, or the one in a folder, to a picture (``.png``, one frame) or an animation
-    (``.gif`` or ``.webp``, all of them).
+    """Draw a run, or the one in a folder, or runs of one motion by their titles, to a picture
+    (``.png``, one frame) or an animation (``.gif`` or ``.webp``, all of them).
 
     ``frame`` is that of a picture: its number, or from the end of those that were written if it is
     negative; by default the last. ``views``, side by side, are of `VIEWS`, or
@@ -194,13 +194,15 @@ def render_run(
     evenly. UsageError if the folder holds nothing to draw, the suffix, frame or view is unknown,
     or another file is in the way.
     """
-    run = open_run(run)
+    runs = run if isinstance(run, Mapping) else {"": open_run(run)}
+    run = next(iter(runs.values()))
     output = Path(output)
     if output.suffix not in (".png", ".gif", ".webp"):
         raise UsageError(f"{output}: the suffix must be .png, .gif or .webp")
     check_picture(output)
-    if not run.has_surfaces:
-        raise UsageError(f"{run.directory or 'the run'} has no surfaces to draw")
+    for drawn in runs.values():
+        if not drawn.has_surfaces:
+            raise UsageError(f"{drawn.directory or 'the run'} has no surfaces to draw")
     if output.suffix == ".png" and seconds is not None:
         raise UsageError(f"{output}: seconds are of an animation (.gif, .webp), not of a picture")
     if output.suffix != ".png" and frame is not None:
@@ -219,15 +221,17 @@ def render_run(
     frames = (
         [frame] if output.suffix == ".png" else chosen_frames(run.frame_numbers, most or len(run))
     )
-    save_images(_draw_views(run, axes, frames, area), output, seconds)
+    save_images(_draw_views(runs, axes, frames, area), output, seconds)
 
 
 def _draw_views(
-    run: RunData, axes: Mapping[str, Floats], frames: Sequence[int], area: float
+    runs: Mapping[str, RunData], axes: Mapping[str, Floats], frames: Sequence[int], area: float
 ) -> list[Image.Image]:
-    """A picture of each frame: views of so many pixels side by side, with titles, caption and
-    colours.
+    """A picture of each frame: views of so many pixels of each run side by side, with titles,
+    caption and colours.
     """
+    run = next(iter(runs.values()))
+    titles = [f"{title}: {view}" if title else view for title in runs for view in axes]
     some = {run.frames[k].index for k in (0, len(run) // 2, -1)}
     names = [*run.muscles, *run.tendons]
     seen = np.concatenate([run.mesh(name, k)[0][::3] for name in names for k in some])
@@ -237,8 +241,8 @@ def _draw_views(
         chips = {run.groups[name]: chips[name] for name in reversed(run.muscles)}
 
     def draw(frame: int) -> Image.Image:
-        image = np.concatenate([_draw_frame(run, camera, frame) for camera in cameras], axis=1)
-        return labelled(image, frame_caption(run, frame), list(axes), chips)
+        drawn = [_draw_frame(one, camera, frame) for one in runs.values() for camera in cameras]
+        return labelled(np.concatenate(drawn, axis=1), frame_caption(run, frame), titles, chips)
 
     return each(draw, frames)
 

@@ -45,12 +45,22 @@ def test_picture_of_a_scene_is_of_the_pose_asked_for(tmp_path, capsys, graphics)
     assert (image(tmp_path / "rest.png") != image(tmp_path / "bent.png")).any(axis=2).mean() > 0.01
 
 
-def test_screenshot_of_several_runs_asks_for_one(run_folder, tmp_path, capsys):
+def test_screenshot_of_a_comparison_has_its_models_side_by_side(run_folder, tmp_path, capsys):
     for name in ("rbf", "pbd"):
         shutil.copytree(run_folder, tmp_path / name)
-    code, _, err = call(capsys, "view", tmp_path, "--screenshot", tmp_path / "a.png")
-    assert code == 2 and "give the folder of one of pbd, rbf" in err
-    assert not (tmp_path / "a.png").exists()
+    code, _, err = call(
+        capsys, "view", tmp_path, "--at", "frame=2", "--screenshot", tmp_path / "a.png"
+    )
+    assert code == 0, err
+    render_run(run_folder, tmp_path / "b.png", frame=2, views=["motion"])
+    both, one = image(tmp_path / "a.png"), image(tmp_path / "b.png")
+    wide = one.shape[1]
+    assert both.shape[1] == 2 * wide
+    titles = slice(0, 22)
+    for half in (both[:, :wide], both[:, wide:]):  # below the titles, which name the models
+        assert (half[titles] != one[titles]).any()
+        np.testing.assert_array_equal(half[22:300], one[22:300])
+    assert (both[titles, :wide] != both[titles, wide:]).any()
 
 
 @pytest.mark.parametrize(
