@@ -136,13 +136,29 @@ class Panel:
 
     def follow_motion(self, arrived: bool) -> None:
         """Set the controls to the frame of the motion where the play bar is: the next one while it
-        plays and pictures have ``arrived`` at the one before.
+        plays and pictures have ``arrived`` at the one before. Where the controls were moved
+        instead, set the play bar to the frame nearest to them.
         """
         if self.play.value and arrived:
             self.frame.value = (self.frame.value + 1) % len(self.source.motion)
         if self.frame.value != self._followed:
             self._followed = self.frame.value
             self.move_to(self.source.motion[self.frame.value])
+        else:
+            self._followed = self.frame.value = self._nearest_frame()
+
+    def _nearest_frame(self) -> int:
+        """The frame of the motion nearest to the controls, in shares of their ranges; the last one
+        followed where others are as near.
+        """
+        names = list(self.source.motion[0])
+        known = [self.source.controls[name] for name in names]
+        span = np.array([max(control.high - control.low, 1e-9) for control in known])
+        here = np.array([self.controls[name].value for name in names])
+        frames = np.array([[frame[name] for name in names] for frame in self.source.motion])
+        away = np.linalg.norm((frames - here) / span, axis=1)
+        least = int(np.argmin(away))
+        return least if away[least] < away[self._followed] - 1e-9 else self._followed
 
     def write(self, sides: list[ModelView], texts: list[str]) -> None:
         """Write the scale of the colours, the numbers of all muscles and texts."""
@@ -394,6 +410,8 @@ class ViewerPage:
         with self.server.atomic():
             for side, other in zip(sides, sides[::-1] if len(sides) > 1 else [None]):
                 side.draw(look, self._probes, None if other is None else other.picture)
+            for side in self.sides:
+                side.caption.visible = len(sides) > 1
             self._write()
             self.panel.plot_on(sides)
 

@@ -112,6 +112,7 @@ class MarkView:
         self._nodes[place].visible = True
 
 
+CAPTION = 0.02  # height of a model's name above it [m]
 LINE = 2.0  # thickness of a fibre [pixel]
 BONE_TRIANGLES = 6000  # Software drawing pays for each of them in every picture.
 
@@ -234,13 +235,18 @@ class ModelView:
         self._painted: list[GlbHandle] = []
         self._lines: dict[str, LineSegmentsHandle] = {}
         self._marks = MarkView(server, f"{root}/.marks", source.marks, 0.001 / source.millimetre)
+        points = (0.001 / source.millimetre) * np.concatenate(self.points())
+        up = source.body[2]
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        above = middle + (np.max((points - middle) @ up) + CAPTION) * up
+        self.caption = server.scene.add_label(f"{root}/.caption", "", position=above, visible=False)
 
     def choose(self, choice: str) -> bool:
         """Show another model or run, or none; returns whether it is another."""
         if choice == self.choice:
             return False
         figure = None if choice == "none" else self.source.figure(choice)
-        self.choice = choice
+        self.choice = self.caption.text = choice
         self.figure = figure
         self.picture = self.source.rest if figure is None else figure.advance()
         self.rest = self.picture

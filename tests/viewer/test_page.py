@@ -134,6 +134,33 @@ def test_second_model_follows_the_same_slider(page, tab):
     wait_for(lambda: page.sides[1].figure is None, SLOW)
 
 
+def test_play_bar_and_sliders_agree_whichever_is_moved(page):
+    panel, slider = page.panel, page.panel.controls["hip.flexion"]
+    wait_for(lambda: arrived(page), SLOW)
+    slider.value = 6.2  # frames are at 0, 2, 4, 6 and 8 degrees
+    wait_for(lambda: panel.frame.value == 3 and arrived(page), SLOW)
+    assert slider.value == 6.2
+    panel.frame.value = 1
+    wait_for(lambda: slider.value == pytest.approx(2.0) and arrived(page), SLOW)
+    assert panel.frame.value == 1
+    page._touch(rest=True)
+    wait_for(lambda: panel.frame.value == 0 and arrived(page), SLOW)
+    assert slider.value == 0.0
+
+
+def test_models_side_by_side_have_their_names_above_them(page):
+    captions = [side.caption for side in page.sides]
+    assert not any(caption.visible for caption in captions)
+    page.panel.models[1].value = "xpbd"
+    wait_for(lambda: captions[1].visible, SLOW)
+    assert [(c.text, c.visible) for c in captions] == [("pbd", True), ("xpbd", True)]
+    tops = [np.concatenate(side.points())[:, 2].max() for side in page.sides]
+    for caption, top in zip(captions, tops):
+        assert caption.position[2] > 0.001 * top  # the phantom is in mm, and stands upright
+    page.panel.models[1].value = "none"
+    wait_for(lambda: page.sides[1].figure is None and not captions[0].visible, SLOW)
+
+
 def test_buttons_turn_the_camera_of_their_own_browser(page, tab):
     client = max(page.server.get_clients().values(), key=lambda client: client.client_id)
     # A click while the page is drawn anew may be lost.
