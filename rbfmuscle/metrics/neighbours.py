@@ -213,5 +213,5 @@ def _parted(points: Floats, other: MeshDistance, gap: Floats) -> Floats:
 
 def _percentile(parted: Iterable[Floats]) -> float:
     """`GAP_PERCENTILE` of what has parted; 0 where nothing touched."""
-    values = np.concatenate([np.zeros(0), *parted])
+    values = np.concatenate([[], *parted])
     return float(np.percentile(values, GAP_PERCENTILE)) if len(values) else 0.0
