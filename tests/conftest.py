@@ -96,6 +96,13 @@ def find_data(name):
     return pytest.skip(f"{name}/ is not here (set RBFMUSCLE_DATA to the folder that holds it)")
 
 
+def samples(count):
+    """So many points of a test, a twentieth without compiler, where each takes 1000 times as
+    long.
+    """
+    return count // 20 if os.environ.get("NUMBA_DISABLE_JIT") else count
+
+
 @pytest.fixture(scope="session")
 def hip_data():
     """Folder of the real hip."""

@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 import trimesh
+from conftest import samples
 
 from rbfmuscle import cache
 from rbfmuscle.bones import rounded
@@ -73,7 +74,7 @@ def test_cache_lies_where_the_platform_keeps_caches(
     assert cache_path() == tmp_path / place
 
 
-POINTS = np.random.default_rng(0).uniform(-25.0, 25.0, (2000, 3))
+POINTS = np.random.default_rng(0).uniform(-25.0, 25.0, (samples(2000), 3))
 DAMAGES = {
     "cut": lambda content: content[: len(content) // 2],
     "flipped": lambda content: content[:500] + bytes([content[500] ^ 0xFF]) + content[501:],

@@ -4,6 +4,7 @@ import igl
 import numpy as np
 import pytest
 import trimesh
+from conftest import samples
 
 from rbfmuscle.bones.distance import STACK, Memory, bone_arrays, distance_loop, winding_number
 from rbfmuscle.geometry.exact_distance import ExactDistance
@@ -34,7 +35,7 @@ def ask(bone, points, *, reach=np.inf, memory=None, pose=None):
 
 
 def points_about(mesh, count=3000, seed=0):
-    rng = np.random.default_rng(seed)
+    count, rng = samples(count), np.random.default_rng(seed)
     near = mesh.vertices[rng.integers(len(mesh.vertices), size=count)]
     low, high = mesh.bounds
     return np.concatenate(
@@ -109,7 +110,8 @@ def test_sides_are_right_at_sharp_edges_and_corners():
     """A thin wedge: beside its sharp edges and corners a face's own normal tells the wrong side."""
     wedge = trimesh.convex.convex_hull([[0.0, 0, 0], [30, 0, 0], [15, 40, 0.5], [15, 10, 3]])
     rng = np.random.default_rng(2)
-    close = wedge.vertices[rng.integers(4, size=4000)] + rng.normal(0.0, 0.5, (4000, 3))
+    close = wedge.vertices[rng.integers(4, size=samples(4000))]
+    close += rng.normal(0.0, 0.5, close.shape)
     distance, _ = ask(arrays_of(wedge), close)
     planes = (close[:, None] - wedge.triangles[:, 0]) @ wedge.face_normals.T
     inside = np.diagonal(planes, axis1=1, axis2=2).max(axis=1) < 0.0
@@ -122,7 +124,7 @@ def test_open_and_crossed_meshes_are_signed_by_their_winding_number():
     hole = np.linalg.norm(ball.triangles_center - [10.0, 0, 0], axis=1) < 3.0
     torn = trimesh.Trimesh(ball.vertices, ball.faces[~hole], process=False)
     two = trimesh.util.concatenate(ball, ball.copy().apply_translation([9.0, 0, 0]))
-    points = np.random.default_rng(4).uniform(-15, 25, (3000, 3))
+    points = np.random.default_rng(4).uniform(-15, 25, (samples(3000), 3))
     for mesh in (torn, two):
         bone = arrays_of(mesh, closed=False)
         winding = igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces), points)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from conftest import samples
 
 from rbfmuscle.bones.rounded import ROUNDING, WIDE, RoundedBone, round_bone, rounded_at
 from rbfmuscle.bones.sdf import BoneSDF
@@ -27,6 +28,7 @@ def asked(rounded, points):
 
 def shell(radius, width, count=500, seed=0):
     rng = np.random.default_rng(seed)
+    count = samples(count)
     way = rng.normal(size=(count, 3))
     way /= np.linalg.norm(way, axis=1)[:, None]
     return way, way * (radius + rng.uniform(-width, width, count))[:, None]

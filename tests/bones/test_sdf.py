@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from conftest import samples
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.bones.sdf import BoneSDF
@@ -25,6 +26,7 @@ def shape(request):
 
 
 def _near(mesh, width, count=20000, seed=0):
+    count = samples(count)
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
     rng = np.random.default_rng(seed)
     return points + mesh.face_normals[faces] * rng.uniform(-width, width, (count, 1))

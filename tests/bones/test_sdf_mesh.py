@@ -5,6 +5,7 @@ import logging
 import numpy as np
 import pytest
 import trimesh
+from conftest import samples
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.validation import MeshError
@@ -16,7 +17,7 @@ def ball():
 
 
 def _random(count=20000, width=26.0):
-    return np.random.default_rng(0).uniform(-width, width, (count, 3))
+    return np.random.default_rng(0).uniform(-width, width, (samples(count), 3))
 
 
 def _sides_right(field, points, radius=20.0, faceting=0.1):

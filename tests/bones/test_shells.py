@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from conftest import samples
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.solids import outer_surface
@@ -73,7 +74,7 @@ def test_a_bone_is_solid_to_its_outer_surface_for_all(kind):
     bone, probe = Bone("femur", mesh), BoneDistance("femur", mesh)
     for distance in (bone.distances, probe.signed, field.distance):
         np.testing.assert_allclose(distance(ASKED), RIGHT, atol=FACETING)
-    points = np.random.default_rng(0).uniform(-28, 28, (5000, 3))
+    points = np.random.default_rng(0).uniform(-28, 28, (samples(5000), 3))
     inside = bone.distances(points) < 0
     np.testing.assert_array_equal(probe.inside(points), inside)
     np.testing.assert_array_equal(bone.nearest(points)[0] < 0, inside)

@@ -4,6 +4,7 @@ import igl
 import numpy as np
 import pytest
 import trimesh
+from conftest import samples
 
 from rbfmuscle.geometry.exact_distance import STACK, ExactDistance, faces_across, nearest_triangle
 
@@ -21,11 +22,10 @@ SHAPES = {
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_distances_and_nearest_points_are_those_of_libigl(shape):
     rng = np.random.default_rng(0)
-    near = shape.vertices[rng.integers(len(shape.vertices), size=3000)] + rng.normal(
-        0.0, 2.0, (3000, 3)
-    )
+    near = shape.vertices[rng.integers(len(shape.vertices), size=samples(3000))]
+    near += rng.normal(0.0, 2.0, near.shape)
     low, high = shape.bounds
-    points = np.concatenate([near, rng.uniform(low - 20.0, high + 20.0, (3000, 3))])
+    points = np.concatenate([near, rng.uniform(low - 20.0, high + 20.0, near.shape)])
     vertices, faces = np.array(shape.vertices), np.array(shape.faces)
     expected = igl.signed_distance(points, vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)[
         0
