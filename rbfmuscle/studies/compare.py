@@ -108,7 +108,8 @@ def compare(
     Examples
     --------
     >>> from rbfmuscle import phantom_scene
-    >>> found = compare(phantom_scene(end=2.0), models=["pbd", "xpbd"], pictures=False)
+    >>> scene = phantom_scene(end=2.0, spacing=6.0)
+    >>> found = compare(scene, models=["pbd", "xpbd"], pictures=False)
     >>> found.models, found.table()["value"].dtype
     (['pbd', 'xpbd'], dtype('float64'))
     """

@@ -652,9 +652,9 @@ def reach_error(
     Examples
     --------
     >>> import trimesh
-    >>> ball = trimesh.creation.icosphere(3, 10.0)
-    >>> found = reach_error(ball, 0.1, kernels=["cubic"])
-    >>> found.reached, found.row.kernel, found.error <= 0.1
+    >>> egg = trimesh.creation.icosphere(3).apply_scale([40.0, 10.0, 10.0])
+    >>> found = reach_error(egg, 1.0, kernels=["cubic"])
+    >>> found.reached, found.row.kernel, found.error <= 1.0
     (True, 'cubic', True)
     """
     if not 0.0 < error < np.inf:

@@ -87,19 +87,6 @@ cli.main()
                 out, ["stl"]
             )
 
-    def test_json_is_told_of_an_interrupt(self, tmp_path):
-        code = (
-            "import os, signal, sys, rbfmuscle.cli as cli\n"
-            "import rbfmuscle.scene.file as m\n"
-            "m.read_scene_file = lambda path: os.kill(os.getpid(), signal.SIGINT)\n"
-            "sys.argv = ['rbfmuscle', 'check', 'a.toml', '--json']\ncli.main()\n"
-        )
-        done = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
-        )
-        assert done.returncode == 130 and done.stderr == "rbfmuscle: interrupted\n"
-        assert json.loads(done.stdout) == {"error": "interrupted", "exit_code": 130}
-
 
 def test_an_error_that_holds_libigls_objects_ends_without_its_complaints():
     code = (

@@ -1,5 +1,6 @@
 """Names that not every system has: all modules are imported and all formats read without them."""
 
+import json
 import os
 import subprocess
 import sys
@@ -42,7 +43,7 @@ def run(code, environment, **options):
     return done.returncode, done.stdout, done.stderr
 
 
-def test_every_module_is_imported(elsewhere):
+def test_every_module_is_imported_and_each_format_of_meshes_read(elsewhere, tmp_path):
     code = """
 import importlib, os, pkgutil, sys
 assert sys.modules["resource"] is None and not hasattr(os, "set_blocking")
@@ -53,16 +54,8 @@ for name in names:
     if not name.endswith("__main__"):
         importlib.import_module(name)
 print(len(names))
-"""
-    code, out, err = run(code, elsewhere)
-    assert code == 0 and int(out) > 150, err
-
-
-def test_each_format_of_meshes_is_read(elsewhere, tmp_path):
-    code = """
-import pyvista, sys, trimesh
-from rbfmuscle.scene.meshes.read import MESH_SUFFIXES
-from rbfmuscle.scene.meshes.read import read_mesh
+import pyvista, trimesh
+from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, read_mesh
 ball = trimesh.creation.icosphere(subdivisions=2, radius=20.0)
 for suffix in MESH_SUFFIXES:
     file = f"ball{suffix}"
@@ -71,15 +64,19 @@ for suffix in MESH_SUFFIXES:
     print(suffix)
 """
     code, out, err = run(code, elsewhere, cwd=tmp_path)
-    assert code == 0 and len(out.split()) >= 5, err
+    assert code == 0, err
+    modules, *suffixes = out.split()
+    assert int(modules) > 150 and len(suffixes) >= 5
 
 
-def test_command_line_starts_and_ends_at_an_interrupt(elsewhere, tmp_path):
+def test_command_line_starts_and_ends_at_an_interrupt_of_which_json_tells(elsewhere, tmp_path):
     code = """
 import os, signal, sys, rbfmuscle.cli as cli
 import rbfmuscle.scene.file as file
 file.read_scene_file = lambda path: os.kill(os.getpid(), signal.SIGINT)
-sys.argv = ["rbfmuscle", "check", "a.toml"]
+sys.argv = ["rbfmuscle", "check", "a.toml", "--json"]
 cli.main()
 """
-    assert run(code, elsewhere, cwd=tmp_path) == (130, "", "rbfmuscle: interrupted\n")
+    code, out, err = run(code, elsewhere, cwd=tmp_path)
+    assert (code, err) == (130, "rbfmuscle: interrupted\n")
+    assert json.loads(out) == {"error": "interrupted", "exit_code": 130}

@@ -4,6 +4,7 @@ notebooks."""
 import ast
 import gc
 import importlib.util
+import runpy
 import subprocess
 import sys
 import types
@@ -49,11 +50,12 @@ def test_import_loads_nothing_heavy():
     assert done.stdout.strip() == "[]"
 
 
-def test_user_script_runs(tmp_path):
-    done = subprocess.run([sys.executable, SCRIPT, tmp_path], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("2 ['abductor'] True ")
-    assert "3 nowhere.toml: no such scene file" in done.stdout
+def test_user_script_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), str(tmp_path)])
+    runpy.run_path(str(SCRIPT), run_name="__main__")
+    printed = capsys.readouterr().out
+    assert printed.startswith("2 ['abductor'] True ")
+    assert "3 nowhere.toml: no such scene file" in printed
 
 
 def test_run_answers_as_a_container(run):

@@ -39,7 +39,7 @@ def ellipsoid():
 
 @pytest.fixture(scope="module")
 def study(ellipsoid):
-    kernels = ["linear", "cubic", "quintic", "gaussian", "wendland_c2", "matern_52"]
+    kernels = ["linear", "cubic", "gaussian", "matern_52"]
     return rm.study_kernels(ellipsoid, kernels=kernels, centres=[40, 80], resolution=32, units="mm")
 
 
@@ -58,10 +58,10 @@ def test_the_sentence_names_those_alike_and_that_the_most_centres_were_best():
 
 def test_rows_are_ranked_and_more_centres_err_less(study):
     good = [row.rms for row in study.rows if not row.unfit]
-    assert good == sorted(good) and len(study.rows) == 12
+    assert good == sorted(good) and len(study.rows) == 8
     assert all(row.unfit for row in study.rows[len(good) :])
     error = {(row.kernel, row.centres): row.rms for row in study.rows}
-    for kernel in ("linear", "cubic", "quintic", "wendland_c2", "matern_52"):
+    for kernel in ("linear", "cubic", "matern_52"):
         assert error[kernel, 80] < error[kernel, 40]
     assert error["cubic", 80] < 0.6 * error["linear", 80]
 
@@ -95,7 +95,7 @@ def test_lines_to_paste_give_the_row(study):
 
 def test_a_study_on_several_threads_is_that_of_one():
     ball = trimesh.creation.icosphere(3, 10.0).apply_scale([2.0, 1.0, 1.0])
-    asked = {"kernels": ["cubic", "quintic", "gaussian"], "centres": [30, 50], "resolution": 24}
+    asked = {"kernels": ["cubic", "gaussian"], "centres": [30], "resolution": 24}
     rows = {}
     threads = thread_count()
     filters = list(warnings.filters)

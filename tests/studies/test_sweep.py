@@ -180,6 +180,7 @@ class TestRun:
         other = [replace(point, reference="other") for point in finished[0]]
         assert not any(SweepFolder(finished[1]).is_done(point) for point in other)
 
+    @pytest.mark.slow  # processes that each load all, and others after one of them has died
     @pytest.mark.filterwarnings("ignore:A worker stopped:UserWarning")
     def test_processes_give_the_same_table_but_for_the_point_of_one_that_dies(
         self, finished, tmp_path
