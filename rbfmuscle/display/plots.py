@@ -45,6 +45,8 @@ _STYLE = {
     "svg.hashsalt": "rbfmuscle",  # the same plot has the same names of its parts
     "text.parse_math": False,
 }
+# A line from the left end of a label, so that it does not cross the letters.
+_JOINED = {"arrowstyle": "-", "linewidth": 0.5, "relpos": (0.0, 0.5), "shrinkA": 1.0}
 _STILL = 1e-9  # coordinates that vary by less do not move [radian, or scene unit]
 
 
@@ -149,7 +151,7 @@ def _label_ends(axes: "Axes", tracks: Sequence[Track], row: float) -> None:
             textcoords="axes fraction",
             verticalalignment="center",
             color=track.colour,
-            arrowprops={"arrowstyle": "-", "color": track.colour, "linewidth": 0.5},
+            arrowprops={**_JOINED, "color": track.colour},
         )
         label.set_gid(_part_name(track.name))
 
@@ -192,7 +194,7 @@ def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
                 textcoords="axes fraction",
                 verticalalignment="center",
                 fontweight="bold" if point.star else "normal",
-                arrowprops={"arrowstyle": "-", "color": _SOFT, "linewidth": 0.5},
+                arrowprops={**_JOINED, "color": _SOFT},
             )
         return _markup(figure, f"{labels[1]} against {labels[0]}")
 

@@ -61,6 +61,10 @@ def test_names_of_lines_stand_in_the_order_of_their_ends_and_none_covers_another
     assert np.diff(sorted(heights)).min() > 10.0  # letters are 8.5 points high
     order = np.array(numbers)[np.argsort(heights)]  # heights count from the top
     assert (np.diff(ends[order]) <= 0.0).all()
+    # The lines to the names end before these.
+    left = min(float(x) for x in re.findall(r'(?:translate\(| x=")([\d.]+)[^>]*>muscle', svg))
+    joints = re.findall(r'<path d="M ([\d.]+) [\d.]+\s+Q', svg)
+    assert len(joints) == 38 and max(map(float, joints)) < left
 
 
 def test_the_same_plot_is_the_same_markup():
