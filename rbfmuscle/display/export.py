@@ -477,7 +477,8 @@ def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -
                 if part.poses is not None:
                     vertices = to_world(vertices, part.poses[k])
                     normals = normals @ part.poses[k][:3, :3].T
-                write_mesh(folder / files[part.name], vertices, faces, normals, arrays)
+                path = folder / files[part.name]
+                write_mesh(path, vertices, faces, normals, arrays, name=part.name)
             written += [folder / files[part.name] for part in moved]
             if collection is not None:
                 collection.add(run.times[k] if run.timed else frame, list(files.items()))
@@ -510,12 +511,15 @@ def write_mesh(
     faces: Integers,
     normals: Floats,
     arrays: Mapping[str, Floats],
+    *,
+    name: str,
 ) -> None:
-    """Write a triangle mesh as ``.vtp`` (with arrays at the vertices), ``.ply``, ``.stl`` or
-    ``.obj``, by suffix; PLY and STL in single precision, STL without normals of vertices.
+    """Write a triangle mesh as ``.vtp`` (with its ``name``, and arrays at the vertices), ``.ply``,
+    ``.stl`` or ``.obj``, by suffix; PLY and STL in single precision, STL without normals of
+    vertices.
     """
     if path.suffix == ".vtp":
-        write_vtp(path, vertices, faces, {**arrays, NORMALS: normals})
+        write_vtp(path, vertices, faces, {**arrays, NORMALS: normals}, name=name)
         return
     made = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
     options: dict[str, dict[str, object]] = {

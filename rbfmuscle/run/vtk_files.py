@@ -28,10 +28,15 @@ _HEAD = """<?xml version="1.0"?>
 <VTKFile type="PolyData" version="1.0"
  byte_order="LittleEndian" header_type="UInt32" compressor="vtkZLibDataCompressor">
 <PolyData>
-<Piece NumberOfPoints="{points}" NumberOfVerts="0" NumberOfLines="{lines}"
+{fields}<Piece NumberOfPoints="{points}" NumberOfVerts="0" NumberOfLines="{lines}"
  NumberOfStrips="0" NumberOfPolys="{faces}">
 {parts}</Piece>
 </PolyData>
+"""
+# A text is the numbers of its letters, and a zero.
+_NAME = """<FieldData>
+<DataArray type="String" Name="name" NumberOfTuples="1" format="ascii">{}</DataArray>
+</FieldData>
 """
 BEFORE_DATA, AFTER_DATA = b'<AppendedData encoding="raw">\n_', b"\n</AppendedData>\n</VTKFile>\n"
 
@@ -51,16 +56,19 @@ def write_vtp(
     vertices: ArrayLike,
     faces: ArrayLike,
     arrays: Mapping[str, ArrayLike] | None = None,
+    *,
+    name: str = "",
 ) -> None:
     """Write vertices (n, 3) in their precision, faces (m, 3), and ``arrays`` (n,) or (n, k) by name
-    in single precision.
+    in single precision; the ``name`` of the mesh as an array "name" of its field data, as PyVista
+    does not read those of a collection.
     """
     points, corners = np.asarray(vertices), np.asarray(faces)
     blocks = [
         made_block(
-            "PointData", name, values, "Float32", same=not (np.size(values) and np.ptp(values))
+            "PointData", key, values, "Float32", same=not (np.size(values) and np.ptp(values))
         )
-        for name, values in (arrays or {}).items()
+        for key, values in (arrays or {}).items()
     ]
     kind = "Float32" if points.dtype == np.float32 else "Float64"
     blocks += [
@@ -68,7 +76,7 @@ def write_vtp(
         made_block("Polys", "connectivity", corners.ravel(), "Int32", same=True),
         made_block("Polys", "offsets", np.arange(3, corners.size + 1, 3), "Int32", same=True),
     ]
-    write_blocks(path, blocks, points=len(points), faces=len(corners))
+    write_blocks(path, blocks, points=len(points), faces=len(corners), name=name)
 
 
 def made_block(part: str, name: str, values: ArrayLike, kind: str, *, same: bool = False) -> Block:
@@ -82,11 +90,17 @@ def made_block(part: str, name: str, values: ArrayLike, kind: str, *, same: bool
 
 
 def write_blocks(
-    path: str | Path, blocks: Sequence[Block], *, points: int, lines: int = 0, faces: int = 0
+    path: str | Path,
+    blocks: Sequence[Block],
+    *,
+    points: int,
+    lines: int = 0,
+    faces: int = 0,
+    name: str = "",
 ) -> None:
-    """Write a PolyData file of so many points, lines and faces."""
-    names = [block.name for block in blocks if block.part == "PointData"]
-    marked = f' Normals="{NORMALS}"' if NORMALS in names else ""
+    """Write a PolyData file of so many points, lines and faces, and a ``name`` unless empty."""
+    held = [block.name for block in blocks if block.part == "PointData"]
+    marked = f' Normals="{NORMALS}"' if NORMALS in held else ""
     elements = dict.fromkeys(_PARTS, "")
     offset = 0
     for block in blocks:
@@ -100,8 +114,9 @@ def write_blocks(
         for part, text in elements.items()
         if text
     )
-    head = _HEAD.format(points=points, lines=lines, faces=faces, parts=parts).encode("ascii")
-    contents = [head, BEFORE_DATA, *(block.data for block in blocks), AFTER_DATA]
+    fields = _NAME.format(" ".join(map(str, [*name.encode(), 0]))) if name else ""
+    head = _HEAD.format(points=points, lines=lines, faces=faces, parts=parts, fields=fields)
+    contents = [head.encode("ascii"), BEFORE_DATA, *(block.data for block in blocks), AFTER_DATA]
     Path(path).write_bytes(b"".join(contents))
 
 

@@ -213,7 +213,7 @@ class RunWriter:
         def write(entry):
             name, file = entry
             arrays = self._arrays_of(frame, name) if name in frame.surfaces else None
-            write_vtp(self.directory / file, *meshes[name], arrays)
+            write_vtp(self.directory / file, *meshes[name], arrays, name=name)
 
         each(write, entries)
         return entries
@@ -253,7 +253,7 @@ class RunWriter:
         file = f"bones/{name}{end}.vtp"
         self._bones[name] = pose, file
         self.folder.add(file)
-        write_vtp(self.directory / file, vertices, faces)
+        write_vtp(self.directory / file, vertices, faces, name=name)
 
 
 def _light_mesh(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:

@@ -58,6 +58,14 @@ class TestVtp:
 
 
 class TestCollections:
+    def test_pyvista_finds_the_names_of_what_a_run_and_an_export_write(self, arm_run, tmp_path):
+        """It reads no names of a collection's blocks."""
+        export_run(arm_run[1], "pvd", output=tmp_path / "export")
+        for folder in (arm_run[1], tmp_path / "export" / "pvd"):
+            for file, names in (("surfaces", ["biceps"]), ("bones", ["upper", "fore"])):
+                blocks = pyvista.read(folder / f"{file}.pvd")
+                assert [str(block.field_data["name"][0]) for block in blocks] == names
+
     def test_a_step_is_added_to_what_is_there(self, tmp_path):
         path = tmp_path / "a.pvd"
         steps = Collection(path)
