@@ -4,8 +4,10 @@ The scripts stand beside the real data, in ``reference/cases``; they need nothin
 """
 
 import json
+import re
 import runpy
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,11 +28,17 @@ from rbfmuscle.validation import MeshError
 
 
 @pytest.fixture
-def write_case(tmp_path, monkeypatch):
-    """Runs a script by its number; the folder with what it wrote."""
-    folder = find_data("leg").parents[1] / "reference" / "cases"
-    if not folder.is_dir():
+def folder():
+    """The folder of the scripts."""
+    cases = find_data("leg").parents[1] / "reference" / "cases"
+    if not cases.is_dir():
         pytest.skip("reference/cases is not here")
+    return cases
+
+
+@pytest.fixture
+def write_case(folder, tmp_path, monkeypatch):
+    """Runs a script by its number; the folder with what it wrote."""
 
     def write(number, *arguments):
         (script,) = folder.glob(f"case{number:02d}_*.py")
@@ -39,6 +47,11 @@ def write_case(tmp_path, monkeypatch):
         return tmp_path
 
     return write
+
+
+def test_every_script_has_a_test(folder):
+    tested = set(re.findall(r"^def test_case_(\d+)_", Path(__file__).read_text(), re.M))
+    assert {path.name[4:6] for path in folder.glob("case*.py")} == tested
 
 
 def test_case_02_empty_masks(write_case, capsys):
@@ -210,3 +223,12 @@ def test_case_46_bones_cut_by_the_field_of_view(write_case, tmp_path_factory, le
         assert cut.orientation.anterior @ whole.orientation.anterior > np.cos(np.radians(5))
         assert any("femur: it is cut off" in doubt for doubt in cut.doubts())
         np.testing.assert_allclose(cut.joints[0].centre, whole.joints[0].centre, atol=1.0)
+    axes = [
+        next(
+            j.axes["flexion"]
+            for j in guess_scene(out / name, "mm", out).joints
+            if j.kind == "hinge"
+        )
+        for name in ("knee", "whole_knee")
+    ]
+    assert axes[0] @ axes[1] > np.cos(np.radians(5))
