@@ -5,6 +5,7 @@ from typing import Literal
 
 from rbfmuscle.cli.options import USUAL, Force, OwnFolder, Printing, print_result
 from rbfmuscle.folders import OutputFolder
+from rbfmuscle.progress import Progress
 from rbfmuscle.validation import UsageError
 
 
@@ -57,7 +58,11 @@ def new(
     base = output.parent
     read = read_labels(source, names=labels) if volume else guess_scene(source, units, base)
     with out.staged(replaces=()) as stage:
-        guess = read if isinstance(read, SceneGuess) else guess_volume(read, stage, base)
+        if isinstance(read, SceneGuess):
+            guess = read
+        else:
+            with Progress("surfaces", "label") as progress:
+                guess = guess_volume(read, stage, base, progress=progress)
         scene = write_scene(guess, output, stage)
     findings = check_scene(scene)
     facts = {

@@ -1,6 +1,7 @@
 """Scenes in memory from meshes, label volumes and OpenSim models."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple
@@ -11,13 +12,10 @@ from rbfmuscle.geometry.arrays import Booleans
 from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
 from rbfmuscle.importers.opensim.scene import import_osim
 from rbfmuscle.importers.volumes import LabelVolume, label_surface, read_labels
-from rbfmuscle.progress import Progress
 from rbfmuscle.scene.names import new_name, plain_name
 from rbfmuscle.scene.objects import MM_PER_UNIT
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import MeshError, UsageError
-
-# Folder of the surfaces, vertices on caps by file, and notes.
 
 
 class Surfaces(NamedTuple):
@@ -77,11 +75,18 @@ def _lasting(source: str, base: Path) -> str:
     return "" if source.startswith(f"{base}{os.sep}") else source
 
 
-def guess_volume(volume: LabelVolume, stage: Path, base: Path) -> SceneGuess:
+def guess_volume(
+    volume: LabelVolume,
+    stage: Path,
+    base: Path,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> SceneGuess:
     """The guess of a label volume, whose surfaces are written into a folder ``stage``; the scene's
-    paths are relative to ``base``.
+    paths are relative to ``base``. ``progress`` is called with the labels that are done, and of how
+    many.
     """
-    found = write_surfaces(volume, stage)
+    found = write_surfaces(volume, stage, progress)
     guess = guess_scene(
         found.folder,
         "mm",
@@ -95,8 +100,12 @@ def guess_volume(volume: LabelVolume, stage: Path, base: Path) -> SceneGuess:
     return guess
 
 
-def write_surfaces(volume: LabelVolume, stage: Path) -> Surfaces:
-    """Surfaces of all labels as PLY in ``meshes`` of a folder."""
+def write_surfaces(
+    volume: LabelVolume, stage: Path, progress: Callable[[int, int], None] | None = None
+) -> Surfaces:
+    """Surfaces of all labels as PLY in ``meshes`` of a folder; ``progress`` as of
+    `guess_volume`.
+    """
     meshes = stage / "meshes"
     meshes.mkdir()
     values = volume.values()
@@ -104,23 +113,23 @@ def write_surfaces(volume: LabelVolume, stage: Path) -> Surfaces:
     unusable: dict[str, str] = {}
     frame = "right, forward, up (RAS), mm"
     notes = [f"surfaces of {Path(volume.source).name}, in its frame: {frame}", *volume.notes]
-    with Progress("surfaces", "label") as progress:
-        for done, label in enumerate(values, start=1):
-            tissue = name_facts(volume.name(label)).tissue
-            if tissue == "other":
-                notes.append(f"{volume.name(label)}: neither bone nor muscle, left out")
-                continue
-            try:
-                surface = label_surface(volume, int(label), pieces=tissue == "bone")
-            except MeshError as error:
-                unusable[volume.name(label)] = str(error).removeprefix(f"{volume.source}: ")
-                continue
-            plain = plain_name(surface.name)
-            file = new_name(surface.name, capped)
-            if plain.lower() in map(str.lower, capped):  # they are two parts
-                notes.append(f"several labels are named {plain}: one of them is {file} here")
-            surface.mesh.export(meshes / f"{file}.ply")
-            capped[file] = surface.capped
-            notes += [f"{surface.name}: {note}" for note in surface.notes]
+    for done, label in enumerate(values, start=1):
+        tissue = name_facts(volume.name(label)).tissue
+        if tissue == "other":
+            notes.append(f"{volume.name(label)}: neither bone nor muscle, left out")
+            continue
+        try:
+            surface = label_surface(volume, int(label), pieces=tissue == "bone")
+        except MeshError as error:
+            unusable[volume.name(label)] = str(error).removeprefix(f"{volume.source}: ")
+            continue
+        plain = plain_name(surface.name)
+        file = new_name(surface.name, capped)
+        if plain.lower() in map(str.lower, capped):  # they are two parts
+            notes.append(f"several labels are named {plain}: one of them is {file} here")
+        surface.mesh.export(meshes / f"{file}.ply")
+        capped[file] = surface.capped
+        notes += [f"{surface.name}: {note}" for note in surface.notes]
+        if progress is not None:
             progress(done, len(values))
     return Surfaces(meshes, capped, notes, unusable)

@@ -40,8 +40,10 @@ def test_scene_from_labels_is_the_one_that_new_writes(tmp_path, capsys):
     names = tmp_path / "names.csv"
     names.write_text("1,tibia\n2,femur\n3,vastus_lateralis\n")
     scene = rm.Scene.from_labels(tmp_path / "leg.nii.gz", labels=names)
+    assert capsys.readouterr() == ("", "")  # progress is the command's
     words = ("new", tmp_path / "leg.nii.gz", "--labels", names, "-o", tmp_path / "out")
-    assert call(capsys, *words)[0] == 0
+    code, _, said = call(capsys, *words)
+    assert code == 0 and "surfaces: label 3 of 3" in said
     written = rm.Scene.load(tmp_path / "out" / "scene.toml")
     assert scene.name == "leg" and scene.path is None
     assert (scene.bones, scene.joints, scene.notes) == (
