@@ -47,6 +47,13 @@ class Panel:
         self.source = source
         self._touch = touch
         self._followed = 0  # frame of the motion
+        # The coordinates that the motion moves, in each of its frames, and their ranges.
+        moved = {name: source.controls[name] for frame in source.motion for name in frame}
+        self._moved = list(moved)
+        self._motion = np.array(
+            [[frame.get(name, c.value) for name, c in moved.items()] for frame in source.motion]
+        )
+        self._span = np.array([max(c.high - c.low, 1e-9) for c in moved.values()])
         self.gui.configure_theme(show_logo=False, show_share_button=False)
         self.gui.main_panel.dock_right()
         self.gui.main_panel.set_width(WIDTH)
@@ -151,12 +158,8 @@ class Panel:
         """The frame of the motion nearest to the controls, in shares of their ranges; the last one
         followed where others are as near.
         """
-        names = list(self.source.motion[0])
-        known = [self.source.controls[name] for name in names]
-        span = np.array([max(control.high - control.low, 1e-9) for control in known])
-        here = np.array([self.controls[name].value for name in names])
-        frames = np.array([[frame[name] for name in names] for frame in self.source.motion])
-        away = np.linalg.norm((frames - here) / span, axis=1)
+        here = np.array([self.controls[name].value for name in self._moved])
+        away = np.linalg.norm((self._motion - here) / self._span, axis=1)
         least = int(np.argmin(away))
         return least if away[least] < away[self._followed] - 1e-9 else self._followed
 
