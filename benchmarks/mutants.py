@@ -60,9 +60,9 @@ def changed(node):
     new = copy.deepcopy(node)
     match node:
         case ast.BinOp(left=left, right=right, op=op) if type(op) in SWAPPED:
-            texts = [isinstance(x, TEXT) or _is_string(x) for x in (left, right)]
+            none = [isinstance(x, TEXT) or _is_string(x) or _is_tiny(x) for x in (left, right)]
             new.op = SWAPPED[type(op)]()
-            return None if any(texts) else new
+            return None if any(none) else new
         case ast.Compare(ops=[op]) if type(op) in SWAPPED:
             new.ops = [SWAPPED[type(op)]()]
             return None if _is_string(node.comparators[0]) else new
@@ -82,7 +82,7 @@ def changed(node):
         case ast.Constant(value=int(value)):
             new.value = value + 1
             return new
-        case ast.Constant(value=float(value)) if not 0.0 < abs(value) < TINY:
+        case ast.Constant(value=float(value)) if not _is_tiny(node):
             new.value = 2.0 * value if value else 1.0
             return new
     return None
@@ -90,6 +90,11 @@ def changed(node):
 
 def _is_string(node):
     return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def _is_tiny(node):
+    value = node.value if isinstance(node, ast.Constant) else None
+    return isinstance(value, float) and 0.0 < abs(value) < TINY
 
 
 def places(tree):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import samples
+from scipy.spatial.transform import Rotation
 
 from rbfmuscle.bones.rounded import ROUNDING, WIDE, RoundedBone, round_bone, rounded_at
 from rbfmuscle.bones.sdf import BoneSDF
@@ -51,7 +52,7 @@ def test_a_rounded_ball_is_a_ball():
 
 def test_the_gradient_is_the_derivative_of_the_smoothed_distance():
     rounded = rounded_of(trimesh.creation.box((20.0, 30.0, 25.0)), reach=3.0)
-    points = np.random.default_rng(1).uniform(-12.0, 12.0, (300, 3))
+    points = np.random.default_rng(1).uniform(-12.0, 12.0, (samples(300), 3))
     smooth, distance, *gradient = asked(rounded, points).T
     known = np.isfinite(smooth)
     assert known.mean() > 0.5
@@ -72,24 +73,27 @@ def test_the_gradient_is_the_derivative_of_the_smoothed_distance():
 
 
 def test_a_linear_distance_is_kept_and_each_node_has_its_own_place():
-    """Nodes of a linear function, each block by itself: the spline is that function."""
+    """Nodes of a linear function, each block by itself: the spline is that function, and over its
+    slope of 0.8 the distance.
+    """
     normal = np.array([2.0, -3.0, 6.0]) / 7.0
     nodes = np.indices((WIDE, WIDE, WIDE)).reshape(3, -1).T - 1.0
     blocks = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0]]) - [1, 2, 3]
-    values = np.array([(nodes + 4.0 * block) @ normal for block in blocks])
+    values = 0.8 * np.array([(nodes + 4.0 * block) @ normal for block in blocks])
     table = np.full((2, 2, 2), -1, dtype=np.int32)
     table[0, 0, 0], table[0, 0, 1], table[0, 1, 0], table[1, 0, 0] = range(4)
-    rounded = RoundedBone(0.5, np.array([1.0, 2, 3]), np.eye(3), blocks[0], table, values)
+    axes = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
+    rounded = RoundedBone(0.5, np.array([1.0, 2, 3]), axes, blocks[0], table, values)
     rng = np.random.default_rng(5)
     for block in blocks:
         place = 4.0 * block + rng.uniform(0.0, 4.0, (20, 3))
-        answers = asked(rounded, rounded.origin + 0.5 * place)
-        np.testing.assert_allclose(answers[:, 0], 0.5 * place @ normal, atol=1e-12)
+        answers = asked(rounded, rounded.origin + 0.5 * place @ axes)
+        np.testing.assert_allclose(answers[:, 0], 0.4 * place @ normal, atol=1e-12)
         np.testing.assert_allclose(answers[:, 1], 0.5 * place @ normal, atol=1e-12)
-        np.testing.assert_allclose(answers[:, 2:], np.tile(normal, (20, 1)), atol=1e-12)
+        np.testing.assert_allclose(answers[:, 2:], np.tile(normal @ axes, (20, 1)), atol=1e-12)
     # Neither beyond the table nor where it has no block.
     for place in ([6.0, 6, 6], [-100, 0, 0], [2, 2, 100]):
-        point = rounded.origin + 0.5 * (4.0 * blocks[0] + place)
+        point = rounded.origin + 0.5 * (4.0 * blocks[0] + place) @ axes
         assert not np.isfinite(rounded_at(rounded, *point)).all()
 
 
