@@ -73,7 +73,7 @@ def paths(
     spans, targets = parse_ranges(loaded, ranges), parse_targets(loaded, names or [])
     paths_folder(output)
     sampled: list[Samples] = []
-    done, begun = 0, time.monotonic()
+    done, begun, said = 0, time.monotonic(), ""
 
     def advance(count, total):
         nonlocal done, begun
@@ -87,7 +87,7 @@ def paths(
         interruption.check()
 
     def kept():
-        return f"paths from {done} poses are in {output}" if done >= FEWEST else ""
+        return said or (f"paths from {done} poses are in {output}" if done >= FEWEST else "")
 
     sample = partial(sample_muscles, samples=samples, fibres=fibres, found=sampled)
     with interruption.keeping(kept):
@@ -95,8 +95,14 @@ def paths(
             with Progress(loaded.name, "pose") as progress, work.threads():
                 sample(loaded, spans, progress=advance)
         except KeyboardInterrupt:
+            said = f"{done} poses are too few to fit anything"
             if usable := [found for found in sampled if fittable(found)]:
-                report_fits(loaded, usable, output, targets=targets)
+                rows, _ = report_fits(loaded, usable, output, targets=targets)
+                worst = max(row["arm_rms"] for row in rows)
+                said = (
+                    f"paths from {done} poses are in {output}, "
+                    f"moment arms wrong by up to {worst:.3g} {loaded.units} RMS"
+                )
             raise
         rows, lines = report_fits(loaded, sampled, output, targets=targets)
     facts = {"file": str(output / "paths.xml"), "paths": rows}
