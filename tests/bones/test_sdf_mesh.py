@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from conftest import samples
 
-from rbfmuscle.bones.sdf import BoneSDF
+from rbfmuscle.bones.sdf import BoneSDF, prepare_bone
 from rbfmuscle.validation import MeshError
 
 
@@ -49,6 +49,18 @@ def test_soup_and_faces_of_mixed_orientation_are_mended(ball):
     for mesh in ((soup, np.arange(len(soup)).reshape(-1, 3)), (ball.vertices, mixed)):
         field = BoneSDF.from_mesh(mesh)
         assert field.closed and _sides_right(field, _random()) == 1.0
+
+
+def test_a_closed_mesh_is_taken_as_it_is():
+    """Two boxes, of which one's corner is where the other's is."""
+    one = trimesh.creation.box((2.0, 2.0, 2.0))
+    both = trimesh.util.concatenate([one, one.copy().apply_translation([2.0, 2.0, 2.0])])
+    taken = prepare_bone(both.vertices, both.faces)
+    np.testing.assert_array_equal(taken.faces, both.faces)
+    assert taken.closed and taken.notes == []
+    turned = prepare_bone(both.vertices, both.faces[:, ::-1])
+    np.testing.assert_array_equal(turned.faces, both.faces)
+    assert turned.notes == ["faces pointed inward and were turned"]
 
 
 def _crossed(ball, away):
