@@ -155,7 +155,7 @@ def in_stages(
     if len(groups) == 1:  # it has all threads to itself
         first(0)
         return [each(second, groups[0])]
-    each(work, range(min(thread_count(), sum(map(len, groups)))))
+    each(work, range(thread_count()))
     return [[results[k, part] for part in range(len(group))] for k, group in enumerate(groups)]
 
 

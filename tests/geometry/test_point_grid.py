@@ -69,10 +69,14 @@ def test_points_that_came_through_end_on_the_surface_and_the_way_fades_where_the
     assert np.abs(np.diff(ways)).max() < 0.05
 
 
-def test_a_point_exactly_below_an_edge_or_a_corner_is_over_a_triangle():
+def test_each_point_has_its_triangle_also_exactly_below_an_edge_or_a_corner():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]])
     faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
     for x, y in ((0.3, 0.3), (0.5, 0.5)):
         shown, moved = vertices.copy(), np.zeros(5, dtype=bool)
         push_off(shown, faces, PointGrid.of(np.array([[x, y, -0.05]])), np.eye(4), 1.0, moved)
         assert shown[4, 2] < -0.02
+    shown, moved = vertices.copy(), np.zeros(5, dtype=bool)
+    both = PointGrid.of(np.array([[0.15, 0.5, -0.05], [0.85, 0.5, -0.05]]))
+    push_off(shown, faces, both, np.eye(4), 1.0, moved)
+    assert moved.all() and (shown[:4, 2] < -0.01).all()

@@ -15,8 +15,8 @@ from rbfmuscle.geometry.frames import (
     turned_quaternions,
 )
 
-# About each axis by nearly half a turn, so that each of the four numbers is once the greatest.
-TURNS = [Rotation.from_rotvec(3.1 * axis) for axis in np.eye(3)]
+# About each axis by half a turn, so that each of the four numbers is once the greatest.
+TURNS = [Rotation.from_rotvec(np.pi * axis) for axis in np.eye(3)]
 TURNS += [Rotation.from_rotvec([0.3, -0.5, 0.2]), Rotation.from_rotvec([-1.9, 1.1, 0.7])]
 
 

@@ -22,6 +22,8 @@ from rbfmuscle.geometry.surfaces import (
     unique_edges,
     vertex_areas,
     vertex_normals,
+    volume_cubic,
+    volume_rate,
 )
 
 BOX = trimesh.creation.box((2.0, 3.0, 4.0)).subdivide()
@@ -110,6 +112,7 @@ def test_crossings_turn_with_the_surface(seed):
 
 def test_farthest_move_is_the_greatest_and_what_is_not_finite_is_not_lost():
     before = np.zeros((3, 3))
+    assert farthest_move(before, before + [0.0, 0.0, 0.25]) == 0.25
     after = np.array([[0.0, 0.0, 1.0], [3.0, 4.0, 0.0], [0.0, 2.0, 0.0]])
     assert farthest_move(before, after) == 5.0
     after[0, 1] = np.nan
@@ -130,3 +133,16 @@ def test_paths_over_a_surface_begin_at_the_nearest_vertex_and_cross_edges():
     assert np.isinf(geodesic(surface_graph(away), 0)[5:]).all()
     flat = trimesh.Trimesh([[0, 0, 0], [2, 0, 0], [1, 1, 0], [1, -1, 0]], [[0, 1, 2], [1, 0, 3]])
     assert geodesic(surface_graph(flat), 2)[3] == pytest.approx(2.0)  # across the edge between
+
+
+def test_volume_along_a_direction_is_a_cubic_of_which_the_rate_is_the_slope():
+    rng = np.random.default_rng(11)
+    vertices = VERTICES + rng.normal(0.0, 0.1, VERTICES.shape) + [5.0, -3.0, 8.0]
+    direction = rng.normal(size=vertices.shape)
+    c = volume_cubic(vertices, FACES, direction)
+    for s in (-0.7, 0.0, 0.4, 1.3):
+        there = mesh_volume(vertices + s * direction, FACES)
+        assert c[0] + s * (c[1] + s * (c[2] + s * c[3])) == pytest.approx(there)
+        volume, rate = volume_rate(vertices + s * direction, FACES, direction)
+        assert volume == pytest.approx(there)
+        assert rate == pytest.approx(c[1] + s * (2.0 * c[2] + s * 3.0 * c[3]))
