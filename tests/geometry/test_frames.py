@@ -11,6 +11,7 @@ from rbfmuscle.geometry.frames import (
     RestFrame,
     box_corners,
     moved_box,
+    numbered_by_place,
     on_one_line,
     principal_axes,
 )
@@ -68,6 +69,26 @@ def test_a_rest_frame_is_right_handed_and_moves_with_its_points():
     found = (chosen - frame.origin) @ frame.axes.T
     np.testing.assert_allclose(found.min(axis=0), inside.min(axis=0), atol=1e-6)
     np.testing.assert_allclose(found.max(axis=0), inside.max(axis=0), atol=1e-6)
+
+
+def test_numbers_by_place_depend_on_no_order_and_no_motion():
+    ball = trimesh.creation.icosphere(2)
+    vertices, faces = ball.vertices * (1.0 + 0.2 * POINTS[7:10, 0]), np.array(ball.faces)
+    vertices = vertices + 0.1 * np.random.default_rng(6).normal(size=vertices.shape)
+    order, numbered = numbered_by_place(vertices, faces)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(vertices)))
+    # Each face is one of the mesh, from its least number on.
+    given = {tuple(np.roll(row, k)) for row in faces.tolist() for k in range(3)}
+    assert {tuple(row) for row in order[numbered].tolist()} <= given
+    assert (numbered[:, :1] <= numbered).all() and len(numbered) == len(faces)
+    rng = np.random.default_rng(7)
+    place = rng.permutation(len(vertices))
+    moved = np.empty_like(vertices)
+    moved[place] = to_world(vertices, pose())
+    turned = np.array([np.roll(row, rng.integers(3)) for row in place[faces]])
+    again, same = numbered_by_place(moved, rng.permutation(turned))
+    np.testing.assert_array_equal(again, place[order])
+    np.testing.assert_array_equal(same, numbered)
 
 
 def test_principal_axes_are_ordered_by_extent_and_right_handed():

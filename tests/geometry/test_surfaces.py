@@ -23,6 +23,7 @@ from rbfmuscle.geometry.surfaces import (
     vertex_areas,
     vertex_normals,
     volume_cubic,
+    volume_loop,
     volume_rate,
 )
 
@@ -133,6 +134,10 @@ def test_paths_over_a_surface_begin_at_the_nearest_vertex_and_cross_edges():
     assert np.isinf(geodesic(surface_graph(away), 0)[5:]).all()
     flat = trimesh.Trimesh([[0, 0, 0], [2, 0, 0], [1, 1, 0], [1, -1, 0]], [[0, 1, 2], [1, 0, 3]])
     assert geodesic(surface_graph(flat), 2)[3] == pytest.approx(2.0)  # across the edge between
+
+
+def test_no_faces_enclose_nothing():
+    assert volume_loop(VERTICES, FACES[:0]) == 0.0
 
 
 def test_volume_along_a_direction_is_a_cubic_of_which_the_rate_is_the_slope():
