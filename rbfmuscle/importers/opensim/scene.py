@@ -85,8 +85,11 @@ def import_osim(
 
 
 def _add_muscles(found, walk):
-    """A tube for each muscle of the model."""
+    """A tube for each muscle of the model. They lie in each other, as round tubes about lines do, so
+    they pass through each other.
+    """
     scene = found.scene
+    scene.neighbours = None
     bones = {bone.name: ExactDistance(bone.mesh.vertices, bone.mesh.faces) for bone in scene.bones}
     attachment_frames = _attachment_frames(walk, found.model.bodies, bones)
     for muscle in found.model.muscles:
