@@ -24,7 +24,7 @@ from rbfmuscle.simulation.contact import EVERYWHERE, BoneContacts, Fences
 from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
 from rbfmuscle.simulation.neighbours import SEARCHED
 from rbfmuscle.simulation.touching import Body, even_points
-from rbfmuscle.solid.contact import NO_FENCES, Mobility, Obstacles
+from rbfmuscle.solid.contact import NO_FENCES, Obstacles
 from rbfmuscle.solid.kernels import turned_normals
 from rbfmuscle.solid.lattice import Lattice
 from rbfmuscle.solid.material import Material
@@ -33,10 +33,10 @@ from rbfmuscle.solid.model import (
     attached_owner,
     build_solid,
     embed,
+    greatest_forces,
     lattice_slopes,
-    stiffness,
 )
-from rbfmuscle.solid.solve import NEAR, Settling, find_slowness
+from rbfmuscle.solid.solve import NEAR, Settling
 from rbfmuscle.solid.state import SolidState, predict, rest_state, transform
 from rbfmuscle.surface.drawing import Carry, SurfaceBuilder
 
@@ -93,7 +93,6 @@ class RBFMuscle:
         self.state = rest_state(self.model)
         self._asked = 0.0
         self._stiffen(0.0)
-        self._slowness = find_slowness(self.model, self._stiffness, self._mobility)
         self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
         self.drawer = SurfaceBuilder(
             muscle,
@@ -142,11 +141,9 @@ class RBFMuscle:
         obstacles.fences = Fences(*map(np.concatenate, zip(*fences))) if fences else NO_FENCES
         return Settling(
             self.model,
-            self._stiffness,
-            self._mobility,
+            self._most,
             self.state,
             obstacles,
-            slowness=self._slowness,
             error=ERROR_ACTIVE if self.state.activation or not self.state.step.any() else None,
             material=self._material,
         )
@@ -200,8 +197,7 @@ class RBFMuscle:
         return Body(points, places, area)
 
     def _stiffen(self, activation: float) -> None:
-        self._stiffness = stiffness(self.model, activation)
-        self._mobility = Mobility(*self.model.embedding, self._stiffness.inverse)
+        self._most = greatest_forces(self.model, activation)
 
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next solve settles under: less of it where fibres

@@ -3,11 +3,11 @@
 A unit force at contact i along n_i moves contact j along n_j, with the volumes of the regions kept,
 by
 
-    G_ij = (n_i · n_j) s_i A⁻¹ s_j - ρ_i · ρ_j,    ρ_i = Σ_k s_ik n_i · U_k,
+    G_ij = (s_i n_i) · H⁻¹ (s_j n_j) - ρ_i · ρ_j,    ρ_i = Σ_k s_ik n_i · U_k,
 
 the Delassus matrix of a solid's contacts after the Schur complement of the volumes; s_i are the
 shape functions of the point, U the whitened responses to the regions' pressures (`solve.py`). In a
-mesh of particles s_i are the shares of its vertices, A is their mass, and ρ is nothing. Forces λ
+mesh of particles s_i are the shares of its vertices, H is their mass, and ρ is nothing. Forces λ
 give every contact the motion z that it needs,
 
     0 <= λ_i <= λ_max,    (G λ)_i + ε λ_i >= z_i where λ_i < λ_max,    λ_i = 0 where it is greater,
@@ -33,7 +33,7 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.loops import loop
 
-SWEEPS = 200  # of the Gauss-Seidel method, at most
+SWEEPS = 2000  # of the Gauss-Seidel method, at most
 TOLERANCE = 2e-5  # violation of a contact, of the body's size, that is left
 PRECISE = 1e-7  # error of the gaps, of the size, for which contact forces are found
 BATCH = 48  # contacts that join those with a force at a time, the deepest first

@@ -11,6 +11,7 @@ import numpy as np
 from rbfmuscle.bones.distance import BoneArrays, Memory, distance_loop
 from rbfmuscle.bones.rounded import RoundedBone, rounded_at
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.loops import loop
 from rbfmuscle.simulation.contact import Fences
 from rbfmuscle.solid.kernels import add_rows
@@ -225,67 +226,76 @@ def meet_bone(
 
 
 @loop(fastmath={"contract"})
-def fill_mobilities(columns, shares, rows, first, out):
-    """Fill s_i A⁻¹ s_j for points i from ``first`` on and all before them, both ways.
+def fill_delassus(columns, shares, normal, rows, out):
+    """Fill the motions (w, w) of points along their ``normal`` (w, 3) by unit forces along these.
 
-    ``columns`` and ``shares`` (w, 27) are those of the points, ``rows`` (w, N) their s_i A⁻¹.
+    ``columns`` and ``shares`` (w, 27) are those of the points, ``rows`` (w, 3 N) the motions of the
+    nodes.
     """
-    for i in range(first, len(columns)):
+    for i in range(len(columns)):
         row = rows[i]
         for j in range(i + 1):
             value = 0.0
             for k in range(columns.shape[1]):
-                value += shares[j, k] * row[columns[j, k]]
+                n = 3 * columns[j, k]
+                along = (
+                    normal[j, 0] * row[n] + normal[j, 1] * row[n + 1] + normal[j, 2] * row[n + 2]
+                )
+                value += shares[j, k] * along
             out[i, j] = value
             out[j, i] = value
 
 
-class Mobility:
-    """Responses s_i A⁻¹ of the points that have been in contact; they depend on the matrix alone.
+class Reaction:
+    """Motions of the nodes by unit forces at the points that have been in contact.
 
     Parameters
     ----------
-    columns, shares : (n, 27) ndarray
-        Nodes and shape functions of all contact points.
-    inverse : (N, N) ndarray
-        A⁻¹.
+    embedding : Embedding
+        Of all contact points.
+    inverse : (3 N, 3 N) ndarray
+        H⁻¹.
     """
 
-    def __init__(self, columns: Integers, shares: Floats, inverse: Floats) -> None:
-        self.columns = columns
-        self.shares = shares
+    def __init__(self, embedding: Embedding, inverse: Floats) -> None:
+        self.embedding = embedding
         self.inverse = inverse
         self._clear()
 
     def _clear(self) -> None:
-        self.slot = np.full(len(self.columns), -1)
-        self.points = np.empty(0, dtype=np.int64)
-        self.rows = np.empty((64, len(self.inverse)))
-        self.pairs = np.empty((64, 64))
+        self.slot = np.full(len(self.embedding.columns), -1)
+        self.count = 0
+        self.rows = np.empty((64, 3, len(self.inverse)))
 
-    def find(self, points: Integers) -> Integers:
-        """Rows of some points in ``rows`` (w, N) and ``pairs`` (w, w); unknown ones are found."""
-        new = points[self.slot[points] < 0]
+    def along(self, points: Integers, normal: Floats) -> Floats:
+        """Motions (w, 3 N) by unit forces along ``normal`` (w, 3) at some points."""
+        new = np.unique(points[self.slot[points] < 0])
         if len(new):
-            new = np.unique(new)
-            if len(self.points) + len(new) > MOST_ROWS:
+            if self.count + len(new) > MOST_ROWS:
                 self._clear()
                 new = np.unique(points)
             self._add(new)
-        return self.slot[points]
+        out = np.empty((len(points), len(self.inverse)))
+        combine(self.slot[points], normal, self.rows, out)
+        return out
 
     def _add(self, new: Integers) -> None:
-        first = len(self.points)
-        self.points = np.concatenate([self.points, new])
-        count = len(self.points)
-        self.slot[new] = np.arange(first, count)
-        if count > len(self.rows):
-            room = 2 * count
-            rows, pairs = self.rows, self.pairs
-            self.rows = np.empty((room, rows.shape[1]))
-            self.pairs = np.empty((room, room))
-            self.rows[:first] = rows[:first]
-            self.pairs[:first, :first] = pairs[:first, :first]
-        columns, shares = self.columns[self.points], self.shares[self.points]
-        add_rows(columns[first:], shares[first:], self.inverse, self.rows[first:count])
-        fill_mobilities(columns, shares, self.rows[:count], first, self.pairs)
+        first, self.count = self.count, self.count + len(new)
+        self.slot[new] = np.arange(first, self.count)
+        if self.count > len(self.rows):
+            known = self.rows
+            self.rows = np.empty((2 * self.count, 3, len(self.inverse)))
+            self.rows[:first] = known[:first]
+        columns, shares = self.embedding.some(new)
+        three = np.repeat(3 * columns, 3, axis=0) + np.tile(np.arange(3), len(new))[:, None]
+        rows = self.rows[first : self.count].reshape(3 * len(new), -1)
+        add_rows(three, np.repeat(shares, 3, axis=0), self.inverse, rows)
+
+
+@loop(fastmath={"contract"})
+def combine(slots, normal, rows, out):
+    """Fill the sums (w, m) along ``normal`` (w, 3) of the ``rows`` (k, 3, m) at ``slots`` (w,)."""
+    for i in range(len(slots)):
+        x, y, z = rows[slots[i]]
+        for n in range(out.shape[1]):
+            out[i, n] = normal[i, 0] * x[n] + normal[i, 1] * y[n] + normal[i, 2] * z[n]

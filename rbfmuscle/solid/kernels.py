@@ -23,13 +23,14 @@ STRETCH = 13  # t of slack fibres
 FIBRE = 14  # 3: a
 LOWER = 17  # stretches between which a fibre is slack
 UPPER = 18
-PASSIVE = 19  # stiffness of a fibre, and that of an active one times the stretch that it wants
+PASSIVE = 19  # stiffness of a fibre, and that of an active one, with the stretch that it wants
 ACTIVE = 20
-WEIGHT = 21  # w
-STRESS = 22  # 9: w T
-COFACTOR = 31  # 9: of F, times w
-DETERMINANT = 40
-ROWS = 41
+CONTENT = 21
+WEIGHT = 22  # w
+STRESS = 23  # 9: w (T - F)
+COFACTOR = 32  # 9: of F, times w
+DETERMINANT = 41
+ROWS = 42
 
 ROUNDS = 10  # of the search for a squeezed point's nearest deformation, found anew each iteration
 STEPS = 3  # of Newton's method for a stretch in an iteration
@@ -130,22 +131,27 @@ def stress_points(work, tension):
         u = 1.0 / np.sqrt(t)
         length = np.sqrt(dot(fa, fa) + 1e-12)
         slack = min(max(length, lower), work[UPPER * POINTS + p])
-        pull = (work[PASSIVE * POINTS + p] * slack + work[ACTIVE * POINTS + p]) / length
+        passive, active = work[PASSIVE * POINTS + p], work[ACTIVE * POINTS + p]
+        wanted = passive * slack + active * work[CONTENT * POINTS + p]
+        pull = wanted / length - passive - active
         w = work[WEIGHT * POINTS + p]
         along = (
             (t - u) * ra[0] + pull * fa[0],
             (t - u) * ra[1] + pull * fa[1],
             (t - u) * ra[2] + pull * fa[2],
         )
-        _put(work, STRESS, p, _plus(r, w * u, along, w, a))
+        stress = _plus(r, u, along, 1.0, a)
+        stress = (
+            _row(stress[0], 1.0, -1.0, f[0]),
+            _row(stress[1], 1.0, -1.0, f[1]),
+            _row(stress[2], 1.0, -1.0, f[2]),
+        )
+        _put(work, STRESS, p, w, stress)
         first = cross(f[1], f[2])
         work[DETERMINANT * POINTS + p] = dot(f[0], first)
         second = cross(f[2], f[0])
         third = cross(f[0], f[1])
-        for k in range(3):
-            work[(COFACTOR + k) * POINTS + p] = w * first[k]
-            work[(COFACTOR + 3 + k) * POINTS + p] = w * second[k]
-            work[(COFACTOR + 6 + k) * POINTS + p] = w * third[k]
+        _put(work, COFACTOR, p, w, (first, second, third))
 
 
 @loop
@@ -189,9 +195,37 @@ def pull_apart(squeezed, nodes, slopes, least, stiffness, work, right):
             for k in range(nodes.shape[1]):
                 pull = 0.0
                 for b in range(3):
-                    pull += g[a][b] * slopes[c, k, b * POINTS + p]
+                    pull += away[b] * slopes[c, k, b * POINTS + p]
                 right[nodes[c, k], a] += weight * pull
     return energy
+
+
+@loop
+def add_stiffness(nodes, slopes, stiffness, out):
+    """Add the stiffness of C cells to that of the nodes (3 N, 3 N), whose rows are node by node.
+
+    ``stiffness`` (C, 3, 3, 3, 3, P) is w ∂²ψ / ∂F_ab ∂F_cd at the points of a cell, in that order.
+    """
+    corners = nodes.shape[1]
+    half = np.empty((3 * corners, 3 * POINTS))
+    for c in range(len(nodes)):
+        for a in range(3):
+            for n in range(corners):
+                for d in range(3):
+                    row = half[3 * n + d]
+                    for b in range(3):
+                        for p in range(POINTS):
+                            value = 0.0
+                            for e in range(3):
+                                value += stiffness[c, a, b, d, e, p] * slopes[c, n, e * POINTS + p]
+                            row[b * POINTS + p] = value
+            found = np.dot(slopes[c], half.T)
+            for k in range(corners):
+                target = out[3 * nodes[c, k] + a]
+                for n in range(corners):
+                    first = 3 * nodes[c, n]
+                    for d in range(3):
+                        target[first + d] += found[k, 3 * n + d]
 
 
 @loop
@@ -235,7 +269,7 @@ def carry_steps(which, columns, shares, y, step, push, margin, here, motion, rea
 
 @loop(fastmath={"contract"})
 def add_rows(columns, shares, matrix, out):
-    """Fill the rows Σ_k shares_k matrix_k (n, N) of a matrix (N, N) for points as in `carry`."""
+    """Fill the rows Σ_k shares_k matrix_k (n, m) of a matrix (N, m) for points as in `carry`."""
     for i in range(len(columns)):
         row = out[i]
         row[:] = 0.0
@@ -284,11 +318,11 @@ def _matrix(work, row, p):
 
 
 @loop(inline="always")
-def _put(work, row, p, matrix):
+def _put(work, row, p, factor, matrix):
     for k in range(3):
-        work[(row + k) * POINTS + p] = matrix[0][k]
-        work[(row + 3 + k) * POINTS + p] = matrix[1][k]
-        work[(row + 6 + k) * POINTS + p] = matrix[2][k]
+        work[(row + k) * POINTS + p] = factor * matrix[0][k]
+        work[(row + 3 + k) * POINTS + p] = factor * matrix[1][k]
+        work[(row + 6 + k) * POINTS + p] = factor * matrix[2][k]
 
 
 @loop(inline="always")

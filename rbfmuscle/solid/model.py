@@ -23,9 +23,6 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.sparse import csr_array
-from scipy.sparse.linalg import LinearOperator, eigsh
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.frames import RestFrame, diameter
@@ -55,9 +52,6 @@ MOBILE = 0.02
 # that shortens fibres by more than the ends approach, as any above 1.5 (1 - d / d₀) does, would
 # straighten the muscle at the first motion.
 ANTI_BUCKLING_TENSION, GREATEST_TENSION = 30.0, 0.9
-# Modes in which a solid is softer than its matrix, the error of these, and the share of the
-# softening that is taken: a stretched or pressed solid is stiffer than at rest.
-SOFT, SOFT_ERROR, SOFTENED = 10, 0.01, 0.5
 BLOCK = 1024  # points whose mobility is found at once
 # Greatest pressure that a contact takes, over 2 μ. With 5 the gluteus maximus is pressed 6.6 mm
 # into the femur in 90 degrees of flexion.
@@ -107,7 +101,8 @@ class SolidModel(NamedTuple):
     end_distance: float  # between the middles of these at rest
     springs: np.ndarray  # (N, h) their forces on nodes at the origin, of held points a unit away
     hangs: np.ndarray  # (N, h) shape functions of the held points
-    matrix: np.ndarray  # (N, N) second derivative of E / 2 μ without springs and fibres
+    links: np.ndarray  # (N, N) second derivative of E / 2 μ: of second differences and springs
+    matrix: np.ndarray  # (N, N) of all but fibres and springs, where rotations and stretches stay
     motion_weights: np.ndarray  # (N, b) how much of each bone's motion a node takes
     reach: np.ndarray  # (N,) how much of a node's motion material takes, about
     axes: np.ndarray  # (3, 3) rows: of the rest frame, which turn with the scene
@@ -115,15 +110,6 @@ class SolidModel(NamedTuple):
     side: float  # of a lattice cell [scene unit]
     area: float  # of the surface, for each contact point [scene unit squared]
     iterations: int  # of a solve, at most
-
-
-class Stiffness(NamedTuple):
-    """What follows from the model and an activation."""
-
-    matrix: np.ndarray  # (N, N) A, the second derivative of E / 2 μ for rotations that stay
-    inverse: np.ndarray  # (N, N)
-    soft: np.ndarray  # (N, 3, m) modes that the solid yields more in, at rest: see `soft_modes`
-    most: np.ndarray  # (n,) greatest contact force, over 2 μ
 
 
 def build_solid(
@@ -155,6 +141,8 @@ def build_solid(
     one = np.ones(len(cells.weights))
     axis = np.tile([1.0, 0.0, 0.0], (len(one), 1))
     end, distance = _farthest_ends(points[held], owner[held])
+    springs = _springs(hangs, owner[held], spring)
+    ghost = GHOST * side * lattice.second_differences()
     model = SolidModel(
         rest=rest,
         cells=cells,
@@ -166,9 +154,10 @@ def build_solid(
         held_bone=owner[held].astype(np.int64),
         end=end,
         end_distance=distance,
-        springs=_springs(hangs, owner[held], spring),
+        springs=springs,
         hangs=hangs,
-        matrix=GHOST * side * lattice.second_differences() + _gram(cells, len(rest)),
+        links=ghost + springs @ hangs.T,
+        matrix=ghost + _gram(cells, len(rest)),
         motion_weights=np.empty((0, 0)),
         reach=_reach(len(rest), embedding, embed(lattice, frame, cells.points)),
         axes=frame.axes,
@@ -271,12 +260,8 @@ def _inverted(matrix: Floats) -> Floats:
     return np.ascontiguousarray(0.5 * (inverse + inverse.T))
 
 
-def stiffness(model: SolidModel, activation: float) -> Stiffness:
-    """The inverse of the matrix with springs and fibres, and the greatest contact forces.
-
-    What a bone that is driven into an attachment would need to lift the points beside it bends the
-    whole muscle: a point that moves less than the median for a unit force bears less.
-    """
+def still_compliance(model: SolidModel, activation: float) -> Floats:
+    """Motions (N, N) of the nodes for unit forces where rotations and stretches stay."""
     matrix = hung_matrix(model)
     cells = model.cells
     fibres = model.fibres
@@ -284,74 +269,25 @@ def stiffness(model: SolidModel, activation: float) -> Stiffness:
     if stiff.any():
         along = _derivatives(cells, fibres.direction, len(model.rest))
         matrix = matrix + (along * (stiff * cells.weights)[:, None]).T @ along
-    inverse = _inverted(matrix)
-    move = mobility(model.embedding, inverse)
-    share = np.minimum(1.0, move / np.median(move[model.owner < 0]))
-    soft = np.zeros((len(inverse), 3, 0))
-    if activation == 0.0:
-        soft = soft_modes(model, matrix)
-    return Stiffness(matrix, inverse, soft, MOST_CONTACT_PRESSURE * model.area * share)
+    return _inverted(matrix)
 
 
-def soft_modes(model: SolidModel, matrix: Floats) -> Floats:
-    """Modes W (N, 3, m) for which A⁻¹ + W Wᵀ comes nearer to the inverse of the solid's stiffness.
+def greatest_forces(model: SolidModel, activation: float) -> Floats:
+    """Greatest contact forces (n,) over 2 μ.
 
-    The matrix A holds what a motion costs whose rotations stay. A slender solid that bends turns,
-    which costs next to nothing: its stiffness H at rest, of ½ |sym ∇u|² in place of ½ |∇u|², is
-    less than A by up to a factor of 60 in its softest modes, and an iteration would contract
-    accordingly slowly. With H v = λ A v and |v|_A = 1, the volumes kept, W holds sqrt(1/λ - 1) v of
-    the `SOFT` softest.
+    What a bone that is driven into an attachment would need to lift the points beside it bends the
+    whole muscle: a point that moves less than the median for a unit force bears less.
     """
-    nodes = len(matrix)
-    cells = model.cells
-    slopes = cells.slopes.reshape(*cells.nodes.shape, 3, -1).transpose(0, 3, 2, 1)
-    count = slopes.shape[0] * slopes.shape[1]
-    root = np.sqrt(cells.weights)[:, None, None]
-    spots = np.repeat(cells.nodes, slopes.shape[1], axis=0)
-    # Derivatives along each axis at the quadrature points, times the root of the weight.
-    row = np.broadcast_to(np.arange(3 * count).reshape(count, 3, 1), (count, 3, 27))
-    column = np.broadcast_to(spots[:, None, :], row.shape)
-    values = root * slopes.reshape(count, 3, -1)
-    gradient = csr_array((values.ravel(), (row.ravel(), column.ravel())), (3 * count, nodes))
-    factor = np.linalg.cholesky(matrix)
-    inverse = solve_triangular(factor, np.eye(nodes), lower=True)
-    kept = _volume_gradients(model, nodes)
-    kept = np.linalg.qr((inverse @ kept).reshape(3 * nodes, -1))[0]
-
-    def turned(x: Floats) -> Floats:
-        """What a motion x (3 N,), in the metric of A, costs less because it may turn."""
-        x = x - kept @ (kept.T @ x)
-        change = (gradient @ (inverse.T @ x.reshape(nodes, 3))).reshape(count, 3, 3)
-        skew = 0.5 * (change - change.swapaxes(1, 2))
-        back = inverse @ (gradient.T @ skew.reshape(3 * count, 3))
-        out = back.ravel()
-        return np.asarray(out - kept @ (kept.T @ out))
-
-    operator = LinearOperator((3 * nodes, 3 * nodes), matvec=turned, dtype=np.float64)
-    start = (np.random.default_rng(0).normal(size=(nodes, 3)) @ model.axes).ravel()
-    less, modes = eigsh(operator, k=SOFT, which="LA", v0=start, tol=SOFT_ERROR)
-    softness = np.sqrt(SOFTENED * less / np.maximum(1.0 - less, 1e-3))
-    found = inverse.T @ (modes * softness).reshape(nodes, -1)
-    return np.ascontiguousarray(found.reshape(nodes, 3, SOFT))
-
-
-def _volume_gradients(model: SolidModel, nodes: int) -> Floats:
-    """Gradients (N, 3 M) of the regions' volumes at rest, axis by axis."""
-    cells = model.cells
-    count, corners = cells.nodes.shape
-    weights = cells.weights.reshape(count, 1, 1, -1)
-    slopes = (cells.slopes.reshape(count, corners, 3, -1) * weights).sum(axis=3)
-    out = np.zeros((nodes, 3, len(cells.volumes)))
-    spots = cells.nodes[:, :, None], np.arange(3), cells.region[:, None, None]
-    np.add.at(out, spots, slopes)
-    return out.reshape(nodes, -1)
+    move = mobility(model.embedding, still_compliance(model, activation))
+    share = np.minimum(1.0, move / np.median(move[model.owner < 0]))
+    return MOST_CONTACT_PRESSURE * model.area * share
 
 
 def attached_owner(model: SolidModel) -> Integers:
     """Row (n,) of the bone that holds each contact point, -1 where none does; free points that a
     force hardly moves count to the bone of the nearest held one.
     """
-    move = mobility(model.embedding, stiffness(model, 0.0).inverse)
+    move = mobility(model.embedding, still_compliance(model, 0.0))
     owner = model.owner.copy()
     free, attached = owner < 0, np.flatnonzero(owner >= 0)
     for point in np.flatnonzero(free & (move < MOBILE * np.median(move[free]))):

@@ -1,15 +1,15 @@
 """Bringing solids to equilibrium under elasticity, pressures and contacts.
 
-An iteration finds rotations and stretches (the local step, `kernels.py`), then the nodes for these
-with a matrix that never changes and pressures that keep the volumes (the global step), and contact
+An iteration finds rotations and stretches (the local step, `kernels.py`), then the nodes by a step
+of Newton's method with pressures that keep the volumes (the global step, `metric.py`), and contact
 forces in the same metric (`contact.py`). Pressures are kept from iteration to iteration, so that
 the fixed point of the iteration is the equilibrium; Anderson acceleration gets there sooner.
 
-With g_r = ∂V_r/∂y the nodes are A⁻¹ (right side + Σ_r p_r g_r). What the volumes then lack is
-corrected by pressures q in the metric of A: the motion for a unit pressure of region r is A⁻¹ g_r,
-and the volumes that it adds are G_rs = g_r · A⁻¹ g_s. With the volumes that pressures compress,
+With g_r = ∂V_r/∂y the nodes move by H⁻¹ (force + Σ_r p_r g_r). What the volumes then lack is
+corrected by pressures q in the same metric: the motion for a unit pressure of region r is H⁻¹ g_r,
+and the volumes that it adds are G_rs = g_r · H⁻¹ g_s. With the volumes that pressures compress,
 K_rr = V_r / BULK, the correction solves (G + K) q = lacking. G + K = L Lᵀ; all of this is in the
-whitened pressures Lᵀ q, for which the responses are U = L⁻¹ A⁻¹ g and the matrix is the identity.
+whitened pressures Lᵀ q, for which the responses are U = L⁻¹ H⁻¹ g and the matrix is the identity.
 
 A surface of points on a bone of flat facets has many equilibria, because each point has to be
 lifted over each edge. A muscle on a bone has not. So the solid settles with contacts that yield a
@@ -19,8 +19,6 @@ little, on bones whose facets are rounded (`rbfmuscle/bones/rounded.py`): one sh
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.interpolation import Embedding, carry
@@ -29,11 +27,11 @@ from rbfmuscle.simulation.touching import (
     Contacts,
     Wanted,
     find_forces,
-    meet,
 )
-from rbfmuscle.solid.contact import Mobility, Obstacles, fill_mobilities
+from rbfmuscle.solid.contact import Obstacles, fill_delassus
 from rbfmuscle.solid.kernels import (
     ACTIVE,
+    CONTENT,
     DETERMINANT,
     FIBRE,
     LOWER,
@@ -51,19 +49,19 @@ from rbfmuscle.solid.kernels import (
     region_volumes,
 )
 from rbfmuscle.solid.material import Material, ask_material
-from rbfmuscle.solid.model import SolidModel, Stiffness
-from rbfmuscle.solid.state import Metric, SolidState, rest_state, tension
+from rbfmuscle.solid.metric import BULK, LEAST, STIFFNESS, Metric, find_metric
+from rbfmuscle.solid.model import SolidModel
+from rbfmuscle.solid.state import SolidState, tension
 
 # All lengths are relative to the muscle's size.
 # A solve ends where its estimated error is below this: the distance of material from where further
 # iterations would take it.
 ERROR = 2e-5
-LONGEST = 0.2  # a longer step is shortened to it
+# A longer step is shortened to it: where fibres are slack, long ones go astray. With 0.2 a bar
+# whose ends approach takes ten times the iterations.
+LONGEST = 0.02
 GROWTH = 2.0  # a motion beyond this multiple of the least so far restarts the acceleration
 MEMORY = 20  # steps that Anderson acceleration combines
-# Iterations in which the motion has not halved, after which steps are plain until it has: where a
-# muscle slips over an edge of a bone, accelerated ones go round in circles.
-STALLED = 12
 # Of the estimated error: the last steps hide a slow mode that they hardly move. Measured without
 # it: up to 1.07 times the estimate from the equilibrium, on the phantom.
 SAFETY = 1.4
@@ -72,28 +70,12 @@ STALE = 0.4  # share of NEAR by which a node moves before they are chosen again
 MARGIN = 0.003  # obstacles are looked for beyond where a point goes by this
 YIELDING = 1e-4  # how far a contact yields under a pressure of 2 μ
 LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
-# Bulk modulus and greatest pressure of a region, over 2 μ: a muscle that bones squeeze yields in
-# volume, by a share of pressure / bulk modulus. With 50, Poisson's ratio 0.495, muscles of the leg
-# lost up to 4.5 % in a squat; with 200, 0.4988, they lose 1.8 % in as many iterations. The surface
-# is drawn at the volume at rest in any case.
-BULK, MOST_PRESSURE = 200.0, 3.0
+MOST_PRESSURE = 3.0  # of a region, over 2 μ
 # Over 2 μ: at higher pressures det F bends the energy more than the iteration's matrix does, and
 # steps are shortened.
 CALM_PRESSURE = 0.5
-# Random motion of nodes at rest, of the size, and iterations, that tell how slowly a solid settles.
-SHAKEN, SHAKES = 1e-5, 120
-# The metric is found anew where the gradients of the volumes have changed by this share.
-TURNED = 0.15
-# Within a solve, where nodes have moved by this, of the size.
-TURNED_WAY = 0.03
-# A quadrature point whose volume det F falls below `LEAST` of that at rest is pulled to the nearest
-# deformation that has it: the energy gains μ Σ_q w_q `STIFFNESS` min over G of |F_q - G|² with
-# det G >= LEAST. Its matrix, as for the other terms, is constant, but has only the points that need
-# it.
-LEAST, STIFFNESS = 0.5, 100.0
-
-
-ALONE = np.ones(1, dtype=np.bool_)  # a group of one body, which acts
+# Iterations after which the metric is found anew: of a solve, and of the last one.
+RENEWED = 10
 
 
 class Report(NamedTuple):
@@ -116,19 +98,14 @@ class SolidRows(NamedTuple):
 
     metric: Metric
     part: float  # of a full step that is taken
-    normal: Floats  # (w, 3) of the forces
-    direct: Floats  # (w, N) motion of the nodes, along the force, by A⁻¹
-    soft: Floats  # (w, m) share of the soft modes in it
+    direct: Floats  # (w, 3 N) motion of the nodes by H⁻¹
     rho: Floats  # (w, M) taken from the whitened pressures
     delassus: Floats  # (w, w) for the share of a step that is taken
 
     def motion(self, force: Floats) -> Floats:
         """Motion (N, 3) of the nodes by contact forces (w,), volumes kept."""
-        return self.part * (
-            self.direct.T @ (force[:, None] * self.normal)
-            + self.metric.soft @ (force @ self.soft)
-            - self.metric.response @ (force @ self.rho)
-        )
+        free = (force @ self.direct).reshape(-1, 3)
+        return self.part * (free - self.metric.response @ (force @ self.rho))
 
 
 class Mixer:
@@ -182,16 +159,12 @@ class Settling:
     Parameters
     ----------
     model : SolidModel
-    stiffness : Stiffness
-        For the activation of the state.
-    mobility : Mobility
-        Of the contact points, for the matrix of ``stiffness``.
+    most : (n,) ndarray
+        Greatest contact forces over 2 μ.
     state : SolidState
         As predicted.
     obstacles : Obstacles
         What its contact points meet.
-    slowness : float
-        Way to the equilibrium over a step at the end of a solve, at least (`find_slowness`).
     error : float, optional
         Of the muscle's size, below which the solve ends; `ERROR` where it is not given.
     material : Material, optional
@@ -201,20 +174,17 @@ class Settling:
     def __init__(
         self,
         model: SolidModel,
-        stiffness: Stiffness,
-        mobility: Mobility,
+        most: Floats,
         state: SolidState,
         obstacles: Obstacles,
         *,
-        slowness: float = 1.0,
         error: float | None = None,
         material: Material | None = None,
     ) -> None:
         self.model = model
         self.size = model.size
         self.material = material
-        self.stiffness = stiffness
-        self.mobility = mobility
+        self.most = most
         self.state = state
         self.obstacles = obstacles
         self.tension = tension(model, state.anchors)
@@ -233,22 +203,22 @@ class Settling:
         self.part = 1.0  # of a full step that is taken
         self.asleep = False
         self._free: tuple[Floats, Floats]
+        self._renewed = 0
         self._asked: Wanted
         self.caps: set[str] = set()
         self.forces_capped = False
         self.mixer = Mixer(self.nodes.size, self.nodes.size + len(self.pressure))
         self._least = np.inf
-        self._halved = (np.inf, 0)
-        self.softened = True
-        self.slowness = max(slowness, state.slowness)
+        self.slowness = max(1.0, state.slowness)
         self._seen = 0.0
         self.wanted = ERROR if error is None else error
         self._localise()
-        if state.metric is None or self._has_turned(state.metric):
+        if state.metric is None or state.settled_in > RENEWED:
             self._renew_metric()
         else:
             self.metric = state.metric
-            self._metric_y = self.nodes.copy()
+            if not np.array_equal(state.turn, np.eye(3)):
+                self.metric = state.metric.turned(model, state.turn)
         sources = obstacles.count
         forces = state.forces
         self.forces = (
@@ -278,10 +248,6 @@ class Settling:
             pull_apart(squeezed, cells.nodes, cells.slopes, LEAST, STIFFNESS, self.work, self.right)
         return joined
 
-    def _has_turned(self, metric: Metric) -> bool:
-        change = np.linalg.norm(self.gradient - metric.gradient)
-        return bool(change > TURNED * np.linalg.norm(metric.gradient))
-
     def _choose_near(self) -> None:
         """Choose the contact points near an obstacle."""
         points = np.empty_like(self.state.points)
@@ -300,9 +266,8 @@ class Settling:
         self.part = 1.0 / max(1.0, highest / CALM_PRESSURE)
         flat = self.gradient.reshape(len(self.volumes), -1)
         pressed = (self.pressure @ flat).reshape(3, -1).T
-        force = self.right + self.springs + pressed
-        force -= metric.matrix @ self.nodes
-        free = self.part * yielded(metric, force)
+        force = self.right + self.springs + pressed - model.links @ self.nodes
+        free = self.part * metric.yielded(force)
         rest = model.cells.volumes
         # What contacts take from the pressures is found with the metric's gradients: with others
         # here the two would not cancel, and where the iteration ends would depend on the metric.
@@ -339,7 +304,7 @@ class Settling:
         """Greatest force (k,) at contact points that stand for an area each, and how far these
         yield to a unit force.
         """
-        most = area / self.model.area * self.stiffness.most[points]
+        most = area / self.model.area * self.most[points]
         return most, YIELDING * self.model.size / area
 
     def feet_of(self, points: Integers) -> Embedding:
@@ -363,25 +328,19 @@ class Settling:
         """What unit forces along ``normal`` (w, 3) at contact points, and behind them at other
         ``feet`` in the material, do to the solid.
         """
-        slots = self.mobility.find(points)
-        known = len(slots)
         columns, shares = self.model.embedding.some(points)
+        motion = self.metric.reaction.along(points, normal[: len(points)])
         if feet is not None:
+            behind = push_rows(feet, normal[len(points) :], self.metric.inverse)
+            motion = np.concatenate([motion, behind])
             columns = np.concatenate([columns, feet.columns])
             shares = np.concatenate([shares, feet.shares])
-        count, nodes = len(columns), len(self.nodes)
-        motion, pairs = np.empty((count, nodes)), np.empty((count, count))
-        motion[:known] = self.mobility.rows[slots]
-        pairs[:known, :known] = self.mobility.pairs[np.ix_(slots, slots)]
-        if count > known:
-            add_rows(columns[known:], shares[known:], self.metric.inverse, motion[known:])
-            fill_mobilities(columns, shares, motion, known, pairs)
-        rho, soft = (
-            _along(columns, shares, part.reshape(nodes, -1), normal)
-            for part in (self.metric.response, self.metric.soft)
-        )
-        delassus = (normal @ normal.T) * pairs + soft @ soft.T - rho @ rho.T
-        return SolidRows(self.metric, self.part, normal, motion, soft, rho, self.part * delassus)
+        count = len(columns)
+        rho = _along(columns, shares, self.metric.response.reshape(len(self.nodes), -1), normal)
+        delassus = np.empty((count, count))
+        fill_delassus(columns, shares, normal, motion, delassus)
+        delassus -= rho @ rho.T
+        return SolidRows(self.metric, self.part, motion, rho, self.part * delassus)
 
     def push(self, motion: Floats | None, rows: "SolidRows", force: Floats, asked: Wanted) -> None:
         """Add the motion (N, 3) by contact forces (w,) to the step, and keep those with
@@ -405,7 +364,7 @@ class Settling:
                 return
             # Where a contact has moved it is another problem.
             self.asleep = False
-            self._least, self._halved = np.inf, (np.inf, self.iterations)
+            self._least = np.inf
             self.mixer.restart()
         self.iterations += 1
         pressure = self.pressure + self.metric.whiten.T @ self.change / self.part
@@ -414,13 +373,8 @@ class Settling:
         if moved > GROWTH * self._least or moved > LONGEST * size:
             self.mixer.restart()
         self._least = moved if moved > GROWTH * self._least else min(self._least, moved)
-        if moved < 0.5 * self._halved[0]:
-            self._halved = (moved, self.iterations)
         here = np.concatenate([self.nodes.ravel(), self.pressure])
         plain = np.concatenate([(self.nodes + self.step).ravel(), pressure])
-        stalled = self.iterations - self._halved[1] >= STALLED
-        if stalled:
-            self.mixer.restart()
         mixed = self.mixer.mix(here, plain)
         way = mixed - here
         far = self._way(way[: self.nodes.size].reshape(-1, 3))
@@ -429,13 +383,7 @@ class Settling:
         self.nodes = (here + way)[: self.nodes.size].reshape(-1, 3)
         self.pressure = (here + way)[self.nodes.size :]
         joined = self._localise()
-        far = np.abs(self.nodes - self._metric_y).max() > TURNED_WAY * size
-        if stalled and self.softened:
-            # Where a solid buckles, soft modes are not what they are at rest.
-            self.softened = False
-            self._halved = (moved, self.iterations)
-            joined = True
-        if joined or far:
+        if joined or self.iterations - self._renewed >= RENEWED:
             self._renew_metric()
         if np.abs(self.nodes - self._near_y).max() > STALE * NEAR * size:
             self._choose_near()
@@ -477,14 +425,8 @@ class Settling:
         return SAFETY * moved * self.slowness
 
     def _renew_metric(self) -> None:
-        matrix, inverse = self.stiffness.matrix, self.stiffness.inverse
-        if self.squeezed.any():
-            matrix, inverse = stiffened(self.model, matrix, inverse, np.flatnonzero(self.squeezed))
-            self.mobility = Mobility(*self.model.embedding, inverse)
-        modes = self.stiffness.soft if self.softened else self.stiffness.soft[:, :, :0]
-        modes = turned_modes(self.model, modes, self.work)
-        self.metric = find_metric(self.model, self.gradient, matrix, inverse, modes)
-        self._metric_y = self.nodes.copy()
+        self.metric = find_metric(self.model, self.gradient, self.work, self.squeezed)
+        self._renewed = self.iterations
         self.mixer.restart()
 
     def report(self) -> Report:
@@ -492,7 +434,7 @@ class Settling:
         caps = set(self.caps)
         if self.forces_capped:
             caps.add("forces")
-        if (self.forces.max(axis=1, initial=0.0) >= self.stiffness.most).any():
+        if (self.forces.max(axis=1, initial=0.0) >= self.most).any():
             caps.add("contact pressure")
         if (np.abs(self.pressure) >= MOST_PRESSURE).any():
             caps.add("pressure")
@@ -514,29 +456,10 @@ class Settling:
             pressures=self.pressure,
             forces=self.forces,
             slowness=self._seen,
-            metric=None if self.squeezed.any() or not self.softened else self.metric,
+            metric=self.metric,
+            turn=np.eye(3),
+            settled_in=self.iterations,
         )
-
-
-def find_slowness(model: SolidModel, stiffness: Stiffness, mobility: Mobility) -> float:
-    """How many times as far as an iteration goes the equilibrium is, at most, near the rest shape:
-    for the mode of the solid that contracts most slowly, which is one of bending.
-
-    By an accelerated solve from nodes moved at random, which meets that mode last.
-    """
-    rest = rest_state(model)
-    shaken = np.random.default_rng(0).normal(size=rest.nodes.shape) @ model.axes
-    state = rest._replace(nodes=rest.nodes + SHAKEN * model.size * shaken)
-    free = np.zeros(len(rest.points), dtype=np.bool_)
-    nothing = Obstacles(
-        [], np.zeros((0, 2, 3)), [], np.zeros((0, 4, 4)), free, np.zeros((0, len(free)))
-    )
-    solid = Settling(model, stiffness, mobility, state, nothing)
-    for _ in range(SHAKES):
-        solid.free_step()
-        meet([solid], ALONE)
-        solid.advance()
-    return solid.slowness
 
 
 def lifted(solid: Settling) -> tuple[Floats, bool]:
@@ -597,74 +520,19 @@ def start_work(model: SolidModel, state: SolidState) -> Floats:
         (LOWER, fibres.lower),
         (UPPER, fibres.upper),
         (PASSIVE, fibres.passive),
-        (ACTIVE, state.activation * fibres.active * fibres.content),
+        (ACTIVE, state.activation * fibres.active),
+        (CONTENT, fibres.content),
         (WEIGHT, cells.weights),
     ):
         rows[:, row] = values.reshape(count, POINTS)
     return rows.reshape(count, -1)
 
 
-def yielded(metric: Metric, forces: Floats) -> Floats:
-    """Motion (N, 3) of nodes under forces (N, 3): A⁻¹ + W Wᵀ times these."""
-    soft = metric.soft.reshape(forces.size, metric.soft.shape[2])
-    turning = soft @ (soft.T @ forces.ravel())
-    return np.asarray(metric.inverse @ forces + turning.reshape(-1, 3))
-
-
-def turned_modes(model: SolidModel, modes: Floats, work: Floats) -> Floats:
-    """Modes (N, 3, m) at rest turned as the material at the nodes is, by the rotations in ``work``
-    (C, ROWS * P).
-    """
-    cells = model.cells
-    rows = work.reshape(len(work), ROWS, POINTS)[:, ROTATION : ROTATION + 4]
-    turns = Rotation.from_quat(rows[:, [1, 2, 3, 0]].swapaxes(1, 2).reshape(-1, 4)).as_matrix()
-    by_cell = turns.reshape(len(work), POINTS, 3, 3).mean(axis=1)
-    mean, count = np.zeros((len(modes), 3, 3)), np.zeros((len(modes), 1, 1))
-    np.add.at(mean, cells.nodes, by_cell[:, None])
-    np.add.at(count, cells.nodes, 1.0)
-    return np.ascontiguousarray((mean / count) @ modes)
-
-
-def find_metric(
-    model: SolidModel, gradient: Floats, matrix: Floats, inverse: Floats, soft: Floats
-) -> Metric:
-    """The metric for gradients (M, 3, N) of the regions' volumes, the matrix (N, N), its inverse
-    and soft modes (N, 3, m).
-
-    LinAlgError where the gradients are not independent.
-    """
-    count, _, nodes = gradient.shape
-    by_axis = soft.transpose(1, 0, 2).reshape(3 * nodes, -1)
-    flat = gradient.reshape(count, -1)
-    answer = (gradient.reshape(-1, nodes) @ inverse).reshape(count, -1)
-    answer += (flat @ by_axis) @ by_axis.T
-    compliance = answer @ flat.T
-    compliance[np.diag_indices(count)] *= 1.0 + 1e-9
-    compliance[np.diag_indices(count)] += model.cells.volumes / BULK
-    whiten = solve_triangular(np.linalg.cholesky(compliance), np.eye(count), lower=True)
-    response = (whiten @ answer).reshape(count, 3, nodes).transpose(2, 1, 0)
-    return Metric(gradient.copy(), matrix, inverse, soft, np.ascontiguousarray(response), whiten)
-
-
-def stiffened(
-    model: SolidModel, matrix: Floats, inverse: Floats, squeezed: Integers
-) -> tuple[Floats, Floats]:
-    """The matrix (N, N) and its inverse with `STIFFNESS` w |F|² of squeezed points added.
-
-    With B the rows sqrt(STIFFNESS w) ∇N of these points the sum is A + BᵀB, and by Woodbury's
-    identity its inverse is A⁻¹ - (L⁻¹ B A⁻¹)ᵀ (L⁻¹ B A⁻¹), where L Lᵀ = I + B A⁻¹ Bᵀ.
-    """
-    cells = model.cells
-    c, p = np.divmod(squeezed, POINTS)
-    slopes = cells.slopes.reshape(*cells.nodes.shape, 3, POINTS)[c, :, :, p]
-    added = np.zeros((len(squeezed), 3, len(inverse)))
-    root = np.sqrt(STIFFNESS * cells.weights[squeezed])
-    spots = cells.nodes[c][:, None, :]
-    np.put_along_axis(
-        added, np.repeat(spots, 3, axis=1), root[:, None, None] * slopes.swapaxes(1, 2), axis=2
-    )
-    rows = added.reshape(-1, len(inverse))
-    answer = rows @ inverse
-    small = np.linalg.cholesky(np.eye(len(rows)) + answer @ rows.T)
-    answer = solve_triangular(small, answer, lower=True)
-    return matrix + rows.T @ rows, np.ascontiguousarray(inverse - answer.T @ answer)
+def push_rows(feet: Embedding, normal: Floats, inverse: Floats) -> Floats:
+    """Motions (w, 3 N) of the nodes by unit forces along ``normal`` (w, 3) at embedded points."""
+    rows = np.empty((len(normal), len(inverse)))
+    width = 3 * feet.columns.shape[1]
+    shares = (feet.shares[:, :, None] * normal[:, None, :]).reshape(-1, width)
+    columns = (3 * feet.columns[:, :, None] + np.arange(3)).reshape(-1, width)
+    add_rows(columns, shares, inverse, rows)
+    return rows

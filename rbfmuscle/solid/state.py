@@ -10,22 +10,12 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.frames import turned_quaternions
 from rbfmuscle.geometry.harmonic import exponential_loop, logarithm_loop
+from rbfmuscle.solid.metric import Metric
 from rbfmuscle.solid.model import ANTI_BUCKLING_TENSION, GREATEST_TENSION, SolidModel
 
 # Greatest multiple of the last sub-step's correction that the next one starts with, and the least
 # motion of an attachment, of the muscle's size, in a step whose correction counts.
 MOST_TREND, LEAST_STEP = 1.5, 2e-5
-
-
-class Metric(NamedTuple):
-    """What corrections of the volumes are made by; it only decides how fast a solve converges."""
-
-    gradient: np.ndarray  # (M, 3, N) of the volumes, where the metric was found
-    matrix: np.ndarray  # (N, N) A, with the stiffness of squeezed points
-    inverse: np.ndarray  # (N, N)
-    soft: np.ndarray  # (N, 3, m) W, turned with the material: nodes yield by A⁻¹ + W Wᵀ
-    response: np.ndarray  # (N, 3, M) motions of the nodes for unit whitened pressures, U
-    whiten: np.ndarray  # (M, M) L⁻¹ of G + K = L Lᵀ
 
 
 class SolidState(NamedTuple):
@@ -46,6 +36,8 @@ class SolidState(NamedTuple):
     start_pressures: np.ndarray
     activation: float
     metric: Metric | None  # of the last solve
+    turn: np.ndarray  # (3, 3) rotation of the solid since then
+    settled_in: int  # iterations of the last solve
     slowness: float  # way to the equilibrium over a step, as the last solve saw it
 
 
@@ -67,6 +59,8 @@ def rest_state(model: SolidModel) -> SolidState:
         np.zeros(regions),
         0.0,
         None,
+        np.eye(3),
+        0,
         0.0,
     )
 
@@ -122,15 +116,6 @@ def transform(state: SolidState, motion: Floats) -> SolidState:
         rotations=turned_quaternions(state.rotations, motion[:3, :3]),
         anchors=state.anchors @ turned + shift,
         step=state.step @ turned,
+        turn=motion[:3, :3] @ state.turn,
         start=state.start @ turned + shift,
-        metric=None if state.metric is None else _turned(state.metric, motion[:3, :3]),
-    )
-
-
-def _turned(metric: Metric, rotation: Floats) -> Metric:
-    """The metric of a solid that was turned by a rotation (3, 3)."""
-    return metric._replace(
-        gradient=np.einsum("ab,mbn->man", rotation, metric.gradient),
-        soft=np.ascontiguousarray(rotation @ metric.soft),
-        response=np.ascontiguousarray(rotation @ metric.response),
     )

@@ -18,8 +18,8 @@ class TestStretchedBar:
     @pytest.mark.parametrize(
         ("model", "stretch", "spacing", "radius", "path"),
         [
-            # A straight bar that is pushed so far is unstable: more iterations find it buckled.
-            ({**FINE_RBF, "slack_ratio": 1.0, "iterations": 24}, 0.8, 1.5, 0.01, 0.003),
+            # One that is pushed to 0.9 buckles.
+            ({**FINE_RBF, "slack_ratio": 1.0}, 0.95, 1.5, 0.01, 0.003),
             # A slack bar that is pushed shortens more where its held ends do not keep it from
             # thickening.
             ({**FINE_RBF, "slack_ratio": 1.6}, 1.2, 1.5, 0.01, 0.003),

@@ -7,7 +7,7 @@ import pytest
 
 from rbfmuscle.geometry.interpolation import Embedding, carry
 from rbfmuscle.simulation.touching import Contacts, Wanted, find_forces, solve_forces
-from rbfmuscle.solid.contact import Mobility, Obstacles, fill_mobilities
+from rbfmuscle.solid.contact import Obstacles, Reaction, fill_delassus
 from rbfmuscle.solid.kernels import (
     GRADIENT,
     POINTS,
@@ -20,8 +20,9 @@ from rbfmuscle.solid.kernels import (
     local_step,
     region_volumes,
 )
+from rbfmuscle.solid.metric import inverted
 from rbfmuscle.solid.model import mobility
-from rbfmuscle.solid.solve import BULK, Mixer
+from rbfmuscle.solid.solve import BULK, Mixer, push_rows
 
 NODES, HANGING = 40, 9
 
@@ -183,25 +184,37 @@ def test_embedded_points_and_their_mobility(rng, system):
     np.testing.assert_allclose(motion, (system.weights @ step)[which], atol=1e-14)
     far = np.linalg.norm((system.weights @ (step + push))[which], axis=1)
     np.testing.assert_allclose(reach, 1.5 * far + 0.2, rtol=1e-12)
-    literal = np.diag(system.weights @ system.inverse @ system.weights.T)
+    rows = np.empty((HANGING, NODES))
+    add_rows(*shape, system.inverse, rows)
+    np.testing.assert_allclose(rows, system.weights @ system.inverse, atol=1e-14)
+    literal = np.diag(rows @ system.weights.T)
     found = mobility(Embedding(*shape), system.inverse)
     np.testing.assert_allclose(found, literal, rtol=1e-12)
 
 
-def test_rows_of_points_do_not_depend_on_when_they_were_asked_for(system):
-    rows = np.empty((HANGING, NODES))
-    add_rows(system.columns, system.shares, system.inverse, rows)
-    np.testing.assert_allclose(rows, system.weights @ system.inverse, atol=1e-14)
-    pairs = np.empty((HANGING, HANGING))
-    fill_mobilities(system.columns, system.shares, rows, 0, pairs)
-    known = Mobility(system.columns, system.shares, system.inverse)
-    for asked in ([3], [5, 3, 0], [8, 1, 2, 3]):
-        slots = known.find(np.array(asked))
-        np.testing.assert_allclose(known.rows[slots], rows[asked], atol=1e-15)
-        np.testing.assert_allclose(
-            known.pairs[np.ix_(slots, slots)], pairs[np.ix_(asked, asked)], atol=1e-15
-        )
-    np.testing.assert_allclose(pairs, system.weights @ system.inverse @ system.weights.T)
+def test_reactions_do_not_depend_on_when_they_were_asked_for(rng, system):
+    """Points that hang on some of NODES nodes with three coordinates each."""
+    root = rng.normal(size=(3 * NODES, 3 * NODES))
+    inverse = np.linalg.inv(root @ root.T + NODES * np.eye(3 * NODES))
+    embedding = Embedding(system.columns, system.shares)
+    normal = rng.normal(size=(HANGING, 3))
+    pushes = np.einsum("wn,wa->wna", system.weights, normal).reshape(HANGING, -1)
+    known = Reaction(embedding, inverse)
+    for asked in ([3], [5, 3, 0], [8, 1, 2, 3], range(HANGING)):
+        rows = known.along(np.array(asked), normal[asked])
+        np.testing.assert_allclose(rows, pushes[asked] @ inverse, atol=1e-14)
+    np.testing.assert_allclose(push_rows(embedding, normal, inverse), rows, atol=1e-14)
+    delassus = np.empty((HANGING, HANGING))
+    fill_delassus(*embedding, normal, rows, delassus)
+    np.testing.assert_allclose(delassus, pushes @ inverse @ pushes.T, atol=1e-14)
+
+
+def test_positive_definite_matrices_are_inverted(rng):
+    root = rng.normal(size=(70, 70))
+    matrix = root @ root.T + np.eye(70)
+    np.testing.assert_allclose(inverted(matrix.copy()) @ matrix, np.eye(70), atol=1e-11)
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        inverted(-matrix)
 
 
 def test_fences_hold_the_points_that_they_name():

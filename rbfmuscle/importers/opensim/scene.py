@@ -85,8 +85,8 @@ def import_osim(
 
 
 def _add_muscles(found, walk):
-    """A tube for each muscle of the model. They lie in each other, as round tubes about lines do, so
-    they pass through each other.
+    """A tube for each muscle of the model. As round tubes about lines lie in each other, muscles do
+    not meet.
     """
     scene = found.scene
     scene.neighbours = None
