@@ -58,7 +58,7 @@ TESTS ?= tests
 portability: $(DEV)
 	$(BIN)/python benchmarks/portability.py $(TESTS) $(if $(ONLY),--only $(ONLY))
 
-# An hour on one core; which packages, and how many faults of each, by FAULTS="--packages fibres --count 50".
+# Hours on one core; which packages, and how many faults of each, by FAULTS="--packages fibres --count 50".
 mutants: $(DEV)
 	$(BIN)/python benchmarks/mutants.py $(FAULTS)
 

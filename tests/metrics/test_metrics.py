@@ -374,8 +374,10 @@ def test_the_way_there_and_the_way_back_are_stretches_of_their_own():
     assert [row.value for row in rough] == pytest.approx([0.0] * len(rough), abs=1e-9)
 
 
-def test_the_sign_of_a_moment_arm_is_judged_where_attachments_are_guessed():
-    rows = _smoothness(_arms(np.arange(0.0, 30.0, 2.0), np.linspace(20.0, -9.0, 15)), guessed=True)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_sign_of_a_moment_arm_is_judged_where_attachments_are_guessed(sign):
+    arms = _arms(np.arange(0.0, 30.0, 2.0), sign * np.linspace(20.0, -9.0, 15))
+    rows = _smoothness(arms, guessed=True)
     sides = [row.value for row in rows if row.quantity == "moment_arm_reversal"]
     # What this frame and those before show, of all but the first: the sign turns after the tenth.
     assert sides == pytest.approx([0.0] * 9 + [9.0 - k * 29.0 / 14.0 for k in (4, 3, 2, 1, 0)])
