@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.crossing import FaceTree
-from rbfmuscle.geometry.exact_distance import nearest_weights
+from rbfmuscle.geometry.exact_distance import nearest_weights, triangle_normal
 from rbfmuscle.geometry.frames import RestFrame
 from rbfmuscle.geometry.surfaces import (
     EdgeLengths,
@@ -134,6 +134,12 @@ def test_paths_over_a_surface_begin_at_the_nearest_vertex_and_cross_edges():
     assert np.isinf(geodesic(surface_graph(away), 0)[5:]).all()
     flat = trimesh.Trimesh([[0, 0, 0], [2, 0, 0], [1, 1, 0], [1, -1, 0]], [[0, 1, 2], [1, 0, 3]])
     assert geodesic(surface_graph(flat), 2)[3] == pytest.approx(2.0)  # across the edge between
+
+
+def test_the_normal_of_a_triangle_is_twice_its_area_vector():
+    vertices = VERTICES + np.random.default_rng(12).normal(0.0, 0.1, VERTICES.shape)
+    for f, area in enumerate(face_normals(vertices, FACES)):
+        np.testing.assert_allclose(triangle_normal(vertices, FACES, f), 2.0 * area, atol=1e-12)
 
 
 def test_no_faces_enclose_nothing():
