@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Floats, Integers, to_world
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import EdgeLengths, label_sheets, mesh_volume
+from rbfmuscle.geometry.surfaces import EdgeLengths, label_sheets, mesh_volume, unique_edges
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
 from rbfmuscle.metrics.neighbours import InputNeighbours, NeighbourMeasures, Shown
@@ -325,9 +325,7 @@ def euler_characteristic(faces: Integers) -> int:
     for each handle.
     """
     faces = np.asarray(faces, dtype=np.int64)
-    ends = np.sort(np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]]), axis=1)
-    edges = np.unique(ends[:, 0] * (faces.max(initial=0) + 1) + ends[:, 1])
-    return len(np.unique(faces)) - len(edges) + len(faces)
+    return len(np.unique(faces)) - len(unique_edges(faces)) + len(faces)
 
 
 class SurfaceForm:
