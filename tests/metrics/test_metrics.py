@@ -110,6 +110,13 @@ class TestLength:
         # 17 chords of an arc of 95 degrees are 0.04 % short.
         assert line.length(bent, {"trunk": start, "limb": pose}) == pytest.approx(100, rel=3e-3)
 
+    def test_slices_lie_evenly_along_a_cylinder_from_the_first_of_its_levels_to_the_last(self):
+        mesh = rod()
+        line = Centreline(rod_muscle(mesh), JOINTS, *arrays(mesh))
+        # Of 120 levels between the ends: the field is even along a cylinder.
+        place = (line.operator @ mesh.vertices)[:, 0]
+        assert place == pytest.approx(np.linspace(100 / 121, 100 * 120 / 121, 16), abs=1e-3)
+
     def test_bones_whose_joint_rests_are_one_end(self):
         rows = [
             ("tibiofibular", "tibia", "fibula"),
