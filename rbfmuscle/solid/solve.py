@@ -74,8 +74,9 @@ MOST_PRESSURE = 3.0  # of a region, over 2 μ
 # Over 2 μ: at higher pressures det F bends the energy more than the iteration's matrix does, and
 # steps are shortened.
 CALM_PRESSURE = 0.5
-# Iterations after which the metric is found anew: of a solve, and of the last one.
-RENEWED = 10
+# Iterations after which the metric is found anew, also as a solve starts, where the last one took
+# twice as many.
+RENEWED = 15
 
 
 class Report(NamedTuple):
@@ -213,7 +214,7 @@ class Settling:
         self._seen = 0.0
         self.wanted = ERROR if error is None else error
         self._localise()
-        if state.metric is None or state.settled_in > RENEWED:
+        if state.metric is None or state.settled_in > 2 * RENEWED:
             self._renew_metric()
         else:
             self.metric = state.metric
