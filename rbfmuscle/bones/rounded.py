@@ -126,13 +126,13 @@ def _fill(
 
 
 @loop
-def rounded_at(rounded, x, y, z):
+def rounded_at(rounded, x, y, z, least):
     """Rounded distance of a point in bone coordinates: the smoothed one, which changes by little
     more than the point moves; the same over its slope, which is near the distance to the smoothed
     surface; and its unit gradient.
 
-    All are NaN where the point is beyond all blocks or deep inside the bone, and where the spline
-    is flat; the distances are infinite farther from the bone than it is rounded.
+    All are NaN where the point is beyond all blocks or deep inside the bone, and where the slope is
+    not more than the ``least``; distances are infinite farther from the bone than it is rounded.
     """
     axes = rounded.axes
     table = rounded.table
@@ -159,9 +159,10 @@ def rounded_at(rounded, x, y, z):
         rounded.nodes, np.int64(table[a, b, c]), start, WIDE, u - i, v - j, w - k
     )
     slope = np.sqrt(sx * sx + sy * sy + sz * sz)
-    if not slope > LEAST_SLOPE:
+    if not slope > least:
         return np.nan, np.nan, np.nan, np.nan, np.nan
     gx = (sx * axes[0, 0] + sy * axes[1, 0] + sz * axes[2, 0]) / slope
     gy = (sx * axes[0, 1] + sy * axes[1, 1] + sz * axes[2, 1]) / slope
     gz = (sx * axes[0, 2] + sy * axes[1, 2] + sz * axes[2, 2]) / slope
-    return value * rounded.edge, value / slope * rounded.edge, gx, gy, gz
+    value *= rounded.edge
+    return value, value / max(slope, LEAST_SLOPE), gx, gy, gz

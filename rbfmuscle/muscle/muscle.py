@@ -173,9 +173,7 @@ class RBFMuscle:
     def body(self) -> Body:
         """What others meet that touch this muscle, whose solves answer them from then on."""
         model, lattice, frame = self.model, self._lattice, self.frame
-        points = even_points(
-            model.points, np.flatnonzero(self.attached_bone < 0), APART * model.size
-        )
+        points = even_points(model.points, np.arange(len(model.points)), APART * model.size)
         spacing = float(np.sqrt(model.area))
         rest = BoneSDF.from_mesh(self._rest_mesh, name=f"muscle {self.name!r}")
         reach = SEARCHED * model.size

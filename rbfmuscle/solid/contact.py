@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.bones.distance import BoneArrays, Memory, distance_loop
-from rbfmuscle.bones.rounded import RoundedBone, rounded_at
+from rbfmuscle.bones.rounded import LEAST_SLOPE, RoundedBone, rounded_at
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.loops import loop
@@ -205,7 +205,7 @@ def meet_bone(
         wanted = reach[k] - allowed[i]
         if bound[i] - np.sqrt(moved) >= wanted or (outside > 0.0 and np.sqrt(outside) >= wanted):
             continue
-        smooth, distance, x, y, z = rounded_at(rounded, local[0], local[1], local[2])
+        smooth, distance, x, y, z = rounded_at(rounded, local[0], local[1], local[2], LEAST_SLOPE)
         if np.isnan(distance):
             unknown[lost] = k
             lost += 1

@@ -16,6 +16,8 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.loops import loop
 
 NEWTON = 8  # steps that find material coordinates, at most
+# Slope of the distance, below which it has no direction: halfway through a thin muscle.
+FLAT = 0.01
 EXACT = 1e-3  # of a cell: a step of less is the last, as it squares the error
 
 
@@ -127,7 +129,7 @@ def ask_material(material, y, points, place, gap, normal, columns, shares):
             rest[a] = material.origin[a]
             for b in range(3):
                 rest[a] += back[a, b] * place[i, b]
-        _, distance, gx, gy, gz = rounded_at(material.rest, rest[0], rest[1], rest[2])
+        _, distance, gx, gy, gz = rounded_at(material.rest, rest[0], rest[1], rest[2], FLAT)
         if not np.isfinite(distance):
             continue
         # g = A⁻ᵀ ∇D with A⁻¹ = back · j⁻¹: the place at rest by the place in the world.

@@ -6,7 +6,7 @@ import trimesh
 from conftest import samples
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.bones.rounded import ROUNDING, WIDE, RoundedBone, round_bone, rounded_at
+from rbfmuscle.bones.rounded import LEAST_SLOPE, ROUNDING, WIDE, RoundedBone, round_bone, rounded_at
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.frames import RestFrame
 
@@ -24,7 +24,7 @@ def rounded_of(mesh, region=BOX, **options):
 
 
 def asked(rounded, points):
-    return np.array([rounded_at(rounded, *point) for point in points])
+    return np.array([rounded_at(rounded, *point, LEAST_SLOPE) for point in points])
 
 
 def shell(radius, width, count=500, seed=0):
@@ -94,7 +94,7 @@ def test_a_linear_distance_is_kept_and_each_node_has_its_own_place():
     # Neither beyond the table nor where it has no block.
     for place in ([6.0, 6, 6], [-100, 0, 0], [2, 2, 100]):
         point = rounded.origin + 0.5 * (4.0 * blocks[0] + place) @ axes
-        assert not np.isfinite(rounded_at(rounded, *point)).all()
+        assert not np.isfinite(rounded_at(rounded, *point, LEAST_SLOPE)).all()
 
 
 def test_blocks_are_those_near_the_surface_in_the_region():

@@ -361,6 +361,34 @@ def test_gap_and_normal_are_those_of_the_surface_where_it_has_been_carried():
         np.testing.assert_allclose(found, (points * [1, 1, 0] + [0, 0, 10.0]) @ matrix.T, atol=0.06)
 
 
+def test_attached_end_pushes_its_way_into_a_neighbour():
+    """A block whose end a bone drives by 6 mm into a belly, which gives way."""
+    belly = ellipsoid((8, 8, 25), (0, 0, 0), subdivisions=3)
+    z, block = belly.vertices[:, 2], box_mesh([-4, -30, -4], [4, -8.5, 4])
+    y = block.vertices[:, 1]
+    muscles = {"belly": (belly, {"floor": np.abs(z) > 19}), "block": (block, {"push": y > -14})}
+    scene = _scene(muscles, [{"push": t} for t in (0.0, 2.0, 4.0, 6.0)], {"push": (0, 1, 0)})
+    _, models = _run(scene)
+    end = models["block"].contact_points()[models["block"].attached_bone >= 0]
+    vertices, faces = map(np.array, models["belly"].material_mesh())
+    assert end[:, 1].max() > -3.5
+    assert (
+        igl.signed_distance(end, vertices, faces)[0].min() > -1.0
+    )  # else 5.5
+
+
+def test_points_halfway_through_a_thin_muscle_are_pushed_back_to_their_side():
+    mesh = box_mesh([-20, -10, -2], [20, 10, 2])
+    scene = _scene({"sheet": (mesh, {"floor": mesh.vertices[:, 0] < -19})}, [{}], {})
+    (model,) = build_models(scene)
+    model.body()
+    solid = model.begin(BoneContacts(BonesInReach([], []), model.attached_bone))
+    points = np.array([[x, 0.0, z] for x in (-5.0, 0.0, 5.0) for z in (0.2, 0.5, 1.0, 1.5)])
+    places = (points - model._material.origin) @ model._material.turn.T
+    gap, normals, _ = solid.ask(points, places)
+    assert gap.max() < 0.0 and normals[:, 2].min() > 0.99
+
+
 def test_muscle_alone_is_the_same_with_neighbours_on_and_off():
     mesh = box_mesh([-20, -6, -6], [20, 6, 6])
     ends = {"floor": mesh.vertices[:, 0] < -18, "pull": mesh.vertices[:, 0] > 18}
