@@ -146,8 +146,8 @@ class PBDMuscle:
 
     def body(self) -> Body:
         """What others meet that touch this muscle."""
-        free = np.flatnonzero(self.attached_bone < 0)
-        points = even_points(self.rest.vertices, free, SPACING * self.size)
+        every = np.arange(len(self.rest.vertices))
+        points = even_points(self.rest.vertices, every, SPACING * self.size)
         faces = self.rest.topology.faces
         self._surface = MovingSurface(self.rest.vertices, faces, SEARCHED * self.size)
         area = float(vertex_areas(self.rest.vertices, faces).sum()) / len(points)

@@ -372,9 +372,7 @@ def test_attached_end_pushes_its_way_into_a_neighbour():
     end = models["block"].contact_points()[models["block"].attached_bone >= 0]
     vertices, faces = map(np.array, models["belly"].material_mesh())
     assert end[:, 1].max() > -3.5
-    assert (
-        igl.signed_distance(end, vertices, faces)[0].min() > -1.0
-    )  # else 5.5
+    assert igl.signed_distance(end, vertices, faces)[0].min() > -1.0  # else 5.5
 
 
 def test_points_halfway_through_a_thin_muscle_are_pushed_back_to_their_side():
