@@ -10,7 +10,7 @@ rotations and x = (ω, t),
 t alone where it is not at one of its bounds. Fibres beyond the band where they are slack add
 c n nᵀ ⊗ a aᵀ and what their tension holds across. With the second differences and the springs this
 is Newton's matrix H without what pressures add, made positive: no direction of a point is softer
-than `FLOOR`. An iteration goes by H⁻¹ (force); where it ends does not depend on H.
+than a floor. An iteration goes by H⁻¹ (force); where it ends does not depend on H.
 """
 
 from typing import NamedTuple
@@ -47,8 +47,6 @@ BULK = 200.0
 # deformation that has it: the energy gains μ Σ_q w_q `STIFFNESS` min over G of |F_q - G|² with
 # det G >= LEAST.
 LEAST, STIFFNESS = 0.5, 100.0
-# The least stiffness of a point along any direction, over 2 μ.
-FLOOR = 0.02
 # Of a stretch: nearer to its bounds it counts as at them.
 AT_BOUND = 1e-6
 # Of a fibre's length: nearer to where it goes slack it counts as taut, as at rest, where else each
@@ -92,14 +90,16 @@ class Metric(NamedTuple):
         )
 
 
-def find_metric(model: SolidModel, gradient: Floats, work: Floats, squeezed: Booleans) -> Metric:
+def find_metric(
+    model: SolidModel, gradient: Floats, work: Floats, squeezed: Booleans, floor: float
+) -> Metric:
     """The metric for gradients (M, 3, N) of the regions' volumes, where the points are as in
     ``work`` (C, ROWS * P), some of them ``squeezed`` (Q,).
 
     LinAlgError where the gradients are not independent.
     """
     count, _, nodes = gradient.shape
-    inverse = inverted(stiffness_matrix(model, work, squeezed))
+    inverse = inverted(stiffness_matrix(model, work, squeezed, floor))
     flat = gradient.transpose(0, 2, 1).reshape(count, -1)
     answer = flat @ inverse
     compliance = answer @ flat.T
@@ -111,12 +111,12 @@ def find_metric(model: SolidModel, gradient: Floats, work: Floats, squeezed: Boo
     return Metric(gradient.copy(), inverse, np.ascontiguousarray(response), whiten, reaction)
 
 
-def stiffness_matrix(model: SolidModel, work: Floats, squeezed: Booleans) -> Floats:
+def stiffness_matrix(model: SolidModel, work: Floats, squeezed: Booleans, floor: float) -> Floats:
     """H (3 N, 3 N), node by node, where the points are as in ``work`` (C, ROWS * P), some of them
     ``squeezed`` (Q,).
     """
     cells, nodes = model.cells, len(model.rest)
-    points = point_stiffness(work)
+    points = point_stiffness(work, floor)
     points[squeezed] += STIFFNESS * np.eye(9)
     points *= cells.weights[:, None, None]
     by_cell = points.reshape(len(cells.nodes), POINTS, 9, 9).transpose(0, 2, 3, 1)
@@ -150,7 +150,7 @@ def mirror(lower):
                     lower[j, i] = lower[i, j]
 
 
-def point_stiffness(work: Floats) -> Floats:
+def point_stiffness(work: Floats, floor: float) -> Floats:
     """Second derivative (Q, 9, 9) of the energy over 2 μ and the weight by F at each point."""
     rows = work.reshape(len(work), ROWS, POINTS)
 
@@ -187,7 +187,7 @@ def point_stiffness(work: Floats) -> Floats:
     value, vector = np.linalg.eigh(root @ matrix @ root.swapaxes(1, 2))
     # Along each direction 1 - 1 / value is left of the stiffness; where the value is not positive,
     # the energy is no minimum.
-    softer = np.minimum(1.0 / np.maximum(value, 1e-3), 1.0 - FLOOR)
+    softer = np.minimum(1.0 / np.maximum(value, 1e-3), 1.0 - floor)
     basis = vector.swapaxes(1, 2) @ root
     ways = (turn[:, None] @ ways).reshape(len(t), 4, 9)
     ways = basis @ ways

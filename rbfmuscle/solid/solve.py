@@ -77,6 +77,11 @@ CALM_PRESSURE = 0.5
 # Iterations after which the metric is found anew, also as a solve starts, where the last one took
 # twice as many.
 RENEWED = 15
+# Least stiffness of a point along any direction in the metric, over 2 μ, as a solve starts; how
+# many times as much after each renewal but the first, and the most. Slack fibres and pressed
+# material have hardly any along some: a low floor needs few iterations, but where the ends of a
+# slender muscle approach these may go in circles.
+FLOOR, FIRMER, MOST_FLOOR = 0.02, 5.0, 0.25
 
 
 class Report(NamedTuple):
@@ -205,6 +210,7 @@ class Settling:
         self.asleep = False
         self._free: tuple[Floats, Floats]
         self._renewed = 0
+        self._floor = FLOOR
         self._asked: Wanted
         self.caps: set[str] = set()
         self.forces_capped = False
@@ -384,7 +390,10 @@ class Settling:
         self.nodes = (here + way)[: self.nodes.size].reshape(-1, 3)
         self.pressure = (here + way)[self.nodes.size :]
         joined = self._localise()
-        if joined or self.iterations - self._renewed >= RENEWED:
+        slow = self.iterations - self._renewed >= RENEWED
+        if slow and self.iterations >= 2 * RENEWED:
+            self._floor = min(FIRMER * self._floor, MOST_FLOOR)
+        if joined or slow:
             self._renew_metric()
         if np.abs(self.nodes - self._near_y).max() > STALE * NEAR * size:
             self._choose_near()
@@ -411,7 +420,7 @@ class Settling:
         A mode that contracts slowly makes small steps on a long way; where iterations have moved by
         ΔX and their steps changed by ΔR, its way is at most max |ΔX c| / |ΔR c| times its step.
         """
-        if self.iterations < 3:
+        if self.iterations - self._renewed < 3:
             return np.inf
         # Where this is not the end in any case it need not be known.
         if self._may_end(moved) and self.mixer.count > 1:
@@ -426,7 +435,7 @@ class Settling:
         return SAFETY * moved * self.slowness
 
     def _renew_metric(self) -> None:
-        self.metric = find_metric(self.model, self.gradient, self.work, self.squeezed)
+        self.metric = find_metric(self.model, self.gradient, self.work, self.squeezed, self._floor)
         self._renewed = self.iterations
         self.mixer.restart()
 

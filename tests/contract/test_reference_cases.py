@@ -179,6 +179,11 @@ def test_case_42_a_coordinate_that_follows(write_case, name):
         assert found["hip.flexion"] == pytest.approx(row["effective"], rel=0.05), row["angle"]
 
 
+def test_case_42_settles_where_the_ends_of_a_slender_muscle_approach(write_case):
+    run = rm.simulate(write_case(42) / "coupled.toml", settings={"output.surfaces": False})
+    assert max(row.value for row in run.metrics if row.quantity == "solver_residual") < 1e-4
+
+
 def test_case_45_ends_in_what_a_path_goes_around(write_case, monkeypatch):
     """Lengths of OpenSim 4.6, as the script has them where OpenSim is there."""
     lines = {}
