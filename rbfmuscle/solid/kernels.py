@@ -2,8 +2,8 @@
 
 The local step finds at each quadrature point the rotation R and the fibre stretch t of least energy
 (`model.py`), by a few steps of Newton's method that go on from the last iteration's: over the
-iterations both converge. For these the energy is quadratic in the nodes, with a matrix that never
-changes and the right side Σ_q w_q T_q ∇N_q (Bouaziz et al. 2014, "Projective dynamics").
+iterations both converge. For these the forces on the nodes are Σ_q w_q (T_q - F_q) ∇N_q, where T_q
+is the deformation that a point wants (Bouaziz et al. 2014, "Projective dynamics").
 
 The points of a cell share its nodes, so that their deformation gradients are one product of
 matrices and the forces on the nodes another; between them processors treat several points at once.
@@ -43,8 +43,8 @@ def local_step(nodes, slopes, region, y, tension, work, right, gradient, volumes
     Of C cells, ``nodes`` (C, 27), the gradients of their shape functions ``slopes`` (C, 27, 3 P),
     in column a P + p that along axis a at point p, and the ``region`` (C,) of each. ``work``
     (C, ROWS * P) holds what is known at the points and is brought up to date; ``right`` (N, 3)
-    becomes the right side, ``gradient`` (M, 3, N) that of the regions' volumes by the nodes, and
-    ``volumes`` (M,) these. ``tension`` is that of slack fibres over 2 μ.
+    becomes the forces on the nodes, ``gradient`` (M, 3, N) that of the regions' volumes by the
+    nodes, and ``volumes`` (M,) these. ``tension`` is that of slack fibres over 2 μ.
     """
     right[:] = 0.0
     gradient[:] = 0.0
@@ -157,7 +157,7 @@ def stress_points(work, tension):
 @loop
 def pull_apart(squeezed, nodes, slopes, least, stiffness, work, right):
     """Add what pulls squeezed quadrature points (k,) to the nearest deformation G with det G of at
-    least ``least`` to the right side (N, 3); returns its energy over 2 μ.
+    least ``least`` to the forces ``right`` (N, 3); returns its energy over 2 μ.
 
     Each round goes to the foot of the perpendicular from F on the tangent plane of det G = least,
     the first from the rotation R of the point.
