@@ -146,8 +146,7 @@ class PBDMuscle:
 
     def body(self) -> Body:
         """What others meet that touch this muscle."""
-        every = np.arange(len(self.rest.vertices))
-        points = even_points(self.rest.vertices, every, SPACING * self.size)
+        points = even_points(self.rest.vertices, SPACING * self.size)
         faces = self.rest.topology.faces
         self._surface = MovingSurface(self.rest.vertices, faces, SEARCHED * self.size)
         area = float(vertex_areas(self.rest.vertices, faces).sum()) / len(points)

@@ -92,7 +92,7 @@ class RBFMuscle:
         )
         self.state = rest_state(self.model)
         self._asked = 0.0
-        self._stiffen(0.0)
+        self._most = greatest_forces(self.model, 0.0)
         self._normals_at = lattice_slopes(self._lattice, self.frame, self.rest.centres)
         self.drawer = SurfaceBuilder(
             muscle,
@@ -173,7 +173,7 @@ class RBFMuscle:
     def body(self) -> Body:
         """What others meet that touch this muscle, whose solves answer them from then on."""
         model, lattice, frame = self.model, self._lattice, self.frame
-        points = even_points(model.points, np.arange(len(model.points)), APART * model.size)
+        points = even_points(model.points, APART * model.size)
         spacing = float(np.sqrt(model.area))
         rest = BoneSDF.from_mesh(self._rest_mesh, name=f"muscle {self.name!r}")
         reach = SEARCHED * model.size
@@ -194,9 +194,6 @@ class RBFMuscle:
         area = float(self._rest_mesh.area) / len(points)
         return Body(points, places, area)
 
-    def _stiffen(self, activation: float) -> None:
-        self._most = greatest_forces(self.model, activation)
-
     def activate(self, activation: float) -> None:
         """Take an activation, 0 to 1, that the next solve settles under: less of it where fibres
         are long.
@@ -208,7 +205,7 @@ class RBFMuscle:
 
     def _take_activation(self, activation: float) -> None:
         if activation != self.state.activation:
-            self._stiffen(activation)
+            self._most = greatest_forces(self.model, activation)
             self.state = self.state._replace(activation=activation, metric=None)
 
     def transform(self, motion: np.ndarray) -> None:

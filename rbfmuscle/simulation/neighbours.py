@@ -95,7 +95,8 @@ class Neighbours:
         for number, (m, bone) in enumerate(zip(holders, self.bones), len(steppers)):
             self.held[m, number] = bone.ask(points[m], self.bodies[number].places)[0]
         for (m, _), gap in self.held.items():
-            some = even_points(points[m], np.flatnonzero(gap < touched), HOLDING * sizes[m])
+            near = np.flatnonzero(gap < touched)
+            some = near[even_points(points[m][near], HOLDING * sizes[m])]
             gap[np.setdiff1d(np.arange(len(gap)), some)] = np.nan
 
     def find(self, solids: Sequence[Moving]) -> Meeting | None:

@@ -476,16 +476,18 @@ def _rank(of: Integers, count: int) -> Integers:
     return rank
 
 
-def even_points(points: Floats, free: Integers, spacing: float) -> Integers:
-    """Which of the ``free`` contact points, of all (n, 3), meet neighbours: so far apart."""
-    tree = cKDTree(points[free])
-    taken = np.zeros(len(free), dtype=np.bool_)
+def even_points(points: Floats, spacing: float) -> Integers:
+    """Which of the points (n, 3) to take, in order, so that none is nearer to another than the
+    ``spacing``.
+    """
+    tree = cKDTree(points)
+    taken = np.zeros(len(points), dtype=np.bool_)
     chosen = []
-    for i in range(len(free)):
+    for i, point in enumerate(points):
         if not taken[i]:
             chosen.append(i)
-            taken[tree.query_ball_point(points[free[i]], spacing)] = True
-    return free[chosen]
+            taken[tree.query_ball_point(point, spacing)] = True
+    return np.array(chosen, dtype=np.int64)
 
 
 @loop

@@ -279,6 +279,15 @@ class Reaction:
         combine(self.slot[points], normal, self.rows, out)
         return out
 
+    def at(self, feet: Embedding, normal: Floats) -> Floats:
+        """Motions (w, 3 N) by unit forces along ``normal`` (w, 3) at other embedded points."""
+        rows = np.empty((len(normal), len(self.inverse)))
+        width = 3 * feet.columns.shape[1]
+        shares = (feet.shares[:, :, None] * normal[:, None, :]).reshape(-1, width)
+        columns = (3 * feet.columns[:, :, None] + np.arange(3)).reshape(-1, width)
+        add_rows(columns, shares, self.inverse, rows)
+        return rows
+
     def _add(self, new: Integers) -> None:
         first, self.count = self.count, self.count + len(new)
         self.slot[new] = np.arange(first, self.count)

@@ -11,6 +11,7 @@ matrices and the forces on the nodes another; between them processors treat seve
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.frames import cross, dot, quaternion_matrix, turn_towards
 from rbfmuscle.loops import loop
 from rbfmuscle.solid.lattice import GROUPS as POINTS
@@ -34,6 +35,14 @@ ROWS = 42
 
 ROUNDS = 10  # of the search for a squeezed point's nearest deformation, found anew each iteration
 STEPS = 3  # of Newton's method for a stretch in an iteration
+
+
+def at_points(work: Floats, row: int, *shape: int) -> Floats:
+    """What the local step knows at the quadrature points (Q, ...), from a row of its ``work``
+    (C, ROWS * P) on.
+    """
+    known = work.reshape(len(work), ROWS, POINTS)[:, row : row + int(np.prod(shape))]
+    return known.swapaxes(1, 2).reshape(-1, *shape)
 
 
 @loop

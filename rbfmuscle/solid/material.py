@@ -72,7 +72,7 @@ def ask_material(material, y, points, place, gap, normal, columns, shares):
 
     ``place`` (n, 3) in the lattice is where the search starts, and ends. ``columns`` and ``shares``
     (n, 27) are filled with those of the foot on the surface. A gap is infinite where the surface is
-    farther than it is known, or the map is folded.
+    farther than it is known, the map is folded, or the point lies exactly halfway through.
     """
     table = material.table
     cells = material.cells

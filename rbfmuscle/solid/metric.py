@@ -31,10 +31,10 @@ from rbfmuscle.solid.kernels import (
     PASSIVE,
     POINTS,
     ROTATION,
-    ROWS,
     STRETCH,
     UPPER,
     add_stiffness,
+    at_points,
 )
 from rbfmuscle.solid.model import SolidModel
 
@@ -49,8 +49,8 @@ BULK = 200.0
 LEAST, STIFFNESS = 0.5, 100.0
 # Of a stretch: nearer to its bounds it counts as at them.
 AT_BOUND = 1e-6
-# Of a fibre's length: nearer to where it goes slack it counts as taut, as at rest, where else each
-# iteration would meet another set of slack fibres.
+# Of a fibre's stretch: nearer to where it goes slack it counts as taut. At rest every fibre stands
+# there, and each iteration would find other ones slack.
 TAUT = 0.004
 BLOCK = 32  # rows and columns of a matrix that are mirrored at once
 GENERATORS = np.array(
@@ -71,13 +71,13 @@ class Metric(NamedTuple):
     inverse: np.ndarray  # (3 N, 3 N) H⁻¹, node by node
     response: np.ndarray  # (N, 3, M) motions of the nodes for unit whitened pressures, U
     whiten: np.ndarray  # (M, M) L⁻¹ of G + K = L Lᵀ
-    reaction: Reaction
+    reaction: Reaction  # motions by unit forces at contact points
 
     def yielded(self, forces: Floats) -> Floats:
         """Motion (N, 3) of nodes under forces (N, 3)."""
         return (self.inverse @ forces.ravel()).reshape(-1, 3)
 
-    def turned(self, model: SolidModel, rotation: Floats) -> "Metric":
+    def turned(self, rotation: Floats) -> "Metric":
         """That of the solid turned by a rotation (3, 3)."""
         nodes = len(self.response)
         half = rotation @ self.inverse.reshape(nodes, 3, 3 * nodes)
@@ -86,7 +86,7 @@ class Metric(NamedTuple):
             gradient=np.einsum("ab,mbn->man", rotation, self.gradient),
             inverse=inverse,
             response=np.ascontiguousarray(rotation @ self.response),
-            reaction=Reaction(model.embedding, inverse),
+            reaction=Reaction(self.reaction.embedding, inverse),
         )
 
 
@@ -94,7 +94,7 @@ def find_metric(
     model: SolidModel, gradient: Floats, work: Floats, squeezed: Booleans, floor: float
 ) -> Metric:
     """The metric for gradients (M, 3, N) of the regions' volumes, where the points are as in
-    ``work`` (C, ROWS * P), some of them ``squeezed`` (Q,).
+    ``work`` (C, ROWS * P), some of them ``squeezed`` (Q,), and none is softer than a ``floor``.
 
     LinAlgError where the gradients are not independent.
     """
@@ -112,9 +112,7 @@ def find_metric(
 
 
 def stiffness_matrix(model: SolidModel, work: Floats, squeezed: Booleans, floor: float) -> Floats:
-    """H (3 N, 3 N), node by node, where the points are as in ``work`` (C, ROWS * P), some of them
-    ``squeezed`` (Q,).
-    """
+    """H (3 N, 3 N), node by node; the rest as in `find_metric`."""
     cells, nodes = model.cells, len(model.rest)
     points = point_stiffness(work, floor)
     points[squeezed] += STIFFNESS * np.eye(9)
@@ -151,15 +149,20 @@ def mirror(lower):
 
 
 def point_stiffness(work: Floats, floor: float) -> Floats:
-    """Second derivative (Q, 9, 9) of the energy over 2 μ and the weight by F at each point."""
-    rows = work.reshape(len(work), ROWS, POINTS)
+    """Second derivative (Q, 9, 9) of the energy over 2 μ and the weight by F at each point, no
+    softer along any direction than a ``floor``.
+    """
+    return matrix_stiffness(work, floor) + fibre_stiffness(work)
 
-    def of(row: int, *shape: int) -> Floats:
-        size = int(np.prod(shape))
-        return rows[:, row : row + size].swapaxes(1, 2).reshape(-1, *shape)
 
-    f, a, t = of(GRADIENT, 3, 3), of(FIBRE, 3), of(STRETCH)
-    turn = Rotation.from_quat(of(ROTATION, 4)[:, [1, 2, 3, 0]]).as_matrix()
+def matrix_stiffness(work: Floats, floor: float) -> Floats:
+    """The part (Q, 9, 9) of the material about the fibres, I - B M⁻¹ Bᵀ.
+
+    With Bᵀ B = L Lᵀ and the eigenvalues m of L⁻¹ M L⁻ᵀ, 1 - 1 / m is left along each of the
+    directions that rotations and stretch follow; where m is not positive, the energy is no minimum.
+    """
+    f, a, t = at_points(work, GRADIENT, 3, 3), at_points(work, FIBRE, 3), at_points(work, STRETCH)
+    turn = Rotation.from_quat(at_points(work, ROTATION, 4)[:, [1, 2, 3, 0]]).as_matrix()
     along = a[:, :, None] * a[:, None, :]
     across = np.eye(3) - along
     u = 1.0 / np.sqrt(t)
@@ -167,41 +170,43 @@ def point_stiffness(work: Floats, floor: float) -> Floats:
     def sections(first: Floats, second: Floats) -> Floats:
         return first[:, None, None] * along + second[:, None, None] * across
 
+    # D and its derivatives by t.
     wanted, slope = sections(t, u), sections(np.ones_like(t), -0.5 * u**3)
     bend = sections(np.zeros_like(t), 0.75 * u**5)
     s = turn.swapaxes(1, 2) @ f
     p = s @ wanted
     p = 0.5 * (p + p.swapaxes(1, 2))
-    free = (t > of(LOWER) * (1.0 + AT_BOUND)) & (t < 1.0 - AT_BOUND)
-    ways = np.zeros((len(t), 4, 3, 3))
+    free = (t > at_points(work, LOWER) * (1.0 + AT_BOUND)) & (t < 1.0 - AT_BOUND)
+    ways = np.empty((len(t), 4, 3, 3))  # the columns of B, before R
     ways[:, :3] = GENERATORS @ wanted[:, None]
     ways[:, 3] = np.where(free[:, None, None], slope, 0.0)
     gram = np.einsum("qiab,qjab->qij", ways, ways)
+    gram[~free, 3, 3] = 1.0
     matrix = np.zeros((len(t), 4, 4))
     matrix[:, :3, :3] = np.trace(p, axis1=1, axis2=2)[:, None, None] * np.eye(3) - p
     mixed = -np.einsum("qab,qkab->qk", s, GENERATORS @ slope[:, None]) * free[:, None]
     matrix[:, :3, 3] = matrix[:, 3, :3] = mixed
     matrix[:, 3, 3] = np.where(free, 1.0 + 2.0 / t**3 - (s * bend).sum(axis=(1, 2)), 1.0)
-    gram[~free, 3, 3] = 1.0
     root = np.linalg.inv(np.linalg.cholesky(gram))
     value, vector = np.linalg.eigh(root @ matrix @ root.swapaxes(1, 2))
-    # Along each direction 1 - 1 / value is left of the stiffness; where the value is not positive,
-    # the energy is no minimum.
     softer = np.minimum(1.0 / np.maximum(value, 1e-3), 1.0 - floor)
-    basis = vector.swapaxes(1, 2) @ root
-    ways = (turn[:, None] @ ways).reshape(len(t), 4, 9)
-    ways = basis @ ways
-    out = np.eye(9) - (ways * softer[:, :, None]).swapaxes(1, 2) @ ways
+    ways = vector.swapaxes(1, 2) @ root @ (turn[:, None] @ ways).reshape(len(t), 4, 9)
+    return np.asarray(np.eye(9) - (ways * softer[:, :, None]).swapaxes(1, 2) @ ways)
+
+
+def fibre_stiffness(work: Floats) -> Floats:
+    """The part (Q, 9, 9) of the fibres: along them, and across by their tension."""
+    f, a = at_points(work, GRADIENT, 3, 3), at_points(work, FIBRE, 3)
+    lower, upper = at_points(work, LOWER), at_points(work, UPPER)
+    passive, active = at_points(work, PASSIVE), at_points(work, ACTIVE)
     fa = np.einsum("qab,qb->qa", f, a)
     length = np.sqrt((fa**2).sum(axis=1) + 1e-12)
-    slack = np.clip(length, of(LOWER), of(UPPER))
-    loose = (length > of(LOWER) + TAUT) & (length < of(UPPER) - TAUT)
-    stiff = np.where(loose, 0.0, of(PASSIVE)) + of(ACTIVE)
-    pull = of(PASSIVE) * (length - slack) + of(ACTIVE) * (length - of(CONTENT))
-    side = np.maximum(pull / length, 0.0)
+    slack = (length > lower + TAUT) & (length < upper - TAUT)
+    stiff = np.where(slack, 0.0, passive) + active
+    tension = passive * (length - np.clip(length, lower, upper))
+    tension += active * (length - at_points(work, CONTENT))
+    side = np.maximum(tension / length, 0.0)
     n = fa / length[:, None]
-    spring = side[:, None, None] * np.eye(3) + (stiff - side)[:, None, None] * (
-        n[:, :, None] * n[:, None, :]
-    )
-    out += np.einsum("qac,qbd->qabcd", spring, along).reshape(-1, 9, 9)
-    return out
+    spring = (stiff - side)[:, None, None] * (n[:, :, None] * n[:, None, :])
+    spring += side[:, None, None] * np.eye(3)
+    return np.einsum("qac,qb,qd->qabcd", spring, a, a).reshape(-1, 9, 9)

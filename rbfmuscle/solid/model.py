@@ -280,7 +280,7 @@ def greatest_forces(model: SolidModel, activation: float) -> Floats:
     """
     move = mobility(model.embedding, still_compliance(model, activation))
     share = np.minimum(1.0, move / np.median(move[model.owner < 0]))
-    # Attached points meet neighbours alone, which their bone presses aside.
+    # Attached points meet neighbours alone, which the bone presses aside with them.
     share[model.owner >= 0] = 1.0
     return MOST_CONTACT_PRESSURE * model.area * share
 

@@ -43,6 +43,7 @@ from rbfmuscle.solid.kernels import (
     UPPER,
     WEIGHT,
     add_rows,
+    at_points,
     carry_steps,
     local_step,
     pull_apart,
@@ -225,7 +226,7 @@ class Settling:
         else:
             self.metric = state.metric
             if not np.array_equal(state.turn, np.eye(3)):
-                self.metric = state.metric.turned(model, state.turn)
+                self.metric = state.metric.turned(state.turn)
         sources = obstacles.count
         forces = state.forces
         self.forces = (
@@ -338,7 +339,7 @@ class Settling:
         columns, shares = self.model.embedding.some(points)
         motion = self.metric.reaction.along(points, normal[: len(points)])
         if feet is not None:
-            behind = push_rows(feet, normal[len(points) :], self.metric.inverse)
+            behind = self.metric.reaction.at(feet, normal[len(points) :])
             motion = np.concatenate([motion, behind])
             columns = np.concatenate([columns, feet.columns])
             shares = np.concatenate([shares, feet.shares])
@@ -453,7 +454,6 @@ class Settling:
 
     def finish(self) -> SolidState:
         """The state where the iteration is."""
-        rows = self.work.reshape(len(self.work), ROWS, POINTS)
         nodes, left = lifted(self)
         if left:
             self.caps.add("lifts")
@@ -461,8 +461,8 @@ class Settling:
             nodes=self.nodes,
             lifted_nodes=nodes,
             points=self.model.embedding.of(nodes),
-            rotations=rows[:, ROTATION : ROTATION + 4].swapaxes(1, 2).reshape(-1, 4).copy(),
-            stretches=rows[:, STRETCH].ravel().copy(),
+            rotations=at_points(self.work, ROTATION, 4),
+            stretches=at_points(self.work, STRETCH),
             pressures=self.pressure,
             forces=self.forces,
             slowness=self._seen,
@@ -536,13 +536,3 @@ def start_work(model: SolidModel, state: SolidState) -> Floats:
     ):
         rows[:, row] = values.reshape(count, POINTS)
     return rows.reshape(count, -1)
-
-
-def push_rows(feet: Embedding, normal: Floats, inverse: Floats) -> Floats:
-    """Motions (w, 3 N) of the nodes by unit forces along ``normal`` (w, 3) at embedded points."""
-    rows = np.empty((len(normal), len(inverse)))
-    width = 3 * feet.columns.shape[1]
-    shares = (feet.shares[:, :, None] * normal[:, None, :]).reshape(-1, width)
-    columns = (3 * feet.columns[:, :, None] + np.arange(3)).reshape(-1, width)
-    add_rows(columns, shares, inverse, rows)
-    return rows

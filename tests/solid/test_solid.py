@@ -30,6 +30,7 @@ from rbfmuscle.solid.kernels import (
     ROWS,
     STRETCH,
     WEIGHT,
+    at_points,
     local_step,
     pull_apart,
 )
@@ -143,12 +144,6 @@ class Local(NamedTuple):
     volumes: np.ndarray
     squeezed: float  # energy over 2 μ of squeezed points
     pull: np.ndarray  # what they add to the right side
-
-
-def at_points(work, row, *shape):
-    """What the local step knows at the quadrature points (Q, ...), from a row of its work on."""
-    known = work.reshape(len(work), ROWS, POINTS)[:, row : row + int(np.prod(shape))]
-    return known.swapaxes(1, 2).reshape(-1, *shape)
 
 
 def project(directions):
