@@ -32,7 +32,11 @@ from evidence import write_evidence
 
 ROOT = Path(__file__).resolve().parent.parent
 COPIED = ("rbfmuscle", "pbd_baseline", "tests", "benchmarks", "docs", "examples")
-PACKAGES = ("geometry", "metrics", "bones", "surface", "solid")
+# Folders of a package's modules and of its tests.
+PACKAGES = {
+    name: (f"rbfmuscle/{name}", f"tests/{name}")
+    for name in ("geometry", "metrics", "bones", "surface", "solid")
+} | {"pbd_baseline": ("pbd_baseline", "tests/pbd")}
 # In seconds of the processor, so that what else runs on the machine changes no answer.
 LONGEST = 20.0  # of a test, coverage included: slower ones are left out
 SHOWN = 30.0  # of the tests that a fault is shown to
@@ -220,10 +224,10 @@ def in_child(folder, act, limit):
 def first_run(folder, package):
     """Seconds of the package's tests, those left out, and which run each line of its modules."""
 
+    modules, tests = PACKAGES[package]
+
     def act():
-        counted = coverage.Coverage(
-            data_file=None, source=[f"rbfmuscle/{package}"], config_file=False
-        )
+        counted = coverage.Coverage(data_file=None, source=[modules], config_file=False)
 
         users = defaultdict(list)  # tests of each fixture that several share
 
@@ -245,7 +249,7 @@ def first_run(folder, package):
 
         watch = Watch()
         counted.start()
-        ended = pytest.main([*PLAIN, f"tests/{package}"], [watch, Contexts()])
+        ended = pytest.main([*PLAIN, tests], [watch, Contexts()])
         if ended not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
             raise RuntimeError(f"pytest ended with {ended!r}")
         counted.stop()
@@ -297,7 +301,7 @@ def measure(folder, package, asked):
         raise SystemExit(f"{said[-4000:]}\nthe tests of {package} fail without a fault")
     planted = [
         (path.relative_to(folder), number)
-        for path in sorted((folder / "rbfmuscle" / package).rglob("*.py"))
+        for path in sorted((folder / PACKAGES[package][0]).rglob("*.py"))
         if not asked.files or path.name in asked.files
         for number in sites(path)
     ]
@@ -333,7 +337,7 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--packages", nargs="+", default=list(PACKAGES))
+    parser.add_argument("--packages", nargs="+", choices=PACKAGES, default=list(PACKAGES))
     parser.add_argument("--files", nargs="*", help="names of modules, otherwise all")
     parser.add_argument("--count", type=int, default=60, help="faults of each package, at random")
     parser.add_argument("--seed", type=int, default=67)
@@ -370,7 +374,8 @@ def _measured_before(path, packages):
         return [], []
     kept = json.loads(path.read_text(encoding="utf-8"))
     rows = [row for row in kept["rows"] if row[0].strip("`") not in packages]
-    return rows, [line for line in kept["survivors"] if line.split("/")[1] not in packages]
+    left_out = tuple(f"{PACKAGES[name][0]}/" for name in packages)
+    return rows, [line for line in kept["survivors"] if not line.startswith(left_out)]
 
 
 if __name__ == "__main__":
