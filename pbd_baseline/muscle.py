@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pbd_baseline.constraints import ContactConstraint
 from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
@@ -17,7 +18,7 @@ from rbfmuscle.geometry.arrays import to_world
 from rbfmuscle.geometry.frames import diameter
 from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.interpolation import SurfaceInterpolation
-from rbfmuscle.geometry.surfaces import vertex_areas
+from rbfmuscle.geometry.surfaces import vertex_areas, vertex_normals
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.muscles import attachment_frames
 from rbfmuscle.scene.objects import Muscle, from_mm
@@ -25,12 +26,13 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
 from rbfmuscle.simulation.neighbours import SEARCHED
-from rbfmuscle.simulation.touching import Body, even_points
+from rbfmuscle.simulation.touching import Body, surface_points
 
 # Bones are looked for within this distance [mm] of the vertices as predicted, and as swept.
 REACH = 6.0
 FINISHING_REACH = 2.0
-SPACING = 0.015  # of the vertices that meet neighbours, of the size
+# Spacing of the vertices that meet neighbours, of the size, and how high the surface rises between.
+SPACING, RISES = 0.015, 4e-4
 # Sweeps after which bones are asked again, and the fibres of a muscle that does not contract.
 FRESH = 10
 # Sweeps at most where a tolerance ends them.
@@ -146,10 +148,12 @@ class PBDMuscle:
 
     def body(self) -> Body:
         """What others meet that touch this muscle."""
-        points = even_points(self.rest.vertices, SPACING * self.size)
-        faces = self.rest.topology.faces
-        self._surface = MovingSurface(self.rest.vertices, faces, SEARCHED * self.size)
-        area = float(vertex_areas(self.rest.vertices, faces).sum()) / len(points)
+        vertices, faces = self.rest.vertices, self.rest.topology.faces
+        normals = vertex_normals(vertices, faces)
+        points = surface_points(vertices, normals, SPACING * self.size, RISES * self.size)
+        self._surface = MovingSurface(vertices, faces, SEARCHED * self.size)
+        nearest = cKDTree(vertices[points]).query(vertices)[1]
+        area = np.asarray(np.bincount(nearest, vertex_areas(vertices, faces)), dtype=np.float64)
         return Body(points, points, area)
 
     def activate(self, activation: float) -> None:

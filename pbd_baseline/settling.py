@@ -317,6 +317,6 @@ class MeshSettling:
         gap = self.surface.ask(points, place, *feet, normal)
         return gap, normal, feet
 
-    def contact_law(self, points: Integers, area: Floats | float) -> tuple[Floats, float]:
+    def contact_law(self, points: Integers, area: Floats) -> tuple[Floats, Floats]:
         """No greatest force, and hard contacts."""
-        return np.full(len(points), np.inf), 0.0
+        return np.full(len(points), np.inf), np.zeros(len(points))

@@ -148,7 +148,7 @@ class ToyMuscle(MuscleModel):
     def body(self):
         self._surface = MovingSurface(self.rest, self.faces, 6.0)
         free = np.flatnonzero(self.attached_bone < 0)
-        return Body(free, free, 1.0)
+        return Body(free, free, np.ones(len(free)))
 
     def transform(self, motion):
         self.x, self.target = (

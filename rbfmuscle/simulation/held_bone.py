@@ -10,7 +10,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.simulation.touching import NOTHING, Body, Wanted
 
-NO_POINTS = Body(np.zeros(0, dtype=np.int64), np.zeros(1), 0.0)
+NO_POINTS = Body(np.zeros(0, dtype=np.int64), np.zeros(1), np.zeros(0))
 
 
 class StillRows:
@@ -70,6 +70,6 @@ class HeldBone:
         gap, normal = self.field.distance_and_gradient(points, self.pose)
         return gap, normal, self.feet_of(np.arange(len(points)))
 
-    def contact_law(self, points: Integers, area: Floats | float) -> tuple[Floats, float]:
+    def contact_law(self, points: Integers, area: Floats) -> tuple[Floats, Floats]:
         """None: it has no contact points."""
-        return np.zeros(len(points)), 0.0
+        return np.zeros(len(points)), np.zeros(len(points))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
@@ -28,9 +28,6 @@ REACH = 3.0
 # Points nearer than this at rest [mm] are held, where that is asked for; these are so far apart, of
 # the size: what a solid does between them its nodes decide.
 TOUCHED, HOLDING = 1.0, 0.05
-# Points so near to an attachment, of the size, do not meet others that lie as near to one: where
-# bones drive both, contact would crush what little is between.
-BESIDE = 0.03
 # How near points of one muscle are to those of another that may meet it in a sub-step, or whose
 # shown surface may, of the size of the smaller one.
 SEARCHED = 0.06
@@ -79,7 +76,6 @@ class Neighbours:
         self.bodies = each(lambda stepper: stepper.model.body(), steppers)
         solids = [stepper.model.begin(stepper.contacts) for stepper in steppers]
         sizes = [solid.size for solid in solids]
-        self.beside = [_beside(*row) for row in zip(steppers, self.bodies, sizes)]
         self.bodies += [NO_POINTS] * len(self.bones)
         scene = steppers[0].scene
         touched = from_mm(TOUCHED, scene.units)
@@ -116,9 +112,7 @@ class Neighbours:
                 continue
             near[one, other] = np.full(len(points[one]), -1)
             near[one, other][which] = nearest
-            met = ~(self.beside[one][which] & self.beside[other][nearest])
-            if met.any():
-                found.append((one, other, which[met], nearest[met]))
+            found.append((one, other, which, nearest))
         self.state = self.state._replace(near=near)
         muscles = len(solids) - len(self.bones)
         for (one, other), gap in self.held.items():
@@ -134,7 +128,7 @@ class Neighbours:
         nearest = {m: [row[3] for row in found if row[1] == m] for m in range(len(solids))}
         none = [np.zeros(0, dtype=np.int64)]
         law = [
-            solids[one].contact_law(self.bodies[one].points[rows], self.bodies[one].area)
+            solids[one].contact_law(self.bodies[one].points[rows], self.bodies[one].area[rows])
             for one, _, rows, _ in found
         ]
         overlap, held, force = (
@@ -155,7 +149,7 @@ class Neighbours:
             [self.bodies[m].places[np.concatenate(rows or none)] for m, rows in nearest.items()],
             (
                 np.concatenate([most for most, _ in law]),
-                np.repeat([y for _, y in law], counts),
+                np.concatenate([softness for _, softness in law]),
             ),
             holds,
             np.where(holds, -held, overlap),
@@ -237,13 +231,6 @@ def _held_bones(steppers: Sequence[MuscleStepper]) -> tuple[list[int], list[Held
                 muscles.append(number)
                 bones.append(HeldBone(field, contacts.placed[row]))
     return muscles, bones
-
-
-def _beside(stepper: MuscleStepper, body: Body, size: float) -> Booleans:
-    """Which (k,) of the points of a muscle lie beside one of its attachments."""
-    points = stepper.model.contact_points()
-    attached = points[stepper.model.attached_bone >= 0]
-    return np.asarray(cKDTree(attached).query(points[body.points])[0] < BESIDE * size)
 
 
 def _near_points(points: Floats, other: cKDTree, reach: float) -> tuple[Integers, Integers]:

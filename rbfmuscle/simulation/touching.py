@@ -35,6 +35,7 @@ from rbfmuscle.loops import loop
 
 SWEEPS = 2000  # of the Gauss-Seidel method, at most
 TOLERANCE = 2e-5  # violation of a contact, of the body's size, that is left
+LEFT = 1e-6  # violation of a contact, of the size, for which another one joins in an iteration
 PRECISE = 1e-7  # error of the gaps, of the size, for which contact forces are found
 BATCH = 48  # contacts that join those with a force at a time, the deepest first
 ROUNDS = 10  # in which contacts join those that bear a force, in an iteration
@@ -76,7 +77,7 @@ class Body(NamedTuple):
 
     points: Integers  # (k,) contact points that meet neighbours
     places: NDArray[Any]  # (k, ...) of these in the muscle, as `Moving.ask` takes them
-    area: float  # that each stands for [scene unit squared]
+    area: Floats  # (k,) that each stands for [scene unit squared]
 
 
 class Moving(Protocol):
@@ -125,8 +126,8 @@ class Moving(Protocol):
         date.
         """
 
-    def contact_law(self, points: Integers, area: Floats | float) -> tuple[Floats, Floats | float]:
-        """Greatest force (k,) at contact points that stand for an area each, and how far these
+    def contact_law(self, points: Integers, area: Floats) -> tuple[Floats, Floats]:
+        """Greatest forces (k,) at contact points that stand for areas (k,), and how far (k,) these
         yield to a unit force.
         """
 
@@ -338,13 +339,13 @@ def meet(solids: Sequence[Moving], acting: Booleans, meeting: Meeting | None = N
         stale = set()
         for m in bodies:
             lacks = asked[m].lacking(motions[m]) if m in motions else asked[m].wanted.motion
-            more = _more(lacks, chosen[m], TOLERANCE * size, BATCH)
+            more = _more(lacks, chosen[m], LEFT * size, BATCH)
             if len(more):
                 chosen[m] = np.union1d(chosen[m], more)
                 stale.add(m)
         if meeting is not None:
             lacks = meeting.wants - meeting.apart([motions.get(m) for m in range(len(solids))])
-            more = _more(meeting.lacking(lacks), touching, TOLERANCE * size, batch)
+            more = _more(meeting.lacking(lacks), touching, LEFT * size, batch)
             if len(more):
                 touching = np.union1d(touching, more)
                 stale |= {*meeting.one[more].tolist(), *meeting.other[more].tolist()} & {*bodies}
@@ -480,13 +481,24 @@ def even_points(points: Floats, spacing: float) -> Integers:
     """Which of the points (n, 3) to take, in order, so that none is nearer to another than the
     ``spacing``.
     """
+    return surface_points(points, np.zeros_like(points), spacing, np.inf)
+
+
+def surface_points(points: Floats, normals: Floats, spacing: float, height: float) -> Integers:
+    """Which of the points (n, 3) of a surface to take, in order, so that every other one is no
+    farther from one of them than the ``spacing``, and the surface, with unit ``normals`` (n, 3),
+    rises by no more than the ``height`` between both: by d |n - m| / 8 over a chord of length d.
+    """
     tree = cKDTree(points)
     taken = np.zeros(len(points), dtype=np.bool_)
     chosen = []
     for i, point in enumerate(points):
         if not taken[i]:
             chosen.append(i)
-            taken[tree.query_ball_point(point, spacing)] = True
+            near = np.array(tree.query_ball_point(point, spacing))
+            chord = np.linalg.norm(points[near] - point, axis=1)
+            turned = np.linalg.norm(normals[near] - normals[i], axis=1)
+            taken[near[chord * turned <= 8.0 * height]] = True
     return np.array(chosen, dtype=np.int64)
 
 

@@ -62,27 +62,27 @@ ERROR = 2e-5
 # whose ends approach takes ten times the iterations.
 LONGEST = 0.02
 GROWTH = 2.0  # a motion beyond this multiple of the least so far restarts the acceleration
-MEMORY = 20  # steps that Anderson acceleration combines
+MEMORY = 5  # steps that Anderson acceleration combines
 # Of the estimated error: the last steps hide a slow mode that they hardly move. Measured without
 # it: up to 1.07 times the estimate from the equilibrium, on the phantom.
 SAFETY = 1.4
 NEAR = 0.015  # contact points nearer to an obstacle take part in a solve
 STALE = 0.4  # share of NEAR by which a node moves before they are chosen again
 MARGIN = 0.003  # obstacles are looked for beyond where a point goes by this
-YIELDING = 1e-4  # how far a contact yields under a pressure of 2 μ
+YIELDING = 1e-4  # how far a contact with a bone yields under a pressure of 2 μ
+SOFT = 4e-4  # the same of one with a muscle
 LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
 MOST_PRESSURE = 3.0  # of a region, over 2 μ
 # Over 2 μ: at higher pressures det F bends the energy more than the iteration's matrix does, and
 # steps are shortened.
 CALM_PRESSURE = 0.5
 # Iterations after which the metric is found anew, also as a solve starts, where the last one took
-# twice as many.
-RENEWED = 15
-# Least stiffness of a point along any direction in the metric, over 2 μ, as a solve starts; how
-# many times as much after each renewal but the first, and the most. Slack fibres and pressed
-# material have hardly any along some: a low floor needs few iterations, but where the ends of a
-# slender muscle approach these may go in circles.
-FLOOR, FIRMER, MOST_FLOOR = 0.02, 5.0, 0.25
+# three times as many. With 15, muscles that slide on each other may not get to their end.
+RENEWED = 10
+# Least stiffness of a point along any direction in the metric, over 2 μ: slack fibres and pressed
+# material have hardly any along some. With less, those that touch take fewer iterations, but where
+# the ends of a slender muscle approach these go in circles.
+FLOOR = 0.02
 
 
 class Report(NamedTuple):
@@ -211,7 +211,6 @@ class Settling:
         self.asleep = False
         self._free: tuple[Floats, Floats]
         self._renewed = 0
-        self._floor = FLOOR
         self._asked: Wanted
         self.caps: set[str] = set()
         self.forces_capped = False
@@ -221,7 +220,7 @@ class Settling:
         self._seen = 0.0
         self.wanted = ERROR if error is None else error
         self._localise()
-        if state.metric is None or state.settled_in > 2 * RENEWED:
+        if state.metric is None or state.settled_in > 3 * RENEWED:
             self._renew_metric()
         else:
             self.metric = state.metric
@@ -296,24 +295,28 @@ class Settling:
         carry_steps(self.near, *self.model.embedding, *nodes, MARGIN * size, here, motion, reach)
         found = self.obstacles.meet(self.near, here, reach)
         point = self.near[found.near]
-        most, softness = self.contact_law(point, self.model.area)
+        area = np.full(len(point), self.model.area)
+        most, softness = self._law(point, area, YIELDING)
         self._asked = Wanted(
             point,
             found.source,
             found.normal,
             -found.gap - np.einsum("ca,ca->c", found.normal, motion[found.near]),
-            np.full(len(point), softness),
+            softness,
             most,
             self.forces[point, found.source],
         )
         return self._asked
 
-    def contact_law(self, points: Integers, area: Floats | float) -> tuple[Floats, Floats | float]:
-        """Greatest force (k,) at contact points that stand for an area each, and how far these
+    def contact_law(self, points: Integers, area: Floats) -> tuple[Floats, Floats]:
+        """Greatest forces (k,) at contact points that stand for areas (k,), and how far (k,) these
         yield to a unit force.
         """
+        return self._law(points, area, SOFT)
+
+    def _law(self, points: Integers, area: Floats, yielding: float) -> tuple[Floats, Floats]:
         most = area / self.model.area * self.most[points]
-        return most, YIELDING * self.model.size / area
+        return most, yielding * self.model.size / area
 
     def feet_of(self, points: Integers) -> Embedding:
         """Contact points (w,) as sums of nodes."""
@@ -391,10 +394,7 @@ class Settling:
         self.nodes = (here + way)[: self.nodes.size].reshape(-1, 3)
         self.pressure = (here + way)[self.nodes.size :]
         joined = self._localise()
-        slow = self.iterations - self._renewed >= RENEWED
-        if slow and self.iterations >= 2 * RENEWED:
-            self._floor = min(FIRMER * self._floor, MOST_FLOOR)
-        if joined or slow:
+        if joined or self.iterations - self._renewed >= RENEWED:
             self._renew_metric()
         if np.abs(self.nodes - self._near_y).max() > STALE * NEAR * size:
             self._choose_near()
@@ -436,7 +436,7 @@ class Settling:
         return SAFETY * moved * self.slowness
 
     def _renew_metric(self) -> None:
-        self.metric = find_metric(self.model, self.gradient, self.work, self.squeezed, self._floor)
+        self.metric = find_metric(self.model, self.gradient, self.work, self.squeezed, FLOOR)
         self._renewed = self.iterations
         self.mixer.restart()
 
