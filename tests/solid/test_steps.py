@@ -4,21 +4,36 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.interpolation import Embedding, carry
 from rbfmuscle.simulation.touching import Contacts, Wanted, find_forces, solve_forces
 from rbfmuscle.solid.contact import Obstacles, Reaction, fill_delassus
 from rbfmuscle.solid.kernels import (
+    ACTIVE,
+    COFACTOR,
+    CONTENT,
+    DETERMINANT,
+    FIBRE,
     GRADIENT,
+    LOWER,
+    PASSIVE,
     POINTS,
     ROTATION,
     ROWS,
+    STRESS,
     STRETCH,
+    UPPER,
     WEIGHT,
     add_rows,
+    at_points,
     carry_steps,
     local_step,
+    pull_apart,
     region_volumes,
+    stress_points,
+    turned_normals,
 )
 from rbfmuscle.solid.metric import inverted
 from rbfmuscle.solid.model import mobility
@@ -169,6 +184,107 @@ def test_volumes_are_determinants_and_their_gradients_differences(rng):
     ahead, behind = (cells.step(y + s * step * direction)[2] for s in (1, -1))
     swollen = np.einsum("ran,na->r", gradient, direction)
     np.testing.assert_allclose(swollen, (ahead - behind) / (2 * step), rtol=1e-8)
+
+
+def put(work, row, values):
+    """Write values (P, ...) of the points of one cell to its ``work`` (1, ROWS * P)."""
+    flat = values.reshape(POINTS, -1).T
+    work.reshape(ROWS, POINTS)[row : row + len(flat)] = flat
+
+
+def test_stresses_of_points_are_the_derivatives_of_the_least_energy(rng):
+    """Minimised over all rotations and stretches by SciPy, with active fibres and springs."""
+    tension, step = 0.1, 1e-4
+    f = Rotation.random(POINTS, random_state=5).as_matrix() @ (
+        np.eye(3) * [0.8, 1.2, 1.1] + 0.1 * rng.normal(size=(POINTS, 3, 3))
+    )
+    fibre = rng.normal(size=(POINTS, 3))
+    fibre /= np.linalg.norm(fibre, axis=1)[:, None]
+    lower, upper, content = 0.5, 0.9, 0.7
+    passive, active, weight = rng.uniform(0.5, 2.0, (3, POINTS))
+    work = np.zeros((1, ROWS * POINTS))
+    polar = np.linalg.svd(f)
+    turn = Rotation.from_matrix(polar.U @ polar.Vh)
+    for row, values in (
+        (GRADIENT, f),
+        (ROTATION, turn.as_quat()[:, [3, 0, 1, 2]]),
+        (STRETCH, np.ones(POINTS)),
+        (FIBRE, fibre),
+        (LOWER, np.full(POINTS, lower)),
+        (UPPER, np.full(POINTS, upper)),
+        (PASSIVE, passive),
+        (ACTIVE, active),
+        (CONTENT, np.full(POINTS, content)),
+        (WEIGHT, weight),
+    ):
+        put(work, row, values)
+    for _ in range(20):
+        stress_points(work[0], tension)
+
+    def energy(p, f):
+        a, along = fibre[p], fibre[p][:, None] * fibre[p]
+
+        def miss(x):
+            wanted = x[3] * along + (np.eye(3) - along) / np.sqrt(x[3])
+            gap = f - (turn[p] * Rotation.from_rotvec(x[:3])).as_matrix() @ wanted
+            return 0.5 * (gap**2).sum() - tension * (1.0 - x[3])
+
+        free = [(None, None)] * 3 + [(lower, 1.0)]
+        least = minimize(miss, [0.0, 0.0, 0.0, 0.9], bounds=free, tol=1e-14).fun
+        length = np.linalg.norm(f @ a)
+        beyond = length - np.clip(length, lower, upper)
+        springs = passive[p] * beyond**2 + active[p] * (length - content) ** 2
+        return weight[p] * (least + 0.5 * springs)
+
+    stress = at_points(work, STRESS, 3, 3)
+    for p in range(POINTS):
+        way = rng.normal(size=(3, 3))
+        ahead, behind = (energy(p, f[p] + sign * step * way) for sign in (1, -1))
+        # What SciPy leaves of the least energy over the step of the differences.
+        assert -np.vdot(stress[p], way) == pytest.approx((ahead - behind) / (2 * step), abs=1e-5)
+    det = np.linalg.det(f)
+    np.testing.assert_allclose(at_points(work, DETERMINANT), det, rtol=1e-12)
+    cofactor = (weight * det)[:, None, None] * np.linalg.inv(f).swapaxes(1, 2)
+    np.testing.assert_allclose(at_points(work, COFACTOR, 3, 3), cofactor, atol=1e-12)
+
+
+@pytest.mark.parametrize("point", [0, 5])
+@pytest.mark.parametrize("half_turn", [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8]])
+def test_pull_on_a_squeezed_point_turns_with_it(half_turn, point):
+    """Of stretches alone the nearest deformation with a volume is one of stretches."""
+    least, stretches = 0.5, np.array([1.2, 0.6, 0.1])
+    turn = Rotation.from_rotvec(np.pi * np.asarray(half_turn, dtype=float))
+    work, right = np.zeros((1, ROWS * POINTS)), np.zeros((3, 3))
+    rows = work.reshape(ROWS, POINTS)
+    rows[GRADIENT : GRADIENT + 9, point] = (turn.as_matrix() * stretches).ravel()
+    rows[ROTATION : ROTATION + 4, point] = turn.as_quat()[[3, 0, 1, 2]]
+    rows[DETERMINANT, point], rows[WEIGHT, point] = stretches.prod(), 2.0
+    # Of three nodes each takes one axis, so that the right side is what the deformation lacks.
+    slopes = np.zeros((1, 3, 3 * POINTS))
+    slopes[0, :, point::POINTS] = np.eye(3)
+    energy = pull_apart(np.array([point]), np.array([[0, 1, 2]]), slopes, least, 3.0, work, right)
+    pulled = turn.as_matrix().T @ right.T / 6.0
+    # Diagonal, it grows by a multiple of the cofactors of what it becomes.
+    goal = stretches + np.diag(pulled)
+    np.testing.assert_allclose(pulled, np.diag(np.diag(pulled)), atol=1e-9)
+    assert goal.prod() == pytest.approx(least, rel=1e-3)  # ten steps of the search
+    share = np.diag(pulled) * goal / least
+    np.testing.assert_allclose(share, share.mean(), rtol=1e-2)
+    assert energy == pytest.approx(0.5 * 6.0 * (pulled**2).sum(), rel=1e-9)
+
+
+def test_normals_of_a_deformed_surface_go_by_the_inverse_transpose(rng):
+    """Of a linear map, whose gradient the slopes reproduce."""
+    nodes, normals = rng.normal(size=(NODES, 3)), rng.normal(size=(HANGING, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    columns = np.array([rng.choice(NODES, 27, replace=False) for _ in range(HANGING)])
+    slopes = rng.normal(size=(HANGING, 27, 3))
+    f = np.einsum("ska,skb->sab", nodes[columns], slopes)
+    wanted = np.linalg.det(f)[:, None] * np.einsum("sba,sb->sa", np.linalg.inv(f), normals)
+    wanted /= np.linalg.norm(wanted, axis=1)[:, None]
+    found = np.empty((HANGING, 3))
+    turned_normals(nodes, columns, slopes, normals, found)
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
 def test_embedded_points_and_their_mobility(rng, system):
