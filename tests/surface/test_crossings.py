@@ -45,6 +45,43 @@ def plate():
     )
 
 
+@pytest.fixture(scope="module")
+def slabs():
+    """Two slabs, one above the other and set off so that their vertices do not face each other."""
+    box = trimesh.creation.box([4.0, 4.0, 1.0]).subdivide().subdivide()
+    low, faces = np.array(box.vertices), np.array(box.faces, dtype=np.int64)
+    vertices = np.concatenate([low, low + [0.8, 0.3, 1.3]])
+    faces = np.concatenate([faces, faces + len(low)])
+    start, other = neighbour_lists(faces, len(vertices))
+    links = csr_matrix((np.ones(len(other)), other, start), (len(vertices),) * 2)
+    return Drawn().shown._replace(
+        rest=vertices,
+        faces=faces,
+        links=links,
+        degree=np.diff(start).astype(float),
+        tree=FaceTree(vertices, faces),
+        edge=float(box.edges_unique_length.mean()),
+    )
+
+
+@pytest.mark.parametrize(("depth", "size"), [(0.1, 1.0), (0.2, 1.0), (0.2, 30.0)])
+def test_sheets_that_ran_into_each_other_go_back_by_half_the_depth_each(slabs, depth, size):
+    carried = slabs.rest.copy()
+    upper = np.arange(len(carried)) >= len(carried) // 2
+    close = np.exp(-2.0 * ((carried[upper, :2] - [0.8, 0.3]) ** 2).sum(axis=1))
+    carried[upper, 2] -= 0.3 + depth * close
+    shown = slabs._replace(rest=size * slabs.rest, edge=size * slabs.edge)
+    assert crossing_faces(carried, slabs.faces).sum() > 10
+    found, moved, crossing = parted(size * carried, shown)
+    assert crossing == 0 and not crossing_faces(found, slabs.faces).any()
+    way = (found / size - carried) / depth
+    # Half the depth, and somewhat more, as triangles beside them cross then.
+    for side, sign in ((upper, 1.0), (~upper, -1.0)):
+        assert 0.5 <= (sign * way[side, 2]).max() < 0.65 and (sign * way[side, 2]).min() > -1e-9
+    assert np.linalg.norm(way, axis=1).max() < 0.7
+    np.testing.assert_allclose(way[~moved], 0.0, atol=1e-9)
+
+
 def turned_inside_out(plate, depth):
     """The plate with both sides pushed through each other by a depth about its middle."""
     carried = plate.rest.copy()
