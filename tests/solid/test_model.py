@@ -20,7 +20,7 @@ from rbfmuscle.solid.model import (
     greatest_forces,
     lattice_slopes,
 )
-from rbfmuscle.solid.solve import ERROR, YIELDING, Settling
+from rbfmuscle.solid.solve import CALM_PRESSURE, ERROR, YIELDING, Settling
 from rbfmuscle.solid.state import predict, rest_state, tension, transform
 
 SIDES = np.array([40.0, 10.0, 8.0])
@@ -281,6 +281,17 @@ def test_a_stated_error_counts_how_slowly_the_steps_go(solid, monkeypatch):
     way = solid.model.embedding.of(slow.nodes - exact.nodes)
     way = np.linalg.norm(way, axis=1).max() / solid.model.size
     assert 10.0 * ERROR < way < report.error
+
+
+def test_steps_are_shortened_by_the_greatest_pressure_of_a_region(solid):
+    floor = Floor(np.zeros(len(solid.points), dtype=bool), PLACE[:3, 2], 0.0)
+    most = greatest_forces(solid.model, 0.0)
+    for pressure, part in ((0.0, 1.0), (0.9 * CALM_PRESSURE, 1.0), (-4.0 * CALM_PRESSURE, 0.25)):
+        state = rest_state(solid.model)
+        state.pressures[1] = pressure
+        solving = Settling(solid.model, most, state, floor)
+        solving.free_step()
+        assert solving.part == pytest.approx(part)
 
 
 def test_contacts_stand_for_areas(solid):

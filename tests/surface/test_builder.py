@@ -25,7 +25,7 @@ TOP = -3.0  # of the bone at rest, a slab below the ball
 class Drawn:
     """The ball, held at its lowest centres by a bone out of reach, above a slab that is another."""
 
-    def __init__(self, shape="material", top=TOP):
+    def __init__(self, shape="material", top=TOP, resolution=0):
         slab = trimesh.creation.box([20.0, 20.0, 4.0]).apply_translation([0.0, 0.0, top - 2.0])
         fit = FieldFit(get_kernel("cubic"), 1.0)
         rest = RestSurface(
@@ -36,7 +36,7 @@ class Drawn:
             CENTRES,
             np.where(HELD, 0, -1),
             mesh_volume(X, np.asarray(BALL.faces)),
-            np.eye(3),
+            Rotation.from_rotvec([0.2, 0.5, -0.3]).as_matrix(),  # the ball itself has no axes
             ["holding"],
         )
         self.builder = SurfaceBuilder(
@@ -45,14 +45,16 @@ class Drawn:
             rest,
             lambda vertices: lambda nodes: vertices @ nodes,
             shape=shape,
+            resolution=resolution,
         )
         bones = BonesInReach(["slab"], [BoneSDF.from_mesh(slab)])
         self.contacts = BoneContacts(bones, rest.held_by)
 
-    def __call__(self, linear, *, raised=0.0, fitted=True):
-        pose = np.eye(4)
-        pose[2, 3] = raised
-        self.contacts.move({"slab": pose})
+    def __call__(self, linear, *, raised=0.0, fitted=True, turned=None):
+        turned = np.eye(4) if turned is None else turned
+        pose = turned.copy()
+        pose[2, 3] += raised
+        self.contacts.move({"slab": pose, "holding": turned})
         normals = CENTRES @ linear
         if not fitted:
             normals[0] = np.nan
@@ -120,3 +122,14 @@ def test_the_shape_at_rest_is_the_one_that_the_first_frame_found():
     drawn.contacts.allow(0, np.full(len(CENTRES), 0.5))
     assert drawn(np.eye(3)).vertices[:, 2].min() > -0.7 - 1e-4 * EDGE
     np.testing.assert_array_equal(drawn.builder.shown.rest, first)
+
+
+def test_marching_cubes_give_the_ball_with_its_volume_and_turn_with_the_bones():
+    drawn, turned = Drawn("marching", resolution=8), np.eye(4)
+    first = drawn(np.eye(3))
+    np.testing.assert_allclose(np.linalg.norm(first.vertices, axis=1), 1.0, atol=0.02)
+    assert mesh_volume(first.vertices, first.faces) == pytest.approx(BALL.volume, rel=1e-6)
+    turned[:3, :3] = Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix()
+    again = Drawn("marching", resolution=8)(turned[:3, :3].T, turned=turned)
+    np.testing.assert_allclose(again.vertices, first.vertices @ turned[:3, :3].T, atol=1e-6)
+    np.testing.assert_array_equal(again.faces, first.faces)

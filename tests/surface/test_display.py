@@ -72,6 +72,15 @@ def test_triangles_that_cross_are_smoothed_until_none_do():
     assert away[np.abs(vertices @ vertices[0]) < 0.5].max() < 1e-5
 
 
+def test_a_tangle_is_smoothed_ring_by_ring_until_none_cross():
+    ball = trimesh.creation.icosphere(2)
+    noise = np.random.default_rng(1).normal(size=ball.vertices.shape)
+    tangle = trimesh.Trimesh(ball.vertices + noise, ball.faces, process=False)
+    found, faces = shown(tangle)
+    assert crossing_faces(tangle.vertices, faces).sum() > 50
+    assert not crossing_faces(found, faces).any()
+
+
 def test_a_resolution_gives_so_many_edges_along_the_longest_side():
     bar = trimesh.creation.icosphere(3).apply_scale([5.0, 5.0, 20.0])
     found, faces = shown(bar, 20)

@@ -11,7 +11,7 @@ from rbfmuscle.geometry.point_grid import PointGrid
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_normals
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.surface.display import neighbour_lists
-from rbfmuscle.surface.finish import STEPS, fill_material, finish
+from rbfmuscle.surface.finish import FAR, NEAR, STEPS, MeetingSheets, fill_material, finish
 from rbfmuscle.surface.projection import (
     ALWAYS,
     FARTHEST,
@@ -239,6 +239,45 @@ def test_a_ball_that_a_bone_cuts_off_is_as_large_as_its_volume_asks(size):
     free = sheet.vertices[:, 2] > -0.6 * size
     radius = np.linalg.norm(sheet.vertices[free], axis=1)
     np.testing.assert_allclose(radius, size + level + change, atol=1e-3 * ball.shown.edge)
+
+
+def test_what_is_bounded_stays_where_a_crossing_is_parted_and_the_volume_met():
+    ball = Ball().wants(1.02)
+    sheet = Sheet.at(ball.rest)
+    bounded = ball.rest[:, 2] > 0.0
+    sheet.bounded[:] = bounded
+    sheet.suspect[:] = True
+    sheet.direction[~bounded] = ball.rest[~bounded]
+    # From inside the ball back through it, to where it sticks out a little.
+    sheet.vertices[ball.rest[:, 2].argmin()] = [0.6, 0.0, -0.85]
+    assert ball.shown.tree.crossing(sheet.vertices).any()
+    change, crossing = finish(ball.shown, ball.bones, sheet)
+    assert crossing == 0 and change > 0.0
+    assert mesh_volume(sheet.vertices, FACES) == pytest.approx(ball.shown.volume, rel=1e-9)
+    np.testing.assert_array_equal(sheet.vertices[bounded], ball.rest[bounded])
+
+
+def test_sheets_meet_where_centres_that_were_far_apart_have_come_near():
+    spacing = 2.0
+    flat = spacing * np.indices((6, 3, 1)).reshape(3, -1).T
+    for apart, now, meets in (
+        (FAR * 1.05, NEAR * 0.95, True),
+        (FAR * 1.05, NEAR * 1.05, False),
+        (FAR * 0.95, NEAR * 0.95, False),
+    ):
+        centres = np.concatenate([flat, flat + [0.0, 0.0, apart * spacing]])
+        vertices = centres + 0.3
+        moved = centres.copy()
+        left = (centres[:, 0] < 2.5 * spacing) & (centres[:, 2] > 0.0)
+        moved[left, 2] = now * spacing
+        found = MeetingSheets(centres, vertices)(moved)
+        # A centre beside those that came down is nearer to one below than to none.
+        wanted = (centres[:, 0] < 2.5 * spacing) & meets
+        np.testing.assert_array_equal(
+            found[centres[found, 0] < 2.0 * spacing],
+            np.flatnonzero(wanted & (centres[:, 0] < 2.0 * spacing)),
+        )
+        assert not np.isin(np.flatnonzero(centres[:, 0] > 4.0 * spacing), found).any()
 
 
 def test_without_all_centres_there_is_no_fit():
