@@ -20,7 +20,7 @@ from rbfmuscle.solid.model import (
     greatest_forces,
     lattice_slopes,
 )
-from rbfmuscle.solid.solve import CALM_PRESSURE, ERROR, YIELDING, Settling
+from rbfmuscle.solid.solve import CALM_PRESSURE, ERROR, SOFT, Settling
 from rbfmuscle.solid.state import predict, rest_state, tension, transform
 
 SIDES = np.array([40.0, 10.0, 8.0])
@@ -298,7 +298,7 @@ def test_contacts_stand_for_areas(solid):
     most = np.linspace(1.0, 2.0, len(solid.points))
     solving, _ = pressed(solid, -100.0, most)
     some = np.array([3, 40])
-    area = 2.5 * solid.model.area
-    found, yields = solving.contact_law(some, area)
-    np.testing.assert_allclose(found, 2.5 * most[some])
-    assert yields == pytest.approx(YIELDING * solid.model.size / area)
+    share = np.array([2.5, 0.5])
+    found, yields = solving.contact_law(some, share * solid.model.area)
+    np.testing.assert_allclose(found, share * most[some])
+    np.testing.assert_allclose(yields, SOFT * solid.model.size / (share * solid.model.area))
