@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import toy_scene as toy
+from tendon_scene import END, arm
 
 from rbfmuscle.metrics.centreline import Centreline
 from rbfmuscle.metrics.metrics import MuscleMeasures
@@ -62,8 +63,9 @@ def scene():
 
 
 def measures_of(scene):
-    mesh = scene.muscles[0].mesh
-    return MuscleMeasures(scene, {"box": (np.array(mesh.vertices), np.array(mesh.faces))})
+    (muscle,) = scene.muscles
+    material = np.array(muscle.mesh.vertices), np.array(muscle.mesh.faces)
+    return MuscleMeasures(scene, {muscle.name: material})
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +144,21 @@ def test_tendons_are_part_of_the_length_and_of_that_of_the_shortest_path(scene, 
     assert found["path_length"] == pytest.approx(found["length"] / found["bowing"])
     for name in ("length", "path_length"):
         assert longer[name] == pytest.approx(found[name] + 7.0)
+
+
+def test_depth_of_a_tendon_is_that_of_its_deepest_point_between_the_ends():
+    scene = arm()
+    mesh = scene.muscles[0].mesh
+    material, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    poses = {name: np.eye(4) for name in ("trunk", "limb", END)}
+    # The trunk's radius is 8, its facets lie 0.02 deeper.
+    points = np.array([[0, 0, 50], [0, -6, 30], [0, -7, 20], [0, -20, 10], [0, -1, 50]], float)
+    frame = Frame(0, {}, poses, {}, {"strap": (material, faces)}, [], {"strap": {}}, 0.0)
+    frame.tendons = {END: SimpleNamespace(points=points)}
+    found = measures_of(scene).measure(frame)["strap"]
+    assert found["tendon_depth"] == pytest.approx(2.0, abs=0.03)
+    frame.tendons = {}
+    assert measures_of(scene).measure(frame)["strap"]["tendon_depth"] == 0.0
 
 
 def test_tendons_of_one_end_count_by_the_areas_of_their_patches():
