@@ -246,8 +246,8 @@ def _motion_weights(model: SolidModel) -> Floats:
     inverse = _inverted(hung_matrix(model))
     bones = range(int(model.held_bone.max()) + 1)
     pulls = [model.springs[:, model.held_bone == b].sum(axis=1) for b in bones]
-    weights = inverse @ np.stack(pulls, 1)
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+    # They sum to one: what moves all held points alike moves all nodes so.
+    return np.asarray(inverse @ np.stack(pulls, 1))
 
 
 def hung_matrix(model: SolidModel) -> Floats:
