@@ -79,10 +79,11 @@ CALM_PRESSURE = 0.5
 # Iterations after which the metric is found anew, also as a solve starts, where the last one took
 # three times as many. With 15, muscles that slide on each other may not get to their end.
 RENEWED = 10
-# Least stiffness of a point along any direction in the metric, over 2 μ: slack fibres and pressed
-# material have hardly any along some. With less, those that touch take fewer iterations, but where
-# the ends of a slender muscle approach these go in circles.
-FLOOR = 0.02
+# Least stiffness of a point along any direction in the metric, over 2 μ; how many times as much
+# after each renewal from so many iterations on, and the most. Slack fibres and pressed material
+# have hardly any along some: a low floor needs few iterations, but where the ends of a slender
+# muscle approach these may go in circles.
+FLOOR, FIRMER, LATE, MOST_FLOOR = 0.02, 5.0, 60, 0.25
 
 
 class Report(NamedTuple):
@@ -211,6 +212,7 @@ class Settling:
         self.asleep = False
         self._free: tuple[Floats, Floats]
         self._renewed = 0
+        self._floor = FLOOR
         self._asked: Wanted
         self.caps: set[str] = set()
         self.forces_capped = False
@@ -394,7 +396,10 @@ class Settling:
         self.nodes = (here + way)[: self.nodes.size].reshape(-1, 3)
         self.pressure = (here + way)[self.nodes.size :]
         joined = self._localise()
-        if joined or self.iterations - self._renewed >= RENEWED:
+        slow = self.iterations - self._renewed >= RENEWED
+        if slow and self.iterations >= LATE:
+            self._floor = min(FIRMER * self._floor, MOST_FLOOR)
+        if joined or slow:
             self._renew_metric()
         if np.abs(self.nodes - self._near_y).max() > STALE * NEAR * size:
             self._choose_near()
@@ -436,7 +441,7 @@ class Settling:
         return SAFETY * moved * self.slowness
 
     def _renew_metric(self) -> None:
-        self.metric = find_metric(self.model, self.gradient, self.work, self.squeezed, FLOOR)
+        self.metric = find_metric(self.model, self.gradient, self.work, self.squeezed, self._floor)
         self._renewed = self.iterations
         self.mixer.restart()
 
