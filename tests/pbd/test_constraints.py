@@ -42,8 +42,35 @@ def test_constraints_of_one_colour_share_no_vertex(body):
     order, start = colour(members, np.ones(topology.vertex_count))
     assert sorted(order) == list(range(len(members)))
     for low, high in itertools.pairwise(start):
-        used = members[order[low:high]].ravel()
-        assert len(np.unique(used)) == len(used)
+        used = members[order[low:high]]
+        assert len(np.unique(used)) == used.size
+        assert (np.diff(used.min(axis=1)) > 0).all()  # by the first vertex, for the cache
+
+
+def test_constraints_at_one_vertex_take_as_many_colours_as_they_are():
+    """More than there are bits in two numbers; no colour is left out."""
+    members = np.column_stack([np.zeros(130, dtype=int), np.arange(1, 131)])
+    order, start = colour(members, np.ones(131))
+    assert sorted(order) == start[:-1].tolist() == list(range(130)) and start[-1] == 130
+
+
+def test_icosahedron_has_thirty_edges_and_rings_of_five():
+    mesh = trimesh.creation.icosahedron()
+    topology = Topology.from_mesh(mesh.vertices, mesh.faces)
+    edges, wings = topology.edges, topology.wings
+    assert (
+        np.array_equal(edges, np.unique(np.sort(mesh.edges, axis=1), axis=0)) and len(edges) == 30
+    )
+    turns = [np.roll(mesh.faces, shift, axis=1) for shift in range(3)]
+    faces = {tuple(map(int, face)) for turned in turns for face in turned}
+    for (i, j), (along, against) in zip(edges.tolist(), wings.tolist(), strict=True):
+        assert (i, j, along) in faces and (j, i, against) in faces
+    assert np.array_equal(np.diff(topology.ring_start), np.full(12, 5))
+    for vertex in range(12):
+        around = slice(topology.ring_start[vertex], topology.ring_start[vertex + 1])
+        assert topology.ring[around].tolist() == sorted(mesh.vertex_neighbors[vertex])
+        for other, edge in zip(topology.ring[around], topology.ring_edge[around], strict=True):
+            assert sorted((vertex, other)) == edges[edge].tolist()
 
 
 def test_a_sweep_over_a_mesh_is_one_edge_after_another(rng):
