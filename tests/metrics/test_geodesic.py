@@ -57,9 +57,9 @@ def test_string_over_a_ball_is_two_tangents_and_an_arc(height, clearance):
 def test_path_is_the_same_in_any_unit_and_is_at_rest_where_it_was(monkeypatch):
     line, still = over_the_ball(20.0), {"ball": np.eye(4)}
     path, _ = shortest_path(line, [ball()], still, clearance=np.full(NODES, 2.0))
-    small = BoneDistance("ball", trimesh.creation.icosphere(5, 1e-3 * RADIUS))
-    found, _ = shortest_path(1e-3 * line, [small], still, clearance=np.full(NODES, 2e-3))
-    np.testing.assert_allclose(1e3 * found, path, atol=1e-6)
+    small = BoneDistance("ball", trimesh.creation.icosphere(5, 1e-4 * RADIUS))
+    found, _ = shortest_path(1e-4 * line, [small], still, clearance=np.full(NODES, 2e-4))
+    np.testing.assert_allclose(1e4 * found, path, atol=1e-6)
     monkeypatch.setattr("rbfmuscle.metrics.centreline.ROUNDS", 2)
     given = line, [ball()], still, np.full(NODES, 2.0)
     again, settled = shortest_path(*given, path - resampled(line, NODES - 1))
