@@ -52,8 +52,8 @@ coverage: $(DEV)
 	$(PYTEST) -q --cov --cov-append --cov-report=term:skip-covered
 	@for package in $(PACKAGES); do echo "$$package $$($(BIN)/python -m coverage report --include="$$package/*" --format=total) %"; done
 
-# The numeric tests with vertices moved in their last digits, other processor features, threads and versions; CI runs two
-# of the variants. A part, or other variants, by TESTS="tests/implicit tests/muscle" ONLY="haswell oldest".
+# The numeric tests with vertices moved in their last digits, other processor features, threads and versions, as CI runs
+# them. A part, or other variants, by TESTS="tests/implicit tests/muscle" ONLY="haswell oldest".
 TESTS ?= tests
 portability: $(DEV)
 	$(BIN)/python benchmarks/portability.py $(TESTS) $(if $(ONLY),--only $(ONLY))

@@ -3,8 +3,8 @@ processor features, threads and versions.
 
     python benchmarks/portability.py [--only NAME ...] [--jobs N] [--folder DIR] [TESTS ...]
 
-Without ``--only``, all that combine several changes; CI runs two of these. Cores that no other
-variant takes are workers of a variant; bone fields are not taken from the cache. Those of the
+Without ``--only``, all that combine several changes, as CI runs them. Cores that no other variant
+takes are workers of a variant; bone fields are not taken from the cache. Those of the
 oldest and the newest versions have an environment of their own each (``.ci/oldest.txt``,
 ``.ci/newest.txt``), kept in the folder. Names each variant in which a test fails; exit code 1
 then.

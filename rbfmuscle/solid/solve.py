@@ -317,6 +317,7 @@ class Settling:
         return self._law(points, area, SOFT)
 
     def _law(self, points: Integers, area: Floats, yielding: float) -> tuple[Floats, Floats]:
+        """`contact_law`, with how far contacts yield under a pressure of 2 μ, of the size."""
         most = area / self.model.area * self.most[points]
         return most, yielding * self.model.size / area
 
