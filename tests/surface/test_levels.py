@@ -217,7 +217,7 @@ def test_both_sides_of_a_ball_that_sinks_in_a_flat_bone_lie_on_it_the_far_one_ab
     normals = vertex_normals(ball.rest, FACES)
     wanted = np.where(z < 0.0, LAMELLA * edge * np.maximum(normals[:, 2], 0.0), z)
     np.testing.assert_allclose(sheet.vertices[:, 2], wanted, atol=1e-6 * size)
-    np.testing.assert_array_equal(sheet.vertices[:, :2], ball.rest[:, :2])
+    np.testing.assert_allclose(sheet.vertices[:, :2], ball.rest[:, :2], atol=1e-9 * size)
     deep = z < -SUNK * edge
     assert 0 < deep.sum() < len(rows)
     np.testing.assert_array_equal(sheet.suspect, deep)
@@ -244,7 +244,7 @@ def test_a_ball_that_a_bone_cuts_off_is_as_large_as_its_volume_asks(size):
 def test_what_is_bounded_stays_where_a_crossing_is_parted_and_the_volume_met():
     ball = Ball().wants(1.02)
     sheet = Sheet.at(ball.rest)
-    bounded = ball.rest[:, 2] > 0.0
+    bounded = ball.rest[:, 2] > 0.1
     sheet.bounded[:] = bounded
     sheet.suspect[:] = True
     sheet.direction[~bounded] = ball.rest[~bounded]
