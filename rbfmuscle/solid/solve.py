@@ -83,7 +83,7 @@ RENEWED = 10
 # after each renewal from so many iterations on, and the most. Slack fibres and pressed material
 # have hardly any along some: a low floor needs few iterations, but where the ends of a slender
 # muscle approach these may go in circles.
-FLOOR, FIRMER, LATE, MOST_FLOOR = 0.02, 5.0, 60, 0.25
+FLOOR, FIRMER, LATE, MOST_FLOOR = 0.02, 5.0, 30, 0.25
 
 
 class Report(NamedTuple):
