@@ -40,22 +40,27 @@ def test_a_fold_is_found_where_nothing_is_suspect_and_parted_where_folds_are_ask
         assert crossing_faces(sheet.vertices, FACES).sum() == (0 if folds else count)
 
 
-@pytest.fixture(scope="module")
-def plate():
-    """A thin plate as a shown surface."""
-    ball = trimesh.creation.icosphere(4)
-    vertices = np.array(ball.vertices) * [1.0, 1.0, 0.1]
-    shown, faces = Drawn().shown, np.array(ball.faces, dtype=np.int64)
+def shown_as(vertices, faces, edge):
+    """A triangle mesh as a shown surface, whose edges are about so long."""
+    faces = np.asarray(faces, dtype=np.int64)
     start, other = neighbour_lists(faces, len(vertices))
     links = csr_matrix((np.ones(len(other)), other, start), (len(vertices),) * 2)
-    return shown._replace(
+    return Drawn().shown._replace(
         rest=vertices,
         faces=faces,
         links=links,
         degree=np.diff(start).astype(float),
         tree=FaceTree(vertices, faces),
-        edge=float(ball.edges_unique_length.mean()),
+        edge=float(edge),
     )
+
+
+@pytest.fixture(scope="module")
+def plate():
+    """A thin plate as a shown surface."""
+    ball = trimesh.creation.icosphere(4)
+    vertices = np.array(ball.vertices) * [1.0, 1.0, 0.1]
+    return shown_as(vertices, np.array(ball.faces), ball.edges_unique_length.mean())
 
 
 @pytest.fixture(scope="module")
@@ -65,16 +70,7 @@ def slabs():
     low, faces = np.array(box.vertices), np.array(box.faces, dtype=np.int64)
     vertices = np.concatenate([low, low + [0.8, 0.3, 1.3]])
     faces = np.concatenate([faces, faces + len(low)])
-    start, other = neighbour_lists(faces, len(vertices))
-    links = csr_matrix((np.ones(len(other)), other, start), (len(vertices),) * 2)
-    return Drawn().shown._replace(
-        rest=vertices,
-        faces=faces,
-        links=links,
-        degree=np.diff(start).astype(float),
-        tree=FaceTree(vertices, faces),
-        edge=float(box.edges_unique_length.mean()),
-    )
+    return shown_as(vertices, faces, box.edges_unique_length.mean())
 
 
 @pytest.mark.parametrize(
