@@ -8,9 +8,11 @@ rotations and x = (ω, t),
     M_ωω = tr(P) I - P,    M_ωt = -S : E_k D',    M_tt = 1 + 2 / t³ - S : D'',
 
 t alone where it is not at one of its bounds. Fibres beyond the band where they are slack add
-c n nᵀ ⊗ a aᵀ and what their tension holds across. With the second differences and the springs this
-is Newton's matrix H without what pressures add, made positive: no direction of a point is softer
-than a floor. An iteration goes by H⁻¹ (force); where it ends does not depend on H.
+c n nᵀ ⊗ a aᵀ and what their tension holds across, and a region's pressure p adds -p ∂² det F / ∂F².
+With the second differences and the springs this is Newton's matrix H. Where the energy of a point
+has a negative second derivative a part of that is taken off, and all of it where H would not be
+positive definite otherwise: the more is taken off, the shorter are the steps. An iteration goes by
+H⁻¹ (force); where it ends does not depend on H.
 """
 
 from typing import NamedTuple
@@ -52,7 +54,14 @@ AT_BOUND = 1e-6
 # Of a fibre's stretch: nearer to where it goes slack it counts as taut. At rest every fibre stands
 # there, and each iteration would find other ones slack.
 TAUT = 0.004
+# Least stiffness of a point along any direction, over 2 μ, and the shares of what points lack of it
+# that are added, in the order in which they are tried until H is positive definite. With all of it
+# muscles that hang between others take steps of a fiftieth of their way.
+FLOOR, SHARES = 0.002, (0.25, 0.5, 1.0)
 BLOCK = 32  # rows and columns of a matrix that are mirrored at once
+# ε_abc, by which ∂² det F / ∂F_ab ∂F_cd = ε_ace ε_bdf F_ef.
+ODD = np.zeros((3, 3, 3))
+ODD[[0, 1, 2], [1, 2, 0], [2, 0, 1]], ODD[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = 1.0, -1.0
 GENERATORS = np.array(
     [
         [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
@@ -91,15 +100,16 @@ class Metric(NamedTuple):
 
 
 def find_metric(
-    model: SolidModel, gradient: Floats, work: Floats, squeezed: Booleans, floor: float
+    model: SolidModel, gradient: Floats, work: Floats, squeezed: Booleans, pressure: Floats
 ) -> Metric:
-    """The metric for gradients (M, 3, N) of the regions' volumes, where the points are as in
-    ``work`` (C, ROWS * P), some of them ``squeezed`` (Q,), and none is softer than a ``floor``.
+    """The metric for gradients (M, 3, N) of the regions' volumes and their pressures (M,), where
+    the points are as in ``work`` (C, ROWS * P), some of them ``squeezed`` (Q,).
 
     LinAlgError where the gradients are not independent.
     """
     count, _, nodes = gradient.shape
-    inverse = inverted(stiffness_matrix(model, work, squeezed, floor))
+    points = point_stiffness(work, np.repeat(pressure[model.cells.region], POINTS))
+    inverse = _positive_inverse(model, points, squeezed)
     flat = gradient.transpose(0, 2, 1).reshape(count, -1)
     answer = flat @ inverse
     compliance = answer @ flat.T
@@ -111,12 +121,31 @@ def find_metric(
     return Metric(gradient.copy(), inverse, np.ascontiguousarray(response), whiten, reaction)
 
 
-def stiffness_matrix(model: SolidModel, work: Floats, squeezed: Booleans, floor: float) -> Floats:
-    """H (3 N, 3 N), node by node; the rest as in `find_metric`."""
+def _positive_inverse(model: SolidModel, points: Floats, squeezed: Booleans) -> Floats:
+    """H⁻¹ (3 N, 3 N) for the stiffness (Q, 9, 9) of the points, with the least share of `SHARES` by
+    which H is positive definite.
+    """
+    for share in SHARES:
+        inverse = inverted(stiffness_matrix(model, raised(points, share), squeezed))
+        if inverse is not None:
+            return inverse
+    raise np.linalg.LinAlgError("the stiffness of the solid is not positive definite")
+
+
+def raised(points: Floats, share: float) -> Floats:
+    """Stiffness (Q, 9, 9) with a share added of what it lacks of `FLOOR` along any direction."""
+    value, vector = np.linalg.eigh(points)
+    value += share * np.maximum(FLOOR - value, 0.0)
+    return np.asarray((vector * value[:, None, :]) @ vector.swapaxes(1, 2))
+
+
+def stiffness_matrix(model: SolidModel, points: Floats, squeezed: Booleans) -> Floats:
+    """H (3 N, 3 N), node by node, for the stiffness (Q, 9, 9) of the points, of which some are
+    ``squeezed`` (Q,).
+    """
     cells, nodes = model.cells, len(model.rest)
-    points = point_stiffness(work, floor)
-    points[squeezed] += STIFFNESS * np.eye(9)
-    points *= cells.weights[:, None, None]
+    points = points * cells.weights[:, None, None]
+    points[squeezed] += STIFFNESS * cells.weights[squeezed, None, None] * np.eye(9)
     by_cell = points.reshape(len(cells.nodes), POINTS, 9, 9).transpose(0, 2, 3, 1)
     shape = (len(cells.nodes), 3, 3, 3, 3, POINTS)
     matrix = np.zeros((nodes, 3, nodes, 3))
@@ -127,12 +156,12 @@ def stiffness_matrix(model: SolidModel, work: Floats, squeezed: Booleans, floor:
     return matrix
 
 
-def inverted(matrix: Floats) -> Floats:
-    """Inverse of a positive definite matrix (n, n); LinAlgError where it is not."""
+def inverted(matrix: Floats) -> Floats | None:
+    """Inverse of a symmetric matrix (n, n); None where it is not positive definite."""
     # LAPACK goes by columns: the upper triangle there is the lower one here.
     factor, failed = lapack.dpotrf(matrix.T, lower=0, overwrite_a=1)
     if failed:
-        raise np.linalg.LinAlgError("the stiffness of the solid is not positive definite")
+        return None
     upper, _ = lapack.dpotri(factor, lower=0, overwrite_c=1)
     mirror(upper.T)
     return upper.T
@@ -148,14 +177,16 @@ def mirror(lower):
                     lower[j, i] = lower[i, j]
 
 
-def point_stiffness(work: Floats, floor: float) -> Floats:
-    """Second derivative (Q, 9, 9) of the energy over 2 μ and the weight by F at each point, no
-    softer along any direction than a ``floor``.
+def point_stiffness(work: Floats, pressure: Floats) -> Floats:
+    """Second derivative (Q, 9, 9) of the energy over 2 μ and the weight by F at each point, under a
+    ``pressure`` (Q,) over 2 μ.
     """
-    return matrix_stiffness(work, floor) + fibre_stiffness(work)
+    f = at_points(work, GRADIENT, 3, 3)
+    bend = np.einsum("ace,bdf,qef->qabcd", ODD, ODD, f, optimize=True).reshape(-1, 9, 9)
+    return matrix_stiffness(work) + fibre_stiffness(work) - pressure[:, None, None] * bend
 
 
-def matrix_stiffness(work: Floats, floor: float) -> Floats:
+def matrix_stiffness(work: Floats) -> Floats:
     """The part (Q, 9, 9) of the material about the fibres, I - B M⁻¹ Bᵀ.
 
     With Bᵀ B = L Lᵀ and the eigenvalues m of L⁻¹ M L⁻ᵀ, 1 - 1 / m is left along each of the
@@ -189,7 +220,7 @@ def matrix_stiffness(work: Floats, floor: float) -> Floats:
     matrix[:, 3, 3] = np.where(free, 1.0 + 2.0 / t**3 - (s * bend).sum(axis=(1, 2)), 1.0)
     root = np.linalg.inv(np.linalg.cholesky(gram))
     value, vector = np.linalg.eigh(root @ matrix @ root.swapaxes(1, 2))
-    softer = np.minimum(1.0 / np.maximum(value, 1e-3), 1.0 - floor)
+    softer = 1.0 / np.maximum(value, 1e-3)
     ways = vector.swapaxes(1, 2) @ root @ (turn[:, None] @ ways).reshape(len(t), 4, 9)
     return np.asarray(np.eye(9) - (ways * softer[:, :, None]).swapaxes(1, 2) @ ways)
 

@@ -73,17 +73,12 @@ YIELDING = 1e-4  # how far a contact with a bone yields under a pressure of 2 μ
 SOFT = 4e-4  # the same of one with a muscle
 LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
 MOST_PRESSURE = 3.0  # of a region, over 2 μ
-# Over 2 μ: at higher pressures det F bends the energy more than the iteration's matrix does, and
-# steps are shortened.
-CALM_PRESSURE = 0.5
 # Iterations after which the metric is found anew, also as a solve starts, where the last one took
 # three times as many. With 15, muscles that slide on each other may not get to their end.
 RENEWED = 10
-# Least stiffness of a point along any direction in the metric, over 2 μ; how many times as much
-# after each renewal from so many iterations on, and the most. Slack fibres and pressed material
-# have hardly any along some: a low floor needs few iterations, but where the ends of a slender
-# muscle approach these may go in circles.
-FLOOR, FIRMER, LATE, MOST_FLOOR = 0.02, 5.0, 30, 0.25
+# Where acceleration would go against a step, which then leads away from a saddle of the energy: how
+# many times the step is taken instead.
+FORWARD = 3.0
 
 
 class Report(NamedTuple):
@@ -105,15 +100,14 @@ class SolidRows(NamedTuple):
     """What unit forces at w contacts do to a solid."""
 
     metric: Metric
-    part: float  # of a full step that is taken
     direct: Floats  # (w, 3 N) motion of the nodes by H⁻¹
     rho: Floats  # (w, M) taken from the whitened pressures
-    delassus: Floats  # (w, w) for the share of a step that is taken
+    delassus: Floats  # (w, w)
 
     def motion(self, force: Floats) -> Floats:
         """Motion (N, 3) of the nodes by contact forces (w,), volumes kept."""
         free = (force @ self.direct).reshape(-1, 3)
-        return self.part * (free - self.metric.response @ (force @ self.rho))
+        return np.asarray(free - self.metric.response @ (force @ self.rho))
 
 
 class Mixer:
@@ -208,11 +202,9 @@ class Settling:
         self.iterations = 0
         self.error = np.inf
         self.residual = np.inf
-        self.part = 1.0  # of a full step that is taken
         self.asleep = False
         self._free: tuple[Floats, Floats]
         self._renewed = 0
-        self._floor = FLOOR
         self._asked: Wanted
         self.caps: set[str] = set()
         self.forces_capped = False
@@ -271,12 +263,10 @@ class Settling:
             self.step, self.change = self._free[0].copy(), self._free[1].copy()
             return
         model, metric = self.model, self.metric
-        highest = np.abs(self.pressure).max(initial=0.0)
-        self.part = 1.0 / max(1.0, highest / CALM_PRESSURE)
         flat = self.gradient.reshape(len(self.volumes), -1)
         pressed = (self.pressure @ flat).reshape(3, -1).T
         force = self.right + self.springs + pressed - model.links @ self.nodes
-        free = self.part * metric.yielded(force)
+        free = metric.yielded(force)
         rest = model.cells.volumes
         # What contacts take from the pressures is found with the metric's gradients: with others
         # here the two would not cancel, and where the iteration ends would depend on the metric.
@@ -354,7 +344,7 @@ class Settling:
         delassus = np.empty((count, count))
         fill_delassus(columns, shares, normal, motion, delassus)
         delassus -= rho @ rho.T
-        return SolidRows(self.metric, self.part, motion, rho, self.part * delassus)
+        return SolidRows(self.metric, motion, rho, delassus)
 
     def push(self, motion: Floats | None, rows: "SolidRows", force: Floats, asked: Wanted) -> None:
         """Add the motion (N, 3) by contact forces (w,) to the step, and keep those with
@@ -363,7 +353,7 @@ class Settling:
         self._push = np.zeros_like(self.nodes) if motion is None else motion
         if motion is not None:
             self.step += motion
-            self.change -= self.part * (force @ rows.rho)
+            self.change -= force @ rows.rho
         self.forces[:] = 0.0
         self.forces[asked.point, asked.source] = asked.force
 
@@ -381,32 +371,33 @@ class Settling:
             self._least = np.inf
             self.mixer.restart()
         self.iterations += 1
-        pressure = self.pressure + self.metric.whiten.T @ self.change / self.part
+        pressure = self.pressure + self.metric.whiten.T @ self.change
         pressure = np.clip(pressure, -MOST_PRESSURE, MOST_PRESSURE)
-        self.residual = moved / self.part / size
+        self.residual = moved / size
         if moved > GROWTH * self._least or moved > LONGEST * size:
             self.mixer.restart()
         self._least = moved if moved > GROWTH * self._least else min(self._least, moved)
         here = np.concatenate([self.nodes.ravel(), self.pressure])
         plain = np.concatenate([(self.nodes + self.step).ravel(), pressure])
-        mixed = self.mixer.mix(here, plain)
-        way = mixed - here
+        step = plain - here
+        way = self.mixer.mix(here, plain) - here
+        if way[: self.nodes.size] @ step[: self.nodes.size] < 0.0:
+            way = FORWARD * step
         far = self._way(way[: self.nodes.size].reshape(-1, 3))
-        self.error = self._estimate(moved) / self.part / size
+        self.error = self._estimate(moved) / size
         way *= min(1.0, LONGEST * size / max(far, 1e-300))
         self.nodes = (here + way)[: self.nodes.size].reshape(-1, 3)
         self.pressure = (here + way)[self.nodes.size :]
         joined = self._localise()
-        slow = self.iterations - self._renewed >= RENEWED
-        if slow and self.iterations >= LATE:
-            self._floor = min(FIRMER * self._floor, MOST_FLOOR)
-        if joined or slow:
-            self._renew_metric()
         if np.abs(self.nodes - self._near_y).max() > STALE * NEAR * size:
             self._choose_near()
-        if self.iterations >= self.model.iterations and self.error >= self.wanted:
+        last = self.iterations >= self.model.iterations
+        if last and self.error >= self.wanted:
             self.caps.add("iterations")
-        self.asleep = self.error < self.wanted or self.iterations >= self.model.iterations
+        self.asleep = last or self.error < self.wanted
+        # A body that sleeps keeps its metric, as it keeps the step that was found by it.
+        if not self.asleep and (joined or self.iterations - self._renewed >= RENEWED):
+            self._renew_metric()
 
     def _way(self, motion: Floats) -> float:
         """How far material goes, about, when nodes move (N, 3): nodes that hold none settle slowly,
@@ -417,7 +408,7 @@ class Settling:
 
     def _may_end(self, moved: float) -> bool:
         """Whether a step ends the iteration by the slowness known so far, or is the last one."""
-        near = SAFETY * moved * self.slowness < self.wanted * self.part * self.model.size
+        near = SAFETY * moved * self.slowness < self.wanted * self.model.size
         return near or self.iterations >= self.model.iterations
 
     def _estimate(self, moved: float) -> float:
@@ -442,7 +433,8 @@ class Settling:
         return SAFETY * moved * self.slowness
 
     def _renew_metric(self) -> None:
-        self.metric = find_metric(self.model, self.gradient, self.work, self.squeezed, self._floor)
+        found = self.gradient, self.work, self.squeezed, self.pressure
+        self.metric = find_metric(self.model, *found)
         self._renewed = self.iterations
         self.mixer.restart()
 
@@ -484,7 +476,6 @@ def lifted(solid: Settling) -> tuple[Floats, bool]:
     """
     model, size = solid.model, solid.model.size
     y, metric = solid.nodes, solid.metric
-    solid.part = 1.0  # a lift is a whole step
     settled = np.empty(len(model.cells.volumes))
     volumes = np.empty_like(settled)
     cells = model.cells

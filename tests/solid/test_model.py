@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.frames import RestFrame
 from rbfmuscle.scene.joints import rotation_about
-from rbfmuscle.simulation.touching import TOLERANCE, settle
+from rbfmuscle.simulation.touching import TOLERANCE, meet, settle
 from rbfmuscle.solid.contact import NO_TOUCH, Touch
 from rbfmuscle.solid.lattice import Lattice
 from rbfmuscle.solid.metric import stiffness_matrix
@@ -20,7 +20,7 @@ from rbfmuscle.solid.model import (
     greatest_forces,
     lattice_slopes,
 )
-from rbfmuscle.solid.solve import CALM_PRESSURE, ERROR, SOFT, Settling
+from rbfmuscle.solid.solve import ERROR, SOFT, Settling
 from rbfmuscle.solid.state import predict, rest_state, tension, transform
 
 SIDES = np.array([40.0, 10.0, 8.0])
@@ -283,15 +283,14 @@ def test_a_stated_error_counts_how_slowly_the_steps_go(solid, monkeypatch):
     assert 10.0 * ERROR < way < report.error
 
 
-def test_steps_are_shortened_by_the_greatest_pressure_of_a_region(solid):
-    floor = Floor(np.zeros(len(solid.points), dtype=bool), PLACE[:3, 2], 0.0)
-    most = greatest_forces(solid.model, 0.0)
-    for pressure, part in ((0.0, 1.0), (0.9 * CALM_PRESSURE, 1.0), (-4.0 * CALM_PRESSURE, 0.25)):
-        state = rest_state(solid.model)
-        state.pressures[1] = pressure
-        solving = Settling(solid.model, most, state, floor)
-        solving.free_step()
-        assert solving.part == pytest.approx(part)
+def test_a_body_stays_asleep_where_its_metric_was_due_to_be_found_anew(solid, monkeypatch):
+    count = pressed(solid, 2.0)[0].iterations
+    monkeypatch.setattr("rbfmuscle.solid.solve.RENEWED", count)
+    solving, _ = pressed(solid, 2.0)
+    assert solving.iterations == count and solving.asleep
+    solving.free_step()
+    meet([solving], np.array([True]))
+    assert np.linalg.norm(solving.step, axis=1).max() < ERROR * solid.model.size
 
 
 def test_contacts_stand_for_areas(solid):

@@ -329,8 +329,7 @@ def test_positive_definite_matrices_are_inverted(rng):
     root = rng.normal(size=(70, 70))
     matrix = root @ root.T + np.eye(70)
     np.testing.assert_allclose(inverted(matrix.copy()) @ matrix, np.eye(70), atol=1e-11)
-    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        inverted(-matrix)
+    assert inverted(-matrix) is None
 
 
 def test_fences_hold_the_points_that_they_name():
