@@ -13,34 +13,35 @@ from rbfmuscle.geometry.arrays import Floats
 # Of what is measured of every fibre of a muscle.
 PERCENTILES: Mapping[str, int] = MappingProxyType({"p05": 5, "p50": 50, "p95": 95})
 _FIBRES = {
-    "fibre_stretch": ("1", "length of a fibre without tendons over that at rest"),
-    "fibre_moment_arm": ("length", "moment arm of a fibre with its tendons"),
+    "fibre_stretch": ("1", "length of a fibre without tendons / the same at rest"),
+    "fibre_moment_arm": ("length", "moment arm of a fibre, tendons included"),
 }
 
 # Quantity: kind of unit (volume and length follow the scene's unit), meaning; in the order of the
 # tables.
 QUANTITIES = {
     "volume": ("volume", "volume enclosed by the surface"),
-    "volume_error": ("1", "volume relative to the input mesh's, minus one"),
+    "volume_error": ("1", "volume / volume of the input mesh, minus one"),
     "penetration_max": (
         "length",
-        "deepest surface vertex inside a bone, by its triangles",
+        "greatest depth of a surface vertex below the triangles of a bone",
     ),
     "penetration_fraction": ("1", "share of surface vertices inside a bone"),
-    "bone_penetration_max": ("length", "deepest bone vertex inside the muscle"),
+    "bone_penetration_max": ("length", "greatest depth of a bone vertex inside the muscle"),
     "solver_penetration_max": (
         "length",
-        "deepest of the model's points inside a bone at the end of the solve",
+        "greatest depth of one of the model's contact points in a bone at the end of the solve",
     ),
     "lifted_penetration_max": (
         "length",
-        "the same after RBF muscles have lifted these points out of bones, before the surface is "
-        "drawn",
+        "the same after an RBF muscle's points are moved out of the bones, before its surface is "
+        "computed",
     ),
     "solver_sweeps": ("1", "sweeps of the last solve of a mesh model"),
     "solver_residual": (
         "1",
-        "greatest unshortened motion of a point in the last iteration, over the muscle's size",
+        "estimated distance from equilibrium at the end of the solve (mesh models: the greatest "
+        "motion in the last sweep), over the muscle's size",
     ),
     "solid_volume_error": (
         "1",
@@ -51,119 +52,141 @@ QUANTITIES = {
         "1",
         "Euler characteristic of the surface: 2 for a sphere, two less for each handle",
     ),
-    "self_crossings": ("1", "triangles of the surface that cross others of it"),
+    "self_crossings": ("1", "triangles of the surface that cross another of its triangles"),
     "unfitted_fraction": (
         "1",
-        "share of surface vertices not on the field's level set; the limit is met unless it is 1, "
-        "where the field is not shown",
+        "share of surface vertices that are not on the field's level set; 1 where the surface is "
+        "shown without the field",
     ),
     "flicker": (
         "length",
-        "greatest change of distances from material mesh to surface since the frame before in the "
-        "motion; none in runs that leave frames out",
+        "greatest change, since the frame before, of the distance from a vertex of the material "
+        "mesh to the surface; not measured in runs that leave frames out",
     ),
     "shown_shift_rms": (
         "length",
-        "distance of the carried material from the surface that is shown; none where it is shown",
+        "RMS distance from the material mesh to the surface; not measured where the surface is the "
+        "material mesh",
     ),
-    "shown_shift_max": ("length", "the same, greatest"),
-    "tunnelled": ("1", "points that passed through a bone and were not brought back"),
+    "shown_shift_max": ("length", "greatest of these distances"),
+    "tunnelled": ("1", "contact points that passed through a bone and were not brought back"),
     "neighbour_overlap_max": (
         "length",
-        "deepest vertex of this muscle or another in the other, beyond their overlap at rest there",
+        "greatest depth of this muscle in another, or of another in it, beyond their overlap there "
+        "at rest",
     ),
     "material_overlap_max": (
         "length",
-        "the same of the carried material, from which a model draws what it shows",
+        "the same between the material meshes, from which the surfaces are computed",
     ),
     "neighbour_overlap_rest": (
         "length",
-        "deepest overlap of the input mesh with that of another muscle; first frame",
+        "greatest overlap of the input meshes of this muscle and another; first frame",
     ),
     "neighbour_gap": (
         "length",
-        "how far the surface has parted from muscles that it touched at rest: 95th percentile",
+        "distance to the muscles that it touched at rest, 95th percentile over these places",
     ),
     "rest_error_rms": (
         "length",
-        "distance between surface and input mesh at rest, both ways, farther than 10 mm from where "
-        "that overlaps a bone",
+        "RMS distance between surface and input mesh at rest, in both directions, except within "
+        "10 mm of an overlap with a bone",
     ),
-    "rest_error_max": ("length", "the same, greatest (Hausdorff)"),
-    "rest_error_at_overlap": ("length", "the same, greatest, within 10 mm of an overlap"),
+    "rest_error_max": ("length", "greatest of these distances (Hausdorff)"),
+    "rest_error_at_overlap": (
+        "length",
+        "greatest distance between them within 10 mm of an overlap with a bone",
+    ),
     "input_overlap": (
         "length",
-        "deepest overlap of the input mesh with a bone at rest, apart from attachments",
+        "greatest overlap of the input mesh with a bone at rest, attached vertices left out",
     ),
     "thickness": (
         "length",
-        "least width of the input mesh's greatest section across its line of action",
+        "least width of the input mesh's largest section across its line from origin to insertion",
     ),
     "articular_share": (
         "1",
-        "greatest share of an attachment on an articular surface at rest",
+        "greatest share of an attachment that lies on an articular surface at rest",
     ),
-    "tendon_depth": ("length", "deepest point of a tendon inside a bone"),
-    "initial_overlap": ("length", "deepest overlap of muscle and bones that is left at rest"),
-    "end_gap": ("length", "distance of the end that lies furthest from its bone at rest"),
+    "tendon_depth": ("length", "greatest depth of a tendon inside a bone"),
+    "initial_overlap": (
+        "length",
+        "greatest overlap of surface, contact points and bones that is left at rest",
+    ),
+    "end_gap": (
+        "length",
+        "greatest distance from an end without a tendon to its bone at rest",
+    ),
     "edge_strain_rms": ("1", "relative change of edge lengths of the material mesh"),
     "condition": ("1", "condition estimate of the fit"),
-    "length": ("length", "centreline from origin to insertion, with its tendons"),
+    "length": (
+        "length",
+        "length of the centreline from origin to insertion, tendons included",
+    ),
     "path_length": (
         "length",
-        "shortest path over the bones between the ends of the centreline, with the tendons",
+        "length of the shortest path outside the bones between the ends of the centreline, tendons "
+        "included",
     ),
     "bowing": (
         "1",
-        "length of the centreline without tendons / that of the shortest path between its ends",
+        "length of the centreline / length of the shortest path, both without tendons",
     ),
     "bowing_at_rest": ("1", "the same at rest, before the first frame"),
     "moment_arm": (
         "length",
-        "minus the change of length with the coordinate's angle; NaN where the activation changes",
+        "minus the derivative of length with respect to the coordinate; NaN where the activation "
+        "changes",
     ),
     "moment_arm_jump": (
         "length",
-        "change of the moment arm's slope over 5 degrees, times these",
+        "change of the moment arm over 5 degrees less its change over the 5 degrees before",
     ),
     "length_roughness": (
         "length",
-        "second difference of the length over 2 degrees; motions by at most these",
+        "second difference of the length over 2 degrees; measured in steps of at most 2 degrees",
     ),
-    "path_roughness": ("length", "the same of the shortest path"),
+    "path_roughness": ("length", "the same of path_length"),
     "roughness_beyond_path": (
         "length",
-        "how much length_roughness exceeds the greatest of the shortest path in the motion",
+        "length_roughness minus the greatest path_roughness of the motion, at least 0",
     ),
-    "moment_arm_reversal": ("length", "how far the moment arm goes to either side of zero"),
+    "moment_arm_reversal": (
+        "length",
+        "the smaller of the greatest positive and the greatest negative moment arm",
+    ),
     **{
         f"{quantity}_{name}": (kind, f"{meaning}: {number}th percentile of the fibres")
         for quantity, (kind, meaning) in _FIBRES.items()
         for name, number in PERCENTILES.items()
     },
-    "activation": ("1", "activation, 0 to 1; this and the next three for muscles that contract"),
-    "belly_thickness": ("length", "least width of the greatest section across the line of action"),
-    "csa_max": ("area", "area of the greatest section across the line of action"),
-    "csa_place": ("1", "where it lies: 0 at the origin, 1 at the insertion"),
+    "activation": ("1", "0 to 1; this and the next three are of muscles that contract"),
+    "belly_thickness": (
+        "length",
+        "least width of the largest section across the line from origin to insertion",
+    ),
+    "csa_max": ("area", "area of that section"),
+    "csa_place": ("1", "its place along the muscle: 0 at the origin, 1 at the insertion"),
     "bone_overlap": (
         "length",
-        "depth of two bones in each other beyond rest; muscle 'all', some frames",
+        "greatest depth of two bones in each other beyond that at rest; muscle 'all', some frames",
     ),
     "joint_gap": (
         "length",
-        "a joint's bones farther apart than at rest; muscle 'all', some frames",
+        "how much farther apart the bones of a joint are than at rest; muscle 'all', some frames",
     ),
     "guessed": ("1", "1 where an attachment of the muscle is a guess, else 0; first frame"),
     "doubtful_guesses": (
         "1",
-        "doubtful guesses about the muscle, under 'all' about joints; first frame",
+        "number of doubtful guesses about the muscle, for muscle 'all' about joints; first frame",
     ),
-    "missing_bones": ("1", "bones of which no mesh could be used; muscle 'all', first frame"),
+    "missing_bones": ("1", "number of bones without a usable mesh; muscle 'all', first frame"),
     "time": ("s", "time of the frame in the motion file; muscle 'all'"),
     "time_solve": ("s", "prediction, solution and contacts"),
     "time_fit": ("s", "fit of the field"),
     "time_extract": ("s", "extraction of the surface"),
-    "time_frame": ("s", "all of the frame; muscle 'all': wall time of all"),
+    "time_frame": ("s", "whole frame; muscle 'all': wall time of all muscles"),
 }
 ALL = "all"
 
