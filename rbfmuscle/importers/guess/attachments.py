@@ -468,7 +468,7 @@ def _hold_whole_end(place, distance, ends):
     """
     chosen = np.flatnonzero(ends.along(place.end) <= UPPER)
     gap = max(float(distance[chosen].min()), 0.0)
-    reason = f"its end, {gap:.3g} mm from the {place.bone.name}, which it moves with"
+    reason = f"the whole end, {gap:.3g} mm from the {place.bone.name}, as its own bone is missing"
     return AttachmentGuess(place.bone, chosen, gap, reason, NO_SITE)
 
 
