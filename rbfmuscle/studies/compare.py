@@ -255,19 +255,19 @@ class Measure(NamedTuple):
 DEEPER = "depth_beyond_rest"
 _ROWS: dict[str, tuple[str, str, str, float, str]] = {
     "volume_error": ("volume error", "1", LAW, 1e-5, "relative to the input mesh"),
-    DEEPER: ("depth beyond rest", "length", LAW, 0.02, "of muscle and bones, less that at rest"),
-    "penetration_max": ("surface in a bone", "length", LAW, 0.02, "deepest vertex, as at rest"),
-    "bone_penetration_max": ("bone in the muscle", "length", LAW, 0.02, "the same of bones"),
-    "solver_penetration_max": ("left by the solver", "length", LAW, 0.02, "its points in a bone"),
-    "neighbour_overlap_max": ("muscles overlap", "length", LAW, 0.02, "deepest, beyond rest"),
-    "neighbour_gap": ("muscles part", "length", LAW, 0.1, "where they touched at rest, 95 %"),
+    DEEPER: ("depth beyond rest", "length", LAW, 0.02, "of muscle or bone, less that at rest"),
+    "penetration_max": ("surface in a bone", "length", LAW, 0.02, "deepest vertex"),
+    "bone_penetration_max": ("bone in the muscle", "length", LAW, 0.02, "deepest bone vertex"),
+    "solver_penetration_max": ("depth after the solve", "length", LAW, 0.02, "contact points"),
+    "neighbour_overlap_max": ("muscles overlap", "length", LAW, 0.02, "depth beyond that at rest"),
+    "neighbour_gap": ("gap of muscles", "length", LAW, 0.1, "where they touched at rest, 95 %"),
     "initial_overlap": ("overlap left at rest", "length", LAW, 0.02, "of muscle and bones"),
     "bowing": ("bowing", "1", LAW, 0.005, "centreline over shortest path"),
     "components": ("pieces", "1", LAW, 0.0, "connected pieces, most in any frame"),
-    "euler_characteristic": ("Euler characteristic", "1", LAW, 0.0, "two less for a handle"),
+    "euler_characteristic": ("Euler characteristic", "1", LAW, 0.0, "2; two less for a handle"),
     "self_crossings": ("self-crossings", "1", LAW, 0.0, "triangles that cross others"),
     "unfitted_fraction": ("surface not fitted", "1", LAW, 1e-4, "share of vertices off the field"),
-    "flicker": ("flicker", "length", LAW, 0.05, "surface against material mesh, by frames"),
+    "flicker": ("flicker", "length", LAW, 0.05, "off the material mesh, change between frames"),
     "tunnelled": ("tunnelled points", "1", LAW, 0.0, "points beyond a bone"),
     "return_rms": ("return error (RMS)", "length", LAW, 0.02, "first pose, there and back"),
     "return_max": ("return error (greatest)", "length", LAW, 0.1, "greatest distance"),
@@ -289,7 +289,7 @@ _ROWS: dict[str, tuple[str, str, str, float, str]] = {
     "time_frame": ("time per frame", "s", COST, 0.0, "median of all muscles, with surfaces"),
     "time_frame_p95": ("time per frame (95 %)", "s", COST, 0.0, "exceeded by one in 20"),
     "time_one_thread": ("time on one thread", "s", COST, 0.0, "median of the first frames"),
-    "time_build": ("build", "s", COST, 0.0, "all models, once, with filled caches"),
+    "time_build": ("time to build", "s", COST, 0.0, "all muscles, once, with filled caches"),
 }
 _IDEAL = {"bowing": 1.0, "euler_characteristic": 2.0}  # 0 of all others
 MEASURES = {name: Measure(*row, _IDEAL.get(name, 0.0)) for name, row in _ROWS.items()}
