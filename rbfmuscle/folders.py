@@ -48,8 +48,17 @@ class OutputFolder:
         found = read_list(directory, command)
         self.listed = found or []
         self._ours = {*(self.listed if replace else ()), *forced}
-        if found is None:
-            self._check_list(beside)
+        # Names that begin with a full stop are of files that systems leave, or that a command is
+        # writing.
+        there = sorted(os.listdir(directory)) if found is None and self.directory.is_dir() else []
+        there = [
+            name for name in there if not name.startswith(".") and (not beside or name == LIST)
+        ]
+        if there:
+            raise UsageError(
+                f"{self.directory} holds {there[0]}, and no earlier result of 'rbfmuscle "
+                f"{self.command}'; give a new or an empty folder"
+            )
         self.check(names)
         _check_writable(self.directory)
 
@@ -107,28 +116,26 @@ class OutputFolder:
         stage = Path(tempfile.mkdtemp(prefix=".rbfmuscle-", dir=self.directory))
         try:
             yield stage
-            self._take(stage, None if replaces is None else tuple(replaces))
+            files = [path for path in sorted(stage.rglob("*")) if path.is_file()]
+            names = [path.relative_to(stage).as_posix() for path in files]
+            self.check(names)
+            others = [name for name in self.listed if name not in set(names)]
+            self.listed = [*others, *names]
+            self._write_list()
+            for name in names:
+                (self.directory / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(stage / name, self.directory / name)
+            going = None if replaces is None else tuple(replaces)
+            for name in others:
+                if going is None or PurePosixPath(name).parts[0] in going:
+                    (self.directory / name).unlink(missing_ok=True)
+                    self.listed.remove(name)
+            self._write_list()
         finally:
             shutil.rmtree(stage, ignore_errors=True)
             if made:
                 with suppress(OSError):  # it is not empty
                     self.directory.rmdir()
-
-    def _take(self, stage: Path, replaces: tuple[str, ...] | None) -> None:
-        files = [path for path in sorted(stage.rglob("*")) if path.is_file()]
-        names = [path.relative_to(stage).as_posix() for path in files]
-        self.check(names)
-        others = [name for name in self.listed if name not in set(names)]
-        self.listed = [*others, *names]
-        self._write_list()
-        for name in names:
-            (self.directory / name).parent.mkdir(parents=True, exist_ok=True)
-            os.replace(stage / name, self.directory / name)
-        for name in others:
-            if replaces is None or PurePosixPath(name).parts[0] in replaces:
-                (self.directory / name).unlink(missing_ok=True)
-                self.listed.remove(name)
-        self._write_list()
 
     def _in_the_way(self, name: str) -> Path | None:
         """What may not be replaced at a name, or in the folder of that name; None where nothing
@@ -142,24 +149,9 @@ class OutputFolder:
             for file in (*files, *linked):
                 inner = Path(place, file)
                 known = inner.relative_to(self.directory).as_posix() in self._ours
-                if not known and not _is_hidden(file):
+                if not known and not file.startswith("."):
                     return inner
         return None
-
-    def _check_list(self, beside: bool) -> None:
-        """Raise UsageError where the folder has no list of the command's, and holds something, or
-        with ``beside`` another list.
-        """
-        if not self.directory.is_dir():
-            return
-        there = [name for name in sorted(os.listdir(self.directory)) if not _is_hidden(name)]
-        if beside:
-            there = [name for name in there if name == LIST]
-        if there:
-            raise UsageError(
-                f"{self.directory} holds {there[0]}, and no earlier result of 'rbfmuscle "
-                f"{self.command}'; give a new or an empty folder"
-            )
 
     def _write_list(self) -> None:
         lines = [_head(self.command), *self.listed]
@@ -198,11 +190,6 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
 
 def _head(command: str) -> str:
     return f"# Written by 'rbfmuscle {command}', which may replace these files and no others."
-
-
-def _is_hidden(name: str) -> bool:
-    """Whether a file is one that systems leave in folders, or that a command is writing."""
-    return name.startswith(".")
 
 
 def _is_inside(folder: Path, name: str) -> bool:

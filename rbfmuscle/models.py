@@ -1,7 +1,7 @@
 """Model names and what builds them; the only module that knows both models."""
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 from rbfmuscle.geometry.threads import blas_limited, each
@@ -40,33 +40,23 @@ class ModelKind(NamedTuple):
     sweeps: int = 0
 
 
+@cache
 def _rbf() -> ModelKind:
-    from rbfmuscle.muscle.rest import RBFOptions
+    from rbfmuscle.muscle.muscle import RBFMuscle
+    from rbfmuscle.muscle.rest import RBFOptions, solved_points
 
-    def build(muscle: Muscle, scene: Scene, options: RBFOptions) -> MuscleModel:
-        from rbfmuscle.muscle.muscle import RBFMuscle
-
-        return RBFMuscle(muscle, scene, options)
-
-    def points(muscle: Muscle, scene: Scene, options: RBFOptions) -> str:
-        from rbfmuscle.muscle.rest import solved_points
-
-        return solved_points(muscle, scene, options)
-
-    return ModelKind(build, RBFOptions, points, "RBF")
+    return ModelKind(RBFMuscle, RBFOptions, solved_points, "RBF")
 
 
+@cache
 def _mesh(method: str, title: str, tolerance: float = 0.0) -> ModelKind:
     from pbd_baseline.muscle import PBDMuscle
     from pbd_baseline.rest import PBDOptions, solved_points
     from pbd_baseline.shapes import METHODS
 
     chosen = METHODS[method]._replace(tolerance=tolerance)
-
-    def build(muscle: Muscle, scene: Scene, options: PBDOptions) -> MuscleModel:
-        return PBDMuscle(muscle, scene, options, method=chosen)
-
-    return ModelKind(build, PBDOptions, solved_points, title, 0 if tolerance else chosen.sweeps)
+    build, sweeps = partial(PBDMuscle, method=chosen), 0 if tolerance else chosen.sweeps
+    return ModelKind(build, PBDOptions, solved_points, title, sweeps)
 
 
 # What loads a kind, by name: a model's package is imported when it is first asked for.
@@ -109,11 +99,6 @@ def model_names() -> tuple[str, ...]:
     return tuple(_KINDS)
 
 
-@cache
-def _loaded(load: Callable[[], ModelKind]) -> ModelKind:
-    return load()
-
-
 def model_kind(name: str) -> ModelKind:
     """What a model's name stands for.
 
@@ -130,7 +115,7 @@ def model_kind(name: str) -> ModelKind:
     if name not in _KINDS:
         hint = did_you_mean(str(name).lower()[:100].replace("_", "-"), model_names())
         raise UsageError(f"unknown model {shown(repr(name))}, {hint}")
-    return _loaded(_KINDS[name])
+    return _KINDS[name]()
 
 
 def model_title(muscle: Muscle) -> str:
@@ -155,13 +140,12 @@ def build_model(muscle: Muscle, scene: Scene, name: str | None = None) -> Muscle
 
 def solved_points(muscle: Muscle, scene: Scene) -> str:
     """The points that the model of a muscle solves for, in words; nothing is built."""
-    kind = model_kind(muscle.model)
-    return kind.points(muscle, scene, _read_options(muscle, kind, muscle.options))
+    return model_kind(muscle.model).points(muscle, scene, _own_options(muscle))
 
 
 def kernel_names(scene: Scene) -> dict[str, str]:
     """Kernel of each muscle whose model has one, by the muscle's name; nothing is built."""
-    options = {m.name: _read_options(m, model_kind(m.model), m.options) for m in scene.muscles}
+    options = {muscle.name: _own_options(muscle) for muscle in scene.muscles}
     return {name: found.kernel for name, found in options.items() if hasattr(found, "kernel")}
 
 
@@ -194,7 +178,7 @@ def configure_scene(
     changed = scene.with_options(settings, model=model, frames=frames)
     for muscle in changed.muscles:
         try:
-            _check_muscle(muscle)
+            _own_options(muscle)
         except SceneError as error:
             raise UsageError(str(error)) from None
     return changed
@@ -208,15 +192,16 @@ def check_models(scene: Scene) -> None:
     root = f"{scene.path}: " if scene.path else ""
     for muscle in scene.muscles:
         try:
-            _check_muscle(muscle)
+            _own_options(muscle)
         except UsageError as error:
             raise SceneError(f"{root}muscle {muscle.name!r}: {error}") from None
         except SceneError as error:
             raise SceneError(f"{root}{error}") from None
 
 
-def _check_muscle(muscle: Muscle) -> None:
-    _read_options(muscle, model_kind(muscle.model), muscle.options)
+def _own_options(muscle: Muscle) -> Table:
+    """The checked settings of a muscle's own model."""
+    return _read_options(muscle, model_kind(muscle.model), muscle.options)
 
 
 def _read_options(muscle: Muscle, kind: ModelKind, table: Mapping[str, object]) -> Table:

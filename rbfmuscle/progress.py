@@ -35,8 +35,13 @@ class Progress:
     def __enter__(self) -> Progress:
         if Progress.shown is None:
             Progress.shown = self
-            self.bar = _bar() if sys.stderr.isatty() and not Progress.quiet else None
-            if self.bar is not None:
+            if sys.stderr.isatty() and not Progress.quiet:
+                from rich.console import Console
+                from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+                from rich.progress import Progress as Bar
+
+                columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+                self.bar = Bar(*columns, console=Console(stderr=True), transient=True)
                 self.bar.start()
                 self.bar.add_task(self.title, total=None)
         return self
@@ -77,12 +82,3 @@ def stage(text: str) -> Iterator[None]:
     if Progress.shown is not None:
         Progress.shown.show(text)
     yield
-
-
-def _bar() -> Bar:
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    return Bar(*columns, console=Console(stderr=True), transient=True)

@@ -20,18 +20,15 @@ from rbfmuscle.fibres import build_bundles
 from rbfmuscle.folders import copy_listed
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
-from rbfmuscle.metrics.quantities import ALL, Row
-from rbfmuscle.metrics.rows import frame_rows, joint_gaps, moment_arm_rows
+from rbfmuscle.metrics.quantities import ALL, Row, frame_rows, joint_gaps, moment_arm_rows
 from rbfmuscle.metrics.summary import (
     LIMITS,
     Doubt,
     Limits,
     Summary,
-    Table,
     parse_limits,
 )
 from rbfmuscle.metrics.verdict import (
-    Verdict,
     describe_verdict,
     judge,
     measured_doubts,
@@ -378,7 +375,13 @@ class Recording:
         try:
             sink.write_info(self.info("running"))
             for frame, measured in self._frames():
-                rows = self._take(frame, measured)
+                # By muscle, whichever thread was first.
+                frame.events.sort(key=lambda event: self._place[event.muscle])
+                events, together = self._skeleton.get(frame.index, ([], {}))
+                frame.events.extend(events)
+                before = next(reversed(self._path.values()), None)
+                rows = frame_rows(self.scene, frame, before, {**measured, ALL: together})
+                self.summary.add(rows)
                 with timed(self.times, "write"):
                     sink.write(frame, rows)
                 self._path[frame.index] = dict(frame.coordinates)
@@ -452,22 +455,15 @@ class Recording:
                 measured = self._measures.measure(frame)
             yield frame, measured
 
-    def _take(self, frame: Frame, measured: Mapping[str, Values]) -> list[Row]:
-        """Complete the events of a frame; the rows of metrics that became complete with it."""
-        # By muscle, whichever thread was first.
-        frame.events.sort(key=lambda event: self._place[event.muscle])
-        events, together = self._skeleton.get(frame.index, ([], {}))
-        frame.events.extend(events)
-        before = next(reversed(self._path.values()), None)
-        rows = frame_rows(self.scene, frame, before, {**measured, ALL: together})
-        self.summary.add(rows)
-        return rows
-
     def info(self, status: str | None = None) -> RunInfo:
         """The facts by now."""
         self.times["wall"] = (self._end or time.perf_counter()) - self._start
         table = self.summary.table()
-        limits, verdict = self.limits, self._verdict(table)
+        limits, verdict = self.limits, judge(table, self.limits, self._doubts)
+        if self.status == "failed" and self.written:  # of how many frames the verdict holds
+            count = f"{len(self.written)} of {len(self.scene.motion)} frames"
+            outcome = f"the run stopped after {count}; in these {verdict.outcome}"
+            verdict = verdict._replace(outcome=outcome)
         return build_info(
             self.scene,
             self.started,
@@ -484,15 +480,6 @@ class Recording:
             neighbours=self._measures.neighbours.table(),
             frames=self.written,
         )
-
-    def _verdict(self, table: Table) -> Verdict:
-        """What the run is worth; where it failed, of how many frames that holds."""
-        verdict = judge(table, self.limits, self._doubts)
-        if self.status == "failed" and self.written:
-            count = f"{len(self.written)} of {len(self.scene.motion)} frames"
-            outcome = f"the run stopped after {count}; in these {verdict.outcome}"
-            verdict = verdict._replace(outcome=outcome)
-        return verdict
 
 
 @contextmanager

@@ -55,8 +55,12 @@ def find_cut(mesh: trimesh.Trimesh, *, depth: float = DEPTH) -> Cut | None:
         np.asarray(values) for values in (mesh.triangles_center, mesh.face_normals, mesh.area_faces)
     )
     depth *= box_size(vertices)
+    # Normals that most of the area has, and the axes of the coordinates.
+    cells, number = np.unique(np.rint(ROUNDED * normals).astype(int), axis=0, return_inverse=True)
+    most = np.argsort(-np.bincount(number.ravel(), weights=areas))[:TRIED]
+    tried = np.concatenate([unit(cells[most].astype(float)), np.eye(3), -np.eye(3)])
     found, largest = None, LEAST_AREA * areas.sum()
-    for direction in _flat_directions(normals, areas):
+    for direction in tried:
         height = points @ direction
         near = height > height.max() - depth
         cap = near & (normals @ direction > CUT_ALONG)
@@ -68,14 +72,6 @@ def find_cut(mesh: trimesh.Trimesh, *, depth: float = DEPTH) -> Cut | None:
             middle = np.average(points[cap], axis=0, weights=areas[cap])
             found = Cut(middle, normal, top > top.max() - depth)
     return found if found is not None else _open_cut(mesh)
-
-
-def _flat_directions(normals, areas):
-    """Unit normals (k, 3) that most of the area has, and the axes of the coordinates."""
-    cells, number = np.unique(np.rint(ROUNDED * normals).astype(int), axis=0, return_inverse=True)
-    area = np.bincount(number.ravel(), weights=areas)
-    most = np.argsort(-area)[:TRIED]
-    return np.concatenate([unit(cells[most].astype(float)), np.eye(3), -np.eye(3)])
 
 
 def _open_cut(mesh):
@@ -537,8 +533,13 @@ def find_orientation(bones: list[Part], header: Orientation | None = None) -> Or
             doubts.append(
                 f"{bone.name}: named {said}, its shape is that of the {shape} one; is it mirrored?"
             )
-    shanks = (_shank_frame(bone, bones) for bone in bones) if not femora else ()
-    frames = [bone.frame for bone in femora] + [frame for frame in shanks if frame is not None]
+    frames = [bone.frame for bone in femora]
+    for bone in bones if not femora else ():  # of a shank its foot lies in front
+        feet = [b.points.mean(axis=0) for b in neighbours(bone, bones, _BELOW) if b.kind == "foot"]
+        if bone.kind == "tibia" and feet:
+            up = shank_up(bone, bones)
+            ahead = unit(across(np.mean(feet, axis=0) - bone.points.mean(axis=0), up))
+            frames.append(Frame(up, ahead))
     if not frames:
         return header
     superior = unit(np.sum([frame.superior for frame in frames], axis=0))
@@ -579,12 +580,3 @@ def neighbours(bone: Part, bones: list[Part], table: dict[str, tuple[str, ...]])
 def shank_up(tibia: Part, bones: list[Part]) -> np.ndarray:
     """Direction (3,) up a tibia."""
     return long_axis(tibia, neighbours(tibia, bones, _BELOW), neighbours(tibia, bones, _ABOVE))
-
-
-def _shank_frame(bone, bones):
-    """Of a shank with a foot, which lies in front; else None."""
-    feet = [b.points.mean(axis=0) for b in neighbours(bone, bones, _BELOW) if b.kind == "foot"]
-    if bone.kind != "tibia" or not feet:
-        return None
-    up = shank_up(bone, bones)
-    return Frame(up, unit(across(np.mean(feet, axis=0) - bone.points.mean(axis=0), up)))

@@ -171,7 +171,10 @@ def _read_words(name):
             continue
         parts = _taken_apart(word)
         if not parts:
-            near = _nearest(word)
+            # The known word of which an unknown one may be a misspelling.
+            known = sorted(one for one in table.known if len(one) >= FEWEST)
+            found = get_close_matches(word, known, n=1, cutoff=LIKE) if len(word) >= FEWEST else []
+            near = found[0] if found else ""
             parts = [near or word]
             if near:
                 spelling[word] = table.forms.get(near, near)
@@ -189,10 +192,3 @@ def _taken_apart(word):
     heads = [word[:k] for k in range(3, len(word) - 2) if word[:k] in known]
     found = [[head, *rest] for head in heads if (rest := _taken_apart(word[len(head) :]))]
     return min(found, key=len, default=[])
-
-
-def _nearest(word):
-    """The known word of which an unknown one may be a misspelling; empty where there is none."""
-    known = sorted(known for known in _table().known if len(known) >= FEWEST)
-    near = get_close_matches(word, known, n=1, cutoff=LIKE) if len(word) >= FEWEST else ()
-    return next(iter(near), "")

@@ -18,9 +18,8 @@ from rbfmuscle import __version__
 from rbfmuscle.cli.check import check
 from rbfmuscle.cli.compare import compare
 from rbfmuscle.cli.export import export, render
-from rbfmuscle.cli.import_osim import import_
 from rbfmuscle.cli.kernels import kernels
-from rbfmuscle.cli.new import new
+from rbfmuscle.cli.new import import_, new
 from rbfmuscle.cli.options import USUAL, Printing, one_line
 from rbfmuscle.cli.paths import paths
 from rbfmuscle.cli.report import report

@@ -2,11 +2,16 @@
 
 import logging
 import sys
+from dataclasses import asdict
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 from rbfmuscle.cli.options import USUAL_WORK, Flag, SceneName, Work, print_result
 from rbfmuscle.progress import Progress, stage
 from rbfmuscle.validation import SceneError, UsageError
+
+if TYPE_CHECKING:
+    from rbfmuscle.studies.accuracy import LatticeError
 
 
 def check(
@@ -36,6 +41,7 @@ def check(
     if time and not plan:
         raise UsageError("--time measures what --plan lists; give check SCENE --plan --time")
     facts: dict[str, object] = {}
+    errors: list[LatticeError] = []
     with Progress(f"check {scene.name}"), work.threads():
         if picture:
             from rbfmuscle.display.pictures import check_picture
@@ -43,11 +49,19 @@ def check(
             check_picture(scene.with_suffix(".png"))
         loaded, findings = _findings(scene)
         usable = bool(loaded.bones) and not any(f.level == "error" for f in findings)
-        pairs = _touching_pairs(loaded) if usable else []
+        from rbfmuscle.simulation.neighbours import find_links
+
+        names = [muscle.name for muscle in loaded.muscles]
+        # Of the muscles that may touch in the motion.
+        pairs = [[names[k] for k in pair] for pair in find_links(loaded, names)] if usable else []
         if plan and usable:
             facts["plan"] = _plan(loaded, time)
         if accuracy and usable:
-            facts["accuracy"] = _accuracy(loaded)
+            from rbfmuscle.studies.accuracy import discretisation_error
+
+            with stage("two lattices"):
+                errors = discretisation_error(loaded)
+            facts["accuracy"] = [asdict(error) for error in errors]
         if picture:
             from rbfmuscle.display.pictures import draw_scene
 
@@ -58,7 +72,15 @@ def check(
     from rbfmuscle.run.info import record_scene
     from rbfmuscle.scene.check import attachment_facts
 
-    lines = [*_scene_lines(loaded, pairs), *map(str, findings), *_more_lines(facts, loaded.units)]
+    lines = [*_scene_lines(loaded, pairs), *map(str, findings)]
+    lines += _plan_lines(facts["plan"]) if "plan" in facts else ()
+    for error in errors:
+        rms, greatest = (f"{value:.2g} {loaded.units}" for value in (error.rms, error.greatest))
+        lines.append(
+            f"muscle {error.muscle}: {error.nodes} nodes are {rms} RMS ({greatest} at most) "
+            f"from twice as many, in frame {error.frame}"
+        )
+    lines += [str(facts["picture"])] if "picture" in facts else ()
     facts |= {"scene": record_scene(loaded), "findings": [vars(finding) for finding in findings]}
     facts["neighbours"] = pairs
     facts["attachments"] = [held._asdict() for held in attachment_facts(loaded)]
@@ -67,18 +89,6 @@ def check(
         last = f"usable; next: rbfmuscle run {scene} -o results" if usable else "not usable"
         print(last, file=sys.stderr)
     return 0 if usable else SceneError.exit_code
-
-
-def _more_lines(facts, units):
-    """Lines of what was asked for besides the check itself."""
-    yield from _plan_lines(facts["plan"]) if "plan" in facts else ()
-    for found in facts.get("accuracy", []):
-        rms, greatest = (f"{found[key]:.2g} {units}" for key in ("rms", "greatest"))
-        yield (
-            f"muscle {found['muscle']}: {found['nodes']} nodes are {rms} RMS ({greatest} at most) "
-            f"from twice as many, in frame {found['frame']}"
-        )
-    yield from [facts["picture"]] if "picture" in facts else ()
 
 
 def _findings(path):
@@ -122,14 +132,6 @@ def _field_notes(scene):
         logger.setLevel(level)
 
 
-def _touching_pairs(scene):
-    """Names of the muscles of each pair that may touch in the motion."""
-    from rbfmuscle.simulation.neighbours import find_links
-
-    names = [muscle.name for muscle in scene.muscles]
-    return [[names[one], names[other]] for one, other in find_links(scene, names)]
-
-
 def _scene_lines(scene, pairs):
     from rbfmuscle.scene.check import attachment_facts
     from rbfmuscle.scene.objects import body_axes, from_mm
@@ -165,15 +167,6 @@ def _scene_lines(scene, pairs):
         others = [name for name in others if name != muscle.name]
         if others:
             yield f"    can touch {', '.join(others)}"
-
-
-def _accuracy(scene):
-    from dataclasses import asdict
-
-    from rbfmuscle.studies.accuracy import discretisation_error
-
-    with stage("two lattices"):
-        return [asdict(found) for found in discretisation_error(scene)]
 
 
 def _plan(scene, timed):

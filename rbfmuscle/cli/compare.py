@@ -81,10 +81,8 @@ def _excess(models, output, limits):
 
     texts = []
     for name in models if limits.fail_on else ():
-        summary = Summary()
-        summary.add(RunData.load(output / name).metrics)
         try:
-            require_limits(summary.table(), limits)
+            require_limits(Summary(RunData.load(output / name).metrics).table(), limits)
         except LimitExceededError as error:
             texts.append(f"{name}: {error}")
     return LimitExceededError("; ".join(texts)) if texts else None

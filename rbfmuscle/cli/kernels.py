@@ -114,13 +114,11 @@ def _find_wanted(meshes, output, error, kernels, units, printing):
         }
     with kernels_folder(output).staged() as stage:
         (stage / "error.json").write_text(json_text(facts), encoding="utf-8")
-    return print_result(printing, facts, _wanted_lines(facts, output))
-
-
-def _wanted_lines(facts, output):
-    for found in facts.values():
-        yield found["said"]
-    yield f"all that was tried in {output / 'error.json'}"
-    for name, found in facts.items():
-        if found["reached"]:
-            yield f"\nto paste at the end of the [[muscle]] {json.dumps(name)}:\n\n{found['toml']}"
+    lines = [found["said"] for found in facts.values()]
+    lines.append(f"all that was tried in {output / 'error.json'}")
+    lines += [
+        f"\nto paste at the end of the [[muscle]] {json.dumps(name)}:\n\n{found['toml']}"
+        for name, found in facts.items()
+        if found["reached"]
+    ]
+    return print_result(printing, facts, lines)

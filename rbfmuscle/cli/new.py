@@ -1,9 +1,13 @@
-"""``rbfmuscle new``: a scene file to start from, of meshes or of a segmentation."""
+"""``rbfmuscle new`` and ``import``: a scene file to start from, of meshes, of a segmentation or of
+an OpenSim model.
+"""
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from rbfmuscle.cli.options import USUAL, Force, OwnFolder, Printing, print_result
+from cyclopts import Parameter
+
+from rbfmuscle.cli.options import USUAL, Force, Output, OwnFolder, Printing, print_result
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import UsageError
@@ -36,8 +40,7 @@ def new(
         Folder for scene.toml; the folder of the meshes by default.
     """
     from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, write_scene
-    from rbfmuscle.importers.scenes import guess_volume
-    from rbfmuscle.importers.volumes import read_labels
+    from rbfmuscle.importers.volumes import guess_volume, read_labels
     from rbfmuscle.scene.check import check_scene
 
     volume = _is_segmentation(source)
@@ -71,16 +74,15 @@ def new(
         "guesses": [one._asdict() for one in scene.guesses],
         "findings": [vars(finding) for finding in findings],
     }
-    return print_result(printing, facts, _new_lines(output, facts["doubts"], findings, scene))
-
-
-def _new_lines(output, doubts, findings, scene):
-    yield f"{output} written; check what has the key guess"
-    yield from (f"doubtful: {doubt}" for doubt in doubts)
-    yield from map(str, findings)
-    if scene.guesses:
-        yield "how to correct guesses: docs/new.md; removing a key guess confirms it"
-    yield f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out"
+    remedy = "how to correct guesses: docs/new.md; removing a key guess confirms it"
+    lines = [
+        f"{output} written; check what has the key guess",
+        *(f"doubtful: {doubt}" for doubt in guess.doubts()),
+        *map(str, findings),
+        *([remedy] if scene.guesses else []),
+        f"next: rbfmuscle check {output}, then rbfmuscle run {output} -o out",
+    ]
+    return print_result(printing, facts, lines)
 
 
 def _is_segmentation(source):
@@ -103,3 +105,45 @@ def _beside(source):
     """Folder of the scene of a segmentation, where none is given."""
     name = source.name.split(".")[0] or "scene"
     return source / "scene" if source.is_dir() else source.parent / f"{name}_scene"
+
+
+def import_(
+    model: Path,
+    *,
+    output: Output,
+    geometry: Annotated[list[Path] | None, Parameter(negative="")] = None,
+    muscles: Annotated[bool, Parameter(negative="--no-muscles")] = True,
+    force: Force = False,
+    printing: Printing = USUAL,
+) -> int:
+    """Write a scene file and its meshes from an OpenSim model (.osim), in metres.
+
+    Parameters
+    ----------
+    model
+        The model, of version 2 to 4; OpenSim itself is not needed.
+    geometry
+        Folder with meshes, besides the model's own and its Geometry; repeatable.
+    muscles
+        Make a tube of each muscle of the model, along its path.
+    """
+    from rbfmuscle.importers.opensim.scene import import_osim, scene_folder, write_imported
+    from rbfmuscle.run.info import record_scene
+
+    scene_folder(output, force=force)
+    for folder in geometry or []:
+        if not folder.is_dir():
+            raise UsageError(f"--geometry {folder}: no such folder")
+    found = import_osim(model, geometry=geometry, muscles=muscles)
+    written = write_imported(found, output, force=force)
+    scene = found.scene
+    facts = {"file": str(written), "notes": found.notes, "scene": record_scene(scene)}
+    lines = [
+        *(f"note: {note}" for note in found.notes),
+        *(f"doubtful: {doubt}" for doubt in scene.doubts),
+        f"{written}: {len(scene.bones)} bones, {len(scene.meshless_bones)} without a mesh, "
+        f"{len(scene.joints)} joints, {len(scene.couplings)} couplings, {len(scene.muscles)} "
+        "muscles as tubes",
+        f"next: rbfmuscle check {written}, then rbfmuscle run {written} -o out",
+    ]
+    return print_result(printing, facts, lines)

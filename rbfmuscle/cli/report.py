@@ -3,7 +3,8 @@ terminal.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from textwrap import fill, shorten
 from typing import Annotated
@@ -42,9 +43,7 @@ def verdict_lines(directory: Path) -> Iterator[str]:
     from rbfmuscle.scene.phantom import PHANTOM
 
     saved = RunData.load(directory)
-    info, summary = saved.info, Summary()
-    summary.add(saved.metrics)
-    table = summary.table()
+    info, table = saved.info, Summary(saved.metrics).table()
     yield _wrapped("verdict: ", info.outcome)
     named = worst_first(info.beyond)[:MOST]
     for row in named:
@@ -109,7 +108,10 @@ def report(
                 facts = redraw_run(directory, fail_on=fail_on, pictures=pictures).to_dict()
             except LimitExceededError as error:
                 facts, failed = RunData.load(directory).info.to_dict(), error
-    return print_result(printing, facts, _report_lines(directory, facts, page), error=failed)
+    said: Iterable[str] = ()
+    if page.name == "report.html":
+        said = [str(facts["answer"])] if "answer" in facts else verdict_lines(directory)
+    return print_result(printing, facts, chain(said, [f"open {page}"]), error=failed)
 
 
 def _redraw_study(directory, *, pictures):
@@ -139,9 +141,3 @@ def _redraw_study(directory, *, pictures):
             ) from None
         return directory / page, facts
     return None
-
-
-def _report_lines(directory, facts, page):
-    if page.name == "report.html":
-        yield from [facts["answer"]] if "answer" in facts else verdict_lines(directory)
-    yield f"open {page}"

@@ -2,6 +2,7 @@
 
 import time
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,7 @@ from rbfmuscle.cli.options import (
     keep_muscles,
     print_result,
 )
+from rbfmuscle.cli.report import verdict_lines
 from rbfmuscle.progress import Progress
 from rbfmuscle.validation import LimitExceededError, RBFMuscleError, SolveError
 
@@ -97,13 +99,7 @@ def run(
         info = RunData.load(output).info
     facts = {"directory": str(output), **info.to_dict()}
     seconds = time.perf_counter() - start
-    return print_result(work, facts, _lines(output, len(info.frames), seconds), error=failed)
-
-
-def _lines(output, frames, seconds):
-    from rbfmuscle.cli.report import verdict_lines
-
-    yield from verdict_lines(output)
     report = output / "report.html"
     there = f"in {output}, open {report}" if report.exists() else f"in {output}"
-    yield f"{frames} frames in {seconds:.1f} s, {there}"
+    last = f"{len(info.frames)} frames in {seconds:.1f} s, {there}"
+    return print_result(work, facts, chain(verdict_lines(output), [last]), error=failed)

@@ -65,7 +65,7 @@ def view(
             return
         from rbfmuscle.scene.file import read_scene_file
         from rbfmuscle.scene.phantom import PHANTOM
-        from rbfmuscle.viewer.server import open_server
+        from rbfmuscle.viewer import open_server
 
         if not scene.is_dir() and str(scene) != PHANTOM:
             read_scene_file(scene)  # its errors are shown before a browser opens
@@ -127,10 +127,17 @@ def _draw(opened, model, stops, path):
     """
     from rbfmuscle.display.pictures import check_picture, render_run
     from rbfmuscle.recording import simulate
+    from rbfmuscle.scene.motion import inner_value, rest_coordinates
+    from rbfmuscle.scene.objects import Motion
+    from rbfmuscle.simulation.live import coordinate_limits
 
     check_picture(path)
-    if not isinstance(opened, dict):
-        render_run(simulate(_posed(opened, stops), model), path, frame=1)
+    if not isinstance(opened, dict):  # a motion from rest to the pose
+        _check_stops(stops, coordinate_limits(opened))
+        rest, scene = rest_coordinates(opened), opened.with_options()
+        there = {name: inner_value(scene, name, x) for name, x in stops.items()}
+        scene.motion = Motion([rest, rest | there])
+        render_run(simulate(scene, model), path, frame=1)
         return
     _check_stops(stops, ["frame"])
     first = next(iter(opened.values()))
@@ -139,17 +146,3 @@ def _draw(opened, model, stops, path):
         render_run(opened, path, frame=frame, views=["motion"])
     else:
         render_run(first, path, frame=frame)
-
-
-def _posed(scene, stops):
-    """The scene with a motion from rest to one pose."""
-    from rbfmuscle.scene.motion import inner_value, rest_coordinates
-    from rbfmuscle.scene.objects import Motion
-    from rbfmuscle.simulation.live import coordinate_limits
-
-    _check_stops(stops, coordinate_limits(scene))
-    rest, scene = rest_coordinates(scene), scene.with_options()
-    scene.motion = Motion(
-        [rest, rest | {name: inner_value(scene, name, x) for name, x in stops.items()}]
-    )
-    return scene

@@ -71,24 +71,10 @@ class AnimatedMesh:
 
 
 @dataclass(frozen=True)
-class AnimatedFibres:
-    """The fibres of a muscle in each frame, always as many lines of as many points."""
-
-    name: str
-    lines: list[FibreLines]
-
-    @property
-    def segments(self) -> Integers:
-        """Numbers (s, 2) of the points that each piece of the lines joins, line by line."""
-        count, points = self.lines[0].points.shape[:2]
-        first = np.arange(count * points).reshape(count, points)
-        return np.stack([first[:, :-1].ravel(), first[:, 1:].ravel()], axis=1)
-
-
-@dataclass(frozen=True)
 class Animation:
     """All muscles and bones of a run over time; ``name`` is the scene's, all lengths are in
-    ``unit``: m, cm or mm. Fibres are those of the muscles that have them.
+    ``unit``: m, cm or mm. Fibres are those of the muscles that have them, in each frame, by the
+    name of their lines; always as many of as many points.
 
     ``times`` (T,) of the frames [s] are the motion's own where ``timed``, ``captions`` those of the
     frames. ``body`` (3, 3) is left, posterior and superior; the motion is seen in its plane from
@@ -104,7 +90,7 @@ class Animation:
     bones: list[AnimatedMesh]
     body: Floats
     direction: Floats
-    fibres: list[AnimatedFibres] = field(default_factory=list)
+    fibres: dict[str, list[FibreLines]] = field(default_factory=dict)
 
 
 def read_animation(run: RunData, names: list[str], frames: list[int], *, unit: str) -> Animation:
@@ -141,31 +127,14 @@ def read_animation(run: RunData, names: list[str], frames: list[int], *, unit: s
     at = np.array([k / FRAMES_A_SECOND if times is None else times[k] for k in frames], dtype=float)
     captions = [frame_caption(run, frame) for frame in frames]
     direction = look.motion_direction([run.frame(frame).poses for frame in frames], run.body)
-    return Animation(
-        name,
-        unit,
-        at,
-        times is not None,
-        captions,
-        muscles,
-        bones,
-        run.body,
-        direction,
-        _animated_fibres(run, names, frames, factor),
-    )
-
-
-def _animated_fibres(
-    run: RunData, names: list[str], frames: list[int], factor: float
-) -> list[AnimatedFibres]:
-    """Fibres of those muscles that have them in all of some frames, lengths scaled."""
-    found = []
-    for name in names:
-        lines = [run.frame(frame).fibres.get(name) for frame in frames]
+    fibres = {}
+    for muscle_name in names:
+        lines = [run.frame(frame).fibres.get(muscle_name) for frame in frames]
         known = [x._replace(points=factor * x.points) for x in lines if x is not None]
         if len(known) == len(frames):
-            found.append(AnimatedFibres(look.fibres_name(name), known))
-    return found
+            fibres[look.fibres_name(muscle_name)] = known
+    timed, seen = times is not None, (run.body, direction)
+    return Animation(name, unit, at, timed, captions, muscles, bones, *seen, fibres)
 
 
 # Whole numbers of which the longest side of all that moves has so many: 0.03 mm of 900.
@@ -197,7 +166,7 @@ def pack_runs(runs: Mapping[str, Animation]) -> str:
         "direction": first.direction.tolist(),
         "origin": packer.origin.tolist(),
         "rate": FRAMES_A_SECOND / 2.0,
-        "bytes": packer.text(),
+        "bytes": base64.b64encode(zlib.compress(b"".join(packer.parts), 4)).decode("ascii"),
     }
     # No name may end the script that holds it.
     return json.dumps(facts, separators=(",", ":")).replace("<", "\\u003c")
@@ -241,7 +210,3 @@ class _Packer:
     def _add(self, values: Integers) -> None:
         places = np.frombuffer(values.tobytes(), dtype=np.uint8).reshape(-1, values.itemsize)
         self.parts.append(places.T.tobytes())
-
-    def text(self) -> str:
-        """All of it, deflated, as base64."""
-        return base64.b64encode(zlib.compress(b"".join(self.parts), 4)).decode("ascii")

@@ -17,7 +17,6 @@ import trimesh
 
 from rbfmuscle.display.animation import (
     FRAMES_A_SECOND,
-    AnimatedFibres,
     AnimatedMesh,
     Animation,
     read_animation,
@@ -29,8 +28,8 @@ from rbfmuscle.run.appearance import linear_rgb, rgb, stretch_colours
 from rbfmuscle.run.data import RunData, open_run
 from rbfmuscle.run.vtk_files import NORMALS, Collection, write_fibres, write_vtp
 from rbfmuscle.run.writer import VertexArrays
-from rbfmuscle.scene.names import DEVICES
-from rbfmuscle.scene.objects import MM_PER_UNIT
+from rbfmuscle.scene.objects import DEVICES, MM_PER_UNIT
+from rbfmuscle.simulation.frame import FibreLines
 from rbfmuscle.validation import MissingDependencyError, SolveError, UsageError
 
 if TYPE_CHECKING:
@@ -69,22 +68,24 @@ def write_usd(path: Path, run: Animation) -> None:
         _fill(mesh, part, codes)
         mesh.CreateDisplayColorAttr([Gf.Vec3f(*linear_rgb(rgb(part.colour)).tolist())])
         mesh.GetPrim().SetDisplayName(part.name)
-    for fibres in run.fibres:
-        curves = UsdGeom.BasisCurves.Define(stage, f"{place}/{identifier(fibres.name, used)}")
+    for name, fibres in run.fibres.items():
+        curves = UsdGeom.BasisCurves.Define(stage, f"{place}/{identifier(name, used)}")
         _fill_curves(curves, fibres, codes)
-        curves.GetPrim().SetDisplayName(fibres.name)
+        curves.GetPrim().SetDisplayName(name)
     stage.GetRootLayer().Export(str(path))
 
 
-def _fill_curves(curves: "UsdGeom.BasisCurves", fibres: AnimatedFibres, codes: list[float]) -> None:
+def _fill_curves(
+    curves: "UsdGeom.BasisCurves", fibres: list[FibreLines], codes: list[float]
+) -> None:
     """Fibres get their points and their colours, by their stretch, at each time."""
     from pxr import UsdGeom, Vt
 
-    count, points = fibres.lines[0].points.shape[:2]
+    count, points = fibres[0].points.shape[:2]
     curves.CreateTypeAttr(UsdGeom.Tokens.linear)
     curves.CreateCurveVertexCountsAttr(Vt.IntArray(count, points))
     colours = curves.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-    for code, lines in zip(codes, fibres.lines):
+    for code, lines in zip(codes, fibres):
         places = np.ascontiguousarray(lines.points.reshape(-1, 3), dtype=np.float32)
         extent = np.stack([places.min(axis=0), places.max(axis=0)])
         shades = linear_rgb(stretch_colours(lines.local_stretch)).reshape(-1, 3)
@@ -163,7 +164,7 @@ def animated_glb(run: Animation) -> bytes:
     if len(run.times) > 1:
         file.times = file.add(run.times[:, None] - run.times[0], "SCALAR", bounds=True)
     children = [_add_part(file, part) for part in (*run.bones, *run.muscles)]
-    children += [_add_fibres(file, fibres) for fibres in run.fibres]
+    children += [_add_fibres(file, *fibres) for fibres in run.fibres.items()]
     root: dict[str, object] = {"name": run.name, "children": children}
     left, posterior, superior = run.body  # glTF looks at what faces +z, with y up
     root["rotation"] = _quaternions(np.stack([left, superior, -posterior])[None])[0].tolist()
@@ -207,10 +208,12 @@ def _add_part(file: "_File", part: AnimatedMesh) -> int:
     return node
 
 
-def _add_fibres(file: "_File", fibres: AnimatedFibres) -> int:
+def _add_fibres(file: "_File", name: str, fibres: list[FibreLines]) -> int:
     """Number of a new node of lines, coloured by the stretch of the first frame."""
-    first = fibres.lines[0]
+    first = fibres[0]
     base = first.points.reshape(-1, 3)
+    numbers = np.arange(len(base)).reshape(first.points.shape[:2])
+    segments = np.stack([numbers[:, :-1].ravel(), numbers[:, 1:].ravel()], axis=1)
     colours = linear_rgb(stretch_colours(first.local_stretch)).reshape(-1, 3)
     primitive: dict[str, object] = {
         "mode": _LINES,
@@ -218,13 +221,13 @@ def _add_fibres(file: "_File", fibres: AnimatedFibres) -> int:
             "POSITION": file.add(base, "VEC3", target=_VERTICES, bounds=True),
             "COLOR_0": file.add(colours, "VEC3", target=_VERTICES),
         },
-        "indices": file.add(fibres.segments.reshape(-1, 1), "SCALAR", target=_INDICES),
+        "indices": file.add(segments.reshape(-1, 1), "SCALAR", target=_INDICES),
     }
     targets = []
-    for lines in fibres.lines[1:]:
+    for lines in fibres[1:]:
         moved = lines.points.reshape(-1, 3) - base
         targets.append({"POSITION": file.add(moved, "VEC3", target=_VERTICES, bounds=True)})
-    return file.add_node(fibres.name, primitive, targets)
+    return file.add_node(name, primitive, targets)
 
 
 def _quaternions(rotations):
@@ -470,7 +473,14 @@ def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -
             for part in moved:
                 arrays: dict[str, Floats] = {}
                 if suffix == "vtp" and group == "surfaces":
-                    arrays = measure.of(part.name, part.mesh(k), _bone_distance(part, solids, k))
+                    # From the nearest bone, negative inside.
+                    points = part.mesh(k)[0]
+                    away = [
+                        solid.signed(points if b.poses is None else to_local(points, b.poses[k]))
+                        for solid, b in solids
+                    ]
+                    nearest = np.min(away, axis=0) if away else None
+                    arrays = measure.of(part.name, part.mesh(k), nearest)
                 vertices, faces, normals = part.own(k)
                 if part.given is not None:
                     arrays = {key: values[part.given.source] for key, values in arrays.items()}
@@ -484,25 +494,11 @@ def _export_meshes(run: Animation, folder: Path, name: str, frames: list[int]) -
                 collection.add(run.times[k] if run.timed else frame, list(files.items()))
         if collection is not None:
             written.append(folder / f"{group}.pvd")
-    for fibres in run.fibres if suffix == "vtp" else ():
-        for frame, lines in zip(frames, fibres.lines):
-            written.append(folder / f"{fibres.name}_{frame:04d}.vtp")
+    for stem, fibres in run.fibres.items() if suffix == "vtp" else ():
+        for frame, lines in zip(frames, fibres):
+            written.append(folder / f"{stem}_{frame:04d}.vtp")
             write_fibres(written[-1], lines)
     return written
-
-
-def _bone_distance(
-    part: AnimatedMesh, solids: Sequence[tuple[SolidDistance, AnimatedMesh]], k: int
-) -> Floats | None:
-    """Distance (n,) of a muscle to the nearest bone in frame ``k``, negative inside; None without
-    bones.
-    """
-    points = part.mesh(k)[0]
-    found = [
-        solid.signed(points if bone.poses is None else to_local(points, bone.poses[k]))
-        for solid, bone in solids
-    ]
-    return np.min(found, axis=0) if found else None
 
 
 def write_mesh(

@@ -283,16 +283,14 @@ def check_picture(path: Path) -> None:
         return
     try:
         with Image.open(path) as image:
-            ours = _SOFTWARE in (image.getexif().get(_SOFTWARE_TAG), _comment(image))
+            comment = image.info.get("comment", b"")
+            if isinstance(comment, bytes):
+                comment = comment.decode("utf-8", "replace")
+            ours = _SOFTWARE in (image.getexif().get(_SOFTWARE_TAG), comment)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         ours = False
     if not ours:
         raise UsageError(f"{path} is in the way, and no picture of rbfmuscle; give another file")
-
-
-def _comment(image: Image.Image) -> str:
-    comment = image.info.get("comment", b"")
-    return comment.decode("utf-8", "replace") if isinstance(comment, bytes) else ""
 
 
 def save_picture(image: Image.Image, path: Path, **options: object) -> None:

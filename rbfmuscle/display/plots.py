@@ -112,10 +112,10 @@ def line_plot(
             else:
                 drawn = [axes.fill_between(band.x, band.low, band.high, alpha=0.2, lw=0.0)]
             for part in drawn:
-                part.set(color=band.colour, gid=_part_name(band.name))
+                part.set(color=band.colour, gid=f"muscle:{band.name}")
         lines = [axes.plot(t.x, t.y, color=t.colour, label=t.name)[0] for t in tracks]
         for line, track in zip(lines, tracks):
-            line.set_gid(_part_name(track.name))
+            line.set_gid(f"muscle:{track.name}")
         for limit in limits:
             axes.axhline(limit, color=_LIMIT, linestyle="--", linewidth=0.8)
         if zero:
@@ -153,7 +153,7 @@ def _label_ends(axes: "Axes", tracks: Sequence[Track], row: float) -> None:
             color=track.colour,
             arrowprops={**_JOINED, "color": track.colour},
         )
-        label.set_gid(_part_name(track.name))
+        label.set_gid(f"muscle:{track.name}")
 
 
 def front_plot(points: Sequence[Point], labels: tuple[str, str]) -> str:
@@ -214,11 +214,6 @@ def _axes(
     axes.set_xlabel(labels[0])
     axes.set_title(labels[1], loc="right", color=_SOFT, fontweight="normal")
     return figure, axes
-
-
-def _part_name(muscle: str) -> str:
-    """Name of a part that is switched on and off with a muscle."""
-    return f"muscle:{muscle}"
 
 
 def _markup(figure: "Figure", title: str) -> str:

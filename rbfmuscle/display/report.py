@@ -152,9 +152,7 @@ def _page(saved: RunData) -> ReportPage:
     answer, details = info.outcome, []
     if complete:
         verdict = Verdict(answer, info.beyond, info.not_measured, info.doubts)
-        summary = Summary()  # with what is measured of the bones
-        summary.add(saved.metrics)
-        table = summary.table()
+        table = Summary(saved.metrics).table()  # with what is measured of the bones
         details = describe_details(verdict, table, info.scene.missing_bones, MOST_DOUBTS)
     else:
         answer = f"the run ended early ({info.status}): {info.message or ''}"
@@ -288,8 +286,7 @@ def _plots(saved: RunData) -> list[Section]:
             group = mechanics if quantity in ("length", "activation", "moment_arm") else errors
             bands = []
             if coordinate:
-                bands = _fibre_bands(tracks, coordinate, saved)
-                bands += _bands(tracks, coordinate, label, saved)
+                bands = _bands(tracks, coordinate, label, saved)
             text = line_plot(title, tracks, (label, unit), limits=limits, zero=zero, bands=bands)
             plots[group].append(text)
     hints = {
@@ -303,19 +300,9 @@ def _plots(saved: RunData) -> list[Section]:
 
 
 def _bands(tracks: Sequence[Track], coordinate: str, label: str, saved: RunData) -> list[Band]:
-    """Published moment arms about a coordinate that alone moves, of the muscles of the tracks."""
-    bands = []
-    for track in tracks:
-        known = published_band(track.name, coordinate)
-        if known is not None and label.startswith(coordinate):
-            scale = from_mm(1.0, saved.units)
-            ends = scale * known.least, scale * known.greatest
-            bands.append(Band(track.name, track.colour, known.angle, *ends, dashed=True))
-    return bands
-
-
-def _fibre_bands(tracks: Sequence[Track], coordinate: str, saved: RunData) -> list[Band]:
-    """Moment arms of the fibres of the tracks' muscles, from the 5th to the 95th percentile."""
+    """Moment arms of the fibres of the tracks' muscles, from the 5th to the 95th percentile, and
+    published ones about a coordinate that alone moves.
+    """
     bands = []
     for track in tracks:
         low, high = (
@@ -324,6 +311,12 @@ def _fibre_bands(tracks: Sequence[Track], coordinate: str, saved: RunData) -> li
         )
         if len(low) == len(track.x):
             bands.append(Band(track.name, track.colour, track.x, low, high))
+    for track in tracks:
+        known = published_band(track.name, coordinate)
+        if known is not None and label.startswith(coordinate):
+            scale = from_mm(1.0, saved.units)
+            ends = scale * known.least, scale * known.greatest
+            bands.append(Band(track.name, track.colour, known.angle, *ends, dashed=True))
     return bands
 
 
@@ -422,16 +415,11 @@ def redraw_run(
     folder = run_folder(directory)
     texts = [name if value is None else f"{name}={value!r}" for name, value in info.fail_on.items()]
     limits = parse_limits(texts if fail_on is None else fail_on, Scene(units=saved.units))
-    summary = Summary()
-    summary.add(saved.metrics)
-    table = summary.table()
+    table = Summary(saved.metrics).table()
     verdict = judge(table, limits, info.doubts)
-    info = info.replaced(
-        limits=dict(limits.values),
-        fail_on=dict(limits.fail_on),
-        verdict=describe_verdict(verdict, table, info.scene.missing_bones),
-        **verdict._asdict(),
-    )
+    facts = {"limits": dict(limits.values), "fail_on": dict(limits.fail_on)} | verdict._asdict()
+    facts["verdict"] = describe_verdict(verdict, table, info.scene.missing_bones)
+    info = info.model_copy(update=facts)
     drawn = pictures and saved.has_surfaces and len(saved.frames) > 1
     folder.add(*(PAGES if drawn else PAGES[:1]))
     write_json(directory / "run.json", info.to_dict())

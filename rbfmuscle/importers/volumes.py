@@ -1,23 +1,32 @@
-"""Label volumes: read as integers in millimetres (NIfTI, NRRD), and their surfaces."""
+"""Label volumes: read as integers in millimetres (NIfTI, NRRD), their surfaces, and the scenes that
+are guessed from these.
+"""
 
 import codecs
 import csv
 import json
 import re
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import trimesh
 from scipy.ndimage import binary_fill_holes, find_objects, gaussian_filter, map_coordinates
 from scipy.ndimage import label as connected
 
+from rbfmuscle.anatomy.bones import HEADER
+from rbfmuscle.anatomy.names import name_facts
 from rbfmuscle.geometry.arrays import Array, Booleans, Floats, to_world
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.exact_distance import faces_across
 from rbfmuscle.geometry.solids import label_shells
 from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normals
+from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, scene_in_memory
+from rbfmuscle.scene.objects import new_name, plain_name
+from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import BROKEN_FILE, MeshError, UsageError
 
 # A label's number is its value in its layer, and this much more for each layer before.
@@ -77,18 +86,15 @@ class LabelVolume:
                 for pair, count in zip(pairs.tolist(), counts.tolist()):
                     labels = pair // LAYER + a * LAYER, pair % LAYER + b * LAYER
                     found.append((count, *labels))
-        lines = [self._overlap(*row) for row in sorted(found, reverse=True)[:MOST_NAMED]]
+        lines = []
+        for count, first, second in sorted(found, reverse=True)[:MOST_NAMED]:
+            size, small = min((int(self.mask(k).sum()), k) for k in (first, second))
+            lines.append(
+                f"{self.name(first)} and {self.name(second)} overlap in {count} voxels "
+                f"({100 * count / size:.3g} % of {self.name(small)}), both kept"
+            )
         more = len(found) - len(lines)
         return lines + ([f"{more} more pairs of labels overlap, each kept whole"] if more else [])
-
-    def _overlap(self, count: int, one: int, other: int) -> str:
-        sizes = {label: int(self.mask(label).sum()) for label in (one, other)}
-        small = min(sizes, key=lambda label: sizes[label])
-        share = 100 * count / sizes[small]
-        return (
-            f"{self.name(one)} and {self.name(other)}"
-            f" overlap in {count} voxels ({share:.3g} % of {self.name(small)}), both kept"
-        )
 
 
 VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr")
@@ -108,17 +114,6 @@ NO_UNIT = "the header states no unit of length: mm taken"
 NUMBER = r"\s*([-+]?\d+(\.\d*)?)?\s*"  # a cell of a table of names that is none, or empty
 # Places of voxels by a NIfTI's two transforms that differ by more than this [mm] are said.
 SAME_PLACE = 0.1
-
-
-@dataclass
-class _Header:
-    """What a file says besides its voxels."""
-
-    affine: Floats  # (4, 4), in its unit
-    unit: str
-    names: dict[int, str]
-    notes: list[str] = field(default_factory=list)
-    directed: bool = True
 
 
 def is_volume(path: Path) -> bool:
@@ -211,22 +206,21 @@ def _read_file(path):
         else ("NIfTI", _read_nifti)
     )
     try:
-        data, header = read(path)
+        volume, unit = read(path)
     except MeshError:
         raise
     except (*BROKEN_FILE, *_own_errors(kind)) as error:
         why = " ".join(str(error).split())[:120] or type(error).__name__
         raise MeshError(f"{path}: no readable {kind} volume ({why}); export it again") from None
-    if header.unit not in _TO_MM:
-        raise MeshError(f"{path}: unknown unit of length {header.unit!r} in its header")
-    header.affine[:3] *= _TO_MM[header.unit]
-    labels = _check_labels(data, path, header.notes)
-    affine = _check_affine(header.affine, path)
-    if not header.directed:
-        header.notes.append(NO_DIRECTIONS)
-    volume = LabelVolume(labels, affine, header.names, str(path), header.notes, header.directed)
+    if unit not in _TO_MM:
+        raise MeshError(f"{path}: unknown unit of length {unit!r} in its header")
+    volume.affine[:3] *= _TO_MM[unit]
+    volume.labels = _check_labels(volume.labels, path, volume.notes)
+    volume.affine = _check_affine(volume.affine, path)
+    if not volume.directed:
+        volume.notes.append(NO_DIRECTIONS)
     occur = set(volume.values().tolist())
-    empty = [name for label, name in header.names.items() if label not in occur]
+    empty = [name for label, name in volume.names.items() if label not in occur]
     if empty:
         volume.notes.append(f"{len(empty)} named labels have no voxel: {', '.join(empty)}")
     return volume
@@ -246,7 +240,9 @@ def _own_errors(kind):
 
 
 def _read_nifti(path):
-    """Voxels (i, j, k) and header, with names that segmentation programs leave in it as XML."""
+    """Unchecked volume, with names that segmentation programs leave in its header as XML, and the
+    unit of its affine.
+    """
     import nibabel
 
     image = nibabel.load(path)
@@ -260,35 +256,27 @@ def _read_nifti(path):
         ):
             names[int(number)] = name.strip()
     data = np.asanyarray(image.dataobj)
-    header = _Header(
-        np.array(image.affine, dtype=np.float64), image.header.get_xyzt_units()[0], names
-    )
-    header.notes += [NO_UNIT] if header.unit == "unknown" else []
+    affine, unit = np.array(image.affine, dtype=np.float64), image.header.get_xyzt_units()[0]
+    volume = LabelVolume(data.reshape(data.shape[:3]), affine, names, str(path))
+    volume.notes += [NO_UNIT] if unit == "unknown" else []
     if not (int(image.header["qform_code"]) or int(image.header["sform_code"])):
-        header.directed = False
-        header.affine = np.diag([*map(float, image.header.get_zooms()[:3]), 1.0])
-    header.notes += _two_places(image)
-    return data.reshape(data.shape[:3]), header
-
-
-def _two_places(image):
-    """A note where both transforms of a NIfTI are set and put its voxels at different places."""
-    first, second = image.get_sform(coded=True), image.get_qform(coded=True)
-    if not (first[1] and second[1]):
-        return []
-    corners = np.stack(np.meshgrid(*([0, size - 1] for size in image.shape[:3])), -1).reshape(-1, 3)
-    way = (first[0] - second[0])[:3] @ np.column_stack([corners, np.ones(8)]).T
-    apart = float(np.linalg.norm(way, axis=0).max())
-    return (
-        [f"its sform counts, from which its qform is up to {apart:.3g} mm off"]
-        if apart > SAME_PLACE
-        else []
-    )
+        volume.directed = False
+        volume.affine = np.diag([*map(float, image.header.get_zooms()[:3]), 1.0])
+    # Both transforms may be set, and put the voxels at different places.
+    (first, known), (second, other) = image.get_sform(coded=True), image.get_qform(coded=True)
+    if known and other:
+        ends = np.meshgrid(*([0, size - 1] for size in image.shape[:3]))
+        corners = np.column_stack([np.stack(ends, -1).reshape(-1, 3), np.ones(8)])
+        apart = float(np.linalg.norm((first - second)[:3] @ corners.T, axis=0).max())
+        if apart > SAME_PLACE:
+            said = f"its sform counts, from which its qform is up to {apart:.3g} mm off"
+            volume.notes.append(said)
+    return volume, unit
 
 
 def _read_nrrd(path):
-    """Voxels (i, j, k), or (layers, i, j, k), and header, with the names that Slicer writes for
-    segments.
+    """Unchecked volume, with the names that Slicer writes for segments, and the unit of its
+    affine.
     """
     import nrrd
 
@@ -314,11 +302,10 @@ def _read_nrrd(path):
         raise MeshError(f"{path}: its space is {space!r}; export it as left-posterior-superior")
     affine[:3] *= [[-1.0] if end in "lpi" else [1.0] for end in ends[:3]]
     unit = str((said.get("space units") or [""])[0]).strip('"').lower()
-    header = _Header(affine, unit or "mm", _segment_names(said, layered is not None))
-    header.directed = "space" in said
     # Spaces of the body are in mm by convention.
-    header.notes += [] if unit or header.directed else [NO_UNIT]
-    return data, header
+    directed, notes = "space" in said, [] if unit or "space" in said else [NO_UNIT]
+    names = _segment_names(said, layered is not None)
+    return LabelVolume(data, affine, names, str(path), notes, directed), unit or "mm"
 
 
 def _layer_axis(header, count):
@@ -569,7 +556,13 @@ def _surface_of(mask, notes):
     import igl
     from skimage.measure import marching_cubes
 
-    smooth = smooth_mask(mask)
+    # A field that is positive inside, zero about half-way between voxels in and out.
+    rest = np.where(mask, np.float32(0.5), np.float32(-0.5))
+    smooth = np.zeros_like(rest)
+    for _ in range(PASSES):
+        part = gaussian_filter(rest, SMOOTHING, truncate=4.0, mode="nearest")
+        smooth += part
+        rest -= part
     if not smooth.min() < 0.0 < smooth.max():
         return np.zeros((1, 3)), np.zeros((0, 3), np.int64)
     vertices, faces, _, _ = marching_cubes(-smooth, 0.0, allow_degenerate=False)
@@ -585,18 +578,14 @@ def _surface_of(mask, notes):
     vertices, crossing = _untangled(vertices, faces, smooth)
     if crossing:
         notes.append(f"{crossing} triangles go through others, where the label is thin")
-    return _to_volume(vertices, faces, int(mask.sum())), faces
-
-
-def smooth_mask(mask: np.ndarray) -> np.ndarray:
-    """Field of a mask (i, j, k): positive inside, zero about half-way between voxels in and out."""
-    rest = np.where(mask, np.float32(0.5), np.float32(-0.5))
-    smooth = np.zeros_like(rest)
-    for _ in range(PASSES):
-        part = gaussian_filter(rest, SMOOTHING, truncate=4.0, mode="nearest")
-        smooth += part
-        rest -= part
-    return smooth
+    # Moved along the normals, all by the same distance, to the volume of the voxels, but for what
+    # is left of an error of some per cent to the fourth power.
+    for _ in range(2):
+        volume = mesh_volume(vertices, faces)
+        normals, area = vertex_normals(vertices, faces), vertex_areas(vertices, faces).sum()
+        off = int(mask.sum()) - abs(volume)
+        vertices = vertices + np.sign(volume) * off / area * normals
+    return vertices, faces
 
 
 def _without_islands(mask, notes, least, *, touching):
@@ -690,12 +679,73 @@ def _on_zero_set(points, smooth):
     return points + moved / np.maximum(np.linalg.norm(moved, axis=1), 1.0)[:, None]
 
 
-def _to_volume(vertices, faces, wanted):
-    """Vertices moved along their normals, all by the same distance, until the mesh holds the wanted
-    volume, but for what is left of an error of some per cent to the fourth power.
+def scene_from_labels(path: Path, *, labels: Path | None) -> Scene:
+    """The scene of `Scene.from_labels`."""
+    volume = read_labels(path, names=labels)
+    with TemporaryDirectory() as base:
+        stage = Path(base, "surfaces")
+        stage.mkdir()
+        scene = scene_in_memory(guess_volume(volume, stage, Path(base)), Path(base))
+    scene.name = plain_name(path.name.split(".")[0]) or "scene"
+    return scene
+
+
+def guess_volume(
+    volume: LabelVolume,
+    stage: Path,
+    base: Path,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> SceneGuess:
+    """The guess of a label volume, whose surfaces are written into a folder ``stage``; the scene's
+    paths are relative to ``base``. ``progress`` is called with the labels that are done, and of how
+    many.
     """
-    for _ in range(2):
-        volume = mesh_volume(vertices, faces)
-        normals, area = vertex_normals(vertices, faces), vertex_areas(vertices, faces).sum()
-        vertices = vertices + np.sign(volume) * (wanted - abs(volume)) / area * normals
-    return vertices
+    folder, capped, notes, unusable = write_surfaces(volume, stage, progress)
+    guess = guess_scene(
+        folder,
+        "mm",
+        base,
+        header=HEADER if volume.directed else None,
+        capped=capped,
+        source=volume.source,
+        unusable=unusable,
+    )
+    guess.parts.notes[:0] = notes
+    return guess
+
+
+def write_surfaces(
+    volume: LabelVolume, stage: Path, progress: Callable[[int, int], None] | None = None
+) -> tuple[Path, dict[str, Booleans], list[str], dict[str, str]]:
+    """Surfaces of all labels as PLY in ``meshes`` of a folder; ``progress`` as of
+    `guess_volume`. Returned are that folder, vertices (n,) on caps by file, notes, and why labels
+    have no surface, by their names.
+    """
+    meshes = stage / "meshes"
+    meshes.mkdir()
+    values = volume.values()
+    capped: dict[str, Booleans] = {}
+    unusable: dict[str, str] = {}
+    frame = "right, forward, up (RAS), mm"
+    notes = [f"surfaces of {Path(volume.source).name}, in its frame: {frame}", *volume.notes]
+    for done, label in enumerate(values, start=1):
+        tissue = name_facts(volume.name(label)).tissue
+        if tissue == "other":
+            notes.append(f"{volume.name(label)}: neither bone nor muscle, left out")
+            continue
+        try:
+            surface = label_surface(volume, int(label), pieces=tissue == "bone")
+        except MeshError as error:
+            unusable[volume.name(label)] = str(error).removeprefix(f"{volume.source}: ")
+            continue
+        plain = plain_name(surface.name)
+        file = new_name(surface.name, capped)
+        if plain.lower() in map(str.lower, capped):  # they are two parts
+            notes.append(f"several labels are named {plain}: one of them is {file} here")
+        surface.mesh.export(meshes / f"{file}.ply")
+        capped[file] = surface.capped
+        notes += [f"{surface.name}: {note}" for note in surface.notes]
+        if progress is not None:
+            progress(done, len(values))
+    return meshes, capped, notes, unusable

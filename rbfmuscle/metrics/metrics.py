@@ -13,8 +13,13 @@ from rbfmuscle.geometry.surfaces import EdgeLengths, label_sheets, mesh_volume, 
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
 from rbfmuscle.metrics.neighbours import InputNeighbours, NeighbourMeasures, Shown
-from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
-from rbfmuscle.metrics.rows import bone_depth, bones_about, surface_depth
+from rbfmuscle.metrics.quantities import (
+    QUANTITIES,
+    bone_depth,
+    bones_about,
+    percentiles,
+    surface_depth,
+)
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.check import articular_share, end_gap, scene_surfaces
 from rbfmuscle.scene.objects import Muscle, from_mm
@@ -147,7 +152,13 @@ class MuscleMeasurer:
         material, surface = frame.material_meshes[self.name][0], frame.surfaces.get(self.name)
         if surface is not None:
             found.update(self._of_surface(frame.index, surface, material, probes, frame.poses))
-            self._carry(*frame.material_meshes[self.name])
+            # The material as a surface of its own, unless it is shown.
+            if self.shown is not None and np.array_equal(self.shown.distance.vertices, material):
+                self.carried = self.shown
+            else:
+                layout = None if self.carried is None else self.carried.distance.layout
+                carried = MeshDistance(*frame.material_meshes[self.name], layout=layout)
+                self.carried = Shown(carried, self.material)
             found.update({q: surface.quantities[q] for q in _FROM_MODEL if q in surface.quantities})
         mine = [event for event in frame.events if event.muscle == self.name]
         found["tunnelled"] = sum(event.count for event in mine if event.action in _THROUGH)
@@ -193,14 +204,6 @@ class MuscleMeasurer:
             **form,
             **self._flicker(index, material, vertices, same, self.form.simple),
         }
-
-    def _carry(self, material: Floats, faces: Integers) -> None:
-        """Keep the material (n, 3) as a surface of its own, unless it is shown."""
-        if self.shown is not None and np.array_equal(self.shown.distance.vertices, material):
-            self.carried = self.shown
-            return
-        layout = None if self.carried is None else self.carried.distance.layout
-        self.carried = Shown(MeshDistance(material, faces, layout=layout), self.material)
 
     def _flicker(self, index, material, vertices, same, simple):
         """Distances of the material to the surface, and their change since the frame before in the

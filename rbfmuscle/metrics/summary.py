@@ -9,7 +9,7 @@ from typing import NamedTuple, TypedDict
 
 import numpy as np
 
-from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, of_coordinate, quantity_of
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, quantity_of
 from rbfmuscle.scene.check import END_GAP_MM, END_SHARE, MOST_ARTICULAR
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
@@ -178,18 +178,19 @@ MORE_BOWING = 0.03
 class Summary:
     """Collects rows of metrics; keeps numbers only, no surfaces."""
 
-    def __init__(self) -> None:
+    def __init__(self, rows: Iterable[Row] = ()) -> None:
         self._values: dict[str, dict[str, list[tuple[int, float]]]] = defaultdict(
             lambda: defaultdict(list)
         )
         self._units: dict[str, str] = {}
+        self.add(rows)
 
     def add(self, rows: Iterable[Row]) -> None:
         """Take in rows of metrics."""
         for row in rows:
             quantity = row.quantity
             if "moment_arm" in quantity or "roughness" in quantity:
-                quantity = of_coordinate(quantity, row.coordinate)
+                quantity = f"{quantity}:{row.coordinate}"
             self._values[row.muscle][quantity].append((row.frame, row.value))
             self._units[quantity] = row.unit
 
@@ -329,11 +330,9 @@ def exceeded(table: Table, limits: Limits) -> list[Exceedance]:
             worst = math.nan if worst is None else worst  # as a file has it
             if not meets_limit(quantity, worst, limit):
                 found.append(Exceedance(muscle, name, worst, limit, facts.get("worst_frame")))
-    return sorted(found, key=_exceedance_ratio, reverse=True)
-
-
-def _exceedance_ratio(row: Exceedance) -> float:
-    return limit_ratio(row.quantity, math.nan if row.value is None else row.value, row.limit)
+    return sorted(
+        found, key=lambda row: limit_ratio(row.quantity, row.value, row.limit), reverse=True
+    )
 
 
 def unmeasured(table: Table, limits: Limits) -> list[Unmeasured]:
@@ -359,10 +358,11 @@ def unmeasured(table: Table, limits: Limits) -> list[Unmeasured]:
     return found
 
 
-def limit_ratio(quantity: str, worst: float, limit: float) -> float:
+def limit_ratio(quantity: str, worst: float | None, limit: float) -> float:
     """How many times its limit a worst value is; of limits that cannot say so, 0 within and
     infinite beyond.
     """
+    worst = math.nan if worst is None else worst
     if quantity in LOWER_BOUNDS or limit <= 0 or not math.isfinite(worst):
         return 0.0 if meets_limit(quantity, worst, limit) else math.inf
     return abs(worst) / limit

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.metrics.quantities import ALL, Row, quantity_of, split_name
-from rbfmuscle.metrics.rows import ROUGH
+from rbfmuscle.metrics.quantities import ALL, ROUGH, Row, quantity_of, split_name
 from rbfmuscle.metrics.summary import (
     LIMITS,
     LOWER_BOUNDS,
@@ -73,15 +72,11 @@ def _outcome(table: Table, found: list[Exceedance], missing: list[Unmeasured]) -
     return f"{text}; the bones are not" if bones else text
 
 
-def describe_verdict(
-    verdict: Verdict, table: Table, missing_bones: Sequence[str] = (), *, most_doubts: int = 1
-) -> str:
+def describe_verdict(verdict: Verdict, table: Table, missing_bones: Sequence[str] = ()) -> str:
     """A verdict in sentences: its outcome, the worst of what is beyond a limit, what to do, what
-    was not measured, and what is doubtful; bones ``missing_bones``.
+    was not measured, and the first of what is doubtful; bones ``missing_bones``.
     """
-    return ". ".join(
-        [verdict.outcome, *describe_details(verdict, table, missing_bones, most_doubts)]
-    )
+    return ". ".join([verdict.outcome, *describe_details(verdict, table, missing_bones, 1)])
 
 
 def describe_details(
@@ -256,7 +251,17 @@ def measured_doubts(
     """Doubts about a run, from its table, the rows of its moment arms, and the coordinates of its
     frames [radian or scene unit].
     """
-    found = [doubt for name in table for doubt in _moved_at_rest(scene, name, table)]
+    found = []
+    for name, facts in table.items():
+        # How far a muscle is moved at rest because its mesh lies in a bone.
+        moved, deep = (
+            facts.get(quantity, {}).get("first")
+            for quantity in ("rest_error_at_overlap", "input_overlap")
+        )
+        if moved is not None and moved > from_mm(MOVED, scene.units):
+            depth, away = (shown_number(value, scene.units) for value in (deep, moved))
+            text = f"its mesh lies {depth} deep in a bone at rest; near there it is moved {away}"
+            found.append(Doubt(name, text))
     arms: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         if row.quantity == "moment_arm":
@@ -270,7 +275,14 @@ def measured_doubts(
                 "frames, as its activation changes there"
             )
             found.append(Doubt(muscle, text))
-        alone = [row for row in mine if _others_rest(path[row.frame], coordinate, rest)]
+        alone = [
+            row
+            for row in mine
+            if all(
+                name == coordinate or abs(value - rest.get(name, 0.0)) < _STILL
+                for name, value in path[row.frame].items()
+            )
+        ]
         found += _outside_band(scene, muscle, coordinate, alone)
     known = all_coordinates(scene.joints)
     turning = any(
@@ -281,29 +293,6 @@ def measured_doubts(
         text = f"roughness is not measured: no frames are {ROUGH:g} degrees apart or less"
         found.append(Doubt(ALL, text))
     return found
-
-
-def _moved_at_rest(scene: Scene, muscle: str, table: Table) -> list[Doubt]:
-    """That a muscle's mesh lies in a bone, and how far it is moved there."""
-    facts = table[muscle]
-    moved, deep = (
-        facts.get(name, {}).get("first") for name in ("rest_error_at_overlap", "input_overlap")
-    )
-    if moved is None or moved <= from_mm(MOVED, scene.units):
-        return []
-    depth, away = (shown_number(value, scene.units) for value in (deep, moved))
-    return [
-        Doubt(
-            muscle, f"its mesh lies {depth} deep in a bone at rest; near there it is moved {away}"
-        )
-    ]
-
-
-def _others_rest(here: Mapping[str, float], coordinate: str, rest: Mapping[str, float]) -> bool:
-    return all(
-        name == coordinate or abs(value - rest.get(name, 0.0)) < _STILL
-        for name, value in here.items()
-    )
 
 
 def _outside_band(scene: Scene, muscle: str, coordinate: str, arms: Sequence[Row]) -> list[Doubt]:

@@ -9,7 +9,6 @@ import io
 import json
 import math
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Self, TypeVar
@@ -19,8 +18,7 @@ import trimesh
 from pydantic import ValidationError
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.metrics.quantities import ALL, Row
-from rbfmuscle.metrics.rows import moment_arms, reaches
+from rbfmuscle.metrics.quantities import ALL, Row, moment_arms, reaches
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.info import FORMAT, FrameInfo, RunInfo
 from rbfmuscle.run.vtk_files import fibre_file, read_fibres, read_vtp
@@ -29,8 +27,8 @@ from rbfmuscle.scene.meshes.repair import InputOrder
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
-from rbfmuscle.simulation.frame import Event, FibreLines, Frame, ModelSurface
-from rbfmuscle.validation import SceneError, UsageError, did_you_mean
+from rbfmuscle.simulation.frame import Event, FibreLines, Frame, Mesh, ModelSurface
+from rbfmuscle.validation import BROKEN_FILE, SceneError, UsageError, did_you_mean
 
 # Coordinates that a caption names at most.
 MOST_SHOWN = 4
@@ -185,7 +183,19 @@ class RunData:
             ``coordinate`` (that of a moment arm, else empty), ``value`` and ``unit``;
             ``pandas.DataFrame`` takes it as it is.
         """
-        return _metrics_table(self.metrics, self.frame_numbers, self.coordinates)
+        rows, place = self.metrics, {frame: k for k, frame in enumerate(self.frame_numbers)}
+        at = np.array([place[row.frame] for row in rows], dtype=int)
+        about = [row.coordinate if "moment_arm" in row.quantity else "" for row in rows]
+        columns = {
+            "frame": np.array([row.frame for row in rows], dtype=int),
+            **{name: values[at] for name, values in self.coordinates.items()},
+            "muscle": np.array([row.muscle for row in rows], dtype=str),
+            "quantity": np.array([row.quantity for row in rows], dtype=str),
+            "coordinate": np.array(about, dtype=str),
+            "value": np.array([row.value for row in rows], dtype=float),
+            "unit": np.array([row.unit for row in rows], dtype=str),
+        }
+        return as_table(columns)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -284,7 +294,7 @@ class MuscleRun:
         """Moment arm (frames, N) of each fibre about a coordinate, of its full or its short name.
 
         Minus the slope of the fibre's length [scene unit per radian, or 1 of a translation], see
-        `rbfmuscle.metrics.rows.moment_arms`; NaN where the coordinate does not move alone.
+        `rbfmuscle.metrics.quantities.moment_arms`; NaN where the coordinate does not move alone.
         """
         path = [frame.coordinates for frame in self.run.frames]
         known = sorted({name for coordinates in path for name in coordinates})
@@ -327,27 +337,6 @@ def frame_caption(run: RunData, number: int) -> str:
     return ", ".join([f"frame {number}", *clock, *texts])
 
 
-def _metrics_table(
-    rows: Sequence[Row], frames: Sequence[int], coordinates: Mapping[str, Floats]
-) -> np.ndarray:
-    """Rows of metrics as a table, see `RunData.table`; ``coordinates`` (n,) are by name, at the
-    frames (n,).
-    """
-    place = {frame: k for k, frame in enumerate(frames)}
-    at = np.array([place[row.frame] for row in rows], dtype=int)
-    about = [row.coordinate if "moment_arm" in row.quantity else "" for row in rows]
-    columns = {
-        "frame": np.array([row.frame for row in rows], dtype=int),
-        **{name: values[at] for name, values in coordinates.items()},
-        "muscle": np.array([row.muscle for row in rows], dtype=str),
-        "quantity": np.array([row.quantity for row in rows], dtype=str),
-        "coordinate": np.array(about, dtype=str),
-        "value": np.array([row.value for row in rows], dtype=float),
-        "unit": np.array([row.unit for row in rows], dtype=str),
-    }
-    return as_table(columns)
-
-
 def as_table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Columns (n,) by name as a structured ndarray (n,)."""
     count = len(next(iter(columns.values())))
@@ -373,38 +362,11 @@ def named_coordinates(quantity: str, rows: Sequence[Row], coordinate: str | None
     return [coordinate]
 
 
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError)
-
-
 def given_file(muscle: str) -> str:
     """File of the vertex order of a muscle's own file, relative to the folder of a run."""
     return f"surfaces/{muscle}.npz"
 
 
-def read_given(directory: Path, muscle: str) -> InputOrder | None:
-    """The vertex order of a muscle's own file, None where the shown mesh has the same; UsageError
-    for what no run writes.
-    """
-    path = directory / given_file(muscle)
-    if not path.is_file():
-        return None
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
-            order = InputOrder(found["faces"], found["source"])
-        if any(numbers.dtype.kind != "i" for numbers in order) or order.source.ndim != 1:
-            raise ValueError("arrays of another kind")
-        if order.faces.shape[1:] != (3,) or order.source.min(initial=0) < 0:
-            raise ValueError("arrays of another shape")
-        if not np.array_equal(np.unique(order.faces), np.arange(len(order.source))):
-            raise ValueError("triangles of other vertices")
-    except _DAMAGE as error:
-        raise UsageError(
-            f"{path} is not as it was written ({error}); run the scene again"
-        ) from None
-    return order
-
-
-Mesh = tuple[Floats, Integers]
 _Row = TypeVar("_Row")
 _Content = TypeVar("_Content")
 Poses = dict[int, dict[str, Floats]]  # (4, 4) by frame and bone
@@ -414,23 +376,40 @@ class FolderMeshes:
     """Meshes that the frames of a run in a folder do not hold, read when asked for."""
 
     def __init__(self, directory: Path) -> None:
-        self.directory: Path | None = directory
-        self._folder = directory
+        self.directory = directory
         self._bones: dict[str, Mesh] = {}
 
     def bone(self, name: str) -> Mesh:
         """A bone at rest."""
         if name not in self._bones:
-            self._bones[name] = read_vtp(self._folder / "bones" / f"{name}.vtp")
+            self._bones[name] = read_vtp(self.directory / "bones" / f"{name}.vtp")
         return self._bones[name]
 
     def given(self, muscle: str) -> InputOrder | None:
-        """The vertex order of a muscle's own file, where it is another one."""
-        return read_given(self._folder, muscle)
+        """The vertex order of a muscle's own file, None where the shown mesh has the same;
+        UsageError for what no run writes.
+        """
+        path = self.directory / given_file(muscle)
+        if not path.is_file():
+            return None
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
+                order = InputOrder(found["faces"], found["source"])
+            if any(numbers.dtype.kind != "i" for numbers in order) or order.source.ndim != 1:
+                raise ValueError("arrays of another kind")
+            if order.faces.shape[1:] != (3,) or order.source.min(initial=0) < 0:
+                raise ValueError("arrays of another shape")
+            if not np.array_equal(np.unique(order.faces), np.arange(len(order.source))):
+                raise ValueError("triangles of other vertices")
+        except (*BROKEN_FILE, zipfile.BadZipFile) as error:
+            raise UsageError(
+                f"{path} is not as it was written ({error}); run the scene again"
+            ) from None
+        return order
 
     def tendons(self, muscle: str, frame: Frame) -> Mesh:
         """All tendons of a muscle in a frame."""
-        return read_vtp(surface_file(self._folder, tendon_name(muscle), frame.index))
+        return read_vtp(surface_file(self.directory, tendon_name(muscle), frame.index))
 
 
 class ReadFiles(Mapping[str, _Content]):
@@ -492,7 +471,7 @@ def read_run(directory: Path) -> tuple[RunInfo, list[Frame], list[Row], FolderMe
     info = read_info(directory)
     poses = _read_poses(directory)
     if info.status == "running":
-        info = info.replaced(frames=_whole_frames(info, directory, poses))
+        info = info.model_copy(update={"frames": _whole_frames(info, directory, poses)})
     frames = _read_frames(info, directory, poses)
     metrics = _read_table(
         directory,

@@ -14,8 +14,7 @@ from rbfmuscle.geometry.surfaces import mesh_hash
 from rbfmuscle.metrics.summary import Doubt, Exceedance, QuantityFacts, Unmeasured
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.joints import all_coordinates, coupling_row, joint_row
-from rbfmuscle.scene.names import check_name
-from rbfmuscle.scene.objects import Muscle
+from rbfmuscle.scene.objects import Muscle, check_name
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
 
@@ -220,10 +219,6 @@ class RunInfo(Part):
     def to_dict(self) -> dict[str, object]:
         """What ``run.json`` holds."""
         return self.model_dump(exclude_unset=True)
-
-    def replaced(self, **facts: object) -> RunInfo:
-        """The facts with others in place of some."""
-        return self.model_copy(update=facts)
 
     @property
     def tendon_muscles(self) -> dict[str, str]:

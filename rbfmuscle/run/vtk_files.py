@@ -2,7 +2,6 @@
 time (.pvd), without loading VTK.
 """
 
-import csv
 import os
 import re
 import zlib
@@ -220,13 +219,9 @@ class Collection:
             file.write(data)
 
 
-FOLDER, TABLE = "fibres", "fibres.csv"
-COLUMNS = ("frame", "muscle", "fibre", "length", "stretch")
-
-
 def fibre_file(muscle: str, frame: int) -> str:
     """Name of the file of a muscle's fibres in a frame, in the run's folder."""
-    return f"{FOLDER}/{muscle}_{frame:04d}.vtp"
+    return f"fibres/{muscle}_{frame:04d}.vtp"
 
 
 def write_fibres(path: Path, fibres: FibreLines) -> None:
@@ -255,20 +250,3 @@ def read_fibres(path: Path) -> FibreLines:
         )
         lines = len(stretch)
         return FibreLines(points.reshape(lines, -1, 3), stretch, local.reshape(lines, -1))
-
-
-def begin_table(directory: Path) -> None:
-    """Write the table's head."""
-    with (directory / TABLE).open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerow(COLUMNS)
-
-
-def write_frame(directory: Path, frame: int, fibres: Mapping[str, FibreLines]) -> None:
-    """Write the fibres of a frame, by muscle: the files and the rows of the table."""
-    for muscle, lines in fibres.items():
-        write_fibres(directory / fibre_file(muscle, frame), lines)
-    with (directory / TABLE).open("a", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        for muscle, lines in fibres.items():
-            for number, row in enumerate(zip(lines.lengths.tolist(), lines.stretch.tolist())):
-                writer.writerow((frame, muscle, number, *row))

@@ -25,15 +25,7 @@ from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.run.appearance import muscle_groups, tendon_mesh
 from rbfmuscle.run.data import given_file
 from rbfmuscle.run.info import FORMAT, RunInfo, record_scene
-from rbfmuscle.run.vtk_files import (
-    FOLDER,
-    TABLE,
-    Collection,
-    begin_table,
-    fibre_file,
-    write_frame,
-    write_vtp,
-)
+from rbfmuscle.run.vtk_files import Collection, fibre_file, write_fibres, write_vtp
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
@@ -75,6 +67,7 @@ TABLES = {
     "poses.csv": ("frame", "bone", *(f"m{i}{j}" for i in range(4) for j in range(4))),
     "events.csv": ("frame", "muscle", "bone", "count", "action"),
     "metrics.csv": tuple("angle" if x == "coordinate_value" else x for x in Row._fields),
+    "fibres.csv": ("frame", "muscle", "fibre", "length", "stretch"),
 }
 
 LIGHT = 1600  # triangles of a bone that moves
@@ -82,7 +75,7 @@ PAGES = ("report.html", "preview.webp")
 MESHES = ("surfaces", "bones")
 # Every file of a run, and every folder of its files.
 _COLLECTIONS = tuple(f"{name}.pvd" for name in MESHES)
-_PLACES = ("run.json", *TABLES, *PAGES, *MESHES, *_COLLECTIONS, FOLDER, TABLE)
+_PLACES = ("run.json", *TABLES, *PAGES, *MESHES, *_COLLECTIONS, "fibres")
 _PACKAGES = ("numpy", "scipy", "numba", "scikit-image", "trimesh", "pyvista", "vtk", "libigl")
 
 
@@ -114,31 +107,22 @@ class RunWriter:
         self._light: dict[str, tuple[Floats, Integers]] = {}
         names = MESHES if self.meshes else ()
         pages = PAGES if scene.output.report else ()
+        tables = [name for name in TABLES if scene.output.fibres or name != "fibres.csv"]
+        # The vertex order of muscles' own files, where it is another one than that of the mesh.
+        orders = {m.name: m.given for m in scene.muscles if self.meshes and m.given is not None}
         try:
             self.folder.clear()
-            self.folder.add("run.json", *TABLES, *pages, *(f"{name}.pvd" for name in names))
-            for name, head in TABLES.items():
-                write_csv(self.directory / name, [head])
-            if scene.output.fibres:
-                self.folder.add(TABLE)
-                begin_table(self.directory)
+            self.folder.add("run.json", *tables, *pages, *(f"{name}.pvd" for name in names))
+            for name in tables:
+                write_csv(self.directory / name, [TABLES[name]])
             self._collections = {name: Collection(self.directory / f"{name}.pvd") for name in names}
-            if self.meshes:
-                self._write_orders()
+            for name, order in orders.items():
+                self.folder.add(given_file(name))
+                np.savez_compressed(self.directory / given_file(name), **order._asdict())
         except OSError as error:
             raise UsageError(
                 f"cannot write to {self.directory}: {error.strerror}; choose another folder"
             ) from None
-
-    def _write_orders(self):
-        """The vertex order of muscles' own files, where it is another one than that of the mesh."""
-        for muscle in self.scene.muscles:
-            if muscle.given is not None:
-                file = given_file(muscle.name)
-                self.folder.add(file)
-                np.savez_compressed(
-                    self.directory / file, faces=muscle.given.faces, source=muscle.given.source
-                )
 
     def write(self, frame: Frame, rows: Sequence[Sequence[object]] = ()) -> None:
         """Write one frame, and the rows of metrics that are complete; SolveError if the disk
@@ -175,7 +159,7 @@ class RunWriter:
             planned = [
                 {name: shown_value(self.scene, name, x) for name, x in k.items()} for k in frames
             ]
-            info = info.replaced(planned=planned)
+            info = info.model_copy(update={"planned": planned})
         write_json(self.directory / "run.json", info.to_dict())
 
     def _write(self, frame, rows):
@@ -185,9 +169,12 @@ class RunWriter:
             surfaces = self._write_surfaces(frame)
             self._collections["bones"].add(step, self._write_bones(frame))
             self._collections["surfaces"].add(step, surfaces)
-        if frame.fibres:
-            self.folder.add(*(fibre_file(name, frame.index) for name in frame.fibres))
-            write_frame(self.directory, frame.index, frame.fibres)
+        fibres = []
+        for name, lines in frame.fibres.items():
+            self.folder.add(fibre_file(name, frame.index))
+            write_fibres(self.directory / fibre_file(name, frame.index), lines)
+            values = zip(lines.lengths.tolist(), lines.stretch.tolist())
+            fibres += [(frame.index, name, number, *row) for number, row in enumerate(values)]
         # A frame's surfaces are on the disk before its poses: readers of a run that was killed rely
         # on it.
         poses = [
@@ -195,8 +182,9 @@ class RunWriter:
             for bone in self.scene.bones
         ]
         events = [(e.frame, e.muscle, e.bone, e.count, e.action) for e in frame.events]
-        for name, table in {"poses": poses, "events": events, "metrics": rows}.items():
-            write_csv(self.directory / f"{name}.csv", table, mode="a")
+        for name, table in zip(TABLES, (poses, events, rows, fibres)):
+            if table:
+                write_csv(self.directory / name, table, mode="a")
 
     def _write_surfaces(self, frame):
         """Surfaces of a frame, side by side: most of the time goes into packing them."""
@@ -212,23 +200,19 @@ class RunWriter:
 
         def write(entry):
             name, file = entry
-            arrays = self._arrays_of(frame, name) if name in frame.surfaces else None
+            arrays, bones, distance = {}, frame.bones.get(name), None
+            if name in frame.surfaces:
+                # Distances to bones that the muscle can reach, and what its model adds, as
+                # ``level_offset``.
+                if bones is not None and bones.names:
+                    distance = bones.distance(meshes[name][0], frame.poses, self._farthest)
+                    distance = np.minimum(distance, self._farthest)
+                arrays = self._arrays.of(name, meshes[name], distance)
+                arrays |= dict(frame.surfaces[name].arrays)
             write_vtp(self.directory / file, *meshes[name], arrays, name=name)
 
         each(write, entries)
         return entries
-
-    def _arrays_of(self, frame, name):
-        """Arrays (n,) at a muscle's vertices: those of `VertexArrays`, with the distance to bones
-        that it can reach, `FARTHEST` at most, and what its model adds, as ``level_offset``.
-        """
-        surface = frame.surfaces[name]
-        bones, distance = frame.bones.get(name), None
-        if bones is not None and bones.names:
-            distance = bones.distance(surface.vertices, frame.poses, self._farthest)
-            distance = np.minimum(distance, self._farthest)
-        mesh = surface.vertices, surface.faces
-        return self._arrays.of(name, mesh, distance) | dict(surface.arrays)
 
     def _write_bones(self, frame):
         """Bones where they are now: the mesh at rest once, and few triangles of one that has moved,
@@ -315,6 +299,13 @@ def build_info(
     for the default), ``verdict``, ``beyond`` (muscle, quantity, worst value, limit, frame),
     ``not_measured`` (muscle, quantity), ``frames`` (`frame_facts`).
     """
+    sources = [
+        scene.path,
+        scene.motion.options.file,
+        *(b.source for b in scene.bones),
+        *(m.source for m in scene.muscles),
+    ]
+    paths = [Path(source) for source in dict.fromkeys(str(source) for source in sources if source)]
     table = {
         "format": FORMAT,
         "started": started.isoformat(timespec="seconds"),
@@ -322,7 +313,12 @@ def build_info(
         "scene": record_scene(scene),
         "versions": versions(),
         "machine": machine(),
-        "inputs": input_hashes(scene),
+        # Files that are gone are left out.
+        "inputs": {
+            str(path): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in paths
+            if path.is_file()
+        },
         "muscles": {name: found for name, found in summary.items() if name != ALL},
         "frame_time": summary.get(ALL, {}).get("time_frame"),
         **facts,
@@ -365,20 +361,4 @@ def machine() -> dict[str, object]:
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
         "threads": thread_count(),
-    }
-
-
-def input_hashes(scene: Scene) -> dict[str, object]:
-    """SHA-256 of the scene file and of the meshes and motion that it names; files that are gone are
-    left out.
-    """
-    sources = [
-        scene.path,
-        scene.motion.options.file,
-        *(b.source for b in scene.bones),
-        *(m.source for m in scene.muscles),
-    ]
-    paths = [Path(source) for source in dict.fromkeys(str(source) for source in sources if source)]
-    return {
-        str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.is_file()
     }

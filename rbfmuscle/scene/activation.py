@@ -70,16 +70,8 @@ def make_contraction(muscle: Muscle) -> Contraction:
     SceneError on fibres outside it, or a tendon that covers all or nothing.
     """
     keys = muscle.contraction or ContractionTable()
-    _check_fibres(muscle)
-    stretch, tendon = keys.fibre_stretch_at_rest, keys.tendon_region
-    strain = TENDON_STRAIN if tendon is None else tendon.strain
-    return Contraction(stretch or 1.0, _tendon(muscle, tendon), strain, stretch is not None)
-
-
-def _check_fibres(muscle):
-    mesh = muscle.mesh
-    vertices = np.asarray(mesh.vertices, dtype=float)
-    distance = ExactDistance(vertices, np.asarray(mesh.faces))
+    vertices = np.asarray(muscle.mesh.vertices, dtype=float)
+    distance = ExactDistance(vertices, np.asarray(muscle.mesh.faces))
     limit = OUTSIDE * box_size(vertices)
     for number, line in enumerate(muscle.fibres or ()):
         outside = float(distance.signed_distance(np.asarray(line, dtype=float)).max())
@@ -89,6 +81,9 @@ def _check_fibres(muscle):
                 f"{outside:.4g} at worst "
                 f"({limit:.4g} is allowed); check its unit and frame"
             )
+    stretch, tendon = keys.fibre_stretch_at_rest, keys.tendon_region
+    strain = TENDON_STRAIN if tendon is None else tendon.strain
+    return Contraction(stretch or 1.0, _tendon(muscle, tendon), strain, stretch is not None)
 
 
 def _tendon(muscle: Muscle, given: TendonRegionTable | None) -> Booleans:
@@ -110,16 +105,6 @@ def _tendon(muscle: Muscle, given: TendonRegionTable | None) -> Booleans:
     if not (free & tendon).any():
         raise SceneError(f"{context}: holds no vertex beyond the attachments, make it longer")
     return tendon
-
-
-def check_activation(muscle: Muscle, motion: Motion) -> None:
-    """Raise SceneError where an activation goes by time and the motion has no times."""
-    given = None if muscle.contraction is None else muscle.contraction.activation
-    if isinstance(given, ActivationTable) and given.times is not None and motion.times is None:
-        raise SceneError(
-            f"muscle {muscle.name!r} activation: "
-            "goes by time, and the motion has none; give frames, or a motion file with time"
-        )
 
 
 def activation_curve(muscle: Muscle, motion: Motion) -> Floats:

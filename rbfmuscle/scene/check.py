@@ -251,15 +251,49 @@ def check_scene(scene: Scene) -> list[Finding]:
     findings += [Finding("warning", name, unusable) for name in scene.missing_bones]
     findings += [Finding("warning", scene.name, doubt) for doubt in scene.doubts]
     findings += [Finding("warning", place, doubt) for place, doubt in _mesh_doubts(scene)]
-    findings += _far_findings(scene)
+    away, size = _far(scene)
+    if away > FAR_SINGLE * size:
+        error = away * float(np.finfo(np.float32).eps) / 2.0
+        said = (
+            f"it lies {away:.3g} {scene.units} from the origin: in files of single precision (STL, "
+            f"PLY, GLB) places are wrong by up to {error:.2g} {scene.units}; move it near the "
+            "origin"
+        )
+        findings.append(Finding("warning", scene.name, said))
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
     findings += _rest_overlaps(scene)
-    findings += _neighbour_findings(scene)
-    findings += _guess_findings(scene)
+    overlaps = input_overlaps(input_distances(scene.muscles))
+    findings += [
+        Finding(
+            "note",
+            f"{one} and {other}",
+            f"the meshes of these muscles overlap by {found.depths.max():.3g} {scene.units}, "
+            f"{len(found.depths)} vertices lie in the other: what does so at rest counts apart",
+        )
+        for (one, other), found in sorted(overlaps.items(), key=lambda row: -row[1].depths.max())
+    ]
+    findings += [
+        Finding(
+            "warning",
+            f"{table} {guess.name}",
+            f"a doubtful guess ({guess.confidence:.1f}): {guess.text}; look at it in a picture, "
+            "correct it or remove its key guess",
+        )
+        for table in ("joint", "muscle")
+        for guess in doubtful(scene.guesses, table)
+    ]
     if scene.meshless_bones and not scene.bones:
         words = "no bone has a mesh, so nothing can be run; give the bones meshes"
         return sort_findings([*findings, Finding("note", scene.name, words)])
-    findings += _attachment_findings(scene)
+    surfaces = scene_surfaces(scene)
+    for muscle in scene.muscles:
+        share, bone_name = articular_share(muscle, scene, surfaces)
+        if share > MOST_ARTICULAR:
+            said = (
+                f"{100 * share:.0f} % of an attachment lies on an articular surface of "
+                f"{bone_name!r}; correct the attachment"
+            )
+            findings.append(Finding("warning", muscle.name, said))
     findings += [Finding("warning", name, text) for name, text in open_ends(scene).items()]
     try:
         findings += bone_findings(bone_collisions(scene), scene.units)
@@ -268,36 +302,6 @@ def check_scene(scene: Scene) -> list[Finding]:
     except RBFMuscleError as error:
         findings.append(Finding("error", scene.name, str(error)))
     return sort_findings(findings)
-
-
-def _guess_findings(scene):
-    """A warning for each doubtful guess of the file."""
-    said = "look at it in a picture, correct it or remove its key guess"
-    return [
-        Finding(
-            "warning",
-            f"{table} {guess.name}",
-            f"a doubtful guess ({guess.confidence:.1f}): {guess.text}; {said}",
-        )
-        for table in ("joint", "muscle")
-        for guess in doubtful(scene.guesses, table)
-    ]
-
-
-def _attachment_findings(scene):
-    """A warning for each attachment on an articular surface."""
-    surfaces = scene_surfaces(scene)
-    shares = ((muscle.name, *articular_share(muscle, scene, surfaces)) for muscle in scene.muscles)
-    return [
-        Finding(
-            "warning",
-            name,
-            f"{100 * share:.0f} % of an attachment lies on an articular surface of {bone!r}; "
-            "correct the attachment",
-        )
-        for name, share, bone in shares
-        if share > MOST_ARTICULAR
-    ]
 
 
 def end_gap(muscle: Muscle, scene: Scene) -> tuple[float, str]:
@@ -371,19 +375,6 @@ def _far(scene: Scene) -> tuple[float, float]:
     return float(np.abs(corners).max()), box_size(corners)
 
 
-def _far_findings(scene: Scene) -> list[Finding]:
-    """What single precision makes of places far from the origin."""
-    away, size = _far(scene)
-    if away <= FAR_SINGLE * size:
-        return []
-    error = away * float(np.finfo(np.float32).eps) / 2.0
-    said = (
-        f"it lies {away:.3g} {scene.units} from the origin: in files of single precision (STL, "
-        f"PLY, GLB) places are wrong by up to {error:.2g} {scene.units}; move it near the origin"
-    )
-    return [Finding("warning", scene.name, said)]
-
-
 def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
     """Return findings, the worst first."""
     return sorted(findings, key=lambda finding: ("error", "warning", "note").index(finding.level))
@@ -418,20 +409,6 @@ def _rest_overlaps(scene):
             )
         )
     return findings
-
-
-def _neighbour_findings(scene):
-    """A note for each pair of muscles whose meshes overlap."""
-    overlaps = input_overlaps(input_distances(scene.muscles))
-    return [
-        Finding(
-            "note",
-            f"{one} and {other}",
-            f"the meshes of these muscles overlap by {found.depths.max():.3g} {scene.units}, "
-            f"{len(found.depths)} vertices lie in the other: what does so at rest counts apart",
-        )
-        for (one, other), found in sorted(overlaps.items(), key=lambda row: -row[1].depths.max())
-    ]
 
 
 def check_initial(scene: Scene) -> None:

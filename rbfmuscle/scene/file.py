@@ -259,7 +259,13 @@ def read_tables(path: Path, *, including: tuple[Path, ...] = ()) -> Tables:
     """
     chain = (*including, path)
     text = _read_text(path)
-    data = _parse(path, text)
+    try:
+        data = tomllib.loads(text)
+    except RecursionError:
+        raise SceneError(f"{path}: not valid TOML: tables or lists are nested too deep") from None
+    except ValueError as error:  # TOML, and integers of thousands of digits
+        quotes = "; text stands in quotes" if str(error).startswith("Invalid value") else ""
+        raise SceneError(f"{path}: not valid TOML: {shown(str(error))}{quotes}") from None
     check_plain(data, context=f"{path}: ")
     about = data.get("scene")
     if isinstance(about, dict) and about.get("format") == 1:
@@ -267,7 +273,13 @@ def read_tables(path: Path, *, including: tuple[Path, ...] = ()) -> Tables:
             f"{path}: files of format 1 are read no more; write the scene anew by "
             f"docs/scene_file.md, with format = {FORMAT}"
         )
-    _refuse_marks(text, context=f"{path}: ")
+    for number, line in enumerate(text.splitlines(), start=1):
+        # Lines that are comments as a whole may say anything.
+        if _MARK.search(line) and not line.lstrip().startswith("#"):
+            raise SceneError(
+                f"{path}: line {number}: comments mark no guesses any more; give the joint or "
+                'attachment guess = { confidence = 0.5, reason = "..." }, or remove the word GUESS'
+            )
     names = data.pop("include", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise SceneError(f"{path}: include must be a list of names of files")
@@ -279,18 +291,6 @@ def read_tables(path: Path, *, including: tuple[Path, ...] = ()) -> Tables:
         moved = {key: _moved(value, Path(name).parent) for key, value in inner.items()}
         data = _merged(moved, data, f"{path}: include {name!r}: ")
     return data
-
-
-def _refuse_marks(text: str, *, context: str) -> None:
-    """SceneError where a comment in a scene file marks a guess; lines that are comments as a whole
-    may say anything.
-    """
-    for number, line in enumerate(text.splitlines(), start=1):
-        if _MARK.search(line) and not line.lstrip().startswith("#"):
-            raise SceneError(
-                f"{context}line {number}: comments mark no guesses any more; give the joint or "
-                'attachment guess = { confidence = 0.5, reason = "..." }, or remove the word GUESS'
-            )
 
 
 def _merged(inner: Tables, own: Tables, context: str) -> Tables:
@@ -307,15 +307,11 @@ def _merged(inner: Tables, own: Tables, context: str) -> Tables:
         first, second = inner.get(key), own.get(key)
         if isinstance(first, dict) and isinstance(second, dict):
             found[key] = first | second
-    first, second = (_units(data) for data in (inner, own))
+    abouts = (data.get("scene") for data in (inner, own))
+    first, second = (about.get("units") if isinstance(about, dict) else None for about in abouts)
     if None not in (first, second) and first != second:
         raise SceneError(f"{context}its lengths are in {shown(first)}, not in {shown(second)}")
     return found
-
-
-def _units(data: Tables) -> object:
-    about = data.get("scene")
-    return about.get("units") if isinstance(about, dict) else None
 
 
 def _moved(value: object, folder: Path, key: str = "") -> object:
@@ -344,16 +340,6 @@ def _read_text(path: Path) -> str:
         raise SceneError(f"{path}: cannot read the scene file: {error.strerror}") from None
     except UnicodeDecodeError:
         raise SceneError(f"{path}: not a text file in UTF-8, give a scene file (.toml)") from None
-
-
-def _parse(path: Path, text: str) -> Tables:
-    try:
-        return tomllib.loads(text)
-    except RecursionError:
-        raise SceneError(f"{path}: not valid TOML: tables or lists are nested too deep") from None
-    except ValueError as error:  # TOML, and integers of thousands of digits
-        quotes = "; text stands in quotes" if str(error).startswith("Invalid value") else ""
-        raise SceneError(f"{path}: not valid TOML: {shown(str(error))}{quotes}") from None
 
 
 def _check_format(number):

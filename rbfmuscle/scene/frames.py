@@ -19,10 +19,9 @@ from rbfmuscle.scene.joints import (
     all_coordinates,
     full_name,
 )
-from rbfmuscle.scene.names import plain_name
-from rbfmuscle.scene.objects import Motion
+from rbfmuscle.scene.objects import Motion, plain_name
 from rbfmuscle.scene.options import MAX_FRAMES, MotionOptions
-from rbfmuscle.validation import SceneError, UsageError, did_you_mean, listed, read_text, shown
+from rbfmuscle.validation import SceneError, UsageError, listed, read_text, shown
 
 
 def read_storage(
@@ -102,10 +101,24 @@ def read_motion_file(
         raise SceneError(
             f"[motion]: {path} row {row + 1}: {labels[used[column]]} is not a finite number"
         )
-    factor, notes = _angle_factor(path, header)
+    said, notes = header.get("indegrees"), []
+    if said is None:
+        notes.append(
+            f"{path} does not say inDegrees: "
+            "angles are taken as radians; add inDegrees=yes to its header"
+        )
+    elif said not in IN_DEGREES:
+        raise SceneError(f"[motion]: {path}: inDegrees={said} is neither yes nor no")
+    factor = IN_DEGREES.get(said or "no", 1.0)
     notes += _storage_notes(path, header, unknown, values.shape)
-    if "time" in labels:
-        notes += _time_notes(path, values[:, labels.index("time")])
+    times = values[:, labels.index("time")] if "time" in labels else None
+    back = np.flatnonzero(np.diff([] if times is None else times) <= 0.0)
+    if times is not None and len(back):
+        row = int(back[0])
+        notes.append(
+            f"{path}: {len(back)} times do not increase, the first after row {row + 1}, "
+            f"{times[row]:g} and {times[row + 1]:g} s; each row is a frame all the same"
+        )
     turns = {name: column for name, column in columns.items() if known[name].motion == "rotation"}
     if factor == 1.0:
         tracks = {name: values[:, column] for name, column in turns.items()}
@@ -120,7 +133,7 @@ def read_motion_file(
             tracks[name] = (values[:, column] * units[known[name].motion]).tolist()
     notes += _spike_notes(path, {name: tracks[name] for name in turns if name in tracks})
     frames = [{name: track[row] for name, track in tracks.items()} for row in range(len(values))]
-    return frames, values[:, labels.index("time")].tolist() if "time" in labels else None, notes
+    return frames, None if times is None else times.tolist(), notes
 
 
 def _storage_notes(path, header, unknown, shape):
@@ -159,18 +172,6 @@ def _spike_notes(path, tracks):
             others = f", and {len(rows) - 1} rows more" if len(rows) > 1 else ""
             notes.append(f"{path} row {row + 2}: {name} jumps {jump}{others}: is the row right?")
     return notes
-
-
-def _time_notes(path, times):
-    """Times that do not increase."""
-    back = np.flatnonzero(np.diff(times) <= 0.0)
-    if not len(back):
-        return []
-    row = int(back[0])
-    return [
-        f"{path}: {len(back)} times do not increase, the first after row {row + 1}, "
-        f"{times[row]:g} and {times[row + 1]:g} s; each row is a frame all the same"
-    ]
 
 
 def _degree_notes(path, known, tracks):
@@ -217,19 +218,6 @@ def match_label(label: str, known: list[str]) -> str | None:
     return None
 
 
-def _angle_factor(path, header):
-    """Radians in the file's unit of angles, and a note where the header does not say it."""
-    said = header.get("indegrees")
-    if said is None:
-        return 1.0, [
-            f"{path} does not say inDegrees: "
-            "angles are taken as radians; add inDegrees=yes to its header"
-        ]
-    if said not in IN_DEGREES:
-        raise SceneError(f"[motion]: {path}: inDegrees={said} is neither yes nor no")
-    return IN_DEGREES[said], []
-
-
 NOT_MOVED = 1e-9  # A locked coordinate may be given, at its rest value.
 # Share of a turn [radian] or of a length that rounding may take a coordinate beyond its range.
 RANGE_TOLERANCE = 1e-6
@@ -260,15 +248,6 @@ def make_motion(
         for frame in frames
     ]
     return Motion(frames, options=options, times=times, notes=notes)
-
-
-def check_coordinates(motion: Motion, joints: list[Joint]) -> None:
-    """Raise SceneError if a motion moves a coordinate that no joint has."""
-    known = all_coordinates(joints)
-    for name in (name for frame in motion.frames for name in frame):
-        if name not in known:
-            hint = did_you_mean(name, sorted(known))
-            raise SceneError(f"[motion]: unknown coordinate {name!r}, {hint}")
 
 
 def slice_motion(motion: Motion, frames: slice | str) -> Motion:

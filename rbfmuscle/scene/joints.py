@@ -519,7 +519,13 @@ class FunctionTable(Table):
         elif self.polynomial is not None:
             found = Polynomial(tuple(self.polynomial))
         elif self.terms is not None:
-            found = _multivariate(self.terms, count, context)
+            for term in self.terms:
+                if len(term) != count + 1 or any(power < 0 or power % 1 for power in term[1:]):
+                    raise SceneError(
+                        f"{context}: each of terms is a coefficient and the whole powers of "
+                        f"{count} coordinates, got {term}"
+                    )
+            found = Multivariate(tuple((c, *map(int, powers)) for c, *powers in self.terms))
         elif points is not None:
             found = (Spline if self.spline else PiecewiseLinear)(tuple(points.x), tuple(points.y))
         else:
@@ -536,16 +542,6 @@ class FunctionTable(Table):
         """The first slope of a linear function, 0 of any other."""
         plain = all(getattr(self, name) is None for name in FUNCTIONS)
         return 1.0 if plain else (self.linear or [0.0])[0]
-
-
-def _multivariate(terms, count, context):
-    for term in terms:
-        if len(term) != count + 1 or any(power < 0 or power % 1 for power in term[1:]):
-            raise SceneError(
-                f"{context}: each of terms is a coefficient and the whole powers of {count} "
-                f"coordinates, got {term}"
-            )
-    return Multivariate(tuple((c, *map(int, powers)) for c, *powers in terms))
 
 
 class AxisTable(FunctionTable):
@@ -602,7 +598,15 @@ class JointTable(Table):
     def joint(self) -> Joint:
         """Return the joint that the table describes, or raise SceneError naming it."""
         context = f"joint {self.name!r}"
-        kind = self.type or self._kind_by_turns(context)
+        kind = self.type
+        if kind is None:  # one to three axes, each of which is turned about
+            count = len(self.axes or self.coordinates)
+            if self.rotations or self.translations or not 0 < count < len(BY_TURNS):
+                raise SceneError(
+                    f"{context}: give its type; without one, "
+                    "one to three axes make a hinge, universal or ball joint"
+                )
+            kind = BY_TURNS[count]
         if self.centre is None and kind != "weld":
             raise SceneError(f"{context}: centre is missing, give the joint's place at rest")
         if (self.radii or self.arc) and (kind != "custom" or len(self.rotations) != 3):
@@ -631,28 +635,25 @@ class JointTable(Table):
             tuple(axis(motion, number, table) for number, table in enumerate(group, 1))
             for motion, group in groups.items()
         )
-        return self._made(kind, coordinates, turns, shifts)
-
-    def _made(self, kind, coordinates, turns, shifts):
-        """The joint of this kind, these coordinates, rotations and translations."""
         centre = np.array(self.centre or (0.0, 0.0, 0.0))
         radii = None
         if self.radii is not None:
             x, y, z = self.radii
             radii = x, y, z
-        bones = self.parent, self.child
-        motions = coordinates, turns, shifts, kind, self.backward
-        return Joint(self.name, *bones, centre, *motions, radii, self.arc, self.guess)
-
-    def _kind_by_turns(self, context):
-        """The kind where none is given: of one to three axes, each of which is turned about."""
-        count = len(self.axes or self.coordinates)
-        if self.rotations or self.translations or not 0 < count < len(BY_TURNS):
-            raise SceneError(
-                f"{context}: give its type; without one, "
-                "one to three axes make a hinge, universal or ball joint"
-            )
-        return BY_TURNS[count]
+        return Joint(
+            self.name,
+            self.parent,
+            self.child,
+            centre,
+            coordinates,
+            turns,
+            shifts,
+            kind,
+            self.backward,
+            radii,
+            self.arc,
+            self.guess,
+        )
 
     def _axes_of_kind(self, kind, context):
         """Tables of the rotations and of the translations of a kind; each is of one coordinate

@@ -17,28 +17,24 @@ from numpy.typing import ArrayLike
 from rbfmuscle.geometry.arrays import Floats, Integers, box_size
 from rbfmuscle.geometry.frames import numbered_by_place
 from rbfmuscle.geometry.surfaces import vertex_areas
-from rbfmuscle.scene.activation import (
-    check_activation,
-    contraction_keys,
-    make_contraction,
-)
+from rbfmuscle.scene.activation import contraction_keys, make_contraction
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.file import MuscleKeys
 from rbfmuscle.scene.joints import Joint, bones_between, rigid_body
 from rbfmuscle.scene.meshes.read import MeshInput, MeshTransform, as_mesh, read_fibres
 from rbfmuscle.scene.meshes.repair import ReadMesh
-from rbfmuscle.scene.names import find_named
 from rbfmuscle.scene.objects import (
     MM_PER_UNIT,
     Attachment,
-    LineTable,
     Motion,
     Muscle,
     ViaTable,
+    find_named,
     split_model,
 )
+from rbfmuscle.scene.options import ActivationTable
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable, select_vertices
-from rbfmuscle.scene.tendons import BonePoint, TendonEnd, tendon_name
+from rbfmuscle.scene.tendons import TendonEnd, tendon_name
 from rbfmuscle.validation import MeshError, SceneError
 
 
@@ -216,10 +212,20 @@ def tendon_ends(muscle: Muscle, bones: list[Bone], joints: list[Joint]) -> list[
     ends = []
     for attachment in muscle.attachments:
         if attachment.tendon is not None:
-            line = _line(attachment.bone, attachment.tendon)
-            middle, radius = _patch(
-                vertices[attachment.vertices], areas[attachment.vertices], line[0][1]
-            )
+            # Via points and insertion of the tendon.
+            line = [
+                (point.bone, np.array(point.point))
+                if isinstance(point, ViaTable)
+                else (attachment.bone, np.array(point))
+                for point in [*attachment.tendon.via, attachment.tendon.to]
+            ]
+            points, weights = vertices[attachment.vertices], areas[attachment.vertices]
+            middle = np.average(points, axis=0, weights=weights)
+            # About the line towards the tendon, of a disc with the same moment of area.
+            towards = line[0][1] - middle
+            direction = towards / max(float(np.linalg.norm(towards)), 1e-300)
+            away = np.linalg.norm(np.cross(points - middle, direction), axis=1)
+            radius = float(np.sqrt(2.0 * np.average(away**2, weights=weights)))
             section = abs(muscle.mesh.volume) / np.linalg.norm(vertices - middle, axis=1).max()
             thin = float(np.sqrt(THIN * section / np.pi))
             radii = radius, min(thin, radius)
@@ -241,26 +247,6 @@ def tendon_ends(muscle: Muscle, bones: list[Bone], joints: list[Joint]) -> list[
     return ends
 
 
-def _line(bone: str, tendon: LineTable) -> list[BonePoint]:
-    """Via points and insertion of a tendon to a bone."""
-    return [
-        (point.bone, np.array(point.point))
-        if isinstance(point, ViaTable)
-        else (bone, np.array(point))
-        for point in [*tendon.via, tendon.to]
-    ]
-
-
-def _patch(points: Floats, areas: Floats, towards: Floats) -> tuple[Floats, float]:
-    """Middle of an end, and its radius about the line towards the tendon, as of a disc with the
-    same moment of area.
-    """
-    middle = np.average(points, axis=0, weights=areas)
-    direction = (towards - middle) / max(float(np.linalg.norm(towards - middle)), 1e-300)
-    away = np.linalg.norm(np.cross(points - middle, direction), axis=1)
-    return middle, float(np.sqrt(2.0 * np.average(away**2, weights=areas)))
-
-
 def check_muscle(muscle: Muscle, motion: Motion) -> None:
     """Raise SceneError if fewer than two bones hold a muscle, or its fibres, tendon or activation
     do not fit it.
@@ -276,7 +262,12 @@ def check_muscle(muscle: Muscle, motion: Motion) -> None:
         )
     if muscle.contraction is not None:
         make_contraction(muscle)
-        check_activation(muscle, motion)
+        given = muscle.contraction.activation
+        if isinstance(given, ActivationTable) and given.times is not None and motion.times is None:
+            raise SceneError(
+                f"muscle {muscle.name!r} activation: "
+                "goes by time, and the motion has none; give frames, or a motion file with time"
+            )
 
 
 def check_file_names(bones: list[Bone], muscles: list[Muscle]) -> None:

@@ -194,14 +194,11 @@ class NeighbourOptions(Table):
         return self.model_copy(update={"pairs": pairs, "bones": bones})
 
 
-def _accept_neighbours(value: object) -> object:
-    """False stands for none, true for the usual ones."""
-    if isinstance(value, bool):
-        return NeighbourOptions() if value else None
-    return value
-
-
-Neighbours = Annotated[NeighbourOptions | None, BeforeValidator(_accept_neighbours)]
+# False stands for none, true for the usual ones.
+Neighbours = Annotated[
+    NeighbourOptions | None,
+    BeforeValidator(lambda x: (NeighbourOptions() if x else None) if isinstance(x, bool) else x),
+]
 
 
 class TunnellingOptions(Table):
@@ -231,16 +228,16 @@ def _accept_format(value: object) -> object:
 DEFAULT_FIBRES, MOST_FIBRES = 32, 1000  # of each muscle
 
 
-def _accept_true(value: object) -> object:
-    """True stands for the usual number of fibres, false for none."""
-    return DEFAULT_FIBRES * value if isinstance(value, bool) else value
-
-
 class OutputOptions(Table):
     """``[output]``: which files a run writes, and how many fibres of each muscle it follows."""
 
     surfaces: Annotated[bool, BeforeValidator(_accept_format)] = True
-    fibres: Annotated[int, Field(ge=0, le=MOST_FIBRES), BeforeValidator(_accept_true)] = 0
+    # True stands for the usual number of fibres, false for none.
+    fibres: Annotated[
+        int,
+        Field(ge=0, le=MOST_FIBRES),
+        BeforeValidator(lambda x: DEFAULT_FIBRES * x if isinstance(x, bool) else x),
+    ] = 0
     report: bool = True
 
 

@@ -98,13 +98,6 @@ class Tube:
             (self.thickness * w / g)[:, None] * thin,
         )
 
-    def points_inside(self, u: Floats, across: float, thick: float) -> Floats:
-        """Points at fractions u of the axis and fixed fractions (within the unit disc) of the
-        half-axes.
-        """
-        centre, wide, thin = self.sections(u)
-        return centre + across * wide + thick * thin
-
     def mesh(self, spacing: float) -> tuple[Floats, Integers, Floats]:
         """Closed outward triangles with edges of about ``spacing``, vertices on the tube.
 
@@ -264,6 +257,7 @@ def solid_mesh(
 PHANTOM = "phantom"
 HEAD_RADIUS = 23.0  # of the femur [mm]
 SOCKET_RADIUS = 26.5  # [mm]
+BONE_EDGE = 3.5  # of the cells from which bones are drawn [mm]
 AXES = {"flexion": (-1, 0, 0), "adduction": (0, -1, 0), "internal_rotation": (0, 0, 1)}
 
 
@@ -301,11 +295,11 @@ def pelvis_distance(points: Floats) -> Floats:
 
 
 @functools.cache
-def bone_meshes(spacing: float = 3.5) -> dict[str, object]:
+def bone_meshes() -> dict[str, object]:
     """Vertices and faces of both bones, by name."""
     return {
-        "pelvis": solid_mesh(pelvis_distance, (-45, -75, -120), (115, 110, 165), spacing),
-        "femur": solid_mesh(femur_distance, (-85, -50, -435), (50, 55, 40), spacing),
+        "pelvis": solid_mesh(pelvis_distance, (-45, -75, -120), (115, 110, 165), BONE_EDGE),
+        "femur": solid_mesh(femur_distance, (-85, -50, -435), (50, 55, 40), BONE_EDGE),
     }
 
 
@@ -337,7 +331,7 @@ MUSCLES = {
     ),
 }
 # Muscle vertices within the first and last parts of the axis, and this near to the bone [mm], are
-# attached.
+# attached. Fibres lie at fixed fractions, within the unit disc, of the half-axes.
 ATTACHED_ENDS = {"extensor": (0.17, 0.83), "abductor": (0.3, 0.87)}
 USUAL_ENDS, ATTACHED_WITHIN = (0.12, 0.88), 6.0
 FIBRE_PLACES = ((0, 0), (0.55, 0), (-0.55, 0), (0, 0.5), (0, -0.5))
@@ -360,7 +354,8 @@ def _parts(spacing):
             Attachment("femur", np.flatnonzero((u >= last) & near["femur"])),
         ]
         along = np.linspace(0.02, 0.98, FIBRE_POINTS)
-        fibres = [tube.points_inside(along, across, thick) for across, thick in FIBRE_PLACES]
+        centre, wide, thin = tube.sections(along)
+        fibres = [centre + across * wide + thick * thin for across, thick in FIBRE_PLACES]
         muscles[name] = ((vertices, faces), attach, fibres)
     return bone_meshes(), muscles
 

@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.content import Compared
 from rbfmuscle.scene.file import ABOUT, FORMAT, SceneFile, SceneFiles, given_keys, read_scene_file
-from rbfmuscle.scene.frames import check_coordinates, make_motion, slice_motion
+from rbfmuscle.scene.frames import make_motion, slice_motion
 from rbfmuscle.scene.joints import (
     Coupling,
     CouplingTable,
     Joint,
     JointTable,
+    all_coordinates,
     check_tree,
     make_coupling,
     ordered,
@@ -40,8 +41,15 @@ from rbfmuscle.scene.muscles import (
     make_muscle,
     tendon_ends,
 )
-from rbfmuscle.scene.names import check_new_name, find_named
-from rbfmuscle.scene.objects import MM_PER_UNIT, Attachment, Motion, Muscle, from_mm
+from rbfmuscle.scene.objects import (
+    MM_PER_UNIT,
+    Attachment,
+    Motion,
+    Muscle,
+    check_new_name,
+    find_named,
+    from_mm,
+)
 from rbfmuscle.scene.options import (
     ContactOptions,
     DetectOptions,
@@ -52,7 +60,7 @@ from rbfmuscle.scene.options import (
 )
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable
 from rbfmuscle.scene.settings import TABLES, change_settings
-from rbfmuscle.validation import MeshError, SceneError, UsageError
+from rbfmuscle.validation import MeshError, SceneError, UsageError, did_you_mean
 
 DOUBTFUL = 0.6  # a guess of less confidence is reported by check and by the verdict of a run
 
@@ -188,7 +196,7 @@ class Scene(Compared):
         MeshError
             If a mesh cannot be used.
         """
-        from rbfmuscle.importers.scenes import scene_from_meshes
+        from rbfmuscle.importers.guess.guess import scene_from_meshes
 
         return scene_from_meshes(Path(folder), units=units)
 
@@ -212,7 +220,7 @@ class Scene(Compared):
         UsageError
             If it holds no bone or no muscle.
         """
-        from rbfmuscle.importers.scenes import scene_from_labels
+        from rbfmuscle.importers.volumes import scene_from_labels
 
         names = None if labels is None else Path(labels)
         return scene_from_labels(Path(path), labels=names)
@@ -237,11 +245,11 @@ class Scene(Compared):
         SceneError
             If the model cannot be read.
         """
-        from rbfmuscle.importers.scenes import scene_from_osim
+        from rbfmuscle.importers.opensim.scene import import_osim
 
-        return scene_from_osim(
-            Path(path), geometry=[Path(one) for one in geometry], muscles=muscles
-        )
+        found = import_osim(path, geometry=[Path(one) for one in geometry], muscles=muscles)
+        found.scene.notes += found.notes
+        return found.scene
 
     def save(self, path: str | Path, *, folder: Path | None = None, comment: str = "") -> Path:
         """Write the scene as a TOML file that loads as the same scene, and return its path.
@@ -491,7 +499,11 @@ def require_complete(scene: Scene) -> Scene:
             raise SceneError(f"scene {scene.name!r} has no {what}, add a [[{what[:-1]}]]")
     check_file_names(scene.bones, scene.muscles)
     _check_neighbours(scene, scene.neighbours)
-    check_coordinates(scene.motion, scene.joints)
+    known = all_coordinates(scene.joints)
+    for name in (name for frame in scene.motion.frames for name in frame):
+        if name not in known:
+            hint = did_you_mean(name, sorted(known))
+            raise SceneError(f"[motion]: unknown coordinate {name!r}, {hint}")
     for muscle in scene.muscles:
         with _naming(muscle.name):
             check_muscle(muscle, scene.motion)

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rbfmuscle.scene.activation import contraction_keys
-from rbfmuscle.scene.names import find_named
-from rbfmuscle.scene.objects import Muscle, split_model
+from rbfmuscle.scene.objects import Muscle, find_named, split_model
 from rbfmuscle.scene.options import (
     KEYS,
     MotionOptions,
@@ -48,7 +47,13 @@ def change_settings(
         head, _, rest = key.partition(".")
         chosen = muscles
         if head == "muscle":
-            name, head, rest = split_muscle_key(key)
+            name, _, inner = rest.partition(".")
+            head, _, rest = inner.partition(".")
+            if head != "model" and head not in KEYS:
+                raise SceneError(
+                    f"{key}: of a muscle its model (muscle.{name}.model.KEY) and "
+                    f"{', '.join(KEYS)} can be set"
+                )
             chosen = [find_named(muscles, name, "muscle")]
         if head == "model" or head in KEYS:
             set_on_muscles(chosen, head, rest, value, key)
@@ -60,20 +65,6 @@ def change_settings(
             raise SceneError(f"{key}: name a key of the table, for instance {head}.KEY=VALUE")
         else:
             tables[head] = changed_table(tables[head], rest, value, key, folder)
-
-
-def split_muscle_key(key: str) -> tuple[str, str, str]:
-    """Name, head and rest of a key ``muscle.NAME.HEAD.REST``."""
-    _, _, inner = key.partition(".")
-    name, _, inner = inner.partition(".")
-    head, _, rest = inner.partition(".")
-    if head != "model" and head not in KEYS:
-        raise SceneError(
-            f"{key}: of a muscle "
-            f"its model (muscle.{name}.model.KEY) and {', '.join(KEYS)}"
-            " can be set"
-        )
-    return name, head, rest
 
 
 def set_on_muscles(

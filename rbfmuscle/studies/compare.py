@@ -253,7 +253,7 @@ class Measure(NamedTuple):
 
 
 DEEPER = "depth_beyond_rest"
-_ROWS: dict[str, tuple[str, str, str, float, str]] = {
+_ROWS: dict[str, tuple] = {
     "volume_error": ("volume error", "1", LAW, 1e-5, "relative to the input mesh"),
     DEEPER: ("depth beyond rest", "length", LAW, 0.02, "of muscle or bone, less that at rest"),
     "penetration_max": ("surface in a bone", "length", LAW, 0.02, "deepest vertex"),
@@ -262,9 +262,16 @@ _ROWS: dict[str, tuple[str, str, str, float, str]] = {
     "neighbour_overlap_max": ("muscles overlap", "length", LAW, 0.02, "depth beyond that at rest"),
     "neighbour_gap": ("gap of muscles", "length", LAW, 0.1, "where they touched at rest, 95 %"),
     "initial_overlap": ("overlap left at rest", "length", LAW, 0.02, "of muscle and bones"),
-    "bowing": ("bowing", "1", LAW, 0.005, "centreline over shortest path"),
+    "bowing": ("bowing", "1", LAW, 0.005, "centreline over shortest path", 1.0),
     "components": ("pieces", "1", LAW, 0.0, "connected pieces, most in any frame"),
-    "euler_characteristic": ("Euler characteristic", "1", LAW, 0.0, "2; two less for a handle"),
+    "euler_characteristic": (
+        "Euler characteristic",
+        "1",
+        LAW,
+        0.0,
+        "2; two less for a handle",
+        2.0,
+    ),
     "self_crossings": ("self-crossings", "1", LAW, 0.0, "triangles that cross others"),
     "unfitted_fraction": ("surface not fitted", "1", LAW, 1e-4, "share of vertices off the field"),
     "flicker": ("flicker", "length", LAW, 0.05, "off the material mesh, change between frames"),
@@ -291,8 +298,7 @@ _ROWS: dict[str, tuple[str, str, str, float, str]] = {
     "time_one_thread": ("time on one thread", "s", COST, 0.0, "median of the first frames"),
     "time_build": ("time to build", "s", COST, 0.0, "all muscles, once, with filled caches"),
 }
-_IDEAL = {"bowing": 1.0, "euler_characteristic": 2.0}  # 0 of all others
-MEASURES = {name: Measure(*row, _IDEAL.get(name, 0.0)) for name, row in _ROWS.items()}
+MEASURES = {name: Measure(*row) for name, row in _ROWS.items()}
 FROM_METRICS = [name for name, m in MEASURES.items() if m.against in (LAW, MESH) and name != DEEPER]
 
 
@@ -300,15 +306,6 @@ VALUE_COLUMNS = ("model", "muscle", "quantity", "value", "unit", "against")
 
 # Values by muscle, "all" included, and quantity.
 Values = dict[str, dict[str, float]]
-
-
-class MeasureFacts(BaseModel):
-    """A measure: its unit, and the words of its row of `MEASURES`."""
-
-    unit: str
-    title: str
-    against: str
-    meaning: str
 
 
 class Spread(BaseModel):
@@ -324,8 +321,9 @@ class Comparison(BaseModel, Study):
     ``poses`` are the numbers of the frames at which distances were measured, ``labels`` models as
     tables name them, ``failed`` why models were not solved, ``answer`` all of it in sentences,
     ``within`` how many muscles of each model are within all limits, ``unknowns`` the points that
-    each model solves for, in words, by model and muscle. ``results`` are by model; ``statistics``
-    by model, muscle and quantity, of moment arms ``"moment_arm:COORDINATE"``.
+    each model solves for, in words, by model and muscle. ``measures`` are the unit of each measure,
+    and the words of its row of `MEASURES`. ``results`` are by model; ``statistics`` by model,
+    muscle and quantity, of moment arms ``"moment_arm:COORDINATE"``.
     """
 
     command: ClassVar[str] = "compare"
@@ -342,7 +340,7 @@ class Comparison(BaseModel, Study):
     answer: str
     within: dict[str, int] = {}
     unknowns: dict[str, dict[str, str]]
-    measures: dict[str, MeasureFacts]
+    measures: dict[str, dict[str, str]]
     results: dict[str, Values]
     statistics: dict[str, dict[str, dict[str, Spread]]]
     machine: dict[str, str | int | None]
@@ -370,7 +368,8 @@ class Comparison(BaseModel, Study):
             for muscle, values in muscles.items():
                 for name, measure in self.measures.items():
                     if name in values:
-                        yield model, muscle, name, values[name], measure.unit, measure.against
+                        unit, against = measure["unit"], measure["against"]
+                        yield model, muscle, name, values[name], unit, against
 
 
 FORMAT = 4  # of comparison.json
@@ -503,12 +502,12 @@ def write_tables(
         within={name: len(runs[name].muscles) - len(found[ALL]) for name, found in beyond.items()},
         unknowns={name: unknowns[name] for name in results},
         measures={
-            name: MeasureFacts(
-                unit=unit_text(m.kind, scene.units),
-                title=m.title,
-                against=m.against,
-                meaning=m.meaning,
-            )
+            name: {
+                "unit": unit_text(m.kind, scene.units),
+                "title": m.title,
+                "against": m.against,
+                "meaning": m.meaning,
+            }
             for name, m in MEASURES.items()
         },
         results=results,
@@ -518,17 +517,14 @@ def write_tables(
     )
     write_json(folder / "comparison.json", table.model_dump())
     write_csv(folder / "comparison.csv", [VALUE_COLUMNS, *table.value_rows()])
-    write_csv(folder / "statistics.csv", _statistics_rows(table))
-    return table
-
-
-def _statistics_rows(table: Comparison) -> Iterator[tuple[object, ...]]:
-    yield "model", "muscle", "quantity", "mean", "sd", "unit"
+    rows: list[tuple[object, ...]] = [("model", "muscle", "quantity", "mean", "sd", "unit")]
     for model, muscles in table.statistics.items():
         for muscle, quantities in muscles.items():
             for name, spread in quantities.items():
                 unit = unit_text(QUANTITIES[quantity_of(name)][0], table.units)
-                yield model, muscle, name, spread.mean, spread.sd, unit
+                rows.append((model, muscle, name, spread.mean, spread.sd, unit))
+    write_csv(folder / "statistics.csv", rows)
+    return table
 
 
 # A model keeps out of bones that is no deeper in one [mm].
@@ -764,7 +760,7 @@ def _light(found: Comparison, quantity: str, limit: float | None) -> CheckRow:
 
 def shown(found: Comparison, quantity: str, value: float | None) -> str:
     """A value of a measure with its unit; lengths that do not count as zero."""
-    measure, unit = MEASURES[quantity], found.measures[quantity].unit
+    measure, unit = MEASURES[quantity], found.measures[quantity]["unit"]
     if value is not None and unit == "mm" and abs(value) < 0.5 * measure.floor:
         value = 0.0
     return shown_number(value, unit)

@@ -143,7 +143,12 @@ def study_kernels(
             study.rows += [one.row for one in found]
             study.surfaces += [one.surface for one in found]
             done += fits
-        write_study(study, folder)
+        with kernels_folder(folder).staged() as staged:
+            table = [[getattr(row, name) for name in _columns()] for row in study.rows]
+            write_csv(staged / "kernels.csv", [_columns(), *table])
+            text = json_text(study.model_dump())
+            (staged / "kernels.json").write_text(text, encoding="utf-8")
+            write_page(staged, study)
         return study.kept_in(folder, own=directory is None)
 
 
@@ -753,15 +758,6 @@ surface."""
 def kernels_folder(directory: str | Path) -> OutputFolder:
     """The folder of a kernel study; UsageError if something in it is in the way."""
     return OutputFolder(directory, "kernels", (*FILES, "error.json"))
-
-
-def write_study(study: KernelStudy, directory: str | Path) -> None:
-    """Write ``kernels.csv``, ``kernels.json`` and ``kernels.html`` of a study."""
-    with kernels_folder(directory).staged() as stage:
-        rows = [[getattr(row, name) for name in _columns()] for row in study.rows]
-        write_csv(stage / "kernels.csv", [_columns(), *rows])
-        (stage / "kernels.json").write_text(json_text(study.model_dump()), encoding="utf-8")
-        write_page(stage, study)
 
 
 def _columns() -> list[str]:

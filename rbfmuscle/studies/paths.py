@@ -186,40 +186,37 @@ def _measured(scene, models, gauges, poses, names, fields):
     rest = [model.snapshot() for model in models]
     loop = None
     for pose in poses:
-        row = None if loop is None else _tried(loop, gauges, pose, names)
+        row = None if loop is None else _row(loop, gauges, pose, names)
         if row is None:
             for model, state in zip(models, rest):
                 model.restore(state)
             loop = FrameLoop(scene, models, bone_sdfs=fields, surfaces=False)
             loop.activations.target = loop.activations.at(0)  # the same in all solves
-            row = _tried(loop, gauges, pose, names)
+            row = _row(loop, gauges, pose, names)
         if row is None:
             loop = None
             row = np.array([[np.nan] * (1 + len(names)) + [0.0]] * len(gauges.names))
         yield row
 
 
-def _tried(loop, gauges, pose, names):
-    """The row of a pose, None where it cannot be solved."""
-    try:
-        return _row(loop, gauges, pose, names)
-    except SolveError:
-        return None
-
-
 def _row(loop, gauges, pose, names):
-    """Length and arms of the gauges at a pose, and whether they did not settle, (n, 2 + d)."""
+    """Length and arms of the gauges at a pose, and whether they did not settle, (n, 2 + d); None
+    where it cannot be solved.
+    """
     for stepper in loop.steppers:
         stepper.events.clear()
-    here, arms = _settled(loop, gauges, pose), []
-    known = all_coordinates(loop.scene.joints)
-    for name in names:
-        value = pose[name]
-        turns = known[name].motion != "translation"
-        step = math.radians(STEP) if turns else from_mm(STEP, loop.scene.units)
-        ends = [known[name].clamped_value(value + side * step) for side in (-1.0, 1.0)]
-        below, above = (_settled(loop, gauges, {**pose, name: end}) for end in ends)
-        arms.append(-(above - below) / (ends[1] - ends[0]))
+    arms, known = [], all_coordinates(loop.scene.joints)
+    try:
+        here = _settled(loop, gauges, pose)
+        for name in names:
+            value = pose[name]
+            turns = known[name].motion != "translation"
+            step = math.radians(STEP) if turns else from_mm(STEP, loop.scene.units)
+            ends = [known[name].clamped_value(value + side * step) for side in (-1.0, 1.0)]
+            below, above = (_settled(loop, gauges, {**pose, name: end}) for end in ends)
+            arms.append(-(above - below) / (ends[1] - ends[0]))
+    except SolveError:
+        return None
     capped = [any(key[2] == "iteration_cap" for key in s.events) for s in loop.steppers]
     return np.stack([here, *arms, np.repeat(capped, gauges.counts)], axis=1)
 
@@ -314,28 +311,23 @@ def _ranges(scene, names, given):
         raise UsageError(
             f"range of {name}: none of the muscles depends on it, or it is locked or follows others"
         )
-    found = {name: _range(scene, name, given) for name in names}
-    missing = [name for name, ends in found.items() if ends is None]
+    found, known = {}, all_coordinates(scene.joints)
+    for name in names:
+        moved = [frame[name] for frame in scene.motion.frames if name in frame]
+        covered = min(moved, default=0.0), max(moved, default=0.0)
+        for ends in (given.get(name), known[name].range, covered):
+            if name not in found and ends is not None and ends[0] < ends[1]:
+                found[name] = tuple(known[name].clamped_value(end) for end in ends)
+                if found[name][0] == found[name][1]:
+                    raise UsageError(
+                        f"range of {name}: it lies outside the range that clamps the coordinate"
+                    )
+    missing = [name for name in names if name not in found]
     if missing:
         raise UsageError(
             f"without a range: {', '.join(missing)}; give each LOW:HIGH, or a value that it holds"
         )
     return found
-
-
-def _range(scene, name, given):
-    """The range of one coordinate, None where it has none."""
-    moved = [frame[name] for frame in scene.motion.frames if name in frame]
-    fact = all_coordinates(scene.joints)[name]
-    for ends in (given.get(name), fact.range, (min(moved, default=0.0), max(moved, default=0.0))):
-        if ends is not None and ends[0] < ends[1]:
-            low, high = (fact.clamped_value(end) for end in ends)
-            if low == high:
-                raise UsageError(
-                    f"range of {name}: it lies outside the range that clamps the coordinate"
-                )
-            return low, high
-    return None
 
 
 def paths_folder(directory: Path) -> OutputFolder:

@@ -17,7 +17,7 @@ from rbfmuscle.run.data import RunData
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import RBFMuscleError, SolveError
-from rbfmuscle.viewer.server import open_server
+from rbfmuscle.viewer import open_server
 from rbfmuscle.viewer.side import COLOURINGS, KINDS, ModelView, ViewSettings, legend
 from rbfmuscle.viewer.sources import LiveSource, SavedSource
 
@@ -106,21 +106,18 @@ class Panel:
         self.view = gui.add_button_group("View", [view.capitalize() for view in VIEWS])
         self.cut = self._watch(gui.add_dropdown("Cut along", ("none", "x", "y", "z")))
         self.place = self._watch(gui.add_slider("Cut at", 0.0, 1.0, 0.01, 0.5))
-        self._add_marks()
+        marks, folder = self.source.marks, self.gui.add_folder
+        kinds = KINDS if marks.held else KINDS[-1:]
+        with folder("Marks", expand_by_default=False):
+            self.marks = {kind: self._watch(self.gui.add_checkbox(kind, False)) for kind in kinds}
+        if marks.doubts:
+            with folder(f"Doubts ({len(marks.doubts)})", expand_by_default=False):
+                lines = "".join(f"<li>{html.escape(doubt)}</li>" for doubt in marks.doubts)
+                gui.add_html(f"<ul style='font-size:12px;padding:0 24px'>{lines}</ul>")
         self.eyes = {}
         for title, names in (("Muscles", self.source.muscles), ("Bones", self.source.bones)):
             with gui.add_folder(title, expand_by_default=False):
                 self.eyes |= {name: self._watch(gui.add_checkbox(name, True)) for name in names}
-
-    def _add_marks(self) -> None:
-        marks = self.source.marks
-        kinds = KINDS if marks.held else KINDS[-1:]
-        with self.gui.add_folder("Marks", expand_by_default=False):
-            self.marks = {kind: self._watch(self.gui.add_checkbox(kind, False)) for kind in kinds}
-        if marks.doubts:
-            with self.gui.add_folder(f"Doubts ({len(marks.doubts)})", expand_by_default=False):
-                lines = "".join(f"<li>{html.escape(doubt)}</li>" for doubt in marks.doubts)
-                self.gui.add_html(f"<ul style='font-size:12px;padding:0 24px'>{lines}</ul>")
 
     def look(self) -> ViewSettings:
         """All that decides how a picture is shown."""
@@ -151,17 +148,14 @@ class Panel:
         if self.frame.value != self._followed:
             self._followed = self.frame.value
             self.move_to(self.source.motion[self.frame.value])
-        else:
-            self._followed = self.frame.value = self._nearest_frame()
-
-    def _nearest_frame(self) -> int:
-        """The frame of the motion nearest to the controls, in shares of their ranges; the last one
-        followed where others are as near.
-        """
+            return
+        # The nearest in shares of the controls' ranges; the last one where others are as near.
         here = np.array([self.controls[name].value for name in self._moved])
         away = np.linalg.norm((self._motion - here) / self._span, axis=1)
         least = int(np.argmin(away))
-        return least if away[least] < away[self._followed] - 1e-9 else self._followed
+        if away[least] < away[self._followed] - 1e-9:
+            self._followed = least
+        self.frame.value = self._followed
 
     def write(self, sides: list[ModelView], texts: list[str]) -> None:
         """Write the scale of the colours, the numbers of all muscles and texts."""

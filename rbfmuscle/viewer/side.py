@@ -12,7 +12,7 @@ import trimesh
 from rbfmuscle.geometry.arrays import Floats, Integers, to_world
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import EdgeStretch, clustered, joined_meshes, mesh_volume
-from rbfmuscle.metrics.rows import surface_depth
+from rbfmuscle.metrics.quantities import surface_depth
 from rbfmuscle.run.appearance import (
     BONE_COLOUR,
     LONG,
@@ -24,11 +24,11 @@ from rbfmuscle.run.appearance import (
 )
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.tendons import tendon_name
+from rbfmuscle.simulation.frame import Mesh
 from rbfmuscle.viewer.sources import (
     LiveFigure,
     LiveSource,
     Marks,
-    Mesh,
     Picture,
     SavedFigure,
     SavedSource,
@@ -73,36 +73,34 @@ class MarkView:
             node.visible = False
         if "Joint axes" in shown:
             for name, axes in self._marks.axes.items():
-                if axes.parent in poses:
-                    self._add_axes(name, to_world(axes.lines, poses[axes.parent]))
+                if axes.parent not in poses:
+                    continue
+                lines = to_world(axes.lines, poses[axes.parent])
+                place, points = f"{self._root}/axes/{name}", lines * self._factor
+                if place not in self._nodes:
+                    colours = np.broadcast_to(np.array(AXIS_COLOUR), lines.shape)
+                    self._nodes[place] = self._server.scene.add_line_segments(
+                        place, points, colours, thickness=3.0, thickness_units="screen"
+                    )
+                self._nodes[place].points = points
+                self._nodes[place].visible = True
+                self._add_name(name, lines[0].mean(axis=0))
         if "Attachments" in shown:
             for number, held in enumerate(self._marks.held):
-                if held.muscle not in hidden:
-                    self._add_points(number, to_world(held.points, poses[held.bone]))
+                if held.muscle in hidden:
+                    continue
+                points = to_world(held.points, poses[held.bone]) * self._factor
+                place = f"{self._root}/held/{number}"
+                if place not in self._nodes:
+                    self._nodes[place] = self._server.scene.add_point_cloud(
+                        place, points, HELD_COLOUR, point_size=POINT
+                    )
+                self._nodes[place].points = points
+                self._nodes[place].visible = True
         if "Names" in shown:
             for name, (vertices, _) in surfaces.items():
                 if name not in hidden:
                     self._add_name(name, vertices.mean(axis=0))
-
-    def _add_axes(self, name: str, lines: Floats) -> None:
-        place, points = f"{self._root}/axes/{name}", lines * self._factor
-        if place not in self._nodes:
-            colours = np.broadcast_to(np.array(AXIS_COLOUR), lines.shape)
-            self._nodes[place] = self._server.scene.add_line_segments(
-                place, points, colours, thickness=3.0, thickness_units="screen"
-            )
-        self._nodes[place].points = points
-        self._nodes[place].visible = True
-        self._add_name(name, lines[0].mean(axis=0))
-
-    def _add_points(self, number: int, points: Floats) -> None:
-        place, points = f"{self._root}/held/{number}", points * self._factor
-        if place not in self._nodes:
-            self._nodes[place] = self._server.scene.add_point_cloud(
-                place, points, HELD_COLOUR, point_size=POINT
-            )
-        self._nodes[place].points = points
-        self._nodes[place].visible = True
 
     def _add_name(self, name: str, middle: Floats) -> None:
         place = f"{self._root}/names/{name}"

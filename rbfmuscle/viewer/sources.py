@@ -11,10 +11,10 @@ import numpy as np
 from rbfmuscle.anatomy.bones import orient_scene
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.fibres import build_bundles
-from rbfmuscle.geometry.arrays import Floats, Integers, unit
+from rbfmuscle.geometry.arrays import Floats, unit
 from rbfmuscle.geometry.surfaces import clustered
 from rbfmuscle.metrics.centreline import Centreline
-from rbfmuscle.metrics.rows import moment_arms, reaches
+from rbfmuscle.metrics.quantities import moment_arms, reaches
 from rbfmuscle.metrics.verdict import describe_doubts
 from rbfmuscle.models import build_models, configure_scene, model_names
 from rbfmuscle.run.appearance import muscle_colours, muscle_groups, tendon_mesh
@@ -26,11 +26,10 @@ from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_si
 from rbfmuscle.scene.objects import body_axes, from_mm
 from rbfmuscle.scene.scene import Scene, doubtful, require_complete
 from rbfmuscle.scene.tendons import tendon_name
-from rbfmuscle.simulation.frame import FibreLines, Frame, MuscleModel
+from rbfmuscle.simulation.frame import FibreLines, Frame, Mesh, MuscleModel
 from rbfmuscle.simulation.live import LiveSession, live_fields
 from rbfmuscle.validation import UsageError
 
-Mesh = tuple[Floats, Integers]
 REACH = 25.0  # of a joint's axis to either side of its centre [mm]
 
 
@@ -180,10 +179,20 @@ class LiveFigure:
     """New models of a session's muscles that follow coordinates set by hand."""
 
     def __init__(self, session: LiveSession, models: list[MuscleModel]) -> None:
-        self.session, self._unfinished = session, True
-        self._bundles = build_bundles(session.scene, models)
-        self._lengths = LengthTrail(session.scene, models)
-        self.stride = math.radians(session.scene.contact.substep_angle)
+        self.session, self._unfinished, scene = session, True, session.scene
+        self._bundles = build_bundles(scene, models)
+        known = all_coordinates(scene.joints)
+        shifts = {name for name, fact in known.items() if fact.motion == "translation"}
+        self._reach = reaches(known, shifts, scene.units)
+        meshes = {model.name: model.material_mesh() for model in models}
+        self._lines = {
+            muscle.name: Centreline(muscle, scene.joints, *meshes[muscle.name])
+            for muscle in scene.muscles
+            if sum(not held.via for held in muscle.attachments) > 1
+        }
+        # Coordinates and lengths of muscles in the last pictures.
+        self._trail: list[tuple[dict[str, float], list[float]]] = []
+        self.stride = math.radians(scene.contact.substep_angle)
         session.use(models)
 
     def set(self, name: str, value: float) -> None:
@@ -196,7 +205,7 @@ class LiveFigure:
     def rest(self) -> None:
         """Put models and bones back to rest; the target stays."""
         self.session.reset()
-        self._lengths.clear()
+        self._trail = []
         self._unfinished = True
 
     @property
@@ -224,45 +233,23 @@ class LiveFigure:
         known = {name: depth for name, depth in depths.items() if depth is not None}
         places = frame.poses, frame.tendons
         fibres = {name: bundle.at(*places) for name, bundle in self._bundles.items()}
-        arms = self._lengths.moment_arms(frame)
+        arms = self._moment_arms(frame)
         return Picture(frame.poses, surfaces, tendons, frame.activations, known, "", fibres, arms)
 
-
-class LengthTrail:
-    """Lengths of muscles in the last pictures, and their moment arms by these."""
-
-    def __init__(self, scene: Scene, models: list[MuscleModel]) -> None:
-        known = all_coordinates(scene.joints)
-        shifts = {name for name, fact in known.items() if fact.motion == "translation"}
-        self._reach = reaches(known, shifts, scene.units)
-        meshes = {model.name: model.material_mesh() for model in models}
-        self._lines = {
-            muscle.name: Centreline(muscle, scene.joints, *meshes[muscle.name])
-            for muscle in scene.muscles
-            if sum(not held.via for held in muscle.attachments) > 1
-        }
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget the pictures."""
-        self._path: list[dict[str, float]] = []
-        self._lengths: list[list[float]] = []
-
-    def moment_arms(self, frame: Frame) -> dict[str, float]:
+    def _moment_arms(self, frame: Frame) -> dict[str, float]:
         """Moment arm of each muscle about the coordinate that moved alone to reach a frame [scene
         unit]; none where several moved.
         """
-        if self._path and self._path[-1] == frame.coordinates:
-            self._path.pop()
-            self._lengths.pop()
+        if self._trail and self._trail[-1][0] == frame.coordinates:
+            self._trail.pop()
         vertices = {name: frame.material_meshes[name][0] for name in self._lines}
         lengths = [
             line.length(vertices[name], frame.poses) + line.tendon_length(frame.tendons)
             for name, line in self._lines.items()
         ]
-        self._path = [*self._path, dict(frame.coordinates)][-TRAIL:]
-        self._lengths = [*self._lengths, lengths][-TRAIL:]
-        found = moment_arms(self._path, self._lengths, self._reach)[-1]
+        self._trail = [*self._trail, (dict(frame.coordinates), lengths)][-TRAIL:]
+        path, before = zip(*self._trail)
+        found = moment_arms(path, before, self._reach)[-1]
         return {name: float(arm) for arms in found.values() for name, arm in zip(self._lines, arms)}
 
 

@@ -31,7 +31,8 @@ from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.lines import line_length, points_along, tube_mesh
 from rbfmuscle.importers.guess.attachments import Ends, guess_attachments
 from rbfmuscle.importers.guess.guess import guess_scene, write_scene
-from rbfmuscle.importers.guess.joints import Face, Skeleton, fit_ball, fit_hinge, guess_joints
+from rbfmuscle.importers.guess.joints import Face, fit_ball, fit_hinge, guess_joints
+from rbfmuscle.importers.guess.sites import Skeleton
 from rbfmuscle.recording import Run
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import check_scene

@@ -7,8 +7,14 @@ import pytest
 from command_line import call
 
 from rbfmuscle.importers.guess.guess import guess_scene
-from rbfmuscle.importers.scenes import write_surfaces
-from rbfmuscle.importers.volumes import LAYER, LabelVolume, label_surface, read_labels, read_names
+from rbfmuscle.importers.volumes import (
+    LAYER,
+    LabelVolume,
+    label_surface,
+    read_labels,
+    read_names,
+    write_surfaces,
+)
 from rbfmuscle.validation import MeshError, UsageError
 
 SHAPE = (30, 26, 40)

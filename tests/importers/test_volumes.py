@@ -16,8 +16,13 @@ from scipy.spatial.transform import Rotation
 from rbfmuscle.cli.new import _beside
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.importers import volumes as surfaces
-from rbfmuscle.importers.scenes import write_surfaces
-from rbfmuscle.importers.volumes import LabelVolume, label_surface, read_labels, read_names
+from rbfmuscle.importers.volumes import (
+    LabelVolume,
+    label_surface,
+    read_labels,
+    read_names,
+    write_surfaces,
+)
 from rbfmuscle.validation import MeshError
 
 RADIUS = 20.0

@@ -10,8 +10,8 @@ from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.metrics.centreline import Centreline, split_ends
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
-from rbfmuscle.metrics.quantities import Row
-from rbfmuscle.metrics.rows import (
+from rbfmuscle.metrics.quantities import (
+    Row,
     _roughness,
     _smoothness,
     bone_depth,

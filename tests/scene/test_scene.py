@@ -14,8 +14,7 @@ from rbfmuscle.run.info import record_scene
 from rbfmuscle.scene.check import bone_collisions, check_initial, check_scene
 from rbfmuscle.scene.file import attachment_file
 from rbfmuscle.scene.frames import parse_slice
-from rbfmuscle.scene.names import new_name
-from rbfmuscle.scene.objects import from_mm
+from rbfmuscle.scene.objects import from_mm, new_name
 from rbfmuscle.scene.options import NeighbourOptions
 from rbfmuscle.scene.scene import Scene, require_complete
 from rbfmuscle.scene.settings import parse_settings

@@ -15,8 +15,8 @@ from rbfmuscle.scene.joints import Coordinate
 from rbfmuscle.scene.options import GuessTable
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.simulation.live import LiveSession, coordinate_limits
+from rbfmuscle.viewer import open_server
 from rbfmuscle.viewer.page import Panel
-from rbfmuscle.viewer.server import open_server
 from rbfmuscle.viewer.side import KINDS, MarkView, vertex_values
 from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSource, scene_marks
 

@@ -19,8 +19,15 @@ from scipy.spatial import cKDTree
 from rbfmuscle.anatomy.bones import Part
 from rbfmuscle.geometry.arrays import unit
 from rbfmuscle.geometry.surfaces import geodesic, surface_graph
-from rbfmuscle.importers.guess.joints import Skeleton
-from rbfmuscle.importers.guess.sites import PELVIS, Anatomy, Site, anatomy_of, sites_on, whole_bone
+from rbfmuscle.importers.guess.sites import (
+    PELVIS,
+    Anatomy,
+    Site,
+    Skeleton,
+    anatomy_of,
+    sites_on,
+    whole_bone,
+)
 
 
 class Ends:
@@ -128,7 +135,9 @@ def tendon_by_mesh(tendon: TendonMesh, bone: Part, skeleton: Skeleton) -> Tendon
         nearest = min(away, key=away.__getitem__)
         inside = away[nearest] < 0.0
         via.append((nearest, skeleton.out_of_bone(middle, nearest) if inside else middle))
-    return TendonGuess(bone, tendon.end_on(bone), tuple(via), tendon.part)
+    points = bone.faces[0]
+    to = points[np.argmin(((points - tendon.end) ** 2).sum(axis=1))]
+    return TendonGuess(bone, to, tuple(via), tendon.part)
 
 
 def unused_tendons(
@@ -161,11 +170,6 @@ class TendonMesh(NamedTuple):
     middles: np.ndarray
     begins: np.ndarray
     gap: float
-
-    def end_on(self, bone: Part) -> np.ndarray:
-        """The place (3,) of a bone's surface that is nearest to the tendon's end."""
-        points = bone.faces[0]
-        return points[np.argmin(((points - self.end) ** 2).sum(axis=1))]
 
 
 def see_tendon(tendon: Part, muscle: Part) -> TendonMesh:
@@ -434,14 +438,21 @@ def _hold(place, distance, ends, muscle, skeleton):
     if by_tendon is not None:
         return by_tendon
     if place.stands_in:
-        return _hold_whole_end(place, distance, ends)
+        # The end moves with a bone that is not here, wherever it lies; not what passes it on the
+        # way.
+        chosen = np.flatnonzero(ends.along(place.end) <= UPPER)
+        gap = max(float(distance[chosen].min()), 0.0)
+        reason = f"the whole end, {gap:.3g} mm from the {bone.name}, as its own bone is missing"
+        return AttachmentGuess(bone, chosen, gap, reason, NO_SITE)
     points = muscle.points
     sites = place.sites or (whole_bone(bone, skeleton.articular[bone]),)
     near = cKDTree(np.concatenate([site.points for site in sites])).query(points)[0] / millimetre
     # The nearest place of the bone belongs to a site whose points are hardly aside of it.
     coarse = np.sqrt(bone.mesh.area / len(bone.faces[0])) / millimetre
     on_site = near <= np.hypot(np.maximum(distance, 0.0), TOUCH + coarse)
-    chosen, gap = _touching(np.where(on_site, distance, np.inf), ends.along(place.end))
+    touching = np.where(on_site & (ends.along(place.end) <= REACH), distance, np.inf)
+    gap = max(float(touching.min()), 0.0)
+    chosen = np.flatnonzero(touching <= (gap + TOUCH if gap <= NEAR else -np.inf))
     where = " and ".join(site.name.replace("_", " ") for site in sites)
     confidence = TOUCHES
     far = min(FAR, FAR_SHARE * ends.length / millimetre)
@@ -462,16 +473,6 @@ def _hold(place, distance, ends, muscle, skeleton):
     return hold
 
 
-def _hold_whole_end(place, distance, ends):
-    """What a bone holds of an end whose own bone is not here: the end, which moves with it,
-    wherever it lies; not what passes it on the way.
-    """
-    chosen = np.flatnonzero(ends.along(place.end) <= UPPER)
-    gap = max(float(distance[chosen].min()), 0.0)
-    reason = f"the whole end, {gap:.3g} mm from the {place.bone.name}, as its own bone is missing"
-    return AttachmentGuess(place.bone, chosen, gap, reason, NO_SITE)
-
-
 def _hold_by_tendon(place, ends, muscle, skeleton):
     """What a tendon that has a mesh holds of an end, None where there is none."""
     if muscle.facts is None or place.stands_in:
@@ -489,17 +490,6 @@ def _hold_by_tendon(place, ends, muscle, skeleton):
         guess = tendon_by_mesh(tendon, place.bone, skeleton)
         return AttachmentGuess(place.bone, begins, gap, reason, BESIDE, guess)
     return None
-
-
-def _touching(distance, along):
-    """Vertices that touch their site, given distances [mm] of those that lie at it, and the least
-    of these.
-    """
-    distance = np.where(along <= REACH, distance, np.inf)
-    least = max(float(distance.min()), 0.0)
-    if least > NEAR:
-        return np.empty(0, dtype=int), least
-    return np.flatnonzero(distance <= least + TOUCH), least
 
 
 def _end(near, ends, place, muscle, millimetre):

@@ -1,31 +1,210 @@
-"""A scene guessed from a folder of meshes: bones, joints, attachments, each with a confidence and
-its reason.
+"""A scene guessed from a folder of meshes: what each mesh is, the unit, joints and attachments; a
+confidence and its reason for each.
 """
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Literal
 
 import numpy as np
 
 from rbfmuscle.anatomy.bones import EXACT, Orientation, Part, find_cut, find_orientation
+from rbfmuscle.anatomy.names import name_facts
 from rbfmuscle.geometry.arrays import Booleans
-from rbfmuscle.importers.guess.anatomy import JointGuess, rounded
+from rbfmuscle.geometry.surfaces import clustered
 from rbfmuscle.importers.guess.attachments import (
     FEWEST,
     MuscleGuess,
     guess_attachments,
     unused_tendons,
 )
-from rbfmuscle.importers.guess.joints import Skeleton, guess_joints
-from rbfmuscle.importers.guess.parts import Parts, read_parts
-from rbfmuscle.importers.guess.sites import bone_frames
+from rbfmuscle.importers.guess.joints import JointGuess, guess_joints, rounded
+from rbfmuscle.importers.guess.sites import Skeleton, bone_frames
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import articular_points
 from rbfmuscle.scene.file import FORMAT, MAIN, attachment_file, table_text
-from rbfmuscle.scene.names import plain_name
+from rbfmuscle.scene.meshes.read import MESH_SUFFIXES, prepare_mesh, read_file
+from rbfmuscle.scene.muscles import LARGEST_MM, SMALLEST_MM
+from rbfmuscle.scene.objects import MM_PER_UNIT, Muscle, from_mm, new_name, plain_name
 from rbfmuscle.scene.scene import DOUBTFUL, Scene
 from rbfmuscle.validation import MeshError, SceneError, UsageError
+
+# Folders below the one that is given, as people sort their meshes.
+FOLDERS = {"bones": "bone", "bone": "bone", "knochen": "bone", "os": "bone"}
+FOLDERS |= {"muscles": "muscle", "muscle": "muscle", "muskeln": "muscle"}
+FOLDERS |= {"tendons": "tendon", "tendon": "tendon", "sehnen": "tendon"}
+# Length of a bone [mm] by its class, and of the largest one where none is known, from child to
+# large adult.
+LENGTHS = {"femur": (200, 600), "tibia": (150, 500), "humerus": (120, 420), "pelvis": (100, 450)}
+LARGEST_BONE = (90, 900)
+# Meshes of more triangles are made coarser, to about as many.
+MOST_TRIANGLES = 400_000
+
+
+@dataclass
+class Parts:
+    """What is in a folder, and the unit of its lengths.
+
+    ``unusable`` gives reasons by file, ``missing_bones`` names those that are no muscles;
+    ``notes`` name what was left out, misspelt or made coarser, and the unit where it was guessed.
+    """
+
+    units: str = ""
+    bones: list[Part] = field(default_factory=list)
+    muscles: list[Part] = field(default_factory=list)
+    tendons: list[Part] = field(default_factory=list)
+    unusable: dict[str, str] = field(default_factory=dict)
+    missing_bones: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def millimetre(self) -> float:
+        """Its length in scene units."""
+        return from_mm(1.0, self.units)
+
+
+def read_parts(
+    folder: Path,
+    units: str | None,
+    base: Path,
+    *,
+    source: str = "",
+    unusable: Mapping[str, str] | None = None,
+) -> Parts:
+    """Bones, muscles and tendons of a folder, and of its folders ``bones``, ``muscles`` and
+    ``tendons``; files relative to ``base``. Messages name the ``source`` of the meshes, the folder
+    by default, and what of it was ``unusable`` before, by name, and why.
+
+    Where no unit is given it is the one in which the bones have the size that they have in people.
+    """
+    found = Parts(unusable=dict(unusable or {}))
+    unknown = []
+    names = set()
+    other = []
+    for path, stem, mesh in _file_meshes(folder, found.notes):
+        facts = name_facts(stem)
+        if facts.tissue == "other":
+            other.append(path.name)
+            continue
+        # A tendon by its name, else by the folder that it is in, else by its name.
+        by_name = facts.tissue == "tendon" or path.parent == folder
+        tissue = facts.tissue if by_name else FOLDERS[path.parent.name.lower()]
+        try:
+            part = _read_part(
+                path, stem, mesh, base, names, facts, found, closed=tissue == "muscle"
+            )
+        except MeshError as error:
+            found.unusable[path.name] = str(error).removeprefix(f"{path}: ")
+            found.missing_bones += [stem] if tissue in ("bone", "") else []
+            continue
+        if facts.spelling:
+            found.notes.append(f"{path.name}: {facts.spelling}")
+        kinds = {"bone": found.bones, "muscle": found.muscles, "tendon": found.tendons}
+        kinds.get(tissue, unknown).append(part)
+    if other:
+        found.notes.append(f"left out, neither bone nor muscle: {', '.join(other)}")
+    # The largest of the others are bones until there are two, the rest muscles if they can be.
+    for part in sorted(unknown, key=lambda part: -part.size):
+        is_bone = len(found.bones) < 2 or not _can_be_muscle(part)
+        part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
+        (found.bones if is_bone else found.muscles).append(part)
+    if not found.bones or not found.muscles:
+        kind, rest = ("bone", "muscles") if not found.bones else ("muscle", "bones")
+        listed = [Path(part.file).name for part in found.bones or found.muscles]
+        listed += [f"{file} ({why})" for file, why in found.unusable.items()]
+        raise UsageError(
+            f"{source or folder} holds no {kind} (by names or sizes all are {rest}, or cannot be "
+            f"used: {', '.join(listed) or 'no files'}); name files ({' '.join(MESH_SUFFIXES)}) or "
+            "labels after what they are, or sort files into folders bones and muscles"
+        )
+    found.units = units or _guess_units(found)
+    for bone in list(found.bones):  # a scene would refuse those of wrong sizes
+        if not SMALLEST_MM <= bone.size / found.millimetre <= LARGEST_MM:
+            words = f"it is {bone.size:.4g} {found.units} across"
+            found.bones.remove(bone)
+            found.missing_bones.append(bone.name)
+            found.unusable[Path(bone.file).name] = words
+    if not found.bones:
+        raise UsageError(f"{bone.file} cannot be a bone: {words}; correct the units")
+    return found
+
+
+def _can_be_muscle(part):
+    """Whether a mesh is one closed surface."""
+    try:
+        prepare_mesh(part.mesh.vertices, part.mesh.faces, context=part.file, name=part.name)
+    except MeshError:
+        return False
+    return True
+
+
+def _file_meshes(folder, notes):
+    """Path, name and FilePart of each mesh in the files of a folder and of its folders for bones,
+    muscles and tendons, several of a file as ``FILE#NAME``; of a file that cannot be read its
+    MeshError.
+    """
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is no folder; give the folder of the meshes")
+    inner = [
+        path for path in sorted(folder.iterdir()) if path.name.lower() in FOLDERS and path.is_dir()
+    ]
+    files = [path for place in [folder, *inner] for path in sorted(place.iterdir())]
+    for path in (file for file in files if file.suffix.lower() in MESH_SUFFIXES):
+        try:
+            meshes = read_file(path)
+        except MeshError as error:
+            yield path, path.stem, error
+            continue
+        if len(meshes) == 1:
+            yield path, path.stem, meshes[0]
+            continue
+        names = [mesh.name for mesh in meshes]
+        notes.append(f"{path.name}: {len(names)} meshes in one file ({', '.join(names)})")
+        for mesh in meshes:
+            yield path.with_name(f"{path.name}#{mesh.name}"), mesh.name, mesh
+
+
+def _read_part(path, stem, mesh, base, names, facts, found, *, closed):
+    if isinstance(mesh, MeshError):
+        raise mesh
+    name = new_name(stem.lower().strip("_ ") or "part", names)
+    names.add(name)
+    vertices, faces = mesh.vertices, mesh.faces
+    coarse = len(faces) > MOST_TRIANGLES and not closed  # cells of thin walls may open a surface
+    if coarse:
+        found.notes.append(
+            f"{path.name}: {len(faces)} triangles, made coarser to about {MOST_TRIANGLES}"
+        )
+        vertices, faces = clustered(vertices, faces, MOST_TRIANGLES)
+    read = prepare_mesh(vertices, faces, context=str(path), name=stem, may_be_open=not closed)
+    read.notes[:0] = mesh.notes
+    try:
+        file = Path(os.path.relpath(path, base)).as_posix()
+    except ValueError:  # there is no way from one to the other, as between drives
+        file = path.absolute().as_posix()
+    part = Part(name, file, read, facts.bone, facts.side, facts=facts.muscle, coarse=coarse)
+    part.tendon_of = facts.tendon_of or ((facts.muscle.name,) if facts.muscle else ())
+    return part
+
+
+def _guess_units(found):
+    """The unit in which a bone has the size that it has in people, a note why; a UsageError where
+    none fits.
+    """
+    known = [bone for bone in found.bones if bone.kind in LENGTHS]
+    bone = max(known or found.bones, key=lambda bone: bone.size)
+    low, high = LENGTHS.get(bone.kind, LARGEST_BONE)
+    for units, millimetres in MM_PER_UNIT.items():
+        if low <= bone.size * millimetres <= high:
+            found.notes.append(f"units are {units}: {bone.name} is {bone.size:.4g} {units} long")
+            return units
+    raise UsageError(
+        f"{bone.file} is {bone.size:.4g} across, which is no bone in mm, cm or m; give its units"
+    )
+
 
 _TAIL = """[contact]
 initial = "keep"   # muscles that start inside a bone stay there; or "error"
@@ -102,7 +281,7 @@ def guess_scene(
     parts.unusable |= unused
     parts.notes += [f"{file} is not used: {reason}" for file, reason in unused.items()]
     for muscle in guess.muscles:
-        _leave_caps(muscle, _capped_vertices(muscle.muscle, capped))
+        _leave_caps(muscle, capped)
     order = [root, *(joint.child for joint in joints)]
     for muscle in guess.muscles:  # from the bone that stands still outwards
         muscle.holds.sort(key=lambda hold: order.index(hold.bone) if hold.bone in order else 0)
@@ -127,19 +306,17 @@ def _skeleton(guess, bodies, millimetre):
     )
 
 
-def _capped_vertices(part, capped):
-    """Vertices of a muscle where a scan ends: those that are ``capped``, by file, where that is
-    known.
+def _leave_caps(muscle, capped):
+    """Take the vertices on the cap at the scan's end from what holds a muscle: those that are
+    ``capped``, by file, where that is known.
     """
+    part = muscle.muscle
     if capped is None:
         cut = find_cut(part.mesh, depth=EXACT)
-        return np.empty(0, dtype=int) if cut is None else np.flatnonzero(cut.on)
-    marked = capped.get(Path(part.file).stem, np.empty(0, dtype=bool))
-    return part.read.vertex_map[np.flatnonzero(marked)]
-
-
-def _leave_caps(muscle, on_cap):
-    """Take the vertices on the cap at the scan's end from what holds a muscle."""
+        on_cap = np.flatnonzero([] if cut is None else cut.on)
+    else:
+        marked = capped.get(Path(part.file).stem, np.empty(0, dtype=bool))
+        on_cap = part.read.vertex_map[np.flatnonzero(marked)]
     if not len(on_cap):
         return
     for hold in list(muscle.holds):
@@ -318,3 +495,26 @@ def _muscle(guess: MuscleGuess, stage: str) -> str:
     if guess.wrong:
         text = "".join(f"# {line}\n" for line in [f"NOT RUN: {guess.wrong}", *text.splitlines()])
     return text
+
+
+def scene_from_meshes(folder: Path, *, units: Literal["mm", "cm", "m"] | None) -> Scene:
+    """The scene of `Scene.from_meshes`."""
+    if units is not None and units not in MM_PER_UNIT:
+        raise UsageError(f"units must be m, cm or mm, got {units!r}")
+    with TemporaryDirectory() as base:
+        guess = guess_scene(folder, units, Path(base))
+        return scene_in_memory(guess, Path(base))
+
+
+def scene_in_memory(guess: SceneGuess, base: Path) -> Scene:
+    """The scene of a guess whose file is in a folder that is removed."""
+    stage = base / "scene"
+    stage.mkdir()
+    scene = write_scene(guess, base / "scene.toml", stage)
+    scene.path = None
+    # Names of files without a way through the folder that is removed; none for those in it.
+    items: list[Bone | Muscle] = [*scene.bones, *scene.muscles]
+    for item in items:
+        source = os.path.normpath(item.source)
+        item.source = "" if source.startswith(f"{base}{os.sep}") else source
+    return scene

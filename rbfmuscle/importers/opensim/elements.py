@@ -36,7 +36,7 @@ from rbfmuscle.scene.joints import (
     full_name,
     scaled,
 )
-from rbfmuscle.scene.names import new_name
+from rbfmuscle.scene.objects import new_name
 from rbfmuscle.validation import SceneError
 
 GROUND = "ground"
@@ -99,14 +99,6 @@ class ModelMuscle:
     title: str = ""
 
 
-@dataclass
-class ModelConstraint:
-    """A constraint between two bodies that is not taken, and its type and name in the file."""
-
-    title: str
-    bodies: tuple[str, str]
-
-
 class Walk(NamedTuple):
     """How the bodies hang together.
 
@@ -124,7 +116,8 @@ class Walk(NamedTuple):
 class OsimModel:
     """All that is taken from an ``.osim`` file; ``bodies`` begin with ``"ground"``.
 
-    ``welds`` are its weld constraints, as joints. ``notes`` say what is in the file and is not
+    ``welds`` are its weld constraints, as joints; ``constraints`` the others, which are not taken:
+    type and name in the file, and the two bodies. ``notes`` say what is in the file and is not
     taken, or taken otherwise than a user may expect; ``doubts`` what makes the scene another one
     than the model.
     """
@@ -136,7 +129,7 @@ class OsimModel:
     joints: list[ModelJoint] = field(default_factory=list)
     welds: list[ModelJoint] = field(default_factory=list)
     couplings: list[Coupling] = field(default_factory=list)
-    constraints: list[ModelConstraint] = field(default_factory=list)
+    constraints: list[tuple[str, str, str]] = field(default_factory=list)
     meshes: list[ModelMesh] = field(default_factory=list)
     muscles: list[ModelMuscle] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -411,18 +404,14 @@ class Frames:
         if path not in self._known:
             self._open.append(path)
             frame = self.offsets[path]
-            self._known[path] = (
-                self._of_stations(frame)
-                if frame.tag == "StationDefinedFrame"
-                else self._of_parent(frame)
-            )
+            if frame.tag == "StationDefinedFrame":
+                self._known[path] = self._of_stations(frame)
+            else:
+                body, outer = self.place(socket(frame, "parent") or "..", inside=path)
+                own = frame_at(frame.vector("translation"), frame.vector("orientation"))
+                self._known[path] = body, outer @ own
             self._open.pop()
         return self._known[path]
-
-    def _of_parent(self, frame):
-        """Body and frame in it (4, 4) of a frame offset from another."""
-        body, outer = self.place(socket(frame, "parent") or "..", inside=frame.path)
-        return body, outer @ frame_at(frame.vector("translation"), frame.vector("orientation"))
 
     def _of_stations(self, frame):
         """Body and frame in it (4, 4) of a frame through three stations, its origin a fourth."""

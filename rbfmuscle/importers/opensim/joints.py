@@ -7,7 +7,6 @@ import numpy as np
 
 from rbfmuscle.importers.opensim.elements import (
     Frames,
-    ModelConstraint,
     ModelJoint,
     Node,
     OsimModel,
@@ -28,7 +27,7 @@ from rbfmuscle.scene.joints import (
     motion_of,
     scaled,
 )
-from rbfmuscle.scene.names import new_name
+from rbfmuscle.scene.objects import new_name
 from rbfmuscle.validation import SceneError
 
 # What OpenSim calls otherwise than our table of joints; where both have one, its coordinates are in
@@ -289,7 +288,7 @@ def read_constraints(reading: Reading, constraints: list[Node]) -> None:
             weld.parent_frame, weld.child_frame = first, second
             model.welds.append(weld)
         else:
-            model.constraints.append(ModelConstraint(title, (ends[0][0], ends[1][0])))
+            model.constraints.append((title, ends[0][0], ends[1][0]))
 
 
 def _constraint_ends(frames, node):

@@ -14,7 +14,7 @@ from rbfmuscle.importers.opensim.elements import (
 )
 from rbfmuscle.importers.opensim.joints import Reading
 from rbfmuscle.scene.joints import Linear, all_coordinates
-from rbfmuscle.scene.names import new_name
+from rbfmuscle.scene.objects import new_name
 from rbfmuscle.validation import SceneError
 
 # Force per area of muscle [N/m2] (Arnold et al. 2010, Ann Biomed Eng 38: 269; Rajagopal et al. 2016
@@ -202,18 +202,15 @@ def _change(point, reading):
             return ""
         return f"point {point.name!r} is on its path for {name} from {low:g} to {high:g} alone"
     if point.tag in MOVING:
-        names = [
-            reading.coordinate(_coordinate_name(point, f"{axis}_coordinate"))
-            for axis in "xyz"
-            if not _is_constant(read_function(point.child(f"{axis}_location")))
-        ]
+        names = []
+        for axis in "xyz":
+            function = read_function(point.child(f"{axis}_location"))
+            constant = isinstance(function, Linear) and not any(function.slopes)
+            if function is not None and not constant:
+                names.append(reading.coordinate(_coordinate_name(point, f"{axis}_coordinate")))
         if names:
             return f"point {point.name!r} moves with {', '.join(dict.fromkeys(names))}"
     return ""
-
-
-def _is_constant(function):
-    return function is None or (isinstance(function, Linear) and not any(function.slopes))
 
 
 def _path_point(point, reading, resting):

@@ -22,8 +22,8 @@ from rbfmuscle.importers.opensim.elements import (
 )
 from rbfmuscle.importers.opensim.joints import Reading, read_constraints, read_joint
 from rbfmuscle.importers.opensim.muscles import read_muscles
-from rbfmuscle.scene.joints import Coupling, ordered
-from rbfmuscle.scene.names import plain_name
+from rbfmuscle.scene.joints import ordered
+from rbfmuscle.scene.objects import plain_name
 from rbfmuscle.validation import SceneError, listed
 
 MOST_ROUNDS = 200  # of meeting the weld constraints; a few are enough where they can be met
@@ -35,7 +35,15 @@ STEP = 1e-6  # of the central differences [radian or metre]
 
 def assemble(model: OsimModel) -> OsimModel:
     """The model, its weld constraints met at rest; what is left out or doubtful is named."""
-    _order_couplings(model)
+    couplings, model.couplings = model.couplings, []
+    for coupling in couplings:
+        try:
+            model.couplings = ordered([*model.couplings, coupling])
+        except SceneError as error:  # another moves the coordinate, or they form a ring
+            of = ", ".join(coupling.of)
+            model.doubts.append(
+                f"the coupler of {coupling.coordinate} to {of} is not taken: {error}"
+            )
     _meet_welds(model)
     walk = model.walk()
     for joint in walk.left:
@@ -45,11 +53,10 @@ def assemble(model: OsimModel) -> OsimModel:
             model.notes.append(
                 f"{weld.name} is taken as a fixed joint, {weld.parent} to {weld.child}"
             )
-    for constraint in model.constraints:
-        first, second = constraint.bodies
+    for title, first, second in model.constraints:
         names = _moving(joints_between(walk, first, second))
         depends = f"; {', '.join(names)} may break it" if names else ""
-        model.doubts.append(f"{constraint.title} ({first} to {second}) is not taken{depends}")
+        model.doubts.append(f"{title} ({first} to {second}) is not taken{depends}")
     for body in walk.roots:
         if body != GROUND:
             model.doubts.append(
@@ -57,20 +64,6 @@ def assemble(model: OsimModel) -> OsimModel:
                 "is, with all that hangs on it"
             )
     return model
-
-
-def _order_couplings(model):
-    """Couplings in order; one of a coordinate that another moves, or of a ring, is left out."""
-    kept: list[Coupling] = []
-    for coupling in model.couplings:
-        try:
-            kept = ordered([*kept, coupling])
-        except SceneError as error:
-            of = ", ".join(coupling.of)
-            model.doubts.append(
-                f"the coupler of {coupling.coordinate} to {of} is not taken: {error}"
-            )
-    model.couplings = kept
 
 
 def _meet_welds(model):
@@ -190,7 +183,13 @@ def _read_model(root, path):
         raise SceneError(
             f"version {root.get('Version', '')[:20]!r} is no number; correct it"
         ) from None
-    _take_defaults(node)
+    # The defaults of a file are no part of the model: the elements of their tags have them.
+    prototypes: dict[str, Node] = {}
+    for defaults in node.findall("defaults"):
+        node.remove(defaults)
+        prototypes |= {inner.tag: inner for inner in defaults.nodes()}
+    for element in node.iter() if prototypes else ():
+        element.prototype = prototypes.get(element.tag)
     notes = _name_joints(node)
     frames = Frames(node)
     model = OsimModel(plain_name(node.name or path.stem), version, path)
@@ -219,17 +218,6 @@ def _read_model(root, path):
     read_constraints(reading, [one for one in constraints if one.tag.endswith("Constraint")])
     read_muscles(reading, node, [*node.objects("ForceSet"), *own])
     return assemble(model)
-
-
-def _take_defaults(node):
-    """Take the defaults of a file out of the model, and give them to the elements of their tags."""
-    prototypes: dict[str, Node] = {}
-    for defaults in node.findall("defaults"):
-        node.remove(defaults)
-        prototypes |= {inner.tag: inner for inner in defaults.nodes()}
-    if prototypes:
-        for element in node.iter():
-            element.prototype = prototypes.get(element.tag)
 
 
 def _name_joints(node):

@@ -271,7 +271,10 @@ def _read_stl(content):
     """The solids of an STL file, each read by trimesh after a check of what it passes over: bytes
     that are missing or left over, corners that make no triangle, solids without any.
     """
-    if not _is_binary(content):
+    # Binary by its length, or by bytes that no text has.
+    text = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:5].lower() == b"solid"
+    no_text = len(content) >= _HEAD and (not text or b"\0" in content)
+    if not (_has_stl_length(content) or no_text):
         return _read_stl_text(content)
     parts, start = [], 0
     while len(content) - start >= _HEAD:
@@ -299,14 +302,6 @@ def _has_stl_length(content):
     """Whether content is as long as a binary STL file of its triangles, of which it has some."""
     count = int.from_bytes(content[80:_HEAD], "little")
     return count > 0 and len(content) == _HEAD + _TRIANGLE * count
-
-
-def _is_binary(content):
-    """Whether an STL file is binary: by its length, or by bytes that no text has."""
-    if _has_stl_length(content):
-        return True
-    text = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:5].lower() == b"solid"
-    return len(content) >= _HEAD and (not text or b"\0" in content)
 
 
 def _read_stl_text(content):
@@ -388,8 +383,10 @@ def _read_obj(content):
     for column, apart in ((0, True), (1, False), (2, True)):
         first: dict[object, int] = {}
         label = np.array([first.setdefault(row[column], k) for k, row in enumerate(labels)], int)
-        if len(first) > 1 and not (apart and _share_vertices(numbers, label[used])):
-            break
+        if len(first) > 1:
+            pairs = np.unique(np.column_stack([numbers, label[used]]), axis=0)
+            if not (apart and len(np.unique(pairs[:, 0])) < len(pairs)):
+                break
     else:
         return [FilePart("", vertices, faces, notes)]
     parts = []
@@ -398,12 +395,6 @@ def _read_obj(content):
         name = labels[k][2 if column == 2 else 1]
         parts.append(FilePart(name, vertices[own], mine.reshape(-1, 3), list(notes)))
     return parts
-
-
-def _share_vertices(numbers, label):
-    """Whether a vertex of ``numbers`` (n,) belongs to two parts, which ``label`` (n,) tells."""
-    pairs = np.unique(np.column_stack([numbers, label]), axis=0)
-    return len(np.unique(pairs[:, 0])) < len(pairs)
 
 
 def _obj_lines(content):

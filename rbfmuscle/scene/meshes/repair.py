@@ -183,7 +183,19 @@ def _check_closed(state, context, may_be_open):
                 f"{', '.join(map(str, sizes[:5]))}); a muscle is one closed surface, split or "
                 "join them"
             )
-        _check_inside(state, context)
+        # Closed, it may still have no inside: flat or twisted, judged over all of its area.
+        wrong = _twisted_share(state.mesh)
+        if wrong > MOST_TWISTED:
+            volume = float(_cones(state.vertices, state.faces).sum())
+            raise MeshError(
+                f"{context}: the surface is flat or passes through itself, {100 * wrong:.0f} % of "
+                f"it does not bound its inside, so its volume ({volume:.4g}) means nothing; repair "
+                "it, for instance by remeshing"
+            )
+        if wrong > TWISTED_NOTED:
+            state.notes.append(
+                f"the surface passes through itself over {100 * wrong:.2g} % of its area"
+            )
 
 
 def _missing_share(state):
@@ -195,24 +207,6 @@ def _missing_share(state):
         missing += 0.5 * np.linalg.norm(np.cross(spokes, np.roll(spokes, -1, axis=0)), axis=1).sum()
     there = 0.5 * igl.doublearea(state.vertices, state.faces).sum()
     return missing / max(missing + there, 1e-300)
-
-
-def _check_inside(state, context):
-    """Refuse or note a surface that is closed and has no inside: flat or twisted, judged over all
-    of its area.
-    """
-    wrong, volume = _twisted_share(state.mesh), float(_cones(state.vertices, state.faces).sum())
-    if wrong > MOST_TWISTED:
-        raise MeshError(
-            f"{context}: the surface is flat or passes through itself, {100 * wrong:.0f} % of it "
-            "does not bound its "
-            f"inside, so its volume ({volume:.4g}) means nothing; repair it, for instance by "
-            "remeshing"
-        )
-    if wrong > TWISTED_NOTED:
-        state.notes.append(
-            f"the surface passes through itself over {100 * wrong:.2g} % of its area"
-        )
 
 
 def _twisted_share(mesh):
