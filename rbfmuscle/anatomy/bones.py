@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -21,10 +21,6 @@ from rbfmuscle.anatomy.names import MuscleFacts, name_facts
 from rbfmuscle.geometry.arrays import across, box_size, unit
 from rbfmuscle.scene.meshes.repair import boundary_rims
 from rbfmuscle.scene.scene import Scene
-
-if TYPE_CHECKING:
-    import trimesh
-
 
 # A cap's faces look along its normal (cosine), lie within a share of the part's size of its end,
 # and are most of what lies there.

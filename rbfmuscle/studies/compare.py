@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel
@@ -51,10 +51,6 @@ from rbfmuscle.simulation.frame import Mesh
 from rbfmuscle.simulation.frame_loop import simulate_frames
 from rbfmuscle.studies.result import OnProgress, Study, part_progress, study_folder
 from rbfmuscle.validation import SolveError, UsageError, listed
-
-if TYPE_CHECKING:
-    from rbfmuscle.scene.scene import Scene
-
 
 FILES = ("comparison.json", "comparison.csv", "statistics.csv", "report.html")
 COARSER = 5  # the motion is repeated with frames this many times as far apart
@@ -308,6 +304,15 @@ VALUE_COLUMNS = ("model", "muscle", "quantity", "value", "unit", "against")
 Values = dict[str, dict[str, float]]
 
 
+class MeasureFacts(BaseModel):
+    """A measure: its unit, and the words of its row of `MEASURES`."""
+
+    unit: str
+    title: str
+    against: str
+    meaning: str
+
+
 class Spread(BaseModel):
     """Mean and standard deviation over the frames."""
 
@@ -321,9 +326,8 @@ class Comparison(BaseModel, Study):
     ``poses`` are the numbers of the frames at which distances were measured, ``labels`` models as
     tables name them, ``failed`` why models were not solved, ``answer`` all of it in sentences,
     ``within`` how many muscles of each model are within all limits, ``unknowns`` the points that
-    each model solves for, in words, by model and muscle. ``measures`` are the unit of each measure,
-    and the words of its row of `MEASURES`. ``results`` are by model; ``statistics`` by model,
-    muscle and quantity, of moment arms ``"moment_arm:COORDINATE"``.
+    each model solves for, in words, by model and muscle. ``results`` are by model; ``statistics``
+    by model, muscle and quantity, of moment arms ``"moment_arm:COORDINATE"``.
     """
 
     command: ClassVar[str] = "compare"
@@ -340,7 +344,7 @@ class Comparison(BaseModel, Study):
     answer: str
     within: dict[str, int] = {}
     unknowns: dict[str, dict[str, str]]
-    measures: dict[str, dict[str, str]]
+    measures: dict[str, MeasureFacts]
     results: dict[str, Values]
     statistics: dict[str, dict[str, dict[str, Spread]]]
     machine: dict[str, str | int | None]
@@ -368,8 +372,7 @@ class Comparison(BaseModel, Study):
             for muscle, values in muscles.items():
                 for name, measure in self.measures.items():
                     if name in values:
-                        unit, against = measure["unit"], measure["against"]
-                        yield model, muscle, name, values[name], unit, against
+                        yield model, muscle, name, values[name], measure.unit, measure.against
 
 
 FORMAT = 4  # of comparison.json
@@ -502,12 +505,12 @@ def write_tables(
         within={name: len(runs[name].muscles) - len(found[ALL]) for name, found in beyond.items()},
         unknowns={name: unknowns[name] for name in results},
         measures={
-            name: {
-                "unit": unit_text(m.kind, scene.units),
-                "title": m.title,
-                "against": m.against,
-                "meaning": m.meaning,
-            }
+            name: MeasureFacts(
+                unit=unit_text(m.kind, scene.units),
+                title=m.title,
+                against=m.against,
+                meaning=m.meaning,
+            )
             for name, m in MEASURES.items()
         },
         results=results,
@@ -760,7 +763,7 @@ def _light(found: Comparison, quantity: str, limit: float | None) -> CheckRow:
 
 def shown(found: Comparison, quantity: str, value: float | None) -> str:
     """A value of a measure with its unit; lengths that do not count as zero."""
-    measure, unit = MEASURES[quantity], found.measures[quantity]["unit"]
+    measure, unit = MEASURES[quantity], found.measures[quantity].unit
     if value is not None and unit == "mm" and abs(value) < 0.5 * measure.floor:
         value = 0.0
     return shown_number(value, unit)

@@ -317,18 +317,6 @@ def _link(root: Node) -> Node:
     return root
 
 
-def _as_utf8(data):
-    """The bytes of a file that says UTF-8, or nothing, and is in Latin-1 as UTF-8: OpenSim reads
-    these too.
-    """
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError:
-        if not re.match(rb"\s*<\?xml[^>]*encoding=[\"'](?!utf-?8)", data, flags=re.IGNORECASE):
-            return data.decode("latin-1").encode("utf-8")
-    return data
-
-
 def read_xml(path: Path) -> Node:
     """The root element of an XML file; two colons in a name, which XML forbids, become two
     underscores.
@@ -342,7 +330,14 @@ def read_xml(path: Path) -> Node:
             raise SceneError(f"more than {MOST_BYTES / 1e6:.0f} MB, this is no OpenSim model")
         builder = ElementTree.TreeBuilder(element_factory=Node)
         parser = defusedxml.ElementTree.DefusedXMLParser(target=builder, forbid_dtd=True)
-        parser.feed(_as_utf8(data).replace(b"::", b"__"))  # nine published models have such names
+        try:
+            data.decode("utf-8")
+        except UnicodeDecodeError:
+            # Of a file that says UTF-8, or nothing, and is in Latin-1: OpenSim reads these too.
+            said = rb"\s*<\?xml[^>]*encoding=[\"'](?!utf-?8)"
+            if not re.match(said, data, flags=re.IGNORECASE):
+                data = data.decode("latin-1").encode("utf-8")
+        parser.feed(data.replace(b"::", b"__"))  # nine published models have such names
         return _link(cast("Node", parser.close()))
     except OSError as error:
         reason = f"cannot read the model: {error.strerror}"

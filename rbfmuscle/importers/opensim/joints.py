@@ -78,7 +78,12 @@ def read_joint(reading: Reading, node: Node, ends: list[End], tag: str) -> None:
     plain: dict[str, str] = {}
     for one in names:
         plain[one] = new_name(one, plain.values(), file=False)
-    axes = _axes(node, kind, names)
+    if kind == "custom":
+        axes = _custom_axes(node, names)
+    else:
+        turns, shifts = KINDS[kind][:2] if kind in KINDS else (CARRYING[kind], ())
+        own = [TransformAxis(axis, (one,)) for axis, one in zip((*turns, *shifts), names)]
+        axes = {"rotation": tuple(own[: len(turns)]), "translation": tuple(own[len(turns) :])}
     joints = [ModelJoint(name, parent, child, np.zeros(3), {}, kind=kind)]
     joints[0].parent_frame, joints[0].child_frame = first, second
     joints[0].rotations, joints[0].translations = axes["rotation"], axes["translation"]
@@ -125,15 +130,6 @@ def _coordinates(node, tag, kind):
     if len(names) != needed:
         raise node.error(f"a {node.tag} has {needed} coordinates, {len(names)} are given")
     return found, names
-
-
-def _axes(node, kind, names):
-    """The rotations and the translations of a joint, each of coordinates as the file names them."""
-    if kind == "custom":
-        return _custom_axes(node, names)
-    turns, shifts = KINDS[kind][:2] if kind in KINDS else (CARRYING[kind], ())
-    axes = [TransformAxis(axis, (name,)) for axis, name in zip((*turns, *shifts), names)]
-    return {"rotation": tuple(axes[: len(turns)]), "translation": tuple(axes[len(turns) :])}
 
 
 def _carrying(reading, node, joint, kind, names):
