@@ -60,7 +60,16 @@ class OutputFolder:
                 f"{self.command}'; give a new or an empty folder"
             )
         self.check(names)
-        _check_writable(self.directory)
+        # Write to it, or where it would be made, before what takes time is begun.
+        path = self.directory.absolute()
+        place = next(place for place in (path, *path.parents) if place.exists())
+        try:
+            with tempfile.TemporaryFile(dir=place):
+                pass
+        except OSError as error:
+            raise UsageError(
+                f"cannot write to {self.directory}: {error.strerror}; choose another folder"
+            ) from None
 
     def check(self, names: Iterable[str]) -> None:
         """Raise UsageError if files or folders of these names are there that may not be
@@ -198,19 +207,6 @@ def _is_inside(folder: Path, name: str) -> bool:
         return False
     parent = (folder / name).parent
     return parent == folder or parent.resolve() == folder.resolve() / path.parent
-
-
-def _check_writable(directory: Path) -> None:
-    """Write to a folder, or where it would be made, before what takes time is begun."""
-    path = directory.absolute()
-    there = next(place for place in (path, *path.parents) if place.exists())
-    try:
-        with tempfile.TemporaryFile(dir=there):
-            pass
-    except OSError as error:
-        raise UsageError(
-            f"cannot write to {directory}: {error.strerror}; choose another folder"
-        ) from None
 
 
 def copy_listed(source: Path, target: Path, command: str) -> None:
