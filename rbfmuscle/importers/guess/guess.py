@@ -338,7 +338,7 @@ def write_scene(guess: SceneGuess, path: Path, stage: Path) -> Scene:
     _write_coarse(guess, stage)
     for muscle in guess.muscles:
         for hold in muscle.holds:
-            file = stage / _hold_file(muscle, hold)
+            file = stage / attachment_file(muscle.muscle.name, hold.bone.name)
             file.parent.mkdir(parents=True, exist_ok=True)
             in_file = np.isin(muscle.muscle.read.vertex_map, hold.vertices)
             np.savetxt(file, np.flatnonzero(in_file), fmt="%d")
@@ -462,11 +462,6 @@ def _motion(joint):
     return table_text("[motion]   # degrees", {"ramp": ramp}, {"ramp": "an example"})
 
 
-def _hold_file(muscle, hold):
-    """File of a hold's vertices, relative to the scene's folder."""
-    return attachment_file(muscle.muscle.name, hold.bone.name)
-
-
 def _confidence(confidence, reason):
     """The key ``guess``."""
     return {"confidence": round(confidence, 1), "reason": reason}
@@ -487,7 +482,8 @@ def _muscle(guess: MuscleGuess, stage: str) -> str:
     part = guess.muscle
     # What makes the muscle doubtful, not one attachment, makes all of them so.
     cap = guess.confidence if guess.doubted else 1.0
-    places = [PurePosixPath(stage, _hold_file(guess, hold)).as_posix() for hold in guess.holds]
+    files = [attachment_file(part.name, hold.bone.name) for hold in guess.holds]
+    places = [PurePosixPath(stage, file).as_posix() for file in files]
     attach = [_attachment(hold, place, cap) for hold, place in zip(guess.holds, places)]
     row = {"name": part.name, "mesh": part.file, "attach": attach}
     head = _headed("[[muscle]]", part, guess.reasons)
