@@ -207,19 +207,6 @@ def slice_operator(
     return sparse.csr_matrix((values, where), shape=(len(levels), len(vertices)))
 
 
-def isolines(
-    vertices: Floats, faces: Integers, field: Floats, levels: Floats
-) -> tuple[Floats, Floats, Integers]:
-    """Segments of a field's isolines on an outward surface, in one direction: start, end (s, 3),
-    level's place (s,).
-    """
-    (a, b, c), (s, t), row = _crossed_edges(faces, field, levels)
-    start = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
-    end = vertices[a] + t[:, None] * (vertices[c] - vertices[a])
-    below = (field[a] <= levels[row])[:, None]
-    return np.where(below, end, start), np.where(below, start, end), row
-
-
 def _crossed_edges(faces, field, levels):
     """Of each face that an isoline crosses: the corner alone on its side, the others, shares of
     both edges, level.
@@ -277,7 +264,12 @@ def belly_measures(
     axis = (last - first) / length
     height = (vertices - first) @ axis
     places = height.min() + np.ptp(height) * (np.arange(STATIONS) + 0.5) / STATIONS
-    start, end, station = isolines(vertices, faces, height, places)
+    # Segments of the isolines on the outward surface, in one direction.
+    (a, b, c), (s, t), station = _crossed_edges(faces, height, places)
+    one = vertices[a] + s[:, None] * (vertices[b] - vertices[a])
+    other = vertices[a] + t[:, None] * (vertices[c] - vertices[a])
+    below = (height[a] <= places[station])[:, None]
+    start, end = np.where(below, other, one), np.where(below, one, other)
     areas = np.abs(
         np.bincount(station, 0.5 * np.cross(start - first, end - first) @ axis, STATIONS)
     )

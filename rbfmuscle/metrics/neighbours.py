@@ -154,7 +154,11 @@ class NeighbourMeasures:
             vertices = shown[one].distance.vertices
             if met:
                 deepest = max(deepest, _deepest(vertices, there, side.allowed))
-            parted.append(_parted(vertices[side.touching], there, side.gap))
+            # How much farther touching places are from the other than at rest.
+            points, away = vertices[side.touching], np.zeros(0)
+            if len(points):
+                away = np.where(there.inside(points), 0.0, there.unsigned(points))
+            parted.append(np.maximum(away - side.gap, 0.0))
         return deepest, parted
 
     def _renew(self, one: str, at_rest: Floats, names: Sequence[str]) -> None:
@@ -183,14 +187,6 @@ def _deepest(vertices: Floats, other: MeshDistance, allowed: Floats | None) -> f
         return 0.0
     depth = other.unsigned(vertices[inside])
     return max(0.0, float((depth if allowed is None else depth - allowed[inside]).max()))
-
-
-def _parted(points: Floats, other: MeshDistance, gap: Floats) -> Floats:
-    """How much farther (n,) points (n, 3) are from another surface than at rest."""
-    if len(points) == 0:
-        return np.zeros(0)
-    away = np.where(other.inside(points), 0.0, other.unsigned(points))
-    return np.maximum(away - gap, 0.0)
 
 
 def _percentile(parted: Iterable[Floats]) -> float:

@@ -310,7 +310,13 @@ def frame_rows(
     """Rows of one frame from values by muscle and quantity; ``before`` are the last frame's
     coordinates, or None.
     """
-    name, angle = _leading_coordinate(scene, frame, before)
+    # The coordinate that moved most to reach the frame, and its value there.
+    names, now = scene.motion.coordinates or list(frame.coordinates), frame.coordinates
+    name, angle = names[0] if names else "", 0.0
+    if names and before is not None:
+        name = max(names, key=lambda n: abs(now.get(n, 0.0) - before.get(n, 0.0)))
+    if names:
+        angle = shown_value(scene, name, now.get(name, 0.0))
     together = dict(measured.get(ALL, {}))
     time = scene.motion.time(frame.index)
     if time is not None:
@@ -490,20 +496,6 @@ def reaches(names: Iterable[str], shifts: Collection[str], units: str) -> dict[s
     """
     near = from_mm(REACH, units)
     return {name: near if name in shifts else math.radians(REACH) for name in names}
-
-
-def _leading_coordinate(scene, frame, before):
-    """The coordinate that moved most to reach a frame, and its value there [degree or scene
-    unit].
-    """
-    names = scene.motion.coordinates or list(frame.coordinates)
-    if not names:
-        return "", 0.0
-    now = frame.coordinates
-    name = names[0]
-    if before is not None:
-        name = max(names, key=lambda n: abs(now.get(n, 0.0) - before.get(n, 0.0)))
-    return name, shown_value(scene, name, now.get(name, 0.0))
 
 
 def moment_arms(

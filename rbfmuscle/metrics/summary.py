@@ -265,21 +265,19 @@ def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> Limits:
             )
         if not given and name not in LIMITS:
             raise UsageError(f"fail_on {name}: give a value, for instance {name}=1")
-        found[name] = _number(value, part) if given else found.get(name)
+        found[name] = found.get(name)
+        if given:
+            try:
+                number = float(value)
+            except ValueError:
+                number = math.nan
+            if not math.isfinite(number) or number < 0:
+                raise UsageError(f"fail_on {part}: the limit must be a number, zero or more")
+            found[name] = number
     values = {name: _in_unit(LIMITS[name].value, name, scene.units) for name in LIMITS}
     return Limits(
         values | {name: value for name, value in found.items() if value is not None}, found
     )
-
-
-def _number(text, part):
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or value < 0:
-        raise UsageError(f"fail_on {part}: the limit must be a number, zero or more")
-    return value
 
 
 def _in_unit(value, quantity, unit):
