@@ -237,7 +237,16 @@ def make_motion(
         frames, times, notes = read_motion_file(options.file, known, followers, metre=metre)
     else:
         frames = _asked_frames(options, known)
-        _refuse_followers(frames, followers, known)
+        for name in dict.fromkeys(name for frame in frames for name in frame):
+            if name in followers:
+                raise SceneError(
+                    f"[motion]: {name!r} follows other coordinates by a coupling, move those"
+                )
+            moved = [abs(frame.get(name, known[name].rest) - known[name].rest) for frame in frames]
+            if known[name].locked and max(moved) > NOT_MOVED:
+                raise SceneError(
+                    f"[motion]: {name!r} is locked, unlock it in its joint or leave it out"
+                )
     # Followers are left out; coordinates that a frame does not mention are at rest.
     free = {name: one.rest for name, one in known.items() if name not in followers}
     at_rest = {name: rest for name, rest in free.items() if rest}
@@ -340,21 +349,6 @@ def _frames_between(stops, names, steps, known):
         marks = [*(k / pace for k in range(1, math.ceil(pace - 1e-9))), 1.0] if pace else []
         rows.extend(before + t * (after - before) for t in marks)
     return [dict(zip(names, (row * factors).tolist())) for row in rows]
-
-
-def _refuse_followers(frames, followers, known):
-    for name in dict.fromkeys(name for frame in frames for name in frame):
-        if name in followers:
-            raise SceneError(
-                f"[motion]: {name!r} follows other coordinates by a coupling, move those"
-            )
-        rest = known[name].rest
-        if known[name].locked and any(
-            abs(frame.get(name, rest) - rest) > NOT_MOVED for frame in frames
-        ):
-            raise SceneError(
-                f"[motion]: {name!r} is locked, unlock it in its joint or leave it out"
-            )
 
 
 def _range_notes(frames: list[dict[str, float]], known: dict[str, Coordinate]) -> list[str]:

@@ -724,11 +724,17 @@ def joint_row(joint: Joint) -> dict[str, object]:
         row["centre"] = joint.centre.tolist()
     if joint.kind == "custom":
         for motion, axes in (("rotation", joint.rotations), ("translation", joint.translations)):
-            if axes:
-                row[f"{motion}s"] = [_axis_row(axis, joint.coordinates, motion) for axis in axes]
+            rows: list[dict[str, object]] = []
+            for axis in axes:
+                inputs = [joint.coordinates[name].motion for name in axis.coordinates]
+                names = {"coordinates": list(axis.coordinates)} if axis.coordinates else {}
+                function = _function_row(axis.function, inputs, motion)
+                rows.append({"axis": list(axis.direction), **names, **function})
+            if rows:
+                row[f"{motion}s"] = rows
     elif joint.coordinates:
-        axes = zip(joint.coordinates, (*joint.rotations, *joint.translations))
-        row["axes"] = {name: list(axis.direction) for name, axis in axes}
+        named = zip(joint.coordinates, (*joint.rotations, *joint.translations))
+        row["axes"] = {name: list(axis.direction) for name, axis in named}
     tables = {
         name: _coordinate_row(coordinate, joint.kind)
         for name, coordinate in joint.coordinates.items()
@@ -763,14 +769,6 @@ def _coordinate_row(coordinate, kind):
         row["range"] = [end / factor for end in coordinate.range]
     row.update({key: True for key in ("clamped", "locked") if getattr(coordinate, key)})
     return row
-
-
-def _axis_row(axis, coordinates, output):
-    function = _function_row(
-        axis.function, [coordinates[name].motion for name in axis.coordinates], output
-    )
-    names = {"coordinates": list(axis.coordinates)} if axis.coordinates else {}
-    return {"axis": list(axis.direction), **names, **function}
 
 
 def _function_row(function: Function, inputs: Sequence[str], output: str) -> dict[str, object]:

@@ -92,19 +92,8 @@ def picked_vertices(points: Floats, vertices: Floats, *, context: str) -> Intege
     return np.union1d(near, nearest)
 
 
-def painted_vertices(colour: str, read: ReadMesh, *, context: str) -> Integers:
-    """The vertices that have a colour (``"#rrggbb"``) in the muscle's file."""
-    if not read.source:
-        raise SceneError(f"{context}a colour needs a mesh that was read from a file")
-    painted = _painted(colour, Path(read.source), len(read.vertex_map), context)
-    kept = read.vertex_map[painted]
-    if not (kept >= 0).any():
-        raise SceneError(f"{context}no vertex has the colour {colour}, or one near to it")
-    return np.unique(kept[kept >= 0])
-
-
 def _painted(colour: str, path: Path, count: int, context: str) -> Booleans:
-    """Whether each of the ``count`` vertices of a file has a colour."""
+    """Whether each of the ``count`` vertices of a file has a colour (``"#rrggbb"``)."""
     if re.fullmatch(r"#[0-9a-fA-F]{6}", colour) is None:
         raise SceneError(f"{context}colour must be like '#ff0000', got {shown(repr(colour))}")
     visual = trimesh.load(path, process=False).visual
@@ -253,7 +242,14 @@ def select_vertices(
         place = transform, table.colour
         return region_vertices(table.region, *place, read.mesh, context=context)
     if table.colour is not None:
-        return painted_vertices(table.colour, read, context=context)
+        if not read.source:
+            raise SceneError(f"{context}a colour needs a mesh that was read from a file")
+        painted = _painted(table.colour, Path(read.source), len(read.vertex_map), context)
+        kept = read.vertex_map[painted]
+        if not (kept >= 0).any():
+            words = f"no vertex has the colour {table.colour}, or one near to it"
+            raise SceneError(f"{context}{words}")
+        return np.unique(kept[kept >= 0])
     if bone is None or not isinstance(table, AttachTable):
         raise TypeError("near belongs to an attachment and its bone")
     return _within(bone.distances(points), table.near or 0.0, "near", context)

@@ -265,7 +265,12 @@ def _merge_equal(state):
     border, apart = _border(new), 0.0
     for tolerance in WIDER_TOLERANCES if border else ():
         wider = np.arange(len(merged))
-        wider[used] = used[_nearby(vertices, tolerance * box_size(vertices))]
+        # The first vertex of each group of those that are so near to another.
+        near = tolerance * box_size(vertices)
+        pairs = cKDTree(vertices).query_pairs(near, output_type="ndarray")
+        links = coo_matrix((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(vertices),) * 2)
+        label = connected_components(links, directed=False)[1]
+        wider[used] = used[np.unique(label, return_index=True)[1][label]]
         joined = _merged_faces(faces, wider)
         few = len(joined) >= (1.0 - TRIANGLES_LOST) * len(new)
         left = _border(joined)
@@ -293,14 +298,6 @@ def _merged_faces(faces, merged):
 def _border(faces):
     """Number of edges of one face alone."""
     return int((_edges(faces)[1] == 1).sum())
-
-
-def _nearby(vertices, distance):
-    """The first vertex (n,) of each group of those within a distance of another."""
-    pairs = cKDTree(vertices).query_pairs(distance, output_type="ndarray")
-    links = coo_matrix((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(vertices),) * 2)
-    _, label = connected_components(links, directed=False)
-    return np.unique(label, return_index=True)[1][label]
 
 
 def _euler(faces):
