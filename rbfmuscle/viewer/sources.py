@@ -145,13 +145,14 @@ class LiveSource:
         self.rest = Picture(bone_poses(scene, {}), coarse, {}, {}, {}, "")
         self.marks = scene_marks(scene)
         session = LiveSession(scene, bone_sdfs={})
-        self.controls = {
-            name: _coordinate(scene, name, (*limits, session.rest[name]))
-            for name, limits in session.limits.items()
-        } | {
-            ACTIVATION + name: Control("Activation", name, 0.0, 1.0, 0.0)
-            for name in session.activation
-        }
+        self.controls: dict[str, Control] = {}
+        for name, limits in session.limits.items():
+            group, _, label = name.rpartition(".")
+            unit = unit_sign(scene, name).strip()
+            ends = (round(shown_value(scene, name, x), 9) for x in (*limits, session.rest[name]))
+            self.controls[name] = Control(group, f"{label} [{unit}]" if unit else label, *ends)
+        for name in session.activation:
+            self.controls[ACTIVATION + name] = Control("Activation", name, 0.0, 1.0, 0.0)
         moved = [
             {n: x for n, x in frame.items() if n in session.limits} for frame in scene.motion.frames
         ]
@@ -166,13 +167,6 @@ class LiveSource:
         """A model of every muscle, at rest."""
         scene = self.scene if choice == self.choices[0] else self.scene.with_options(model=choice)
         return LiveFigure(LiveSession(scene, bone_sdfs=self.fields), build_models(scene))
-
-
-def _coordinate(scene: Scene, name: str, numbers: tuple[float, ...]) -> Control:
-    group, _, label = name.rpartition(".")
-    unit = unit_sign(scene, name).strip()
-    numbers = tuple(round(shown_value(scene, name, number), 9) for number in numbers)
-    return Control(group, f"{label} [{unit}]" if unit else label, *numbers)
 
 
 class LiveFigure:
