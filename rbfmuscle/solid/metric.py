@@ -57,11 +57,13 @@ TAUT = 0.004
 # Least stiffness of a point along any direction, over 2 μ, and the shares of what points lack of it
 # that are added, in the order in which they are tried until H is positive definite. With all of it
 # muscles that hang between others take steps of a fiftieth of their way.
-FLOOR, SHARES = 0.002, (0.25, 0.5, 1.0)
+FLOOR = 0.002
+SHARES = (0.25, 0.5, 1.0)
 BLOCK = 32  # rows and columns of a matrix that are mirrored at once
 # ε_abc, by which ∂² det F / ∂F_ab ∂F_cd = ε_ace ε_bdf F_ef.
-ODD = np.zeros((3, 3, 3))
-ODD[[0, 1, 2], [1, 2, 0], [2, 0, 1]], ODD[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = 1.0, -1.0
+LEVI_CIVITA = np.zeros((3, 3, 3))
+LEVI_CIVITA[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
+LEVI_CIVITA[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
 GENERATORS = np.array(
     [
         [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
@@ -105,7 +107,7 @@ def find_metric(
     """The metric for gradients (M, 3, N) of the regions' volumes and their pressures (M,), where
     the points are as in ``work`` (C, ROWS * P), some of them ``squeezed`` (Q,).
 
-    LinAlgError where the gradients are not independent.
+    LinAlgError where the gradients are not independent, or H is not positive definite.
     """
     count, _, nodes = gradient.shape
     points = point_stiffness(work, np.repeat(pressure[model.cells.region], POINTS))
@@ -125,18 +127,19 @@ def _positive_inverse(model: SolidModel, points: Floats, squeezed: Booleans) -> 
     """H⁻¹ (3 N, 3 N) for the stiffness (Q, 9, 9) of the points, with the least share of `SHARES` by
     which H is positive definite.
     """
+    missing = lacking(points)
     for share in SHARES:
-        inverse = inverted(stiffness_matrix(model, raised(points, share), squeezed))
+        inverse = inverted(stiffness_matrix(model, points + share * missing, squeezed))
         if inverse is not None:
             return inverse
     raise np.linalg.LinAlgError("the stiffness of the solid is not positive definite")
 
 
-def raised(points: Floats, share: float) -> Floats:
-    """Stiffness (Q, 9, 9) with a share added of what it lacks of `FLOOR` along any direction."""
+def lacking(points: Floats) -> Floats:
+    """What the stiffness (Q, 9, 9) of points lacks of `FLOOR` along any direction."""
     value, vector = np.linalg.eigh(points)
-    value += share * np.maximum(FLOOR - value, 0.0)
-    return np.asarray((vector * value[:, None, :]) @ vector.swapaxes(1, 2))
+    missing = np.maximum(FLOOR - value, 0.0)
+    return np.asarray((vector * missing[:, None, :]) @ vector.swapaxes(1, 2))
 
 
 def stiffness_matrix(model: SolidModel, points: Floats, squeezed: Booleans) -> Floats:
@@ -144,8 +147,8 @@ def stiffness_matrix(model: SolidModel, points: Floats, squeezed: Booleans) -> F
     ``squeezed`` (Q,).
     """
     cells, nodes = model.cells, len(model.rest)
-    points = points * cells.weights[:, None, None]
-    points[squeezed] += STIFFNESS * cells.weights[squeezed, None, None] * np.eye(9)
+    points = points + STIFFNESS * squeezed[:, None, None] * np.eye(9)
+    points *= cells.weights[:, None, None]
     by_cell = points.reshape(len(cells.nodes), POINTS, 9, 9).transpose(0, 2, 3, 1)
     shape = (len(cells.nodes), 3, 3, 3, 3, POINTS)
     matrix = np.zeros((nodes, 3, nodes, 3))
@@ -182,8 +185,9 @@ def point_stiffness(work: Floats, pressure: Floats) -> Floats:
     ``pressure`` (Q,) over 2 μ.
     """
     f = at_points(work, GRADIENT, 3, 3)
-    bend = np.einsum("ace,bdf,qef->qabcd", ODD, ODD, f, optimize=True).reshape(-1, 9, 9)
-    return matrix_stiffness(work) + fibre_stiffness(work) - pressure[:, None, None] * bend
+    bend = np.einsum("ace,bdf,qef->qabcd", LEVI_CIVITA, LEVI_CIVITA, f, optimize=True)
+    pressed = pressure[:, None, None] * bend.reshape(-1, 9, 9)
+    return matrix_stiffness(work) + fibre_stiffness(work) - pressed
 
 
 def matrix_stiffness(work: Floats) -> Floats:

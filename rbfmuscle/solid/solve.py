@@ -76,8 +76,8 @@ MOST_PRESSURE = 3.0  # of a region, over 2 μ
 # Iterations after which the metric is found anew, also as a solve starts, where the last one took
 # three times as many. With 15, muscles that slide on each other may not get to their end.
 RENEWED = 10
-# Where acceleration would go against a step, which then leads away from a saddle of the energy: how
-# many times the step is taken instead.
+# Where the accelerated motion is against the step, it goes to a saddle of the energy: so many times
+# the step is taken instead.
 FORWARD = 3.0
 
 
@@ -201,7 +201,6 @@ class Settling:
         self.volumes = np.empty(count)
         self.iterations = 0
         self.error = np.inf
-        self.residual = np.inf
         self.asleep = False
         self._free: tuple[Floats, Floats]
         self._renewed = 0
@@ -373,7 +372,6 @@ class Settling:
         self.iterations += 1
         pressure = self.pressure + self.metric.whiten.T @ self.change
         pressure = np.clip(pressure, -MOST_PRESSURE, MOST_PRESSURE)
-        self.residual = moved / size
         if moved > GROWTH * self._least or moved > LONGEST * size:
             self.mixer.restart()
         self._least = moved if moved > GROWTH * self._least else min(self._least, moved)
@@ -433,8 +431,9 @@ class Settling:
         return SAFETY * moved * self.slowness
 
     def _renew_metric(self) -> None:
-        found = self.gradient, self.work, self.squeezed, self.pressure
-        self.metric = find_metric(self.model, *found)
+        self.metric = find_metric(
+            self.model, self.gradient, self.work, self.squeezed, self.pressure
+        )
         self._renewed = self.iterations
         self.mixer.restart()
 

@@ -35,7 +35,7 @@ from rbfmuscle.solid.kernels import (
     pull_apart,
 )
 from rbfmuscle.solid.lattice import LEAST_REGION, Lattice
-from rbfmuscle.solid.metric import FLOOR, find_metric, point_stiffness, raised, stiffness_matrix
+from rbfmuscle.solid.metric import FLOOR, find_metric, lacking, point_stiffness, stiffness_matrix
 from rbfmuscle.solid.model import TOGETHER, build_solid, greatest_forces
 from rbfmuscle.solid.solve import (
     BULK,
@@ -294,13 +294,31 @@ def test_stiffness_is_raised_to_its_floor_and_the_metric_is_positive_where_a_bar
     local = solid.localise(rest * 0.5 + np.random.default_rng(1).normal(0, 0.3, rest.shape), 0.0)
     none = np.zeros(len(at_points(local.work, STRETCH)), dtype=bool)
     points = point_stiffness(local.work, np.zeros(len(none)))
-    before, half, whole = (np.linalg.eigvalsh(raised(points, s)) for s in (0.0, 0.5, 1.0))
+    before, half, whole = (
+        np.linalg.eigvalsh(points + share * lacking(points)) for share in (0.0, 0.5, 1.0)
+    )
     assert before.min() < 0.0
     assert whole.min() == pytest.approx(FLOOR, rel=1e-6)
     np.testing.assert_allclose(half, 0.5 * (before + whole), atol=1e-9 * np.abs(before).max())
     pressure = np.zeros(len(solid.model.cells.volumes))
     metric = find_metric(solid.model, local.gradient, local.work, none, pressure)
     assert np.linalg.eigvalsh(metric.inverse).min() > 0.0
+
+
+@pytest.mark.parametrize(("push", "least", "most"), [(2.5, 0.0, 0.1), (4.0, 2.5, 4.0)])
+def test_a_bar_stays_straight_up_to_its_critical_load_and_buckles_beyond(push, least, most):
+    """The straight bar is in equilibrium at any load; beyond the critical one it is a saddle."""
+    bar = Bar(tension=False, subdivisions=2)
+    rest = bar.model.rest
+    bent = rest.copy()
+    bent[:, 2] += 1e-3 * np.cos(np.pi * rest[:, 0] / 40.0) ** 2
+    bar.state = bar.state._replace(nodes=bent)
+    bar.settle(trimesh.transformations.translation_matrix([-push, 0.0, 0.0]))
+    assert bar.report.caps == ()
+    before = bar.model.embedding.of(rest)
+    moved = bar.model.embedding.of(bar.state.nodes) - before
+    middle = np.abs(before[:, 0]) < 2.0
+    assert least <= np.linalg.norm(moved[middle, 1:].mean(axis=0)) <= most
 
 
 def test_motion_of_nodes_counts_by_what_hangs_on_them():
