@@ -19,7 +19,7 @@ import numpy as np
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.metrics.metrics import SurfaceForm
-from rbfmuscle.metrics.quantities import bone_depth, surface_depth
+from rbfmuscle.metrics.rows import bone_depth, surface_depth
 from rbfmuscle.models import build_model, configure_scene
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.settings import parse_settings

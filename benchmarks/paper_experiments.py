@@ -25,7 +25,7 @@ import numpy as np
 from peers import paper_models
 
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.metrics.quantities import bone_depth, surface_depth
+from rbfmuscle.metrics.rows import bone_depth, surface_depth
 from rbfmuscle.models import build_model
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.objects import from_mm

@@ -15,7 +15,7 @@ from rbfmuscle.geometry.lines import distance_along, nearest_pieces, points_alon
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import moving_joints, split_ends
-from rbfmuscle.metrics.quantities import bones_about
+from rbfmuscle.metrics.rows import bones_about
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene

@@ -55,7 +55,8 @@ def _mesh(method: str, title: str, tolerance: float = 0.0) -> ModelKind:
     from pbd_baseline.shapes import METHODS
 
     chosen = METHODS[method]._replace(tolerance=tolerance)
-    build, sweeps = partial(PBDMuscle, method=chosen), 0 if tolerance else chosen.sweeps
+    build = partial(PBDMuscle, method=chosen)
+    sweeps = 0 if tolerance else chosen.sweeps
     return ModelKind(build, PBDOptions, solved_points, title, sweeps)
 
 

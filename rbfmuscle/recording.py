@@ -20,7 +20,8 @@ from rbfmuscle.fibres import build_bundles
 from rbfmuscle.folders import copy_listed
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.metrics.metrics import MuscleMeasures, Values
-from rbfmuscle.metrics.quantities import ALL, Row, frame_rows, joint_gaps, moment_arm_rows
+from rbfmuscle.metrics.quantities import ALL, Row
+from rbfmuscle.metrics.rows import frame_rows, joint_gaps, moment_arm_rows
 from rbfmuscle.metrics.summary import (
     LIMITS,
     Doubt,
@@ -459,7 +460,7 @@ class Recording:
         """The facts by now."""
         self.times["wall"] = (self._end or time.perf_counter()) - self._start
         table = self.summary.table()
-        limits, verdict = self.limits, judge(table, self.limits, self._doubts)
+        verdict = judge(table, self.limits, self._doubts)
         if self.status == "failed" and self.written:  # of how many frames the verdict holds
             count = f"{len(self.written)} of {len(self.scene.motion)} frames"
             outcome = f"the run stopped after {count}; in these {verdict.outcome}"
@@ -473,8 +474,8 @@ class Recording:
             options=self.options,
             kernels=kernel_names(self.scene),
             times=self.times,
-            limits=limits.values,
-            fail_on=limits.fail_on,
+            limits=self.limits.values,
+            fail_on=self.limits.fail_on,
             verdict=describe_verdict(verdict, table, self.scene.missing_bones),
             **verdict._asdict(),
             neighbours=self._measures.neighbours.table(),

@@ -43,7 +43,8 @@ def verdict_lines(directory: Path) -> Iterator[str]:
     from rbfmuscle.scene.phantom import PHANTOM
 
     saved = RunData.load(directory)
-    info, table = saved.info, Summary(saved.metrics).table()
+    info = saved.info
+    table = Summary(saved.metrics).table()
     yield _wrapped("verdict: ", info.outcome)
     named = worst_first(info.beyond)[:MOST]
     for row in named:

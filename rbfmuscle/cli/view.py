@@ -134,7 +134,8 @@ def _draw(opened, model, stops, path):
     check_picture(path)
     if not isinstance(opened, dict):  # a motion from rest to the pose
         _check_stops(stops, coordinate_limits(opened))
-        rest, scene = rest_coordinates(opened), opened.with_options()
+        rest = rest_coordinates(opened)
+        scene = opened.with_options()
         there = {name: inner_value(scene, name, x) for name, x in stops.items()}
         scene.motion = Motion([rest, rest | there])
         render_run(simulate(scene, model), path, frame=1)

@@ -133,8 +133,8 @@ def read_animation(run: RunData, names: list[str], frames: list[int], *, unit: s
         known = [x._replace(points=factor * x.points) for x in lines if x is not None]
         if len(known) == len(frames):
             fibres[look.fibres_name(muscle_name)] = known
-    timed, seen = times is not None, (run.body, direction)
-    return Animation(name, unit, at, timed, captions, muscles, bones, *seen, fibres)
+    timed = times is not None
+    return Animation(name, unit, at, timed, captions, muscles, bones, run.body, direction, fibres)
 
 
 # Whole numbers of which the longest side of all that moves has so many: 0.03 mm of 900.

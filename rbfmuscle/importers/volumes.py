@@ -256,14 +256,16 @@ def _read_nifti(path):
         ):
             names[int(number)] = name.strip()
     data = np.asanyarray(image.dataobj)
-    affine, unit = np.array(image.affine, dtype=np.float64), image.header.get_xyzt_units()[0]
+    affine = np.array(image.affine, dtype=np.float64)
+    unit = image.header.get_xyzt_units()[0]
     volume = LabelVolume(data.reshape(data.shape[:3]), affine, names, str(path))
     volume.notes += [NO_UNIT] if unit == "unknown" else []
     if not (int(image.header["qform_code"]) or int(image.header["sform_code"])):
         volume.directed = False
         volume.affine = np.diag([*map(float, image.header.get_zooms()[:3]), 1.0])
     # Both transforms may be set, and put the voxels at different places.
-    (first, known), (second, other) = image.get_sform(coded=True), image.get_qform(coded=True)
+    first, known = image.get_sform(coded=True)
+    second, other = image.get_qform(coded=True)
     if known and other:
         ends = np.meshgrid(*([0, size - 1] for size in image.shape[:3]))
         corners = np.column_stack([np.stack(ends, -1).reshape(-1, 3), np.ones(8)])
@@ -303,7 +305,8 @@ def _read_nrrd(path):
     affine[:3] *= [[-1.0] if end in "lpi" else [1.0] for end in ends[:3]]
     unit = str((said.get("space units") or [""])[0]).strip('"').lower()
     # Spaces of the body are in mm by convention.
-    directed, notes = "space" in said, [] if unit or "space" in said else [NO_UNIT]
+    directed = "space" in said
+    notes = [] if unit or directed else [NO_UNIT]
     names = _segment_names(said, layered is not None)
     return LabelVolume(data, affine, names, str(path), notes, directed), unit or "mm"
 

@@ -20,7 +20,7 @@ from rbfmuscle.geometry.lines import distance_along, line_length, points_along
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import connected_vertices, vertex_areas
 from rbfmuscle.loops import loop
-from rbfmuscle.metrics.quantities import bones_about
+from rbfmuscle.metrics.rows import bones_about
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.joints import Joint, all_coordinates, rigid_body
 from rbfmuscle.scene.objects import Attachment, Muscle

@@ -13,13 +13,8 @@ from rbfmuscle.geometry.surfaces import EdgeLengths, label_sheets, mesh_volume, 
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import Centreline, moving_joints
 from rbfmuscle.metrics.neighbours import InputNeighbours, NeighbourMeasures, Shown
-from rbfmuscle.metrics.quantities import (
-    QUANTITIES,
-    bone_depth,
-    bones_about,
-    percentiles,
-    surface_depth,
-)
+from rbfmuscle.metrics.quantities import QUANTITIES, percentiles
+from rbfmuscle.metrics.rows import bone_depth, bones_about, surface_depth
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.check import articular_share, end_gap, scene_surfaces
 from rbfmuscle.scene.objects import Muscle, from_mm

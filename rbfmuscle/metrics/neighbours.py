@@ -52,6 +52,16 @@ class Side:
     allowed: Floats | None
 
 
+@dataclass
+class PairFacts:
+    """Worst values of a pair over the frames [scene unit], and the frames."""
+
+    overlap: float = 0.0
+    overlap_frame: int = 0
+    gap: float = 0.0
+    gap_frame: int = 0
+
+
 class InputNeighbours:
     """Muscles as the input has them: distances to their meshes, and which of these overlap."""
 
@@ -96,9 +106,7 @@ class NeighbourMeasures:
         self._places: dict[str, Floats] = {}
         self._sides: dict[tuple[str, str], Side] = {}
         self._touched: set[tuple[str, str]] = set()
-        # Of the pairs that met or touched the worst values over the frames [scene unit], and the
-        # frames.
-        self._worst: dict[tuple[str, str], dict[str, float]] = {}
+        self.pairs: dict[tuple[str, str], PairFacts] = {}
 
     def measure(self, index: int, shown: Mapping[str, Shown]) -> dict[str, dict[str, float]]:
         """Values of each muscle that is shown, in the frame of this number."""
@@ -123,16 +131,7 @@ class NeighbourMeasures:
                 overlap[name] = max(overlap[name], deepest)
                 gaps[name].append(gap)
             if deepest > 0.0 or (one, other) in self._touched:
-                nothing = {"overlap_max": 0.0, "overlap_frame": index}
-                nothing |= {"overlap_rest": 0.0, "gap": 0.0, "gap_frame": index}
-                if (one, other) in self.input.overlaps:
-                    depths = self.input.overlaps[one, other].depths
-                    nothing["overlap_rest"] = float(depths.max())
-                worst, gap = self._worst.setdefault((one, other), nothing), _percentile(parted)
-                if deepest > worst["overlap_max"]:
-                    worst |= {"overlap_max": deepest, "overlap_frame": index}
-                if gap > worst["gap"]:
-                    worst |= {"gap": gap, "gap_frame": index}
+                self._keep((one, other), index, deepest, _percentile(parted))
         return {
             name: {"neighbour_overlap_max": overlap[name], "neighbour_gap": _percentile(gaps[name])}
             for name in names
@@ -140,8 +139,27 @@ class NeighbourMeasures:
 
     def table(self) -> list[dict[str, object]]:
         """Pairs that met or touched, the deepest overlap first [scene unit]."""
-        ordered = sorted(self._worst.items(), key=lambda found: -found[1]["overlap_max"])
-        return [{"muscles": list(pair), **worst} for pair, worst in ordered]
+        ordered = sorted(self.pairs.items(), key=lambda found: -found[1].overlap)
+        return [
+            {
+                "muscles": list(pair),
+                "overlap_max": worst.overlap,
+                "overlap_frame": worst.overlap_frame,
+                "overlap_rest": float(self.input.overlaps[pair].depths.max())
+                if pair in self.input.overlaps
+                else 0.0,
+                "gap": worst.gap,
+                "gap_frame": worst.gap_frame,
+            }
+            for pair, worst in ordered
+        ]
+
+    def _keep(self, pair: tuple[str, str], index: int, overlap: float, gap: float) -> None:
+        worst = self.pairs.setdefault(pair, PairFacts(overlap_frame=index, gap_frame=index))
+        if overlap > worst.overlap:
+            worst.overlap, worst.overlap_frame = overlap, index
+        if gap > worst.gap:
+            worst.gap, worst.gap_frame = gap, index
 
     def _pair(
         self, row: tuple[str, str, bool], shown: Mapping[str, Shown]
@@ -154,11 +172,7 @@ class NeighbourMeasures:
             vertices = shown[one].distance.vertices
             if met:
                 deepest = max(deepest, _deepest(vertices, there, side.allowed))
-            # How much farther touching places are from the other than at rest.
-            points, away = vertices[side.touching], np.zeros(0)
-            if len(points):
-                away = np.where(there.inside(points), 0.0, there.unsigned(points))
-            parted.append(np.maximum(away - side.gap, 0.0))
+            parted.append(_parted(vertices[side.touching], there, side.gap))
         return deepest, parted
 
     def _renew(self, one: str, at_rest: Floats, names: Sequence[str]) -> None:
@@ -187,6 +201,14 @@ def _deepest(vertices: Floats, other: MeshDistance, allowed: Floats | None) -> f
         return 0.0
     depth = other.unsigned(vertices[inside])
     return max(0.0, float((depth if allowed is None else depth - allowed[inside]).max()))
+
+
+def _parted(points: Floats, other: MeshDistance, gap: Floats) -> Floats:
+    """How much farther (n,) points (n, 3) are from another surface than at rest."""
+    if len(points) == 0:
+        return np.zeros(0)
+    away = np.where(other.inside(points), 0.0, other.unsigned(points))
+    return np.maximum(away - gap, 0.0)
 
 
 def _percentile(parted: Iterable[Floats]) -> float:

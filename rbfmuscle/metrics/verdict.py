@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.metrics.quantities import ALL, ROUGH, Row, quantity_of, split_name
+from rbfmuscle.metrics.quantities import ALL, Row, quantity_of, split_name
+from rbfmuscle.metrics.rows import ROUGH
 from rbfmuscle.metrics.summary import (
     LIMITS,
     LOWER_BOUNDS,

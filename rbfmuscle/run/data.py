@@ -18,7 +18,8 @@ import trimesh
 from pydantic import ValidationError
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.metrics.quantities import ALL, Row, moment_arms, reaches
+from rbfmuscle.metrics.quantities import ALL, Row
+from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.info import FORMAT, FrameInfo, RunInfo
 from rbfmuscle.run.vtk_files import fibre_file, read_fibres, read_vtp
@@ -183,7 +184,8 @@ class RunData:
             ``coordinate`` (that of a moment arm, else empty), ``value`` and ``unit``;
             ``pandas.DataFrame`` takes it as it is.
         """
-        rows, place = self.metrics, {frame: k for k, frame in enumerate(self.frame_numbers)}
+        rows = self.metrics
+        place = {frame: k for k, frame in enumerate(self.frame_numbers)}
         at = np.array([place[row.frame] for row in rows], dtype=int)
         about = [row.coordinate if "moment_arm" in row.quantity else "" for row in rows]
         columns = {
@@ -294,7 +296,7 @@ class MuscleRun:
         """Moment arm (frames, N) of each fibre about a coordinate, of its full or its short name.
 
         Minus the slope of the fibre's length [scene unit per radian, or 1 of a translation], see
-        `rbfmuscle.metrics.quantities.moment_arms`; NaN where the coordinate does not move alone.
+        `rbfmuscle.metrics.rows.moment_arms`; NaN where the coordinate does not move alone.
         """
         path = [frame.coordinates for frame in self.run.frames]
         known = sorted({name for coordinates in path for name in coordinates})

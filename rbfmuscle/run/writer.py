@@ -182,9 +182,10 @@ class RunWriter:
             for bone in self.scene.bones
         ]
         events = [(e.frame, e.muscle, e.bone, e.count, e.action) for e in frame.events]
-        for name, table in zip(TABLES, (poses, events, rows, fibres)):
+        tables = {"poses": poses, "events": events, "metrics": rows, "fibres": fibres}
+        for name, table in tables.items():
             if table:
-                write_csv(self.directory / name, table, mode="a")
+                write_csv(self.directory / f"{name}.csv", table, mode="a")
 
     def _write_surfaces(self, frame):
         """Surfaces of a frame, side by side: most of the time goes into packing them."""
@@ -200,8 +201,10 @@ class RunWriter:
 
         def write(entry):
             name, file = entry
-            arrays, bones, distance = {}, frame.bones.get(name), None
+            arrays = {}
             if name in frame.surfaces:
+                bones = frame.bones.get(name)
+                distance = None
                 # Distances to bones that the muscle can reach, and what its model adds, as
                 # ``level_offset``.
                 if bones is not None and bones.names:

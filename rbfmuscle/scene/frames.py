@@ -101,7 +101,8 @@ def read_motion_file(
         raise SceneError(
             f"[motion]: {path} row {row + 1}: {labels[used[column]]} is not a finite number"
         )
-    said, notes = header.get("indegrees"), []
+    said = header.get("indegrees")
+    notes = []
     if said is None:
         notes.append(
             f"{path} does not say inDegrees: "

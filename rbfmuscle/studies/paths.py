@@ -205,7 +205,8 @@ def _row(loop, gauges, pose, names):
     """
     for stepper in loop.steppers:
         stepper.events.clear()
-    arms, known = [], all_coordinates(loop.scene.joints)
+    arms = []
+    known = all_coordinates(loop.scene.joints)
     try:
         here = _settled(loop, gauges, pose)
         for name in names:
@@ -311,7 +312,8 @@ def _ranges(scene, names, given):
         raise UsageError(
             f"range of {name}: none of the muscles depends on it, or it is locked or follows others"
         )
-    found, known = {}, all_coordinates(scene.joints)
+    found = {}
+    known = all_coordinates(scene.joints)
     for name in names:
         moved = [frame[name] for frame in scene.motion.frames if name in frame]
         covered = min(moved, default=0.0), max(moved, default=0.0)

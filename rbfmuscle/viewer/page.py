@@ -106,12 +106,12 @@ class Panel:
         self.view = gui.add_button_group("View", [view.capitalize() for view in VIEWS])
         self.cut = self._watch(gui.add_dropdown("Cut along", ("none", "x", "y", "z")))
         self.place = self._watch(gui.add_slider("Cut at", 0.0, 1.0, 0.01, 0.5))
-        marks, folder = self.source.marks, self.gui.add_folder
+        marks = self.source.marks
         kinds = KINDS if marks.held else KINDS[-1:]
-        with folder("Marks", expand_by_default=False):
-            self.marks = {kind: self._watch(self.gui.add_checkbox(kind, False)) for kind in kinds}
+        with gui.add_folder("Marks", expand_by_default=False):
+            self.marks = {kind: self._watch(gui.add_checkbox(kind, False)) for kind in kinds}
         if marks.doubts:
-            with folder(f"Doubts ({len(marks.doubts)})", expand_by_default=False):
+            with gui.add_folder(f"Doubts ({len(marks.doubts)})", expand_by_default=False):
                 lines = "".join(f"<li>{html.escape(doubt)}</li>" for doubt in marks.doubts)
                 gui.add_html(f"<ul style='font-size:12px;padding:0 24px'>{lines}</ul>")
         self.eyes = {}

@@ -12,7 +12,7 @@ import trimesh
 from rbfmuscle.geometry.arrays import Floats, Integers, to_world
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import EdgeStretch, clustered, joined_meshes, mesh_volume
-from rbfmuscle.metrics.quantities import surface_depth
+from rbfmuscle.metrics.rows import surface_depth
 from rbfmuscle.run.appearance import (
     BONE_COLOUR,
     LONG,

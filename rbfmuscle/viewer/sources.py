@@ -14,7 +14,7 @@ from rbfmuscle.fibres import build_bundles
 from rbfmuscle.geometry.arrays import Floats, unit
 from rbfmuscle.geometry.surfaces import clustered
 from rbfmuscle.metrics.centreline import Centreline
-from rbfmuscle.metrics.quantities import moment_arms, reaches
+from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.metrics.verdict import describe_doubts
 from rbfmuscle.models import build_models, configure_scene, model_names
 from rbfmuscle.run.appearance import muscle_colours, muscle_groups, tendon_mesh
@@ -173,7 +173,9 @@ class LiveFigure:
     """New models of a session's muscles that follow coordinates set by hand."""
 
     def __init__(self, session: LiveSession, models: list[MuscleModel]) -> None:
-        self.session, self._unfinished, scene = session, True, session.scene
+        self.session = session
+        self._unfinished = True
+        scene = session.scene
         self._bundles = build_bundles(scene, models)
         known = all_coordinates(scene.joints)
         shifts = {name for name, fact in known.items() if fact.motion == "translation"}

@@ -21,7 +21,7 @@ from rbfmuscle.importers.guess.guess import guess_scene
 from rbfmuscle.importers.opensim import tubes
 from rbfmuscle.importers.opensim.scene import import_osim
 from rbfmuscle.importers.volumes import label_surface, read_labels
-from rbfmuscle.metrics.quantities import moment_arms
+from rbfmuscle.metrics.rows import moment_arms
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.validation import MeshError

@@ -9,7 +9,8 @@ from blend_model import arm_scene, use_blend_model
 
 from rbfmuscle.cli.report import verdict_lines
 from rbfmuscle.display.report import write_report
-from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, joint_gaps, unit_text
+from rbfmuscle.metrics.quantities import ALL, QUANTITIES, Row, unit_text
+from rbfmuscle.metrics.rows import joint_gaps
 from rbfmuscle.metrics.summary import (
     LIMITS,
     NEEDS,

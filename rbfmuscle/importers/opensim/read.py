@@ -35,7 +35,8 @@ STEP = 1e-6  # of the central differences [radian or metre]
 
 def assemble(model: OsimModel) -> OsimModel:
     """The model, its weld constraints met at rest; what is left out or doubtful is named."""
-    couplings, model.couplings = model.couplings, []
+    couplings = model.couplings
+    model.couplings = []
     for coupling in couplings:
         try:
             model.couplings = ordered([*model.couplings, coupling])
