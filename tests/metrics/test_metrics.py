@@ -10,8 +10,15 @@ from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.metrics.centreline import Centreline, split_ends
 from rbfmuscle.metrics.metrics import MuscleMeasures, SurfaceForm, euler_characteristic
-from rbfmuscle.metrics.quantities import Row, _roughness, _smoothness
-from rbfmuscle.metrics.rows import bone_depth, moment_arm_rows, moment_arms, surface_depth
+from rbfmuscle.metrics.quantities import Row
+from rbfmuscle.metrics.rows import (
+    _roughness,
+    _smoothness,
+    bone_depth,
+    moment_arm_rows,
+    moment_arms,
+    surface_depth,
+)
 from rbfmuscle.recording import simulate
 from rbfmuscle.scene.bone import Bone, BoneDistance
 from rbfmuscle.scene.joints import Coordinate
