@@ -240,9 +240,6 @@ class MuscleMeasurer:
         found["initial_overlap"] = max(
             float(surface_depth(surface.vertices, probes, poses).max()),
             bone_depth(shown, probes, poses),
-            surface.quantities.get(
-                "lifted_penetration_max", surface.quantities.get("solver_penetration_max", 0.0)
-            ),
         )
         if self.line is not None:
             found["thickness"] = self.line.section(*mesh, poses)["belly_thickness"]

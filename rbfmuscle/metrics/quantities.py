@@ -112,7 +112,7 @@ QUANTITIES = {
     "tendon_depth": ("length", "greatest depth of a tendon inside a bone"),
     "initial_overlap": (
         "length",
-        "greatest overlap of surface, contact points and bones that is left at rest",
+        "greatest overlap of surface and bones that is left at rest",
     ),
     "end_gap": (
         "length",

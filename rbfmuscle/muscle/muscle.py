@@ -127,7 +127,8 @@ class RBFMuscle:
 
     def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """The samples and their triangulation: a material surface of constant topology."""
-        return self.state.points[len(self.rest.centres) :], self.rest.sample_faces
+        points = self.model.embedding.of(self.state.nodes)
+        return points[len(self.rest.centres) :], self.rest.sample_faces
 
     def predict(self, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray]) -> None:
         """Go along with the bones."""
@@ -234,7 +235,7 @@ class RBFMuscle:
     def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
         """What gives the present places (n, 3) of points (n, 3) of the muscle at rest."""
         placed = self._carry(points)
-        return lambda: placed(self.state.lifted_nodes)
+        return lambda: placed(self.state.nodes)
 
     def _carry(self, points: np.ndarray) -> Carry:
         """What gives the places (n, 3) of points (n, 3) of the muscle at rest from the nodes."""
@@ -242,7 +243,7 @@ class RBFMuscle:
 
     def embedded_mesh(self) -> Mesh:
         """The shown mesh where the solid carries it."""
-        return self.drawer.carry(self.state.lifted_nodes), self.drawer.shown.faces
+        return self.drawer.carry(self.state.nodes), self.drawer.shown.faces
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lies in the way."""

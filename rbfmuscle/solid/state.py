@@ -22,7 +22,7 @@ class SolidState(NamedTuple):
     """A solid of N nodes, Q quadrature points, M regions, n contact points and h held ones."""
 
     nodes: np.ndarray  # (N, 3) in equilibrium with contacts that yield a little
-    lifted_nodes: np.ndarray  # (N, 3) the same with what is left in a bone moved out of it
+    lifted_nodes: np.ndarray  # (N, 3) for the shown surface: what is left in a bone moved out
     points: np.ndarray  # (n, 3) contact points, carried by the lifted nodes
     rotations: np.ndarray  # (Q, 4) unit quaternions
     stretches: np.ndarray  # (Q,) of slack fibres
