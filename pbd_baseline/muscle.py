@@ -24,7 +24,7 @@ from rbfmuscle.scene.muscles import attachment_frames
 from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
+from rbfmuscle.simulation.frame import LogState, ModelSurface, SolveLog
 from rbfmuscle.simulation.neighbours import SEARCHED
 from rbfmuscle.simulation.touching import Body, surface_points
 
@@ -196,10 +196,6 @@ class PBDMuscle:
         """
         inside = SurfaceInterpolation(self.rest.vertices, points)
         return lambda: inside(self.points)
-
-    def embedded_mesh(self) -> Mesh:
-        """That of the material."""
-        return self.material_mesh()
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The mesh as it is now, where it overlapped bones at rest taken out of them."""

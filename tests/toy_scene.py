@@ -164,8 +164,6 @@ class ToyMuscle(MuscleModel):
     def material_mesh(self):
         return self.x.copy(), self.faces
 
-    embedded_mesh = material_mesh
-
     def surface(self, contacts):
         return ModelSurface(self.x.copy(), self.faces, {"solver_penetration_max": 0.0})
 

@@ -241,10 +241,6 @@ class RBFMuscle:
         """What gives the places (n, 3) of points (n, 3) of the muscle at rest from the nodes."""
         return embed(self._lattice, self.frame, points).of
 
-    def embedded_mesh(self) -> Mesh:
-        """The shown mesh where the solid carries it."""
-        return self.drawer.carry(self.state.nodes), self.drawer.shown.faces
-
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The closed surface at the rest volume, cut by what lies in the way."""
         nodes = self.state.lifted_nodes

@@ -184,8 +184,5 @@ class MuscleModel(Protocol):
     def follower(self, points: np.ndarray) -> Callable[[], np.ndarray]:
         """What gives the present places (n, 3) of points (n, 3) of the muscle at rest."""
 
-    def embedded_mesh(self) -> Mesh:
-        """Vertices and faces of the mesh that is shown, where the material takes it."""
-
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The closed, outward surface as the muscle is now."""

@@ -250,7 +250,9 @@ def test_shown_surfaces_meet_between_muscles_that_touch():
     (group,) = loop.groups
     number = [stepper.name for stepper in group.steppers].index("a")
     # What bulges by a millimetre towards its neighbours goes back; what is far from them stays.
-    vertices, faces = group.steppers[number].model.embedded_mesh()
+    model = group.steppers[number].model
+    vertices = model.drawer.carry(model.state.nodes)
+    faces = model.drawer.shown.faces
     normals = trimesh.Trimesh(vertices, faces, process=False).vertex_normals
     moved = group.neighbours.out_of_neighbours(number, vertices + normals)
     away = np.linalg.norm(moved, axis=1)
