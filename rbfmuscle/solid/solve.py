@@ -76,6 +76,7 @@ MOST_PRESSURE = 3.0  # of a region, over 2 μ
 # Iterations after which the metric is found anew, also as a solve starts, where the last one took
 # three times as many. With 15, muscles that slide on each other may not get to their end.
 RENEWED = 10
+KNOWN = 3  # iterations with a metric before the error is estimated by it
 # Where the accelerated motion is against the step, it goes to a saddle of the energy: so many times
 # the step is taken instead.
 FORWARD = 3.0
@@ -84,10 +85,10 @@ FORWARD = 3.0
 class Report(NamedTuple):
     """How a solve ended.
 
-    ``error`` is the estimated distance of material from the equilibrium, of the muscle's size;
-    ``volume_error`` the greatest relative error of a region's volume. ``caps`` says what ended at
-    its greatest number: iterations, the last contact forces, a contact at its greatest force, a
-    region at its greatest pressure.
+    ``error`` is the estimated distance of material from the equilibrium, of the muscle's size, and
+    1 where it is more or not known; ``volume_error`` the greatest relative error of a region's
+    volume. ``caps`` says what ended at its greatest number: iterations, the last contact forces, a
+    contact at its greatest force, a region at its greatest pressure.
     """
 
     iterations: int
@@ -393,8 +394,11 @@ class Settling:
         if last and self.error >= self.wanted:
             self.caps.add("iterations")
         self.asleep = last or self.error < self.wanted
-        # A body that sleeps keeps its metric, as it keeps the step that was found by it.
-        if not self.asleep and (joined or self.iterations - self._renewed >= RENEWED):
+        # A body that sleeps keeps its metric, as it keeps the step that was found by it. Just
+        # before the last iteration a new one would leave the error unknown.
+        late = self.iterations + KNOWN > self.model.iterations
+        stale = joined or self.iterations - self._renewed >= RENEWED
+        if stale and not late and not self.asleep:
             self._renew_metric()
 
     def _way(self, motion: Floats) -> float:
@@ -416,7 +420,7 @@ class Settling:
         A mode that contracts slowly makes small steps on a long way; where iterations have moved by
         ΔX and their steps changed by ΔR, its way is at most max |ΔX c| / |ΔR c| times its step.
         """
-        if self.iterations - self._renewed < 3:
+        if self.iterations - self._renewed < KNOWN:
             return np.inf
         # Where this is not the end in any case it need not be known.
         if self._may_end(moved) and self.mixer.count > 1:
@@ -447,7 +451,7 @@ class Settling:
         if (np.abs(self.pressure) >= MOST_PRESSURE).any():
             caps.add("pressure")
         error = float(np.abs(self.volumes / self.model.cells.volumes - 1.0).max())
-        return Report(self.iterations, self.error, error, tuple(sorted(caps)))
+        return Report(self.iterations, min(self.error, 1.0), error, tuple(sorted(caps)))
 
     def finish(self) -> SolidState:
         """The state where the iteration is."""

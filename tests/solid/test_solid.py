@@ -41,6 +41,7 @@ from rbfmuscle.solid.solve import (
     BULK,
     ERROR,
     LEAST,
+    RENEWED,
     STIFFNESS,
     Settling,
     start_work,
@@ -456,6 +457,13 @@ def test_solve_that_is_cut_short_says_so_and_its_residual_shrinks_with_iteration
     assert found[0].iterations == 1 and found[1].iterations == 3
     first, second, last = (report.error for report in found)
     assert first > second > 2.0 * last and second > ERROR > last
+
+
+@pytest.mark.parametrize("iterations", [RENEWED, RENEWED + 1, RENEWED + 2])
+def test_a_solve_that_ends_when_its_metric_was_due_states_its_error(iterations):
+    solid = Bar(iterations=iterations).with_fibres([1.0, 0.0, 0.0], ratio=4.0, slack=1.5)
+    solid.settle(rotation_about([0, 1, 0], 0.3, np.array([20.0, 0.0, 0.0])) @ shift(-2.0))
+    assert solid.report.caps == ("iterations",) and ERROR < solid.report.error < 1.0
 
 
 def test_a_slow_solve_that_ends_at_its_cap_says_how_far_it_is_from_the_equilibrium():
