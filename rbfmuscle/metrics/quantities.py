@@ -41,7 +41,8 @@ QUANTITIES = {
     "solver_residual": (
         "1",
         "estimated distance from equilibrium at the end of the solve (mesh models: the greatest "
-        "motion in the last sweep), over the muscle's size",
+        "motion in the last sweep), over the muscle's size; 1 where an RBF muscle's is greater or "
+        "not known",
     ),
     "solid_volume_error": (
         "1",
