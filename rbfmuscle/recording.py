@@ -473,6 +473,11 @@ class Recording:
             message=self.message,
             options=self.options,
             kernels=kernel_names(self.scene),
+            epsilons={
+                model.name: epsilon
+                for model in self._models
+                if (epsilon := getattr(model, "epsilon", None)) is not None
+            },
             times=self.times,
             limits=self.limits.values,
             fail_on=self.limits.fail_on,

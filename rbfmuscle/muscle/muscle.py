@@ -67,6 +67,8 @@ class RBFMuscle:
     Attributes
     ----------
     rest : RestState
+    epsilon : float or None
+        Shape parameter of the kernel, as given or as found; None where the kernel has none.
     model : SolidModel
         Of the elastic solid that carries the centres.
     state : SolidState
@@ -91,6 +93,8 @@ class RBFMuscle:
         self._rest_mesh = muscle.mesh
         self.options = options or RBFOptions()
         self.rest = RestState.from_muscle(muscle, scene, self.options)
+        fit = self.rest.fit
+        self.epsilon = fit.epsilon if fit.kernel.has_epsilon else None
         self.frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
         self._lattice = Lattice(self.frame.local, np.asarray(muscle.mesh.faces), self.options.nodes)
         self.model = _build_solid(

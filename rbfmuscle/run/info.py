@@ -185,11 +185,12 @@ class RunInfo(Part):
     """The facts of a run.
 
     ``status`` is "running", "complete", "interrupted" or "failed", ``message`` why it did not
-    complete. ``times`` are those of the parts of the run [s], ``muscles`` and ``frame_time`` what
-    `Summary.table` gives. ``limits`` are in the scene's unit, ``fail_on`` those that it may fail
-    on (None: the default); ``beyond`` are values beyond a limit, ``not_measured`` limits without a
-    value, ``outcome`` which muscles are within all limits, ``doubts`` what no limit
-    holds, ``verdict`` all of these in sentences. ``neighbours`` are the pairs of muscles that
+    complete. ``epsilons`` are the shape parameters of the ``kernels`` that have one [1 / scene
+    unit], both by muscle. ``times`` are those of the parts of the run [s], ``muscles`` and
+    ``frame_time`` what `Summary.table` gives. ``limits`` are in the scene's unit, ``fail_on`` those
+    that it may fail on (None: the default); ``beyond`` are values beyond a limit, ``not_measured``
+    limits without a value, ``outcome`` which muscles are within all limits, ``doubts`` what no
+    limit holds, ``verdict`` all of these in sentences. ``neighbours`` are the pairs of muscles that
     touched or met, with the worst of each. ``planned`` are the coordinates of all frames while the
     run goes on.
     """
@@ -202,6 +203,7 @@ class RunInfo(Part):
     versions: dict[str, str] = {}
     machine: dict[str, str | int | None] = {}
     kernels: dict[str, str] = {}
+    epsilons: dict[str, float] = {}
     times: dict[str, float] = {}
     muscles: dict[str, dict[str, Facts]] = {}
     frame_time: Facts | None = None

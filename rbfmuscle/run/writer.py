@@ -297,6 +297,7 @@ def build_info(
 
     Other facts are kept as they are: ``status`` ("running", "complete", "interrupted" or "failed"),
     ``message`` (why it did not complete), ``options`` of the caller, ``kernels`` by muscle,
+    ``epsilons`` (shape parameters of those kernels that have one, by muscle [1 / scene unit]),
     ``neighbours`` (`NeighbourMeasures.table`),
     ``times`` of the parts of the run [s], ``limits``, ``fail_on`` (those that it may fail on, None
     for the default), ``verdict``, ``beyond`` (muscle, quantity, worst value, limit, frame),

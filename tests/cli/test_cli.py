@@ -88,18 +88,23 @@ class TestRun:
             "--set",
             "model.centres=80",
             "--set",
+            "model.kernel=wendland_c2",
+            "--set",
             "contact.initial=keep",
         )
         info = json.loads(out)
         assert code == 0 and len(info["frames"]) == 2
-        assert info["scene"]["muscles"][0]["model"] == {"name": "rbf", "centres": 80}
+        model = {"name": "rbf", "centres": 80, "kernel": "wendland_c2"}
+        assert info["scene"]["muscles"][0]["model"] == model
+        assert info["kernels"] == {"biceps": "wendland_c2"} and info["epsilons"]["biceps"] > 0.0
         assert info["scene"]["contact"]["initial"] == "keep"
 
     def test_one_muscle_alone(self, folder, tmp_path, capsys):
         command = ("run", "phantom", "-o", tmp_path / "o", "--model", "pbd", "--frames", "0:1")
         code, _, _ = call(capsys, *command, "--muscles", "extensor", "--set", "neighbours=false")
         info = json.loads((tmp_path / "o" / "run.json").read_text(encoding="utf-8"))
-        assert code == 0 and list(info["muscles"]) == ["extensor"] and info["kernels"] == {}
+        assert code == 0 and list(info["muscles"]) == ["extensor"]
+        assert info["kernels"] == info["epsilons"] == {}
         code, _, err = call(capsys, *command, "--muscles", "extensor,abducto")
         assert code == 2 and "did you mean 'abductor'?" in one_line(err)
 
