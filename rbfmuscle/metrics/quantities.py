@@ -146,7 +146,8 @@ QUANTITIES = {
     ),
     "length_roughness": (
         "length",
-        "second difference of the length over 2 degrees; measured in steps of at most 2 degrees",
+        "second difference of the length over 2 degrees; measured where frames at most 2 degrees "
+        "apart span 4 degrees or more",
     ),
     "path_roughness": ("length", "the same of path_length"),
     "roughness_beyond_path": (

@@ -291,7 +291,10 @@ def measured_doubts(
         for (_, name), mine in arms.items()
     )
     if turning and not any(row.quantity == "length_roughness" for row in rows):
-        text = f"roughness is not measured: no frames are {ROUGH:g} degrees apart or less"
+        text = (
+            "roughness is not measured: it needs three frames or more, at most "
+            f"{ROUGH:g} degrees apart, that span {2 * ROUGH:g} degrees"
+        )
         found.append(Doubt(ALL, text))
     return found
 

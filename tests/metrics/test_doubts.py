@@ -55,6 +55,7 @@ def test_moment_arms_without_a_value_and_steps_too_long_to_see_a_jump_are_doubts
     assert said == ("extensor", said.text) and "not defined in 4 of 4 frames" in said.text
     (said,) = doubts([3.0] * 4, muscle="extensor", step=5.0)
     assert said.muscle == ALL and "not measured" in said.text
+    assert "three frames or more, at most 2 degrees apart, that span 4 degrees" in said.text
 
 
 @pytest.mark.parametrize(("moved", "said"), [(0.4, False), (12.0, True)])
