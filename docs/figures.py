@@ -23,7 +23,7 @@ import numpy as np  # noqa: E402
 
 from rbfmuscle.display.plots import Band, Track, line_plot  # noqa: E402
 from rbfmuscle.metrics.quantities import QUANTITIES  # noqa: E402
-from rbfmuscle.metrics.summary import LIMITS, LOWER_BOUNDS  # noqa: E402
+from rbfmuscle.metrics.summary import LIMITS, LOWER_BOUNDS, MORE_BOWING  # noqa: E402
 from rbfmuscle.metrics.verdict import published_band  # noqa: E402
 from rbfmuscle.run.appearance import MUSCLE_COLOURS  # noqa: E402
 
@@ -140,7 +140,8 @@ def quantities_table():
             return ""
         unit = " mm" if QUANTITIES[name][0] == "length" else ""
         least = "at least " if name in LOWER_BOUNDS else ""
-        return f"{least}{found.value:g}{unit}"
+        greater = f", or `bowing_at_rest` + {MORE_BOWING:g} if that is greater"
+        return f"{least}{found.value:g}{unit}{greater if name == 'bowing' else ''}"
 
     lines = ["| quantity | what | limit |", "|---|---|---|"]
     for name, (_, what) in QUANTITIES.items():
