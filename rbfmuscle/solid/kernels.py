@@ -37,8 +37,8 @@ ROUNDS = 10  # of the search for a squeezed point's nearest deformation, found a
 STEPS = 3  # of Newton's method for a stretch in an iteration
 # Stretch over which the material along slack fibres begins to resist lengthening. Were it 0, the
 # stiffness would jump where fibres become taut, and with it the slope of a muscle's length over the
-# angle of a joint.
-TOE = 0.1
+# angle of a joint. With 0.05 and more a gluteus maximus has two shapes in some poses.
+TOE = 0.03
 
 
 def at_points(work: Floats, row: int, *shape: int) -> Floats:

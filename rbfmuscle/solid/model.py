@@ -55,8 +55,9 @@ MOBILE = 0.02
 # Tension of slack fibres over 2 μ. It begins with no slope: one that shortens fibres by more than
 # the ends approach, as any above 1.5 (1 - d / d₀) does, would straighten the muscle at the first
 # motion. Where it straightens the muscle within a few degrees, lengths bend there: with 30 in place
-# of 5 their second differences on the hip are half as great again.
-ANTI_BUCKLING_TENSION, GREATEST_TENSION = 5.0, 0.9
+# of 10 their second differences on the hip are a third greater. With 5 the adductor brevis, among
+# its neighbours, has two shapes in some poses.
+ANTI_BUCKLING_TENSION, GREATEST_TENSION = 10.0, 0.9
 BLOCK = 1024  # points whose mobility is found at once
 # Greatest pressure that a contact takes, over 2 μ. With 5 the gluteus maximus is pressed 6.6 mm
 # into the femur in 90 degrees of flexion.

@@ -64,8 +64,8 @@ LONGEST = 0.02
 GROWTH = 2.0  # a motion beyond this multiple of the least so far restarts the acceleration
 MEMORY = 5  # steps that Anderson acceleration combines
 # Of the estimated error: the last steps hide a slow mode that they hardly move. Measured without
-# it: up to 1.07 times the estimate from the equilibrium, on the phantom.
-SAFETY = 1.4
+# it: up to 1.9 times the estimate from the equilibrium, on the phantom.
+SAFETY = 2.0
 NEAR = 0.015  # contact points nearer to an obstacle take part in a solve
 STALE = 0.4  # share of NEAR by which a node moves before they are chosen again
 MARGIN = 0.003  # obstacles are looked for beyond where a point goes by this
